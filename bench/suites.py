@@ -65,9 +65,9 @@ class Result:
 
 
 @contextlib.contextmanager
-def busy(loops: int) -> Iterator[None]:
-    """Processes that compute without end."""
-    processes = [subprocess.Popen(BUSY_LOOP) for _ in range(loops)]
+def busy(loops: int, niceness: int) -> Iterator[None]:
+    """Processes that compute without end, as nice as the tests: beside others the tests would get no turn for hours."""
+    processes = [subprocess.Popen(('nice', '-n', str(niceness), *BUSY_LOOP)) for _ in range(loops)]
     try:
         yield
     finally:
@@ -91,7 +91,7 @@ def run(row: Row, number: int, tests: Sequence[str]) -> Result:
     # Tests wait for ports, discs and DDS: one more than the cores keeps them busy.
     command += ['-n', str(row.cores + 1), f'--junit-xml={report}', *tests]
     began = time.monotonic()
-    with busy(row.busy_loops), log.open('w') as out:
+    with busy(row.busy_loops, row.niceness), log.open('w') as out:
         status = subprocess.run(command, cwd=ROOT, env=environment, stdout=out, stderr=out, check=False).returncode
     seconds = time.monotonic() - began
     if not report.exists():

@@ -46,10 +46,11 @@ class PageSection(NamedTuple):
 
 
 class StudyResult(abc.ABC):
-    """The answer of a study. ``study``: its name, and that of its JSON file. ``title``: of its page."""
+    """The answer of a study. ``study``: its name; ``title``: of its page; ``json_name``: of the file of the tree."""
 
     study: ClassVar[str]
     title: ClassVar[str]
+    json_name: ClassVar[str]
 
     @abc.abstractmethod
     def tree(self) -> dict[str, Any]:
@@ -90,7 +91,7 @@ class StudyResult(abc.ABC):
 
     def files(self) -> dict[str, str]:
         """What :meth:`save` writes, by name."""
-        return {'report.html': self.report(), f'{self.study}.json': self.json()}
+        return {'report.html': self.report(), self.json_name: self.json()}
 
     def save(self, folder: str | Path) -> list[Path]:
         """Write the page, the JSON and whatever else there is into ``folder``; it is made if it is not there.

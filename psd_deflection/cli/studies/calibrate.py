@@ -25,7 +25,6 @@ row. REC may then be a pattern, or a .txt file that lists recordings and pattern
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -51,14 +50,14 @@ from psd_deflection.cli._options import make_writable, namespace_option, number
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.model.misalignment.rig import is_calibrated
-from psd_deflection.model.simulation.catalogue import effects_of_rig, effects_to_values
+from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import nominal_rig, rig_at_end
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.rig.parameter_files import with_effects_section, with_values
+from psd_deflection.rig.parameter_files import with_values
 from psd_deflection.run.fleet.parquet import Field
 from psd_deflection.studies.calibrate import check as checking
-from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
+from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import (
     DarkLevel,
     dark_levels,
@@ -67,11 +66,10 @@ from psd_deflection.studies.calibrate.dark import (
     values_of_levels,
     words_of_level,
 )
-from psd_deflection.studies.calibrate.fit import NAMES
+from psd_deflection.studies.calibrate.fit import NAMES, REPORTED, UNITS
 from psd_deflection.studies.calibrate.from_recordings import read_run, read_runs
 from psd_deflection.studies.calibrate.observation import CalibrationRun
-from psd_deflection.studies.calibrate.report import report_html
-from psd_deflection.studies.calibrate.result import REPORTED, UNITS, result, sentence, source_of, values_of
+from psd_deflection.studies.calibrate.result import Calibrated
 from psd_deflection.studies.study import described, edited_rig_file
 
 MOST_EXPOSURE = 0.02
@@ -165,17 +163,14 @@ def run(args: argparse.Namespace) -> int:
             bar.set_description_str(words)
             bar.update()
 
-        found = replace(calibrate(runs, rig, alone=args.alone, progress=progress), dark=levels)
+        found = asked.calibrated(runs, rig, levels, progress, warn)
         progress('report')
-        files = asked.files(rig, found)
+        files = found.files()
     save_all(files, out)
     if args.json:
-        print(files['calibration.json'].removesuffix('\n'))  # noqa: T201 - no control characters, long lines
+        print(files[found.json_name].removesuffix('\n'))  # noqa: T201 - no control characters, long lines
         return 0
-    show(sentence(found), *map(words_of_level, levels))
-    for direction in found.undetermined:
-        show(f'undetermined: {", ".join(direction.parts)}; it needs {direction.needs}')
-    show(f'see {out / "report.html"}; use {out / "rig.yaml"} as --params-file')
+    show(*found.lines(), f'see {out / "report.html"}; use {out / "rig.yaml"} as --params-file')
     return 0
 
 
@@ -210,22 +205,25 @@ class CalibrationOptions:
             return []
         return dark_levels([read_run(path, rig, namespace=self.namespace) for path in self.dark], rig, runs)
 
-    def files(self, rig: Rig, found: Calibration) -> dict[str, str]:
-        """The files of --out by their names."""
-        return {
-            'rig.yaml': _rig_yaml(self.params_file, rig, found, self.date),
-            'calibration.json': json.dumps(result(found, self.date), indent=1, allow_nan=False) + '\n',
-            'report.html': report_html(found, self.date),
-        }
+    def calibrated(
+        self,
+        runs: Sequence[CalibrationRun],
+        rig: Rig,
+        levels: Sequence[DarkLevel],
+        progress: Callable[[str], None],
+        tell: Callable[[str], None],
+    ) -> Calibrated:
+        """The answer; ``tell``: is told if the rig file cannot be edited."""
+        found = replace(calibrate(runs, rig, alone=self.alone, progress=progress), dark=levels)
+        return Calibrated(found, rig, self.params_file, self.date, tell)
 
 
 def answer_of(path: str, asked: CalibrationOptions) -> TaskResult:
     """The task for one of many recordings."""
     warnings: list[str] = []
     rig = asked.rig([path], warnings.append)
-    found = calibrate(asked.runs([path], rig), rig, alone=asked.alone)
-    files = asked.files(rig, found)
-    tree = result(found, asked.date)
+    answer = asked.calibrated(asked.runs([path], rig), rig, (), lambda words: None, warnings.append)
+    found, files, tree = answer.found, answer.files(), answer.tree()
     cells: dict[str, object] = {
         'kind': found.kind,
         'refused': found.refused or '',
@@ -234,7 +232,7 @@ def answer_of(path: str, asked: CalibrationOptions) -> TaskResult:
         'heldout_after': found.gap.heldout_after,
         **{name: one['value'] for name, one in tree['parameters'].items()},
         **{f'sd {name}': one['sd'] for name, one in tree['parameters'].items()},
-        'result': files['calibration.json'],
+        'result': files[answer.json_name],
     }
     return TaskResult(files, cells, warnings)
 
@@ -274,19 +272,6 @@ def _line(cells: Mapping[str, Any]) -> list[str]:
         str(cells['undetermined']),
         *(f'{cells[key] * 1e6:.2f}' for key in ('heldout_before', 'heldout_after')),
     ]
-
-
-def _rig_yaml(params_file: str | None, rig: Rig, found: Calibration, date: str) -> str:
-    """The user's parameter file with the calibration, comments kept; without one what describes the rig."""
-    values, effects = values_of(found, date)
-
-    def edit(text: str, path: Path) -> str:
-        # Without a calibration the effects are those of the file.
-        plain = text if found.refused else with_effects_section(text, effects_to_values(effects), path)
-        return with_values(plain, values, f'Calibrated by {source_of(found, date)}', path)
-
-    kept = effects_of_rig(rig) if found.refused else effects
-    return edited_rig_file(params_file, 'rig.yaml', lambda: described(rig, kept), edit, warn)
 
 
 def _dark_alone(args: argparse.Namespace, asked: CalibrationOptions, rig: Rig, levels: Sequence[DarkLevel]) -> int:

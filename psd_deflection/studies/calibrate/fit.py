@@ -35,6 +35,9 @@ Kind = Literal['reference', 'loads', 'self']
 NAMES = (*(p.name for p in ALL), *CLAMP, 'reference.clock')
 SIZE = len(NAMES)
 CLAMP_AT, CLOCK = COUNT, COUNT + 2
+UNITS = (*(p.unit for p in ALL), *(['rad/(N m)'] * len(CLAMP)), 's')
+REPORTED = (*range(ZERO), CLAMP_AT, CLAMP_AT + 1)
+"""Parameters of calibration.json, by their index: the zero has a place of its own."""
 CLOCK_SD = 0.005
 """s. Tolerance of the reference's clock, once the offset that is seen roughly is taken off."""
 CLAMP_SHARE = 0.2

@@ -1,23 +1,82 @@
-"""The output of calibrate: calibration.json and the values of the rig file (docs/calibration.md)."""
+"""The answer of calibrate: calibration.json, the page, and the rig file (docs/calibration.md)."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from psd_deflection import __version__
-from psd_deflection.model.misalignment.model import ALL, COUNT, ZERO
+from psd_deflection.model.misalignment.model import COUNT, ZERO
 from psd_deflection.model.misalignment.rig import CLAMP, rig_values
+from psd_deflection.model.simulation.catalogue import effects_of_rig, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.calibrate.calibrate import Calibration
-from psd_deflection.studies.calibrate.dark import result_of_levels, source_of_levels, values_of_levels
-from psd_deflection.studies.calibrate.fit import CLAMP_AT, CLOCK, NAMES
+from psd_deflection.studies.calibrate.dark import result_of_levels, source_of_levels, values_of_levels, words_of_level
+from psd_deflection.studies.calibrate.fit import CLAMP_AT, CLOCK, NAMES, REPORTED, UNITS
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
+from psd_deflection.studies.study import PageSection, StudyResult, Tell, described, edited_rig_file, warn_caller
 
-REPORTED = (*range(ZERO), CLAMP_AT, CLAMP_AT + 1)
-"""Parameters of calibration.json, by their index: the zero has a place of its own."""
-UNITS = (*(p.unit for p in ALL), *(['rad/(N m)'] * len(CLAMP)), 's')
+
+@dataclass(frozen=True)
+class Calibrated(StudyResult):
+    """``found``: the fit and what it means. ``rig``: as it was known, with the parameter file it has, if any.
+
+    ``date``: of the calibration, for the provenance. ``tell``: takes warnings.
+    """
+
+    study, json_name = 'calibrate', 'calibration.json'
+    title = 'Calibration'
+
+    found: Calibration
+    rig: Rig
+    params_file: str | Path | None
+    date: str
+    tell: Tell = warn_caller
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """Version, date, recordings with their digests."""
+        runs = {f'recording {n}': f'{run.name} (sha256 {run.digest})' for n, run in enumerate(self.found.runs, 1)}
+        return {'version': __version__, 'date': self.date, **runs}
+
+    def sentences(self) -> list[str]:
+        """The answer in one sentence, the dark levels, and what is left open."""
+        found = self.found
+        said = [sentence(found), *map(words_of_level, found.dark)]
+        return said + [f'undetermined: {", ".join(d.parts)}; it needs {d.needs}' for d in found.undetermined]
+
+    def tree(self) -> dict[str, Any]:
+        """Parameters with covariance, what is left open, noise, gap, provenance."""
+        return result(self.found, self.date)
+
+    def sections(self) -> Iterable[PageSection]:
+        """Before and after, parameters, what is left open, noise, dark levels, what to do next."""
+        from psd_deflection.studies.calibrate.pictures import sections
+
+        return sections(self.found)
+
+    def rig_yaml(self) -> str:
+        """The user's parameter file with the calibration, comments kept; without one what describes the rig."""
+        found = self.found
+        values, effects = values_of(found, self.date)
+
+        def edit(text: str, path: Path) -> str:
+            # Without a calibration the effects are those of the file.
+            plain = text if found.refused else with_effects_section(text, effects_to_values(effects), path)
+            return with_values(plain, values, f'Calibrated by {source_of(found, self.date)}', path)
+
+        kept = effects_of_rig(self.rig) if found.refused else effects
+        return edited_rig_file(self.params_file, 'rig.yaml', lambda: described(self.rig, kept), edit, self.tell)
+
+    def files(self) -> dict[str, str]:
+        """The rig file, the page and the JSON."""
+        return {'rig.yaml': self.rig_yaml(), **super().files()}
 
 
 def result(found: Calibration, date: str) -> dict[str, Any]:

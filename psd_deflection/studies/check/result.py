@@ -61,7 +61,7 @@ class Checkup(StudyResult):
     (4,): m/s, of the device's channels x1 y1 x2 y2. ``notes``: what else is worth a look. ``source``: the recording.
     """
 
-    study = 'check'
+    study, json_name = 'check', 'check.json'
     title = 'Is the rig set up as its file says?'
 
     rig: Rig

@@ -25,7 +25,7 @@ from psd_deflection.studies.study import PageSection, StudyResult, described, ed
 class Identified(StudyResult):
     """``axes``: the modes of dX, dY, theta in ``problem.poses``."""
 
-    study = 'identify'
+    study, json_name = 'identify', 'identify.json'
     title = 'Modes of the link'
 
     problem: IdentifyProblem

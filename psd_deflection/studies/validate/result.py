@@ -27,7 +27,7 @@ class Validated(StudyResult):
     reference does not state its own. ``left_out``: references without samples about them.
     """
 
-    study = 'validate'
+    study, json_name = 'validate', 'validate.json'
     title = 'Estimate against reference'
 
     problem: ValidateProblem

@@ -1,20 +1,19 @@
-"""report.html of a calibration: one self-contained page."""
+"""The sections of the page of calibrate."""
 
 from __future__ import annotations
 
 import html
-import json
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from psd_deflection.base.pages import page, picture, table
+from psd_deflection.base.pages import picture, table
 from psd_deflection.model.misalignment.model import ALL, COUNT, ZERO
 from psd_deflection.studies.calibrate.calibrate import Calibration, before_of
-from psd_deflection.studies.calibrate.fit import CLOCK, NAMES, linearised
+from psd_deflection.studies.calibrate.fit import CLOCK, NAMES, REPORTED, UNITS, linearised
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
-from psd_deflection.studies.calibrate.result import REPORTED, UNITS, result, sentence
+from psd_deflection.studies.study import PageSection
 
 BEFORE, AFTER = '#c44e52', '#4c72b0'
 _READ = {'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 's': (1e3, 'ms'), '': (1.0, '')}
@@ -24,31 +23,23 @@ _WORDS = {p.name: p.words for p in ALL} | {
 }
 
 
-def report_html(found: Calibration, date: str) -> str:
-    """The page, pictures inside."""
-    body = ['<h1>Calibration</h1>', f'<p class=verdict>{html.escape(sentence(found))}</p>']
-    body.append('<h2>Before and after</h2>')
-    body.append(picture(_residuals(found), 'reading minus model over time, before and after'))
-    body.append(_gap(found))
-    body.append('<h2>Parameters</h2>')
-    body.append(
+def sections(found: Calibration) -> list[PageSection]:
+    """The page below the sentence."""
+    open_words = (
         '<p class=quiet>Left open: the standard deviation over that of the rig file or its tolerance; 1: nothing was '
         'learnt, and the file keeps its value.</p>'
     )
-    body.append(_parameters(found))
-    body.append(picture(_correlations(found), 'correlations of the parameters'))
-    body.append('<h2>What these recordings cannot determine</h2>')
-    body.append(_undetermined(found))
-    body.append('<h2>Noise</h2>')
-    body.append(_noise(found))
-    if found.dark:
-        body.append('<h2>Dark levels and other light</h2>')
-        body.append(_dark(found))
-    body.append('<h2>What to do next</h2><ul>')
-    body.append(''.join(f'<li>{html.escape(words)}</li>' for words in advice(found)))
-    source = html.escape(json.dumps(result(found, date)['provenance'], indent=1))
-    body.append(f'</ul><h2>Provenance</h2><pre role="group" tabindex="0" aria-label="provenance">{source}</pre>')
-    return page('psd-deflection calibrate', body)
+    residuals = picture(_residuals(found), 'reading minus model over time, before and after')
+    correlations = picture(_correlations(found), 'correlations of the parameters')
+    todo = ''.join(f'<li>{html.escape(words)}</li>' for words in advice(found))
+    return [
+        PageSection('Before and after', (residuals, _gap(found))),
+        PageSection('Parameters', (open_words, _parameters(found), correlations)),
+        PageSection('What these recordings cannot determine', (_undetermined(found),)),
+        PageSection('Noise', (_noise(found),)),
+        *([PageSection('Dark levels and other light', (_dark(found),))] if found.dark else []),
+        PageSection('What to do next', (f'<ul>{todo}</ul>',)),
+    ]
 
 
 def advice(found: Calibration) -> list[str]:
