@@ -17,14 +17,14 @@ from psd_deflection.model.misalignment.model import (
     ZERO,
     response_of,
 )
-from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, is_ours, make_active, sort_effects
-from psd_deflection.model.simulation.declaration import PSD, ActiveEffect, Effect
+from psd_deflection.model.simulation.catalogue import effects_of_rig, make_active, our_effects, sort_effects
+from psd_deflection.model.simulation.declaration import CALIBRATED_OF_LINK, PSD, ActiveEffect, Effect
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds
 
-CLAMP = ('clamp.bending_compliance', 'clamp.torsional_compliance')
-"""Compliances, rad/(N m): parameters of a calibration that no reading depends on by itself."""
 _SLOPE = 'link.slope_ratio'
+CLAMP = tuple(name for name in CALIBRATED_OF_LINK if name != _SLOPE)
+"""Compliances, rad/(N m): parameters of a calibration that no reading depends on by itself."""
 _AIMED = 'aimed'
 """Whether the laser was aimed at the true centre: a choice, no number that a calibration finds."""
 NOT_CALIBRATED = ('none',)
@@ -55,13 +55,13 @@ class RigVector(NamedTuple):
 def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> RigVector:
     """The parameters as ``rig`` has them; ``effects``: its effects, if they are known.
 
-    Raises ConfigError if an effect is listed twice.
+    Raises ConfigError if an effect is listed twice, or if two effects are the same parameter.
     """
     check_two_psds(rig, 'a calibration')
     v = np.zeros(len(ALL))
     clamp = dict.fromkeys(CLAMP, 0.0)
     others: list[ActiveEffect] = []
-    seen: set[str] = set()
+    seen: dict[str, str] = {}
     listed: set[str] = set()
     tilts = False
     v[SLOPE] = rig.link.slope_ratio
@@ -76,11 +76,11 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
         if not called:
             others.append(active)
             continue
-        if active.label in seen:
-            raise ConfigError(f'effects: {active.label}: listed twice; a calibration takes one of them')
-        # Of one PSD an effect counts once, whatever its other choices are.
-        seen.add(active.label.split(',')[0])
         for own, name in called.items():
+            # Of one PSD an effect counts once, whatever its other choices are.
+            whole = f'psd_{active.values[PSD.name]:.0f}.{name}' if PSD in active.effect.parameters else name
+            if active.values[own] != active.effect.parameter(own).nominal or name == _AIMED:
+                _claim(seen, whole, active)
             if name in clamp:
                 clamp[name] = active.values[own]
             elif name == _SLOPE:
@@ -88,7 +88,7 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
             elif name == _AIMED:
                 aimed[int(active.values[PSD.name]) - 1] = active.values[own]
             else:
-                v[INDEX[f'psd_{active.values[PSD.name]:.0f}.{name}']] += active.values[own]
+                v[INDEX[whole]] += active.values[own]
         listed.add(active.effect.name)
         tilts = tilts or _SLOPE in called.values()
     for i, psd in enumerate(rig.psds):
@@ -98,6 +98,16 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
         by = ARITHMETICS[rig.estimator.arithmetic]
         v[ZERO + 2 * i : ZERO + 2 * i + 2] = response_of(v, i).reading(np.array(x), np.array(y), by)
     return RigVector(v, clamp, others, frozenset(listed), tilts)
+
+
+def _claim(claimed: dict[str, str], name: str, active: ActiveEffect) -> None:
+    """Note that ``active`` gives the parameter ``name``. Raises ConfigError if another effect gives it already."""
+    before = claimed.get(name)
+    if before == active.label:
+        raise ConfigError(f'effects: {before}: listed twice; a calibration takes one of them')
+    if before is not None:
+        raise ConfigError(f'effects: {before} and {active.label}: both give {name}; a calibration takes one of them')
+    claimed[name] = active.label
 
 
 class Known(NamedTuple):
@@ -196,9 +206,9 @@ def _written(listed: frozenset[str]) -> Iterator[tuple[Effect, dict[str, str]]]:
 
     Of several effects for one parameter: that which the rig file listed, otherwise the package's own.
     """
-    known = [e for e in catalogue().values() if e.calibrated_as and not e.in_rig_file]
+    known = [e for e in our_effects(*listed).values() if e.calibrated_as and not e.is_placed]
     taken: set[str] = set()
-    for effect in sorted(known, key=lambda e: (e.name not in listed, not is_ours(e.name))):
+    for effect in sorted(known, key=lambda e: e.name not in listed):
         if called := {key: name for key, name in effect.calibrated_as.items() if name not in taken}:
             taken.update(called.values())
             yield effect, called

@@ -83,11 +83,6 @@ def _words(place: Place) -> str:
     return str(place) if isinstance(place, Path) else place.value
 
 
-def is_ours(name: str) -> bool:
-    """Whether the package has that effect, and not a user."""
-    return any(module.name == name for module in pkgutil.iter_modules(ours.__path__))
-
-
 def effect_names() -> list[str]:
     """Every effect's name, without loading any. Raises ConfigError if two have one name."""
     return sorted(_places())
@@ -127,7 +122,17 @@ def _load(name: str, place: Place) -> Effect:
 
 def catalogue() -> Mapping[str, Effect]:
     """Every effect by name, in the order in which they act. Raises ConfigError if one cannot be loaded."""
-    found = [_load(name, place) for name, place in _places().items()]
+    return _loaded(_places())
+
+
+def our_effects(*others: str) -> Mapping[str, Effect]:
+    """The package's own effects and ``others``, by name. What else a user has is not loaded, so it cannot fail."""
+    own = {module.name for module in pkgutil.iter_modules(ours.__path__)}
+    return _loaded({name: place for name, place in _places().items() if name in own or name in others})
+
+
+def _loaded(places: Mapping[str, Place]) -> dict[str, Effect]:
+    found = [_load(name, place) for name, place in places.items()]
     return {e.name: e for e in sorted(found, key=lambda e: e.rank)}
 
 

@@ -33,6 +33,14 @@ STAGES: tuple[Stage, ...] = typing.get_args(Stage)
 """In the order in which they act."""
 
 
+CALIBRATED_OF_LINK = ('link.slope_ratio', 'clamp.bending_compliance', 'clamp.torsional_compliance')
+"""What a calibration finds of the link; an effect without a PSD may declare it."""
+CALIBRATED_OF_PSD = ('rotation', 'gain_x', 'gain_y', 'crosstalk_xy', 'crosstalk_yx', 'nonlinearity')
+"""What a calibration finds of each PSD; an effect with a PSD may declare it."""
+PLACED_OF_PSD = ('center_x', 'center_y', 'height', 'aimed')
+"""The same, if the rig file has a parameter of its own for it: a calibrated file does not list the effect."""
+
+
 @dataclass(frozen=True, slots=True)
 class EffectParameter:
     """One parameter of an effect, with its bounds and the settings of a search.
@@ -171,9 +179,9 @@ class Effect:
     ``grid`` are probed. ``whole``: ``apply`` must see the whole history at once, because a sample depends on later
     ones; no effect of the catalogue does.
 
-    ``calibrated_as``: what a calibration calls the effect's parameters (:mod:`psd_deflection.model.misalignment.model`,
-    without ``psd_N.``): it then finds the effect's size; without it a calibration refuses rigs that have the effect.
-    ``in_rig_file``: the rig file states what a calibration finds of it, so that a calibrated file does not list it.
+    ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
+    ``PLACED_OF_PSD`` (an effect with a PSD) or of ``CALIBRATED_OF_LINK``. The calibration then finds their sizes;
+    without it a calibration refuses rigs that have the effect.
     Raises ValueError if the declaration contradicts itself.
     """
 
@@ -194,7 +202,6 @@ class Effect:
     whole: bool = False
     order: int = 0
     calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
-    in_rig_file: bool = False
 
     def __post_init__(self) -> None:
         names = [p.name for p in self.parameters]
@@ -220,6 +227,30 @@ class Effect:
                 raise ValueError(f'{p.name}: a choice, and nothing else, has choices')
         if not set(self.calibrated_as) <= set(names):
             raise ValueError(f'calibrated_as = {dict(self.calibrated_as)!r}: must name parameters')
+        self._check_calibrated()
+
+    def _check_calibrated(self) -> None:
+        called = list(self.calibrated_as.values())
+        if left := [p.name for p in self.parameters if called and p != PSD and p.name not in self.calibrated_as]:
+            raise ValueError(
+                f'calibrated_as: {", ".join(left)}: not named; a calibration finds all parameters of an effect or none'
+            )
+        known = (*CALIBRATED_OF_PSD, *PLACED_OF_PSD) if PSD in self.parameters else CALIBRATED_OF_LINK
+        for own, name in self.calibrated_as.items():
+            if name not in known:
+                whose = 'a PSD' if PSD in self.parameters else 'the link'
+                raise ValueError(f'calibrated_as: {own} = {name!r}: a calibration finds of {whose}: {", ".join(known)}')
+        if len(set(called)) < len(called):
+            raise ValueError(f'calibrated_as = {dict(self.calibrated_as)!r}: has a name twice')
+        if 0 < len(set(called) & set(PLACED_OF_PSD)) < len(called):
+            raise ValueError(
+                f'calibrated_as = {dict(self.calibrated_as)!r}: {", ".join(PLACED_OF_PSD)} need an effect of their own'
+            )
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether the rig file has parameters for what a calibration finds of it: a calibrated file lists it not."""
+        return not set(PLACED_OF_PSD).isdisjoint(self.calibrated_as.values())
 
     @property
     def rank(self) -> tuple[int, int, str]:

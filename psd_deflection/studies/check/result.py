@@ -84,12 +84,16 @@ class Checkup(StudyResult):
 
     def sentences(self) -> list[str]:
         """The verdict, then what is wrong, one line each, then what to look at."""
-        return [_verdict(self), *_findings(self), *(f'look at  {note}' for note in self.notes)]
+        wrong = [f'{what}: {fix}' for what, fix in _findings(self)]
+        return [_verdict(self), *wrong, *_other_causes(self), *(f'look at  {note}' for note in self.notes)]
 
     def lines(self) -> list[str]:
         """Pushes, verdict, lines for the rig file, levels."""
         out = ['', *columns(_pushes(self)).splitlines(), '', _verdict(self)]
-        out += [f'  {text}' for text in _findings(self)]
+        findings = _findings(self)
+        width = max((len(what) for what, _ in findings), default=0)
+        out += [f'  {what:<{width}}   {fix}' for what, fix in findings]
+        out += [f'  {text}' for text in _other_causes(self)]
         if self.values:
             out += ['', 'Lines for the rig file, below ros__parameters:', '']
             out += [f'    {line(name, value)}' for name, value in self.values.items()]
@@ -174,17 +178,18 @@ def _verdict(found: Checkup) -> str:
     return f'WRONG: {fits}, and that of the rig file does not.'
 
 
-def _findings(found: Checkup) -> list[str]:
-    if not found.findings:
-        return []
+def _findings(found: Checkup) -> list[tuple[str, str]]:
+    """What is wrong, and what to do about it."""
     rows = []
     for f in found.findings:
         where = f.where.replace(' ', ' and ') if f.name == 'psd_swap' else f.where
         rows.append((f'{where}: {NAMES[f.name]}', f.fix))
-    width = max(len(what) for what, _ in rows)
-    out = [f'{what:<{width}}   {fix}' for what, fix in rows]
-    also = dict.fromkeys(text for f in found.findings for text in f.equivalent)
-    return [*out, *(f'or else: {_other(text)}' for text in also)]
+    return rows
+
+
+def _other_causes(found: Checkup) -> list[str]:
+    """What else would look the same."""
+    return [f'or else: {_other(text)}' for text in dict.fromkeys(t for f in found.findings for t in f.equivalent)]
 
 
 def _other(text: str) -> str:

@@ -13,12 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import psd_deflection
-from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.correction import Correction
 from psd_deflection.model.detector.response import DetectorResponse, freed, pulled
-from psd_deflection.model.misalignment.model import INDEX, TOLERANCES
-from psd_deflection.model.misalignment.rig import rig_values, vector_of_rig
-from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effect_names, make_active
+from psd_deflection.model.simulation.catalogue import effect_names, make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.samples import SimulatedSamples
@@ -147,62 +143,3 @@ def test_no_other_file_names_an_effect() -> None:
             if not (where.startswith(PLACES) and node.value in HOMONYMS):
                 found.append(f'{where}:{node.lineno}: {node.value}')
     assert found == []
-
-
-OWN = """
-from psd_deflection.model.simulation.declaration import PSD, Effect, EffectParameter
-
-def _apply(samples, values, state):
-    samples.dots[2 * (int(values['psd']) - 1)] *= 1.0 + values['x']
-
-def _correct(reading, values):
-    reading.dots[2 * (int(values['psd']) - 1)] /= 1.0 + values['x']
-
-EFFECT = Effect(
-    name='my_gain', stage='psd', summary='-', equation='-', source='-', needs='-', point='dots', order=5,
-    parameters=(PSD, EffectParameter('x', '', -0.5, 0.5, 1e-3, 'of x')),
-    apply=_apply, correct=_correct, calibrated_as={'x': 'gain_x'},
-)
-"""
-
-
-def test_a_calibration_takes_an_effect_of_the_users_own_for_what_it_declares(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / 'my_gain.py').write_text(OWN)
-    monkeypatch.setenv(FOLDERS, str(tmp_path))
-    assert catalogue()['my_gain'].calibrated_as == {'x': 'gain_x'}
-    listed = {'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}
-    rig = load_rig(overrides=listed)
-    vector = vector_of_rig(rig)
-    assert vector.others == []
-    at = INDEX['psd_2.gain_x']
-    assert vector.values[at] == 0.01
-    # What a calibration finds goes into the effect that the file has; of others into the package's own.
-    found = vector.values.copy()
-    found[at] = 0.012
-    found[INDEX['psd_1.rotation']] = TOLERANCES[INDEX['psd_1.rotation']]
-    _, effects = rig_values(vector, found, vector.clamp)
-    own = [a for a in effects if 'psd' in a.values]
-    assert [(a.effect.name, a.values['psd']) for a in own] == [('sensor_rotation', 1.0), ('my_gain', 2.0)]
-    assert own[1].values['x'] == 0.012
-    dots = np.array([[0.0, 0.0, 1.01e-3, 0.0]])
-    assert Correction.from_rig(rig).apply(dots)[0, 2] == pytest.approx(1e-3)
-    found[INDEX['psd_2.gain_y']] = 0.004
-    for known, want in ((vector, ['my_gain', 'sensor_gain']), (vector_of_rig(RIG), ['sensor_gain'])):
-        _, effects = rig_values(known, found, vector.clamp)
-        gains = [a for a in effects if a.effect.name.endswith('gain')]
-        assert [a.effect.name for a in gains] == want
-        assert gains[-1].values['y'] == 0.004
-
-
-def test_a_declaration_names_its_own_parameters() -> None:
-    with pytest.raises(ValueError, match=r"calibrated_as = .'z': 'gain_x'.: must name parameters"):
-        replace(catalogue()['sensor_gain'], calibrated_as={'z': 'gain_x'})
-
-
-def test_an_effect_listed_twice_is_refused() -> None:
-    twice = {f'effects.{key}.{name}': value for key in 'ab' for name, value in
-             {'name': 'sensor_gain', 'psd': 1, 'x': 0.01}.items()}  # fmt: skip
-    with pytest.raises(ConfigError, match='listed twice'):
-        vector_of_rig(load_rig(overrides=twice))

@@ -41,5 +41,4 @@ EFFECT = Effect(
     point='configure',
     configure=_configure,
     calibrated_as={'x': 'center_x', 'y': 'center_y', 'aimed': 'aimed'},
-    in_rig_file=True,
 )
