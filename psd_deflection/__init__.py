@@ -10,8 +10,17 @@
     estimates.t, estimates.dx, estimates.dy              # s, m, m; .theta rad; .sd; .wrench N, N, N m
     pd.solve([0.0, -1e-3, 0.0, -2e-3], rig).pose         # dots in m (x1, y1, x2, y2) to dX m, dY m, theta rad
     pd.simulate(rig, (0, -10, -5.85), seconds=2)         # a recording of this rig under a load, N, N, N m
+    pd.check(recording)                                  # is the rig wired and set up as its file says?
+    pd.identify(recording)                               # the modes of the link
+    pd.validate(recording, 'tracker.csv')                # against an independent reference
+    pd.calibrate([recording]).save('calibrated')         # how the rig differs from its file; writes rig.yaml
+    pd.budget(rig).tree()                                # what each source of error does
     pd.discover([recording], rig)                        # the effects that the simulation lacks
     pd.discover_in(plant)                                # the same for a machine of yours that simulates itself
+
+The answers of check, identify, validate, calibrate and budget are :class:`psd_deflection.studies.study.StudyResult`:
+``sentences()`` for a person, ``tree()`` for a program, ``report()`` is the page, ``save(folder)`` writes what the
+command writes.
 
 SI units everywhere. What is refused raises a subclass of ``psd_deflection.base.errors.PsdDeflectionError``: one line
 with the file or argument, the value and its bound. The command ``psd-deflection`` does the same from a shell, and more.
@@ -32,12 +41,30 @@ if TYPE_CHECKING:
     from psd_deflection.recordings.recording import Recording
     from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
     from psd_deflection.rig.config import Rig
+    from psd_deflection.studies.budget.result import Budgeted
+    from psd_deflection.studies.calibrate.result import Calibrated
+    from psd_deflection.studies.check.result import Checkup
     from psd_deflection.studies.discover.discover import Discovery
     from psd_deflection.studies.discover.plants import Plant, PlantDiscovery
+    from psd_deflection.studies.identify.result import Identified
+    from psd_deflection.studies.validate.result import Validated
 
 __version__ = '0.1.0'
 
-__all__ = ['discover', 'discover_in', 'load_rig', 'open', 'replay', 'simulate', 'solve']
+__all__ = [
+    'budget',
+    'calibrate',
+    'check',
+    'discover',
+    'discover_in',
+    'identify',
+    'load_rig',
+    'open',
+    'replay',
+    'simulate',
+    'solve',
+    'validate',
+]
 
 # Every function imports what it needs when it is called, to keep `import psd_deflection` fast.
 
@@ -175,6 +202,130 @@ def replay(
         for warning in nominal_rig(opened):
             warnings.warn(warning, stacklevel=2)
     return replayed_estimates(opened, known)
+
+
+def check(recording: Recording | str | Path, rig: Rig | str | Path | None = None) -> Checkup:
+    """Is the rig wired, quiet and lit as its file says? From pushes with known loads.
+
+    ``recording``: from :func:`open` or :func:`simulate`, or its path. ``rig``: the rig or its parameter file; by
+    default the parameters in the recording.
+    Raises :class:`psd_deflection.base.errors.RecordingError` if it has no loads, and
+    :class:`~psd_deflection.base.errors.ConfigError`.
+    """
+    from psd_deflection.rig.wiring import Wiring
+    from psd_deflection.studies.check.checkup import check as of_problem
+    from psd_deflection.studies.check.checkup import of_recording
+    from psd_deflection.studies.discover.from_recordings import read_observation
+    from psd_deflection.studies.study import opened
+
+    given = opened(recording, rig)
+    seen = read_observation(given.recording, given.rig)
+    volts = Wiring.from_rig(given.rig).to_device(seen.volts)
+    return of_problem(of_recording(given.rig, volts, seen.loads, str(given.recording.path)))
+
+
+def identify(recording: Recording | str | Path, rig: Rig | str | Path | None = None) -> Identified:
+    """The modes of the link (frequency, damping ratio, each with its ±) and the input shaper for them.
+
+    ``recording`` with knocks or releases, and ``rig``: as for :func:`check`. ``save`` writes ``rig.yaml`` too.
+    Raises :class:`psd_deflection.base.errors.RecordingError` and :class:`~psd_deflection.base.errors.ConfigError`.
+    """
+    from psd_deflection.studies.identify.from_recordings import read_identify
+    from psd_deflection.studies.identify.identify import identify as of_problem
+    from psd_deflection.studies.study import opened
+
+    return of_problem(read_identify(opened(recording, rig)))
+
+
+def validate(
+    recording: Recording | str | Path,
+    reference: str | Path | None = None,
+    rig: Rig | str | Path | None = None,
+    *,
+    align: bool = False,
+    max_offset: float = 1.0,
+    exposure: float = 0.0,
+) -> Validated:
+    """How the estimates of a recording agree with an independent reference.
+
+    ``recording`` and ``rig``: as for :func:`check`. ``reference``: a table ``t,dx,dy,theta`` or another recording; by
+    default the reference in the recording. ``align``: remove the offset between the clocks, which is looked for up
+    to ``max_offset``, s. ``exposure``: time over which each reference is a mean, s.
+    Raises :class:`psd_deflection.base.errors.RecordingError` and :class:`~psd_deflection.base.errors.ConfigError`.
+    """
+    from psd_deflection.studies.study import opened
+    from psd_deflection.studies.validate.from_recordings import read_validate
+    from psd_deflection.studies.validate.validate import validate as of_problem
+
+    known = opened(recording, rig)
+    return of_problem(read_validate(known, reference, align=align, largest=max_offset, exposure=exposure))
+
+
+def calibrate(
+    recordings: Sequence[Recording | str | Path],
+    rig: str | Path | None = None,
+    *,
+    references: Sequence[str | Path] = (),
+    dark: Sequence[Recording | str | Path] = (),
+    exposure: float = 0.0,
+    alone: bool = False,
+) -> Calibrated:
+    """How a real rig differs from its rig file, by a reference or by known loads.
+
+    ``recordings``: from :func:`open` or :func:`simulate`, or paths. ``rig``: the parameter file of the rig as it is
+    known, which ``save`` writes anew with its comments; by default the parameters in the first recording.
+    ``references``: one for each recording, by default those in them. ``dark``: recordings with the lasers off.
+    ``exposure``: time over which each reference is a mean, s. ``alone``: by the redundant reading alone.
+    Raises :class:`psd_deflection.base.errors.RecordingError` and :class:`~psd_deflection.base.errors.ConfigError`.
+    """
+    from psd_deflection.base.errors import ConfigError
+    from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions
+    from psd_deflection.studies.study import warn_caller
+
+    if not recordings:
+        raise ConfigError('recordings: must be at least one')
+    if references and len(references) != len(recordings):
+        raise ConfigError(f'references: {len(references)} for {len(recordings)} recordings; give one for each')
+    file = None if rig is None else str(rig)
+    asked = CalibrationOptions(file, None, exposure, alone, tuple(references), tuple(dark))
+    known = asked.rig(recordings, warn_caller)
+    runs = asked.runs(recordings, known)
+    return asked.calibrated(runs, known, asked.levels(known, runs), lambda words: None, warn_caller)
+
+
+def budget(
+    rig: Rig | str | Path | None = None,
+    load: Sequence[float] | None = None,
+    *,
+    inputs: str | Path | Mapping[str, object] | None = None,
+    method: str | None = None,
+    draws: int = 0,
+    seed: int = 1,
+) -> Budgeted:
+    """What each source of error does to dX, dY and theta of a rig.
+
+    ``rig``: the rig or its parameter file; by default the thesis rig. ``load``: at the tip, Fx N, Fy N, Tz N m; by
+    default one that suits the rig. ``inputs``: sizes of the errors by name, or a YAML file of them;
+    ``psd-deflection budget --explain`` lists them. ``method``: whose errors are computed, by default that of the rig.
+    ``draws``: random draws of all causes at once that check the totals, with ``seed``.
+    Raises :class:`psd_deflection.base.errors.ConfigError` naming argument, value and bound.
+    """
+    import math
+    from pathlib import Path
+
+    from psd_deflection.base.errors import ConfigError
+    from psd_deflection.studies.budget.budget import BudgetProblem
+    from psd_deflection.studies.budget.budget import budget as of_problem
+    from psd_deflection.studies.budget.inputs import read_inputs
+
+    file = str(rig) if isinstance(rig, (str, Path)) else ''
+    sizes = read_inputs(inputs, {}) if isinstance(inputs, (str, Path)) else read_inputs(None, inputs or {}, 'inputs')
+    held: tuple[float, float, float] | None = None
+    if load is not None:
+        if len(load) != 3 or not all(math.isfinite(v) for v in load):
+            raise ConfigError(f'load = {list(load)}: must be three finite numbers: Fx N, Fy N, Tz N m')
+        held = float(load[0]), float(load[1]), float(load[2])
+    return of_problem(BudgetProblem(_rig(rig), sizes, held, method, draws, seed, file))
 
 
 def discover(

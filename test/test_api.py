@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import importlib.util
 import json
 import pydoc
@@ -16,6 +17,7 @@ import pytest
 
 import psd_deflection
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError, SolverError
+from psd_deflection.cli.main import main
 from psd_deflection.studies.discover.discover import Discovery
 from tools.program import ROOT
 
@@ -42,13 +44,18 @@ def test_the_import_is_fast_and_brings_nothing_along() -> None:
 def test_help_teaches() -> None:
     text = pydoc.plain(pydoc.render_doc(psd_deflection))
     assert sorted(psd_deflection.__all__) == [
+        'budget',
+        'calibrate',
+        'check',
         'discover',
         'discover_in',
+        'identify',
         'load_rig',
         'open',
         'replay',
         'simulate',
         'solve',
+        'validate',
     ]
     for name in psd_deflection.__all__:
         assert f'\n    {name}(' in text
@@ -275,3 +282,70 @@ def test_a_damaged_recording_can_be_shown(tmp_path: Path) -> None:
     recording = psd_deflection.open(path)
     assert 'cannot be read' in recording._repr_html_()
     assert 'CsvRecording' in repr(recording)
+
+
+def pushed(seed: int = 2) -> Any:
+    """Rest, a push along X, one along Y, a turn; each held for 2 s."""
+    loads = [(0, 0, 0), (8, 0, 0), (0, 0, 0), (0, -8, 0), (0, 0, 0), (0, 0, 2), (0, 0, 0)]
+    return psd_deflection.simulate(None, loads, seconds=2, seed=seed)
+
+
+def test_every_study_can_be_asked_from_python(tmp_path: Path) -> None:
+    run = pushed()
+    answers = {
+        'check.json': psd_deflection.check(run),
+        'identify.json': psd_deflection.identify(run),
+        'calibration.json': psd_deflection.calibrate([run]),
+        'budget.json': psd_deflection.budget(load=(0.0, -10.0, 0.0), draws=200),
+    }
+    for name, answer in answers.items():
+        first, *_ = answer.sentences()
+        files = {path.name: path for path in answer.save(tmp_path / answer.study)}
+        assert {name, 'report.html'} <= set(files)
+        assert json.loads(files[name].read_text()) == json.loads(answer.json())
+        assert html.escape(first) in files['report.html'].read_text()
+    assert answers['check.json'].sentences() == ['RIGHT: of 128 wirings only that of the rig file fits.']
+    assert psd_deflection.load_rig(tmp_path / 'calibrate' / 'rig.yaml').link.length == 0.585
+
+
+def test_the_budget_of_python_is_that_of_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    rig = str(ROOT / 'config' / 'thesis_rig.yaml')
+    out = tmp_path / 'budget'
+    words = ['budget', '--params-file', rig, '--load', '0', '-10', '0', '--set', 'rotation_tolerance=1e-3']
+    assert main([*words, '--json', '--out', str(out)]) == 0
+    answer = psd_deflection.budget(rig, (0, -10, 0), inputs={'rotation_tolerance': 1e-3})
+    told = capsys.readouterr().out
+    assert answer.tree() == json.loads(told) == json.loads((out / 'budget.json').read_text())
+    assert (out / 'report.html').read_text() == answer.report()
+
+
+def test_a_validation_takes_a_table(tmp_path: Path) -> None:
+    run = pushed()
+    table = tmp_path / 'tracker.csv'
+    samples = run.samples[::50]
+    t = samples['t_ns'] * 1e-9
+    rows = [f'{at:.6f},{x:.9f},{y:.9f},{turn:.9f}' for at, (x, y, turn) in zip(t, run.pose[::50], strict=True)]
+    table.write_text('\n'.join(['t,dx,dy,theta', *rows]) + '\n')
+    found = psd_deflection.validate(run, table)
+    tree = found.tree()
+    assert tree['references'] + tree['left_out'] == len(samples)
+    assert 'tracker.csv' in found.report()
+
+
+@pytest.mark.parametrize(
+    ('ask', 'words'),
+    [
+        (lambda: psd_deflection.budget(load=(1.0, 2.0)), r'load = \[1.0, 2.0\]: must be three finite numbers'),
+        (lambda: psd_deflection.budget(load=(1.0, 2.0, float('nan'))), 'must be three finite numbers'),
+        (lambda: psd_deflection.budget(inputs={'rotation_tolerence': 1.0}), 'inputs: rotation_tolerence = 1.0'),
+        (lambda: psd_deflection.calibrate([]), 'recordings: must be at least one'),
+        (lambda: psd_deflection.calibrate(['a.csv'], references=['b', 'c']), 'references: 2 for 1 recordings'),
+        (lambda: psd_deflection.check('bags/clean'), 'holds no loads'),
+    ],
+)
+def test_what_a_study_is_asked_wrongly_is_refused(
+    ask: Callable[[], Any], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    with pytest.raises(PsdDeflectionError, match=words):
+        ask()

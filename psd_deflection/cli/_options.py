@@ -170,6 +170,12 @@ def picture_name(*suffixes: str) -> Callable[[str], str]:
     return read
 
 
+def picture_or_folder(*suffixes: str) -> Callable[[str], str]:
+    """Reads an --out that is a picture by its ending, or a folder, which has none; what it gives raises UsageError."""
+    picture = picture_name(*suffixes)
+    return lambda text: text if not Path(text).suffix or Path(text).is_dir() else picture(text)
+
+
 def need_folder(out: Path) -> None:
     """Raise RecordingError, before the work is done, if the folder of ``out`` does not exist."""
     if not out.parent.is_dir():

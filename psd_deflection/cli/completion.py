@@ -32,6 +32,7 @@ FILES = (
     'FILE.yaml',
     'FILE.png',
     'FILE.png|svg|pdf',
+    'DIR|FILE.png|svg|pdf',
     'PORT',
     'PATH',
 )

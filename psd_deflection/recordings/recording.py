@@ -17,6 +17,7 @@ from psd_deflection.base.errors import RecordingError, printable
 from psd_deflection.base.tables import Column, Table, columns_of, html_table
 from psd_deflection.measure.averaging import BlockCutter
 from psd_deflection.recordings.estimates import EstimateSeries
+from psd_deflection.recordings.read.grid import digest_of
 from psd_deflection.recordings.read.mcap_reader import RawMessage
 from psd_deflection.records import (
     RESTART,
@@ -174,6 +175,11 @@ class Recording(abc.ABC):
     @abc.abstractmethod
     def estimates(self) -> dict[str, EstimateSeries]:
         """Recorded deflections by topic; {} if none were recorded."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of its files; '' if it has none. Raises RecordingError if one cannot be read."""
+        return digest_of(self.path)
 
     @functools.cached_property
     def sample_rate_hz(self) -> float:

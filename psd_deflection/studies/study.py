@@ -150,6 +150,11 @@ def opened(
     return Opened(recording.with_block_size(known.estimator.block_size), known, params_file, tell)
 
 
+def named(recording: str, digest: str, digits: int = 16) -> str:
+    """A recording by its name and the start of its SHA-256, if it has files."""
+    return f'{recording} (sha256 {digest[:digits]})' if digest else recording
+
+
 def described(rig: Rig, effects: Iterable[ActiveEffect]) -> str:
     """What describes the rig, as a ROS 2 parameter file with ``effects`` instead of its own.
 

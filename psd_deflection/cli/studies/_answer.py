@@ -41,10 +41,7 @@ def counted(args: argparse.Namespace) -> Callable[[Iterable[SampleBlock]], Itera
 
 def answer(args: argparse.Namespace, result: StudyResult) -> int:
     """Print the result and write its files."""
-    if args.json:
-        print_json(result.tree(), indent=1)
-    else:
-        show(*result.lines())
+    print_answer(args, result)
     if args.out is not None:
         with told('drawing', quiet=args.json):
             files = result.files()
@@ -53,3 +50,11 @@ def answer(args: argparse.Namespace, result: StudyResult) -> int:
         *others, last = files
         show(f'wrote {", ".join(others)} and {last} into {folder}', aside=args.json)
     return 0
+
+
+def print_answer(args: argparse.Namespace, result: StudyResult) -> None:
+    """Print the result for a person or, with --json, for a program."""
+    if args.json:
+        print_json(result.tree(), indent=1)
+    else:
+        show(*result.lines())

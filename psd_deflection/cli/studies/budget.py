@@ -4,7 +4,7 @@ The causes are those of the thesis's Table 3.1, with corrected equations, and th
 out. Numbers are standard deviations, except for known biases: errors that follow from the pose
 because the method ignores something. Percentages are shares of the mean square of the total.
 
-  psd-deflection budget --params-file config/thesis_rig.yaml --out budget.png
+  psd-deflection budget --params-file config/thesis_rig.yaml --out budget
   psd-deflection budget --set rotation_tolerance=0.001 --method beam --json
   psd-deflection budget --explain
 
@@ -18,43 +18,35 @@ import argparse
 import contextlib
 import math
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from psd_deflection.base.errors import UsageError
-from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import (
     PICTURES,
     given_as_option,
+    make_writable,
     need_finite,
     need_folder,
-    picture_name,
+    picture_or_folder,
     refuse,
     seed,
     whole,
 )
-from psd_deflection.cli._report import print_json, save_figure, show, show_text
+from psd_deflection.cli._report import save_figure, show, show_text
+from psd_deflection.cli.studies._answer import answer, print_answer
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.budget import optics
+from psd_deflection.studies.budget.budget import BudgetProblem, budget
 from psd_deflection.studies.budget.computation import stop_window
 from psd_deflection.studies.budget.environment import averaging_gain
-from psd_deflection.studies.budget.estimate import METHODS, method_of
-from psd_deflection.studies.budget.evaluate import CAUSES, Budget, evaluate, monte_carlo
+from psd_deflection.studies.budget.estimate import METHODS
+from psd_deflection.studies.budget.evaluate import CAUSES
 from psd_deflection.studies.budget.inputs import INPUTS, read_inputs
-from psd_deflection.studies.budget.load import default_load
-from psd_deflection.studies.budget.term import Contribution, Kind, Situation
-
-MICRO_MILLIDEGREE = np.array([1e6, 1e6, math.degrees(1e3)])
+from psd_deflection.studies.budget.pictures import chart
 
 MAX_DRAWS = 10_000_000
-
-KINDS = {Kind.PER_ESTIMATE: 'per estimate', Kind.SYSTEMATIC: 'systematic', Kind.KNOWN: 'known bias'}
-
-# Okabe & Ito: told apart by a colour-blind reader too.
-COLOURS = {Kind.PER_ESTIMATE: '#56B4E9', Kind.SYSTEMATIC: '#E69F00', Kind.KNOWN: '#999999'}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,9 +74,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--seed', type=seed, default=1, help='seed of the random draws (default 1)')
     parser.add_argument(
         '--out',
-        type=picture_name(*PICTURES),
-        metavar='FILE.png|svg|pdf',
-        help='draw the chart',
+        type=picture_or_folder(*PICTURES),
+        metavar='DIR|FILE.png|svg|pdf',
+        help='write report.html and budget.json into this folder, or draw the chart alone',
     )
     parser.add_argument('--json', action='store_true', help='print JSON in SI units')
     parser.add_argument('--explain', action='store_true', help='print formulas, inputs and their sources, and stop')
@@ -102,30 +94,29 @@ def run(args: argparse.Namespace) -> int:
     if args.explain:
         show_text(explain(rig, inputs))
         return 0
-    method = args.method or method_of(rig)
-    load = tuple(args.load) if args.load else default_load(rig)
-    need_finite('--load', load)
-    if args.out is not None:
+    load = tuple(args.load) if args.load else None
+    if load is not None:
+        need_finite('--load', load)
+    chart_alone = args.out is not None and Path(args.out).suffix.lower() in PICTURES and not Path(args.out).is_dir()
+    if chart_alone:
         need_folder(Path(args.out))
-    with given_as_option('load') if args.load or args.set else contextlib.nullcontext():
-        budget = evaluate(Situation.at_load(rig, inputs, load, method))
-    draws = args.monte_carlo
-    sampled = None
-    if draws is not None:
-        hidden = True if args.json else None
-        with tqdm(total=draws, unit=' draws', delay=1.0, leave=False, disable=hidden, ncols=80) as bar:
-            sampled = monte_carlo(budget.at, draws, args.seed, drawn=bar.update)
-    if args.json:
-        print_json(as_json(budget, load, sampled), indent=1)
-    else:
-        show_text(table(budget, load))
-        if sampled is not None:
-            show('', f'Monte Carlo, {draws} draws of everything at once (seed {args.seed}):')
-            show('total     ' + _figures_text(sampled))
-    if args.out is not None:
-        draw_terms(budget, Path(args.out))
-        if not args.json:
-            show('', args.out)
+    elif args.out is not None:
+        make_writable(args.out)
+    draws = args.monte_carlo or 0
+    hidden = True if args.json or not draws else None
+    with (
+        given_as_option('load') if args.load or args.set else contextlib.nullcontext(),
+        tqdm(total=draws, unit=' draws', delay=1.0, leave=False, disable=hidden, ncols=80) as bar,
+    ):
+        found = budget(
+            BudgetProblem(rig, inputs, load, args.method, draws, args.seed, args.params_file or ''), bar.update
+        )
+    if not chart_alone:
+        return answer(args, found)
+    print_answer(args, found)
+    save_figure(chart(found.budget), Path(args.out), dpi=150)
+    if not args.json:
+        show('', args.out)
     return 0
 
 
@@ -146,7 +137,7 @@ def explain(rig: Rig, inputs: dict[str, float]) -> str:
     ]
     for cause in CAUSES:
         row = f' ({cause.row})' if cause.row else ''
-        lines.append(f'  {cause.name}{row}, {KINDS[cause.kind]}: {cause.formula}')
+        lines.append(f'  {cause.name}{row}, {cause.kind.value}: {cause.formula}')
     lines += ['', 'Inputs: name = value unit: what it is (bounds); source of the default']
     for entry in INPUTS:
         p = entry.parameter
@@ -184,93 +175,3 @@ def _each(metres: FloatArray, digits: int) -> str:
     """The values of x1, y1, x2, y2 in µm; one if all are the same."""
     words = [f'{value * 1e6:.{digits}f}' for value in metres.ravel()]
     return words[0] if len(set(words)) == 1 else ', '.join(words)
-
-
-def table(budget: Budget, load: tuple[float, ...]) -> str:
-    """The budget as text."""
-    at = budget.at
-    dx, dy, theta = at.pose.tolist()
-    rows = [['term', 'Table 3.1', 'kind', 'ΔX µm', 'ΔY µm', 'θ mdeg', 'ΔX %', 'ΔY %', 'θ %']]
-    for cause, line in budget.lines:
-        shares = [f'{100.0 * v:.1f}' for v in budget.shares(line).tolist()]
-        rows.append([cause.name, cause.row or '-', KINDS[cause.kind], *_figures(line), *shares])
-    totals = [['', 'ΔX µm', 'ΔY µm', 'θ mdeg']]
-    totals += [[f'all {name} terms', *_figures(budget.total(kind))] for kind, name in KINDS.items()]
-    totals.append(['total', *_figures(budget.total())])
-    samples = at.rig.estimator.block_size
-    return (
-        f'Load ({load[0]:g} N, {load[1]:g} N, {load[2]:g} N m): ΔX {dx * 1e3:.4f} mm, ΔY {dy * 1e3:.4f} mm, '
-        f'θ {math.degrees(theta):.4f} deg; method {at.method}; mean of {samples} samples\n\n'
-        + columns(rows, left=3)
-        + '\n\n'
-        + columns(totals)
-    )
-
-
-def _figures(line: Contribution) -> list[str]:
-    return [f'{v:.3f}' for v in (line.rms * MICRO_MILLIDEGREE).tolist()]
-
-
-def _figures_text(line: Contribution) -> str:
-    dx, dy, theta = _figures(line)
-    return f'ΔX {dx} µm  ΔY {dy} µm  θ {theta} mdeg'
-
-
-def as_json(budget: Budget, load: tuple[float, ...], sampled: Contribution | None) -> dict[str, Any]:
-    """The budget for another program: SI, (ΔX, ΔY, θ) in this order."""
-
-    def figures(line: Contribution) -> dict[str, Any]:
-        return {'rms': line.rms.tolist(), 'bias': line.bias.tolist(), 'covariance': line.covariance.tolist()}
-
-    totals = {kind.name.lower(): figures(budget.total(kind)) for kind in Kind}
-    totals['total'] = figures(budget.total())
-    if sampled is not None:
-        totals['monte_carlo'] = figures(sampled)
-    return {
-        'unit': ['m', 'm', 'rad'],
-        'load': list(load),
-        'pose': budget.at.pose.tolist(),
-        'method': budget.at.method,
-        'terms': [
-            {
-                'name': cause.name,
-                'row': cause.row,
-                'kind': cause.kind.name.lower(),
-                'formula': cause.formula,
-                'inputs': {name: budget.at[name] for name in cause.inputs},
-                **figures(line),
-                'share': budget.shares(line).tolist(),
-            }
-            for cause, line in budget.lines
-        ],
-        'totals': totals,
-    }
-
-
-def draw_terms(budget: Budget, path: Path) -> None:
-    """Bars of every term, largest first, beside the total, written to ``path``."""
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
-
-    total = budget.total().rms * MICRO_MILLIDEGREE
-    # What does nothing, or only rounds, has no place on a logarithmic axis.
-    least = 1e-9 * budget.total().rms
-    lines = [(c, line.rms * MICRO_MILLIDEGREE) for c, line in budget.lines if np.any(line.rms > least)]
-    lines.sort(key=lambda entry: float(np.max(entry[1] / np.where(total > 0.0, total, 1.0))))
-    names = [f'{c.name} ({c.row})' if c.row else c.name for c, _ in lines]
-    figure = Figure(figsize=(11.0, 0.28 * len(lines) + 1.8), layout='constrained')
-    panels: Any = figure.subplots(1, 3, sharey=True)
-    titles = ('ΔX, µm', 'ΔY, µm', 'θ, mdeg')
-    for panel, title, index in zip(panels, titles, range(3), strict=True):
-        values = [v[index] for _, v in lines]
-        panel.barh(names, values, color=[COLOURS[c.kind] for c, _ in lines])
-        panel.axvline(total[index], color='black', linewidth=1.0)
-        panel.text(total[index], len(lines) - 0.4, f' {total[index]:.3g}', ha='right', va='bottom', fontsize=9)
-        panel.set(xscale='log', xlabel=title, xlim=(total[index] * 1e-3, total[index] * 2.0))
-        panel.grid(axis='x', alpha=0.3)
-        panel.set_axisbelow(True)
-    handles = [Patch(color=COLOURS[kind], label=name) for kind, name in KINDS.items()]
-    handles.append(Patch(facecolor='white', edgecolor='black', label='total (line)'))
-    figure.legend(handles=handles, loc='outside lower center', ncols=4, frameon=False)
-    figure.suptitle(f'Error budget, method {budget.at.method}: standard deviation or known bias')
-    save_figure(figure, path, dpi=150)

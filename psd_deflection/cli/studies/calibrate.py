@@ -26,9 +26,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -51,25 +49,19 @@ from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.model.misalignment.rig import is_calibrated
 from psd_deflection.model.simulation.catalogue import effects_of_rig
-from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.replay.engine import nominal_rig, rig_at_end
-from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import with_values
 from psd_deflection.run.fleet.parquet import Field
 from psd_deflection.studies.calibrate import check as checking
-from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import (
     DarkLevel,
-    dark_levels,
     result_of_levels,
     source_of_levels,
     values_of_levels,
     words_of_level,
 )
 from psd_deflection.studies.calibrate.fit import NAMES, REPORTED, UNITS
-from psd_deflection.studies.calibrate.from_recordings import read_run, read_runs
-from psd_deflection.studies.calibrate.observation import CalibrationRun
-from psd_deflection.studies.calibrate.result import Calibrated
+from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions, read_runs
 from psd_deflection.studies.study import described, edited_rig_file
 
 MOST_EXPOSURE = 0.02
@@ -140,7 +132,6 @@ def run(args: argparse.Namespace) -> int:
         args.namespace,
         args.exposure,
         args.alone,
-        datetime.now(UTC).date().isoformat(),
         tuple(args.reference),
         tuple(args.dark),
     )
@@ -155,7 +146,6 @@ def run(args: argparse.Namespace) -> int:
     make_writable(args.out)
     if not runs:
         return _dark_alone(args, asked, rig, levels)
-    rig = replace_values(rig, values_of_levels(levels))
     hidden = True if args.quiet or args.json else None
     with tqdm(total=STEPS, disable=hidden, file=sys.stderr, bar_format='{l_bar}{bar}| {elapsed}') as bar:
 
@@ -172,50 +162,6 @@ def run(args: argparse.Namespace) -> int:
         return 0
     show(*found.lines(), f'see {out / "report.html"}; use {out / "rig.yaml"} as --params-file')
     return 0
-
-
-@dataclass(frozen=True, slots=True)
-class CalibrationOptions:
-    """What is asked of each calibration, as the options say it; goes to a worker. ``date``: of the calibration."""
-
-    params_file: str | None
-    namespace: str | None
-    exposure: float
-    alone: bool
-    date: str
-    references: tuple[str, ...] = ()
-    dark: tuple[str, ...] = ()
-
-    def rig(self, recordings: Sequence[str], tell: Callable[[str], None]) -> Rig:
-        """The known rig; ``tell`` is told if the recording names none."""
-        if self.params_file is not None:
-            return load_rig(self.params_file)
-        recording = open_recording(recordings[0], namespace=self.namespace)
-        for warning in nominal_rig(recording):
-            tell(warning)
-        return rig_at_end(recording)
-
-    def runs(self, recordings: Sequence[str], rig: Rig) -> list[CalibrationRun]:
-        """The recordings with their references."""
-        return read_runs(recordings, rig, references=self.references, exposure=self.exposure, namespace=self.namespace)
-
-    def levels(self, rig: Rig, runs: Sequence[CalibrationRun]) -> list[DarkLevel]:
-        """What the recordings of --dark tell, if there are any; ``runs``: with the lasers on."""
-        if not self.dark:
-            return []
-        return dark_levels([read_run(path, rig, namespace=self.namespace) for path in self.dark], rig, runs)
-
-    def calibrated(
-        self,
-        runs: Sequence[CalibrationRun],
-        rig: Rig,
-        levels: Sequence[DarkLevel],
-        progress: Callable[[str], None],
-        tell: Callable[[str], None],
-    ) -> Calibrated:
-        """The answer; ``tell``: is told if the rig file cannot be edited."""
-        found = replace(calibrate(runs, rig, alone=self.alone, progress=progress), dark=levels)
-        return Calibrated(found, rig, self.params_file, self.date, tell)
 
 
 def answer_of(path: str, asked: CalibrationOptions) -> TaskResult:

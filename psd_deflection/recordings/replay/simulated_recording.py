@@ -40,6 +40,11 @@ class SimulatedRecording(Recording):
         self._samples = RawChunk(seq, t_ns, volts, np.zeros(n, dtype=np.uint8))
 
     @property
+    def digest(self) -> str:
+        """Nothing: it is in memory."""
+        return ''
+
+    @property
     def complete(self) -> bool:
         """True: nothing is missing."""
         return True

@@ -28,6 +28,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.calibrate.fit import Mask, fewer
 from psd_deflection.studies.calibrate.observation import CalibrationRun
+from psd_deflection.studies.study import named
 
 PIECES = 20
 """Means that the standard error comes from."""
@@ -112,7 +113,7 @@ def result_of_levels(levels: Sequence[DarkLevel]) -> dict[str, Any]:
 
 def source_of_levels(levels: Sequence[DarkLevel]) -> str:
     """The recordings, in words."""
-    return ', '.join(dict.fromkeys(f'{one.recording} (sha256 {one.digest[:16]})' for one in levels))
+    return ', '.join(dict.fromkeys(named(one.recording, one.digest) for one in levels))
 
 
 def words_of_level(one: DarkLevel) -> str:

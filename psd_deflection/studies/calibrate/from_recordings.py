@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
+from psd_deflection.recordings.read.grid import MAX_SAMPLES, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import References, read_references, references_in
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds
 from psd_deflection.records import CHANNELS, FloatArray
-from psd_deflection.rig.config import Rig, check_two_psds
+from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.calibrate.calibrate import calibrate
+from psd_deflection.studies.calibrate.dark import DarkLevel, dark_levels, values_of_levels
 from psd_deflection.studies.calibrate.observation import CalibrationRun
+from psd_deflection.studies.calibrate.result import Calibrated
+from psd_deflection.studies.study import Tell, opened
 
 
 def read_run(
@@ -64,7 +70,7 @@ def read_run(
         (references.t_ns - start).astype(np.float64) * 1e-9,
         references.poses,
         loads,
-        digest_of(path) if path.exists() else '',
+        recording.digest,
         references.sd,
         exposure,
     )
@@ -84,3 +90,55 @@ def read_runs(
         read_run(source, rig, reference=table, exposure=exposure, namespace=namespace)
         for source, table in zip(sources, tables, strict=True)
     ]
+
+
+def today() -> str:
+    """The date of a calibration, UTC."""
+    return datetime.now(UTC).date().isoformat()
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """What is asked of a calibration; it goes to a worker process.
+
+    ``params_file``: of the rig as it is known; None: the rig in the first recording. ``exposure``: time over which
+    each reference is a mean, s. ``alone``: by the redundant reading alone. ``references``: none, or one for each
+    recording. ``dark``: recordings with the lasers off. ``date``: of the calibration.
+    """
+
+    params_file: str | None = None
+    namespace: str | None = None
+    exposure: float = 0.0
+    alone: bool = False
+    references: tuple[str | Path, ...] = ()
+    dark: tuple[Recording | str | Path, ...] = ()
+    date: str = field(default_factory=today)
+
+    def rig(self, recordings: Sequence[Recording | str | Path], tell: Tell) -> Rig:
+        """The known rig; ``tell`` gets a warning if neither a file nor the recording names one."""
+        if self.params_file is not None:
+            return load_rig(self.params_file)
+        return opened(recordings[0], namespace=self.namespace, tell=tell).rig
+
+    def runs(self, recordings: Sequence[Recording | str | Path], rig: Rig) -> list[CalibrationRun]:
+        """The recordings with their references."""
+        return read_runs(recordings, rig, references=self.references, exposure=self.exposure, namespace=self.namespace)
+
+    def levels(self, rig: Rig, runs: Sequence[CalibrationRun]) -> list[DarkLevel]:
+        """The light in the recordings of ``dark``; ``runs``: with the lasers on."""
+        if not self.dark:
+            return []
+        return dark_levels([read_run(source, rig, namespace=self.namespace) for source in self.dark], rig, runs)
+
+    def calibrated(
+        self,
+        runs: Sequence[CalibrationRun],
+        rig: Rig,
+        levels: Sequence[DarkLevel],
+        progress: Callable[[str], None],
+        tell: Tell,
+    ) -> Calibrated:
+        """The answer; ``tell`` gets a warning if the rig file cannot be edited."""
+        lit = replace_values(rig, values_of_levels(levels))
+        found = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
+        return Calibrated(found, lit, self.params_file, self.date, tell)

@@ -20,7 +20,7 @@ from psd_deflection.studies.calibrate.calibrate import Calibration
 from psd_deflection.studies.calibrate.dark import result_of_levels, source_of_levels, values_of_levels, words_of_level
 from psd_deflection.studies.calibrate.fit import CLAMP_AT, CLOCK, NAMES, REPORTED, UNITS
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
-from psd_deflection.studies.study import PageSection, StudyResult, Tell, described, edited_rig_file, warn_caller
+from psd_deflection.studies.study import PageSection, StudyResult, Tell, described, edited_rig_file, named, warn_caller
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Calibrated(StudyResult):
     @property
     def sources(self) -> dict[str, str]:
         """Version, date, recordings with their digests."""
-        runs = {f'recording {n}': f'{run.name} (sha256 {run.digest})' for n, run in enumerate(self.found.runs, 1)}
+        runs = {f'recording {n}': named(run.name, run.digest, 64) for n, run in enumerate(self.found.runs, 1)}
         return {'version': __version__, 'date': self.date, **runs}
 
     def sentences(self) -> list[str]:
@@ -119,7 +119,7 @@ def result(found: Calibration, date: str) -> dict[str, Any]:
 
 def source_of(found: Calibration, date: str) -> str:
     """Where a calibrated rig file comes from, in one line."""
-    recordings = ', '.join(f'{run.name} (sha256 {run.digest[:16]})' for run in found.runs)
+    recordings = ', '.join(named(run.name, run.digest) for run in found.runs)
     dark = f'; dark levels from {source_of_levels(found.dark)}' if found.dark else ''
     return f'psd-deflection {__version__}, {date}, from {recordings}{dark}'
 

@@ -107,14 +107,13 @@ def read_observation(
             warm = held_at(at, celsius, t_ns, grace, celsius[0])
         else:
             warm = np.interp(t_ns, at.astype(np.float64), celsius)
-    digest = '' if isinstance(recording, SimulatedRecording) else digest_of(path)
     return Observation(
         path.name,
         rig,
         Wiring.from_rig(rig).to_psds(volts),
         held,
         warm,
-        digest=digest,
+        digest=recording.digest,
         unknown_load=(before, after),
         stated_rate_hz=stated,
     )

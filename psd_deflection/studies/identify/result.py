@@ -12,13 +12,12 @@ from typing import Any
 from psd_deflection import __version__
 from psd_deflection.arms.shapers import Shaper, recommended
 from psd_deflection.model.simulation.catalogue import effects_of_rig
-from psd_deflection.recordings.read.grid import digest_of
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import with_values
 from psd_deflection.studies.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
 from psd_deflection.studies.identify.modes import AxisModes
-from psd_deflection.studies.study import PageSection, StudyResult, described, edited_rig_file
+from psd_deflection.studies.study import PageSection, StudyResult, described, edited_rig_file, named
 
 
 @dataclass(frozen=True)
@@ -130,8 +129,8 @@ class Identified(StudyResult):
         """The user's parameter file with the modes, comments kept; without one what describes the rig."""
         recording, rig, params_file, tell = self.problem.opened
         date = datetime.now(UTC).date().isoformat()
-        name, digest = recording.path.name, digest_of(recording.path)
-        source = f'Identified by psd-deflection {__version__}, {date}, from {name} (sha256 {digest[:16]})'
+        recorded = named(recording.path.name, recording.digest)
+        source = f'Identified by psd-deflection {__version__}, {date}, from {recorded}'
 
         def edit(text: str, path: Path) -> str:
             return with_values(text, self.values, source, path)

@@ -1,0 +1,44 @@
+"""What every source of error does to ΔX, ΔY and θ of one rig under one load."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.budget.estimate import method_of
+from psd_deflection.studies.budget.evaluate import evaluate, monte_carlo
+from psd_deflection.studies.budget.inputs import read_inputs
+from psd_deflection.studies.budget.load import default_load
+from psd_deflection.studies.budget.result import Budgeted
+from psd_deflection.studies.budget.term import Situation
+
+
+@dataclass(frozen=True)
+class BudgetProblem:
+    """``rig``; ``inputs``: sizes of the errors by name, those that differ from the defaults.
+
+    ``load``: at the tip, Fx N, Fy N, Tz N m; None: a weight on a sidebar that suits the rig. ``method``: whose errors
+    are computed; None: that of the rig. ``draws``: random draws of all causes at once, 0: none; ``seed`` of them.
+    ``rig_file``: the name of the rig's, '' if it has none.
+    """
+
+    rig: Rig
+    inputs: Mapping[str, float] = field(default_factory=lambda: read_inputs(None, {}))
+    load: tuple[float, float, float] | None = None
+    method: str | None = None
+    draws: int = 0
+    seed: int = 1
+    rig_file: str = ''
+
+
+def budget(problem: BudgetProblem, drawn: Callable[[int], object] = lambda size: None) -> Budgeted:
+    """Every cause to first order, and the random draws that must agree; ``drawn`` gets the number of draws just done.
+
+    Raises ConfigError if the load leaves the active area or the method does not suit the rig.
+    """
+    rig = problem.rig
+    load = default_load(rig) if problem.load is None else problem.load
+    found = evaluate(Situation.at_load(rig, problem.inputs, load, problem.method or method_of(rig)))
+    sampled = monte_carlo(found.at, problem.draws, problem.seed, drawn=drawn) if problem.draws else None
+    return Budgeted(found, load, sampled, problem.draws, problem.seed, problem.rig_file)
