@@ -9,11 +9,13 @@ import math
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.recordings.window import WHOLE, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameter_files import read_parameter_file
@@ -29,6 +31,8 @@ FOREIGN = frozenset(_FOREIGN.split())
 
 N = TypeVar('N', int, float)
 
+LONGEST_SPAN_S = 1e8
+"""Bound of --from and --to, s: three years."""
 PICTURES = ('.png', '.svg', '.pdf')
 
 
@@ -110,6 +114,50 @@ def namespace_option(parser: argparse._ActionsContainer) -> None:
         metavar='/NAME',
         help='namespace of the recorded node, for a bag of several rigs (the only one is found by itself)',
     )
+
+
+def span_options(parser: argparse._ActionsContainer) -> None:
+    """Add --from and --to, for a part of a recording: ``args.span``."""
+    parser.set_defaults(span=WHOLE)
+    for at, (option, words) in enumerate((('--from', 'from'), ('--to', 'up to'))):
+        parser.add_argument(
+            option,
+            action=_SpanEnd,
+            at=at,
+            dest='span',
+            metavar='TIME',
+            help=f'only what was recorded {words} this time: s from the first sample, or a time as 2026-11-24T14:03:10',
+        )
+
+
+class _SpanEnd(argparse.Action):
+    """Reads one end of ``span``."""
+
+    def __init__(self, *args: Any, at: int, **named: Any) -> None:
+        super().__init__(*args, **named)
+        self._at = at
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        ends = list(namespace.span)
+        ends[self._at] = _bound(str(option), values)
+        namespace.span = tuple(ends)
+
+
+def _bound(option: str, text: str) -> Bound:
+    try:
+        seconds = float(text)
+    except ValueError:
+        try:
+            return datetime.fromisoformat(text).astimezone()
+        except (ValueError, OverflowError, OSError):
+            raise UsageError(
+                f'{option} {text}: must be s from the first sample, or a time such as 2026-11-24T14:03:10'
+            ) from None
+    if not abs(seconds) <= LONGEST_SPAN_S:
+        raise UsageError(f'{option} {text}: must be at most {LONGEST_SPAN_S:g} s')
+    return seconds
 
 
 def world_option(parser: argparse._ActionsContainer) -> None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
 from psd_deflection.base.tables import Column, Table, columns_of, html_table
 from psd_deflection.records import FloatArray, IntArray
@@ -33,6 +34,22 @@ class EstimateSeries:
     wrench: FloatArray | None = None
     chi_square: FloatArray | None = None
     start_ns: int | None = None
+
+    def rows(self, chosen: npt.NDArray[np.bool_]) -> EstimateSeries:
+        """The estimates at which ``chosen`` (n,) is True."""
+
+        def part(values: FloatArray | None) -> FloatArray | None:
+            return None if values is None else values[chosen]
+
+        return EstimateSeries(
+            self.topic,
+            self.t_ns[chosen],
+            self.pose[chosen],
+            self.tilt[chosen],
+            part(self.covariance),
+            part(self.wrench),
+            part(self.chi_square),
+        )
 
     def __len__(self) -> int:
         return len(self.t_ns)

@@ -7,6 +7,7 @@ import copy
 import functools
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -63,8 +64,11 @@ class Recording(abc.ABC):
     ``changes``: of parameters during the run, in order. ``restarts``: of the device, each as the last sample
     number before and the first after; the numbers between belong to no sample. ``restarts`` and ``warnings``
     (one line each) are complete after the first full pass over the recording. ``requested_block_size``: None takes
-    the recorded one.
+    the recorded one. ``temperatures_held``: whether each temperature holds until the next one, as in the rows of a CSV;
+    otherwise they are points on a curve.
     """
+
+    temperatures_held = False
 
     def __init__(self, path: Path, block_size: int | None) -> None:
         self.path = path
@@ -101,6 +105,16 @@ class Recording(abc.ABC):
         other.__dict__.pop('samples', None)
         other.restarts = self._noted_restarts()
         return other
+
+    def crop(self, first: float | datetime | None = None, last: float | datetime | None = None) -> Recording:
+        """The part from ``first`` on and before ``last``: s from the first sample, or times with a time zone.
+
+        The load and the temperature that held at its start belong to it.
+        Raises RecordingError if no sample lies in it, ConfigError if ``first`` is not below ``last``.
+        """
+        from psd_deflection.recordings.window import RecordingWindow
+
+        return RecordingWindow(self, first, last)
 
     def _noted_restarts(self) -> set[tuple[int, int]]:
         """The restarts that the recorder noted, before any pass over the recording."""
@@ -155,6 +169,10 @@ class Recording(abc.ABC):
     @abc.abstractmethod
     def loads(self) -> list[AppliedLoad]:
         """Known loads, each held until the next."""
+
+    def rows_with_load(self) -> tuple[int, int]:
+        """Of a CSV: number of rows that say their load, and the time of the last one, ns; (0, 0) otherwise."""
+        return 0, 0
 
     def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
         """Known accelerations of the base as they came, each with the time (ns) when it was there."""

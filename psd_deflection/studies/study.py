@@ -25,6 +25,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import nominal_rig, rig_at_end
+from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import nested, parameter_text
@@ -132,14 +133,16 @@ def opened(
     rig: Rig | str | Path | None = None,
     *,
     namespace: str | None = None,
+    span: Span = WHOLE,
     tell: Tell = warn_caller,
 ) -> Opened:
     """The recording and the rig that describes it: ``rig``, its parameter file, or that of the recording's end.
 
-    ``tell`` gets a warning if nobody names a rig. Raises RecordingError and ConfigError.
+    ``span``: the part of the recording that is meant. ``tell`` gets a warning if nobody names a rig.
+    Raises RecordingError and ConfigError.
     """
     if not isinstance(recording, Recording):
-        recording = open_recording(recording, namespace=namespace)
+        recording = open_recording(recording, namespace=namespace, span=span)
     params_file = None if rig is None or isinstance(rig, Rig) else Path(rig)
     if rig is None:
         for warning in nominal_rig(recording):

@@ -8,6 +8,7 @@ estimates, dots, loads and losses with a layout, and cannot be read back.
   psd-deflection convert bags/clean --out clean.csv
   psd-deflection convert bags/lost_samples --out lost_samples.rrd
   psd-deflection convert run.csv --out run --params-file my_rig.yaml
+  psd-deflection convert bags/clean --out part.csv --from 1 --to 2.5
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from psd_deflection.cli._options import namespace_option, recording_name
+from psd_deflection.cli._options import namespace_option, recording_name, span_options
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.recordings.conversion import Beside, convert, convert_computed
@@ -41,6 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='RIG.yaml',
         help="the rig to store in a bag or to compute an .rrd with (default: the recording's own)",
     )
+    span_options(parser)
     namespace_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
@@ -49,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     """Convert and say what was written."""
     if is_for_viewing(args.out):
         return _to_viewer(args)
-    recording = open_recording(args.recording, namespace=args.namespace)
+    recording = open_recording(args.recording, namespace=args.namespace, span=args.span)
     parameters = recording.parameters if args.params_file is None else load_rig(args.params_file).flat()
     with told('reading loads, references, temperatures', quiet=args.json):
         beside = Beside.of(recording)
@@ -65,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _to_viewer(args: argparse.Namespace) -> int:
     out, in_json = Path(args.out), args.json
-    recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
+    recording, rig = open_for_replay(args.recording, args.params_file, args.namespace, args.span)
     with progress_of(recording.blocks(), quiet=in_json) as blocks:
         done = convert_computed(recording, out, rig, blocks)
     if in_json:

@@ -30,13 +30,14 @@ from psd_deflection.cli._fleet import (
     tell_each,
     write_rows,
 )
-from psd_deflection.cli._options import namespace_option, parquet_name
+from psd_deflection.cli._options import namespace_option, parquet_name, span_options
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show
 from psd_deflection.recordings.provenance import NAMES
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import described, is_table
 from psd_deflection.recordings.summary import summary
+from psd_deflection.recordings.window import Span
 from psd_deflection.run.fleet.parquet import Field, ParquetFile
 
 _EPOCH_FROM_NS = 10**18
@@ -72,6 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     recordings_argument(parser, 'a bag folder, an .mcap or a .csv; a pattern or a .txt list of them')
     parser.add_argument('--out', metavar='X.parquet', type=parquet_name, help='write a row a recording')
+    span_options(parser)
     namespace_option(parser)
     executor_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
@@ -90,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         else:
             show(f'{path}: a table of readings', *(f'  {name:<12} {text}' for name, text in told_of))
         return 0
-    recording = open_recording(path, namespace=args.namespace)
+    recording = open_recording(path, namespace=args.namespace, span=args.span)
     with told('counting messages', quiet=args.json):
         topics = recording.topics()
     found = summary(recording, topics, progress_of(recording.blocks(), topics.get(SAMPLES), quiet=args.json))
@@ -101,9 +103,9 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def summary_of(name: str, namespace: str | None) -> dict[str, Any]:
+def summary_of(name: str, namespace: str | None, span: Span) -> dict[str, Any]:
     """The task for one of many recordings."""
-    recording = open_recording(name, namespace=namespace)
+    recording = open_recording(name, namespace=namespace, span=span)
     return summary(recording, recording.topics(), recording.blocks())
 
 
@@ -111,7 +113,7 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
     found: dict[str, dict[str, Any]] = {}
     with contextlib.ExitStack() as stack:
         out = None if args.out is None else stack.enter_context(ParquetFile(args.out, FIELDS))
-        failed = run_each(args, names, partial(summary_of, namespace=args.namespace), found.__setitem__)
+        failed = run_each(args, names, partial(summary_of, namespace=args.namespace, span=args.span), found.__setitem__)
         if out is not None:
             write_rows(out, names, {name: _row(one) for name, one in found.items()}, failed)
     tell_each(args, names, found, failed, HEAD, _line)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterable
 
-from psd_deflection.cli._options import make_writable, namespace_option
+from psd_deflection.cli._options import make_writable, namespace_option, span_options
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.records import SampleBlock
@@ -18,6 +18,7 @@ def recording_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='use this rig instead of the parameters in the recording'
     )
+    span_options(parser)
     namespace_option(parser)
 
 
@@ -31,7 +32,7 @@ def opened_recording(args: argparse.Namespace) -> Opened:
     """The recording and the rig of ``args``; the folder of --out is made first, before the work."""
     if args.out is not None:
         make_writable(args.out)
-    return opened(args.recording, args.params_file, namespace=args.namespace, tell=warn)
+    return opened(args.recording, args.params_file, namespace=args.namespace, span=args.span, tell=warn)
 
 
 def counted(args: argparse.Namespace) -> Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]:

@@ -44,7 +44,7 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import make_writable, namespace_option, number
+from psd_deflection.cli._options import make_writable, namespace_option, number, span_options
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.model.misalignment.rig import is_calibrated
@@ -104,6 +104,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--self', action='store_true', dest='alone', help='by the redundant reading alone, without reference and loads'
     )
+    span_options(parser)
     namespace_option(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument('--json', action='store_true', help='print the content of calibration.json, or of the check')
@@ -134,6 +135,7 @@ def run(args: argparse.Namespace) -> int:
         args.alone,
         tuple(args.reference),
         tuple(args.dark),
+        span=args.span,
     )
     names = each_for_itself(args)
     if names is not None:
@@ -244,7 +246,12 @@ def _check(args: argparse.Namespace) -> int:
         raise ConfigError(f'{args.check}: calibration.names: not there; --check takes the rig.yaml of a calibration')
     with told('checking', quiet=args.quiet or args.json):
         runs = read_runs(
-            args.recordings, rig, references=args.reference, exposure=args.exposure, namespace=args.namespace
+            args.recordings,
+            rig,
+            references=args.reference,
+            exposure=args.exposure,
+            namespace=args.namespace,
+            span=args.span,
         )
         found = checking.check(runs, rig, alone=args.alone)
     if args.json:

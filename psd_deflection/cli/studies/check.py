@@ -22,13 +22,21 @@ from __future__ import annotations
 import argparse
 import sys
 
-from psd_deflection.base.errors import printable
-from psd_deflection.cli._options import given_parameters, in_the_world, parameter_option, refuse, world_option
+from psd_deflection.base.errors import UsageError, printable
+from psd_deflection.cli._options import (
+    given_parameters,
+    in_the_world,
+    parameter_option,
+    refuse,
+    span_options,
+    world_option,
+)
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import LONGEST_LINE, show
 from psd_deflection.cli.studies._answer import answer, answer_arguments
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_end
+from psd_deflection.recordings.window import WHOLE
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.run.guided import run_guided
@@ -49,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help="the rig file to check (default: the recording's rig)"
     )
+    span_options(parser)
     answer_arguments(parser, 'report.html and check.json')
     group = parser.add_argument_group('guided (no REC)')
     parameter_option(group, '--port', 'port')
@@ -61,14 +70,17 @@ def run(args: argparse.Namespace) -> int:
     """Check and print."""
     if args.recording is not None:
         refuse(args, {'port': None, 'source': None, 'baud': None, 'world': []}, 'is for the guide: give no REC')
-        rig = load_rig(args.params_file) if args.params_file else rig_at_end(open_recording(args.recording))
+        recording = open_recording(args.recording, span=args.span)
+        rig = load_rig(args.params_file) if args.params_file else rig_at_end(recording)
         with told('reading', quiet=args.json):
-            seen = read_observation(args.recording, rig)
+            seen = read_observation(recording, rig)
         volts = Wiring.from_rig(rig).to_device(seen.volts)
         found = check(of_recording(rig, volts, seen.loads, args.recording))
         if not args.json:
             show(f'{args.recording}: {seen.duration:.1f} s')
     else:
+        if args.span != WHOLE:
+            raise UsageError('--from, --to: are for a recording: give REC')
         found = _guided(args)
     return answer(args, found)
 

@@ -51,12 +51,13 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import make_folder, make_writable, namespace_option, refuse, seed
+from psd_deflection.cli._options import make_folder, make_writable, namespace_option, refuse, seed, span_options
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save, save_all, show, show_text, warn
 from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
+from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.run.fleet.parquet import Field
@@ -119,6 +120,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _next.add_arguments(parser)
     parser.epilog = _next.HELP
+    span_options(parser)
     namespace_option(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
     parser.add_argument('--json', action='store_true', help='print the content of result.json')
@@ -132,7 +134,9 @@ def run(args: argparse.Namespace) -> int:
     if args.params_file is not None:
         # Before the search, which takes its time.
         load_rig(args.params_file)
-    asked = SearchOptions(absolute(args.params_file), args.namespace, args.seed, tuple(args.without), args.adopt)
+    asked = SearchOptions(
+        absolute(args.params_file), args.namespace, args.seed, tuple(args.without), args.adopt, args.span
+    )
     names = each_for_itself(args)
     if names is not None:
         refuse(args, {'next': False}, 'is not for --each')
@@ -245,16 +249,20 @@ class SearchOptions:
     seed: int
     without: tuple[str, ...]
     adopt: str | None = None
+    span: Span = WHOLE
 
     def read(self, recordings: Sequence[str], tell: Callable[[str], None]) -> list[Observation]:
         """The recordings; ``tell`` is told what is odd."""
         given = None if self.params_file is None else load_rig(self.params_file)
-        return read_observations(recordings, given, namespace=self.namespace, warn=tell, any_rate=True)
+        return read_observations(recordings, given, namespace=self.namespace, span=self.span, warn=tell, any_rate=True)
 
     def tables(self, recordings: Sequence[str], tell: Callable[[str], None]) -> list[Readings]:
         """The tables of readings; none if ``recordings`` are none."""
         given = None if self.params_file is None else load_rig(self.params_file)
-        return read_tables(recordings, given, tell)
+        tables = read_tables(recordings, given, tell)
+        if tables and self.span != WHOLE:
+            raise UsageError('--from, --to: are for recordings; a table of readings has no times')
+        return tables
 
     def rig(self, observations: Sequence[Observation]) -> Rig:
         """The known rig."""

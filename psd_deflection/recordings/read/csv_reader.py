@@ -42,6 +42,8 @@ class CsvRecording(Recording):
     Raises RecordingError naming file, line and column of a fault.
     """
 
+    temperatures_held = True
+
     def __init__(self, path: Path, block_size: int | None = None, sample_rate_hz: float | None = None) -> None:
         super().__init__(path, block_size)
         self._warnings: list[str] = []

@@ -10,6 +10,7 @@ from psd_deflection.recordings.read.bag_reader import BagRecording
 from psd_deflection.recordings.read.csv_reader import CsvRecording
 from psd_deflection.recordings.read.mcap_reader import MAGIC
 from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.window import WHOLE, Span
 
 MOST_NAMES = 1000
 """Names of a folder that are looked at for one that was meant."""
@@ -21,15 +22,20 @@ def open_recording(
     block_size: int | None = None,
     sample_rate_hz: float | None = None,
     namespace: str | None = None,
+    span: Span = WHOLE,
 ) -> Recording:
     """Open ``path``: a bag folder, a lone ``.mcap`` or a ``.csv``.
 
     ``block_size``: samples per block; by default from the recording's own parameters (20 if it has
     none). ``sample_rate_hz``: for a CSV whose times do not determine it.
-    ``namespace``: of the recorded node, for a bag of several rigs.
-    Raises RecordingError if it is none of the three, or cannot be read.
+    ``namespace``: of the recorded node, for a bag of several rigs. ``span``: the part that is meant.
+    Raises RecordingError if it is none of the three, or cannot be read, and as :meth:`Recording.crop` does.
     """
-    path = Path(path)
+    whole = _open(Path(path), block_size, sample_rate_hz, namespace)
+    return whole if span == WHOLE else whole.crop(*span)
+
+
+def _open(path: Path, block_size: int | None, sample_rate_hz: float | None, namespace: str | None) -> Recording:
     suffix = path.suffix.lower()
     try:
         if path.is_dir():

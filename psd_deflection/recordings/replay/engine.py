@@ -19,6 +19,7 @@ from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.summary import NO_PARAMETERS
+from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,
@@ -58,15 +59,15 @@ def nominal_rig(recording: Recording, params_file: str | None = None) -> list[st
 
 
 def open_for_replay(
-    path: str | Path, params_file: str | None = None, namespace: str | None = None
+    path: str | Path, params_file: str | None = None, namespace: str | None = None, span: Span = WHOLE
 ) -> tuple[Recording, Rig]:
     """The recording, cut into the rig's blocks, and the rig: from ``params_file``, else from the recording.
 
-    ``namespace``: as :func:`open_recording` has it.
+    ``namespace``, ``span``: as :func:`open_recording` has them.
 
     Raises RecordingError and ConfigError.
     """
-    recording = open_recording(path, namespace=namespace)
+    recording = open_recording(path, namespace=namespace, span=span)
     rig = rig_at_start(recording) if params_file is None else load_rig(params_file)
     check_psds(recording, rig)
     if recording.block_size != rig.estimator.block_size:

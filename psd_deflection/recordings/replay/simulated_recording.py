@@ -25,6 +25,8 @@ class SimulatedRecording(Recording):
     plate, m. The same rig, loads and ``seed`` give the same samples.
     """
 
+    temperatures_held = True
+
     def __init__(
         self, rig: Rig, known: Rig, loads: FloatArray, temperature: FloatArray | None = None, seed: int = 0
     ) -> None:

@@ -15,6 +15,7 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import References, read_references, references_in
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds
+from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -32,13 +33,14 @@ def read_run(
     reference: str | Path | None = None,
     exposure: float = 0.0,
     namespace: str | None = None,
+    span: Span = WHOLE,
 ) -> CalibrationRun:
     """One recording: the recording or its path. Raises RecordingError if it cannot be read.
 
     ``reference``: a table of it, or another recording; None: in the recording. ``exposure``: time over which each
-    reference is a mean, s.
+    reference is a mean, s. ``span``: the part of the recording that is meant.
     """
-    recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace)
+    recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace, span=span)
     path = recording.path
     check_two_psds(rig, 'a calibration')
     check_psds(recording, rig)
@@ -83,11 +85,12 @@ def read_runs(
     references: Sequence[str | Path] = (),
     exposure: float = 0.0,
     namespace: str | None = None,
+    span: Span = WHOLE,
 ) -> list[CalibrationRun]:
     """All of ``sources``; ``references``: none, or the reference of each."""
     tables: Sequence[str | Path | None] = references or [None] * len(sources)
     return [
-        read_run(source, rig, reference=table, exposure=exposure, namespace=namespace)
+        read_run(source, rig, reference=table, exposure=exposure, namespace=namespace, span=span)
         for source, table in zip(sources, tables, strict=True)
     ]
 
@@ -104,6 +107,7 @@ class CalibrationOptions:
     ``params_file``: of the rig as it is known; None: the rig in the first recording. ``exposure``: time over which
     each reference is a mean, s. ``alone``: by the redundant reading alone. ``references``: none, or one for each
     recording. ``dark``: recordings with the lasers off. ``date``: of the calibration.
+    ``span``: the part of each of the recordings, not of ``dark``.
     """
 
     params_file: str | None = None
@@ -113,12 +117,13 @@ class CalibrationOptions:
     references: tuple[str | Path, ...] = ()
     dark: tuple[Recording | str | Path, ...] = ()
     date: str = field(default_factory=today)
+    span: Span = WHOLE
 
     def rig(self, recordings: Sequence[Recording | str | Path], tell: Tell) -> Rig:
         """The known rig; ``tell`` gets a warning if neither a file nor the recording names one."""
         if self.params_file is not None:
             return load_rig(self.params_file)
-        return opened(recordings[0], namespace=self.namespace, tell=tell).rig
+        return opened(recordings[0], namespace=self.namespace, span=self.span, tell=tell).rig
 
     def runs(self, recordings: Sequence[Recording | str | Path], rig: Rig) -> list[CalibrationRun]:
         """The recordings with their references."""

@@ -11,13 +11,12 @@ import numpy as np
 
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_file
-from psd_deflection.recordings.read.csv_reader import CsvRecording
 from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
 from psd_deflection.recordings.recording import TEMPERATURE_COLUMN, Recording
 from psd_deflection.recordings.replay.engine import check_psds, nominal_rig, rig_at_end
-from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
+from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -32,21 +31,23 @@ def read_observation(
     where: str = 'overrides',
     *,
     namespace: str | None = None,
+    span: Span = WHOLE,
     warn: Callable[[str], None] | None = None,
     any_rate: bool = False,
 ) -> Observation:
     """One recording with its rig (by default from its own parameters), changed by ``overrides``.
 
     ``source``: the recording or its path. ``where``: where the overrides are from, for a message.
-    ``namespace``: as in :func:`open_recording`. ``warn``: told if the recording names no rig. ``any_rate``: if its
-    times say another sample rate than the rig file, they are believed, and the observation says so.
+    ``namespace``, ``span``: as in :func:`open_recording`. ``warn``: told if the recording names no rig.
+    ``any_rate``: if its times say another sample rate than the rig file, they are believed, and the observation
+    says so.
 
     Raises RecordingError if it has no loads or cannot be read, ConfigError for a bad override.
 
     The sample at t sees the loads applied before t: a load counts from the first sample at or
     after its own time.
     """
-    recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace)
+    recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace, span=span)
     path = recording.path
     if rig is None:
         rig = rig_at_end(recording)
@@ -91,18 +92,17 @@ def read_observation(
     times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
     held = held_at(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
     before, after = int(np.count_nonzero(t_ns + grace < times.min())), 0
-    if isinstance(recording, CsvRecording):
-        count, last = recording.rows_with_load()
-        later = t_ns > last - start + grace
-        # Rows say their load, one after the other, and then no more: it may have changed unseen.
-        if count > 0.9 * np.count_nonzero(~later):
-            after = int(np.count_nonzero(later))
+    count, last = recording.rows_with_load()
+    later = t_ns > last - start + grace
+    # Rows of a CSV say their load, one after the other, and then no more: it may have changed unseen.
+    if count > 0.9 * np.count_nonzero(~later):
+        after = int(np.count_nonzero(later))
     temperatures = recording.temperatures()
     warm: FloatArray | None = None
     if temperatures:
         at = np.array([r.t_ns - start for r in temperatures], dtype=np.int64)
         celsius = np.array([r.celsius for r in temperatures])
-        if isinstance(recording, CsvRecording | SimulatedRecording):
+        if recording.temperatures_held:
             # A row's value holds until the next differs; a thermometer's messages are points on a curve.
             warm = held_at(at, celsius, t_ns, grace, celsius[0])
         else:
@@ -124,6 +124,7 @@ def read_observations(
     rig: Rig | None = None,
     *,
     namespace: str | None = None,
+    span: Span = WHOLE,
     warn: Callable[[str], None] | None = None,
     any_rate: bool = False,
 ) -> list[Observation]:
@@ -135,7 +136,7 @@ def read_observations(
     Raises ConfigError and RecordingError naming file and key.
     """
     return [
-        read_observation(source, rig, overrides, where, namespace=namespace, warn=warn, any_rate=any_rate)
+        read_observation(source, rig, overrides, where, namespace=namespace, span=span, warn=warn, any_rate=any_rate)
         for source, overrides, where in entries(sources)
     ]
 
