@@ -80,11 +80,11 @@ def run(compensated: bool, end: float = END) -> Ran:
         at = seen.deflection.position + noise.normal(size=3) * NOISE
         if not LOST <= t < BACK:
             late.append((t, Transform(seen.deflection.rotation, at)))
-        command = compensator.watch(t)
         while late and late[0][0] <= t - LATE:
             stamp, deflection = late.popleft()
             covariance = np.eye(6) * NOISE**2
-            command = compensator.observe(t, Observed(stamp, deflection, covariance, t - stamp))
+            compensator.observe(t, Observed(stamp, deflection, covariance, t - stamp))
+        command = compensator.watch(t)
         offsets = command.offsets
         error = np.linalg.norm(seen.deflected.position - arm.pose(wanted(t)).position)
         rows.append((t, error, *offsets, command.state is State.HOLDING))

@@ -48,7 +48,8 @@ class Loop:
             self.compensator.joints(self.t, self.plant.angles)
             at = self.plant.end().deflection
             noisy = Transform(at.rotation, at.position + self.noise.normal(size=3) * 1e-6)
-            command = self.compensator.observe(self.t, Observed(self.t, noisy, CERTAIN))
+            self.compensator.observe(self.t, Observed(self.t, noisy, CERTAIN))
+            command = self.compensator.watch(self.t)
             self.offsets = command.offsets
         return command
 
