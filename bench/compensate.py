@@ -65,7 +65,7 @@ def run(compensated: bool, end: float = END) -> Ran:
     file = read_chain(ROOT / 'config' / 'two_links.yaml')
     plant = SimulatedArm(file.chain, POSES[0], damping=0.02)
     arm = read_arm(URDF, 'tool')
-    compensator = Compensator(arm, CompensatorSettings(axes=('x', 'z')))
+    compensator = Compensator(arm, CompensatorSettings(axes=('x', 'z'), takeover=False))
     noise = np.random.default_rng(1)
     late: collections.deque[tuple[float, Transform]] = collections.deque()
     offsets = np.zeros(2)

@@ -26,8 +26,8 @@ import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory
 
 from bench.simulated_arm import SimulatedArm
 from psd_deflection.arms.chains.chain_file import read_chain
@@ -99,10 +99,11 @@ SENT: dict[str, tuple[int, tuple[str, ...]]] = {
 
 
 class Plant:
-    """The arm on the graph: it adds the offsets that it hears to its commands, and tells its deflection and joints.
+    """The arm on the graph: it adds the offsets that it hears to its commands, and tells them, its deflection
+    and its joints.
 
     ``tell`` may change what it says of the deflection, and withholds it by False. ``offsets``: all that were heard, and
-    ``stamps`` their times, s.
+    ``stamps`` when they came, s.
     """
 
     def __init__(self, node: Any, topic: str = '/end_effector/deflection', joints: str = '/joint_states') -> None:
@@ -115,18 +116,20 @@ class Plant:
         self._noise = np.random.default_rng(0)
         self._deflections = node.create_publisher(PoseWithCovarianceStamped, topic, 5)
         self._joints = node.create_publisher(JointState, joints, 5)
-        node.create_subscription(JointTrajectory, '/compensator/offsets', self._heard, 5)
+        node.create_subscription(Float64MultiArray, '/compensator/offsets', self._heard, 5)
+        self._applied = node.create_publisher(Float64MultiArray, '/compensator/applied', 5)
         self._then = time.monotonic()
         node.create_timer(PERIOD_S, self._step)
 
     def _heard(self, message: Any) -> None:
-        self.offsets.append(np.array(message.points[0].positions))
-        self.stamps.append(message.header.stamp.sec + message.header.stamp.nanosec / 1e9)
+        self.offsets.append(np.array(message.data))
+        self.stamps.append(time.time())
 
     def _step(self) -> None:
         now = time.monotonic()
         self.arm.step(NOMINAL + self.offsets[-1], now - self._then)
         self._then = now
+        self._applied.publish(Float64MultiArray(data=self.offsets[-1].tolist()))
         self._joints.publish(JointState(name=['elbow', 'shoulder'], position=self.arm.angles[::-1].tolist()))
         deflection = self.arm.end().deflection
         message = PoseWithCovarianceStamped()

@@ -19,6 +19,7 @@ from psd_deflection.recordings.window import WHOLE, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameter_files import read_parameter_file
+from psd_deflection.rig.parameters import Parameter, Section, Value, check_value
 from psd_deflection.run.fleet.parquet import ENDING, is_parquet
 
 _FOREIGN = """
@@ -30,6 +31,7 @@ FOREIGN = frozenset(_FOREIGN.split())
 """Endings of other kinds of files. Any other ending is part of a folder's name, as in ``run_0.5N``."""
 
 N = TypeVar('N', int, float)
+S = TypeVar('S')
 
 LONGEST_SPAN_S = 1e8
 """Bound of --from and --to, s: three years."""
@@ -79,6 +81,42 @@ def parameter_option(parser: argparse._ActionsContainer, option: str, name: str)
         metavar='N' if p.kind == 'integer' else option.strip('-').upper(),
         help=text.replace('%', '%%'),
     )
+
+
+def section_options(parser: argparse._ActionsContainer, section: Section[Any]) -> None:
+    """Add an option for each parameter of a section, as it is declared; a list is written X,Y."""
+    for declared in section.parameters.values():
+        unit = f', {declared.unit}' if declared.unit else ''
+        default = declared.default
+        text = ','.join(map(str, default)) if isinstance(default, list) else f'{default}'
+        bounds = f', {declared.bound_text()}' if declared.choices is not None else ''
+        parser.add_argument(
+            f'--{declared.name.replace("_", "-")}',
+            dest=declared.name,
+            type=functools.partial(_of_section, declared),
+            default=default,
+            metavar='X,Y' if isinstance(default, list) else 'VALUE',
+            help=f'{declared.description}{unit}{bounds} (default {text or "none"})'.replace('%', '%%'),
+        )
+
+
+def _of_section(declared: Parameter, text: str) -> Value:
+    option = f'--{declared.name.replace("_", "-")}'
+    value: object = text
+    if declared.kind.endswith('_array'):
+        value = text.split(',')
+    elif declared.kind == 'integer' and re.fullmatch(r'[+-]?[0-9]{1,18}', text):
+        value = int(text)
+    try:
+        return check_value(declared, value, 'options')
+    except ConfigError as error:
+        raise UsageError(str(error).removeprefix('options: ').replace(declared.name, option, 1)) from None
+
+
+def of_options(args: argparse.Namespace, section: Section[S]) -> S:
+    """The settings that the options of :func:`section_options` give. Raises UsageError if they do not fit together."""
+    with given_as_option(*(p.name for p in section.parameters.values())):
+        return section.of({p.name: getattr(args, p.name) for p in section.parameters.values()})
 
 
 def given_parameters(args: argparse.Namespace) -> dict[str, object]:

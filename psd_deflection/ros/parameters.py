@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
@@ -25,12 +25,11 @@ from psd_deflection.model.solvers.registry import SOLVERS, check_live, solver_cl
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME, QOS_OVERRIDES_PREFIX, ROS_OWN, SIMULATED
 from psd_deflection.rig.parameters import Parameter
+from psd_deflection.ros.declared import AT_START, SOURCE, descriptor, plain
 from psd_deflection.run.session import Session
 
-SOURCE = 'ROS parameters'
-
 _READ = 'read when the node is configured'
-_AT_START = {'autostart': 'read at the start of the process'}
+_AT_START = {'autostart': AT_START}
 
 _SIMULATED = ParameterDescriptor(
     name=SIMULATED,
@@ -45,16 +44,16 @@ def rig_of_node(node: Node) -> tuple[Rig, set[str]]:
     The node was made with ``automatically_declare_parameters_from_overrides``. Raises ConfigError
     for an unknown parameter, a wrong type or a value out of bounds.
     """
-    given = {name: _plain(parameter) for name, parameter in node.get_parameters_by_prefix('').items()}
+    given = {name: plain(parameter) for name, parameter in node.get_parameters_by_prefix('').items()}
     rig = rig_from_values(given, SOURCE)
     shown = _ros_values(rig)
     values = {p.name: (shown[p.name], _descriptor(p)) for p in rig.parameters}
-    for name, (value, descriptor) in {**values, SIMULATED: (False, _SIMULATED)}.items():
+    for name, (value, shown_as) in {**values, SIMULATED: (False, _SIMULATED)}.items():
         # rclpy tells of overrides that nobody declares (a mistyped name) only by declaring them, and then without
         # descriptor and with the type as it was typed.
         if name in given:
             node.undeclare_parameter(name)
-        node.declare_parameter(name, value, descriptor, ignore_override=True)
+        node.declare_parameter(name, value, shown_as, ignore_override=True)
     return rig, set(given)
 
 
@@ -67,26 +66,8 @@ def _ros_values(rig: Rig) -> dict[str, Any]:
     return {**rig.values, **signed}
 
 
-def _plain(parameter: RosParameter) -> Any:
-    value = parameter.value
-    return value if value is None or isinstance(value, (str, bool, int, float)) else list(value)
-
-
 def _descriptor(parameter: Parameter) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(
-        name=parameter.name,
-        description=parameter.description + (f' [{parameter.unit}]' if parameter.unit else ''),
-        additional_constraints='; '.join(
-            filter(None, (_bound_text(parameter), '' if parameter.live else _AT_START.get(parameter.name, _READ)))
-        ),
-    )
-    low = parameter.minimum if parameter.minimum is not None else parameter.above
-    if low is not None and parameter.maximum is not None:
-        if parameter.kind == 'double':
-            descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=parameter.maximum)]
-        elif parameter.kind == 'integer':
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(parameter.maximum), step=1)]
-    return descriptor
+    return descriptor(parameter, _bound_text(parameter), '' if parameter.live else _AT_START.get(parameter.name, _READ))
 
 
 def _bound_text(parameter: Parameter) -> str:
@@ -144,7 +125,7 @@ class LiveParameters:
         changed = [
             RosParameter(name, value=value)
             for name, value in {**_ros_values(self.rig), SIMULATED: simulated}.items()
-            if _plain(self._node.get_parameter(name)) != value
+            if plain(self._node.get_parameter(name)) != value
         ]
         self._showing = True
         try:
@@ -165,7 +146,7 @@ class LiveParameters:
     def _change(self, changed: list[RosParameter]) -> SetParametersResult:
         if self._showing:
             return SetParametersResult(successful=True)
-        values = {p.name: _plain(p) for p in changed if p.name not in ROS_OWN}
+        values = {p.name: plain(p) for p in changed if p.name not in ROS_OWN}
         values = {n: v for n, v in values.items() if not n.startswith(QOS_OVERRIDES_PREFIX)}
         try:
             self._take(values)
@@ -178,7 +159,7 @@ class LiveParameters:
     def _take(self, values: dict[str, Any]) -> None:
         """Set all of ``values`` or none. Raises ConfigError or, if no data flows, TimeoutError."""
         # A file that `ros2 param dump` wrote names every parameter; only those that differ are changes.
-        new = {n: v for n, v in values.items() if v != _plain(self._node.get_parameter(n))}
+        new = {n: v for n, v in values.items() if v != plain(self._node.get_parameter(n))}
         for name in new:
             if name == SIMULATED:
                 raise ConfigError(f'{name}: is set by the node')

@@ -21,12 +21,14 @@ import numpy as np
 
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.arm import Arm
+from psd_deflection.arms.inputs import LARGEST_POSITION
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameters import Section, check_value, parameter
 
 AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 OFFSETS, COMMANDS = 'offsets', 'commands'
+ALL_JOINTS = 'all'
 LONGEST_S = 0.1
 """A step is never longer than this: after a pause the offsets do not leap."""
 FOLLOW_S = 0.3
@@ -60,6 +62,13 @@ class CompensatorSettings:
         'what a controller gets: offsets that it adds to its commands, or commands (position plus offset)',
         choices=(OFFSETS, COMMANDS),
     )
+    joints: tuple[str, ...] = parameter(
+        (ALL_JOINTS,), '', 'joints in the order of the outputs; all: those of the URDF file, from the base on'
+    )
+    takeover: bool = parameter(
+        True, '', 'with offsets: wait until the controller tells those that it applies, and begin there; false: at 0'
+    )
+    frame_prefix: str = parameter('', '', 'prefix of the frames of the deflection')
     max_offset: float = parameter(0.05, 'rad or m', 'largest offset of a joint', above=0.0, maximum=10.0, live=True)
     max_rate: float = parameter(
         0.1,
@@ -226,8 +235,11 @@ class Compensator:
             self._offsets = self._wanted = self._applied.copy()
 
     def joints(self, now: float, positions: FloatArray) -> None:
-        """Where the joints are, offsets included unless ``dry``, in the order of the arm; passed over if not finite."""
-        if not np.all(np.isfinite(positions)):
+        """Where the joints are, offsets included unless ``dry``, in the order of the arm.
+
+        Passed over if one is not finite or beyond ``LARGEST_POSITION``.
+        """
+        if not np.all(np.abs(positions) <= LARGEST_POSITION):
             return
         seen = np.array(positions, dtype=np.float64)
         before, then = self._joints, self._joints_t
@@ -259,8 +271,8 @@ class Compensator:
             if self._good < self.settings.good:
                 return self._command()
             self._fault = ''
-        nominal = self._nominal()
-        if self.enabled and nominal is not None:
+        nominal = self._nominal() if self.enabled else None
+        if nominal is not None:
             elapsed = seen.t - before.t if before is not None else 0.0
             self._follow(nominal, seen.deflection, min(max(elapsed, 0.0), LONGEST_S))
         return self._command()
@@ -284,6 +296,12 @@ class Compensator:
         limit = self.settings.max_rate * elapsed
         self._offsets = self._offsets + np.clip(self._wanted - self._offsets, -limit, limit)
         return self._command()
+
+    @property
+    def waits(self) -> bool:
+        """Whether nothing may be sent yet, because the controller has not told which offsets it applies."""
+        settings = self.settings
+        return settings.takeover and settings.output == OFFSETS and not self._dry and self._applied is None
 
     def commands(self) -> FloatArray | None:
         """Positions (n,) of the joints with the offsets; None as long as the joints' own positions are not known."""
@@ -355,6 +373,8 @@ class Compensator:
             return f'the deflection {what} {settings.stale:g} s'
         if self._joints is None or now - self._joints_t > settings.stale:
             return 'the positions of the joints are not known'
+        if self.waits:
+            return 'the controller has not told the offsets that it applies'
         return self._stop or self._broken
 
     def _hold(self, fault: str) -> None:

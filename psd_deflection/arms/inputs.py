@@ -1,0 +1,47 @@
+"""What an arm's node may believe of a message: joint positions, a deflection. Each check gives the reason why not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+LARGEST_POSITION = 1e4
+"""Bound of a joint's position, rad or m: a number beyond it is no position."""
+LONGEST_LIST = 1000
+"""Joints in a message."""
+UNIT_WITHIN = 1e-3
+"""How far the length of a quaternion may be from 1."""
+
+
+def joints_fault(names: Sequence[str], positions: Sequence[float]) -> str:
+    """Why positions of joints cannot be used; '' if they can."""
+    if len(names) > LONGEST_LIST:
+        return f'{len(names)} joints: must be at most {LONGEST_LIST}'
+    if len(set(names)) < len(names):
+        return 'a joint is named twice'
+    if len(positions) != len(names):
+        return f'{len(positions)} positions of {len(names)} joints'
+    for name, position in zip(names, positions, strict=True):
+        if not abs(position) <= LARGEST_POSITION:
+            return f'{name} = {position:g}: must be finite and at most {LARGEST_POSITION:g}'
+    return ''
+
+
+def quaternion_fault(quaternion: Sequence[float]) -> str:
+    """Why (x, y, z, w) is no rotation; '' if it is one."""
+    length = math.sqrt(math.fsum(v * v for v in quaternion)) if np.all(np.abs(quaternion) < 2.0) else math.nan
+    return '' if abs(length - 1.0) <= UNIT_WITHIN else 'its orientation is no unit quaternion'
+
+
+def stamp_fault(seconds: int, nanoseconds: int) -> str:
+    """Why a stamp is none; '' if it is one."""
+    if seconds < 0 or not 0 <= nanoseconds < 1_000_000_000:
+        return f'stamp {seconds} s {nanoseconds} ns: is no time'
+    return ''
+
+
+def frame_fault(frame: str, wanted: str) -> str:
+    """Why ``frame`` is not the frame that is ``wanted``; '' if it is, or if it is not given."""
+    return '' if frame in ('', wanted) else f'frame_id {frame!r}: must be {wanted}'

@@ -1,0 +1,117 @@
+"""The settings of a node as its ROS parameters: described, bounded, unknown ones refused; live ones may be set.
+
+A section of :mod:`psd_deflection.rig.parameters` declares them, once, for the command line, too. A value of
+``-p NAME:=VALUE`` or ``--params-file`` has the last word.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+from rclpy.parameter import Parameter as RosParameter
+
+from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.rig.declarations import QOS_OVERRIDES_PREFIX, ROS_OWN
+from psd_deflection.rig.parameters import Parameter, Section, Value, check_value
+
+SOURCE = 'ROS parameters'
+AT_START = 'read at the start of the process'
+T = TypeVar('T')
+
+
+def descriptor(parameter: Parameter, bounds: str, constraint: str) -> ParameterDescriptor:
+    """What ``ros2 param describe`` shows; ``bounds`` in words, ``constraint``: what else holds."""
+    out = ParameterDescriptor(
+        name=parameter.name,
+        description=parameter.description + (f' [{parameter.unit}]' if parameter.unit else ''),
+        additional_constraints='; '.join(filter(None, (bounds, constraint))),
+    )
+    low = parameter.minimum if parameter.minimum is not None else parameter.above
+    if low is not None and parameter.maximum is not None:
+        if parameter.kind == 'double':
+            out.floating_point_range = [FloatingPointRange(from_value=low, to_value=parameter.maximum)]
+        elif parameter.kind == 'integer':
+            out.integer_range = [IntegerRange(from_value=int(low), to_value=int(parameter.maximum), step=1)]
+    return out
+
+
+def plain(parameter: RosParameter) -> Any:
+    """Its value; a list for an array."""
+    value = parameter.value
+    return value if value is None or isinstance(value, (str, bool, int, float)) else list(value)
+
+
+def node_with_overrides(name: str) -> Node:
+    """A node that has what was given to it as parameters. Raises ConfigError if one cannot be read."""
+    try:
+        return Node(name, automatically_declare_parameters_from_overrides=True)
+    except (ParameterException, ValueError) as error:
+        raise ConfigError(f'{SOURCE}: {error}') from None
+
+
+class DeclaredParameters(Generic[T]):
+    """The parameters of ``node`` that ``section`` declares, at ``values`` unless ROS was given others.
+
+    ``node``: of :func:`node_with_overrides`. ``make``: makes the settings of all values, and raises ConfigError if they
+    contradict each other. ``changed``: gets the settings when a live one was set.
+    Raises ConfigError for an unknown parameter, a wrong type or a value out of bounds.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        section: Section[T],
+        values: Mapping[str, Value],
+        changed: Callable[[T], None] = lambda _: None,
+    ) -> None:
+        self._node, self._section, self._changed = node, section, changed
+        self._declared = {p.name: p for p in section.parameters.values()}
+        given = refuse_unknown(node, self._declared)
+        checked = {name: check_value(self._declared[name], value, SOURCE) for name, value in given.items()}
+        self._values: dict[str, Value] = {**values, **checked}
+        self.settings = section.of(self._values)
+        for name, parameter in self._declared.items():
+            if name in given:
+                node.undeclare_parameter(name)
+            shown = descriptor(parameter, parameter.bound_text(), '' if parameter.live else AT_START)
+            node.declare_parameter(name, self._values[name], shown, ignore_override=True)
+        node.add_on_set_parameters_callback(self._set)
+
+    def _set(self, changed: list[RosParameter]) -> SetParametersResult:
+        try:
+            self._take({p.name: plain(p) for p in changed if not _is_ros_own(p.name)})
+        except ConfigError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _take(self, values: Mapping[str, object]) -> None:
+        """Set all of ``values`` or none."""
+        new = dict(self._values)
+        for name, value in values.items():
+            if name not in self._declared:
+                raise ConfigError(f'{name!r}: no parameter of that name{did_you_mean(name, self._declared)}')
+            new[name] = check_value(self._declared[name], value, SOURCE)
+            if new[name] != self._values[name] and not self._declared[name].live:
+                raise ConfigError(f'{name}: is {AT_START}')
+        settings = self._section.of(new)
+        if new != self._values:
+            self._values, self.settings = new, settings
+            self._changed(settings)
+
+
+def refuse_unknown(node: Node, known: Mapping[str, Parameter]) -> dict[str, Any]:
+    """What ``node`` was given, by name. Raises ConfigError if a parameter is not ``known``."""
+    given = {name: plain(p) for name, p in node.get_parameters_by_prefix('').items() if not _is_ros_own(name)}
+    for name, value in given.items():
+        if name not in known:
+            there = did_you_mean(name, known) or ('' if known else '; this node has none')
+            raise ConfigError(f'{SOURCE}: {name} = {value!r}: no parameter of that name{there}')
+    return given
+
+
+def _is_ros_own(name: str) -> bool:
+    return name in ROS_OWN or name.startswith(QOS_OVERRIDES_PREFIX)
