@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -15,18 +15,26 @@ UNIT_WITHIN = 1e-3
 """How far the length of a quaternion may be from 1."""
 
 
-def joints_fault(names: Sequence[str], positions: Sequence[float]) -> str:
-    """Why positions of joints cannot be used; '' if they can."""
+def joints_fault(names: Sequence[str], positions: Sequence[float], ours: Collection[str]) -> str:
+    """Why positions of joints cannot be used; '' if they can. Of other joints than ``ours`` the values do not count."""
     if len(names) > LONGEST_LIST:
         return f'{len(names)} joints: must be at most {LONGEST_LIST}'
     if len(set(names)) < len(names):
         return 'a joint is named twice'
+    if not len(positions):
+        # A driver may tell speeds or forces alone.
+        return ''
     if len(positions) != len(names):
         return f'{len(positions)} positions of {len(names)} joints'
     for name, position in zip(names, positions, strict=True):
-        if not abs(position) <= LARGEST_POSITION:
+        if name in ours and not is_position(position):
             return f'{name} = {position:g}: must be finite and at most {LARGEST_POSITION:g}'
     return ''
+
+
+def is_position(value: float) -> bool:
+    """Whether a number can be a joint's position, rad or m."""
+    return abs(value) <= LARGEST_POSITION
 
 
 def quaternion_fault(quaternion: Sequence[float]) -> str:

@@ -34,6 +34,7 @@ from psd_deflection.camera.settings import settings_from
 from psd_deflection.camera.targets import target_of
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport, Record, ReferencePose
+from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.wires import message_class, relative
 
 NODE_NAME = 'camera'
@@ -47,7 +48,8 @@ class CameraNode:
 
     def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None]) -> None:
         opencv()
-        self._say = say
+        self._say: Callable[[str], None] = say
+        self._log: NodeLog | None = None
         self._reference: CameraReference | None = None
         self._info: Any = None
         self._since: collections.Counter[str] = collections.Counter()
@@ -61,6 +63,8 @@ class CameraNode:
             given = self.node.get_parameters_by_prefix('')
             values = {name: _plain(p.value) for name, p in given.items() if name.partition('.')[0] not in _NOT_OURS}
             self.settings = settings_from(values, 'ROS parameters')
+            self._log = NodeLog(self.node, say)
+            self._say = self._log
             # Reliable: a subscriber may ask for less, as the estimator does.
             self._publishers = {
                 topic: self.node.create_publisher(
@@ -156,6 +160,8 @@ class CameraNode:
 
     def close(self) -> None:
         """Leave the graph."""
+        if self._log is not None:
+            self._log.close()
         self.node.destroy_node()
 
 

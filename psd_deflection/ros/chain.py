@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import math
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future as DiskFuture
@@ -18,7 +17,6 @@ from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -26,9 +24,13 @@ from msg_adapters import DEFLECTION_WITH_COVARIANCE, DIAGNOSTICS, END_EFFECTOR, 
 from msg_adapters.pose_with_covariance_stamped import from_end_effector
 from psd_deflection.arms.chains.chain_file import ChainFile
 from psd_deflection.arms.chains.transform import Transform
+from psd_deflection.arms.inputs import joints_fault
 from psd_deflection.base.errors import PsdDeflectionError, Warned
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.ros.declared import node_with_overrides, refuse_unknown
+from psd_deflection.ros.gate import InputGate
+from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.names import BASE, END, END_REST, JOINT_STATES, RECORD, REST, TF, TF_STATIC, TIP, ZERO
 from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.transforms import installed, static_transforms, transform_message
@@ -49,15 +51,18 @@ class ChainNode:
     """The node and its rigs, which are open; :meth:`start` lets samples flow."""
 
     def __init__(self, file: ChainFile, say: Callable[[str], None], signals: Signals) -> None:
-        self._say = say
-        self.node = Node(NODE_NAME)
+        self.node = node_with_overrides(NODE_NAME)
+        self._say: Callable[[str], None] = say
+        self._log: NodeLog | None = None
         try:
+            refuse_unknown(self.node, {})
+            self._say = say = self._log = NodeLog(self.node, say)
             name = self.node.get_fully_qualified_name()
             self.chain = signals.interruptible(
                 lambda: ChainSession(file, say, lambda _, rig, told: Session(rig, told, name))
             )
         except BaseException:
-            self.node.destroy_node()
+            self._leave()
             raise
         try:
             self._offer(file)
@@ -68,6 +73,7 @@ class ChainNode:
     def _offer(self, file: ChainFile) -> None:
         """Everything on the graph."""
         node = self.node
+        self._gate = InputGate(node, self._say)
         self._wires: list[PublisherWire] = []
         self._told: list[RigPublisher] = []
         self._health = [HealthReporter(session) for session in self.chain.sessions]
@@ -88,7 +94,8 @@ class ChainNode:
             self._tf_static = node.create_publisher(self._message, TF_STATIC, qos(TF_STATIC))
         self.chain.listeners.append(self._composed)
         if any(joint.name for joint in file.joints):
-            node.create_subscription(message_class('sensor_msgs/msg/JointState'), JOINT_STATES, self._joints, 10)
+            kind = message_class('sensor_msgs/msg/JointState')
+            self._gate.listen(kind, JOINT_STATES, self._joints_fault, self._joints, 10)
         node.create_service(Trigger, ZERO, self._zero)
         # In a separate group: while one request waits for the disk, the node serves everything else.
         node.create_service(SetBool, RECORD, self._record, callback_group=ReentrantCallbackGroup())
@@ -115,9 +122,12 @@ class ChainNode:
         if self._tf is not None:
             self._tf.publish(self._message(transforms=chain_transforms(self.chain, composed)))
 
+    def _joints_fault(self, message: Any) -> str:
+        return joints_fault(message.name, message.position, {joint.name for joint in self.chain.file.joints})
+
     def _joints(self, message: Any) -> None:
         angles = zip(message.name, message.position, strict=False)
-        self.chain.turn({name: angle for name, angle in angles if math.isfinite(angle)})
+        self.chain.turn(dict(angles))
 
     def _zero(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = False
@@ -151,6 +161,7 @@ class ChainNode:
 
     def _report(self) -> None:
         chain = self.chain
+        self._gate.settle()
         node = self.node.get_fully_qualified_name().removeprefix('/')
         for name, session, health, told in zip(chain.file.names, chain.sessions, self._health, self._told, strict=True):
             told.tell(again=False)
@@ -176,11 +187,17 @@ class ChainNode:
         values += [
             (f'angle {j.name}', f'{a:.6f}') for j, a in zip(chain.file.joints, chain.angles, strict=True) if j.name
         ]
+        values += self._gate.values()
         return DiagnosticEntry(f'{node}: end effector', level, text, tuple(values))
 
     def close(self) -> None:
         """End the rigs, then the node."""
         self.chain.close()
+        self._leave()
+
+    def _leave(self) -> None:
+        if self._log is not None:
+            self._log.close()
         self.node.destroy_node()
 
 

@@ -164,7 +164,7 @@ class CompensatorNode:
 
     def _joints_fault(self, message: Any) -> str:
         stamp = message.header.stamp
-        fault = stamp_fault(stamp.sec, stamp.nanosec) or joints_fault(message.name, message.position)
+        fault = stamp_fault(stamp.sec, stamp.nanosec) or joints_fault(message.name, message.position, self._names)
         if fault or not set(self._names) <= set(message.name):
             return fault
         t_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
@@ -174,6 +174,8 @@ class CompensatorNode:
 
     def _joints(self, message: Any) -> None:
         names = list(message.name)
+        if not len(message.position):
+            return
         if names != self._places[0]:
             if not set(self._names) <= set(names):
                 # Another part of the robot may publish its joints on the same topic.

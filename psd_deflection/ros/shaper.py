@@ -11,18 +11,20 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.time import Time
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from msg_adapters import DIAGNOSTICS, TOPIC_TYPES, to_messages
 from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory, TrajectoryShaper, checked
+from psd_deflection.arms.inputs import is_position, joints_fault, stamp_fault
 from psd_deflection.base.errors import ConfigError, Warned, printable
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.ros.declared import node_with_overrides, refuse_unknown
+from psd_deflection.ros.gate import InputGate
+from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.names import JOINT_STATES
 from psd_deflection.ros.running import SPIN_S, executor_of, ros
 from psd_deflection.ros.wires import message_class, qos
@@ -47,22 +49,30 @@ class ShaperNode:
     def __init__(self, shaper: TrajectoryShaper, described: str, say: Callable[[str], None]) -> None:
         self._shaper = shaper
         self._described = described
-        self._repeats = Repeats(say)
+        self.node = node = node_with_overrides(NODE_NAME)
+        try:
+            refuse_unknown(node, {})
+        except ConfigError:
+            node.destroy_node()
+            raise
+        self._log = NodeLog(node, say)
+        self._gate = InputGate(node, self._log)
+        self._repeats = Repeats(self._log)
         self._measured: dict[str, tuple[float, float]] = {}
         self._shaped = self._refused = 0
         self._why = ''
-        self.node = node = Node(NODE_NAME)
-        node.create_subscription(JointTrajectory, GIVEN, self._given, 10)
-        node.create_subscription(message_class('sensor_msgs/msg/JointState'), JOINT_STATES, self._joints, 5)
+        states = message_class('sensor_msgs/msg/JointState')
+        self._gate.listen(JointTrajectory, GIVEN, _trajectory_fault, self._given, 10)
+        self._gate.listen(states, JOINT_STATES, lambda m: joints_fault(m.name, m.position, ()), self._joints)
         self._out = node.create_publisher(JointTrajectory, SHAPED, 10)
         self._health = node.create_publisher(message_class(TOPIC_TYPES[DIAGNOSTICS]), DIAGNOSTICS, qos(DIAGNOSTICS))
         node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        say(f'publishing {self._out.topic_name}: {described}')
+        self._log(f'publishing {self._out.topic_name}: {described}')
 
     def _joints(self, message: Any) -> None:
         now = time.monotonic()
         for name, position in zip(message.name, message.position, strict=False):
-            if np.isfinite(position):
+            if is_position(position):
                 self._measured[name] = position, now
 
     def _given(self, message: Any) -> None:
@@ -98,6 +108,7 @@ class ShaperNode:
 
     def _report(self) -> None:
         self._repeats.settle(time.monotonic())
+        self._gate.settle()
         level, text = (WARN, f'the last trajectory was refused: {self._why}') if self._why else (OK, self._described)
         shaper = self._shaper.shaper
         values = (
@@ -105,6 +116,7 @@ class ShaperNode:
             ('delay (s)', f'{shaper.duration:.4f}'),
             ('trajectories shaped', str(self._shaped)),
             ('trajectories refused', str(self._refused)),
+            *self._gate.values(),
         )
         node = self.node.get_fully_qualified_name().removeprefix('/')
         entry = DiagnosticEntry(f'{node}: trajectories', level, text, values)
@@ -113,7 +125,13 @@ class ShaperNode:
 
     def close(self) -> None:
         """Leave the graph."""
+        self._log.close()
         self.node.destroy_node()
+
+
+def _trajectory_fault(message: Any) -> str:
+    stamp = message.header.stamp
+    return stamp_fault(stamp.sec, stamp.nanosec)
 
 
 def _trajectory(message: Any) -> Trajectory:

@@ -182,7 +182,11 @@ class ChainSession:
         if joined.missing:
             why = '; '.join(f'{self.file.names[n]}: {self.reasons[n] or "no estimate"}' for n in joined.missing)
             return Composed(joined.t_ns, None, why)
-        return Composed(joined.t_ns, self.file.chain.compose(joined.tips, self._angles))
+        try:
+            return Composed(joined.t_ns, self.file.chain.compose(joined.tips, self._angles))
+        except (ArithmeticError, ValueError) as error:
+            # Each link measures and records on, whatever the angles of the joints are.
+            return Composed(joined.t_ns, None, f'cannot be composed ({error})')
 
     def zero(self) -> list[ParameterChange | None]:
         """Take the present dots of every link as the unloaded ones; None for a link whose last block is not good.
