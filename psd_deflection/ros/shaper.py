@@ -85,7 +85,8 @@ class ShaperNode:
         measured = {name: at for name, (at, then) in self._measured.items() if now - then <= KNOWN_S}
         try:
             trajectory = _trajectory(message)
-            shaped = self._shaper.shape(self._start_ns(message), trajectory, measured)
+            start_ns = self._start_ns(message)
+            shaped = self._shaper.shape(start_ns, trajectory, measured)
         except ConfigError as error:
             self._refused += 1
             self._why = printable(str(error), LONGEST)
@@ -93,6 +94,8 @@ class ShaperNode:
             return
         self._shaped += 1
         self._why = ''
+        # Whoever gets it begins when we did, however long the messages take: one that replaces another makes no step.
+        message.header.stamp = Time(nanoseconds=start_ns).to_msg()
         self._out.publish(_message(shaped, message.header))
 
     def _start_ns(self, message: Any) -> int:

@@ -107,6 +107,22 @@ def test_the_shaper_is_launched_with_its_options(launch_modules: None) -> None:
     assert [(a, b.name) for a, b in node.remappings] == [('~/trajectory', 'given'), ('~/shaped', 'shaped')]
 
 
+def test_the_compensator_is_launched_with_its_options(launch_modules: None) -> None:
+    names = runpy.run_path(str(LAUNCH / 'compensator.launch.py'))
+    declared = {a.words[0]: a for a in names['generate_launch_description']() if hasattr(a, 'description')}
+    assert declared.keys() == {'namespace', 'drive', 'params_file', *names['ARGUMENTS'], *names['TOPICS']}
+    assert all(a.description for a in declared.values())
+    options = make_parser(['compensator']).parse_args(['compensator', 'arm.urdf', '--tip', 'tool'])
+    assert set(names['ARGUMENTS']) <= vars(options).keys()
+    given = {'urdf': 'arm.urdf', 'tip': 'tool', 'drive': 'true', 'max_rate': '0.05', 'params_file': 'p.yaml'}
+    (node,) = names['compensator'](dict.fromkeys(declared, '') | given)
+    assert node.arguments == ['arm.urdf', '--tip', 'tool', '--max-rate', '0.05', '--drive']
+    assert node.parameters == ['p.yaml']
+    assert [(a, b.name) for a, b in node.remappings] == [(f'~/{name}', name) for name in names['TOPICS']]
+    (dry,) = names['compensator'](dict.fromkeys(declared, '') | {'urdf': 'arm.urdf', 'tip': 'tool'})
+    assert dry.arguments == ['arm.urdf', '--tip', 'tool']
+
+
 @pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 launch comes with a ROS installation')
 def test_ros2_launch_shows_the_arguments() -> None:
     command = ['ros2', 'launch', str(FILE), '--show-args']

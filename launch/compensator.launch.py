@@ -1,0 +1,68 @@
+"""The compensator: ``ros2 launch psd_deflection compensator.launch.py urdf:=arm.urdf tip:=tool0 drive:=true``.
+
+It is silent until ``/compensator/enable`` is called. For ``forward_position_controller``::
+
+    ros2 launch psd_deflection compensator.launch.py urdf:=arm.urdf tip:=tool0 drive:=true \
+        output:=commands commands:=/forward_position_controller/commands
+"""
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+ARGUMENTS: dict[str, str] = {
+    'urdf': 'kinematics of the arm',
+    'tip': 'link of the end effector',
+    'base': 'link from which on joints count (empty: the root)',
+    'axes': "axes of the end effector's pose that are corrected, of x,y,z,rx,ry,rz (empty: x,y,z)",
+    'output': 'offsets, which your controller adds, or commands, position plus offset (empty: offsets)',
+    'max_offset': 'largest offset of a joint, rad or m (empty: 0.05)',
+    'max_rate': 'largest rate of an offset, rad/s or m/s (empty: 0.1)',
+}
+"""Options of the command with their descriptions; the default of each is empty."""
+
+TOPICS = {'offsets': 'compensator/offsets', 'commands': 'compensator/commands', 'applied': 'compensator/applied'}
+"""Topics with their names in the namespace."""
+
+
+def generate_launch_description() -> LaunchDescription:
+    """One node."""
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument('namespace', default_value='', description='namespace of the node and its topics'),
+            DeclareLaunchArgument(
+                'drive', default_value='false', description='publish for a controller'
+            ),
+            DeclareLaunchArgument('params_file', default_value='', description='ROS parameters of the node'),
+            *(DeclareLaunchArgument(name, default_value='', description=what) for name, what in ARGUMENTS.items()),
+            *(
+                DeclareLaunchArgument(name, default_value=topic, description=f'topic of the {name}')
+                for name, topic in TOPICS.items()
+            ),
+            OpaqueFunction(function=compensator),
+        ]
+    )
+
+
+def compensator(context: LaunchContext) -> list[Node]:
+    """The node, with the arguments that were given."""
+    given = {name: LaunchConfiguration(name).perform(context) for name in (*ARGUMENTS, 'drive', 'params_file')}
+    arguments = [given['urdf']]
+    for name in ARGUMENTS:
+        if name != 'urdf' and given[name]:
+            arguments += ['--' + name.replace('_', '-'), given[name]]
+    if given['drive'].lower() in ('true', '1'):
+        arguments.append('--drive')
+    return [
+        Node(
+            package='psd_deflection',
+            executable='compensator',
+            name='compensator',
+            namespace=LaunchConfiguration('namespace'),
+            output='screen',
+            arguments=arguments,
+            parameters=[given['params_file']] if given['params_file'] else [],
+            remappings=[(f'~/{name}', LaunchConfiguration(name)) for name in TOPICS],
+        )
+    ]
