@@ -31,9 +31,7 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription(
         [
             DeclareLaunchArgument('namespace', default_value='', description='namespace of the node and its topics'),
-            DeclareLaunchArgument(
-                'drive', default_value='false', description='publish for a controller'
-            ),
+            DeclareLaunchArgument('drive', default_value='false', description='publish for a controller'),
             DeclareLaunchArgument('params_file', default_value='', description='ROS parameters of the node'),
             *(DeclareLaunchArgument(name, default_value='', description=what) for name, what in ARGUMENTS.items()),
             *(
