@@ -21,8 +21,9 @@ from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_val
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import DarkLevel, dark_levels, values_of_levels
-from psd_deflection.studies.calibrate.observation import CalibrationRun
+from psd_deflection.studies.calibrate.observation import CalibrationRun, usable_dots
 from psd_deflection.studies.calibrate.result import Calibrated
+from psd_deflection.studies.noted_loads import mend_loads
 from psd_deflection.studies.study import Tell, opened
 
 
@@ -95,6 +96,18 @@ def read_runs(
     ]
 
 
+def timed(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
+    """``run`` with its loads at the times at which they acted, by the motion; ``tell`` gets what was noted wrong."""
+    if run.loads is None:
+        return run
+    mended = mend_loads(rig, usable_dots(run, rig), run.loads)
+    if mended is None:
+        return run
+    for note in mended.notes:
+        tell(note.words(run.name))
+    return replace(run, loads=mended.loads)
+
+
 def today() -> str:
     """The date of a calibration, UTC."""
     return datetime.now(UTC).date().isoformat()
@@ -143,7 +156,8 @@ class CalibrationOptions:
         progress: Callable[[str], None],
         tell: Tell,
     ) -> Calibrated:
-        """The answer; ``tell`` gets a warning if the rig file cannot be edited."""
+        """The answer; ``tell`` gets a warning if a load was noted late, or if the rig file cannot be edited."""
+        runs = [timed(run, rig, tell) for run in runs]
         lit = replace_values(rig, values_of_levels(levels))
         found = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
         return Calibrated(found, lit, self.params_file, self.date, tell)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.levels import NOISE_FACTOR, SUM_FACTOR, Levels, levels
@@ -27,6 +27,7 @@ from psd_deflection.studies.check.wirings import (
     misfit,
     parameters,
 )
+from psd_deflection.studies.noted_loads import MendedNote, mend_loads
 
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
@@ -41,7 +42,8 @@ UNIT_TOLERANCE = 0.1
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckProblem:
     """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``, ``drift_sd`` (4,): m/s, of
-    the device's channels x1 y1 x2 y2. ``source``: the recording, '' at the bench.
+    the device's channels x1 y1 x2 y2. ``source``: the recording, '' at the bench. ``late``: loads whose noted time
+    is not that of their motion.
     """
 
     rig: Rig
@@ -50,12 +52,19 @@ class CheckProblem:
     drift: FloatArray
     drift_sd: FloatArray
     source: str = ''
+    late: Sequence[MendedNote] = ()
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
     """The problem of a recording: ``volts`` (n, 6) of the device's channels, ``loads`` (n, 3), N, N, N m, held."""
-    answered = responses(rig, volts, loads)
-    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source)
+    mended = mend_loads(rig, volts[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
+    late: Sequence[MendedNote] = ()
+    moved = volts
+    if mended is not None:
+        loads, late = mended.loads, mended.notes
+        moved = np.where(mended.unused[:, None], np.nan, volts)
+    answered = responses(rig, moved, loads)
+    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, late)
 
 
 def check(problem: CheckProblem) -> Checkup:
@@ -65,7 +74,7 @@ def check(problem: CheckProblem) -> Checkup:
     seen = tuple(p for p in pushes if p.seen)
     dead = [*measured.stuck, *(c for c in _dead(seen) if c not in measured.stuck)]
     found = fitting_wirings(seen) if seen else []
-    findings: list[Finding] = []
+    findings = [Finding('load_time', n.which, n.late, n.words(problem.source), abs(n.late)) for n in problem.late]
     lines: dict[str, object] = {}
     for channel in dead:
         findings.append(Finding('stuck_channel', channel, None, f'{channel} does not answer: look at its cable'))

@@ -29,6 +29,7 @@ NAMES = {
     'psd_swap': 'exchanged',
     'load_sign': 'sign turned',
     'load_unit': 'other unit',
+    'load_time': 'noted late or early',
     'stuck_channel': 'dead',
     'noise_level': 'noise',
     'load_coverage': 'not seen',
@@ -40,10 +41,10 @@ WIRED = ('channel_sign', 'axis_swap', 'psd_swap')
 class Finding:
     """One thing that is not as the rig file or the recording says.
 
-    ``name``: channel_sign, axis_swap, psd_swap, load_sign, load_unit, load_coverage, stuck_channel, noise_level.
-    ``where``: channel, PSD or load. ``value``: -1 for a turned sign, or a factor. ``fix``: the line for the rig file,
-    or what to do. ``evidence``: how much more of the movement (summed over the pushes) the rig file leaves unexplained.
-    ``equivalent``: other causes that look the same to first order.
+    ``name``: channel_sign, axis_swap, psd_swap, load_sign, load_unit, load_time, load_coverage, stuck_channel,
+    noise_level. ``where``: channel, PSD or load. ``value``: -1 for a turned sign, a factor, or s late. ``fix``: the
+    line for the rig file, or what to do. ``evidence``: how much more of the movement (summed over the pushes) the rig
+    file leaves unexplained. ``equivalent``: other causes that look the same to first order.
     """
 
     name: str

@@ -47,7 +47,7 @@ from psd_deflection.studies.discover.search.weighing import (
     without_one,
 )
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.cleaning import clean
+from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, beginning, mistakes
 from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, noise_finding, said, wire
 
@@ -115,12 +115,14 @@ def discover(
     base = effects_of_rig(rig)
     progress('checking the recording')
     cleaned = [clean(o, base) for o in recordings]
-    observations, findings, rewired = wire([o for o, _ in cleaned], base)
+    timed = [time_loads(o) for o, _ in cleaned]
+    late = [f for _, found in timed for f in found]
+    observations, findings, rewired = wire([o for o, _ in timed], base)
     before = 0.0
-    if findings:
+    if findings or late:
         stated = Workspace([o for o, _ in cleaned], base)
         before = stated.gap(stated.residual(base)[1])
-    findings = [*(f for _, found in cleaned for f in found), *findings]
+    findings = [*late, *(f for _, found in cleaned for f in found), *findings]
     lines.update(rewired)
     if lines:
         rig = replace_values(rig, lines)

@@ -240,6 +240,9 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
     ws, left = discovery.workspace, _left(discovery)
     before = f'{ws.scale_shown[0] * discovery.gap_before:{ws.digits}}'
     if discovery.verdict == 'nothing_missing':
+        if not math.isfinite(discovery.gap_floor):
+            # Without a stated noise nobody knows whether what remains is noise.
+            return f'Nothing in the library helps{besides}; {left} remains, and no noise is stated to hold it against.'
         return f'Nothing is missing{besides}: the gap is {left}.'
     parts = []
     for e in discovery.effects:

@@ -101,6 +101,20 @@ def test_wiring_signs_and_units_are_put_right(
     assert replace_values(RIG, lines).values == mended.rig.values
 
 
+@pytest.mark.parametrize(
+    ('factor', 'unit'), [(9.80665e-3, 'kg mm'), (1e-2, 'N cm'), (9.80665e-2, 'kg cm')], ids=['kg mm', 'N cm', 'kg cm']
+)
+def test_the_nearest_of_two_units_that_are_alike_is_named(factor: float, unit: str) -> None:
+    _, findings, _ = wire([loaded(recorded(), 1.0, 1.0, 1.0 / factor)], ())
+    assert [(f.name, f.where, f.value) for f in findings] == [('load_unit', 'tz', factor)]
+    assert f'it is noted in {unit} instead' in findings[0].fix
+
+
+def test_loads_in_grams_have_one_factor_for_forces_and_torque() -> None:
+    _, findings, _ = wire([loaded(recorded(), *[1.0 / 9.80665e-3] * 3)], ())
+    assert [(f.where, f.value) for f in findings] == [('fx fy', 9.80665e-3), ('tz', 9.80665e-3)]
+
+
 def test_a_soft_or_stiff_link_is_no_other_unit() -> None:
     for modulus in (6.9e11, 6.9e9, 7.2e10, 5e10):
         _, findings, _ = wire([recorded(link__youngs_modulus=modulus)], ())

@@ -16,11 +16,12 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.proposals import coarse_step
+from psd_deflection.studies.noted_loads import mend_loads
 
 FAR = 8.0
 """A sample this many standard deviations from what its neighbours predict is an outlier."""
@@ -154,3 +155,15 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     if np.array_equal(volts, o.volts, equal_nan=True):
         return o, findings
     return dataclasses.replace(o, volts=volts, digest=o.digest or o.hashed()), findings
+
+
+def time_loads(observation: Observation) -> tuple[Observation, list[Finding]]:
+    """The recording with its loads at the times at which they acted, by the motion, and which were noted otherwise."""
+    o = observation
+    mended = mend_loads(o.rig, o.volts[:, list(DOT_CHANNELS)] * o.rig.sensitivities.ravel(), o.loads)
+    if mended is None:
+        return o, []
+    volts = o.volts.copy()
+    volts[mended.unused] = np.nan
+    findings = [Finding('load_time', n.which, n.late, n.words(o.name), abs(n.late)) for n in mended.notes]
+    return dataclasses.replace(o, volts=volts, loads=mended.loads, digest=o.digest or o.hashed()), findings

@@ -214,13 +214,19 @@ def _units(sizes: FloatArray) -> dict[int, tuple[float, str]]:
     out: dict[int, tuple[float, str]] = {}
     force = [float(s) for s in sizes[:2] if math.isfinite(s)]
     torque = float(sizes[2])
-    for factor, unit in _both_ways(FORCE_UNITS, 'N'):
-        if force and all(abs(s / factor - 1.0) < UNIT_TOLERANCE for s in force) and not _power_of_ten(force, torque):
-            out.update({k: (factor, unit) for k in range(2) if math.isfinite(sizes[k])})
-    for factor, unit in _both_ways(TORQUE_UNITS, 'N m'):
-        if math.isfinite(torque) and abs(torque / factor - 1.0) < UNIT_TOLERANCE:
-            out[2] = (factor, unit)
+    if force and not _power_of_ten(force, torque) and (found := _nearest(force, FORCE_UNITS, 'N')):
+        out.update({k: found for k in range(2) if math.isfinite(sizes[k])})
+    if math.isfinite(torque) and (found := _nearest([torque], TORQUE_UNITS, 'N m')):
+        out[2] = found
     return out
+
+
+def _nearest(sizes: Sequence[float], units: dict[float, str], own: str) -> tuple[float, str] | None:
+    """The factor and unit within ``UNIT_TOLERANCE`` of all ``sizes`` that is nearest to them: kg mm and N cm are 2 %
+    apart.
+    """
+    fitting = [u for u in _both_ways(units, own) if all(abs(s / u[0] - 1.0) < UNIT_TOLERANCE for s in sizes)]
+    return min(fitting, key=lambda u: sum(abs(math.log(s / u[0])) for s in sizes), default=None)
 
 
 def _both_ways(units: dict[float, str], own: str) -> list[tuple[float, str]]:

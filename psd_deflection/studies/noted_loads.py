@@ -1,0 +1,354 @@
+"""When noted loads began to act, by the motion of the dots: a person notes a weight some seconds after it was hung.
+
+Every step of the dots that lasts is found without a model of the rig: the mean just after a moment against the mean
+just before it, over whole periods of the link's bending. Steps and notes are matched in their order. If they agree, or
+all notes are late alike, nothing is changed. Else one time is fitted to each step, with the ringing that follows and,
+if the load was applied slowly, the time that it took. Only the link's natural frequencies are taken from the rig file,
+so a wrong wiring, sign or unit changes no time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.optimize import minimize, minimize_scalar
+
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.plate.linear import design_matrix
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.rig.config import Rig
+
+PERIODS = 4
+"""Bending periods that each mean on either side of a moment takes."""
+STANDS_OUT = 10.0
+"""A step is at least so many times the median of what is there without one."""
+LEAST_SHARE = 0.03
+"""A step is at least this share of the largest."""
+APART_S = 0.25
+"""Noted changes that follow each other faster than this are a sweep or a ramp, not notes of a person."""
+FARTHEST_S = 30.0
+"""A note belongs to no step that is farther away."""
+ALIKE_S = 0.03
+"""Notes are late alike if their delays differ by less than this."""
+ONE_DELAY_S = 0.9
+"""One delay of all loads up to this is a parameter of the searches, which fit it better."""
+GRADUAL_S = 0.1
+"""A load that took longer than this was applied slowly."""
+BETTER = 4.0
+"""Mended times must leave so many times less of the movement than the noted ones."""
+SETTLED_S = 5.0
+"""Time constants of the slower mode after which a link is at rest."""
+ROUGH = 3.0
+"""The motion under a load applied slowly is left out if what remains of its ringing is so many times the noise."""
+
+_PER_SECOND = 1.0 / 5.0
+_SKIP_STEP, _SKIP_NOTE = 4.0, 9.0
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class MendedNote:
+    """One noted load: ``number`` from 1; ``load`` fx N, fy N, tz N m; ``noted``, ``hung``: s from the first sample.
+
+    ``took``: time that it was applied over, s, 0 for a step. ``settled_only``: the motion is left out.
+    """
+
+    number: int
+    load: tuple[float, float, float]
+    noted: float
+    hung: float
+    took: float
+    settled_only: bool = False
+
+    @property
+    def late(self) -> float:
+        """s; below 0 if it was noted early."""
+        return self.noted - self.hung
+
+    @property
+    def which(self) -> str:
+        """``3rd load, 3.4 s late`` or ``1st load, applied over 0.8 s``."""
+        return f'{ordinal(self.number)} load, {" and ".join(self._how("2g"))}'
+
+    def words(self, name: str) -> str:
+        """What was wrong, and what to do; ``name``: of the recording."""
+        fx, fy, tz = self.load
+        how = ' and '.join(self._how('3f'))
+        until = f', as a ramp until {self.hung + self.took:.3f} s' if self.took > 0.0 else ''
+        left = '; here only the link at rest under it is used' if self.settled_only else ''
+        return (
+            f'the {ordinal(self.number)} load of {name} ({fx:g} N, {fy:g} N, {tz:g} N m) was noted {how}: note it '
+            f'{self.hung:.3f} s after the first sample{until}, not {self.noted:.3f} s{left}'
+        ).replace('was noted applied', 'was applied')
+
+    def _how(self, digits: str) -> list[str]:
+        out = []
+        if abs(self.late) > ALIKE_S and abs(self.late) > self.took:
+            out.append(f'{abs(self.late):.{digits}} s {"late" if self.late > 0.0 else "early"}')
+        if self.took > 0.0:
+            out.append(f'applied over {self.took:.2g} s')
+        return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MendedLoads:
+    """``loads`` (n, 3) N, N, N m as they acted; ``notes``: those that were wrong; ``unused`` (n,): samples in motion
+    that the mended loads do not describe.
+    """
+
+    loads: FloatArray
+    notes: tuple[MendedNote, ...]
+    unused: BoolArray
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """``at``: sample of its middle; ``size``: how far the dots moved, m; ``first``, ``last``: samples about it."""
+
+    at: float
+    size: float
+    first: int
+    last: int
+
+
+def ordinal(number: int) -> str:
+    """1st, 2nd, 3rd, 4th."""
+    ending = 'th' if 10 <= number % 100 <= 20 else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')
+    return f'{number}{ending}'
+
+
+def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
+    """The loads with the times at which they acted; None if the noted times are right or the motion does not tell.
+
+    ``dots`` (n, 4) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as noted, held.
+    """
+    period = 1.0 / rig.converter.sample_rate_hz
+    changes = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
+    if len(changes) == 0 or np.any(np.diff(changes) * period < APART_S):
+        return None
+    width = max(2, round(PERIODS / rig.dynamics.bending_frequency / period))
+    steps = _steps(dots, width)
+    sizes = _expected(rig, loads[changes] - loads[changes - 1])
+    matched = _matched(changes, sizes, steps, period)
+    if not matched:
+        return None
+    late = np.array([(changes[i] - steps[j].at) * period for i, j in matched])
+    long = np.array([steps[j].last - steps[j].first > 2.0 * width + GRADUAL_S / period for _, j in matched])
+    # The middle of a step is known to a fraction of a period.
+    if _alike(late, ALIKE_S + 0.5 / rig.dynamics.bending_frequency) and not long.any():
+        return None
+    edges = [0.0, *(s.at for s in steps), float(len(dots))]
+    fitted = {i: _fitted(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}
+    late = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
+    if _alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
+        return None
+    mended = np.tile(loads[0], (len(loads), 1))
+    t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
+    notes = []
+    for i, at in enumerate(changes.tolist()):
+        noted = at * period
+        start, took = fitted.get(i, (noted, 0.0))
+        mended += _profile(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
+        if abs(noted - start) > ALIKE_S or took > GRADUAL_S:
+            fx, fy, tz = loads[at].tolist()
+            notes.append(MendedNote(i + 1, (fx, fy, tz), noted, start, took if took > GRADUAL_S else 0.0))
+    left, rest = _left(rig, dots, mended)
+    if BETTER * left > _left(rig, dots, loads)[0]:
+        return None
+    unused = np.zeros(len(loads), dtype=bool)
+    told = []
+    for note in notes:
+        moving = _moving(rig, note, t)
+        told.append(note)
+        # A step is the simplest motion: if the link rings otherwise, that is the rig's.
+        if note.took > 0.0 and _rough(rest, moving & (t > note.hung + note.took), rig.estimator.block_size):
+            unused |= moving
+            told[-1] = MendedNote(note.number, note.load, note.noted, note.hung, note.took, settled_only=True)
+    return MendedLoads(mended, tuple(told), unused)
+
+
+def _alike(late: FloatArray, within: float) -> bool:
+    middle = float(np.median(late))
+    return abs(middle) <= ONE_DELAY_S and bool(np.all(np.abs(late - middle) <= within))
+
+
+def _expected(rig: Rig, changes: FloatArray) -> FloatArray:
+    """How far (k,) the dots move, m, by changes (k, 3) of the load."""
+    poses = changes @ LinkStatics.from_rig(rig).compliance
+    return np.asarray(np.linalg.norm(poses @ design_matrix(rig.centers + rig.zeros).T, axis=1))
+
+
+def _steps(dots: FloatArray, width: int) -> list[_Step]:
+    """Where the mean of ``width`` samples differs from that of as many before."""
+    n = len(dots)
+    if n < 4 * width:
+        return []
+    there: BoolArray = np.all(np.isfinite(dots), axis=1)
+    sums = np.vstack((np.zeros(4), np.cumsum(np.where(there[:, None], dots, 0.0), axis=0)))
+    counts = np.concatenate(([0], np.cumsum(there)))
+    at = np.arange(width, n - width)
+    before, after = counts[at] - counts[at - width], counts[at + width] - counts[at]
+    apart = (sums[at + width] - sums[at]) / np.maximum(after, 1)[:, None]
+    apart -= (sums[at] - sums[at - width]) / np.maximum(before, 1)[:, None]
+    size = np.where((before > width // 4) & (after > width // 4), np.linalg.norm(apart, axis=1), 0.0)
+    least = max(STANDS_OUT * float(np.median(size)), LEAST_SHARE * float(size.max(initial=0.0)))
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], size > least, [False])).astype(np.int8)))
+    out = []
+    for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        # Two steps close together make one stretch with two peaks.
+        weights = np.maximum(size[a:b] - 0.5 * size[a:b].max(), 0.0)
+        if weights.sum() <= 0.0 or b - a < width // 2:
+            continue
+        first, last = a + width, b + width
+        beyond = slice(last, min(last + width, n)), slice(max(first - width, 0), first)
+        moved = [float(x) for x in np.linalg.norm(_difference(dots, *beyond), axis=0, keepdims=True)]
+        out.append(_Step(float(at[a:b] @ weights / weights.sum()), moved[0], first, last))
+    return out
+
+
+def _difference(dots: FloatArray, after: slice, before: slice) -> FloatArray:
+    means = []
+    for part in (dots[after], dots[before]):
+        good = part[np.isfinite(part).all(axis=1)]
+        means.append(good.mean(axis=0) if len(good) else np.zeros(4))
+    return np.asarray(means[0] - means[1])
+
+
+def _matched(changes: IntArray, sizes: FloatArray, steps: list[_Step], period: float) -> list[tuple[int, int]]:
+    """Pairs of a noted change and a step, both in their order, at least cost; changes that move nothing have none."""
+    if not steps or float(sizes.sum()) <= 0.0:
+        return []
+    seen = [i for i in range(len(changes)) if sizes[i] > LEAST_SHARE * float(sizes.max())]
+    factor = sum(s.size for s in steps) / float(sizes[seen].sum())
+    cost = np.zeros((len(seen) + 1, len(steps) + 1))
+    way = np.zeros(cost.shape, dtype=np.int64)
+    cost[:, 0], cost[0] = _SKIP_NOTE * np.arange(len(seen) + 1), _SKIP_STEP * np.arange(len(steps) + 1)
+    way[1:, 0], way[0, 1:] = 1, 2
+    for a, i in enumerate(seen, start=1):
+        for b, step in enumerate(steps, start=1):
+            away = abs(step.at - changes[i]) * period
+            unlike = math.log(max(step.size, 1e-12) / (factor * float(sizes[i]))) / 0.5
+            pair = math.inf if away > FARTHEST_S else _PER_SECOND * away + min(unlike**2, 8.0)
+            ways = (cost[a - 1, b - 1] + pair, cost[a - 1, b] + _SKIP_NOTE, cost[a, b - 1] + _SKIP_STEP)
+            way[a, b] = int(np.argmin(ways))
+            cost[a, b] = ways[way[a, b]]
+    out = []
+    a, b = len(seen), len(steps)
+    while a > 0 or b > 0:
+        chosen = way[a, b]
+        if chosen == 0:
+            out.append((seen[a - 1], b - 1))
+        a, b = a - (chosen != 2), b - (chosen != 1)
+    return out[::-1]
+
+
+def _profile(t: FloatArray, start: float, took: float, period: float) -> FloatArray:
+    """Share (n,) of a load that acts from ``t`` to the next sample, if applied from ``start`` on in ``took`` s."""
+    # Rounded, so that a step at a sample is one in floating point, too.
+    return np.asarray(np.clip(np.round((t + period - start) / max(took, period), 6), 0.0, 1.0))
+
+
+def _modes(rig: Rig) -> tuple[tuple[float, float], ...]:
+    d = rig.dynamics
+    return (d.bending_frequency, d.bending_damping_ratio), (d.torsion_frequency, d.torsion_damping_ratio)
+
+
+def _fitted(
+    rig: Rig, dots: FloatArray, step: _Step, between: tuple[float, float], period: float
+) -> tuple[float, float]:
+    """When the load of ``step`` began to act, and over which time it was applied, s.
+
+    ``between``: samples of the steps before and after it. Fitted with it: a constant, drift, the ringing of before.
+    """
+    reach = round(2.0 / period)
+    a = max(step.first - reach // 2, math.ceil(between[0]) + round(0.1 / period), 0)
+    b = min(step.last + reach, math.floor(between[1]) - round(0.1 / period), len(dots))
+    a, b = min(a, step.first), max(b, step.last)
+    t: FloatArray = np.arange(a, b, dtype=np.float64) * period
+    part = dots[a:b]
+    there = np.isfinite(part).all(axis=1)
+    since = t - t[0]
+    columns = [np.ones_like(t), since]
+    for frequency, ratio in _modes(rig):
+        w = 2.0 * math.pi * frequency
+        fade = np.exp(-ratio * w * since)
+        columns += [fade * np.cos(w * since), fade * np.sin(w * since)]
+    plain = np.column_stack(columns)[there]
+    basis, _ = np.linalg.qr(plain)
+    values = part[there] - basis @ (basis.T @ part[there])
+    filters = [mode_coefficients(f, ratio, period) for f, ratio in _modes(rig)]
+
+    def left(x: FloatArray) -> float:
+        pushed = _profile(t, float(x[0]), abs(float(x[1])), period)
+        moved = np.column_stack([Filter(c)(pushed) for c in filters])[there]
+        moved = moved - basis @ (basis.T @ moved)
+        slopes = np.linalg.lstsq(moved, values, rcond=1e-9)[0]
+        return float(((values - moved @ slopes) ** 2).sum())
+
+    middle = step.at * period
+    sudden = _least(left, [(middle + d, 0.0) for d in np.arange(-0.15, 0.1501, 0.006)], period)
+    slow = _least(left, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
+    start, took = slow[1] if slow[0] < 0.5 * sudden[0] else (sudden[1][0], 0.0)
+    return start, abs(took)
+
+
+def _least(
+    left: Callable[[FloatArray], float], starts: list[tuple[float, float]], reach: float
+) -> tuple[float, tuple[float, float]]:
+    """The least of ``left`` and where, from the best of ``starts``; a start without duration keeps none."""
+    best = np.array(min(starts, key=lambda x: left(np.array(x))))
+    if best[1] > 0.0:
+        corners = best + reach * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        found = minimize(left, best, method='Nelder-Mead', options={'maxfev': 120, 'initial_simplex': corners})
+        return float(found.fun), (float(found.x[0]), float(found.x[1]))
+    one = minimize_scalar(
+        lambda x: left(np.array([x, 0.0])),
+        bounds=(float(best[0]) - 6.0 * reach, float(best[0]) + 6.0 * reach),
+        method='bounded',
+        options={'xatol': 1e-3 * reach},
+    )
+    return float(one.fun), (float(one.x), 0.0)
+
+
+def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:
+    """What a regression of the dots on the motion under ``loads`` leaves, m^2; block means of it (n, 4), m."""
+    period = 1.0 / rig.converter.sample_rate_hz
+    static = loads @ LinkStatics.from_rig(rig).compliance
+    bending, torsion = (mode_coefficients(f, ratio, period) for f, ratio in _modes(rig))
+    poses = np.column_stack([Filter(c)(static[:, k]) for k, c in enumerate((bending, bending, torsion))])
+    scale = np.maximum(np.abs(poses).max(axis=0), 1e-30)
+    t = np.linspace(-1.0, 1.0, len(dots))
+    design = np.column_stack((poses / scale, np.ones_like(t), t))
+    there: BoolArray = np.all(np.isfinite(dots), axis=1)
+    slopes = np.linalg.lstsq(design[there], dots[there], rcond=1e-9)[0]
+    rest = np.where(there[:, None], dots - design @ slopes, 0.0)
+    # Means of blocks, so that noise does not hide what the loads leave.
+    size = rig.estimator.block_size
+    first = np.arange(0, len(dots), size)
+    counts = np.add.reduceat(there.astype(np.float64), first)
+    blocks = np.add.reduceat(rest, first, axis=0) / np.maximum(counts, 1.0)[:, None]
+    blocks[counts == 0.0] = np.nan
+    return float((rest**2).sum()), np.repeat(blocks, size, axis=0)[: len(dots)]
+
+
+def _moving(rig: Rig, note: MendedNote, t: FloatArray) -> BoolArray:
+    """Samples (n,) in which the link moves by the load of ``note``."""
+    slowest = max(1.0 / (2.0 * math.pi * f * max(ratio, 1e-3)) for f, ratio in _modes(rig))
+    ends = note.hung + note.took + SETTLED_S * slowest
+    return np.asarray((t >= note.hung - 0.02) & (t < ends))
+
+
+def _rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
+    """Whether the link rings otherwise than the mended load makes it; ``rest`` (n, 4): means of blocks of ``size``."""
+    blocks, rings = rest[::size], ringing[::size]
+    noise = 0.5 * np.nanmedian((np.diff(blocks, axis=0) ** 2).sum(axis=1))
+    seen = blocks[rings & np.all(np.isfinite(blocks), axis=1)]
+    if len(seen) < 4:
+        return False
+    return bool(((seen - seen.mean(axis=0)) ** 2).sum(axis=1).mean() > ROUGH**2 * noise)

@@ -1,0 +1,172 @@
+"""Loads that a person noted some seconds late: the motion says when they were hung, and every study says so alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.calibrate.from_recordings import timed
+from psd_deflection.studies.calibrate.observation import CalibrationRun
+from psd_deflection.studies.check.checkup import check, of_recording
+from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.result import sentence
+from psd_deflection.studies.noted_loads import ALIKE_S, MendedLoads, mend_loads, ordinal
+
+RIG = load_rig()
+LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, 0, 0)], float)
+DWELL = 5000
+COUNT = DWELL * len(LEVELS)
+LATE = (1.3, 1.7, 3.4, 2.7, 0.3, 2.3)
+
+
+def hung(took: float = 0.0) -> FloatArray:
+    """Loads as they act: the next level every 5 s, in ``took`` s."""
+    out = np.empty((COUNT, 3))
+    for i, level in enumerate(LEVELS):
+        before = LEVELS[max(i - 1, 0)]
+        share = np.ones(DWELL) if took == 0.0 else np.clip(np.arange(DWELL) / (1000.0 * took), 0.0, 1.0)
+        out[i * DWELL : (i + 1) * DWELL] = before + (level - before) * share[:, None]
+    return out
+
+
+def noted(late: tuple[float, ...]) -> FloatArray:
+    """Loads as a person notes them, each so many seconds late."""
+    out = np.tile(LEVELS[0], (COUNT, 1))
+    for i, seconds in enumerate(late, start=1):
+        out[i * DWELL + round(1000 * seconds) :] = LEVELS[i]
+    return out
+
+
+def volts(loads: FloatArray, seed: int = 0, **true: object) -> FloatArray:
+    """What the device reads (n, 6), V, of a rig that differs by ``true`` from the rig file."""
+    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
+    counts = RigSimulator(rig, seed).step(loads).counts
+    return np.asarray(counts * RIG.converter.volts_per_count, dtype=np.float64)
+
+
+QUIET = volts(hung())
+TURNED = volts(hung(), effects__e__name='sensor_rotation', effects__e__psd=1, effects__e__angle=0.02)
+
+
+def mended(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> MendedLoads | None:
+    return mend_loads(rig, read[:, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity, loads)
+
+
+@pytest.mark.parametrize(
+    'late', [LATE, (0, 0, 3, 0, 0, 0), (2.0,) * 6, (-1.5, 0.4, -2.0, 0.2, -0.3, 1.0), (4.5, 3.0, 4.8, 4.0, 2.0, 4.0)]
+)
+@pytest.mark.parametrize('read', [QUIET, TURNED], ids=['quiet', 'turned'])
+def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], read: FloatArray) -> None:
+    found = mended(read, noted(late))
+    assert found is not None
+    wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > ALIKE_S}
+    assert {n.number: n.late for n in found.notes} == pytest.approx(wrong, abs=0.002)
+    assert not found.unused.any()
+    assert np.count_nonzero(np.abs(found.loads - hung()).max(axis=1) > 0.1) <= 2 * len(LEVELS)
+
+
+@pytest.mark.parametrize(
+    'loads',
+    [noted((0.0,) * 6), noted((0.3,) * 6), noted((0.01, 0, 0.02, 0, 0.01, 0)), hung(1.2)],
+    ids=['right', 'alike', 'a few ms', 'a noted ramp'],
+)
+def test_right_times_and_one_small_delay_of_all_are_left_as_they_are(loads: FloatArray) -> None:
+    assert mended(QUIET, loads) is None
+    assert mended(TURNED, loads) is None
+
+
+def test_a_load_that_no_motion_tells_of_is_left_as_it_is() -> None:
+    still = volts(np.zeros((COUNT, 3)))
+    assert mended(still, noted(LATE)) is None
+    assert mended(QUIET, np.zeros((COUNT, 3))) is None
+    assert mended(QUIET[:50], noted((0,) * 6)[:50]) is None
+
+
+def test_wiring_signs_and_units_change_no_time() -> None:
+    other = QUIET[:, [1, 0, 2, 4, 3, 5]] * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    found = mended(other, noted(LATE) * np.array([-0.102, 0.102, 0.102]))
+    assert found is not None
+    assert [n.late for n in found.notes] == pytest.approx(LATE, abs=0.002)
+
+
+def test_lost_samples_change_no_time() -> None:
+    read = QUIET.copy()
+    read[np.random.default_rng(1).random(COUNT) < 0.3] = np.nan
+    read[2 * DWELL - 20 : 2 * DWELL + 20] = np.nan
+    found = mended(read, noted(LATE))
+    assert found is not None
+    assert [n.late for n in found.notes] == pytest.approx(LATE, abs=0.003)
+
+
+def test_a_load_applied_over_a_second_and_noted_as_a_step_is_a_ramp() -> None:
+    found = mended(volts(hung(0.8)), noted((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
+    assert found is not None
+    assert [n.took for n in found.notes] == pytest.approx([0.8] * 6, abs=0.01)
+    assert found.notes[0].which == '1st load, applied over 0.8 s'
+    assert found.notes[1].which == '2nd load, 2 s late and applied over 0.8 s'
+    assert 'as a ramp until 5.80' in found.notes[0].words('x.csv')
+    assert not found.unused.any()
+
+
+def test_motion_that_no_ramp_describes_is_left_out() -> None:
+    smooth = hung(0.8)
+    for i in range(1, len(LEVELS)):
+        share = np.clip(np.arange(DWELL) / 800.0, 0.0, 1.0)
+        part = slice(i * DWELL, (i + 1) * DWELL)
+        smooth[part] = LEVELS[i - 1] + (LEVELS[i] - LEVELS[i - 1]) * (share**2 * (3.0 - 2.0 * share))[:, None]
+    found = mended(volts(smooth), noted((1.0, 2.0, 1.5, 1.0, 0.5, 2.0)))
+    assert found is not None
+    assert found.notes[0].settled_only
+    assert found.unused[DWELL + 300]
+    assert not found.unused[DWELL - 500]
+    assert 'at rest' in found.notes[0].words('x.csv')
+
+
+def test_the_words_say_what_to_do() -> None:
+    found = mended(QUIET, noted(LATE))
+    assert found is not None
+    third = found.notes[2]
+    assert third.which == '3rd load, 3.4 s late'
+    assert third.words('x.csv') == (
+        'the 3rd load of x.csv (0 N, -50 N, -29 N m) was noted 3.400 s late: note it 15.000 s after the first sample, '
+        'not 18.400 s'
+    )
+    assert [ordinal(i) for i in (1, 2, 3, 4, 11, 12, 13, 21, 111)] == (
+        ['1st', '2nd', '3rd', '4th', '11th', '12th', '13th', '21st', '111th']
+    )
+
+
+def test_check_and_calibrate_say_the_same() -> None:
+    expected = mended(QUIET, noted(LATE))
+    assert expected is not None
+    words = [n.words('x') for n in expected.notes]
+    checked = check(of_recording(RIG, QUIET, noted(LATE), 'x'))
+    assert [f.fix for f in checked.findings if f.name == 'load_time'] == words
+    assert {f.name for f in checked.findings} == {'load_time'}
+    assert checked.sizes == pytest.approx([1.0] * 3, abs=0.01)
+    told: list[str] = []
+    t = np.arange(COUNT) / 1000.0
+    run = CalibrationRun('x', t, QUIET, np.zeros(0), np.zeros((0, 3)), noted(LATE))
+    again = timed(run, RIG, told.append)
+    assert told == words
+    assert again.loads is not None
+    # The correction gives dots in 32 bits: a time differs by some microseconds.
+    assert np.abs(again.loads - expected.loads).max() < 0.5
+    right = CalibrationRun('x', t, QUIET, np.zeros(0), np.zeros((0, 3)), hung())
+    assert timed(right, RIG, told.append) is right
+
+
+def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
+    found = discover([Observation('x', RIG, TURNED, noted(LATE))])
+    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
+    assert found.effects[0].active.values['angle'] == pytest.approx(0.02, abs=1e-4)
+    assert found.verdict == 'effects_found'
+    assert found.floors < 1.05
+    assert {f.name for f in found.setup} == {'load_time'}
+    assert not found.lines
+    assert '3rd load, 3.4 s late' in sentence(found)
+    assert found.gap_before > 100.0 * found.gap_after
