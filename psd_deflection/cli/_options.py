@@ -107,6 +107,9 @@ def _of_section(declared: Parameter, text: str) -> Value:
         value = text.split(',')
     elif declared.kind == 'integer' and re.fullmatch(r'[+-]?[0-9]{1,18}', text):
         value = int(text)
+    elif declared.kind == 'double':
+        with contextlib.suppress(ValueError):
+            value = float(text)
     try:
         return check_value(declared, value, 'options')
     except ConfigError as error:

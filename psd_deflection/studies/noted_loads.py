@@ -72,14 +72,28 @@ class MendedNote:
         return self.noted - self.hung
 
     @property
-    def which(self) -> str:
-        """``3rd load, 3.4 s late`` or ``1st load, applied over 0.8 s``."""
-        return f'{ordinal(self.number)} load, {" and ".join(self._how("2g"))}'
+    def name(self) -> str:
+        """Of the finding: ``load_time``, or ``load_ramp`` if it was noted in time and applied slowly."""
+        return 'load_time' if self._is_late else 'load_ramp'
+
+    @property
+    def where(self) -> str:
+        """``load 3``."""
+        return f'load {self.number}'
+
+    @property
+    def value(self) -> float:
+        """s by which it was noted late, or in which it was applied."""
+        return self.late if self._is_late else self.took
+
+    @property
+    def _is_late(self) -> bool:
+        return abs(self.late) > ALIKE_S and abs(self.late) > self.took
 
     def words(self, name: str) -> str:
         """What was wrong, and what to do; ``name``: of the recording."""
         fx, fy, tz = self.load
-        how = ' and '.join(self._how('3f'))
+        how = ' and '.join(self._how())
         until = f', as a ramp until {self.hung + self.took:.3f} s' if self.took > 0.0 else ''
         left = '; here only the link at rest under it is used' if self.settled_only else ''
         return (
@@ -87,10 +101,10 @@ class MendedNote:
             f'{self.hung:.3f} s after the first sample{until}, not {self.noted:.3f} s{left}'
         ).replace('was noted applied', 'was applied')
 
-    def _how(self, digits: str) -> list[str]:
+    def _how(self) -> list[str]:
         out = []
-        if abs(self.late) > ALIKE_S and abs(self.late) > self.took:
-            out.append(f'{abs(self.late):.{digits}} s {"late" if self.late > 0.0 else "early"}')
+        if self._is_late:
+            out.append(f'{abs(self.late):.3f} s {"late" if self.late > 0.0 else "early"}')
         if self.took > 0.0:
             out.append(f'applied over {self.took:.2g} s')
         return out

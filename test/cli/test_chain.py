@@ -42,8 +42,8 @@ def test_two_simulated_links_as_json_and_csv(tmp_path: Path, capsys: pytest.Capt
         (['chain', EXAMPLE, '--no-ros', '--out', 'gone/x.csv'], 4, 'there is no folder gone'),
         (['chain', 'gone.yaml', '--no-ros'], 3, 'gone.yaml: no such chain file'),
         (['compensator', URDF, '--tip', 'tol'], 3, 'tip: no link tol; did you mean tool?'),
-        (['compensator', URDF, '--tip', 'tool', '--axes', 'x,u'], 2, 'axes = u: must be some of x, y, z'),
-        (['compensator', URDF, '--tip', 'tool', '--stale', 'nan'], 2, '--stale nan: must be a number of at least'),
+        (['compensator', URDF, '--tip', 'tool', '--axes', 'x,u'], 2, "--axes = ['x', 'u']: each must be one of"),
+        (['compensator', URDF, '--tip', 'tool', '--stale', 'nan'], 2, '--stale = nan s: must be finite'),
         (['compensator', 'gone.urdf', '--tip', 'tool'], 3, 'gone.urdf: no such URDF file'),
     ],
 )

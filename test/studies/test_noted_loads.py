@@ -106,8 +106,8 @@ def test_a_load_applied_over_a_second_and_noted_as_a_step_is_a_ramp() -> None:
     found = mended(volts(hung(0.8)), noted((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
     assert found is not None
     assert [n.took for n in found.notes] == pytest.approx([0.8] * 6, abs=0.01)
-    assert found.notes[0].which == '1st load, applied over 0.8 s'
-    assert found.notes[1].which == '2nd load, 2 s late and applied over 0.8 s'
+    assert [n.name for n in found.notes] == ['load_ramp', 'load_time', *['load_ramp'] * 4]
+    assert [round(n.value, 2) for n in found.notes[:2]] == [0.8, 2.0]
     assert 'as a ramp until 5.80' in found.notes[0].words('x.csv')
     assert not found.unused.any()
 
@@ -130,7 +130,8 @@ def test_the_words_say_what_to_do() -> None:
     found = mended(QUIET, noted(LATE))
     assert found is not None
     third = found.notes[2]
-    assert third.which == '3rd load, 3.4 s late'
+    assert (third.name, third.where) == ('load_time', 'load 3')
+    assert third.value == pytest.approx(3.4, abs=2e-3)
     assert third.words('x.csv') == (
         'the 3rd load of x.csv (0 N, -50 N, -29 N m) was noted 3.400 s late: note it 15.000 s after the first sample, '
         'not 18.400 s'
@@ -168,5 +169,5 @@ def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
     assert found.floors < 1.05
     assert {f.name for f in found.setup} == {'load_time'}
     assert not found.lines
-    assert '3rd load, 3.4 s late' in sentence(found)
+    assert 'load_time (load 3, 3.4 s late)' in sentence(found)
     assert found.gap_before > 100.0 * found.gap_after

@@ -74,7 +74,7 @@ def check(problem: CheckProblem) -> Checkup:
     seen = tuple(p for p in pushes if p.seen)
     dead = [*measured.stuck, *(c for c in _dead(seen) if c not in measured.stuck)]
     found = fitting_wirings(seen) if seen else []
-    findings = [Finding('load_time', n.which, n.late, n.words(problem.source), abs(n.late)) for n in problem.late]
+    findings = [Finding(n.name, n.where, n.value, n.words(problem.source), abs(n.late)) for n in problem.late]
     lines: dict[str, object] = {}
     for channel in dead:
         findings.append(Finding('stuck_channel', channel, None, f'{channel} does not answer: look at its cable'))

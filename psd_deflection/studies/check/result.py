@@ -29,6 +29,7 @@ NAMES = {
     'psd_swap': 'exchanged',
     'load_sign': 'sign turned',
     'load_unit': 'other unit',
+    'load_ramp': 'applied slowly',
     'load_time': 'noted late or early',
     'stuck_channel': 'dead',
     'noise_level': 'noise',

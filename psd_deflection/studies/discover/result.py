@@ -8,6 +8,7 @@ from typing import Any
 
 from psd_deflection import __version__
 from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.discover import Discovery
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.search.ties import ties
@@ -191,8 +192,16 @@ def _left(discovery: Conclusion) -> str:
 
 def _setup(discovery: Discovery) -> str:
     """What is wrong with the set-up, in a sentence, or nothing."""
-    names = list(dict.fromkeys(f'{f.name} ({f.where})' for f in discovery.setup))
+    names = list(dict.fromkeys(f'{f.name} ({f.where}{_seconds(f)})' for f in discovery.setup))
     return f'The set-up is not as the rig file or the recording says: {", ".join(names)}. ' if names else ''
+
+
+def _seconds(finding: Finding) -> str:
+    """How late a load was noted, or how long it took."""
+    if finding.value is None or finding.name not in ('load_time', 'load_ramp'):
+        return ''
+    late = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
+    return f', {abs(finding.value):.2g} s{late}'
 
 
 def sentence(discovery: Conclusion) -> str:

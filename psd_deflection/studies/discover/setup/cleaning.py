@@ -165,5 +165,5 @@ def time_loads(observation: Observation) -> tuple[Observation, list[Finding]]:
         return o, []
     volts = o.volts.copy()
     volts[mended.unused] = np.nan
-    findings = [Finding('load_time', n.which, n.late, n.words(o.name), abs(n.late)) for n in mended.notes]
+    findings = [Finding(n.name, n.where, n.value, n.words(o.name), abs(n.late)) for n in mended.notes]
     return dataclasses.replace(o, volts=volts, loads=mended.loads, digest=o.digest or o.hashed()), findings
