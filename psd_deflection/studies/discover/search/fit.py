@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
 from psd_deflection.records import FloatArray
@@ -21,6 +22,8 @@ STEP = 0.05
 
 STOP = 0.05
 """A refit ends when an iteration gains less than this in chi-square."""
+
+BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,6 +79,12 @@ def _moved(
     return [ActiveEffect(a.effect, v) for a, v in zip(effects, values, strict=True)]
 
 
+def _unseen(parameters: Sequence[EffectParameter], lengths: FloatArray, ranges: FloatArray) -> BoolArray:
+    """Sizes (p,) whose whole range moves the residual by less than one standard deviation: nothing determines them."""
+    sizes = np.array([p.kind in ('amplitude', 'coupled') for p in parameters], dtype=bool)
+    return np.asarray(sizes & (lengths * ranges < 1.0))
+
+
 def refit(
     workspace: Comparison,
     effects: Sequence[ActiveEffect],
@@ -105,6 +114,8 @@ def refit(
     chi2 = workspace.loss(residual)
     jacobian = np.empty((len(residual), len(free)))
     damping = 1e-4
+    off = np.clip([p.off(workspace.physics) for _, p in free], low, high)
+    unseen = np.zeros(len(free), dtype=bool)
     for _ in range(iterations if free else 0):
         for j in range(len(free)):
             h = STEP * scale[j]
@@ -115,13 +126,20 @@ def refit(
             there = workspace.simulate([*base, *_moved(effects, free, moved)])
             jacobian[:, j] = workspace.whiten([(a - b) / h for a, b in zip(there, simulated, strict=True)])
         lengths = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-150)
+        # A size that is off at a bound stays there by itself, and a column of zeros may be a threshold's before it.
+        loose = (off > low) & (off < high) & ((lengths > 1e-150) | (x <= low) | (x >= high))
+        unseen = unseen | (loose & _unseen([p for _, p in free], lengths, high - low))
+        if np.any(x[unseen] != off[unseen]):
+            x = np.where(unseen, off, x)
+            residual, difference, simulated = evaluate(x)
+            chi2 = workspace.loss(residual)
         f = (jacobian / lengths).T @ (jacobian / lengths)
         g = (jacobian.T @ residual) / lengths
         gained = 0.0
         for _ in range(5):
             # A parameter at its bound does not move if the step would leave the bounds.
             stuck = ((x <= low) & (g < 0.0)) | ((x >= high) & (g > 0.0))
-            go = np.flatnonzero(~stuck)
+            go = np.flatnonzero(~stuck & ~unseen)
             if len(go) == 0:
                 break
             a = f[np.ix_(go, go)] + damping * np.eye(len(go))
@@ -141,6 +159,7 @@ def refit(
         if gained < STOP + 1e-7 * chi2:
             break
     named = [(i - count, p.name) for i, p in free]
-    bound = tuple(name for name, v, (a, b) in zip(named, x, bounds, strict=True) if v <= a or v >= b)
+    stopped = ((x <= low) | (x >= high)) & ~unseen
+    bound = tuple(name for name, at in zip(named, stopped.tolist(), strict=True) if at)
     final = tuple(_moved(effects, free, x))
     return Fit(final[count:], chi2, residual, difference, jacobian, tuple(named), bound, final[:count])
