@@ -23,9 +23,8 @@ from psd_deflection.base.pages import page, table
 from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.recording import WHOLE, Recording, Span
 from psd_deflection.recordings.replay.engine import nominal_rig, rig_at_end
-from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import nested, parameter_text

@@ -36,8 +36,8 @@ from psd_deflection.cli._report import print_json, show
 from psd_deflection.recordings.provenance import NAMES
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import described, is_table
+from psd_deflection.recordings.recording import Span
 from psd_deflection.recordings.summary import summary
-from psd_deflection.recordings.window import Span
 from psd_deflection.run.fleet.parquet import Field, ParquetFile
 
 _EPOCH_FROM_NS = 10**18

@@ -57,7 +57,7 @@ from psd_deflection.cli._report import save, save_all, show, show_text, warn
 from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
-from psd_deflection.recordings.window import WHOLE, Span
+from psd_deflection.recordings.recording import WHOLE, Span
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.run.fleet.parquet import Field

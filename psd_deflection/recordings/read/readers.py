@@ -9,8 +9,7 @@ from psd_deflection.base.errors import RecordingError, did_you_mean
 from psd_deflection.recordings.read.bag_reader import BagRecording
 from psd_deflection.recordings.read.csv_reader import CsvRecording
 from psd_deflection.recordings.read.mcap_reader import MAGIC
-from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.window import WHOLE, Span
+from psd_deflection.recordings.recording import WHOLE, Recording, Span
 
 MOST_NAMES = 1000
 """Names of a folder that are looked at for one that was meant."""

@@ -17,9 +17,8 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.recording import WHOLE, Recording, Span
 from psd_deflection.recordings.summary import NO_PARAMETERS
-from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,

@@ -13,9 +13,8 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings.read.grid import MAX_SAMPLES, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import References, read_references, references_in
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.recording import WHOLE, Recording, Span
 from psd_deflection.recordings.replay.engine import check_psds
-from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring

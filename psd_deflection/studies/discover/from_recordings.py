@@ -14,9 +14,8 @@ from psd_deflection.base.foreign_yaml import tree_of_file
 from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
-from psd_deflection.recordings.recording import TEMPERATURE_COLUMN, Recording
+from psd_deflection.recordings.recording import TEMPERATURE_COLUMN, WHOLE, Recording, Span
 from psd_deflection.recordings.replay.engine import check_psds, nominal_rig, rig_at_end
-from psd_deflection.recordings.window import WHOLE, Span
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring

@@ -16,9 +16,8 @@ import psd_deflection
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import COMMANDS, main, make_parser
 from psd_deflection.recordings.conversion import Beside, convert
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.recordings.replay.engine import rig_at_end
-from psd_deflection.recordings.window import RecordingWindow
 from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import ParameterChange
 from tools.program import ROOT
