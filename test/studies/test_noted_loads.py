@@ -169,5 +169,5 @@ def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
     assert found.floors < 1.05
     assert {f.name for f in found.setup} == {'load_time'}
     assert not found.lines
-    assert 'load_time (load 3, 3.4 s late)' in sentence(found)
+    assert '; load 3, 3.4 s late; load 4, ' in sentence(found)
     assert found.gap_before > 100.0 * found.gap_after

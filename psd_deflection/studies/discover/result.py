@@ -192,7 +192,10 @@ def _left(discovery: Conclusion) -> str:
 
 def _setup(discovery: Discovery) -> str:
     """What is wrong with the set-up, in a sentence, or nothing."""
-    names = list(dict.fromkeys(f'{f.name} ({f.where}{_seconds(f)})' for f in discovery.setup))
+    where: dict[str, dict[str, None]] = {}
+    for f in discovery.setup:
+        where.setdefault(f.name, {})[f'{f.where}{_seconds(f)}'] = None
+    names = [f'{name} ({"; ".join(places)})' for name, places in where.items()]
     return f'The set-up is not as the rig file or the recording says: {", ".join(names)}. ' if names else ''
 
 
