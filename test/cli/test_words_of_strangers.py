@@ -22,7 +22,7 @@ def clean_of(text: str) -> None:
 
 
 def test_info_prints_no_control_characters(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    def opened(path: Path, namespace: str | None = None) -> Recording:
+    def opened(path: Path, namespace: str | None = None, **_: object) -> Recording:
         recording = info_of(path)
         recording.hello = {'serial': ESCAPE, ESCAPE: '\ud800', 'firmware': 'x' * 10_000}
         recording.version = ESCAPE
