@@ -105,7 +105,7 @@ class CompensatorNode:
         node.create_timer(TOLD_S, self._tell, clock=steady)
         node.create_timer(1.0, self._report, clock=steady)
         self.command = self._told = self.compensator.watch(time.monotonic())
-        self._ended = threading.Event()
+        self._ended, self._ramped = threading.Event(), threading.Event()
         self._failed: BaseException | None = None
         self._sender = threading.Thread(target=self._send_until_the_end, name='offsets', daemon=True)
         self._sender.start()
@@ -218,7 +218,10 @@ class CompensatorNode:
                 due = max(due + PERIOD_S, time.monotonic())
         except BaseException as error:
             self._failed = error
-            self._ramp_down()
+            try:
+                self._ramp_down()
+            finally:
+                self._ramped.set()
 
     def _send(self) -> None:
         with self._lock:
@@ -248,8 +251,8 @@ class CompensatorNode:
         self.command = self.command._replace(offsets=offsets)
 
     def check(self) -> None:
-        """Raise what ended the thread that sends the offsets, if anything did and the offsets are back at zero."""
-        if self._failed is not None and not np.any(self.command.offsets):
+        """Raise what ended the thread that sends the offsets, if anything did, once it has taken them back."""
+        if self._failed is not None and self._ramped.is_set():
             raise self._failed
 
     def _tell(self) -> None:

@@ -241,7 +241,11 @@ def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> No
         assert np.any(held)
         first = Program(command)
         peer.until(lambda: 'once it is enabled' in first.text, 'the node')
-        # It was told what is applied, and goes back from there unless it is enabled.
+        states = peer.collect(DiagnosticArray, '/diagnostics')
+        count = len(plant.offsets)
+        peer.until(lambda: len(states) > 1, 'diagnostics of the second')
+        # It was told what is applied, and is silent until it is enabled.
+        assert len(plant.offsets) == count
         assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
         peer.until(lambda: 'following' in first.text, 'that it follows')
         peer.until(lambda: len(plant.offsets) > heard + 50, 'offsets')

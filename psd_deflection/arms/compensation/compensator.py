@@ -220,6 +220,8 @@ class Compensator:
         if wanted and not self.enabled and not np.any(self._offsets):
             # With commands the arm keeps the pose that it has now.
             self._held_at = None
+            if self._applied is not None and self.settings.output == OFFSETS:
+                self._offsets = self._wanted = self._applied.copy()
         self.enabled = wanted
         self._broken = ''
         self._anchor = self._away_t = None
@@ -229,9 +231,10 @@ class Compensator:
         self._stop = why
 
     def applied(self, offsets: FloatArray) -> None:
-        """The offsets that the controller says it applies. Those that it has at the start are where ours begin."""
+        """The offsets that the controller says it applies: where ours begin when they are enabled."""
+        waited = self.waits
         self._applied = np.array(offsets, dtype=np.float64)
-        if not self.enabled and not np.any(self._offsets):
+        if waited and self.enabled:
             self._offsets = self._wanted = self._applied.copy()
 
     def joints(self, now: float, positions: FloatArray) -> None:

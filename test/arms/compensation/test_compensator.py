@@ -289,8 +289,10 @@ def test_what_the_controller_applies_is_where_it_begins(arm: Arm) -> None:
     again.enable(False)
     loop.offsets = applied.copy()
     again.applied(applied)
-    assert np.array_equal(again.watch(loop.t).offsets, applied)
+    # Nobody has enabled it, so it is silent, whatever the controller has.
+    assert again.watch(loop.t).state is State.OFF
     again.enable(True)
+    assert np.array_equal(again.watch(loop.t).offsets, applied)
     for _ in range(60):
         again.applied(loop.offsets)
         before = loop.offsets
@@ -398,5 +400,5 @@ def test_whatever_comes_no_step_is_larger_than_the_rate_allows(events: list[tupl
         # Silent, it may be told where the controller is.
         if sent is not None and began:
             assert np.abs(command.offsets - sent).max() <= 0.1 * (now - then) * (1.0 + 1e-9)
-        began = command.state is not State.OFF
+        began = command.state is not State.OFF and not compensator.waits
         sent = command.offsets
