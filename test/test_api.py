@@ -308,6 +308,7 @@ def test_every_study_can_be_asked_from_python(tmp_path: Path) -> None:
     assert psd_deflection.load_rig(tmp_path / 'calibrate' / 'rig.yaml').link.length == 0.585
 
 
+@pytest.mark.repeatable
 def test_the_budget_of_python_is_that_of_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     rig = str(ROOT / 'config' / 'thesis_rig.yaml')
     out = tmp_path / 'budget'
