@@ -77,7 +77,6 @@ def test_the_version_is_the_same_everywhere() -> None:
 
 
 FROM_PYPI = {
-    'cobs': 'python-cobs-pip',
     'cv2': 'python3-opencv',
     'ruamel': 'python3-ruamel.yaml',
     # It brings the others.
@@ -90,6 +89,7 @@ ROS_PACKAGES = {'rclpy', 'rcl_interfaces', 'launch', 'launch_ros'}
 UNNAMED = {
     **dict.fromkeys(('rerun', 'pandas', 'xarray', 'foxglove', 'distributed', 'pyarrow'), 'an extra'),
     'shtab': 'completion in the shell, which says that it is missing; not in rosdep',
+    'cobs': 'the encoding of frames as judge; from PyPI',
     'cyclonedds': 'another DDS as judge; not in rosdep',
     'rosbags': 'another reader as judge; from PyPI, so not forced on whoever builds the workspace',
     'selenium': 'the page in a browser; not tested in a build of ROS',

@@ -17,8 +17,7 @@ from collections.abc import Mapping
 from enum import IntEnum, StrEnum
 from typing import NamedTuple
 
-from cobs import cobs
-
+from psd_deflection.devices.protocol import cobs
 from psd_deflection.devices.protocol.words import device_words
 from psd_deflection.records import MOST_PSDS
 
@@ -142,8 +141,7 @@ _RESIDUE = 0x2144DF1C
 
 
 def _seal(payload: bytes) -> bytes:
-    sealed: bytes = cobs.encode(payload + _CRC.pack(zlib.crc32(payload)))
-    return sealed + b'\x00'
+    return cobs.encode(payload + _CRC.pack(zlib.crc32(payload))) + b'\x00'
 
 
 def encode(frame: GoodFrame, *, wide: bool = False) -> bytes:
@@ -275,6 +273,7 @@ class FrameDecoder:
         if size > MAX_ENCODED:
             return BadFrame(BadReason.TOO_LONG, size)
         try:
-            return _parse(cobs.decode(encoded), size, self._samples)
-        except cobs.DecodeError:
+            payload = cobs.decode(encoded)
+        except ValueError:
             return BadFrame(BadReason.COBS, size)
+        return _parse(payload, size, self._samples)
