@@ -113,12 +113,30 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r'[^\w\- ]', '', h.lower()).strip().replace(' ', '-') for h in headings}
 
 
+def links(page: Path) -> list[str]:
+    """The targets of its links within the repository."""
+    found = re.findall(r'\]\(([^)\s]+)(?: "[^"]*")?\)', FENCE.sub('', page.read_text()))
+    return [target for target in found if not target.startswith(('http://', 'https://', 'mailto:'))]
+
+
+def linked(page: Path) -> set[Path]:
+    """The files that it links to."""
+    return {(page.parent / target.partition('#')[0]).resolve() for target in links(page) if target[0] != '#'}
+
+
+def test_every_page_is_two_steps_from_the_readme() -> None:
+    first = linked(ROOT / 'README.md')
+    second = set().union(*(linked(page) for page in first if page.suffix == '.md'))
+    assert {str(page.relative_to(ROOT)) for page in PAGES if page not in first | second | {ROOT / 'README.md'}} == set()
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / 'README.md').read_text().splitlines()) <= 120
+
+
 @pytest.mark.parametrize('page', PAGES, ids=lambda p: p.name)
 def test_links_lead_somewhere(page: Path) -> None:
-    text = FENCE.sub('', page.read_text())
-    for target in re.findall(r'\]\(([^)\s]+)(?: "[^"]*")?\)', text):
-        if target.startswith(('http://', 'https://', 'mailto:')):
-            continue
+    for target in links(page):
         name, _, anchor = target.partition('#')
         path = (page.parent / name).resolve() if name else page
         assert path.exists(), f'{page.name}: {target}'
