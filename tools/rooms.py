@@ -4,16 +4,19 @@
 
 A room is a folder or a file at the top of ``psd_deflection``, or ``msg_adapters``. An arrow leads
 from a room to another one that it imports, however often. The package's own ``__init__`` is a door
-for users and no room. A circle is a group of rooms, or of modules, that lead to each other.
+for users and no room. A circle is a group of rooms, or of modules, that lead to each other. A
+function is large if its complexity (McCabe's, as radon counts it) or its number of parameters is.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import sys
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import grimp
 import numpy as np
@@ -21,6 +24,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 PACKAGES = ('psd_deflection', 'msg_adapters')
+MOST_COMPLEX, MOST_PARAMETERS = 20, 8
+Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def room_of(module: str) -> str:
@@ -41,6 +46,75 @@ def circles(arrows: Iterable[tuple[str, str]]) -> list[list[str]]:
     for name, group in zip(names, groups.tolist(), strict=True):
         found[group].append(name)
     return sorted(group for group in found.values() if len(group) > 1)
+
+
+class Measured(NamedTuple):
+    """Of a function: its paths and its parameters, without ``self``, ``cls`` and the starred ones."""
+
+    complexity: int
+    parameters: int
+
+    @property
+    def is_large(self) -> bool:
+        """Whether either number is above its bound."""
+        return self.complexity > MOST_COMPLEX or self.parameters > MOST_PARAMETERS
+
+
+def _own_nodes(function: ast.AST) -> Iterator[ast.AST]:
+    """All nodes of a function but those of functions and classes inside it."""
+    waiting = [function]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        inside = ast.iter_child_nodes(node)
+        waiting += [n for n in inside if not isinstance(n, Function | ast.ClassDef)]
+
+
+def complexity(function: ast.AST) -> int:
+    """1 and each place where the way through it forks."""
+    paths = 1
+    for node in _own_nodes(function):
+        if isinstance(node, ast.BoolOp):
+            paths += len(node.values) - 1
+        elif isinstance(node, ast.Try):
+            paths += len(node.handlers) + bool(node.orelse)
+        elif isinstance(node, ast.For | ast.While | ast.AsyncFor):
+            paths += 1 + bool(node.orelse)
+        elif isinstance(node, ast.comprehension):
+            paths += 1 + len(node.ifs)
+        elif isinstance(node, ast.If | ast.IfExp | ast.match_case):
+            paths += 1
+    return paths
+
+
+def measured(source: str) -> dict[str, Measured]:
+    """The functions of a module by name; those inside a class or a function as ``Outer.inner``."""
+    out: dict[str, Measured] = {}
+
+    def visit(outer: ast.AST, prefix: str) -> None:
+        for node in ast.iter_child_nodes(outer):
+            if isinstance(node, Function):
+                of = [a.arg for a in (*node.args.posonlyargs, *node.args.args)]
+                count = len(of) + len(node.args.kwonlyargs) - (of[:1] in (['self'], ['cls']))
+                out[prefix + node.name] = Measured(complexity(node), count)
+            if isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+                visit(node, f'{prefix}{node.name}.')
+            else:
+                visit(node, prefix)
+
+    visit(ast.parse(source), '')
+    return out
+
+
+def large_functions(root: Path) -> dict[str, Measured]:
+    """The large functions of the package below ``root``, as ``room/module.py:Class.method``."""
+    package = root / PACKAGES[0]
+    return {
+        f'{path.relative_to(package).as_posix()}:{name}': one
+        for path in sorted(package.rglob('*.py'))
+        for name, one in measured(path.read_text(encoding='utf-8')).items()
+        if one.is_large
+    }
 
 
 def main() -> int:
@@ -72,6 +146,10 @@ def main() -> int:
         out, into = (sum(pair[side] == room for pair in between) for side in (0, 1))
         print(f'| `{room}` | {len(lengths)} | {sum(lengths)} | {out} | {into} |')
     every = [n for lengths in files.values() for n in lengths]
+    large = large_functions(root)
+    print(f'\n{len(large)} large functions')
+    for name, one in sorted(large.items(), key=lambda item: item[1], reverse=True):
+        print(f'  {name}: complexity {one.complexity}, {one.parameters} parameters')
     print(f'\n{len(files)} rooms, {len(every)} files, {sum(every)} lines, {len(between)} arrows')
     of_rooms, of_modules = circles(between) or 'none', circles(modules) or 'none'
     print(f'circles of rooms: {of_rooms}; circles of modules: {of_modules}')

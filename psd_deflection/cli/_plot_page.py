@@ -8,7 +8,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -45,41 +45,61 @@ CAPTIONS = {
 }
 
 
+class DrawnInputs(NamedTuple):
+    """What came into the recording from outside: known loads, references, and when the zero was taken, ns.
+
+    ``start_ns``: the time from which the page counts.
+    """
+
+    loads: list[AppliedLoad]
+    references: list[ReferencePose]
+    zeros: list[int]
+    start_ns: int
+
+    def seconds(self, t_ns: int) -> float:
+        """A time on the page, s."""
+        return (t_ns - self.start_ns) / 1e9
+
+    def content(self, end: float) -> dict[str, object]:
+        """For the page's script; the last load is held until ``end``, s."""
+        loads, references = self.loads, self.references
+        marks: list[tuple[float, list[object]]] = [
+            (self.seconds(load.t_ns), ['load', load.fx, load.fy, load.tz]) for load in loads
+        ]
+        marks += [(self.seconds(z), ['zero']) for z in self.zeros]
+        held: dict[str, str] = {}
+        if loads:
+            times = [self.seconds(load.t_ns) for load in loads]
+            held['t'] = _packed([*times, max(end, times[-1])], np.float64)
+            for i, name in enumerate(('fx', 'fy', 'tz'), start=1):
+                held[name] = _packed([load[i] for load in (*loads, loads[-1])])
+        poses = enumerate(('dx', 'dy', 'theta'), start=1)
+        return {
+            'marks': [[t, *words] for t, words in sorted(marks, key=lambda mark: mark[0])],
+            'loads': held,
+            'references': {
+                't': _packed([self.seconds(r.t_ns) for r in references], np.float64),
+                **{name: _packed([r[i] for r in references]) for i, name in poses},
+            },
+        }
+
+
 def plot_page(
     title: str,
     table: Mapping[str, FloatArray],
     spectrum: tuple[FloatArray, FloatArray] | None,
-    loads: Sequence[AppliedLoad],
-    references: Sequence[ReferencePose],
-    zeros: Sequence[int],
-    start_ns: int,
+    inputs: DrawnInputs,
     rig: Rig,
     summary: Sequence[tuple[str, str]],
 ) -> str:
     """The page as text.
 
-    ``table``: as ``Drawn.table`` makes it. ``spectrum``: frequencies (k,) Hz and densities (2P, k) m/sqrt(Hz).
-    ``zeros``: when the zero was taken, ns. Times are shown from ``start_ns`` on.
+    ``table``: as ``Drawn.table`` makes it. ``spectrum``: frequencies (k,) Hz and densities (2P, k)
+    m/sqrt(Hz). ``summary``: names and values for its table.
     """
-    end = float(table['t'][-1])
-    seconds = [(load.t_ns - start_ns) / 1e9 for load in loads]
-    marks: list[tuple[float, list[object]]] = [
-        (s, ['load', load.fx, load.fy, load.tz]) for s, load in zip(seconds, loads, strict=True)
-    ]
-    marks += [((z - start_ns) / 1e9, ['zero']) for z in zeros]
-    held: dict[str, str] = {}
-    if loads:
-        held['t'] = _packed([*seconds, max(end, seconds[-1])], np.float64)
-        for i, name in enumerate(('fx', 'fy', 'tz'), start=1):
-            held[name] = _packed([load[i] for load in (*loads, loads[-1])])
     content = {
         'columns': {n: _packed(v, np.float64 if n == 't' else np.float32) for n, v in table.items()},
-        'marks': [[t, *words] for t, words in sorted(marks, key=lambda mark: mark[0])],
-        'loads': held,
-        'references': {
-            't': _packed([(r.t_ns - start_ns) / 1e9 for r in references], np.float64),
-            **{n: _packed([r[i] for r in references]) for i, n in enumerate(('dx', 'dy', 'theta'), start=1)},
-        },
+        **inputs.content(float(table['t'][-1])),
         'spectrum': None
         if spectrum is None
         else {'f': _packed(spectrum[0]), 'density': [_packed(row) for row in spectrum[1]]},
@@ -88,7 +108,7 @@ def plot_page(
         'sum_nominal': rig.amplifier.sum_nominal,
     }
     keys = _keys(len(rig.psds))
-    shown = [name for name in keys if (name != 'load' or loads) and (name != 'spectrum' or spectrum is not None)]
+    shown = [name for name in keys if (name != 'load' or inputs.loads) and (name != 'spectrum' or spectrum is not None)]
     rows = ''.join(f'<tr><th scope="row">{html.escape(k)}</th><td>{html.escape(v)}</td></tr>' for k, v in summary)
     detectors = ''.join(
         f'<figure class="detector"><figcaption>PSD {n}</figcaption>'

@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
         if args.json:
             print_json({'path': str(path), 'table': told_of}, indent=2)
         else:
-            show(f'{path}: a table of readings', *(f'  {name:<12} {text}' for name, text in told_of))
+            show(f'{path}: a table of readings', *(_row_of(name, text) for name, text in told_of))
         return 0
     recording = open_recording(path, namespace=args.namespace, span=args.span)
     with told('counting messages', quiet=args.json):
@@ -138,12 +138,26 @@ def _line(found: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _lines(found: Mapping[str, Any]) -> list[str]:
-    def row(name: str, text: str) -> str:
-        return f'  {name:<12} {text}'
+def _row_of(name: str, text: str) -> str:
+    return f'  {name:<12} {text}'
 
+
+def _lines(found: Mapping[str, Any]) -> list[str]:
     out = [f'{found["path"]}: {found["bytes"] / 1e6:.2f} MB']
-    out.append(row('state', 'complete' if found['complete'] else 'INCOMPLETE, see below'))
+    out += _lines_of_origin(found)
+    out += _lines_of_samples(found)
+    out += [_row_of('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
+    out.append('  topics')
+    width = max((len(t) for t in found['topics']), default=0)
+    out += [f'    {topic:<{width}}  {count}' for topic, count in sorted(found['topics'].items())]
+    out += _lines_of_parameters(found)
+    out += [f'  warning: {w}' for w in found['warnings']]
+    return out
+
+
+def _lines_of_origin(found: Mapping[str, Any]) -> list[str]:
+    row = _row_of
+    out = [row('state', 'complete' if found['complete'] else 'INCOMPLETE, see below')]
     if found['namespace']:
         out.append(row('namespace', found['namespace']))
     if found['version']:
@@ -157,26 +171,33 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     if found['device_hello'] is not None:
         hello = {k: ' '.join(map(str, v)) if isinstance(v, list) else v for k, v in found['device_hello'].items()}
         out.append(row('device', ', '.join(f'{k} {v}' for k, v in hello.items())))
+    return out
+
+
+def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
+    row = _row_of
     start, samples, lost = found['start_ns'], found['samples'], found['lost']
-    share = 100.0 * lost / (samples + lost) if samples else 0.0
     if not samples:
-        out.append(row('samples', 'none'))
-    else:
-        if start >= _EPOCH_FROM_NS:
-            when = datetime.fromtimestamp(start // 1_000_000_000, UTC).strftime('%Y-%m-%d %H:%M:%S')
-            out.append(row('start', f'{when}.{start % 1_000_000_000:09d} UTC'))
-        else:
-            out.append(row('start', f'{start * 1e-9:.9f} s'))
-        out.append(row('duration', f'{found["duration_s"]:.3f} s'))
-        out.append(row('samples', f'{samples} present, {lost} lost ({share:.3g} %), {found["flagged"]} flagged'))
-        if found['restarts']:
-            out.append(row('restarts', f'{found["restarts"]} of the device'))
-        out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
-        out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
-    out += [row('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
-    out.append('  topics')
-    width = max((len(t) for t in found['topics']), default=0)
-    out += [f'    {topic:<{width}}  {count}' for topic, count in sorted(found['topics'].items())]
+        return [row('samples', 'none')]
+    when = f'{start * 1e-9:.9f} s'
+    if start >= _EPOCH_FROM_NS:
+        second = datetime.fromtimestamp(start // 1_000_000_000, UTC).strftime('%Y-%m-%d %H:%M:%S')
+        when = f'{second}.{start % 1_000_000_000:09d} UTC'
+    share = f'{100.0 * lost / (samples + lost):.3g} %'
+    out = [
+        row('start', when),
+        row('duration', f'{found["duration_s"]:.3f} s'),
+        row('samples', f'{samples} present, {lost} lost ({share}), {found["flagged"]} flagged'),
+    ]
+    if found['restarts']:
+        out.append(row('restarts', f'{found["restarts"]} of the device'))
+    out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
+    out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
+    return out
+
+
+def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
+    out: list[str] = []
     if found['parameters'] and not found['changed_parameters']:
         out.append('  all parameters at their defaults')
     elif found['parameters']:
@@ -189,5 +210,4 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
         f'  from block {c["block"]} on: ' + ', '.join(f'{k} = {v}' for k, v in c['values'].items())
         for c in found['changes']
     ]
-    out += [f'  warning: {w}' for w in found['warnings']]
     return out

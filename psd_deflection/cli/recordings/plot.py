@@ -17,25 +17,23 @@ import os
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from psd_deflection.base.errors import RecordingError, UsageError, printable
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, number, picture_name
-from psd_deflection.cli._plot_page import plot_page
+from psd_deflection.cli._plot_page import DrawnInputs, plot_page
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.records import (
-    AppliedLoad,
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
     Record,
-    ReferencePose,
     SampleBlock,
     SpotMeans,
     dot_names,
@@ -77,14 +75,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         )
     namespace_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON, in SI units')
-
-
-class Inputs(NamedTuple):
-    """What came into the recording from outside: known loads, references, and when the zero was taken, ns."""
-
-    loads: list[AppliedLoad]
-    references: list[ReferencePose]
-    zeros: list[int]
 
 
 @dataclass
@@ -132,7 +122,7 @@ class Drawn:
         """Whether the window lies before the record that was added last."""
         return bool(self.spots) and not self._inside
 
-    def inputs(self) -> Inputs:
+    def inputs(self) -> DrawnInputs:
         """Loads, references and zeros within the window; first the load that is held when it begins."""
         first = self.spots[0].t_ns
         last = self.spots[-1].t_ns
@@ -140,7 +130,12 @@ class Drawn:
         before = [load._replace(t_ns=first) for load in loads if load.t_ns <= first][-1:]
         references = [r for r in self.recording.references() if first <= r.t_ns <= last]
         zeros = [z for z in self.zeros if first <= z <= last]
-        return Inputs([*before, *(r for r in loads if r.t_ns > first)], references, zeros)
+        return DrawnInputs(
+            loads=[*before, *(r for r in loads if r.t_ns > first)],
+            references=references,
+            zeros=zeros,
+            start_ns=self.start_ns or 0,
+        )
 
     def table(self) -> dict[str, FloatArray]:
         """Arrays (n,): t from the first block, pose, standard deviations, dots, sums, samples lost, 1 if unfinished."""
@@ -220,8 +215,7 @@ def run(args: argparse.Namespace) -> int:
         if out.suffix.lower() == '.html':
             density = spectrum.density()
             shape = None if density is None else (spectrum.frequencies, density)
-            start_ns = drawn.start_ns or 0
-            page = plot_page(title, drawn.table(), shape, *drawn.inputs(), start_ns, rig, summary)
+            page = plot_page(title, drawn.table(), shape, drawn.inputs(), rig, summary)
             save(page.encode(), out)
         else:
             save_figure(draw_recording(drawn, spectrum, rig, name), out, dpi=150)
@@ -313,7 +307,7 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
             axes.set_ylabel(f'{label} ({unit})')
             axes.set_title(f'{label}{typical}', loc='left', fontsize=9)
             _mark_losses(axes, table)
-            _mark_inputs(axes, inputs, key, scale, drawn.start_ns or 0)
+            _mark_inputs(axes, inputs, key, scale)
         if left[0].get_legend_handles_labels()[0]:
             left[0].legend(loc='upper right', fontsize=8)
         sums = [f'sum{n}' for n in range(1, len(rig.psds) + 1)]
@@ -326,7 +320,7 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
         )
         left[3].legend(loc='center right', fontsize=8, ncols=len(sums))
         if inputs.loads:
-            _loads(left[4], inputs.loads, drawn.start_ns or 0, float(t[-1]))
+            _loads(left[4], inputs, float(t[-1]))
         left[-1].set_xlabel('t (s)')
         for number in range(1, len(rig.psds) + 1):
             _detector(figure.add_subplot(grid[_place(number, len(rig.psds))]), table, rig, number, raster)
@@ -371,24 +365,25 @@ def _mark_losses(axes: Any, table: dict[str, FloatArray]) -> None:
         )
 
 
-def _mark_inputs(axes: Any, inputs: Inputs, name: str, scale: float, start_ns: int) -> None:
+def _mark_inputs(axes: Any, inputs: DrawnInputs, name: str, scale: float) -> None:
     """Rings where a reference was, a dashed line where the zero was taken or the load changed."""
     if inputs.references:
-        at = [(r.t_ns - start_ns) / 1e9 for r in inputs.references]
+        at = [inputs.seconds(r.t_ns) for r in inputs.references]
         values = [getattr(r, name) * scale for r in inputs.references]
         every = max(1, len(at) // MOST_REFERENCES)
         axes.plot(
             at[::every], values[::every], 'o', ms=3, mfc='none', color=COLORS['quiet'], alpha=0.8, label='reference'
         )
     for i, zero in enumerate(inputs.zeros):
-        axes.axvline((zero - start_ns) / 1e9, color=COLORS['lost'], ls='--', lw=1, label='' if i else 'zero taken')
+        axes.axvline(inputs.seconds(zero), color=COLORS['lost'], ls='--', lw=1, label='' if i else 'zero taken')
     for load in inputs.loads[1:]:
-        axes.axvline((load.t_ns - start_ns) / 1e9, color=COLORS['quiet'], ls='--', lw=0.6)
+        axes.axvline(inputs.seconds(load.t_ns), color=COLORS['quiet'], ls='--', lw=0.6)
 
 
-def _loads(axes: Any, loads: list[AppliedLoad], start_ns: int, end: float) -> None:
+def _loads(axes: Any, inputs: DrawnInputs, end: float) -> None:
     """The known load: forces on the left, the torque on the right."""
-    at = [*((r.t_ns - start_ns) / 1e9 for r in loads), end]
+    loads = inputs.loads
+    at = [*(inputs.seconds(r.t_ns) for r in loads), end]
     twin = axes.twinx()
     lines = []
     for name, unit, color, where in (

@@ -110,8 +110,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print the content of calibration.json, or of the check')
 
 
-def run(args: argparse.Namespace) -> int:
-    """Read, calibrate or check, write, and say it in a sentence."""
+def _refuse_mixed(args: argparse.Namespace) -> None:
+    """Refuse options that contradict each other."""
     if args.reference and len(args.reference) != len(args.recordings):
         raise UsageError(
             f'--reference is given {len(args.reference)} times for {len(args.recordings)} recordings: '
@@ -125,9 +125,15 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError(
                 '--check RIG.yaml is for itself: give none of --params-file, --out, --each, --executor, --dark'
             )
-        return _check(args)
-    if args.out is None:
+    elif args.out is None:
         raise UsageError('--out DIR (a calibration) or --check RIG.yaml (of an older one) is needed')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read, calibrate or check, write, and say it in a sentence."""
+    _refuse_mixed(args)
+    if args.check is not None:
+        return _check(args)
     asked = CalibrationOptions(
         absolute(args.params_file),
         args.namespace,

@@ -99,10 +99,10 @@ def _points(
     """Plate points (2, n) under the beam that is at ``beam`` (2,) on the plate at rest."""
     dx, dy, theta = pose
     k = p[SLOPE] / length
-    slope_x, slope_y = by.tan_many(p[_BEAMS + 2 * psd : _BEAMS + 2 * psd + 2])
+    slopes = by.tan_many(p[_BEAMS + 2 * psd : _BEAMS + 2 * psd + 2])
     height = p[_PER_PSD * psd + _HEIGHT]
-    phi, omega = -k * dy, k * dx
-    return np.stack(points_under_leaning(beam[0], beam[1], slope_x, slope_y, height, dx, dy, theta, phi, omega, by))
+    place = beam[0], beam[1], height
+    return np.stack(points_under_leaning(place, (slopes[0], slopes[1]), (dx, dy, theta, -k * dy, k * dx), by))
 
 
 def by_parameters(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = LIBRARY) -> FloatArray:

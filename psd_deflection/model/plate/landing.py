@@ -13,36 +13,27 @@ the reference section. The plate is turned by R = Ry(omega) Rx(phi) Rz(theta) (t
 from __future__ import annotations
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
-from psd_deflection.model.plate.plate import Number, Row, Turns, turns_of
+from psd_deflection.model.plate.plate import Beam, Number, Pose, Row, Turns, turns_of
 from psd_deflection.records import FloatArray
 
 
-def _place(
-    lx: Number, ly: Number, height: Number, dx: Number, dy: Number, turns: Turns[Number]
-) -> tuple[Number, Number, Number, Number]:
+def _place(beam: Beam[Number], dx: Number, dy: Number, turns: Turns[Number]) -> tuple[Number, Number, Number, Number]:
     """a_x, a_y, x, y as in the module's text."""
+    lx, ly, height = beam
     ct, st, cp, sp, co, so = turns
     ax, ay = ct * lx - st * ly, st * lx + ct * ly
     across = ax * so + height
     return ax, ay, dx + (ax + height * so) / co, dy + ay / cp - across * sp / (cp * co)
 
 
-def landing(
-    lx: float,
-    ly: float,
-    height: float,
-    dx: float,
-    dy: float,
-    theta: float,
-    phi: float,
-    omega: float,
-    arithmetic: Arithmetic = LIBRARY,
-) -> tuple[float, float, Row, Row]:
+def landing(beam: Beam[float], pose: Pose[float], arithmetic: Arithmetic = LIBRARY) -> tuple[float, float, Row, Row]:
     """(x, y, dx, dy) of one laser's dot: m; m/m for dX, dY and m/rad for the angles."""
+    dx, dy, theta, phi, omega = pose
+    height = beam[2]
     sin, cos = arithmetic.sin, arithmetic.cos
     turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
     _, _, cp, sp, co, so = turns
-    ax, ay, x, y = _place(lx, ly, height, dx, dy, turns)
+    ax, ay, x, y = _place(beam, dx, dy, turns)
     return (
         x,
         y,
@@ -58,15 +49,8 @@ def landing(
 
 
 def landings(
-    lx: FloatArray,
-    ly: FloatArray,
-    height: FloatArray,
-    dx: FloatArray,
-    dy: FloatArray,
-    theta: FloatArray,
-    phi: FloatArray,
-    omega: FloatArray,
-    arithmetic: Arithmetic = LIBRARY,
+    beam: Beam[FloatArray], pose: Pose[FloatArray], arithmetic: Arithmetic = LIBRARY
 ) -> tuple[FloatArray, FloatArray]:
-    """x and y, m, one array for each, of any shapes that broadcast; for long runs of samples."""
-    return _place(lx, ly, height, dx, dy, turns_of(theta, phi, omega, arithmetic))[2:]
+    """x and y, m, from arrays whose shapes broadcast; for long runs of samples."""
+    dx, dy, theta, phi, omega = pose
+    return _place(beam, dx, dy, turns_of(theta, phi, omega, arithmetic))[2:]

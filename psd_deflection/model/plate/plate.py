@@ -35,11 +35,16 @@ Five = tuple[Number, Number, Number, Number, Number]
 
 Row = Five[float]
 
+Beam = tuple[Number, Number, Number]
+"""l_x, l_y and the height h of the surface that the beam meets, m."""
 
-def _point(
-    lx: Number, ly: Number, height: Number, dx: Number, dy: Number, turns: Turns[Number]
-) -> tuple[Number, Number, Number, Number]:
+Pose = tuple[Number, Number, Number, Number, Number]
+"""dX, dY m, theta, phi, omega rad."""
+
+
+def _point(beam: Beam[Number], dx: Number, dy: Number, turns: Turns[Number]) -> tuple[Number, Number, Number, Number]:
     """x', y', q_x, q_y as in the module's docstring."""
+    lx, ly, height = beam
     ct, st, cp, sp, co, so = turns
     y = (ly - dy + height * sp) / cp
     x = (lx - dx - height * so * cp - y * so * sp) / co
@@ -63,22 +68,13 @@ def _rows(
     )
 
 
-def crossing(
-    lx: float,
-    ly: float,
-    height: float,
-    dx: float,
-    dy: float,
-    theta: float,
-    phi: float,
-    omega: float,
-    arithmetic: Arithmetic = LIBRARY,
-) -> tuple[float, float, Row, Row]:
+def crossing(beam: Beam[float], pose: Pose[float], arithmetic: Arithmetic = LIBRARY) -> tuple[float, float, Row, Row]:
     """(q_x, q_y, dq_x, dq_y) of one beam: m; m/m for dX, dY and m/rad for the angles."""
+    dx, dy, theta, phi, omega = pose
     sin, cos = arithmetic.sin, arithmetic.cos
     turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
-    x, y, qx, qy = _point(lx, ly, height, dx, dy, turns)
-    row_x, row_y = _rows(x, y, qx, qy, height, turns)
+    x, y, qx, qy = _point(beam, dx, dy, turns)
+    row_x, row_y = _rows(x, y, qx, qy, beam[2], turns)
     return qx, qy, row_x, row_y
 
 
@@ -99,7 +95,7 @@ def crossings(
     """
     dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
     turns = turns_of(theta, phi, omega, arithmetic)
-    x, y, qx, qy = _point(beams[..., 0], beams[..., 1], heights, dx, dy, turns)
+    x, y, qx, qy = _point((beams[..., 0], beams[..., 1], heights), dx, dy, turns)
     points = np.stack((qx, qy), axis=-1)
     jacobian = np.empty((*points.shape, 5))
     for axis, row in enumerate(_rows(x, y, qx, qy, heights, turns)):
@@ -113,53 +109,41 @@ def plate_points(
 ) -> FloatArray:
     """The points of :func:`crossings` alone, (..., P, 2) m."""
     dx, dy, theta, phi, omega = (poses[..., i, None] for i in range(5))
-    qx, qy = points_under(beams[..., 0], beams[..., 1], heights, dx, dy, theta, phi, omega, arithmetic)
+    beam = beams[..., 0], beams[..., 1], heights
+    qx, qy = points_under(beam, (dx, dy, theta, phi, omega), arithmetic)
     return np.stack((qx, qy), axis=-1)
 
 
 def points_under(
-    lx: FloatArray,
-    ly: FloatArray,
-    height: FloatArray,
-    dx: FloatArray,
-    dy: FloatArray,
-    theta: FloatArray,
-    phi: FloatArray,
-    omega: FloatArray,
-    arithmetic: Arithmetic = LIBRARY,
+    beam: Beam[FloatArray], pose: Pose[FloatArray], arithmetic: Arithmetic = LIBRARY
 ) -> tuple[FloatArray, FloatArray]:
-    """q_x and q_y, m, one array for each coordinate, of any shapes that broadcast; for long runs of
-    samples.
-    """
-    return _point(lx, ly, height, dx, dy, turns_of(theta, phi, omega, arithmetic))[2:]
+    """q_x and q_y, m, from arrays whose shapes broadcast; for long runs of samples."""
+    dx, dy, theta, phi, omega = pose
+    return _point(beam, dx, dy, turns_of(theta, phi, omega, arithmetic))[2:]
 
 
 def points_under_leaning(
-    lx: FloatArray,
-    ly: FloatArray,
-    slope_x: FloatArray,
-    slope_y: FloatArray,
-    height: FloatArray,
-    dx: FloatArray,
-    dy: FloatArray,
-    theta: FloatArray,
-    phi: FloatArray,
-    omega: FloatArray,
+    beam: Beam[FloatArray],
+    slopes: tuple[FloatArray, FloatArray],
+    pose: Pose[FloatArray],
     arithmetic: Arithmetic = LIBRARY,
 ) -> tuple[FloatArray, FloatArray]:
-    """:func:`points_under` for beams that lean by ``slope_x`` and ``slope_y`` (m/m) along Z.
+    """:func:`points_under` for beams that lean by ``slopes`` in x and y (m/m) along Z.
 
     (l_x, l_y): where the beam crosses the surface of the plate at rest, z = h. The surface meets it at z, where the
     beam is at l + slope (z - h). Each pass leaves the product of the plate's tilt and the slope, below 1e-3, of the
     error before it.
     """
+    lx, ly, height = beam
+    dx, dy, theta, phi, omega = pose
     turns = turns_of(theta, phi, omega, arithmetic)
     _, _, cp, sp, co, so = turns
-    x, y, qx, qy = _point(lx, ly, height, dx, dy, turns)
+    x, y, qx, qy = _point(beam, dx, dy, turns)
     for _ in range(3):
         # (x', y') is q turned by theta about the plate's normal; what is left of R is Ry(omega) Rx(phi).
         z = -so * x + co * sp * y + co * cp * height
-        x, y, qx, qy = _point(lx + slope_x * (z - height), ly + slope_y * (z - height), height, dx, dy, turns)
+        met = lx + slopes[0] * (z - height), ly + slopes[1] * (z - height), height
+        x, y, qx, qy = _point(met, dx, dy, turns)
     return qx, qy
 
 

@@ -204,8 +204,6 @@ class Effect:
     calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
 
     def __post_init__(self) -> None:
-        names = [p.name for p in self.parameters]
-        amplitudes = [p.name for p in self.parameters if p.kind == 'amplitude']
         if self.stage not in STAGES:
             raise ValueError(f'stage = {self.stage!r}: must be one of {", ".join(STAGES)}')
         if self.point not in POINTS:
@@ -216,6 +214,12 @@ class Effect:
             raise ValueError(f'point = {self.point!r}: trace_back is for the points load, static and pose')
         if not self.uses <= set(typing.get_args(Use)):
             raise ValueError(f'uses = {set(self.uses)!r}: must be of {", ".join(typing.get_args(Use))}')
+        self._check_parameters()
+        self._check_calibrated()
+
+    def _check_parameters(self) -> None:
+        names = [p.name for p in self.parameters]
+        amplitudes = [p.name for p in self.parameters if p.kind == 'amplitude']
         if len(set(names)) < len(names) or not amplitudes:
             raise ValueError('parameters must have different names, and one must be an amplitude')
         for p in self.parameters:
@@ -227,7 +231,6 @@ class Effect:
                 raise ValueError(f'{p.name}: a choice, and nothing else, has choices')
         if not set(self.calibrated_as) <= set(names):
             raise ValueError(f'calibrated_as = {dict(self.calibrated_as)!r}: must name parameters')
-        self._check_calibrated()
 
     def _check_calibrated(self) -> None:
         called = list(self.calibrated_as.values())

@@ -17,13 +17,14 @@ def dots_on_plate(pose: FloatArray, beams: FloatArray, physics: Physics) -> Floa
     """
     k = physics.slope_ratio / physics.length
     phi, omega = (-k * pose[1], k * pose[0]) if k != 0.0 else (np.zeros(1), np.zeros(1))
-    place = beams[0::2], beams[1::2]
-    rest = physics.heights[:, None], pose[0], pose[1], pose[2], phi, omega
+    places = beams[0::2], beams[1::2], physics.heights[:, None]
+    moved = pose[0], pose[1], pose[2], phi, omega
     if physics.slopes.any() and not physics.psds_at_base:
-        qx, qy = points_under_leaning(*place, physics.slopes[:, :1], physics.slopes[:, 1:], *rest, physics.by)
+        slopes = physics.slopes[:, :1], physics.slopes[:, 1:]
+        qx, qy = points_under_leaning(places, slopes, moved, physics.by)
     else:
         fall = landings if physics.psds_at_base else points_under
-        qx, qy = fall(*place, *rest, physics.by)
+        qx, qy = fall(places, moved, physics.by)
     dots = np.empty_like(beams)
     np.subtract(qx, physics.centers[:, :1], out=dots[0::2])
     np.subtract(qy, physics.centers[:, 1:], out=dots[1::2])

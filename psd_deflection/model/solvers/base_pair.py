@@ -84,7 +84,7 @@ class BasePairSolver(Solver):
 
     def _refuse_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
         heights = np.asarray(geometry.heights)
-        at_rest = [landing(lx, ly, h, 0.0, 0.0, 0.0, 0.0, 0.0) for lx, ly, h in self._rows]
+        at_rest = [landing(place, (0.0, 0.0, 0.0, 0.0, 0.0)) for place in self._rows]
         jacobian = np.array([row for rows in at_rest for row in rows[2:]])
         if assume == 'nothing' and self._count == 2:
             null = np.linalg.svd(jacobian)[2][4]
@@ -129,8 +129,8 @@ class BasePairSolver(Solver):
         dx, dy, theta, phi, omega = [total([a * b for a, b in zip(row, x, strict=True)]) for row in self._spread]
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
-        for lx, ly, height in self._rows:
-            px, py, jx, jy = landing(lx, ly, height, dx, dy, theta, phi, omega, self._arithmetic)
+        for place in self._rows:
+            px, py, jx, jy = landing(place, (dx, dy, theta, phi, omega), self._arithmetic)
             predicted.append(px)
             predicted.append(py)
             for j in (jx, jy):

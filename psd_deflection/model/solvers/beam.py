@@ -72,10 +72,11 @@ class BeamSolver(Solver):
     def _model(self, x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
         dx, dy, theta = x
         tie = self._tie
+        pose = dx, dy, theta, -tie * dy, tie * dx
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
         for (lx, ly), height in zip(self._beams, self._heights, strict=True):
-            qx, qy, jx, jy = crossing(lx, ly, height, dx, dy, theta, -tie * dy, tie * dx, self._arithmetic)
+            qx, qy, jx, jy = crossing((lx, ly, height), pose, self._arithmetic)
             predicted.append(qx)
             predicted.append(qy)
             rows.append((jx[0] + tie * jx[4], jx[1] - tie * jx[3], jx[2]))

@@ -77,8 +77,8 @@ class PoseSolver(Solver):
         dx, dy, theta, phi, omega = x
         predicted: list[float] = []
         rows: list[Sequence[float]] = []
-        for lx, ly, height in self._rows:
-            qx, qy, jx, jy = crossing(lx, ly, height, dx, dy, theta, phi, omega, self._arithmetic)
+        for place in self._rows:
+            qx, qy, jx, jy = crossing(place, (dx, dy, theta, phi, omega), self._arithmetic)
             predicted.append(qx)
             predicted.append(qy)
             rows.append(jx)

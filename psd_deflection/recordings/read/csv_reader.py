@@ -67,27 +67,31 @@ class CsvRecording(Recording):
     def _read_header(self) -> dict[str, int]:
         names, number = self._source.header, self._source.header_line
         columns = {name: i for i, name in enumerate(names)}
-        missing = [n for n in REQUIRED if n not in columns]
-        if missing:
-            hint = ', between commas' if len(names) == 1 else ''
-            if 't' in missing and ('mass' in columns or LOAD_COLUMNS[0] in columns):
-                hint += '; discover and info take a table of readings without times'
-            raise self._refuse(
-                f'the header lacks {", ".join(missing)}; a recording begins with {",".join(REQUIRED)}{hint}', number
-            )
+        self._refuse_missing(columns, number)
         for name in KNOWN:
             if names.count(name) > 1:
                 raise self._refuse(f'column {name} is there twice', number)
-        for group in (LOAD_COLUMNS, REFERENCE_COLUMNS):
-            there = [n for n in group if n in columns]
-            if there and len(there) < len(group):
-                lacking = ', '.join(n for n in group if n not in columns)
-                raise self._refuse(f'has {", ".join(there)} without {lacking}', number)
         self.psds = self._count_psds(columns, number)
         unknown = [n for n in names if n not in KNOWN]
         if unknown:
             self._warnings.append(f'{self.path}:{number}: columns that are not read: {", ".join(unknown)}')
         return columns
+
+    def _refuse_missing(self, columns: Collection[str], number: int) -> None:
+        """Refuse a header without the columns of a recording, or with a part of a group."""
+        missing = [n for n in REQUIRED if n not in columns]
+        if missing:
+            hint = ', between commas' if len(columns) == 1 else ''
+            if 't' in missing and ('mass' in columns or LOAD_COLUMNS[0] in columns):
+                hint += '; discover and info take a table of readings without times'
+            raise self._refuse(
+                f'the header lacks {", ".join(missing)}; a recording begins with {",".join(REQUIRED)}{hint}', number
+            )
+        for group in (LOAD_COLUMNS, REFERENCE_COLUMNS):
+            there = [n for n in group if n in columns]
+            if there and len(there) < len(group):
+                lacking = ', '.join(n for n in group if n not in columns)
+                raise self._refuse(f'has {", ".join(there)} without {lacking}', number)
 
     def _count_psds(self, columns: Collection[str], line: int) -> int:
         """PSDs of which there are columns, 2 or more; none may be left out, and none in part."""

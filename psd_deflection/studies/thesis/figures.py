@@ -294,7 +294,12 @@ def base_pair() -> Figure:
     poses[:, 0], poses[:, 1], poses[:, 2] = 1e-3, -2e-3, theta
     poses = tied_pose(poses[:, :3], 1.5, nominal.link_length)
     rows = np.column_stack((geometry.beams, geometry.heights)).tolist()
-    places = np.array([[landing(*row, *pose)[:2] for row in rows] for pose in poses.tolist()])
+    places = np.array(
+        [
+            [landing(row, (dx, dy, twist, phi, omega))[:2] for row in rows]
+            for dx, dy, twist, phi, omega in poses.tolist()
+        ]
+    )
     dots = (places - geometry.centers).reshape(len(poses), -1)
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout='constrained')
     for assume, color in (('no_twist', _RED), ('beam', _GREEN)):

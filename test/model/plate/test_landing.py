@@ -22,13 +22,15 @@ def test_a_laser_on_the_plate_lands_where_its_ray_meets_the_surface(pose: np.nda
     plate = rotation(*pose[2:])
     start = plate @ [*PLACE, 0.0] + [pose[0], pose[1], 0.0]
     want = hit(start, plate[:, 2], np.array([0.0, 0.0, height]), np.eye(3))
-    x, y, by_x, by_y = landing(*PLACE, height, *pose.tolist())
+    x, y, by_x, by_y = landing((*PLACE, height), tuple(pose.tolist()))
     assert (x, y) == pytest.approx(want, abs=1e-15)
     lx, ly, h, dx, dy, theta, phi, omega = (np.asarray(v) for v in (*PLACE, height, *pose))
-    assert np.array(landings(lx, ly, h, dx, dy, theta, phi, omega)) == pytest.approx(want, abs=1e-15)
+    many = landings((lx, ly, h), (dx, dy, theta, phi, omega))
+    assert np.array(many) == pytest.approx(want, abs=1e-15)
     for i in range(5):
         step = 1e-6 * np.eye(5)[i]
-        ahead, behind = (np.array(landing(*PLACE, height, *(pose + s).tolist())[:2]) for s in (step, -step))
+        moved = [tuple((pose + s).tolist()) for s in (step, -step)]
+        ahead, behind = (np.array(landing((*PLACE, height), p)[:2]) for p in moved)
         assert (by_x[i], by_y[i]) == pytest.approx((ahead - behind) / 2e-6, abs=1e-9)
 
 
@@ -39,7 +41,7 @@ def test_a_beam_that_leans_meets_the_plate_where_its_ray_does(height: float) -> 
     origin = plate @ [0.0, 0.0, height] + [pose[0], pose[1], 0.0]
     want = hit(np.array([*PLACE, height]), np.array([*slopes, 1.0]), origin, plate)
     lx, ly, sx, sy, h, dx, dy, theta, phi, omega = (np.asarray(v) for v in (*PLACE, *slopes, height, *pose))
-    got = points_under_leaning(lx, ly, sx, sy, h, dx, dy, theta, phi, omega)
+    got = points_under_leaning((lx, ly, h), (sx, sy), (dx, dy, theta, phi, omega))
     # Three passes, each of which leaves 6e-4 of the error before it, of 10 um at first.
     assert np.array(got) == pytest.approx(want, abs=3e-14)
 

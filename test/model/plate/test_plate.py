@@ -48,14 +48,18 @@ def test_the_dots_are_where_the_rays_meet_the_plate(rays: Any) -> None:
     assert points == pytest.approx(expected, abs=1e-15)
     np.testing.assert_array_equal(plate_points(POSES, beams, heights), points)
     np.testing.assert_array_equal(
-        np.stack(points_under(beams[:, 0], beams[:, 1], heights, *np.moveaxis(POSES[..., None], 1, 0)), axis=-1), points
+        np.stack(
+            points_under((beams[:, 0], beams[:, 1], heights), tuple(np.moveaxis(POSES[..., None], 1, 0))),
+            axis=-1,
+        ),
+        points,
     )
     # One beam and pose at a time, in floats.
     for i in range(len(POSES)):
         dx, dy, theta, phi, omega = POSES[i].tolist()
         for j in range(3):
             lx, ly = beams[j].tolist()
-            qx, qy, row_x, row_y = crossing(lx, ly, float(heights[j]), dx, dy, theta, phi, omega)
+            qx, qy, row_x, row_y = crossing((lx, ly, float(heights[j])), (dx, dy, theta, phi, omega))
             assert (qx, qy) == pytest.approx(points[i, j], abs=1e-16)
             assert np.array([row_x, row_y]) == pytest.approx(jacobian[i, j], abs=1e-14)
     # A beam of its own for each pose.
