@@ -15,6 +15,7 @@ from concurrent.futures import Future as DiskFuture
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.publisher import Publisher
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -56,7 +57,8 @@ class ChainNode(BaseNode):
         self._told: list[RigPublisher] = []
         self._health: list[HealthReporter] = []
         self._seen = (0, 0)
-        self._tf = self._tf_static = None
+        self._tf: Publisher | None = None
+        self._tf_static: Publisher | None = None
         super().__init__(NODE_NAME, say)
 
     @property
