@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.lens import Lens
+from psd_deflection.rig.parameters import Section, parameter
 
 TARGETS = ('circles', 'charuco', 'apriltag')
 VIEWS = ('outside', 'base')
-
-
-def _parameter(name: str, help_: str, default: Any, unit: str = '', least: float = -math.inf) -> Any:
-    known = {'name': name, 'help': help_, 'unit': unit, 'least': least}
-    return field(default=default, metadata=known)
+_LENGTH: Mapping[str, Any] = {'minimum': 1e-6, 'maximum': 100.0, 'live': True}
+_COUNT: Mapping[str, Any] = {'minimum': 0, 'maximum': 1000, 'live': True}
 
 
 @dataclass(frozen=True)
@@ -28,23 +25,61 @@ class CameraSettings:
     The camera looks at the tip's outer face (``view`` ``outside``: image right is +X, up is +Y) or from the base.
     """
 
-    target: str = _parameter('target.kind', 'circles, charuco or apriltag', 'circles')
-    spacing: float = _parameter('target.spacing', 'between the centres of neighbouring discs', 0.025, 'm', 1e-6)
-    radius: float = _parameter('target.radius', 'radius of a disc', 0.008, 'm', 1e-6)
-    columns: int = _parameter('target.columns', 'squares or tags along X of a board', 0, '', 0)
-    rows: int = _parameter('target.rows', 'squares or tags along Y of a board', 0, '', 0)
-    square: float = _parameter('target.square', 'side of a square of a ChArUco board', 0.010, 'm', 1e-6)
-    marker: float = _parameter('target.marker', 'side of a marker or tag', 0.007, 'm', 1e-6)
-    gap: float = _parameter('target.gap', 'space between neighbouring tags', 0.0045, 'm', 1e-6)
-    dictionary: str = _parameter('target.dictionary', 'dictionary of the markers, by its name in OpenCV', '')
-    matrix: tuple[float, ...] = _parameter('camera.matrix', 'camera matrix, row by row; empty: not known', (), 'px')
-    distortion: tuple[float, ...] = _parameter('camera.distortion', "distortion in OpenCV's order; empty: none", ())
-    view: str = _parameter('camera.view', 'outside or base', 'outside')
-    turn: float = _parameter('camera.turn', 'about how far the image of the plate is turned clockwise', 0.0, 'rad')
-    exposure: float = _parameter('camera.exposure', 'of each frame, if the source does not say it', 0.0, 's', 0.0)
-    rest_frames: int = _parameter(
-        'rest.frames', 'first good frames whose mean is the rest; 0: as many as do not move', 0, '', 0
+    target: str = parameter('circles', '', 'kind of the target', name='target.kind', choices=TARGETS, live=True)
+    spacing: float = parameter(
+        0.025, 'm', 'between the centres of neighbouring discs', name='target.spacing', **_LENGTH
     )
+    radius: float = parameter(0.008, 'm', 'radius of a disc', name='target.radius', **_LENGTH)
+    columns: int = parameter(
+        0, '', 'squares or tags along X of a board; 0: the usual number', name='target.columns', **_COUNT
+    )
+    rows: int = parameter(
+        0, '', 'squares or tags along Y of a board; 0: the usual number', name='target.rows', **_COUNT
+    )
+    square: float = parameter(0.010, 'm', 'side of a square of a ChArUco board', name='target.square', **_LENGTH)
+    marker: float = parameter(0.007, 'm', 'side of a marker or tag', name='target.marker', **_LENGTH)
+    gap: float = parameter(0.0045, 'm', 'space between neighbouring tags', name='target.gap', **_LENGTH)
+    dictionary: str = parameter(
+        '', '', 'dictionary of the markers, by its name in OpenCV', name='target.dictionary', live=True
+    )
+    matrix: tuple[float, ...] = parameter(
+        (), 'px', 'camera matrix, row by row; empty: not known', name='camera.matrix', live=True
+    )
+    distortion: tuple[float, ...] = parameter(
+        (), '', "distortion in OpenCV's order; empty: none", name='camera.distortion', live=True
+    )
+    view: str = parameter(
+        'outside', '', 'from where the camera sees the plate', name='camera.view', choices=VIEWS, live=True
+    )
+    turn: float = parameter(
+        0.0,
+        'rad',
+        'about how far the image of the plate is turned clockwise',
+        name='camera.turn',
+        minimum=-10.0,
+        maximum=10.0,
+        live=True,
+    )
+    exposure: float = parameter(
+        0.0,
+        's',
+        'of each frame, if the source does not say it',
+        name='camera.exposure',
+        minimum=0.0,
+        maximum=3600.0,
+        live=True,
+    )
+    rest_frames: int = parameter(
+        0,
+        '',
+        'first good frames whose mean is the rest; 0: as many as do not move',
+        name='rest.frames',
+        minimum=0,
+        maximum=100_000,
+        live=True,
+    )
+
+    frame_prefix: str = parameter('', '', 'of the rig: put before link_tip_rest, the frame of the reference on ROS')
 
     def lens(self, shape: tuple[int, int]) -> Lens:
         """The lens for images of ``shape`` (rows, columns). Raises ConfigError."""
@@ -57,12 +92,6 @@ class CameraSettings:
         return replace(self, target=target)
 
     def __post_init__(self) -> None:
-        for name, value, choices in (
-            ('target.kind', self.target, TARGETS),
-            ('camera.view', self.view, VIEWS),
-        ):
-            if value not in choices:
-                raise ConfigError(f'{name} = {value}: must be one of {", ".join(choices)}')
         if len(self.matrix) not in (0, 9):
             raise ConfigError(f'camera.matrix has {len(self.matrix)} numbers: must be nine, row by row')
         if self.distortion and not self.matrix:
@@ -77,58 +106,16 @@ class CameraSettings:
             self.lens((1, 1))
 
 
-PARAMETERS: Mapping[str, Any] = {f.metadata['name']: f for f in fields(CameraSettings)}
-"""Name of a parameter to its field of :class:`CameraSettings`."""
+SETTINGS = Section(CameraSettings)
+MATRIX = 'camera.matrix'
 
 
 def settings_from(values: Mapping[str, object], where: str) -> CameraSettings:
-    """The settings of flat ``values`` (``target.spacing`` …). ``where``: for messages. Raises ConfigError."""
-    known: dict[str, Any] = {}
-    for name, value in values.items():
-        found = PARAMETERS.get(name)
-        if found is None:
-            raise ConfigError(f'{where}: no parameter {name}{did_you_mean(name, PARAMETERS)}')
-        known[found.name] = _checked(name, value, found, where)
-    try:
-        return CameraSettings(**known)
-    except ConfigError as error:
-        raise ConfigError(f'{where}: {error}') from None
+    """The settings of flat ``values`` (``target.spacing`` …); the matrix may be in rows. Raises ConfigError.
 
-
-def _checked(name: str, value: object, declared: Any, where: str) -> object:
-    """``value`` as the type of its field."""
-    default, least, unit = declared.default, declared.metadata['least'], declared.metadata['unit']
-    if isinstance(default, str):
-        if isinstance(value, str):
-            return value
-        raise ConfigError(f'{where}: {name} = {value!r}: must be text')
-    if isinstance(default, tuple):
-        flat = _flat(value)
-        if flat is None:
-            raise ConfigError(f'{where}: {name}: must be a list of numbers')
-        return flat
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ConfigError(f'{where}: {name} = {value!r}: must be a number')
-    if isinstance(default, int) and value != int(value):
-        raise ConfigError(f'{where}: {name} = {value!r}: must be a whole number')
-    if value < least:
-        raise ConfigError(f'{where}: {name} = {value:g} {unit}: must be at least {least:g}'.replace('  ', ' '))
-    return int(value) if isinstance(default, int) else float(value)
-
-
-def _flat(value: object) -> tuple[float, ...] | None:
-    """A list of numbers, or of lists of numbers (a matrix in rows)."""
-    if not isinstance(value, Sequence) or isinstance(value, str):
-        return None
-    flat: list[float] = []
-    for item in value:
-        if isinstance(item, Sequence) and not isinstance(item, str):
-            inner = _flat(item)
-            if inner is None:
-                return None
-            flat += inner
-        elif isinstance(item, bool) or not isinstance(item, int | float) or not math.isfinite(item):
-            return None
-        else:
-            flat.append(float(item))
-    return tuple(flat)
+    ``where``: for messages.
+    """
+    rows = values.get(MATRIX)
+    if isinstance(rows, Sequence) and rows and all(isinstance(row, list | tuple) for row in rows):
+        values = {**values, MATRIX: [number for row in rows for number in row]}
+    return SETTINGS.read(values, where)

@@ -24,7 +24,7 @@ from typing import Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
 
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.errors import ConfigError, did_you_mean
 
 Kind = Literal['double', 'integer', 'bool', 'string', 'double_array', 'string_array']
 Value = float | int | bool | str | list[float] | list[str]
@@ -126,6 +126,29 @@ class Section(Generic[T]):
         """The section with these flat, checked values (``link.length``); lists become tuples."""
         own = {name: values[p.name] for name, p in self.parameters.items()}
         return self._kind(**{name: tuple(v) if isinstance(v, list) else v for name, v in own.items()})
+
+    def read(self, given: Mapping[str, object], source: str) -> T:
+        """The section with what is ``given``, flat and unchecked, and its defaults.
+
+        Raises ConfigError naming ``source``: an unknown name, a value that is not valid, or values that contradict.
+        """
+        known = {p.name: p for p in self.parameters.values()}
+        values: dict[str, Value] = {name: p.default for name, p in known.items()}
+        for name, value in given.items():
+            if name not in known:
+                raise ConfigError(
+                    f'{source}: {name} = {shown(value)}: no parameter of that name{did_you_mean(name, known)}'
+                )
+            values[name] = check_value(known[name], value, source)
+        try:
+            return self.of(values)
+        except ConfigError as error:
+            raise ConfigError(f'{source}: {error}') from None
+
+    def values(self, settings: T) -> dict[str, Value]:
+        """The flat values that :meth:`of` makes ``settings`` of."""
+        own = {p.name: getattr(settings, name) for name, p in self.parameters.items()}
+        return {name: list(v) if isinstance(v, tuple) else v for name, v in own.items()}
 
 
 def _declared(prefix: str, field_name: str, kind: object, default: object, metadata: Mapping[str, Any]) -> Parameter:

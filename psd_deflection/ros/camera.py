@@ -1,93 +1,105 @@
 """The node ``camera``: images in, ``/reference/deflection`` out, with its covariance and the reasons of refused frames.
 
 It subscribes to ``image`` (sensor_msgs/Image) and ``image/compressed`` (sensor_msgs/CompressedImage), and takes the
-lens from ``camera_info`` if no parameter ``camera.matrix`` says it. The executor runs in the main thread; of the frames
-that come while one is measured, all but the last are dropped.
+lens from ``camera_info`` beside the image if no parameter ``camera.matrix`` says it. A parameter that is set takes
+effect with the next frame. The executor runs in the main thread; of the frames that come while one is measured, all but
+the last are dropped.
 """
 
 from __future__ import annotations
 
 import collections
+import contextlib
 import math
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import rclpy
-from rclpy.clock import Clock, ClockType
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter as RosParameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.signals import SignalHandlerOptions
 
-from msg_adapters import DIAGNOSTICS, REFERENCE, REFERENCE_WITH_COVARIANCE, TOPIC_TYPES, to_messages
-from psd_deflection.base.errors import ConfigError
+from msg_adapters import REFERENCE, REFERENCE_WITH_COVARIANCE, TOPIC_TYPES, to_messages
+from psd_deflection.arms.inputs import stamp_fault
+from psd_deflection.base.errors import ConfigError, Warned
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.footage import decoded, of_ros_image
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.reference import CameraReference
-from psd_deflection.camera.settings import settings_from
+from psd_deflection.camera.settings import SETTINGS, CameraSettings
 from psd_deflection.camera.targets import target_of
 from psd_deflection.recordings import cdr
-from psd_deflection.records import DiagnosticEntry, DiagnosticReport, Record, ReferencePose
-from psd_deflection.ros.log import NodeLog
+from psd_deflection.records import Record, ReferencePose
+from psd_deflection.ros.node import BaseNode, Health, serve
+from psd_deflection.ros.running import ros
 from psd_deflection.ros.wires import message_class, relative
+from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN
 
 NODE_NAME = 'camera'
-STATUS = 'psd_deflection: camera'
-_DEPTH = 10
-_OK, _WARN, _ERROR, _STALE = range(4)
+MOST_IMAGE_BYTES = 400_000_000
+"""Maximum size of an image's message: that of the largest image that is read, with 16 bits a pixel."""
+MOST_DISTORTIONS = 14
+LARGEST_NUMBER = 1e7
+"""Bound of the numbers of a camera's matrix, px, and of its distortion."""
 
 
-class CameraNode:
-    """The node. Raises ConfigError if a parameter is refused or OpenCV is missing."""
+class CameraNode(BaseNode):
+    """The node. ``given``: parameters of a file or an option. Raises ConfigError if OpenCV is missing, too."""
 
-    def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None]) -> None:
+    def __init__(self, given: CameraSettings, say: Callable[[str], None]) -> None:
         opencv()
-        self._say: Callable[[str], None] = say
-        self._log: NodeLog | None = None
+        self._given = given
         self._reference: CameraReference | None = None
         self._info: Any = None
         self._since: collections.Counter[str] = collections.Counter()
         self._last: FrameAnswer | None = None
-        self.node = Node(
-            NODE_NAME,
-            automatically_declare_parameters_from_overrides=True,
-            parameter_overrides=[RosParameter(name, value=value) for name, value in overrides.items()],
-        )
-        try:
-            given = self.node.get_parameters_by_prefix('')
-            values = {name: _plain(p.value) for name, p in given.items() if name.partition('.')[0] not in _NOT_OURS}
-            self.settings = settings_from(values, 'ROS parameters')
-            self._log = NodeLog(self.node, say)
-            self._say = self._log
+        super().__init__(NODE_NAME, say)
+
+    @property
+    def settings(self) -> CameraSettings:
+        """As they are now."""
+        return self._parameters.settings
+
+    @property
+    def frame_prefix(self) -> str:
+        """Of the frame of the references."""
+        return self.settings.frame_prefix
+
+    def set_up(self) -> None:
+        """Declare parameters; listen to images."""
+        self._parameters = self.declare(SETTINGS, SETTINGS.values(self._given), self._changed)
+        target_of(self.settings)
+        self._out = {
             # Reliable: a subscriber may ask for less, as the estimator does.
-            self._publishers = {
-                topic: self.node.create_publisher(
-                    message_class(TOPIC_TYPES[topic]),
-                    relative(topic),
-                    _DEPTH,
-                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-                )
-                for topic in (REFERENCE, REFERENCE_WITH_COVARIANCE, DIAGNOSTICS)
-            }
-            newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-            for topic, kind, take in (
-                ('image', 'sensor_msgs/msg/Image', self._image),
-                ('image/compressed', 'sensor_msgs/msg/CompressedImage', self._compressed),
-                ('camera_info', 'sensor_msgs/msg/CameraInfo', self._take_info),
-            ):
-                self.node.create_subscription(message_class(kind), topic, take, newest)
-            self.node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        except BaseException:
-            self.node.destroy_node()
-            raise
-        topics = ', '.join(self._publishers[t].topic_name for t in (REFERENCE, REFERENCE_WITH_COVARIANCE))
-        self._say(f'waiting for images on {self.node.resolve_topic_name("image")}; publishing {topics}')
+            topic: self.publisher(message_class(TOPIC_TYPES[topic]), relative(topic))
+            for topic in (REFERENCE, REFERENCE_WITH_COVARIANCE)
+        }
+        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        image = self.node.resolve_topic_name('image')
+        for topic, kind, check, take in (
+            (image, 'sensor_msgs/msg/Image', _image_fault, self._image),
+            (self._beside('image/compressed', f'{image}/compressed'), *_COMPRESSED, self._compressed),
+            # As image_transport has it: the camera's information is beside its images.
+            (self._beside('camera_info', image.rpartition('/')[0] + '/camera_info'), *_INFO, self._take_info),
+        ):
+            self.gate.listen(message_class(kind), topic, check, take, newest, MOST_IMAGE_BYTES)
+        topics = ', '.join(publisher.topic_name for publisher in self._out.values())
+        self.log(f'waiting for images on {image}; publishing {topics}')
+
+    def _beside(self, topic: str, usual: str) -> str:
+        """``topic`` if the user has remapped it, else the ``usual`` name beside the image."""
+        told: str = self.node.resolve_topic_name(topic)
+        return usual if told == self.node.resolve_topic_name(topic, only_expand=True) else told
+
+    def _changed(self, settings: CameraSettings) -> None:
+        target_of(settings)
+        if self._reference is not None and replace(settings, exposure=self.settings.exposure) != self.settings:
+            self._reference = None
+            self.log(Warned('a parameter was changed: the next good frames are the rest'))
+
+    def cleanup(self) -> None:
+        """Forget the rest."""
+        super().cleanup()
+        self._reference = None
 
     def _take_info(self, message: Any) -> None:
         self._info = message
@@ -107,24 +119,26 @@ class CameraNode:
         self._take(message.header.stamp, decoded(np.frombuffer(message.data, dtype=np.uint8), opencv()))
 
     def _take(self, stamp: Any, image: Any) -> None:
+        if not self.active:
+            return
         t_ns = stamp.sec * 1_000_000_000 + stamp.nanosec + round(self.settings.exposure * 0.5e9)
         if self._reference is None:
-            self._begin()
-        if self._reference is not None:
-            for answer in self._reference.take(t_ns, image):
-                self._publish(answer)
+            self._reference = self._begin()
+        for answer in self._reference.take(t_ns, image):
+            self._publish(answer)
 
-    def _begin(self) -> None:
+    def _begin(self) -> CameraReference:
         settings = self.settings
         if not settings.matrix and self._info is not None and self._info.k[0] > 0.0:
             k, d = tuple(map(float, self._info.k)), tuple(map(float, self._info.d))
             try:
                 settings = replace(settings, matrix=k, distortion=d)
             except (ConfigError, ValueError) as error:
-                self._say(f'camera_info is not used: {error}')
+                self.log(Warned(f'camera_info is not used: {error}'))
         if not settings.matrix:
-            self._say('camera.matrix is not given and there is no camera_info: distortion is not corrected')
-        self._reference = CameraReference(settings, target_of)
+            why = 'camera.matrix is not given and there is no camera_info'
+            self.log(Warned(f'{why}: distortion is not corrected'))
+        return CameraReference(settings, target_of)
 
     def _publish(self, answer: FrameAnswer) -> None:
         self._since[str(answer.status)] += 1
@@ -135,10 +149,11 @@ class CameraNode:
             self._send(record)
 
     def _send(self, record: Record) -> None:
-        for message in to_messages(record):
-            self._publishers[message.topic].publish(cdr.encode(message.type, message.fields))
+        for message in to_messages(record, self.frame_prefix):
+            self._out[message.topic].publish(cdr.encode(message.type, message.fields))
 
-    def _report(self) -> None:
+    def health(self) -> Iterable[Health]:
+        """Frames and answers of the last second, and why the others were refused."""
         since, self._since = self._since, collections.Counter()
         frames, good = sum(since.values()), since.pop(str(Status.OK), 0)
         values = [('frames/s', str(frames)), ('answers/s', str(good))]
@@ -151,40 +166,32 @@ class CameraNode:
         worst = since.most_common(1)
         if not frames:
             waits = self._reference is not None and self._reference.rest is None
-            level, text = (_WARN, 'the rest is not known yet') if waits else (_STALE, 'no images')
+            level, text = (WARN, 'the rest is not known yet') if waits else (STALE, 'no images')
         elif worst:
-            level, text = (_WARN if good else _ERROR), f'{frames - good} of {frames} frames refused: {worst[0][0]}'
+            level, text = (WARN if good else ERROR), f'{frames - good} of {frames} frames refused: {worst[0][0]}'
         else:
-            level, text = _OK, f'{good} answers/s'
-        self._send(DiagnosticReport(time.time_ns(), (DiagnosticEntry(STATUS, level, text, tuple(values)),)))
-
-    def close(self) -> None:
-        """Leave the graph."""
-        if self._log is not None:
-            self._log.close()
-        self.node.destroy_node()
+            level, text = OK, f'{good} answers/s'
+        if not self.active:
+            level, text = STALE, 'not active'
+        yield Health('reference', level, text, tuple(values))
 
 
-_NOT_OURS = {'use_sim_time', 'qos_overrides', 'start_type_description_service'}
+def _image_fault(message: Any) -> str:
+    return stamp_fault(message.header.stamp.sec, message.header.stamp.nanosec)
 
 
-def _plain(value: Any) -> object:
-    """A parameter's value; arrays as lists."""
-    return list(value) if hasattr(value, '__len__') and not isinstance(value, str) else value
+def _info_fault(message: Any) -> str:
+    numbers = (*message.k, *message.d)
+    good = all(abs(number) <= LARGEST_NUMBER for number in numbers) and len(message.d) <= MOST_DISTORTIONS
+    return '' if good else 'no camera has such a matrix or distortion'
 
 
-def run_camera(ros_arguments: list[str], overrides: Mapping[str, object], say: Callable[[str], None]) -> None:
-    """Measure until Ctrl-C. Raises ConfigError."""
-    rclpy.init(args=['camera', *ros_arguments], signal_handler_options=SignalHandlerOptions.ALL)
-    node: CameraNode | None = None
-    try:
-        node = CameraNode(overrides, say)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node.node)
-        executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    finally:
-        if node is not None:
-            node.close()
-        rclpy.try_shutdown()
+_COMPRESSED = 'sensor_msgs/msg/CompressedImage', _image_fault
+_INFO = 'sensor_msgs/msg/CameraInfo', _info_fault
+
+
+def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Callable[[str], None]) -> int:
+    """Measure until SIGINT or SIGTERM. Raises ConfigError."""
+    with ros(NODE_NAME, ros_arguments) as signals, contextlib.closing(CameraNode(given, say)) as owner:
+        serve(owner, signals)
+    return 0

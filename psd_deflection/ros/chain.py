@@ -8,37 +8,33 @@ the pipeline threads.
 
 from __future__ import annotations
 
-import contextlib
 import importlib
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future as DiskFuture
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
+from rclpy.publisher import Publisher
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from msg_adapters import DEFLECTION_WITH_COVARIANCE, DIAGNOSTICS, END_EFFECTOR, TOPIC_TYPES, to_messages
+from msg_adapters import DEFLECTION_WITH_COVARIANCE, END_EFFECTOR, TOPIC_TYPES
 from msg_adapters.pose_with_covariance_stamped import from_end_effector
-from psd_deflection.arms.chains.chain_file import ChainFile
+from psd_deflection.arms.chains.chain_file import SETTINGS, ChainFile
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.inputs import joints_fault
 from psd_deflection.base.errors import PsdDeflectionError, Warned
 from psd_deflection.recordings import cdr
-from psd_deflection.records import DiagnosticEntry, DiagnosticReport
-from psd_deflection.ros.declared import node_with_overrides, refuse_unknown
-from psd_deflection.ros.gate import InputGate
-from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.names import BASE, END, END_REST, JOINT_STATES, RECORD, REST, TF, TF_STATIC, TIP, ZERO
-from psd_deflection.ros.running import SPIN_S, executor_of, ros
+from psd_deflection.ros.node import BaseNode, Health, serve
+from psd_deflection.ros.running import ros
 from psd_deflection.ros.transforms import installed, static_transforms, transform_message
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, message_class, qos, relative, topics_of
 from psd_deflection.run.chain import ChainSession, Composed
-from psd_deflection.run.diagnostics import ERROR, OK, WARN, HealthReporter
+from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN, HealthReporter
 from psd_deflection.run.fanout import subscribed
-from psd_deflection.run.realtime import Watchdog, settle
+from psd_deflection.run.realtime import Watchdog
 from psd_deflection.run.rig_publisher import RigPublisher
 from psd_deflection.run.session import Session, why_no_zero, zero_text
 from psd_deflection.run.signals import Signals, StopRequestedError
@@ -47,96 +43,129 @@ NODE_NAME = 'chain'
 _KIND = TOPIC_TYPES[DEFLECTION_WITH_COVARIANCE]
 
 
-class ChainNode:
-    """The node and its rigs, which are open; :meth:`start` lets samples flow."""
+class ChainNode(BaseNode):
+    """The node and, while it is configured, its rigs."""
+
+    SYSTEM_TIME = True
 
     def __init__(self, file: ChainFile, say: Callable[[str], None], signals: Signals) -> None:
-        self.node = node_with_overrides(NODE_NAME)
-        self._say: Callable[[str], None] = say
-        self._log: NodeLog | None = None
-        try:
-            refuse_unknown(self.node, {})
-            self._say = say = self._log = NodeLog(self.node, say)
-            name = self.node.get_fully_qualified_name()
-            self.chain = signals.interruptible(
-                lambda: ChainSession(file, say, lambda _, rig, told: Session(rig, told, name))
-            )
-        except BaseException:
-            self._leave()
-            raise
-        try:
-            self._offer(file)
-        except BaseException:
-            self.close()
-            raise
-
-    def _offer(self, file: ChainFile) -> None:
-        """Everything on the graph."""
-        node = self.node
-        self._gate = InputGate(node, self._say)
+        self.chain: ChainSession | None = None
+        self._file = file
+        self._signals = signals
         self._wires: list[PublisherWire] = []
+        self._inputs: list[InputRecorder] = []
         self._told: list[RigPublisher] = []
-        self._health = [HealthReporter(session) for session in self.chain.sessions]
-        for link, session in zip(file.names, self.chain.sessions, strict=True):
-            wire = PublisherWire(node, topics_of(session.rig), link)
-            wire.active = True
-            session.fanout.wires.insert(0, wire)
-            self._wires.append(wire)
-            told = RigPublisher(wire, session)
-            session.fanout.change_wires.append(told)
-            self._told.append(told)
-            InputRecorder(node, subscribed(session.rig), link).session = session
-        self._end = node.create_publisher(message_class(_KIND), relative(END_EFFECTOR), qos(END_EFFECTOR))
-        self._tf = self._tf_static = None
+        self._health: list[HealthReporter] = []
+        self._seen = (0, 0)
+        self._tf: Publisher | None = None
+        self._tf_static: Publisher | None = None
+        super().__init__(NODE_NAME, say)
+
+    @property
+    def frame_prefix(self) -> str:
+        """Of all frames."""
+        return self._file.settings.frame_prefix
+
+    def set_up(self) -> None:
+        """Declare parameters; make what is on the graph while the node lives."""
+        settings = self.declare(SETTINGS, SETTINGS.values(self._file.settings)).settings
+        self._file = file = self._file.with_settings(settings)
+        node = self.node
+        self._end = self.publisher(message_class(_KIND), relative(END_EFFECTOR), qos(END_EFFECTOR))
         if installed():
             self._message = importlib.import_module('tf2_msgs.msg').TFMessage
             self._tf = node.create_publisher(self._message, TF, qos(TF))
             self._tf_static = node.create_publisher(self._message, TF_STATIC, qos(TF_STATIC))
-        self.chain.listeners.append(self._composed)
+        else:
+            self.log(Warned('tf2_msgs is not installed: no frames on /tf'))
+        for name, rig in zip(file.names, file.rigs, strict=True):
+            self._wires.append(PublisherWire(node, topics_of(rig), name))
+            self._inputs.append(InputRecorder(node, subscribed(rig), name))
         if any(joint.name for joint in file.joints):
             kind = message_class('sensor_msgs/msg/JointState')
-            self._gate.listen(kind, JOINT_STATES, self._joints_fault, self._joints, 10)
+            self.gate.listen(kind, JOINT_STATES, self._joints_fault, self._joints, 10)
         node.create_service(Trigger, ZERO, self._zero)
         # In a separate group: while one request waits for the disk, the node serves everything else.
         node.create_service(SetBool, RECORD, self._record, callback_group=ReentrantCallbackGroup())
-        self._seen = (0, 0)
-        node.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
 
-    def start(self) -> None:
-        """Let samples flow. Raises RecordingError."""
-        now = time.time_ns()
+    def configure(self) -> None:
+        """Open the rigs and let samples flow; nothing is published yet. Raises the errors of a session."""
+        file, name = self._file, self.full_name()
+        self.chain = chain = self._signals.interruptible(
+            lambda: ChainSession(file, self.log, lambda _, rig, told: Session(rig, told, name))
+        )
+        try:
+            self._health = [HealthReporter(session) for session in chain.sessions]
+            self._told = []
+            for wire, inputs, session in zip(self._wires, self._inputs, chain.sessions, strict=True):
+                session.fanout.wires.insert(0, wire)
+                told = RigPublisher(wire, session)
+                session.fanout.change_wires.append(told)
+                self._told.append(told)
+                inputs.session = session
+            self._seen = (0, 0)
+            chain.listeners.append(self._composed)
+            chain.start()
+        except BaseException:
+            self.cleanup()
+            raise
+
+    def activate(self) -> None:
+        """Publish."""
+        super().activate()
+        for wire in self._wires:
+            wire.active = True
         if self._tf_static is not None:
-            fixed = [t for session in self.chain.sessions for t in static_transforms(session.rig, now)]
+            now = time.time_ns()
+            fixed = [t for rig in self._file.rigs for t in static_transforms(rig, now)]
             self._tf_static.publish(self._message(transforms=fixed))
         for told in self._told:
             told.tell()
-        self.chain.start()
         topics = [self._end.topic_name, *(w.names((DEFLECTION_WITH_COVARIANCE,))[0] for w in self._wires)]
-        self._say(f'publishing {", ".join(topics)} …; services {ZERO} and {RECORD} of {NODE_NAME}')
+        self.log(f'publishing {", ".join(topics)} …; services {ZERO} and {RECORD} of {NODE_NAME}')
+
+    def deactivate(self) -> None:
+        """Publish no more; the rigs are read on."""
+        super().deactivate()
+        for wire in self._wires:
+            wire.active = False
+
+    def cleanup(self) -> None:
+        """End the rigs."""
+        self.deactivate()
+        for inputs in self._inputs:
+            inputs.session = None
+        chain, self.chain = self.chain, None
+        self._told, self._health = [], []
+        if chain is not None:
+            chain.close()
 
     def _composed(self, composed: Composed) -> None:
         record = composed.as_record()
-        if record is None:
+        if record is None or not self.active:
             return
-        self._end.publish(cdr.encode(_KIND, from_end_effector(record, END_REST)))
+        self._end.publish(cdr.encode(_KIND, from_end_effector(record, self.frame_prefix + END_REST)))
         if self._tf is not None:
-            self._tf.publish(self._message(transforms=chain_transforms(self.chain, composed)))
+            self._tf.publish(self._message(transforms=chain_transforms(self._file, composed)))
 
     def _joints_fault(self, message: Any) -> str:
-        return joints_fault(message.name, message.position, {joint.name for joint in self.chain.file.joints})
+        return joints_fault(message.name, message.position, {joint.name for joint in self._file.joints})
 
     def _joints(self, message: Any) -> None:
-        angles = zip(message.name, message.position, strict=False)
-        self.chain.turn(dict(angles))
+        if self.chain is not None:
+            self.chain.turn(dict(zip(message.name, message.position, strict=False)))
 
     def _zero(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         response.success = False
+        if self.chain is None:
+            response.message = 'not zeroed: the node is not configured'
+            return response
         try:
             taken = self.chain.zero()
         except (PsdDeflectionError, TimeoutError) as error:
             response.message = f'not zeroed: {error}'
             return response
-        links = zip(self.chain.file.names, self.chain.sessions, taken, strict=True)
+        links = zip(self._file.names, self.chain.sessions, taken, strict=True)
         response.message = '; '.join(
             f'{name}: not zeroed: {why_no_zero(session.pipeline)}'
             if change is None
@@ -148,6 +177,9 @@ class ChainNode:
 
     async def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         response.success = False
+        if self.chain is None:
+            response.message = 'the node is not configured'
+            return response
         try:
             folders = [await _answer(asked) for asked in self.chain.record(request.data)]
         except (PsdDeflectionError, TimeoutError) as error:
@@ -159,20 +191,24 @@ class ChainNode:
         response.message = f'{verb} {", ".join(said)}' if said else 'no recording runs'
         return response
 
-    def _report(self) -> None:
-        chain = self.chain
-        self._gate.settle()
-        node = self.node.get_fully_qualified_name().removeprefix('/')
-        for name, session, health, told in zip(chain.file.names, chain.sessions, self._health, self._told, strict=True):
+    def report(self) -> None:
+        """Publish the states of the links, which are recorded, and of the end effector."""
+        super().report()
+        if self.chain is None:
+            return
+        node = self.full_name().removeprefix('/')
+        links = zip(self._file.names, self.chain.sessions, self._health, self._told, strict=True)
+        for name, session, health, told in links:
             told.tell(again=False)
             report = health.report(session.acquisition.now_ns())
             entries = (e._replace(name=e.name.replace('psd_deflection', f'{node}/{name}', 1)) for e in report.entries)
             session.fanout.put(report._replace(entries=tuple(entries)))
-        (message,) = to_messages(DiagnosticReport(time.time_ns(), (self._entry(node),)))
-        self._wires[0].put(DIAGNOSTICS, message.type, cdr.encode(message.type, message.fields), message.t_ns)
 
-    def _entry(self, node: str) -> DiagnosticEntry:
+    def health(self) -> Iterable[Health]:
+        """What was composed in the last second."""
         chain = self.chain
+        if chain is None:
+            return (Health('end effector', STALE, 'not configured'),)
         missing = chain.missing
         before, self._seen = self._seen, (chain.composed, sum(missing.values()))
         new, lacking = (now - then for now, then in zip(self._seen, before, strict=True))
@@ -185,20 +221,9 @@ class ChainNode:
             level, text = OK, f'{new} composed in a second'
         values = [('composed', str(chain.composed)), *((f'missing {name}', str(n)) for name, n in missing.items())]
         values += [
-            (f'angle {j.name}', f'{a:.6f}') for j, a in zip(chain.file.joints, chain.angles, strict=True) if j.name
+            (f'angle {j.name}', f'{a:.6f}') for j, a in zip(self._file.joints, chain.angles, strict=True) if j.name
         ]
-        values += self._gate.values()
-        return DiagnosticEntry(f'{node}: end effector', level, text, tuple(values))
-
-    def close(self) -> None:
-        """End the rigs, then the node."""
-        self.chain.close()
-        self._leave()
-
-    def _leave(self) -> None:
-        if self._log is not None:
-            self._log.close()
-        self.node.destroy_node()
+        return (Health('end effector', level, text, tuple(values)),)
 
 
 async def _answer(asked: DiskFuture[Any]) -> Any:
@@ -209,12 +234,13 @@ async def _answer(asked: DiskFuture[Any]) -> Any:
     return asked.result()
 
 
-def chain_transforms(chain: ChainSession, composed: Composed) -> list[Any]:
+def chain_transforms(file: ChainFile, composed: Composed) -> list[Any]:
     """The TransformStamped of all that moves at one time: clamps, tips, the end effector and its rigid pose."""
     end = composed.end
     if end is None:
         return []
-    file, t_ns = chain.file, composed.t_ns
+    t_ns = composed.t_ns
+    prefix_of_all = file.settings.frame_prefix
 
     def message(parent: str, child: str, pose: Transform) -> Any:
         x, y, z = pose.position.tolist()
@@ -228,8 +254,8 @@ def chain_transforms(chain: ChainSession, composed: Composed) -> list[Any]:
         out.append(message(holder, prefix + BASE, link.base(angle)))
         out.append(message(prefix + REST, prefix + TIP, tip))
         holder = prefix + TIP
-    out.append(message(holder, END, file.chain.end))
-    out.append(message(file.base_frame, END_REST, end.rigid))
+    out.append(message(holder, prefix_of_all + END, file.chain.end))
+    out.append(message(file.base_frame, prefix_of_all + END_REST, end.rigid))
     return out
 
 
@@ -240,30 +266,27 @@ def run_chain(
 
     Raises the errors of the package if the run cannot start, or if a pipeline failed.
     """
-    with ros(NODE_NAME, ros_args) as signals, contextlib.suppress(StopRequestedError):
-        _spin(file, say, watch, signals)
+    with ros(NODE_NAME, ros_args) as signals:
+        owner, watchdog = ChainNode(file, say, signals), Watchdog()
+
+        def runs() -> bool:
+            chain = owner.chain
+            if chain is not None:
+                if not chain.alive:
+                    return False
+                watch(chain)
+            if chain is None or chain.responsive():
+                watchdog.alive()
+            return True
+
+        try:
+            serve(owner, signals, runs, watchdog.ready)
+            failed = owner.chain.failed if owner.chain is not None else None
+        except StopRequestedError:
+            failed = None
+        finally:
+            watchdog.stopping()
+            owner.close()
+        if failed is not None:
+            raise failed
     return 0
-
-
-def _spin(
-    file: ChainFile, say: Callable[[str], None], watch: Callable[[ChainSession], object], signals: Signals
-) -> None:
-    if not installed():
-        say(Warned('tf2_msgs is not installed: no frames on /tf'))
-    owner = ChainNode(file, say, signals)
-    watchdog = Watchdog()
-    try:
-        with executor_of(owner.node) as executor:
-            settle()
-            owner.start()
-            watchdog.ready()
-            while not signals.stop and owner.chain.alive:
-                executor.spin_once(timeout_sec=SPIN_S)
-                if owner.chain.responsive():
-                    watchdog.alive()
-                watch(owner.chain)
-    finally:
-        watchdog.stopping()
-        owner.close()
-    if owner.chain.failed is not None:
-        raise owner.chain.failed

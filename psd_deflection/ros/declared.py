@@ -6,11 +6,11 @@ A section of :mod:`psd_deflection.rig.parameters` declares them, once, for the c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import ParameterException, ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -20,6 +20,7 @@ from psd_deflection.rig.parameters import Parameter, Section, Value, check_value
 
 SOURCE = 'ROS parameters'
 AT_START = 'read at the start of the process'
+USE_SIM_TIME = ROS_OWN[0]
 T = TypeVar('T')
 
 
@@ -45,6 +46,44 @@ def plain(parameter: RosParameter) -> Any:
     return value if value is None or isinstance(value, (str, bool, int, float)) else list(value)
 
 
+def declare(node: Node, parameter: Parameter, value: Value, shown: ParameterDescriptor) -> None:
+    """Declare ``parameter`` of ``node`` at ``value``, which may be an empty list."""
+    if value != []:
+        node.declare_parameter(parameter.name, value, shown, ignore_override=True)
+        return
+    # rclpy cannot tell the type of an empty list.
+    kind, example = _EMPTY[parameter.kind]
+    node.declare_parameter(parameter.name, [example], shown, ignore_override=True)
+    node.set_parameters([RosParameter(parameter.name, kind, [])])
+
+
+_EMPTY = {
+    'double_array': (RosParameter.Type.DOUBLE_ARRAY, 0.0),
+    'string_array': (RosParameter.Type.STRING_ARRAY, ''),
+}
+
+
+class UnknownParameterError(ParameterNotDeclaredException):  # type: ignore[misc]
+    """Its text is the answer of the service. rclpy's own lists no names, and it takes an empty name for a known one."""
+
+    def __init__(self, name: str, known: Mapping[str, object]) -> None:
+        Exception.__init__(self, f'{name!r}: no parameter of that name{did_you_mean(name, known)}')
+
+
+def meant(node: Node, changed: list[RosParameter], known: Mapping[str, Parameter]) -> list[RosParameter]:
+    """``changed`` without synonyms, whose type rclpy would refuse: `ros2 param set … degraded off` sends false.
+
+    Raises UnknownParameterError, whose text names the nearest of ``known``.
+    """
+    out = []
+    for parameter in changed:
+        if not parameter.name or not node.has_parameter(parameter.name):
+            raise UnknownParameterError(parameter.name, known)
+        value = known[parameter.name].meant(parameter.value) if parameter.name in known else parameter.value
+        out.append(parameter if value is parameter.value else RosParameter(parameter.name, value=value))
+    return out
+
+
 def node_with_overrides(name: str) -> Node:
     """A node that has what was given to it as parameters. Raises ConfigError if one cannot be read."""
     try:
@@ -56,9 +95,9 @@ def node_with_overrides(name: str) -> Node:
 class DeclaredParameters(Generic[T]):
     """The parameters of ``node`` that ``section`` declares, at ``values`` unless ROS was given others.
 
-    ``node``: of :func:`node_with_overrides`. ``make``: makes the settings of all values, and raises ConfigError if they
-    contradict each other. ``changed``: gets the settings when a live one was set.
-    Raises ConfigError for an unknown parameter, a wrong type or a value out of bounds.
+    ``node``: has what was given to it as parameters. ``changed``: gets the settings when a live one was set; it may
+    raise ConfigError to refuse them. ``more``: further parameters, at their defaults; ``values`` has all of them.
+    Raises ConfigError for an unknown parameter, a wrong type or a value out of bounds, or if values contradict.
     """
 
     def __init__(
@@ -67,18 +106,20 @@ class DeclaredParameters(Generic[T]):
         section: Section[T],
         values: Mapping[str, Value],
         changed: Callable[[T], None] = lambda _: None,
+        more: Sequence[Parameter] = (),
     ) -> None:
-        self._node, self._section, self._changed = node, section, changed
-        self._declared = {p.name: p for p in section.parameters.values()}
+        self._section, self._changed = section, changed
+        self._declared = {p.name: p for p in (*section.parameters.values(), *more)}
         given = refuse_unknown(node, self._declared)
         checked = {name: check_value(self._declared[name], value, SOURCE) for name, value in given.items()}
-        self._values: dict[str, Value] = {**values, **checked}
-        self.settings = section.of(self._values)
+        self.values: dict[str, Value] = {**{p.name: p.default for p in more}, **values, **checked}
+        self.settings = section.of(self.values)
         for name, parameter in self._declared.items():
             if name in given:
                 node.undeclare_parameter(name)
             shown = descriptor(parameter, parameter.bound_text(), '' if parameter.live else AT_START)
-            node.declare_parameter(name, self._values[name], shown, ignore_override=True)
+            declare(node, parameter, self.values[name], shown)
+        node.add_pre_set_parameters_callback(lambda changed: meant(node, changed, self._declared))
         node.add_on_set_parameters_callback(self._set)
 
     def _set(self, changed: list[RosParameter]) -> SetParametersResult:
@@ -90,17 +131,15 @@ class DeclaredParameters(Generic[T]):
 
     def _take(self, values: Mapping[str, object]) -> None:
         """Set all of ``values`` or none."""
-        new = dict(self._values)
+        new = dict(self.values)
         for name, value in values.items():
-            if name not in self._declared:
-                raise ConfigError(f'{name!r}: no parameter of that name{did_you_mean(name, self._declared)}')
             new[name] = check_value(self._declared[name], value, SOURCE)
-            if new[name] != self._values[name] and not self._declared[name].live:
+            if new[name] != self.values[name] and not self._declared[name].live:
                 raise ConfigError(f'{name}: is {AT_START}')
         settings = self._section.of(new)
-        if new != self._values:
-            self._values, self.settings = new, settings
+        if new != self.values:
             self._changed(settings)
+            self.values, self.settings = new, settings
 
 
 def refuse_unknown(node: Node, known: Mapping[str, Parameter]) -> dict[str, Any]:

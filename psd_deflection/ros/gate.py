@@ -1,7 +1,7 @@
 """What other nodes send comes in through one gate: what cannot be used is refused, counted, and said once.
 
-A check gives the reason why a message is refused, or ''. A message that makes a node's own code fail is refused, too:
-no message ends a node.
+A message is bounded in size before it is unpacked, and a topic in messages a second. A check gives the reason why a
+message is refused, or ''. A message that makes a node's own code fail is refused, too: no message ends a node.
 """
 
 from __future__ import annotations
@@ -13,14 +13,21 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
+from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 
-from psd_deflection.base.errors import PsdDeflectionError, Warned, printable
+from psd_deflection.base.errors import ConfigError, PsdDeflectionError, Warned, printable
 from psd_deflection.run.repeats import Repeats
 
 LONGEST = 200
 """Characters of a reason, in which a stranger's words may be."""
 NEWS = 3
 """Refusals of a topic that are said one by one, before they are counted and said together."""
+MOST_BYTES = 1_000_000
+"""Maximum size of a message, unless the topic has its own; those of a robot's joints have some hundred bytes."""
+MOST_A_SECOND = 5000
+"""Messages of one topic that are looked at within a second."""
 FAILURES = (PsdDeflectionError, ArithmeticError, ValueError, LookupError, TypeError, AttributeError)
 """What a message of a strange content can cause; scipy's and numpy's errors of linear algebra are ValueErrors."""
 
@@ -44,20 +51,31 @@ class InputGate:
         check: Callable[[Any], str],
         take: Callable[[Any], None],
         delivery: QoSProfile | int = 5,
-    ) -> None:
-        """Subscribe to ``topic``: ``take`` gets each message that ``check`` finds nothing wrong with."""
+        most_bytes: int = MOST_BYTES,
+    ) -> Subscription:
+        """Subscribe to ``topic``: ``take`` gets each message that ``check`` finds nothing wrong with.
 
-        def heard(message: Any) -> None:
-            try:
-                why = check(message)
-                if not why:
-                    take(message)
-            except FAILURES as error:
-                why = f'{type(error).__name__}: {error}'
+        ``kind``: its class. Raises ConfigError for a QoS override that ROS does not take.
+        """
+        rate = _Rate()
+
+        def heard(encoded: bytes) -> None:
+            if len(encoded) > most_bytes:
+                why = f'{len(encoded)} bytes: must be at most {most_bytes}'
+            elif not rate.allows(time.monotonic()):
+                why = f'more than {MOST_A_SECOND} messages a second'
+            else:
+                why = _carried_out(kind, encoded, check, take)
             if why:
                 self._refuse(topic, why)
 
-        self._node.create_subscription(kind, topic, heard, delivery)
+        options = QoSOverridingOptions.with_default_policies()
+        try:
+            return self._node.create_subscription(
+                kind, topic, heard, delivery, raw=True, qos_overriding_options=options
+            )
+        except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
+            raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
 
     def _refuse(self, topic: str, why: str) -> None:
         self.refused[topic] += 1
@@ -72,3 +90,29 @@ class InputGate:
     def values(self) -> list[tuple[str, str]]:
         """For the node's diagnostics."""
         return [(f'messages refused: {topic}', str(count)) for topic, count in sorted(self.refused.items())]
+
+
+class _Rate:
+    """Counts the messages of each second."""
+
+    def __init__(self) -> None:
+        self._since, self._count = 0.0, 0
+
+    def allows(self, now_s: float) -> bool:
+        """Whether one more may be looked at."""
+        if now_s - self._since >= 1.0:
+            self._since, self._count = now_s, 0
+        self._count += 1
+        return self._count <= MOST_A_SECOND
+
+
+def _carried_out(kind: Any, encoded: bytes, check: Callable[[Any], str], take: Callable[[Any], None]) -> str:
+    """Take the message, or give the reason why not."""
+    try:
+        message = deserialize_message(encoded, kind)
+        why = check(message)
+        if not why:
+            take(message)
+    except FAILURES as error:
+        return f'{type(error).__name__}: {error}'
+    return why

@@ -15,17 +15,16 @@ from __future__ import annotations
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
-from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.devices.registry import source_names
 from psd_deflection.model.solvers.registry import SOLVERS, check_live, solver_class
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME, QOS_OVERRIDES_PREFIX, ROS_OWN, SIMULATED
 from psd_deflection.rig.parameters import Parameter
-from psd_deflection.ros.declared import AT_START, SOURCE, descriptor, plain
+from psd_deflection.ros.declared import AT_START, SOURCE, descriptor, meant, plain
 from psd_deflection.run.session import Session
 
 _READ = 'read when the node is configured'
@@ -87,13 +86,6 @@ def _check_solvers(rig: Rig) -> None:
         solver_class(name)
 
 
-class _UnknownParameterError(ParameterNotDeclaredException):  # type: ignore[misc]
-    """Its text is the answer of the service. rclpy's own lists no names, and it takes an empty name for a known one."""
-
-    def __init__(self, name: str) -> None:
-        Exception.__init__(self, f'{name!r}: no parameter of that name{did_you_mean(name, BY_NAME)}')
-
-
 class LiveParameters:
     """Carries out changes of the node's parameters, or refuses them.
 
@@ -107,7 +99,7 @@ class LiveParameters:
         self.rig, self.given = rig_of_node(node)
         self._zeros = self.rig.zeros_by_name
         self.session: Session | None = None
-        node.add_pre_set_parameters_callback(self._known)
+        node.add_pre_set_parameters_callback(lambda changed: meant(node, changed, BY_NAME))
         node.add_on_set_parameters_callback(self._change)
 
     @property
@@ -132,16 +124,6 @@ class LiveParameters:
             self._node.set_parameters(changed)
         finally:
             self._showing = False
-
-    def _known(self, changed: list[RosParameter]) -> list[RosParameter]:
-        """``changed`` without synonyms, whose type rclpy would refuse: `ros2 param set … degraded off` sends false."""
-        out = []
-        for parameter in changed:
-            if not parameter.name or not self._node.has_parameter(parameter.name):
-                raise _UnknownParameterError(parameter.name)
-            meant = BY_NAME[parameter.name].meant(parameter.value) if parameter.name in BY_NAME else parameter.value
-            out.append(parameter if meant is parameter.value else RosParameter(parameter.name, value=meant))
-        return out
 
     def _change(self, changed: list[RosParameter]) -> SetParametersResult:
         if self._showing:

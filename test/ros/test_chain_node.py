@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -79,14 +78,13 @@ def test_the_frames_lead_from_the_base_to_the_deflected_end_effector() -> None:
     file = read_chain(EXAMPLE)
     tips = file.chain.tips_under(np.array([3.0, 5.0, -2.0]), file.angles)
     end = file.chain.compose([TipDeflection(t, np.eye(3)) for t in tips], file.angles)
-    session: Any = SimpleNamespace(file=file)
-    sent = {t.child_frame_id: t for t in chain_transforms(session, Composed(5, end))}
+    sent = {t.child_frame_id: t for t in chain_transforms(file, Composed(5, end))}
     assert list(sent) == [
         *('upper_link_base', 'upper_link_tip', 'fore_link_base', 'fore_link_tip'),
         *('end_effector', 'end_effector_rest'),
     ]
     assert sent['upper_link_tip'].header.frame_id == 'upper_link_tip_rest'
-    assert chain_transforms(session, Composed(5, None, 'fore: no estimate')) == []
+    assert chain_transforms(file, Composed(5, None, 'fore: no estimate')) == []
     # What tf2 makes of them.
     at, frame = np.zeros(3), 'end_effector'
     lengths = {'upper_link_tip_rest': 0.585, 'fore_link_tip_rest': 0.585}

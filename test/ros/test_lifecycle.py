@@ -33,7 +33,7 @@ from visualization_msgs.msg import MarkerArray  # noqa: E402
 from psd_deflection.base.errors import ConfigError, DeviceError  # noqa: E402
 from psd_deflection.devices.serial_port import SerialPort  # noqa: E402
 from psd_deflection.recordings.read.readers import open_recording  # noqa: E402
-from psd_deflection.ros import estimator  # noqa: E402
+from psd_deflection.ros import estimator, node  # noqa: E402
 from test.heard import WAIT_S  # noqa: E402
 from test.ros.conftest import PATIENT, stamp  # noqa: E402
 
@@ -85,9 +85,8 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
         assert not change(peer, wrong)
     daemon.until('change_state: refused')
     strange = ParameterMessage(name='sum_min', value=ParameterValue(type=42))
-    assert (
-        peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[strange])).results == []
-    )
+    answer = peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[strange]))
+    assert [(r.successful, '42' in r.reason) for r in answer.results] == [(False, True)]
     peer.until(lambda: len(poses) >= 10 and len(markers) > 0, 'estimates')
     assert change(peer, Transition.TRANSITION_DEACTIVATE)
     seen = len(health)
@@ -265,6 +264,6 @@ def test_a_refusal_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPat
     def refused(*args: Any, **options: Any) -> Any:
         raise RuntimeError('error creating node: no security libraries\nPlease compile')
 
-    monkeypatch.setattr(estimator, '_ManagedNode', refused)
+    monkeypatch.setattr(node, '_ManagedNode', refused)
     with pytest.raises(ConfigError, match=r'^ROS: error creating node: no security libraries Please compile$'):
         estimator.run(['--ros-args'], {}, lambda text: None)

@@ -4,6 +4,7 @@
 
     slopes: end_force                # or ratio (the default)
     base_frame: base_link
+    frame_prefix: left_              # before the name of each frame
     links:
       - name: upper
         rig: upper.yaml              # a rig file, beside this file; without it the default rig
@@ -19,53 +20,91 @@ Lengths in m, angles in rad.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from psd_deflection.arms.chains.chain import Chain, ChainLink
+from psd_deflection.arms.chains.chain import SLOPES, Chain, ChainLink
 from psd_deflection.arms.chains.transform import Transform, of_position_and_angles
 from psd_deflection.base.errors import ConfigError, did_you_mean
 from psd_deflection.base.foreign_yaml import tree_of_file
 from psd_deflection.model.link.statics import LinkStatics
-from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import FRAME_PREFIX
 from psd_deflection.rig.parameter_files import flattened, read_parameter_file
+from psd_deflection.rig.parameters import Section, parameter
 
 MOST_LINKS = 32
 BASE_FRAME = 'base_link'
+T = TypeVar('T')
 LARGEST = 1000.0
 """Largest length, m, and angle, rad."""
 
-_NAME = re.compile(r'[a-z][a-z0-9_]{0,39}')
-_TOP = ('links', 'end_effector', 'slopes', 'base_frame')
-_OF_LINK = ('name', 'rig', 'port', 'parameters', 'mount', 'joint', 'slope_ratio_sd')
-_OF_PLACE = ('xyz', 'rpy')
-_OF_JOINT = ('name', 'axis', 'angle')
+_WITHIN: Mapping[str, Any] = {'minimum': -LARGEST, 'maximum': LARGEST}
+
+
+@dataclass(frozen=True, slots=True)
+class ChainSettings:
+    """What the file says of the chain as a whole; the node has it as ROS parameters."""
+
+    slopes: str = parameter(SLOPES[0], '', 'where the tilts of the tips come from', choices=SLOPES)
+    base_frame: str = parameter(BASE_FRAME, '', "name of the frame of the chain's base, without the prefix")
+    frame_prefix: str = parameter('', '', 'put before the name of each frame, to distinguish two chains')
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r'\w[\w/]{0,99}', self.base_frame):
+            raise ConfigError(f'base_frame = {self.base_frame!r}: must be the name of a frame')
+        if not re.fullmatch(r'[\w/]{0,100}', self.frame_prefix):
+            raise ConfigError(f'frame_prefix = {self.frame_prefix!r}: must be the begin of the name of a frame')
 
 
 @dataclass(frozen=True, slots=True)
 class Joint:
-    """The joint before a link: its ``name`` in joint states, '' if none tells it; ``angle``, rad, until one does."""
+    """The joint before a link. ``name``: in joint states, '' if none tells it; ``angle``: until one does."""
 
-    name: str = ''
-    angle: float = 0.0
+    name: str = parameter('', '', 'name of the joint in joint states')
+    axis: tuple[float, float, float] = parameter((0.0, 0.0, 1.0), '', 'in the mounted frame', **_WITHIN)
+    angle: float = parameter(0.0, 'rad', 'until joint states tell another', **_WITHIN)
+
+    def __post_init__(self) -> None:
+        if not any(self.axis):
+            raise ConfigError('axis: must not be zero')
+
+
+@dataclass(frozen=True, slots=True)
+class _LinkEntry:
+    name: str = parameter('', '', 'namespace of the topics, and with _ prefix of the frames')
+    rig: str = parameter('', '', 'rig file, beside the chain file; empty: the default rig')
+    port: str = parameter('', '', 'serial port; empty: that of the rig file, or a simulated rig')
+    slope_ratio_sd: float = parameter(0.0, '', 'standard deviation of the slope ratio', minimum=0.0, maximum=LARGEST)
+
+    def __post_init__(self) -> None:
+        if not re.fullmatch(r'[a-z][a-z0-9_]{0,39}', self.name):
+            raise ConfigError(f'name = {self.name!r}: must be a lower-case letter, then letters, digits and _')
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    xyz: tuple[float, float, float] = parameter((0.0, 0.0, 0.0), 'm', 'position', **_WITHIN)
+    rpy: tuple[float, float, float] = parameter((0.0, 0.0, 0.0), 'rad', 'roll, pitch and yaw', **_WITHIN)
+
+
+SETTINGS = Section(ChainSettings)
+_JOINT, _LINK, _PLACE = Section(Joint), Section(_LinkEntry), Section(_Place)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainFile:
-    """``rigs`` and ``joints`` in the order of the links of ``chain``; ``base_frame``: name of the chain's base."""
+    """``rigs`` and ``joints`` in the order of the links of ``chain``."""
 
     chain: Chain
     rigs: tuple[Rig, ...]
     joints: tuple[Joint, ...]
-    base_frame: str = BASE_FRAME
+    settings: ChainSettings = ChainSettings()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -77,6 +116,19 @@ class ChainFile:
         """Of the joints, as the file has them, rad."""
         return tuple(joint.angle for joint in self.joints)
 
+    @property
+    def base_frame(self) -> str:
+        """Name of the frame of the chain's base."""
+        return self.settings.frame_prefix + self.settings.base_frame
+
+    def with_settings(self, settings: ChainSettings) -> ChainFile:
+        """The same chain with other settings."""
+        chain = Chain(self.chain.links, self.chain.end, settings.slopes)
+        before = len(self.settings.frame_prefix)
+        prefixes = [settings.frame_prefix + rig.monitor.frame_prefix[before:] for rig in self.rigs]
+        rigs = [replace_values(rig, {FRAME_PREFIX: new}) for rig, new in zip(self.rigs, prefixes, strict=True)]
+        return replace(self, chain=chain, rigs=tuple(rigs), settings=settings)
+
 
 def read_chain(path: str | Path, given: Mapping[str, object] | None = None, slopes: str | None = None) -> ChainFile:
     """The chain in the file ``path``. Raises ConfigError.
@@ -84,89 +136,68 @@ def read_chain(path: str | Path, given: Mapping[str, object] | None = None, slop
     ``given``: parameters that every rig has. ``slopes``: instead of that of the file.
     """
     path = Path(path)
-    tree = _map_of(tree_of_file(path, 'chain file'), str(path), _TOP)
+    settings, tree = _read(SETTINGS, tree_of_file(path, 'chain file'), str(path), ('links', 'end_effector'))
     links = tree.get('links')
     if not isinstance(links, list) or not 1 <= len(links) <= MOST_LINKS:
         raise ConfigError(f'{path}: links: must be a list of 1 to {MOST_LINKS} links')
     read = [_link(path, number, entry, given or {}) for number, entry in enumerate(links, start=1)]
-    frame = tree.get('base_frame', BASE_FRAME)
-    if not isinstance(frame, str) or not re.fullmatch(r'\w[\w/]{0,99}', frame):
-        raise ConfigError(f'{path}: base_frame = {frame!r}: must be the name of a frame')
     end = _place(tree.get('end_effector', {}), f'{path}: end_effector')
     try:
-        chain = Chain([link for link, _, _ in read], end, slopes or tree.get('slopes', 'ratio'))
+        chain = Chain([link for link, _, _ in read], end, slopes or settings.slopes)
     except ConfigError as error:
         raise ConfigError(f'{path}: {error}') from None
-    return ChainFile(chain, tuple(rig for _, rig, _ in read), tuple(joint for _, _, joint in read), frame)
+    file = ChainFile(chain, tuple(rig for _, rig, _ in read), tuple(joint for _, _, joint in read))
+    return file.with_settings(replace(settings, slopes=chain.slopes))
 
 
 def _link(path: Path, number: int, entry: object, given: Mapping[str, object]) -> tuple[ChainLink, Rig, Joint]:
-    where = f'{path}: link {number}'
-    values = _map_of(entry, where, _OF_LINK)
-    name = values.get('name')
-    if not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise ConfigError(f'{where}: name = {name!r}: must be a lower-case letter, then letters, digits and _')
-    where = f'{path}: {name}'
-    rig = _rig(path, where, values, name, given)
-    joint = _map_of(values.get('joint', {}), f'{where}: joint', _OF_JOINT)
-    axis = _three(joint.get('axis', (0.0, 0.0, 1.0)), f'{where}: joint.axis')
-    length = float(np.linalg.norm(axis))
-    if not length:
-        raise ConfigError(f'{where}: joint.axis: must not be zero')
-    joint_name = joint.get('name', '')
-    if not isinstance(joint_name, str):
-        raise ConfigError(f'{where}: joint.name = {joint_name!r}: must be a text')
+    read, more = _read(_LINK, entry, f'{path}: link {number}', ('parameters', 'mount', 'joint'))
+    where = f'{path}: {read.name}'
+    rig = _rig(path, read, more.get('parameters', {}), given)
+    joint, _ = _read(_JOINT, more.get('joint', {}), f'{where}: joint')
+    axis = np.array(joint.axis)
     link = ChainLink(
-        name,
-        _place(values.get('mount', {}), f'{where}: mount'),
+        read.name,
+        _place(more.get('mount', {}), f'{where}: mount'),
         LinkStatics.from_rig(rig),
         rig.link.slope_ratio,
-        _number(values.get('slope_ratio_sd', 0.0), f'{where}: slope_ratio_sd', least=0.0),
-        axis / length,
+        read.slope_ratio_sd,
+        axis / float(np.linalg.norm(axis)),
     )
-    return link, rig, Joint(joint_name, _number(joint.get('angle', 0.0), f'{where}: joint.angle'))
+    return link, rig, joint
 
 
-def _rig(path: Path, where: str, values: Mapping[str, Any], name: str, given: Mapping[str, object]) -> Rig:
-    flat: dict[str, object] = {FRAME_PREFIX: f'{name}_'}
-    rig_file = values.get('rig')
-    if rig_file is not None:
-        if not isinstance(rig_file, str):
-            raise ConfigError(f'{where}: rig = {rig_file!r}: must be the name of a rig file')
-        flat |= read_parameter_file(path.parent / rig_file)
-    flat |= flattened(_map_of(values.get('parameters', {}), f'{where}: parameters'), where)
-    if values.get('port') is not None:
-        flat['port'] = values['port']
+def _rig(path: Path, link: _LinkEntry, parameters: object, given: Mapping[str, object]) -> Rig:
+    where = f'{path}: {link.name}'
+    flat: dict[str, object] = {FRAME_PREFIX: f'{link.name}_'}
+    if link.rig:
+        flat |= read_parameter_file(path.parent / link.rig)
+    flat |= flattened(_map_of(parameters, f'{where}: parameters'), where)
+    if link.port:
+        flat['port'] = link.port
     rig = rig_from_values({**flat, **given}, where)
     # Recordings that begin in the same second must not be of one name.
-    return replace_values(rig, {'bag_dir': str(Path(rig.acquisition.bag_dir) / name)}, where)
+    return replace_values(rig, {'bag_dir': str(Path(rig.acquisition.bag_dir) / link.name)}, where)
 
 
 def _place(value: object, where: str) -> Transform:
-    place = _map_of(value, where, _OF_PLACE)
-    zero = (0.0, 0.0, 0.0)
-    return of_position_and_angles(
-        _three(place.get('xyz', zero), f'{where}.xyz'), _three(place.get('rpy', zero), f'{where}.rpy')
-    )
+    place, _ = _read(_PLACE, value, where)
+    return of_position_and_angles(np.array(place.xyz), np.array(place.rpy))
+
+
+def _read(section: Section[T], value: object, where: str, others: tuple[str, ...] = ()) -> tuple[T, dict[str, Any]]:
+    """What ``section`` declares, and the ``others`` of the keys of a map."""
+    known = tuple(p.name for p in section.parameters.values())
+    tree = _map_of(value, where, (*known, *others))
+    # A key without a value is as good as none.
+    own = {name: tree[name] for name in known if tree.get(name) is not None}
+    return section.read(own, where), {name: tree[name] for name in others if name in tree}
 
 
 def _map_of(value: object, where: str, known: tuple[str, ...] = ()) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise ConfigError(f'{where}: must be a map' + (f' with keys of {", ".join(known)}' if known else ''))
     for key in value if known else ():
-        if known and key not in known:
+        if key not in known:
             raise ConfigError(f'{where}: unknown key {key!r}{did_you_mean(str(key), known)}')
     return value
-
-
-def _three(value: object, where: str) -> FloatArray:
-    if not isinstance(value, list | tuple) or len(value) != 3:
-        raise ConfigError(f'{where}: must be a list of three numbers')
-    return np.array([_number(number, where) for number in value])
-
-
-def _number(value: object, where: str, least: float = -LARGEST) -> float:
-    number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
-    if not least <= number <= LARGEST:
-        raise ConfigError(f'{where} = {value!r}: must be a number of {least:g} to {LARGEST:g}')
-    return number

@@ -33,7 +33,7 @@ from tqdm import tqdm
 from psd_deflection.base.errors import RecordingError, UsageError
 from psd_deflection.base.files import replace_file
 from psd_deflection.camera.answer import FrameAnswer, Status
-from psd_deflection.camera.footage import Footage, Frame, read_image, read_settings, read_values
+from psd_deflection.camera.footage import Footage, Frame, read_image, read_settings
 from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.preview import preview
@@ -41,6 +41,7 @@ from psd_deflection.camera.print_target import printed, sizes
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import TARGETS, CameraSettings
 from psd_deflection.camera.targets import target_of
+from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import FOREIGN, need_folder, picture_name, whole
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.recordings.write.csv_writer import CsvReferenceFile
@@ -88,11 +89,10 @@ def _node(args: argparse.Namespace) -> int:
         raise UsageError('IN is missing: a video, a folder of images or a device; without IN it is a ROS node')
     from psd_deflection.ros.camera import run_camera
 
-    values = {} if args.params_file is None else read_values(args.params_file)
+    settings = read_settings(args.params_file)
     if args.target is not None:
-        values['target.kind'] = args.target
-    run_camera(args.ros_arguments, values, show)
-    return 0
+        settings = settings.of_kind(args.target)
+    return run_camera(args.ros_arguments, settings, Display().say)
 
 
 def _print_target(args: argparse.Namespace, settings: CameraSettings) -> int:
