@@ -22,7 +22,7 @@ The answers of check, identify, validate, calibrate and budget are :class:`psd_d
 ``sentences()`` for a person, ``tree()`` for a program, ``report()`` is the page, ``save(folder)`` writes what the
 command writes.
 
-SI units everywhere. What is refused raises a subclass of ``psd_deflection.base.errors.PsdDeflectionError``: one line
+SI units everywhere. What is refused raises a subclass of ``psd_deflection.errors.PsdDeflectionError``: one line
 with the file or argument, the value and its bound. The command ``psd-deflection`` does the same from a shell, and more.
 """
 
@@ -31,6 +31,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    import types
     from collections.abc import Mapping, Sequence
     from pathlib import Path
 
@@ -66,6 +67,16 @@ __all__ = [
     'validate',
 ]
 
+
+def __getattr__(name: str) -> types.ModuleType:
+    """``psd_deflection.errors``: what is raised."""
+    if name == 'errors':
+        from psd_deflection.base import errors
+
+        return errors
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+
 # Every function imports what it needs when it is called, to keep `import psd_deflection` fast.
 
 
@@ -97,7 +108,8 @@ def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str 
 
     ``dots``: (2P,) or (n, 2P) of P PSDs: x1, y1, x2, y2 ... from each PSD's centre, m. ``rig``: the rig or its
     parameter file; by default the thesis rig. ``solver``: by default that of the rig;
-    :mod:`psd_deflection.model.solvers` has their names.
+    :mod:`psd_deflection.model.solvers` has their names. A dot farther from the centre than the width of its detector
+    is refused.
 
     The result has ``pose`` (dX m, dY m, theta rad), ``tilt`` (phi, omega, rad), ``covariance`` of the pose (for means
     of one block, with the rig's noise), ``residual`` (m) and ``status`` (0: solved), each for one block or for n.
@@ -125,6 +137,14 @@ def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str 
     bad = np.argwhere(~np.isfinite(rows))
     if len(bad):
         raise ConfigError(f'dots{bad[0].tolist()} = {rows[tuple(bad[0])]} m: must be finite')
+    # A dot off the detector cannot be read: most likely it is in other units.
+    widths = np.array([side for psd in known.psds for side in psd.active_area])
+    bad = np.argwhere(np.abs(rows) > widths)
+    if len(bad):
+        at = tuple(bad[0])
+        raise ConfigError(
+            f'dots{bad[0].tolist()} = {rows[at]:g} m: must be at most {widths[at[-1]]:g} m, the width of its detector'
+        )
     method = solver_from_rig(known.estimator.solver if solver is None else solver, known)
     found = method.solve_many(np.atleast_2d(rows), dot_noise_variances(known) / known.estimator.block_size)
     if rows.ndim == 2:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import html
 import importlib.util
 import json
+import pickle
 import pydoc
 import subprocess
 import sys
@@ -306,6 +308,41 @@ def test_every_study_can_be_asked_from_python(tmp_path: Path) -> None:
         assert html.escape(first) in files['report.html'].read_text()
     assert answers['check.json'].sentences() == ['RIGHT: of 128 wirings only that of the rig file fits.']
     assert psd_deflection.load_rig(tmp_path / 'calibrate' / 'rig.yaml').link.length == 0.585
+
+
+def test_a_dot_off_its_detector_is_refused() -> None:
+    assert psd_deflection.solve([0.0, -9.9e-3, 0.0, -9.9e-3]).status == 0
+    with pytest.raises(ConfigError, match=r'dots\[1\] = -1 m: must be at most 0.01 m, the width of its detector'):
+        psd_deflection.solve([0.0, -1.0, 0.0, -2.0])  # mm for m
+
+
+def test_errors_are_an_attribute_of_the_package() -> None:
+    script = 'import psd_deflection; print(psd_deflection.errors.ConfigError.exit_status)'
+    said = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True, check=True).stdout
+    assert int(said) == ConfigError.exit_status
+
+
+@pytest.mark.parametrize(
+    'name',
+    sorted(
+        path.name for path in (ROOT / 'config').glob('*.yaml') if path.name in ('thesis_rig.yaml', 'three_psds.yaml')
+    ),
+)
+def test_a_rig_can_be_sent_to_another_process_and_copied(name: str) -> None:
+    rig = psd_deflection.load_rig(ROOT / 'config' / name)
+    for other in (pickle.loads(pickle.dumps(rig)), copy.deepcopy(rig), copy.copy(rig)):  # noqa: S301
+        assert other == rig
+        assert other.flat() == rig.flat()
+
+
+def test_a_rig_is_varied_by_replace() -> None:
+    rig = psd_deflection.load_rig(block_size=10, **{'psd_3.center': [0.05, 0.05]})
+    longer = rig.replace(link={'length': 1.0}, **{'psd_1.height': 0.002})
+    assert (longer.link.length, longer.psds[0].height, longer.estimator.block_size) == (1.0, 0.002, 10)
+    assert rig.link.length == 0.585
+    assert len(longer.psds) == 3
+    with pytest.raises(ConfigError, match=r'replace: link.lenght = 1.0: no parameter of that name'):
+        rig.replace(link={'lenght': 1.0})
 
 
 @pytest.mark.repeatable

@@ -7,7 +7,7 @@ rclpy; :func:`load_rig` has them from a parameter file.
 from __future__ import annotations
 
 import operator
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -49,7 +49,7 @@ from psd_deflection.rig.declarations import (
     MonitorConfig,
     PsdConfig,
 )
-from psd_deflection.rig.parameter_files import EFFECTS_PREFIX, read_parameter_file
+from psd_deflection.rig.parameter_files import EFFECTS_PREFIX, flattened, read_parameter_file
 from psd_deflection.rig.parameters import Parameter, Section, Value, check_value, shown
 
 _ORDERED = (
@@ -95,6 +95,18 @@ class Rig:
                 for name, value in flat.items()
             ),
         )
+
+    def __reduce__(self) -> tuple[Callable[..., Rig], tuple[dict[str, object]]]:
+        """Pickles and copies are made of the flat values."""
+        return rig_from_values, (self.flat(),)
+
+    def replace(self, **changes: object) -> Rig:
+        """The same rig with some values changed: ``rig.replace(link={'length': 1.0}, block_size=10)``.
+
+        ``changes``: with dots or as maps, as for :func:`psd_deflection.load_rig`. Raises ConfigError, which names
+        parameter, value and bound.
+        """
+        return replace_values(self, flattened(changes, 'replace'), 'replace')
 
     def flat(self) -> dict[str, object]:
         """All values under their flat names, including simulated effects; :func:`rig_from_values` reads them."""
