@@ -75,13 +75,19 @@ class CameraNode(BaseNode):
         }
         newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         image = self.node.resolve_topic_name('image')
-        for topic, kind, check, take in (
-            (image, 'sensor_msgs/msg/Image', _image_fault, self._image),
-            (self._beside('image/compressed', f'{image}/compressed'), *_COMPRESSED, self._compressed),
-            # As image_transport has it: the camera's information is beside its images.
-            (self._beside('camera_info', image.rpartition('/')[0] + '/camera_info'), *_INFO, self._take_info),
+        for topic, name, take in (
+            (image, 'sensor_msgs/msg/Image', self._image),
+            (
+                self._beside('image/compressed', f'{image}/compressed'),
+                'sensor_msgs/msg/CompressedImage',
+                self._compressed,
+            ),
         ):
-            self.gate.listen(message_class(kind), topic, check, take, newest, MOST_IMAGE_BYTES)
+            self.gate.listen(message_class(name), topic, _image_fault, take, newest, MOST_IMAGE_BYTES)
+        # As image_transport has it: the camera's information is beside its images.
+        info = self._beside('camera_info', image.rpartition('/')[0] + '/camera_info')
+        kind = message_class('sensor_msgs/msg/CameraInfo')
+        self.gate.listen(kind, info, _info_fault, self._take_info, newest)
         topics = ', '.join(publisher.topic_name for publisher in self._out.values())
         self.log(f'waiting for images on {image}; publishing {topics}')
 
@@ -184,10 +190,6 @@ def _info_fault(message: Any) -> str:
     numbers = (*message.k, *message.d)
     good = all(abs(number) <= LARGEST_NUMBER for number in numbers) and len(message.d) <= MOST_DISTORTIONS
     return '' if good else 'no camera has such a matrix or distortion'
-
-
-_COMPRESSED = 'sensor_msgs/msg/CompressedImage', _image_fault
-_INFO = 'sensor_msgs/msg/CameraInfo', _info_fault
 
 
 def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Callable[[str], None]) -> int:

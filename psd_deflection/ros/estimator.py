@@ -104,7 +104,7 @@ class EstimatorNode(BaseNode):
         """Open the port and let samples flow; nothing is published yet."""
         node, rig, unzeroed = self.node.get_fully_qualified_name(), self._live.rig, self._live.unzeroed
         self._wire.offer(topics_of(rig))
-        self._inputs.listen(subscribed(rig))
+        self._inputs.offer(subscribed(rig))
         session = self._signals.interruptible(lambda: Session(rig, self.log, node, unzeroed))
         self.session = session
         try:

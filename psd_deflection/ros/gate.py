@@ -11,8 +11,9 @@ from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
@@ -26,20 +27,20 @@ NEWS = 3
 """Refusals of a topic that are said one by one, before they are counted and said together."""
 MOST_BYTES = 1_000_000
 """Maximum size of a message, unless the topic has its own; those of a robot's joints have some hundred bytes."""
-MOST_A_SECOND = 5000
+MOST_A_SECOND = 2000
 """Messages of one topic that are looked at within a second."""
 FAILURES = (PsdDeflectionError, ArithmeticError, ValueError, LookupError, TypeError, AttributeError)
 """What a message of a strange content can cause; scipy's and numpy's errors of linear algebra are ValueErrors."""
 
 
 class InputGate:
-    """Subscriptions of ``node``. ``say`` gets the refusals.
+    """Subscriptions of ``node``. ``say`` gets the refusals. ``clock``: monotonic, s.
 
     ``refused``: messages by topic; ``why``: the last reason of each.
     """
 
-    def __init__(self, node: Node, say: Callable[[str], None]) -> None:
-        self._node = node
+    def __init__(self, node: Node, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+        self._node, self._clock = node, clock
         self._repeats = Repeats(say)
         self.refused: Counter[str] = Counter()
         self.why: dict[str, str] = {}
@@ -55,41 +56,68 @@ class InputGate:
     ) -> Subscription:
         """Subscribe to ``topic``: ``take`` gets each message that ``check`` finds nothing wrong with.
 
-        ``kind``: its class. Raises ConfigError for a QoS override that ROS does not take.
+        ``kind``: its class. A publisher whose messages cannot come, because they have to be reliable, counts as a
+        refusal. Raises ConfigError for a QoS override that ROS does not take.
         """
         rate = _Rate()
 
         def heard(encoded: bytes) -> None:
-            if len(encoded) > most_bytes:
-                why = f'{len(encoded)} bytes: must be at most {most_bytes}'
-            elif not rate.allows(time.monotonic()):
-                why = f'more than {MOST_A_SECOND} messages a second'
-            else:
-                why = _carried_out(kind, encoded, check, take)
+            why = self._let_in(encoded, most_bytes, rate) or self._carry_out(kind, encoded, check, take)
             if why:
-                self._refuse(topic, why)
+                self.refuse(topic, why)
 
-        options = QoSOverridingOptions.with_default_policies()
+        def hidden(event: Any) -> None:
+            if event.last_policy_kind == QoSPolicyKind.RELIABILITY:
+                self.refuse(topic, 'a publisher is best effort, and this has to be reliable: none of its messages come')
+
         try:
             return self._node.create_subscription(
-                kind, topic, heard, delivery, raw=True, qos_overriding_options=options
+                kind,
+                topic,
+                heard,
+                delivery,
+                raw=True,
+                event_callbacks=SubscriptionEventCallbacks(incompatible_qos=hidden),
+                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
             )
         except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
             raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
 
-    def _refuse(self, topic: str, why: str) -> None:
+    def unpack(self, kind: Any, encoded: bytes) -> Any:
+        """The message that check and take get."""
+        return deserialize_message(encoded, kind)
+
+    def refuse(self, topic: str, why: str) -> None:
+        """Count a message and say why it is refused."""
         self.refused[topic] += 1
         self.why[topic] = printable(why, LONGEST)
         line = Warned(f'{topic}: refused: {self.why[topic]}')
-        self._repeats.tell(topic, line, time.monotonic(), NEWS)
+        self._repeats.tell(topic, line, self._clock(), NEWS)
 
     def settle(self) -> None:
         """Say what was counted and is due; to be called now and then."""
-        self._repeats.settle(time.monotonic())
+        self._repeats.settle(self._clock())
 
     def values(self) -> list[tuple[str, str]]:
         """For the node's diagnostics."""
         return [(f'messages refused: {topic}', str(count)) for topic, count in sorted(self.refused.items())]
+
+    def _let_in(self, encoded: bytes, most_bytes: int, rate: _Rate) -> str:
+        """Why a message is not even unpacked, or ''."""
+        if len(encoded) > most_bytes:
+            return f'{len(encoded)} bytes: must be at most {most_bytes}'
+        return '' if rate.allows(self._clock()) else f'more than {MOST_A_SECOND} messages a second'
+
+    def _carry_out(self, kind: Any, encoded: bytes, check: Callable[[Any], str], take: Callable[[Any], None]) -> str:
+        """Take the message, or give the reason why not."""
+        try:
+            message = self.unpack(kind, encoded)
+            why = check(message)
+            if not why:
+                take(message)
+        except FAILURES as error:
+            return f'{type(error).__name__}: {error}'
+        return why
 
 
 class _Rate:
@@ -104,15 +132,3 @@ class _Rate:
             self._since, self._count = now_s, 0
         self._count += 1
         return self._count <= MOST_A_SECOND
-
-
-def _carried_out(kind: Any, encoded: bytes, check: Callable[[Any], str], take: Callable[[Any], None]) -> str:
-    """Take the message, or give the reason why not."""
-    try:
-        message = deserialize_message(encoded, kind)
-        why = check(message)
-        if not why:
-            take(message)
-    except FAILURES as error:
-        return f'{type(error).__name__}: {error}'
-    return why

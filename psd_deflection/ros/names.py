@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from msg_adapters import INPUTS, LATCHED, SAMPLES
+from msg_adapters import INPUTS, LATCHED, LOAD, SAMPLES
 from psd_deflection.records import MOST_PSDS
 
 
@@ -35,6 +35,8 @@ _DELIVERY: Mapping[str, Delivery] = {
     MARKERS_AT_REST: _LATCHED,
     **dict.fromkeys(LATCHED, _LATCHED),
     **{topic: Delivery(_SAMPLES_DEPTH, reliable=False) for topic in INPUTS},
+    # It holds until the next: a lost message would be a wrong label of all that follows.
+    LOAD: Delivery(_SAMPLES_DEPTH),
 }
 
 

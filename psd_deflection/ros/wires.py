@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node
@@ -20,6 +21,8 @@ from msg_adapters import (
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, SampleBlock, TemperatureReading
 from psd_deflection.rig.config import Rig
+from psd_deflection.ros.gate import InputGate
+from psd_deflection.ros.inputs import input_fault
 from psd_deflection.ros.names import VOLTS, delivery
 from psd_deflection.run.fanout import published
 from psd_deflection.run.session import Session
@@ -108,42 +111,50 @@ class VoltsPublisher:
                     self._wire.put(topic, vector3_stamped.MESSAGE.name, self._encode(fields), t_ns)
 
 
-class InputRecorder:
-    """Gives the session what other nodes say, as it arrives.
+class InputRecorder(InputGate):
+    """Gives the session what other nodes say, as it arrives and if it can be used.
 
-    ``session``: the one that takes it, or None. A message that is too long for its type is refused, so that another
-    node cannot fill the disk. ``below``: as of :class:`PublisherWire`.
+    ``session``: the one that takes it, or None. It counts and says what is refused. ``below``: as of
+    :class:`PublisherWire`.
     """
 
     def __init__(self, node: Node, topics: Iterable[str], below: str = '') -> None:
+        super().__init__(node, lambda line: None)
         self.session: Session | None = None
-        self._node = node
         self._below = below
         self._subscriptions: dict[str, Subscription] = {}
-        self.listen(topics)
+        self.offer(topics)
 
-    def listen(self, topics: Iterable[str]) -> None:
+    def offer(self, topics: Iterable[str]) -> None:
         """Subscribe to exactly these topics from now on. Only while no session runs."""
         topics = tuple(topics)
         for topic in [t for t in self._subscriptions if t not in topics]:
             self._node.destroy_subscription(self._subscriptions.pop(topic))
         for topic in [t for t in topics if t not in self._subscriptions]:
-            self._subscriptions[topic] = self._node.create_subscription(
-                message_class(TOPIC_TYPES[topic]),
-                relative(topic, self._below),
-                lambda message, topic=topic: self._received(topic, message),
-                qos(topic),
-                raw=True,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-            )
+            kind, name = message_class(TOPIC_TYPES[topic]), relative(topic, self._below)
+            check, take = partial(self._fault, topic), partial(self._take, topic)
+            self._subscriptions[topic] = self.listen(kind, name, check, take, qos(topic), MAX_INPUT_BYTES)
 
-    def _received(self, topic: str, message: bytes) -> None:
+    def unpack(self, kind: Any, encoded: bytes) -> bytes:
+        """The message as it came: the session records these bytes."""
+        return bytes(encoded)
+
+    def refuse(self, topic: str, why: str) -> None:
+        """Let the session count it and say why."""
+        if self.session is not None:
+            self.session.refuse_input('/' + topic.removeprefix(self._below).removeprefix('/'), why)
+
+    def _fault(self, topic: str, message: bytes) -> str:
+        session = self.session
+        if session is None:
+            return ''
+        fields = cdr.decode(TOPIC_TYPES[topic], message)
+        return input_fault(topic, fields, session.rig, session.acquisition.now_ns())
+
+    def _take(self, topic: str, message: bytes) -> None:
         if self.session is None:
             return
-        if len(message) > MAX_INPUT_BYTES:
-            self.session.refuse_input(topic, f'{len(message)} bytes: must be at most {MAX_INPUT_BYTES}')
-            return
-        record = self.session.take_input(topic, bytes(message))
+        record = self.session.take_input(topic, message)
         if isinstance(record, TemperatureReading):
             try:
                 self.session.temperature(record.celsius)

@@ -469,7 +469,7 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
             return str(json.load(answer)['message'])
 
     def known() -> bool:
-        # Best effort, and matched on this side only at first: it may be lost.
+        # Matched on this side only at first: it may be lost.
         weights.publish(hung)
         return 'Fy -10 N' in noted(0.0)
 

@@ -1,0 +1,116 @@
+"""The gate: what is bounded before it is unpacked, and who is told that his messages do not come."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.ros
+rclpy = pytest.importorskip('rclpy')
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
+
+from msg_adapters import INPUTS, LOAD  # noqa: E402
+from psd_deflection.base.errors import Warned  # noqa: E402
+from psd_deflection.ros.gate import MOST_A_SECOND, InputGate  # noqa: E402
+from psd_deflection.ros.wires import qos  # noqa: E402
+
+TOPIC = '/said'
+
+
+class Gated:
+    """A gate on a node of the peer's own executor."""
+
+    def __init__(self, peer: Any) -> None:
+        self.said: list[str] = []
+        self.heard: list[str] = []
+        self.node = rclpy.create_node('gated', context=peer.context)
+        peer.executor.add_node(self.node)
+        self.now = 100.0
+        self.gate = InputGate(self.node, self.said.append, lambda: self.now)
+
+    def listen(self, delivery: Any = 50, **more: Any) -> None:
+        self.gate.listen(
+            String,
+            TOPIC,
+            lambda message: 'empty' if not message.data else '',
+            lambda message: self.heard.append(message.data),
+            delivery,
+            **more,
+        )
+
+
+@pytest.fixture
+def gated(peer: Any) -> Iterator[Gated]:
+    one = Gated(peer)
+    yield one
+    peer.executor.remove_node(one.node)
+    one.node.destroy_node()
+
+
+def sender(peer: Any, delivery: Any = 50) -> Any:
+    publisher = peer.node.create_publisher(String, TOPIC, delivery)
+    peer.until(lambda: peer.node.count_subscribers(TOPIC) > 0, 'the gate')
+    return publisher
+
+
+def test_good_ones_are_taken_and_others_counted_and_said(peer: Any, gated: Gated) -> None:
+    gated.listen(most_bytes=1000)
+    publisher = sender(peer)
+
+    def sent() -> bool:
+        for text in ('good', '', 'x' * 2000):
+            publisher.publish(String(data=text))
+        return bool(gated.heard) and gated.gate.refused[TOPIC] >= 2
+
+    peer.until(sent, 'the messages')
+    assert set(gated.heard) == {'good'}
+    assert {str(line) for line in gated.said} == {
+        f'{TOPIC}: refused: empty',
+        f'{TOPIC}: refused: 2009 bytes: must be at most 1000',
+    }
+    assert all(isinstance(line, Warned) for line in gated.said)
+    assert gated.gate.values() == [(f'messages refused: {TOPIC}', str(gated.gate.refused[TOPIC]))]
+
+
+def test_a_text_that_is_no_text_ends_nothing(peer: Any, gated: Gated) -> None:
+    gated.listen()
+    publisher = sender(peer)
+    # CDR, little-endian: a string of two bytes and a zero that are no UTF-8.
+    wrong = b'\x00\x01\x00\x00\x03\x00\x00\x00\xff\xfe\x00'
+
+    def sent() -> bool:
+        publisher.publish(wrong)
+        publisher.publish(String(data='good'))
+        return bool(gated.heard) and (gated.gate.refused[TOPIC] > 0 or len(gated.heard) > 20)
+
+    peer.until(sent, 'the good one')
+    assert 'good' in gated.heard
+
+
+def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> None:
+    gated.listen()
+    publisher = sender(peer)
+
+    def flooded() -> bool:
+        for _ in range(20):
+            publisher.publish(String(data='x'))
+        return gated.gate.refused[TOPIC] > 0
+
+    peer.until(flooded, 'the end of the flood')
+    assert len(gated.heard) == MOST_A_SECOND
+    assert gated.gate.why[TOPIC] == f'more than {MOST_A_SECOND} messages a second'
+    gated.now += 1.0
+    peer.until(lambda: not flooded() or len(gated.heard) > MOST_A_SECOND, 'the next second')
+
+
+def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(peer: Any, gated: Gated) -> None:
+    """It holds until the next: a lost one would be a wrong label of all that follows."""
+    assert [topic for topic in INPUTS if qos(topic).reliability is ReliabilityPolicy.RELIABLE] == [LOAD]
+    gated.listen(qos(LOAD))
+    peer.node.create_publisher(String, TOPIC, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+    peer.until(lambda: gated.gate.refused[TOPIC] > 0, 'the publisher that is best effort')
+    assert 'a publisher is best effort, and this has to be reliable' in gated.said[0]

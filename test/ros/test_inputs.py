@@ -1,0 +1,118 @@
+"""Which messages of other nodes a session takes, and why it does not take the others."""
+
+from __future__ import annotations
+
+import copy
+import math
+from typing import Any
+
+import pytest
+
+from msg_adapters import ACCELERATION, LOAD, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE, TOPICS
+from psd_deflection.records import AppliedLoad, BaseAcceleration, ReferencePose, TemperatureReading
+from psd_deflection.rig.config import rig_from_values
+from psd_deflection.ros.inputs import input_fault
+
+NOW_NS = 1_700_000_000_000_000_000
+RECORDS: dict[str, Any] = {
+    LOAD: AppliedLoad(t_ns=NOW_NS, fx=3.0, fy=-4.0, tz=0.5),
+    REFERENCE: ReferencePose(t_ns=NOW_NS, dx=1e-3, dy=2e-3, theta=0.1),
+    TEMPERATURE: TemperatureReading(t_ns=NOW_NS, celsius=21.0),
+    ACCELERATION: BaseAcceleration(t_ns=NOW_NS, linear=(0.0, 1.0, 0.0), angular=(0.0, 0.0, 2.0)),
+}
+
+
+def fields_of(topic: str) -> Any:
+    declared = {t.name: t for t in TOPICS}
+    if topic == REFERENCE_WITH_COVARIANCE:
+        inner = copy.deepcopy(fields_of(REFERENCE))
+        return {'header': inner['header'], 'pose': {'pose': inner['pose'], 'covariance': [0.0] * 36}}
+    return copy.deepcopy(declared[topic].fields(RECORDS[topic]))
+
+
+def fault(topic: str, changes: dict[str, Any], **rig: Any) -> str:
+    """Of the good message of ``topic`` with ``changes`` by dotted names."""
+    fields = fields_of(topic)
+    for name, value in changes.items():
+        *way, last = name.split('.')
+        holder = fields
+        for key in way:
+            holder = holder[key]
+        holder[last] = value
+    return input_fault(topic, fields, rig_from_values(rig), NOW_NS)
+
+
+@pytest.mark.parametrize('topic', [*RECORDS, REFERENCE_WITH_COVARIANCE])
+def test_what_our_own_nodes_send_is_taken(topic: str) -> None:
+    assert fault(topic, {}) == ''
+
+
+@pytest.mark.parametrize('topic', [LOAD, REFERENCE, REFERENCE_WITH_COVARIANCE])
+def test_the_frame_is_that_of_this_rig_at_rest_or_not_said(topic: str) -> None:
+    assert fault(topic, {'header.frame_id': ''}) == ''
+    assert fault(topic, {'header.frame_id': 'left_link_tip_rest'}, frame_prefix='left_') == ''
+    assert fault(topic, {'header.frame_id': 'link_tip_rest'}, frame_prefix='left_') != ''
+    for other in ('tool0', 'world', 'link_tip', 'xlink_tip_rest'):
+        assert fault(topic, {'header.frame_id': other}) == f"frame_id '{other}': must be link_tip_rest"
+
+
+def test_an_acceleration_says_its_frame() -> None:
+    assert fault(ACCELERATION, {'header.frame_id': ''}) == "frame_id '': must be link_base"
+    assert fault(ACCELERATION, {'header.frame_id': 'a_link_base'}) != ''
+    assert fault(ACCELERATION, {'header.frame_id': 'a_link_base'}, frame_prefix='a_') == ''
+
+
+@pytest.mark.parametrize('part', ['force.z', 'torque.x', 'torque.y'])
+def test_a_component_that_cannot_be_used_is_refused(part: str) -> None:
+    said = fault(LOAD, {f'wrench.{part}': 50.0})
+    assert said == f'{part.replace(".", " ")} = 50: cannot be used, only force x, force y and torque z can'
+    assert fault(LOAD, {f'wrench.{part}': -0.0}) == ''
+
+
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, 1e300, -1e300])
+@pytest.mark.parametrize(
+    ('topic', 'name'),
+    [
+        (LOAD, 'wrench.force.x'),
+        (LOAD, 'wrench.torque.z'),
+        (REFERENCE, 'pose.position.y'),
+        (REFERENCE, 'pose.orientation.w'),
+        (REFERENCE_WITH_COVARIANCE, 'pose.pose.position.x'),
+        (TEMPERATURE, 'temperature'),
+        (ACCELERATION, 'accel.linear.z'),
+        (ACCELERATION, 'accel.angular.x'),
+    ],
+)
+def test_numbers_that_cannot_be_are_refused(topic: str, name: str, value: float) -> None:
+    assert fault(topic, {name: value}) != ''
+
+
+def test_a_reference_is_within_reach_of_the_link() -> None:
+    assert fault(REFERENCE, {'pose.position.x': 0.5}) == ''
+    assert (
+        fault(REFERENCE, {'pose.position.x': 1.5}) == 'a tip 1.5 m away: must be finite and at most the length, 0.585 m'
+    )
+
+
+def test_kelvin_is_no_celsius() -> None:
+    assert fault(TEMPERATURE, {'temperature': 293.15}) == '293.15 °C: must be -100 to 200'
+
+
+@pytest.mark.parametrize('topic', [*RECORDS, REFERENCE_WITH_COVARIANCE])
+def test_a_stamp_that_is_no_time_is_refused(topic: str) -> None:
+    for stamp in ({'sec': -(2**31), 'nanosec': 0}, {'sec': 5, 'nanosec': 2_000_000_000}):
+        assert 'is no time' in fault(topic, {'header.stamp': stamp})
+
+
+@pytest.mark.parametrize('topic', [LOAD, TEMPERATURE, ACCELERATION])
+def test_a_stamp_of_another_clock_is_refused_but_that_of_a_reference(topic: str) -> None:
+    seconds = NOW_NS // 10**9
+    for away, refused in ((0, False), (50, False), (-50, False), (70, True), (-70, True), (2**31 - 1 - seconds, True)):
+        stamp = {'sec': seconds + away, 'nanosec': 0}
+        assert bool(fault(topic, {'header.stamp': stamp})) == refused, away
+        # Its offset is found afterwards, from the motion.
+        assert fault(REFERENCE, {'header.stamp': stamp}) == ''
+
+
+def test_no_stamp_is_now() -> None:
+    assert fault(LOAD, {'header.stamp': {'sec': 0, 'nanosec': 0}}) == ''
