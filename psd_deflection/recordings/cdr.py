@@ -3,8 +3,8 @@
 The node publishes and the recorder writes the same bytes (XCDR1, little-endian, header
 ``00 01 00 00``), so a message is encoded once. The encoders are made from the message definitions.
 Seven of a block's eight messages consist of a header and numbers: they are packed in one step, and
-:func:`numbers` reads them in one step. ``mcap_ros2`` decodes all others, and
-``clouds`` the samples.
+:func:`numbers` reads them in one step. The decoders of all others are made from the definitions too;
+``clouds`` reads the samples.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from functools import cache
 from operator import itemgetter
 from typing import Any
 
-from mcap.records import Schema
-from mcap_ros2.decoder import DecoderFactory
-
 from msg_adapters import MESSAGE_TYPES
 from msg_adapters.message_type import Constant, MessageType
 
 Encoder = Callable[[Mapping[str, Any]], bytes]
 _Writer = Callable[[bytearray, Any], None]
+_Reader = Callable[[bytes, int, str], tuple[Any, int]]
+"""Of the bytes behind the encapsulation, an offset and the byte order (< or >): the value, and the offset behind it."""
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'
 LITTLE = b'\x00\x01'
@@ -194,11 +193,92 @@ def _taker(names: list[str]) -> Callable[[Any], Iterable[float]]:
     return itemgetter(*names) if len(names) > 1 else lambda part: (part[names[0]],)
 
 
+def _reader(message: MessageType, kind: str) -> _Reader:
+    """A function that reads a ``kind`` (a type or an array of one) from behind the encapsulation; '' is the message."""
+    array = _ARRAY.fullmatch(kind)
+    if array is not None:
+        return _array_reader(message, array[1], array[2])
+    if kind == 'string':
+        return _read_text
+    if kind in _FORMATS:
+        numbers = _numbers_reader(kind)
+
+        def read_number(body: bytes, at: int, order: str) -> tuple[Any, int]:
+            (value,), at = numbers(body, at, order, 1)
+            return value, at
+
+        return read_number
+    fields = [(name, _reader(message, inner)) for inner, name in message.members(kind)]
+    if not fields:
+        raise KeyError(f'{message.name}: {kind} is not defined')
+
+    def read_fields(body: bytes, at: int, order: str) -> tuple[Any, int]:
+        found = {}
+        for name, read in fields:
+            found[name], at = read(body, at, order)
+        return found, at
+
+    return read_fields
+
+
+def _numbers_reader(kind: str) -> Callable[[bytes, int, str, int], tuple[tuple[Any, ...], int]]:
+    form = _FORMATS[kind]
+    size = struct.calcsize(f'<{form}')
+
+    def read_numbers(body: bytes, at: int, order: str, count: int) -> tuple[tuple[Any, ...], int]:
+        if not count:
+            return (), at
+        at += -at % size
+        return struct.unpack_from(f'{order}{count}{form}', body, at), at + count * size
+
+    return read_numbers
+
+
+def _read_size(body: bytes, at: int, order: str) -> tuple[int, int]:
+    at += -at % 4
+    (size,) = (_U32 if order == '<' else _U32_BIG).unpack_from(body, at)
+    return size, at + 4
+
+
+def _read_bytes(body: bytes, at: int, size: int) -> tuple[bytes, int]:
+    if size > len(body) - at:
+        raise ValueError(f'{size} bytes at byte {at} of {len(body)}')
+    return body[at : at + size], at + size
+
+
+def _read_text(body: bytes, at: int, order: str) -> tuple[str, int]:
+    size, at = _read_size(body, at, order)
+    # With its terminating zero; some write no byte for an empty text.
+    encoded, at = _read_bytes(body, at, size)
+    return encoded[:-1].decode(), at
+
+
+def _array_reader(message: MessageType, kind: str, length: str) -> _Reader:
+    """``length``: number of elements of a fixed array, else ''."""
+    numbers = _numbers_reader(kind) if kind in _FORMATS else None
+    read_one = None if numbers is not None else _reader(message, kind)
+
+    def read(body: bytes, at: int, order: str) -> tuple[Any, int]:
+        count, at = (int(length), at) if length else _read_size(body, at, order)
+        if kind in ('uint8', 'byte'):
+            return _read_bytes(body, at, count)
+        if count > len(body) - at:
+            raise ValueError(f'{count} elements at byte {at} of {len(body)}')
+        if numbers is not None:
+            values, at = numbers(body, at, order, count)
+            return list(values), at
+        found = []
+        for _ in range(count):
+            one, at = read_one(body, at, order)  # type: ignore[misc]
+            found.append(one)
+        return found, at
+
+    return read
+
+
 @cache
-def _decoder(type_name: str) -> Callable[[bytes], Any]:
-    schema = Schema(id=1, name=type_name, encoding='ros2msg', data=MESSAGE_TYPES[type_name].definition.encode())
-    decoder: Callable[[bytes], Any] = DecoderFactory().decoder_for('cdr', schema)
-    return decoder
+def _decoder(type_name: str) -> _Reader:
+    return _reader(MESSAGE_TYPES[type_name], '')
 
 
 @cache
@@ -225,13 +305,15 @@ def decode(type_name: str, cdr: bytes) -> dict[str, Any]:
 
     Raises ValueError if the bytes are not a message of that type.
     """
+    read = _decoder(type_name)
+    if len(cdr) < len(_ENCAPSULATION):
+        raise ValueError(f'not a {type_name} ({len(cdr)} bytes)')
     try:
-        fields: dict[str, Any] = _plain(_decoder(type_name)(cdr))
-    except KeyError:
-        raise
-    except Exception as error:  # the decoder lets struct, index and unicode errors through
+        fields, _ = read(cdr[len(_ENCAPSULATION) :], 0, '<' if cdr[1] & 1 else '>')
+    except (struct.error, ValueError) as error:
         raise ValueError(f'not a {type_name} ({error})') from None
-    return fields
+    decoded: dict[str, Any] = fields
+    return decoded
 
 
 def numbers(type_name: str, cdr: bytes) -> tuple[int, tuple[float, ...]]:
@@ -265,12 +347,3 @@ def u32(cdr: bytes, at: int) -> int:
 def after_text(cdr: bytes, at: int) -> int:
     """Offset of a number of four bytes that follows the text at the offset ``at``. Raises struct.error."""
     return at + 4 + (u32(cdr, at) + 3) // 4 * 4
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, list):
-        return [_plain(v) for v in value]
-    names = getattr(value, '__slots__', None)
-    if names is None:
-        return value
-    return {name: _plain(getattr(value, name)) for name in names}

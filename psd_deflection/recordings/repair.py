@@ -10,19 +10,19 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-
-from mcap.records import Channel, McapRecord, Message, Metadata, Schema
-from mcap.writer import CompressionType, Writer
+from typing import BinaryIO
 
 from psd_deflection import __version__
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.recordings.mcap_format import MAGIC, Channel, McapMessage, McapRecord, Metadata, Schema
 from psd_deflection.recordings.read.allowance import DamagedError
 from psd_deflection.recordings.read.bag_reader import files_in, read_information
-from psd_deflection.recordings.read.mcap_reader import MAGIC, McapReader
+from psd_deflection.recordings.read.mcap_reader import McapReader
 from psd_deflection.recordings.write.bag_metadata import (
     DEFAULT_QOS,
     FileCount,
@@ -33,6 +33,7 @@ from psd_deflection.recordings.write.bag_metadata import (
     write_metadata,
 )
 from psd_deflection.recordings.write.bag_writer import CHUNK_NS, CUSTOM
+from psd_deflection.recordings.write.mcap_writer import McapWriter
 
 _MAX_QOS_TEXT = 10_000
 
@@ -57,7 +58,7 @@ class Recovered:
     set_aside: list[Path]
 
 
-def _qos_of(metadata: dict[str, str]) -> Qos | list[Qos]:
+def _qos_of(metadata: Mapping[str, str]) -> Qos | list[Qos]:
     """The QoS profile of a channel, so that ``metadata.yaml`` and the channel agree."""
     text = metadata.get('offered_qos_profiles', '')
     if not text or len(text) > _MAX_QOS_TEXT:
@@ -76,10 +77,12 @@ class _Copy:
         self.topics: dict[str, TopicCount] = {}
         self.times: list[int] = []
         self._stream = target.open('xb') if target is not None else None
-        self._writer: Writer | None = None
-        if self._stream is not None:
-            self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
-            self._writer.start(profile='ros2', library=f'psd_deflection {__version__} recover')
+        self._spool: BinaryIO | None = None
+        self._writer: McapWriter | None = None
+        if target is not None and self._stream is not None:
+            with HeldFolder(target.parent) as held:
+                self._spool = held.unnamed(f'.{target.name}.index')
+            self._writer = McapWriter(self._stream, self._spool, library=f'psd_deflection {__version__} recover')
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._numbers: dict[int, int] = {}
@@ -89,7 +92,7 @@ class _Copy:
         self.start = self.end = 0
 
     def add(self, record: McapRecord) -> None:
-        if isinstance(record, Message):
+        if isinstance(record, McapMessage):
             self._add_message(record)
         elif isinstance(record, Schema):
             self._schemas[record.id] = record
@@ -98,11 +101,11 @@ class _Copy:
         elif isinstance(record, Metadata) and self._writer is not None and record.name != 'rosbag2':
             self._writer.add_metadata(record.name, record.metadata)
 
-    def _add_message(self, m: Message) -> None:
+    def _add_message(self, m: McapMessage) -> None:
         channel = self._channels.get(m.channel_id)
         if channel is None:
             raise DamagedError('a message belongs to no channel')
-        schema = self._schemas.get(channel.schema_id, Schema(0, b'', '', ''))
+        schema = self._schemas.get(channel.schema_id, Schema(id=0, name='', encoding='', data=b''))
         topic = self.topics.get(channel.topic)
         if topic is None:
             type_hash = channel.metadata.get('topic_type_hash', '')
@@ -120,7 +123,7 @@ class _Copy:
             if key not in self._schema_numbers:
                 self._schema_numbers[key] = writer.register_schema(*key)
             self._numbers[m.channel_id] = writer.register_channel(
-                channel.topic, channel.message_encoding, self._schema_numbers[key], channel.metadata
+                channel.topic, channel.encoding, self._schema_numbers[key], channel.metadata
             )
         if self._first is not None and abs(m.log_time - self._first) >= CHUNK_NS:
             writer.flush()
@@ -134,11 +137,12 @@ class _Copy:
         self._writer.finish()
         self._stream.flush()
         os.fsync(self._stream.fileno())
-        self._stream.close()
+        self.abandon()
 
     def abandon(self) -> None:
-        if self._stream is not None:
-            self._stream.close()
+        for one in (self._stream, self._spool):
+            if one is not None:
+                one.close()
 
 
 def _recover_file(path: Path) -> RecoveredFile:

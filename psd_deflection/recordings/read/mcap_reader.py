@@ -1,36 +1,36 @@
 """Reads one MCAP file from front to back, even if it is cut or damaged.
 
-It differs from the readers of the ``mcap`` package in two ways. If a file lost its end, or a chunk is
-damaged, everything else is read, with a warning. Every size that a file declares is compared with the
-file's own size or with the :mod:`~psd_deflection.recordings.read.allowance` before it is used. ``mcap.records``
-parses the content of a record.
+If a file lost its end, or a chunk is damaged, everything else is read, with a warning. Every size that a file
+declares is compared with the file's own size or with the :mod:`~psd_deflection.recordings.read.allowance` before
+it is used.
 The format: https://mcap.dev/spec.
 """
 
 from __future__ import annotations
 
 import contextlib
-import struct
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping
-from io import BytesIO
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, TypeVar
+from typing import BinaryIO, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import EndOfFile
-from mcap.opcode import Opcode
-from mcap.records import Channel, Chunk, McapRecord, Message, Metadata, Schema
 
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.recordings.mcap_format import (
+    MAGIC,
+    MESSAGE_HEAD,
+    RECORD_HEAD,
+    Channel,
+    McapRecord,
+    Metadata,
+    Opcode,
+    Schema,
+    parsed,
+    parsed_chunk,
+)
 from psd_deflection.recordings.read.allowance import MAX_CHUNK_BYTES, Allowance, DamagedError, Warnings
-
-MAGIC = b'\x89MCAP0\r\n'
-
-_RECORD = struct.Struct('<BQ')
-_MESSAGE_HEAD = struct.Struct('<HIQQ')
 
 
 class RecordedChannel(NamedTuple):
@@ -47,45 +47,6 @@ class RawMessage(NamedTuple):
     channel: RecordedChannel
     log_time: int
     cdr: bytes
-
-
-class _WholeFields(ReadDataStream):
-    """The library's field reader with a check: the library accepts a field that is longer than its record."""
-
-    def read(self, length: int) -> bytes:
-        """The next ``length`` bytes. Raises DamagedError if the record ends before them."""
-        try:
-            piece = super().read(length)
-        except (EndOfFile, OverflowError):
-            piece = b''
-        if len(piece) != length:
-            raise DamagedError('a field is longer than its record')
-        return piece
-
-
-T = TypeVar('T')
-
-
-def _read(read: Callable[[ReadDataStream], T], content: bytes) -> T:
-    try:
-        return read(_WholeFields(BytesIO(content)))
-    except UnicodeDecodeError:
-        raise DamagedError('a text is not UTF-8') from None
-
-
-_READ: Mapping[int, Callable[[ReadDataStream], McapRecord]] = {
-    Opcode.SCHEMA: Schema.read,
-    Opcode.CHANNEL: Channel.read,
-    Opcode.METADATA: Metadata.read,
-}
-
-
-def _parsed(opcode: int, content: bytes) -> McapRecord:
-    """A schema, channel, metadata record or message. Raises DamagedError if it contradicts itself."""
-    if opcode == Opcode.MESSAGE:
-        message: Message = _read(lambda fields: Message.read(fields, len(content)), content)
-        return message
-    return _read(_READ[opcode], content)
 
 
 class McapReader:
@@ -134,15 +95,15 @@ class McapReader:
                 self.warn(f'holds more than a file of {self._size} bytes can need; what follows byte {at} is left out')
                 return
             stream.seek(at)
-            head = stream.read(_RECORD.size)
-            if len(head) < _RECORD.size:
+            head = stream.read(RECORD_HEAD.size)
+            if len(head) < RECORD_HEAD.size:
                 self._cut(at)
                 return
-            opcode, length = _RECORD.unpack(head)
-            at += _RECORD.size
+            opcode, length = RECORD_HEAD.unpack(head)
+            at += RECORD_HEAD.size
             # No record has opcode 0: these are the zeros that a file system leaves after a power cut.
             if length > self._size - at or opcode == 0:
-                self._cut(at - _RECORD.size)
+                self._cut(at - RECORD_HEAD.size)
                 return
             yield opcode, at, length
             at += length
@@ -174,7 +135,7 @@ class McapReader:
             stream.seek(at)
             try:
                 allowance.describe(length)
-                self._note(_parsed(opcode, stream.read(length)))
+                self._note(parsed(opcode, stream.read(length)))
             except DamagedError as error:
                 self.warn(f'the record at byte {at} is damaged ({error}) and is left out')
 
@@ -187,7 +148,7 @@ class McapReader:
             type_name = self._types.get(record.schema_id, '')
             if type_name.count('/') == 1:
                 type_name = type_name.replace('/', '/msg/')
-            self._channels[record.id] = RecordedChannel(record.topic, type_name, record.message_encoding)
+            self._channels[record.id] = RecordedChannel(record.topic, type_name, record.encoding)
 
     def _parts(self, opcodes: Collection[int], allowance: Allowance) -> Iterator[tuple[int, bytes]]:
         """(offset, records) of each chunk, unpacked, and of each record outside of any, as in a chunk."""
@@ -204,7 +165,7 @@ class McapReader:
                     stream.seek(at)
                     content = stream.read(length)
                     if opcode != Opcode.CHUNK:
-                        yield at, _RECORD.pack(opcode, length) + content
+                        yield at, RECORD_HEAD.pack(opcode, length) + content
                         continue
                     with self._damage_told(at):
                         yield at, _unpacked(content, allowance)
@@ -236,8 +197,8 @@ class McapReader:
         wanted: dict[int, RecordedChannel],
         allowance: Allowance,
     ) -> Iterator[RawMessage]:
-        # The library's Message is ten times slower, and this loop handles every message of a replay.
-        unpack, head = _MESSAGE_HEAD.unpack_from, _MESSAGE_HEAD.size
+        # Without a Message for each: this loop handles every message of a replay.
+        unpack, head = MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
         for opcode, at, end in _records_in(records, allowance):
             if opcode == Opcode.MESSAGE:
                 if end - at < head:
@@ -248,7 +209,7 @@ class McapReader:
                     yield RawMessage(channel, log_time, records[at + head : end])
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 allowance.describe(end - at)
-                record = _parsed(opcode, records[at:end])
+                record = parsed(opcode, records[at:end])
                 self._note(record)
                 if isinstance(record, Channel):
                     if topics is None or record.topic in topics:
@@ -269,13 +230,13 @@ class McapReader:
                     if opcode in kinds:
                         if opcode != Opcode.MESSAGE:
                             allowance.describe(end - start)
-                        yield _parsed(opcode, records[start:end])
+                        yield parsed(opcode, records[start:end])
 
 
 def _records_in(records: bytes, allowance: Allowance) -> Iterator[tuple[int, int, int]]:
     """(opcode, offset of the content, its end) of each record of a chunk. Raises DamagedError."""
     at, size = 0, len(records)
-    unpack, head = _RECORD.unpack_from, _RECORD.size
+    unpack, head = RECORD_HEAD.unpack_from, RECORD_HEAD.size
     while at < size:
         allowance.records -= 1
         if allowance.records < 0:
@@ -294,14 +255,14 @@ def _records_in(records: bytes, allowance: Allowance) -> Iterator[tuple[int, int
 
 def _unpacked(content: bytes, allowance: Allowance) -> bytes:
     """The records of a chunk record's content. Raises DamagedError if it contradicts itself, or declares too much."""
-    chunk: Chunk = _read(Chunk.read, content)
-    size = chunk.uncompressed_size
+    chunk = parsed_chunk(content)
+    size = chunk.size
     allowance.may_unpack(size)
     plain = _decompress(chunk.data, chunk.compression, size)
     allowance.unpacked(len(plain))
     if len(plain) != size:
         raise DamagedError(f'it holds {len(plain)} bytes and declares {size}')
-    if chunk.uncompressed_crc and zlib.crc32(plain) != chunk.uncompressed_crc:
+    if chunk.crc and zlib.crc32(plain) != chunk.crc:
         raise DamagedError('its CRC does not match')
     return plain
 

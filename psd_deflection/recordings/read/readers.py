@@ -6,9 +6,9 @@ import itertools
 from pathlib import Path
 
 from psd_deflection.base.errors import RecordingError, did_you_mean
+from psd_deflection.recordings.mcap_format import MAGIC
 from psd_deflection.recordings.read.bag_reader import BagRecording
 from psd_deflection.recordings.read.csv_reader import CsvRecording
-from psd_deflection.recordings.read.mcap_reader import MAGIC
 from psd_deflection.recordings.recording import WHOLE, Recording, Span
 
 MOST_NAMES = 1000

@@ -13,13 +13,9 @@ import contextlib
 import fcntl
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Self
-
-from mcap.data_stream import RecordBuilder
-from mcap.records import ChunkIndex
-from mcap.writer import CompressionType, Writer
 
 from msg_adapters import LATCHED, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
@@ -38,6 +34,7 @@ from psd_deflection.recordings.write.bag_metadata import (
     totals,
     write_metadata,
 )
+from psd_deflection.recordings.write.mcap_writer import McapWriter
 from psd_deflection.records import ParameterChange, Record, RigState
 from psd_deflection.rig.declarations import FRAME_PREFIX
 
@@ -52,11 +49,6 @@ META_HELLO = 'psd_deflection.device_hello'
 META_CHANGE = 'psd_deflection.change.'
 """Names of the MCAP metadata records, and of a value in the first; every value in the last three is JSON."""
 
-
-_CHUNK_INDICES = '_Writer__chunk_indices'
-"""Private attribute of mcap's writer that holds the chunk indexes; there is no public one. If a later mcap renames it,
-they stay in memory, and a test fails."""
-
 CUSTOM = {'psd_deflection_version': __version__}
 
 
@@ -69,35 +61,6 @@ def _json_values(values: Mapping[str, object]) -> dict[str, str]:
         raise TypeError(f'{type(value).__name__} {value!r} has no JSON')
 
     return {key: json.dumps(value, default=plain) for key, value in values.items()}
-
-
-class _IndexSpool:
-    """Keeps the chunk indexes of a recording until its end, in ``file``, which is unnamed.
-
-    The writer would keep them in a list: a kilobyte per chunk, 180 MB a day.
-    """
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file = file
-
-    def append(self, index: ChunkIndex) -> None:
-        """Append one chunk index."""
-        record = RecordBuilder()
-        index.write(record)
-        self._file.write(record.end())
-
-    def __iter__(self) -> Iterator[_IndexSpool]:
-        yield self
-
-    def write(self, summary: RecordBuilder) -> None:
-        """All chunk indexes, encoded as in the summary."""
-        self._file.seek(0)
-        while part := self._file.read(1 << 20):
-            summary.write(part)
-
-    def close(self) -> None:
-        """It is gone."""
-        self._file.close()
 
 
 class _RecordSink(abc.ABC):
@@ -166,18 +129,16 @@ class McapFile(_RecordSink):
         # Written with the next message, whose time is then known.
         self._untold = [self._state(0, 0, {})] if rig_values else []
         self._stream: BinaryIO | None = None
-        self._spool: _IndexSpool | None = None
+        self._spool: BinaryIO | None = None
         parameters = _json_values(rig_values)
         hello = None if device_hello is None else _json_values(device_hello)
         with creating(path), HeldFolder(path.parent) if folder is None else contextlib.nullcontext(folder) as held:
             self._stream = held.create(path.name)
             with contextlib.suppress(OSError):
                 fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            spool = _IndexSpool(held.unnamed(f'.{path.name}.index'))
-        self._writer = Writer(self._stream, compression=CompressionType.ZSTD, enable_crcs=True)
+            spool = self._spool = held.unnamed(f'.{path.name}.index')
         with self._guard():
-            self._spool = vars(self._writer)[_CHUNK_INDICES] = spool
-            self._writer.start(profile='ros2', library=f'psd_deflection {__version__}')
+            self._writer = McapWriter(self._stream, spool, library=f'psd_deflection {__version__}')
             self._writer.add_metadata(META_SOFTWARE, {'version': __version__, **({META_NODE: node} if node else {})})
             self._writer.add_metadata(META_MADE_WITH, dict(provenance()))
             self._writer.add_metadata(META_PARAMETERS, parameters)
@@ -285,7 +246,7 @@ class McapFile(_RecordSink):
             schema = self._writer.register_schema(type_name, 'ros2msg', message.definition.encode())
             self._schemas[type_name] = schema
         qos = LATCHED_QOS if topic in LATCHED else DEFAULT_QOS
-        channel: int = self._writer.register_channel(
+        channel = self._writer.register_channel(
             topic, 'cdr', schema, {'offered_qos_profiles': qos_text(qos), 'topic_type_hash': message.type_hash}
         )
         self._channels[topic] = channel
