@@ -187,9 +187,10 @@ def _image_fault(message: Any) -> str:
 
 
 def _info_fault(message: Any) -> str:
-    numbers = (*message.k, *message.d)
-    good = all(abs(number) <= LARGEST_NUMBER for number in numbers) and len(message.d) <= MOST_DISTORTIONS
-    return '' if good else 'no camera has such a matrix or distortion'
+    if len(message.d) > MOST_DISTORTIONS:
+        return f'{len(message.d)} numbers of distortion: must be at most {MOST_DISTORTIONS}'
+    beyond = [number for number in (*message.k, *message.d) if not abs(number) <= LARGEST_NUMBER]
+    return f'{beyond[0]:g}: must be finite and at most {LARGEST_NUMBER:g}' if beyond else ''
 
 
 def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Callable[[str], None]) -> int:

@@ -100,7 +100,11 @@ class InputGate:
 
     def values(self) -> list[tuple[str, str]]:
         """For the node's diagnostics."""
-        return [(f'messages refused: {topic}', str(count)) for topic, count in sorted(self.refused.items())]
+        counted = sorted(self.refused.items())
+        return [
+            *((f'messages refused: {topic}', str(count)) for topic, count in counted),
+            *((f'refused last: {topic}', self.why[topic]) for topic, _ in counted),
+        ]
 
     def _let_in(self, encoded: bytes, most_bytes: int, rate: _Rate) -> str:
         """Why a message is not even unpacked, or ''."""
@@ -112,6 +116,10 @@ class InputGate:
         """Take the message, or give the reason why not."""
         try:
             message = self.unpack(kind, encoded)
+        except (*FAILURES, RuntimeError, MemoryError):
+            # Its reason is that of the library, with paths of the machine that built it.
+            return f'{len(encoded)} bytes: no message of this type'
+        try:
             why = check(message)
             if not why:
                 take(message)

@@ -73,7 +73,10 @@ def test_good_ones_are_taken_and_others_counted_and_said(peer: Any, gated: Gated
         f'{TOPIC}: refused: 2009 bytes: must be at most 1000',
     }
     assert all(isinstance(line, Warned) for line in gated.said)
-    assert gated.gate.values() == [(f'messages refused: {TOPIC}', str(gated.gate.refused[TOPIC]))]
+    count, why = gated.gate.values()
+    assert count == (f'messages refused: {TOPIC}', str(gated.gate.refused[TOPIC]))
+    assert why[0] == f'refused last: {TOPIC}'
+    assert f'{TOPIC}: refused: {why[1]}' in set(map(str, gated.said))
 
 
 def test_a_text_that_is_no_text_ends_nothing(peer: Any, gated: Gated) -> None:

@@ -46,6 +46,7 @@ from psd_deflection.model.simulation.hysteresis import play
 from psd_deflection.model.simulation.modes import mode_coefficients
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.parameters import Parameter, check_value
 
 Kind = Literal['static', 'switched', 'rate', 'history', 'resonance', 'variance']
 
@@ -186,6 +187,7 @@ class Form:
     per_second: int = 0
 
 
+_FREE = (-math.inf, math.inf)
 _ANY, _POSITIVE = (-1e12, 1e12), (1e-12, 1e12)
 FORMS: Mapping[str, Form] = {
     'product': Form('static', '{v}', apart=lambda v, _: v),
@@ -538,16 +540,11 @@ def _one_of(path: Path, key: str, value: object, allowed: Mapping[str, object] |
     return value
 
 
-def _number(path: Path, key: str, body: Mapping[str, object], default: float | None = None) -> float:
-    value = body.get(key.rpartition('.')[2], default)
-    # YAML 1.1 takes 1e-7 for a text.
-    try:
-        number = float(value) if isinstance(value, (int, float, str)) and not isinstance(value, bool) else math.nan
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise ConfigError(f'{path}: {key} = {value!r}: must be a number')
-    return number
+def _number(
+    path: Path, key: str, body: Mapping[str, object], default: float | None = None, within: tuple[float, float] = _FREE
+) -> float:
+    declared = Parameter(key, 'double', default, '', '', *within)
+    return cast(float, check_value(declared, body.get(key.rpartition('.')[2], default), str(path)))
 
 
 def _term(path: Path, at: str, body: object, acts_on: str) -> LawTerm:
@@ -559,18 +556,16 @@ def _term(path: Path, at: str, body: object, acts_on: str) -> LawTerm:
         raise ConfigError(f'{path}: {at}.of = {of!r}: must be a list of variables')
     for variable in of:
         _one_of(path, f'{at}.of', variable, TARGETS[acts_on].variables)
-    times = body.get('times', [])
-    if not isinstance(times, list) or not all(isinstance(t, (int, float)) for t in times) or times != sorted(times):
+    declared = Parameter(f'{at}.times', 'double_array', [], 's', '')
+    times = cast(list[float], check_value(declared, body.get('times', []), str(path)))
+    if times != sorted(times):
         raise ConfigError(f'{path}: {at}.times = {times!r}: must be a list of rising times, s')
     if bool(times) != (name == 'switched'):
         raise ConfigError(f'{path}: {at}.times = {times!r}: a switched term, and no other, has times')
     shapes = {}
     for key in (*form.fitted, *form.fixed):
-        value = _number(path, f'{at}.{key}', body)
         _, low, high = form.fitted.get(key, ('v', *_ANY))
-        if not low <= value <= high:
-            raise ConfigError(f'{path}: {at}.{key} = {value}: must be {low:g} to {high:g}')
-        shapes[key] = value
+        shapes[key] = _number(path, f'{at}.{key}', body, within=(low, high))
     listed = body.get('sd', {})
     sd = {k: _number(path, f'{at}.sd.{k}', listed) for k in listed} if isinstance(listed, dict) else {}
-    return LawTerm(name, tuple(of), _number(path, f'{at}.coefficient', body), shapes, tuple(map(float, times)), sd)
+    return LawTerm(name, tuple(of), _number(path, f'{at}.coefficient', body), shapes, tuple(times), sd)

@@ -1,0 +1,64 @@
+"""The robot's description (URDF) as ROS 2 has it: latched on ``robot_description``, from robot_state_publisher."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.ros.gate import InputGate
+from psd_deflection.ros.running import SPIN_S, executor_of
+from psd_deflection.ros.wires import message_class
+from psd_deflection.run.signals import Signals, StopRequestedError
+
+TOPIC = 'robot_description'
+WAIT_S = 30.0
+"""Time limit for it, s."""
+MOST_BYTES = 20_000_000
+"""Maximum size of the message; the largest robots have some hundred thousand bytes."""
+
+
+def robot_description(
+    signals: Signals, say: Callable[[str], None], wait_s: float = WAIT_S, clock: Callable[[], float] = time.monotonic
+) -> str:
+    """The text on ``robot_description`` in the namespace that the ROS arguments give; rclpy is started.
+
+    Raises ConfigError if none comes in ``wait_s``, s, and StopRequestedError if a signal comes before it.
+    """
+    heard: list[str] = []
+    node = Node(f'{TOPIC}_reader', start_parameter_services=False)
+    try:
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        gate = InputGate(node, say)
+        gate.listen(
+            message_class('std_msgs/msg/String'),
+            TOPIC,
+            _fault,
+            lambda message: heard.append(message.data),
+            latched,
+            MOST_BYTES,
+        )
+        topic = node.resolve_topic_name(TOPIC)
+        say(f'waiting for the robot on {topic}')
+        until = clock() + wait_s
+        with executor_of(node) as executor:
+            while not heard:
+                if signals.stop:
+                    raise StopRequestedError
+                if clock() >= until:
+                    why = gate.why.get(
+                        TOPIC, 'nobody publishes it' if not node.count_publishers(topic) else 'none came'
+                    )
+                    raise ConfigError(f'{topic}: no description of the robot in {wait_s:g} s ({why}); give a URDF file')
+                executor.spin_once(timeout_sec=SPIN_S)
+    finally:
+        node.destroy_node()
+    return heard[0]
+
+
+def _fault(message: Any) -> str:
+    return '' if message.data.strip() else 'it is empty'
