@@ -16,8 +16,9 @@ MESSAGE = MessageType(
     'string data\n',
 )
 
-MAX_CHARACTERS = 1_000_000
-"""Longest text that is parsed; ours have some thousand characters."""
+MAX_CHARACTERS = 16_000_000
+"""Longest text that is parsed. Ours have some thousand characters, with what a pipeline remembers some ten thousand,
+and some million if its blocks are long or its filter goes on for a minute without samples."""
 
 
 def _plain(value: object) -> object:
@@ -38,6 +39,8 @@ def from_rig(state: RigState) -> Fields:
         'changed': state.changed,
         'made_with': state.made_with,
     }
+    if state.memory is not None:
+        tree['memory'] = state.memory
     return {'data': json.dumps(tree, default=_plain)}
 
 
@@ -53,16 +56,16 @@ def to_rig(fields: Mapping[str, Any]) -> RigState:
     kinds = {'version': str, 't_ns': int, 'block': int, 'parameters': dict, 'changed': dict}
     if not isinstance(tree, dict) or not all(isinstance(tree.get(name), kind) for name, kind in kinds.items()):
         raise ValueError('lacks one of ' + ', '.join(kinds))
-    hello, told = tree.get('hello'), tree.get('made_with')
-    made_with = told if isinstance(told, dict) else {}
+    hello, memory = (tree.get(name) if isinstance(tree.get(name), dict) else None for name in ('hello', 'memory'))
+    told = tree.get('made_with')
+    made_with = told.items() if isinstance(told, dict) else ()
     return RigState(
-        tree['t_ns'],
-        tree['block'],
-        tree['parameters'],
-        hello if isinstance(hello, dict) else None,
-        tree['changed'],
-        tree['version'],
-        {name: value for name, value in made_with.items() if isinstance(value, str)}
-        if isinstance(made_with, dict)
-        else {},
+        t_ns=tree['t_ns'],
+        block=tree['block'],
+        parameters=tree['parameters'],
+        hello=hello,
+        changed=tree['changed'],
+        version=tree['version'],
+        made_with={name: value for name, value in made_with if isinstance(value, str)},
+        memory=memory,
     )

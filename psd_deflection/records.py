@@ -290,7 +290,8 @@ class RigState(NamedTuple):
     ``parameters``: all of them, flat, as they are from block ``block`` on. ``hello``: the device's, or None.
     ``changed``: the values of the :class:`ParameterChange` that it was sent for, {} if there was none.
     ``version``: of the software. ``t_ns``: time of the change, 0 at the start. ``made_with``: what computes
-    (:mod:`psd_deflection.recordings.provenance`).
+    (:mod:`psd_deflection.recordings.provenance`). ``memory``: what the pipeline remembers before block ``block``
+    (:meth:`psd_deflection.measure.pipeline.Pipeline.memory`), {} if that is nothing; None if it is not told.
     """
 
     t_ns: int
@@ -300,6 +301,7 @@ class RigState(NamedTuple):
     changed: Mapping[str, object]
     version: str
     made_with: Mapping[str, str] = MappingProxyType({})
+    memory: Mapping[str, object] | None = None
 
 
 class DiagnosticEntry(NamedTuple):

@@ -12,6 +12,7 @@ import threading
 import time
 from pathlib import Path
 
+from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import (
     BadFrame,
     Frame,
@@ -137,7 +138,7 @@ def main() -> int:
     try:
         port = qemu.until(r'redirected to (\S+)')[1]
         bad, trip = dialogue(port)
-        session = Session(load_rig(overrides={'port': port}), lambda text: print(f'  {text}', file=sys.stderr))
+        session = Session(load_rig(overrides={'port': port}), texts(lambda text: print(f'  {text}', file=sys.stderr)))
         checked = Checked(args.seconds)
         session.processing.sinks.append(checked)
         session.start()

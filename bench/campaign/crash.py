@@ -21,6 +21,7 @@ from pathlib import Path
 
 from rosbags.rosbag2 import Reader
 
+from psd_deflection.base.log import unsaid
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.repair import recover
 from psd_deflection.rig.config import Rig, load_rig
@@ -32,7 +33,7 @@ ALLOWED_S = 1.0
 
 def daemon(rig: Rig) -> None:
     """The child: records until it is killed."""
-    session = Session(rig, lambda text: None)
+    session = Session(rig, unsaid)
     session.start()
     signal.pause()
 

@@ -163,7 +163,7 @@ def parameters_target() -> tuple[Target, list[bytes]]:
     nominal = load_rig()
 
     def load_zero(path: Path) -> None:
-        _, said = ZeroStore(load_rig(None, {'zero_file': str(path)}), 'A').load(nominal)
+        _, said, _ = ZeroStore(load_rig(None, {'zero_file': str(path)}), 'A').load(nominal)
         if '\n' in said:
             raise AssertionError(f'more than one line: {said!r}')
 

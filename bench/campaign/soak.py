@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.campaign.line import hello_of
+from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import (
     FrameDecoder,
     FrameType,
@@ -235,7 +236,7 @@ def real_time(minutes: float) -> bool:
 def simulated_time(hours: float) -> bool:
     """Decoder, numbers, clock and pipeline as fast as they go."""
     rig = load_rig(None, {'port': 'simulated', 'realtime': False, 'queue_blocks': 100_000})
-    acquisition = Acquisition(rig, lambda text: print(f'  said: {text}'))
+    acquisition = Acquisition(rig, texts(lambda text: print(f'  said: {text}')))
     pipeline = Pipeline(rig)
     decoder = FrameDecoder()
     decoder.feed(b'\x00')

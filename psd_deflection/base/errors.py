@@ -6,9 +6,7 @@ of this package and ends with a traceback.
 
 from __future__ import annotations
 
-import contextlib
-import difflib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 
 INTERRUPTED = 130
 
@@ -104,53 +102,3 @@ class MachineError(PsdDeflectionError):
     """
 
     exit_status = 71
-
-
-def did_you_mean(name: str, known: Iterable[str]) -> str:
-    """``; did you mean X?`` if ``name`` is close to one of ``known``, else an empty string."""
-    near = difflib.get_close_matches(name, list(known), n=1)
-    return f'; did you mean {near[0]}?' if near else ''
-
-
-class Warned(str):
-    """A line about what somebody should look at. A line of neither kind is information."""
-
-    __slots__ = ()
-
-
-class Failed(str):
-    """A line about what does not work."""
-
-    __slots__ = ()
-
-
-def printable(text: str, longest: int) -> str:
-    """``text`` in one line of printable characters; what is beyond ``longest`` characters is cut, with an ellipsis.
-
-    A stranger's words (a device's, a file's) can so neither move the cursor, change colours, forge a line, nor fail
-    to be encoded. Text that is so already comes back as it is.
-    """
-    if text.isprintable() and len(text) <= longest:
-        return text
-    pieces: list[str] = []
-    length = 0
-    for character in text[: longest + 1]:
-        piece = character if character.isprintable() else character.encode('unicode_escape').decode('ascii')
-        length += len(piece)
-        pieces.append(piece)
-    if length <= longest and len(text) <= longest:
-        return ''.join(pieces)
-    while length > longest - 1:
-        length -= len(pieces.pop())
-    return ''.join(pieces) + '\N{HORIZONTAL ELLIPSIS}'
-
-
-@contextlib.contextmanager
-def creating(path: object) -> Iterator[None]:
-    """Raise RecordingError if the recording ``path`` exists already or cannot be made inside."""
-    try:
-        yield
-    except FileExistsError:
-        raise RecordingError(f'{path}: exists already; a recording is never overwritten') from None
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be made ({error.strerror or error})') from None

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
+
+from psd_deflection.base.errors import RecordingError
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -88,3 +91,14 @@ class HeldFolder:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+@contextlib.contextmanager
+def creating(path: object) -> Iterator[None]:
+    """Raise RecordingError if the recording ``path`` exists already or cannot be made inside."""
+    try:
+        yield
+    except FileExistsError:
+        raise RecordingError(f'{path}: exists already; a recording is never overwritten') from None
+    except OSError as error:
+        raise RecordingError(f'{path}: cannot be made ({error.strerror or error})') from None

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.base.errors import ConfigError, printable
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.printable import printable
 
 if TYPE_CHECKING:
     import pandas

@@ -11,13 +11,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from psd_deflection.base.errors import Failed, Warned
+from psd_deflection.base.log import ERROR, INFO, WARNING
 from psd_deflection.cli._program import program
 from psd_deflection.run.session import Session
 
 REFRESH_S = 0.25
 PLAIN_REFRESH_S = 5.0
 PLAIN_REFRESH_LATER_S = 60.0
+
+_SIGNS = {WARNING: '[WARN] ', ERROR: '[ERROR] '}
 
 
 class Display:
@@ -48,11 +50,10 @@ class Display:
         for folder in (f for f in self._recorded if f.is_dir()):
             self.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')
 
-    def say(self, text: str) -> None:
+    def say(self, text: str, level: int = INFO, /) -> None:
         """Print a message on its own line, above the live one."""
-        sign = '[ERROR] ' if isinstance(text, Failed) else '[WARN] ' if isinstance(text, Warned) else ''
         with self._lock:
-            self._put(f'{sign}{text}\n', shown=False)
+            self._put(f'{_SIGNS.get(level, "")}{text}\n', shown=False)
 
     def update(self, session: Session) -> None:
         """Show the state, if an update is due."""

@@ -8,9 +8,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.base.errors import RecordingError, printable
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import replace_file
 from psd_deflection.base.json_text import json_text
+from psd_deflection.base.printable import printable
 
 LONGEST_LINE = 2000
 """Characters of a line with words of a file or of a device in it."""

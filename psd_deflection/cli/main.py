@@ -30,9 +30,9 @@ from psd_deflection.base.errors import (
     RecordingError,
     SomeFailedError,
     UsageError,
-    did_you_mean,
-    printable,
 )
+from psd_deflection.base.printable import printable
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.cli._report import LONGEST_LINE
 
 # Our matrices are small, or tall and narrow: more threads spin more than they compute. Before numpy is imported.

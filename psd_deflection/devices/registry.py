@@ -16,7 +16,8 @@ from collections.abc import Iterator
 from importlib.metadata import entry_points
 from types import MappingProxyType
 
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.devices.device import Device
 from psd_deflection.devices.source import Source
 from psd_deflection.rig.config import Rig

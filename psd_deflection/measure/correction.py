@@ -10,19 +10,20 @@ placed rig would have shown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
 from psd_deflection.base.arithmetic import ARITHMETICS
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.memory import Memory, Value, misfit
 from psd_deflection.model.plate.plate import flat_poses
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect, Reading, Use, Values
 from psd_deflection.model.simulation.optics import dots_on_plate
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.samples import SimulatedSamples
-from psd_deflection.records import FloatArray
+from psd_deflection.records import ENVIRONMENT, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 
 PASSES = 3
@@ -31,6 +32,43 @@ PASSES = 3
 """
 OPTICS = ('centers', 'beams', 'slopes', 'heights', 'slope_ratio')
 """The constants that decide where the beams meet the plate (fields of :class:`Physics`)."""
+
+
+START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
+
+
+class Surroundings:
+    """What corrections depend on besides the samples: when they began, how warm it was then and is now.
+
+    ``known``: the values by name, as far as they are known (:data:`psd_deflection.records.ENVIRONMENT`).
+    """
+
+    part = 'what is known of the surroundings'
+    remembers = ENVIRONMENT
+
+    def __init__(self) -> None:
+        self.known: dict[str, float] = {}
+
+    @property
+    def warmer(self) -> float:
+        """K above the first temperature; 0 while none is known."""
+        return self.known.get(TEMPERATURE, 0.0) - self.known.get(FIRST_TEMPERATURE, 0.0)
+
+    def seconds(self, t_ns: IntArray) -> FloatArray:
+        """Time (n,) s since the first sample, of the times ``t_ns`` (n,)."""
+        since: FloatArray = (t_ns - self.known.get(START, float(t_ns[0]))) * np.float64(1e-9)
+        return since
+
+    def memory(self) -> Memory:
+        """What is known."""
+        return dict(self.known)
+
+    def restore(self, values: Mapping[str, Value]) -> None:
+        """Take what another one knew. Raises ValueError if one of ``values`` is no number."""
+        for name, value in values.items():
+            if not isinstance(value, (int, float)):
+                raise misfit(name, value, 'a number')
+            self.known[name] = float(value)
 
 
 class Correction:

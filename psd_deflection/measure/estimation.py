@@ -7,7 +7,7 @@ measured, for ``degraded: hold``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
 from typing import NamedTuple
@@ -16,6 +16,7 @@ import numpy as np
 
 from psd_deflection.base.arithmetic import ARITHMETICS, Arithmetic
 from psd_deflection.measure.health import FROZEN_BLOCKS, OpticsHealth, Verdict
+from psd_deflection.measure.memory import Memory, Value, numbers
 from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck, widened
 from psd_deflection.measure.uncertainty.stamped import SomePsds, StampedDots
 from psd_deflection.model.detector import dot_noise_variances
@@ -30,6 +31,9 @@ from psd_deflection.model.solvers.registry import psds_at_base, solver_class
 from psd_deflection.model.solvers.some_psds import solver_of_some
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
+
+HELD, SYSTEMATIC, ZERO_VARIANCES = 'state.held_twist', 'state.systematic', 'state.zero_variances'
+"""Names under which :meth:`Estimation.memory` is recorded."""
 
 Dots = tuple[float, ...]
 Failure = tuple[BlockStatus, str]
@@ -109,6 +113,9 @@ class Estimation:
     Raises SolverError or ConfigError if the rig cannot be solved.
     """
 
+    part = 'the estimate'
+    remembers = (HELD, SYSTEMATIC, ZERO_VARIANCES)
+
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         config = rig.estimator
         self._by = ARITHMETICS[config.arithmetic]
@@ -123,14 +130,41 @@ class Estimation:
 
     def build(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         """Use ``rig`` from the next block on."""
-        self._rig = rig
+        self._rig, self._effects = rig, effects
         self._optics = OpticsHealth(rig)
         self._one_psd = OnePsd(Geometry.from_rig(rig))
         config = rig.estimator
-        self.spread = None if psds_at_base(rig) else ParameterSpread.from_rig(rig, self.zero_variances, effects)
+        self._spread_from(self.zero_variances)
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
         self._some_solvers: dict[tuple[int, tuple[int, ...]], Solver | None] = {}
+
+    def _spread_from(self, zero_variances: tuple[float, ...]) -> None:
+        """Take the uncertainty of the calibration, and of a zero with these variances (2P,) m^2, () if it has none."""
+        self.zero_variances = zero_variances
+        at_base = psds_at_base(self._rig)
+        self.spread = None if at_base else ParameterSpread.from_rig(self._rig, zero_variances, self._effects)
+
+    def memory(self) -> Memory:
+        """The held twist, what the filter's covariance takes over from the last estimate, how sure the zero is."""
+        out: Memory = {}
+        config = self._rig.estimator
+        if self.spread is not None and self.zero_variances:
+            out[ZERO_VARIANCES] = self.zero_variances
+        if self.held is not None and config.degraded == 'hold':
+            out[HELD] = tuple(self.held)
+        if self.systematic is not None and config.filter != 'none':
+            out[SYSTEMATIC] = tuple(self.systematic.ravel().tolist())
+        return out
+
+    def restore(self, values: Mapping[str, Value]) -> None:
+        """Go on from another one's :meth:`memory`. Raises ValueError if it was of another number of PSDs."""
+        if variances := numbers(values, ZERO_VARIANCES, 'a variance of each reading', 2 * len(self._rig.psds)):
+            self._spread_from(variances)
+        if held := numbers(values, HELD, 'time, twist and variance', 3):
+            self.held = HeldTwist(int(held[0]), held[1], held[2])
+        if systematic := numbers(values, SYSTEMATIC, 'a covariance', 9):
+            self.systematic = np.reshape(systematic, (3, 3))
 
     @property
     def primary(self) -> Solver:

@@ -1,18 +1,20 @@
 """Checks lasers and detectors from a block's samples, before the block is solved.
 
 A fault makes one detector unreliable (``faulty``). A finding is a warning that does not stop the
-estimate (``findings``). Both come from the block's own samples and the rig. One count comes from
-the pipeline: the number of blocks in a row in which a detector's values did not change.
+estimate (``findings``). Both come from the block's own samples and the rig. One count goes on
+from block to block: for how many in a row a detector's values did not change.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.measure.memory import Memory, Value, numbers
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock, channel_names, dot_names
 from psd_deflection.rig.config import Rig
 
@@ -21,6 +23,9 @@ FROZEN_BLOCKS = 5
 
 NOISY = 5.0
 """Times the noise of the rig file."""
+
+FROZEN = 'state.frozen_blocks'
+"""Name under which the counts of :class:`Stillness` are recorded."""
 
 HALF_LIGHT = (0.35, 0.65)
 """Fraction of ``sum_nominal`` on all detectors if one of the splitter's two lasers fails."""
@@ -53,6 +58,30 @@ def _long(frozen: tuple[int, ...]) -> list[tuple[int, str]]:
         for psd, blocks in enumerate(frozen, start=1)
         if blocks >= FROZEN_BLOCKS
     ]
+
+
+class Stillness:
+    """``blocks`` (P,): for how many blocks in a row each detector's values have not changed."""
+
+    part = 'the count of blocks whose values do not change'
+    remembers = (FROZEN,)
+
+    def __init__(self, psds: int) -> None:
+        self.blocks: tuple[int, ...] = (0,) * psds
+
+    def count(self, still: tuple[bool, ...]) -> None:
+        """Take one block, as :meth:`OpticsHealth.still` has it."""
+        self.blocks = tuple(n + 1 if same else 0 for n, same in zip(self.blocks, still, strict=True))
+
+    def memory(self) -> Memory:
+        """The counts, if there are any."""
+        return {FROZEN: self.blocks} if any(self.blocks) else {}
+
+    def restore(self, values: Mapping[str, Value]) -> None:
+        """Take the counts. Raises ValueError if they are of another number of PSDs."""
+        row = numbers(values, FROZEN, 'one count for each PSD', len(self.blocks))
+        if row is not None:
+            self.blocks = tuple(map(int, row))
 
 
 class OpticsHealth:

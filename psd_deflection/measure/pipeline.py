@@ -5,9 +5,9 @@ calls, so ``replay`` reproduces it bit for bit. The steps are: counts -> volts -
 metres -> correction of the effects in the rig file -> health checks -> solvers -> estimates, and
 the tip load that the link model computes from them.
 
-It has some state from block to block: the twist that ``degraded: hold`` keeps, for how long a
-detector's values have not changed, and what effects of the link remember of past loads. When a
-recording starts, this state is written as a record (:meth:`Pipeline.memory`).
+Its parts remember things from block to block: the noise, the motion, the twist that ``degraded: hold`` keeps, what
+effects of the link remember of past loads. Each part tells that itself (:mod:`psd_deflection.measure.memory`); when a
+recording starts, it is written as a record (:meth:`Pipeline.memory`).
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ import numpy.typing as npt
 from psd_deflection.base.arithmetic import ARITHMETICS
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.averaging import BlockCutter, block_middle_ns, covariance
-from psd_deflection.measure.correction import Correction
-from psd_deflection.measure.estimation import BlockSolution, Dots, Estimation, HeldTwist, SeenBlock
-from psd_deflection.measure.health import OpticsHealth
-from psd_deflection.measure.motion.motion import INERTIA, STATE, ModalFilter, joined_ns, split_ns
+from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
+from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, SeenBlock
+from psd_deflection.measure.health import OpticsHealth, Stillness, Verdict
+from psd_deflection.measure.memory import STATE, WHOLE, Memory, Part, Value, numbers, restore
+from psd_deflection.measure.motion.motion import ModalFilter, joined_ns, split_ns
 from psd_deflection.measure.uncertainty.rest import why_moving
-from psd_deflection.measure.uncertainty.stamped import FIT, HELD_RESIDUAL, NOISE, REDUNDANCY, SOME
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.tip_load import TipLoads
@@ -40,7 +40,6 @@ from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
-    IntArray,
     ParameterChange,
     RawChunk,
     Record,
@@ -54,13 +53,6 @@ from psd_deflection.rig.declarations import ZEROS
 
 ZERO_BLOCKS = 25
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
-
-START, FIRST_TEMPERATURE, TEMPERATURE = ENVIRONMENT
-HELD, FROZEN, TIP_LOADS = 'state.held_twist', 'state.frozen_blocks', 'state.tip_loads'
-SYSTEMATIC = 'state.systematic'
-ZERO_VARIANCES = 'state.zero_variances'
-REMEMBERED = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY)
-"""Names of the values in the record of :meth:`Pipeline.memory`."""
 
 
 @dataclass(slots=True)
@@ -80,13 +72,12 @@ class PipelineCounters:
 
 
 class Pipeline:
-    """Samples in, records out.
+    """Samples in, records out. ``misfits``: of the last change, what no part of this rig could go on from.
 
     Raises SolverError or ConfigError if the rig cannot be solved.
     """
 
     def __init__(self, rig: Rig) -> None:
-        self.rig = rig
         self.counters = PipelineCounters()
         self.last_estimate: DeflectionEstimate | None = None
         self.last_spots: SpotMeans | None = None
@@ -94,17 +85,28 @@ class Pipeline:
         self._by = ARITHMETICS[config.arithmetic]
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
-        self._effects = effects_of_rig(rig)
-        self.tip_loads = TipLoads(rig, self._effects if config.wrench == 'effects' else ())
-        self._recent: list[Dots] = []
-        self._environment: dict[str, float] = {}
         self.zero_refused = ''
         self._end_ns: int | None = None
-        self._frozen: tuple[int, ...] = (0,) * len(rig.psds)
+        self.misfits: list[str] = []
+        self._begin(rig)
+
+    def _begin(self, rig: Rig) -> None:
+        """Remember nothing."""
+        self._effects = effects_of_rig(rig)
+        self.tip_loads = TipLoads(rig, self._effects if rig.estimator.wrench == 'effects' else ())
+        self._recent: list[Dots] = []
+        self._surroundings = Surroundings()
+        self._stillness = Stillness(len(rig.psds))
         self.estimation = Estimation(rig, self._effects)
         self.stamped = self.estimation.stamped
         self._take(rig)
         self.motion_filter = self._new_filter()
+
+    @property
+    def _parts(self) -> tuple[Part, ...]:
+        """Everything that remembers."""
+        parts = (self._surroundings, self._stillness, self.estimation, self.tip_loads, self.stamped)
+        return parts if self.motion_filter is None else (*parts, self.motion_filter)
 
     def _new_filter(self) -> ModalFilter | None:
         """The filter of the motion at the rig's present zero; None if the rig asks for none."""
@@ -146,7 +148,7 @@ class Pipeline:
                 f'the samples are of {volts.shape[1] // 3} PSDs, the rig file has {len(self.rig.psds)} (psd_N.center)'
             )
         for block in self._cutter.add(chunk, volts):
-            if self._correction.uses_time and START not in self._environment:
+            if self._correction.uses_time and START not in self._surroundings.known:
                 yield self._environment_change(block.index, {START: float(block.t_ns[0])})
             yield from self._block(block)
 
@@ -191,87 +193,76 @@ class Pipeline:
         return record
 
     def apply(self, change: ParameterChange) -> None:
-        """Use the changed values from now on. Raises ConfigError if one is out of bounds."""
-        values = {name: list(v) if isinstance(v, tuple) else v for name, v in change.values}
-        for name in ENVIRONMENT:
-            value = values.pop(name, None)
-            if isinstance(value, (int, float)):
-                self._environment[name] = float(value)
+        """Use the changed values from now on, and go on from what is told of a state.
+
+        Raises ConfigError if a parameter is out of bounds; then nothing has changed. ``misfits`` has a line for each
+        value that fits no part of this rig; it is left out.
+        """
+        told = dict(change.values)
         # It says which numbers belong to no sample; no estimate depends on it.
-        values.pop(RESTART, None)
-        held, frozen, loads = values.pop(HELD, None), values.pop(FROZEN, None), values.pop(TIP_LOADS, None)
-        motion, load, inertia = values.pop(STATE, None), values.pop(KNOWN_LOAD, None), values.pop(INERTIA, None)
-        systematic = values.pop(SYSTEMATIC, None)
-        names = [name for name in values if name in REMEMBERED or name.startswith(SOME)]
-        told = {name: tuple(v) for name in names if isinstance(v := values.pop(name), list)}
-        if isinstance(held, list) and len(held) == 3:
-            self.estimation.held = HeldTwist(int(held[0]), held[1], held[2])
-        if isinstance(frozen, list) and len(frozen) == len(self._frozen):
-            self._frozen = tuple(map(int, frozen))
-        variances = values.pop(ZERO_VARIANCES, None)
-        if isinstance(variances, list) and len(variances) == 2 * len(self.rig.psds):
-            self.estimation.zero_variances = tuple(variances)
-        if any(name in ZEROS for name in values):
-            self.tip_loads.zeroed = True
-            if variances is None:
-                # A zero from elsewhere: of as many blocks, with the noise of the rig file.
-                self.estimation.zero_variances = tuple(v / ZERO_BLOCKS for v in self.estimation.variances[-1])
-        if isinstance(loads, list):
-            self.tip_loads.restore(tuple(loads))
-        if values:
-            rig = replace_values(self.rig, values, 'change')
-            if rig.effects != self.rig.effects:
-                self._effects = effects_of_rig(rig)
-            self.estimation.build(rig, self._effects)
-            self._take(rig)
-            self.stamped.set_zeros(self.rig)
-            if any(name in ZEROS for name in values):
-                # The tip did not move with its zero.
-                self.motion_filter = self._new_filter()
-        self.stamped.restore(told)
+        told.pop(RESTART, None)
+        load = {name: told.pop(name) for name in (KNOWN_LOAD,) if name in told}
+        memory = {name: told.pop(name) for name in tuple(told) if name in ENVIRONMENT or name.startswith(STATE)}
+        if memory.pop(WHOLE, None) is not None:
+            self._begin(self.rig)
+        if told:
+            self._change_rig(told)
+        self.misfits = restore(self._parts, memory)
         if self.motion_filter is not None:
             self.motion_filter.set_noise(self.stamped.noise.gamma)
-            if isinstance(motion, list):
-                self.motion_filter.restore(tuple(motion))
-            if isinstance(inertia, list):
-                self.motion_filter.restore_inertia(tuple(inertia))
-            if isinstance(systematic, list):
-                self.estimation.systematic = np.reshape(systematic, (3, 3))
-            if isinstance(load, list) and len(load) == 5:
-                self.motion_filter.load(AppliedLoad(joined_ns(load[0], load[1]), load[2], load[3], load[4]))
+            self._apply_load(self.motion_filter, load)
+
+    def _change_rig(self, told: Mapping[str, Value]) -> None:
+        """Use the parameters ``told``."""
+        values = {name: list(v) if isinstance(v, tuple) else v for name, v in told.items()}
+        rig = replace_values(self.rig, values, 'change')
+        zeroed = any(name in ZEROS for name in values)
+        if rig.effects != self.rig.effects:
+            self._effects = effects_of_rig(rig)
+        if zeroed:
+            self.tip_loads.zeroed = True
+            # A zero from elsewhere, unless its variances are told: of as many blocks, with the noise of the rig file.
+            self.estimation.zero_variances = tuple(v / ZERO_BLOCKS for v in self.estimation.variances[-1])
+        self.estimation.build(rig, self._effects)
+        self._take(rig)
+        self.stamped.set_zeros(rig)
+        if zeroed:
+            # The tip did not move with its zero.
+            self.motion_filter = self._new_filter()
+
+    def _apply_load(self, motion: ModalFilter, told: Memory) -> None:
+        try:
+            load = numbers(told, KNOWN_LOAD, 'seconds, nanoseconds and a load', 5)
+        except ValueError as error:
+            self.misfits.append(str(error))
+            return
+        if load is not None:
+            motion.load(AppliedLoad(joined_ns(load[0], load[1]), load[2], load[3], load[4]))
+
+    @property
+    def gathers(self) -> int:
+        """How many numbers the segment of the noise under way makes of :meth:`memory`; 0 between two segments."""
+        return self.stamped.noise.gathered
 
     def memory(self, rig: Rig) -> ParameterChange | None:
         """The state that the next block depends on besides its samples and ``rig``; None if there is none.
 
-        ``rig``: the rig as it was at the start; later changes are part of the memory.
+        ``rig``: the rig as it was at the start; later changes are part of the memory. Nothing is changed by it.
         """
-        changed = {name: value for name, value in self.rig.values.items() if value != rig.values[name]}
-        values: list[tuple[str, float | str | tuple[float, ...]]] = []
-        for name, value in changed.items():
-            values.append((name, tuple(map(float, value)) if isinstance(value, list) else value))
-        values += self._environment.items()
-        estimation = self.estimation
-        if estimation.spread is not None and estimation.zero_variances:
-            values.append((ZERO_VARIANCES, estimation.zero_variances))
-        if estimation.held is not None and self.rig.estimator.degraded == 'hold':
-            values.append((HELD, tuple(estimation.held)))
-        if any(self._frozen):
-            values.append((FROZEN, self._frozen))
-        if loads := self.tip_loads.memory():
-            values.append((TIP_LOADS, loads))
-        if self.last_spots is not None:
-            values += self.stamped.memory().items()
-        if self.motion_filter is not None and (motion := self.motion_filter.memory()):
-            values.append((STATE, motion))
-            if estimation.systematic is not None:
-                values.append((SYSTEMATIC, tuple(estimation.systematic.ravel().tolist())))
-        if self.motion_filter is not None and (inertia := self.motion_filter.inertia_memory()):
-            values.append((INERTIA, inertia))
+        values: Memory = {
+            name: tuple(map(float, value)) if isinstance(value, list) else value
+            for name, value in self.rig.values.items()
+            if value != rig.values[name]
+        }
+        for part in self._parts:
+            # Before the first block the fit knows what a new one knows.
+            if part is not self.stamped or self.last_spots is not None:
+                values |= part.memory()
         if not values:
             return None
         last = self.last_spots
         t_ns, block = (last.t_ns, last.index + 1) if last is not None else (0, 0)
-        return ParameterChange(t_ns, block, tuple(values))
+        return ParameterChange(t_ns, block, tuple(values.items()))
 
     def load(self, load: AppliedLoad) -> ParameterChange | None:
         """Tell the filter of the motion a known load; None if there is no filter, or if it holds already.
@@ -301,19 +292,17 @@ class Pipeline:
         if not self._correction.uses_temperature:
             return None
         index = self.last_spots.index + 1 if self.last_spots is not None else 0
-        first = self._environment.get(FIRST_TEMPERATURE, celsius)
+        first = self._surroundings.known.get(FIRST_TEMPERATURE, celsius)
         return self._environment_change(index, {FIRST_TEMPERATURE: first, TEMPERATURE: celsius})
 
     def _environment_change(self, block: int, values: Mapping[str, float]) -> ParameterChange:
-        self._environment.update(values)
+        self._surroundings.known.update(values)
         t_ns = self.last_spots.t_ns if self.last_spots is not None else 0
-        return ParameterChange(t_ns, block, tuple(self._environment.items()))
+        return ParameterChange(t_ns, block, tuple(self._surroundings.known.items()))
 
     def _corrected(self, block: SampleBlock, samples: FloatArray, sums: FloatArray) -> FloatArray:
-        held = self._environment
-        warmer = held.get(TEMPERATURE, 0.0) - held.get(FIRST_TEMPERATURE, 0.0)
-        t: FloatArray = (block.t_ns - held.get(START, float(block.t_ns[0]))) * np.float64(1e-9)
-        return self._correction.apply(samples, sums, warmer, t)
+        around = self._surroundings
+        return self._correction.apply(samples, sums, around.warmer, around.seconds(block.t_ns))
 
     def dots(self, block: SampleBlock) -> FloatArray:
         """Dots (n, 2P), m, of the samples of ``block``, calibrated and corrected as for the estimate."""
@@ -324,99 +313,122 @@ class Pipeline:
         return self._corrected(block, samples, volts[:, 2::3].astype(np.float64))
 
     def _block(self, block: SampleBlock) -> Iterator[Record]:
-        size = self._cutter.block_size
-        present = len(block.seq)
-        self.counters.samples += present
-        self.counters.blocks += 1
-        self._end_ns = int(block.t_ns[-1])
         volts = self._calibration.seen(block.volts)
+        seen = self._judged(block, volts)
+        verdict = seen.verdict
+        solvable = verdict.status is BlockStatus.OK or verdict.sound
+        answer = self.estimation.solve(seen) if solvable else BlockSolution(seen.means)
+        self.last_estimate = answer.estimate
+        self.stamped.left_out = self.estimation.left_out(answer.used)
+        status, reason = answer.failure or (verdict.status, verdict.reason)
+        self._count(status, verdict, answer)
+        yield from self._estimates(seen, answer, status)
+        # The estimates are out: the rest is not urgent.
+        findings = self._findings(volts, seen, answer, status)
+        self.last_spots = SpotMeans(
+            t_ns=seen.t_ns,
+            index=seen.index,
+            dots=answer.dots,
+            sums=tuple((self._by.sum(seen.sums, 0) / len(seen.slots)).tolist()),
+            covariance=covariance(seen.samples, self._by),
+            present=len(seen.slots),
+            lost=self._cutter.block_size - len(seen.slots),
+            status=status,
+            reason=reason,
+            findings=findings,
+            left_out=self.stamped.left_out,
+        )
+        yield self.last_spots
+        yield block
+
+    def _judged(self, block: SampleBlock, volts: npt.NDArray[np.float32]) -> SeenBlock:
+        """The dots of a block, and whether lasers and detectors are sound. ``volts`` (n, 3P): of each PSD in turn."""
+        self.counters.samples += len(block.seq)
+        self._end_ns = int(block.t_ns[-1])
         sums = volts[:, 2::3].astype(np.float64)
         samples = self.dots(block)
-        means: Dots = tuple((self._by.sum(samples, 0) / present).tolist())
+        means: Dots = tuple((self._by.sum(samples, 0) / len(samples)).tolist())
         if self._optics.refuses_frozen:
-            self._count_still(volts)
-        verdict = self._optics.judge(block, volts, means, sums, self._frozen)
-        status, reason, findings = verdict.status, verdict.reason, verdict.findings
-        t_ns = block_middle_ns(block, size, self._period_ns)
-        slots = block.seq - block.index * size
-        seen = SeenBlock(t_ns, block.index, slots, samples, means, sums, verdict, self._frozen)
-        answer = self.estimation.solve(seen) if status is BlockStatus.OK or verdict.sound else BlockSolution(means)
-        used, best = answer.used, answer.estimate
-        degraded = status is not BlockStatus.OK
-        if answer.failure is not None:
-            status, reason = answer.failure
-        if used is not None and used.wrong:
-            findings = (*findings, f'psd_{used.wrong} contradicts the others and is left out')
-        self.last_estimate = best
-        left_out = self.estimation.left_out(used)
-        self.stamped.left_out = left_out
+            self._stillness.count(self._optics.still(volts))
+        frozen = self._stillness.blocks
+        return SeenBlock(
+            t_ns=block_middle_ns(block, self._cutter.block_size, self._period_ns),
+            index=block.index,
+            slots=block.seq - block.index * self._cutter.block_size,
+            samples=samples,
+            means=means,
+            sums=sums,
+            verdict=self._optics.judge(block, volts, means, sums, frozen),
+            frozen=frozen,
+        )
+
+    def _count(self, status: BlockStatus, verdict: Verdict, answer: BlockSolution) -> None:
+        counters = self.counters
+        counters.blocks += 1
+        if answer.estimate is None:
+            name = status.name.lower()
+            counters.refused[name] = counters.refused.get(name, 0) + 1
+            return
+        counters.estimates += 1
+        counters.degraded += verdict.status is not BlockStatus.OK or not answer.complete
+
+    def _estimates(self, seen: SeenBlock, answer: BlockSolution, status: BlockStatus) -> Iterator[Record]:
+        """The primary estimate first, then its load, the motion and the other solvers' estimates."""
+        best, used = answer.estimate, answer.used
         if best is not None:
-            self.counters.estimates += 1
-            self.counters.degraded += degraded or not answer.complete
             yield best
-        if best is not None and used is not None:
-            yield TipLoad(t_ns, *self.tip_loads.tip_load(block.index, best.dx, best.dy, best.theta))
+            if used is not None:
+                load = self.tip_loads.tip_load(seen.index, best.dx, best.dy, best.theta)
+                yield TipLoad(seen.t_ns, *load)
         if self.motion_filter is not None:
             # Poses of some PSDs have another noise than the filter knows: it coasts.
             usable = status is BlockStatus.TOO_FEW_SAMPLES or (status is BlockStatus.OK and answer.complete)
-            moved = self._moved(self.motion_filter, block.index, t_ns, slots, samples if usable else None)
+            moved = self._moved(self.motion_filter, seen, usable)
             if moved is not None:
                 yield moved
+        self._keep_for_zero(seen, answer)
         if best is not None and used is not None:
-            if answer.complete:
-                # The zero must not be a mean across an outage.
-                last = self.last_spots
-                if last is not None and t_ns - last.t_ns > ZERO_BLOCKS * size * self._period_ns:
-                    self._recent = []
-                self._recent = [*self._recent[1 - ZERO_BLOCKS :], used.dots]
-            else:
-                self._recent = []
             yield from self.estimation.others(seen, used)
-        else:
+
+    def _keep_for_zero(self, seen: SeenBlock, answer: BlockSolution) -> None:
+        """Keep the dots of the last good blocks; a zero must not be a mean across an outage."""
+        if answer.estimate is None or answer.used is None or not answer.complete:
             self._recent = []
-        if best is None:
-            name = status.name.lower()
-            self.counters.refused[name] = self.counters.refused.get(name, 0) + 1
-        # The estimates are out: the rest is not urgent.
+            return
+        last = self.last_spots
+        if last is not None and seen.t_ns - last.t_ns > ZERO_BLOCKS * self._cutter.block_size * self._period_ns:
+            self._recent = []
+        self._recent = [*self._recent[1 - ZERO_BLOCKS :], answer.used.dots]
+
+    def _findings(
+        self, volts: npt.NDArray[np.float32], seen: SeenBlock, answer: BlockSolution, status: BlockStatus
+    ) -> tuple[str, ...]:
+        """What is odd about a block; of one that is not, the noise is learnt."""
+        findings, used = seen.verdict.findings, answer.used
+        if used is not None and used.wrong:
+            findings = (*findings, f'psd_{used.wrong} contradicts the others and is left out')
         sound = status is BlockStatus.OK and not findings
-        if sound and self.stamped.learn(block.index, slots, samples) and self.motion_filter is not None:
+        if sound and self.stamped.learn(seen.index, seen.slots, seen.samples) and self.motion_filter is not None:
             self.motion_filter.set_noise(self.stamped.noise.gamma)
         if answer.complete and used is not None and used.checked is not None:
-            self.stamped.suspect(block.index, used.dots, used.checked)
+            self.stamped.suspect(seen.index, used.dots, used.checked)
         if not self._optics.refuses_frozen:
-            self._count_still(volts)
-        findings += self._optics.late_findings(volts, verdict, self._frozen)
+            self._stillness.count(self._optics.still(volts))
+        findings += self._optics.late_findings(volts, seen.verdict, self._stillness.blocks)
         for finding in findings:
             name = finding.split(':')[0]
             self.counters.findings[name] = self.counters.findings.get(name, 0) + 1
-        spots = SpotMeans(
-            t_ns,
-            block.index,
-            answer.dots,
-            tuple((self._by.sum(sums, 0) / present).tolist()),
-            covariance(samples, self._by),
-            present,
-            size - present,
-            status,
-            reason,
-            findings,
-            left_out,
-        )
-        self.last_spots = spots
-        yield spots
-        yield block
+        return findings
 
-    def _moved(
-        self, motion: ModalFilter, block: int, t_ns: int, slots: IntArray, samples: FloatArray | None
-    ) -> TipMotion | None:
-        """The motion by the filter; ``samples`` (n, 4) m, None if none of the block can be used."""
-        poses: FloatArray | None = None
-        if samples is not None:
-            solved = self.estimation.primary.solve_many(samples, np.array(self.estimation.variances[0]))
+    def _moved(self, motion: ModalFilter, seen: SeenBlock, usable: bool) -> TipMotion | None:
+        """The motion by the filter; ``usable``: whether samples of the block can be used."""
+        slots, poses = seen.slots, None
+        if usable:
+            solved = self.estimation.primary.solve_many(seen.samples, np.array(self.estimation.variances[0]))
             sound = solved.status == SolverStatus.OK
             if sound.any():
                 slots, poses = slots[sound], solved.pose[sound]
-        moved = motion.block(block, t_ns, slots if poses is not None else None, poses)
+        moved = motion.block(seen.index, seen.t_ns, slots if poses is not None else None, poses)
         if moved is None:
             return None
         systematic = self.estimation.systematic
@@ -424,21 +436,17 @@ class Pipeline:
         dx, dy, theta = moved.pose.tolist()
         vx, vy, vtheta = moved.velocity.tolist()
         return TipMotion(
-            moved.t_ns,
-            block,
-            dx,
-            dy,
-            theta,
-            0.0,
-            0.0,
-            tuple(covariance.ravel().tolist()),
-            vx,
-            vy,
-            vtheta,
-            tuple(moved.velocity_covariance.ravel().tolist()),
-            moved.coasted,
+            t_ns=moved.t_ns,
+            block=seen.index,
+            dx=dx,
+            dy=dy,
+            theta=theta,
+            phi=0.0,
+            omega=0.0,
+            covariance=tuple(covariance.ravel().tolist()),
+            vx=vx,
+            vy=vy,
+            vtheta=vtheta,
+            velocity_covariance=tuple(moved.velocity_covariance.ravel().tolist()),
+            coasted=moved.coasted,
         )
-
-    def _count_still(self, volts: npt.NDArray[np.float32]) -> None:
-        still = self._optics.still(volts)
-        self._frozen = tuple(n + 1 if same else 0 for n, same in zip(self._frozen, still, strict=True))

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from psd_deflection import __version__
-from psd_deflection.base.errors import printable
+from psd_deflection.base.printable import printable
 
 PROCESSOR = ('machine', 'processor', 'kernel', 'C library')
 """Entries that the last digits depend on only with ``arithmetic: library``."""

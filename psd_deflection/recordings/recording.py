@@ -16,10 +16,12 @@ import numpy as np
 import numpy.typing as npt
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
-from psd_deflection.base.errors import ConfigError, RecordingError, printable
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.base.printable import printable
 from psd_deflection.base.tables import Column, Table, columns_of, html_table
 from psd_deflection.measure.averaging import BlockCutter
 from psd_deflection.recordings.estimates import EstimateSeries
+from psd_deflection.recordings.read.allowance import Warnings
 from psd_deflection.recordings.read.grid import digest_of
 from psd_deflection.recordings.read.mcap_reader import RawMessage
 from psd_deflection.records import (
@@ -70,7 +72,8 @@ class Recording(abc.ABC):
     ``made_with``: what computed it (:func:`psd_deflection.recordings.provenance.provenance`), {} if it does not say.
     ``node``: full name of the ROS node that recorded itself, or ''.
     ``rig_from_messages``: whether these come from messages, because the file lacks our metadata.
-    ``changes``: of parameters during the run, in order. ``restarts``: of the device, each as the last sample
+    ``changes``: of parameters during the run, in order. ``memories``: the first few times that the pipeline said all
+    that it remembered, each with the block before which that was. ``restarts``: of the device, each as the last sample
     number before and the first after; the numbers between belong to no sample. ``restarts`` and ``warnings``
     (one line each) are complete after the first full pass over the recording. ``requested_block_size``: None takes
     the recorded one. ``temperatures_held``: whether each temperature holds until the next one, as in the rows of a CSV;
@@ -88,8 +91,10 @@ class Recording(abc.ABC):
         self.node = ''
         self.rig_from_messages = False
         self.changes: Sequence[ParameterChange] = ()
+        self.memories: Sequence[ParameterChange] = ()
         self.restarts: set[tuple[int, int]] = set()
         self.requested_block_size = block_size
+        self._found = Warnings()
 
     @property
     def namespace(self) -> str:
@@ -127,6 +132,15 @@ class Recording(abc.ABC):
         """The restarts that the recorder noted, before any pass over the recording."""
         return {r for change in self.changes if (r := _restart_in(change)) is not None}
 
+    def memory_from(self, first: int) -> ParameterChange | None:
+        """What the pipeline remembered before block ``first``, the recording's first one, or before one after it.
+
+        None if that is not recorded, or if the blocks are cut to another size.
+        """
+        if self.block_size != self.parameters.get('block_size'):
+            return None
+        return next((memory for memory in self.memories if memory.block >= first), None)
+
     @property
     @abc.abstractmethod
     def complete(self) -> bool:
@@ -136,6 +150,10 @@ class Recording(abc.ABC):
     @abc.abstractmethod
     def warnings(self) -> Sequence[str]:
         """Faults that did not stop the reading."""
+
+    def warn(self, text: str) -> None:
+        """Add to ``warnings`` what was found while it was used."""
+        self._found.add(text)
 
     def blocks(self) -> Iterator[SampleBlock]:
         """The samples, cut into blocks at seq // block_size.
@@ -356,6 +374,10 @@ class RecordingWindow(Recording):
     def warnings(self) -> Sequence[str]:
         """Of the whole."""
         return self._source.warnings
+
+    def warn(self, text: str) -> None:
+        """To those of the whole."""
+        self._source.warn(text)
 
     def _chunks(self) -> Iterator[RawChunk]:
         for block in self._source.blocks():

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.base.errors import ConfigError, printable
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import YamlError, edited, text_of_file, tree_of_text
+from psd_deflection.base.printable import printable
 
 MAX_KEYS = 10_000
 LONGEST_SOURCE = 4000

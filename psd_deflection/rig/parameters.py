@@ -24,7 +24,8 @@ from typing import Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
 
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.spelling import did_you_mean
 
 Kind = Literal['double', 'integer', 'bool', 'string', 'double_array', 'string_array']
 Value = float | int | bool | str | list[float] | list[str]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,7 +20,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from msg_adapters import REFERENCE, REFERENCE_WITH_COVARIANCE, TOPIC_TYPES, to_messages
 from psd_deflection.arms.inputs import stamp_fault
-from psd_deflection.base.errors import ConfigError, Warned
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import WARNING, Say
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.footage import decoded, of_ros_image
 from psd_deflection.camera.opencv import opencv
@@ -45,7 +46,7 @@ LARGEST_NUMBER = 1e7
 class CameraNode(BaseNode):
     """The node. ``given``: parameters of a file or an option. Raises ConfigError if OpenCV is missing, too."""
 
-    def __init__(self, given: CameraSettings, say: Callable[[str], None]) -> None:
+    def __init__(self, given: CameraSettings, say: Say) -> None:
         opencv()
         self._given = given
         self._reference: CameraReference | None = None
@@ -100,7 +101,7 @@ class CameraNode(BaseNode):
         target_of(settings)
         if self._reference is not None and replace(settings, exposure=self.settings.exposure) != self.settings:
             self._reference = None
-            self.log(Warned('a parameter was changed: the next good frames are the rest'))
+            self.log('a parameter was changed: the next good frames are the rest', WARNING)
 
     def cleanup(self) -> None:
         """Forget the rest."""
@@ -140,10 +141,10 @@ class CameraNode(BaseNode):
             try:
                 settings = replace(settings, matrix=k, distortion=d)
             except (ConfigError, ValueError) as error:
-                self.log(Warned(f'camera_info is not used: {error}'))
+                self.log(f'camera_info is not used: {error}', WARNING)
         if not settings.matrix:
             why = 'camera.matrix is not given and there is no camera_info'
-            self.log(Warned(f'{why}: distortion is not corrected'))
+            self.log(f'{why}: distortion is not corrected', WARNING)
         return CameraReference(settings, target_of)
 
     def _publish(self, answer: FrameAnswer) -> None:
@@ -193,7 +194,7 @@ def _info_fault(message: Any) -> str:
     return f'{beyond[0]:g}: must be finite and at most {LARGEST_NUMBER:g}' if beyond else ''
 
 
-def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Callable[[str], None]) -> int:
+def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Say) -> int:
     """Measure until SIGINT or SIGTERM. Raises ConfigError."""
     with ros(NODE_NAME, ros_arguments) as signals, contextlib.closing(CameraNode(given, say)) as owner:
         serve(owner, signals)

@@ -24,7 +24,8 @@ from msg_adapters.pose_with_covariance_stamped import from_end_effector
 from psd_deflection.arms.chains.chain_file import SETTINGS, ChainFile
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.inputs import joints_fault
-from psd_deflection.base.errors import PsdDeflectionError, Warned
+from psd_deflection.base.errors import PsdDeflectionError
+from psd_deflection.base.log import WARNING, Say
 from psd_deflection.recordings import cdr
 from psd_deflection.ros.names import BASE, END, END_REST, JOINT_STATES, RECORD, REST, TF, TF_STATIC, TIP, ZERO
 from psd_deflection.ros.node import BaseNode, Health, serve
@@ -48,7 +49,7 @@ class ChainNode(BaseNode):
 
     SYSTEM_TIME = True
 
-    def __init__(self, file: ChainFile, say: Callable[[str], None], signals: Signals) -> None:
+    def __init__(self, file: ChainFile, say: Say, signals: Signals) -> None:
         self.chain: ChainSession | None = None
         self._file = file
         self._signals = signals
@@ -77,7 +78,7 @@ class ChainNode(BaseNode):
             self._tf = node.create_publisher(self._message, TF, qos(TF))
             self._tf_static = node.create_publisher(self._message, TF_STATIC, qos(TF_STATIC))
         else:
-            self.log(Warned('tf2_msgs is not installed: no frames on /tf'))
+            self.log('tf2_msgs is not installed: no frames on /tf', WARNING)
         for name, rig in zip(file.names, file.rigs, strict=True):
             self._wires.append(PublisherWire(node, topics_of(rig), name))
             self._inputs.append(InputRecorder(node, subscribed(rig), name))
@@ -101,6 +102,7 @@ class ChainNode(BaseNode):
                 session.fanout.wires.insert(0, wire)
                 told = RigPublisher(wire, session)
                 session.fanout.change_wires.append(told)
+                session.processing.sinks.append(told)
                 self._told.append(told)
                 inputs.session = session
             self._seen = (0, 0)
@@ -259,9 +261,7 @@ def chain_transforms(file: ChainFile, composed: Composed) -> list[Any]:
     return out
 
 
-def run_chain(
-    ros_args: Sequence[str], file: ChainFile, say: Callable[[str], None], watch: Callable[[ChainSession], object]
-) -> int:
+def run_chain(ros_args: Sequence[str], file: ChainFile, say: Say, watch: Callable[[ChainSession], object]) -> int:
     """Run the node until SIGINT or SIGTERM. ``watch``: called about ten times a second.
 
     Raises the errors of the package if the run cannot start, or if a pipeline failed.

@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -37,7 +37,8 @@ from psd_deflection.arms.compensation.compensator import (
     State,
 )
 from psd_deflection.arms.inputs import LARGEST_POSITION, frame_fault, joints_fault, quaternion_fault, stamp_fault
-from psd_deflection.base.errors import ConfigError, Warned
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport, FloatArray
 from psd_deflection.ros.declared import DeclaredParameters, node_with_overrides
@@ -71,7 +72,7 @@ _LEVELS = {State.OFF: OK, State.FOLLOWING: OK, State.RELEASING: WARN, State.HOLD
 class CompensatorNode:
     """The node; ``drive``: publish offsets for a controller, else proposals. Raises ConfigError for a bad parameter."""
 
-    def __init__(self, arm: Arm, settings: CompensatorSettings, say: Callable[[str], None], drive: bool) -> None:
+    def __init__(self, arm: Arm, settings: CompensatorSettings, say: Say, drive: bool) -> None:
         self.node = node = node_with_overrides(NODE_NAME)
         try:
             values = dataclasses.asdict(settings)
@@ -264,7 +265,7 @@ class CompensatorNode:
         if before.state is not command.state or (command.state is State.HOLDING and before.why != command.why):
             line = f'{command.state}{": " if command.why else ""}{command.why}'
             bad = command.state is State.HOLDING
-            self._repeats.tell(str(command.state), Warned(line) if bad else line, time.monotonic(), NEWS)
+            self._repeats.tell(str(command.state), line, WARNING if bad else INFO, time.monotonic(), NEWS)
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         with self._lock:
@@ -305,9 +306,7 @@ def _order(arm: Arm, joints: Sequence[str]) -> list[int]:
     return [arm.names.index(name) for name in joints]
 
 
-def run_compensator(
-    ros_args: Sequence[str], arm: Arm, settings: CompensatorSettings, say: Callable[[str], None], drive: bool
-) -> int:
+def run_compensator(ros_args: Sequence[str], arm: Arm, settings: CompensatorSettings, say: Say, drive: bool) -> int:
     """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
     if settings.joints == (ALL_JOINTS,):
         settings = dataclasses.replace(settings, joints=arm.names)

@@ -10,6 +10,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import Say
 from psd_deflection.ros.gate import InputGate
 from psd_deflection.ros.running import SPIN_S, executor_of
 from psd_deflection.ros.wires import message_class
@@ -23,7 +24,7 @@ MOST_BYTES = 20_000_000
 
 
 def robot_description(
-    signals: Signals, say: Callable[[str], None], wait_s: float = WAIT_S, clock: Callable[[], float] = time.monotonic
+    signals: Signals, say: Say, wait_s: float = WAIT_S, clock: Callable[[], float] = time.monotonic
 ) -> str:
     """The text on ``robot_description`` in the namespace that the ROS arguments give; rclpy is started.
 

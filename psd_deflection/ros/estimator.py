@@ -22,7 +22,8 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from msg_adapters import DEFLECTION, DIAGNOSTICS, to_messages
-from psd_deflection.base.errors import ConfigError, PsdDeflectionError, Warned
+from psd_deflection.base.errors import ConfigError, PsdDeflectionError
+from psd_deflection.base.log import WARNING, Say
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.rig.config import Rig
@@ -51,7 +52,7 @@ class EstimatorNode(BaseNode):
 
     SYSTEM_TIME = True
 
-    def __init__(self, overrides: Mapping[str, object], say: Callable[[str], None], signals: Signals) -> None:
+    def __init__(self, overrides: Mapping[str, object], say: Say, signals: Signals) -> None:
         self.session: Session | None = None
         self._signals = signals
         self._health: HealthReporter | None = None
@@ -93,7 +94,7 @@ class EstimatorNode(BaseNode):
             self._transforms = TransformPublisher(self.node, session.rig)
             session.processing.sinks.append(self._transforms)
         elif shown.publish_tf and 'publish_tf' in self._live.given:
-            self.log(Warned('tf2_msgs is not installed: no frames on /tf (publish_tf)'))
+            self.log('tf2_msgs is not installed: no frames on /tf (publish_tf)', WARNING)
         if shown.markers:
             # Imported here: only the markers need visualization_msgs.
             from psd_deflection.ros.markers import RigMarkers
@@ -114,6 +115,7 @@ class EstimatorNode(BaseNode):
             session.fanout.wires.insert(0, self._wire)
             self._rig_told = RigPublisher(self._wire, session)
             session.fanout.change_wires.append(self._rig_told)
+            session.processing.sinks.append(self._rig_told)
             self._make_views(session)
             self._inputs.session = session
             session.start()
@@ -231,7 +233,7 @@ class EstimatorNode(BaseNode):
 def run(
     ros_args: Sequence[str],
     overrides: Mapping[str, object],
-    say: Callable[[str], None],
+    say: Say,
     while_running: Callable[[Session], None] | None = None,
 ) -> int:
     """Run the node until SIGINT or SIGTERM, however often they come.

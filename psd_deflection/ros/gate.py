@@ -18,7 +18,9 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-from psd_deflection.base.errors import ConfigError, PsdDeflectionError, Warned, printable
+from psd_deflection.base.errors import ConfigError, PsdDeflectionError
+from psd_deflection.base.log import WARNING, Say
+from psd_deflection.base.printable import printable
 from psd_deflection.run.repeats import Repeats
 
 LONGEST = 200
@@ -39,7 +41,7 @@ class InputGate:
     ``refused``: messages by topic; ``why``: the last reason of each.
     """
 
-    def __init__(self, node: Node, say: Callable[[str], None], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, node: Node, say: Say, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
         self._repeats = Repeats(say)
         self.refused: Counter[str] = Counter()
@@ -91,8 +93,7 @@ class InputGate:
         """Count a message and say why it is refused."""
         self.refused[topic] += 1
         self.why[topic] = printable(why, LONGEST)
-        line = Warned(f'{topic}: refused: {self.why[topic]}')
-        self._repeats.tell(topic, line, self._clock(), NEWS)
+        self._repeats.tell(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
 
     def settle(self) -> None:
         """Say what was counted and is due; to be called now and then."""

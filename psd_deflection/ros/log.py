@@ -12,7 +12,6 @@ import os
 import queue
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from rcl_interfaces.msg import Log
@@ -20,19 +19,12 @@ from rclpy.logging import LoggingSeverity, get_logging_directory
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from psd_deflection.base.errors import Failed, Warned
+from psd_deflection.base.log import INFO, Say
 
 MOST_LINES = 1000
 """Lines that wait for a slow disk; further ones are not in the file."""
 JOIN_S = 0.2
 """Time limit for the last lines to reach the disk."""
-
-
-def severity(text: str) -> LoggingSeverity:
-    """Severity of a line that a session says."""
-    if isinstance(text, Failed):
-        return LoggingSeverity.ERROR
-    return LoggingSeverity.WARN if isinstance(text, Warned) else LoggingSeverity.INFO
 
 
 def rcl_log_file() -> Path | None:
@@ -47,7 +39,7 @@ def rcl_log_file() -> Path | None:
 class NodeLog:
     """Call it with a line. ``say`` puts it on the terminal; what ``--log-level`` leaves out goes nowhere."""
 
-    def __init__(self, node: Node, say: Callable[[str], None]) -> None:
+    def __init__(self, node: Node, say: Say) -> None:
         self._say = say
         self._logger = node.get_logger()
         as_every_node = QoSProfile(depth=MOST_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -59,21 +51,21 @@ class NodeLog:
             self._thread = threading.Thread(target=self._write, args=(file,), name='log', daemon=True)
             self._thread.start()
 
-    def __call__(self, text: str) -> None:
+    def __call__(self, text: str, level: int = INFO, /) -> None:
         """Log one line, from any thread."""
-        level = severity(text)
-        if not self._logger.is_enabled_for(level):
+        severity = LoggingSeverity(level)
+        if not self._logger.is_enabled_for(severity):
             return
-        line = Log(level=int(level), name=self._logger.name, msg=text)
+        line = Log(level=level, name=self._logger.name, msg=text)
         line.stamp.sec, line.stamp.nanosec = divmod(time.time_ns(), 1_000_000_000)
         # The terminal comes last: who reads a line there finds it in the file.
         if self._thread is not None and self._lines.qsize() < MOST_LINES:
             seconds = f'{line.stamp.sec}.{line.stamp.nanosec:09d}'
-            self._lines.put(f'[{level.name}] [{seconds}] [{self._logger.name}]: {text}\n')
+            self._lines.put(f'[{severity.name}] [{seconds}] [{self._logger.name}]: {text}\n')
         # An abandoned thread may log a line after the node is gone.
         with contextlib.suppress(RuntimeError):
             self._publisher.publish(line)
-        self._say(text)
+        self._say(text, level)
 
     def close(self) -> None:
         """Write the last lines."""

@@ -23,7 +23,8 @@ from rclpy.qos import QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from msg_adapters import DIAGNOSTICS, TOPIC_TYPES, to_messages
-from psd_deflection.base.errors import ConfigError, Failed, PsdDeflectionError, Warned
+from psd_deflection.base.errors import ConfigError, PsdDeflectionError
+from psd_deflection.base.log import ERROR, WARNING, Say
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.rig.declarations import BY_NAME
@@ -93,9 +94,7 @@ class BaseNode:
     SYSTEM_TIME: ClassVar[bool] = False
     """What it measures is stamped by the system clock, so it refuses ``use_sim_time``."""
 
-    def __init__(
-        self, name: str, say: Callable[[str], None], overrides: Mapping[str, object] = MappingProxyType({})
-    ) -> None:
+    def __init__(self, name: str, say: Say, overrides: Mapping[str, object] = MappingProxyType({})) -> None:
         self.error: Exception | None = None
         self.finished = self.active = False
         self._starting = False
@@ -255,11 +254,11 @@ class BaseNode:
     def _tell_error(self, text: str) -> None:
         # At the start it is raised, and the caller reports it.
         if not self._starting:
-            self.log(Failed(text))
+            self.log(text, ERROR)
 
     def _tell_frames(self, action: Callable[[], None]) -> None:
         if action == self.activate and self.frame_prefix == '' and self.node.get_namespace() != '/':
-            self.log(Warned('frames have no prefix: where several run, give each its own (frame_prefix)'))
+            self.log('frames have no prefix: where several run, give each its own (frame_prefix)', WARNING)
 
     def _refuse_sim_time(self) -> None:
         if not self.SYSTEM_TIME:
@@ -267,7 +266,7 @@ class BaseNode:
         why = 'what is measured is stamped by the system clock'
         if self.node.get_parameter(USE_SIM_TIME).value:
             self.node.set_parameters([RosParameter(USE_SIM_TIME, value=False)])
-            self.log(Warned(f'{USE_SIM_TIME} is refused: {why}'))
+            self.log(f'{USE_SIM_TIME} is refused: {why}', WARNING)
 
         def check(changed: list[RosParameter]) -> SetParametersResult:
             wanted = any(p.name == USE_SIM_TIME and p.value for p in changed)
@@ -288,7 +287,7 @@ class BaseNode:
                     return await await_or_execute(carry_out, request, response)
                 except Exception as error:
                     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                    self.log(Warned(f'{name}: refused: {reason}'))
+                    self.log(f'{name}: refused: {reason}', WARNING)
                     return _refusal(request, response, reason)
 
             return answer
@@ -301,7 +300,7 @@ class BaseNode:
         rivals = frozenset(self.rivals())
         for topic in sorted(rivals - self._rivals):
             remedy = 'start one of them in a namespace (-r __ns:=/NAME)'
-            self.log(Warned(f'another node publishes on {topic} too: {remedy}'))
+            self.log(f'another node publishes on {topic} too: {remedy}', WARNING)
         self._rivals = rivals
         self.report()
 

@@ -8,7 +8,7 @@ thread.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from rclpy.clock import Clock, ClockType
@@ -19,7 +19,9 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from msg_adapters import DIAGNOSTICS, TOPIC_TYPES, to_messages
 from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory, TrajectoryShaper, checked
 from psd_deflection.arms.inputs import is_position, joints_fault, stamp_fault
-from psd_deflection.base.errors import ConfigError, Warned, printable
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import WARNING, Say
+from psd_deflection.base.printable import printable
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.ros.declared import node_with_overrides, refuse_unknown
@@ -46,7 +48,7 @@ LONGEST = 200
 class ShaperNode:
     """The node. ``described``: the shaper, for people."""
 
-    def __init__(self, shaper: TrajectoryShaper, described: str, say: Callable[[str], None]) -> None:
+    def __init__(self, shaper: TrajectoryShaper, described: str, say: Say) -> None:
         self._shaper = shaper
         self._described = described
         self.node = node = node_with_overrides(NODE_NAME)
@@ -90,7 +92,7 @@ class ShaperNode:
         except ConfigError as error:
             self._refused += 1
             self._why = printable(str(error), LONGEST)
-            self._repeats.tell('refused', Warned(f'trajectory refused: {self._why}'), now, NEWS)
+            self._repeats.tell('refused', f'trajectory refused: {self._why}', WARNING, now, NEWS)
             return
         self._shaped += 1
         self._why = ''
@@ -156,7 +158,7 @@ def _message(trajectory: Trajectory, header: Any) -> Any:
     return out
 
 
-def run_shaper(ros_args: Sequence[str], shaper: TrajectoryShaper, described: str, say: Callable[[str], None]) -> int:
+def run_shaper(ros_args: Sequence[str], shaper: TrajectoryShaper, described: str, say: Say) -> int:
     """Run the node until SIGINT or SIGTERM."""
     with ros(NODE_NAME, ros_args) as signals:
         owner = ShaperNode(shaper, described, say)

@@ -18,6 +18,7 @@ from msg_adapters import (
     TOPIC_TYPES,
     vector3_stamped,
 )
+from psd_deflection.base.log import unsaid
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, SampleBlock, TemperatureReading
 from psd_deflection.rig.config import Rig
@@ -119,7 +120,7 @@ class InputRecorder(InputGate):
     """
 
     def __init__(self, node: Node, topics: Iterable[str], below: str = '') -> None:
-        super().__init__(node, lambda line: None)
+        super().__init__(node, unsaid)
         self.session: Session | None = None
         self._below = below
         self._subscriptions: dict[str, Subscription] = {}

@@ -18,6 +18,7 @@ from typing import NamedTuple
 from psd_deflection.arms.chains.chain import EndEffector
 from psd_deflection.arms.chains.chain_file import ChainFile
 from psd_deflection.arms.chains.joining import Joined, Joiner
+from psd_deflection.base.log import INFO, Say
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -82,8 +83,8 @@ class ChainSession:
     def __init__(
         self,
         file: ChainFile,
-        say: Callable[[str], None],
-        open_session: Callable[[str, Rig, Callable[[str], None]], Session] = lambda _, rig, say: Session(rig, say),
+        say: Say,
+        open_session: Callable[[str, Rig, Say], Session] = lambda _, rig, say: Session(rig, say),
     ) -> None:
         self.file = file
         self.sessions: list[Session] = []
@@ -94,7 +95,7 @@ class ChainSession:
         self._closed = False
         self._lock = threading.Lock()
         self._say = say
-        self._spokesman = Spokesman(lambda line: say(type(line)(f'end effector: {line}')))
+        self._spokesman = Spokesman(lambda line, level=INFO: say(f'end effector: {line}', level))
         self._joiner = Joiner([round(1e9 * r.estimator.block_size / r.converter.sample_rate_hz) for r in file.rigs])
         try:
             with contextlib.ExitStack() as early:
@@ -110,8 +111,8 @@ class ChainSession:
             session.acquisition.to_ros_ns = self.sessions[0].acquisition.to_ros_ns
             session.processing.sinks.append(_LinkSink(self, link))
 
-    def _said(self, name: str, line: str) -> None:
-        self._say(type(line)(f'{name}: {line}'))
+    def _said(self, name: str, line: str, level: int = INFO, /) -> None:
+        self._say(f'{name}: {line}', level)
 
     @property
     def alive(self) -> bool:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from psd_deflection.base.errors import DeviceError
+from psd_deflection.base.log import Say
 from psd_deflection.model.detector import counts_to_volts
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.rig.config import Rig, replace_values
@@ -22,8 +23,6 @@ LOOK_S = 0.2
 SILENT_LOOKS = 50
 SIMULATED_PUSH = 0.5e-3
 """m: how far the simulated hand moves a dot."""
-
-Say = Callable[[str], None]
 
 
 def run_guided(rig: Rig, world: Rig, say: Say, show: Callable[[Guide], None]) -> Checkup:

@@ -6,14 +6,13 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar
 
+from psd_deflection.base.log import Say
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.run.realtime import Watchdog, settle
 from psd_deflection.run.session import Session
 from psd_deflection.run.signals import Signals, StopRequestedError
 
 LOOK_S = 0.1
-
-Say = Callable[[str], None]
 
 
 class Companion(Protocol):

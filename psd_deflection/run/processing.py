@@ -16,7 +16,7 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from psd_deflection.base.errors import Warned
+from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
 from psd_deflection.run.reading.acquisition import Arrival, Item, Restarted
@@ -54,7 +54,7 @@ class Spokesman:
     Blocks that were affected in between are counted in the next line.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
+    def __init__(self, say: Say) -> None:
         self._say = say
         self._last_line = -INTERVAL_S
         self._now = ''
@@ -76,7 +76,7 @@ class Spokesman:
             line += f' ({self._blocks} {noun} affected since the last line)'
         self._last_line = now
         self._blocks = self._changes = 0
-        self._say(Warned(line) if cause else line)
+        self._say(line, WARNING if cause else INFO)
 
 
 class Processing:
@@ -89,7 +89,7 @@ class Processing:
         self,
         items: queue.SimpleQueue[Item],
         pipeline: Pipeline,
-        say: Callable[[str], None],
+        say: Say,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.pipeline = pipeline

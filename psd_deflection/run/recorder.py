@@ -22,7 +22,8 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 
-from psd_deflection.base.errors import Failed, RecordingError, Warned
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.log import ERROR, WARNING, Say
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 from psd_deflection.rig.config import Rig
@@ -92,7 +93,7 @@ class Recorder:
     def __init__(
         self,
         queue_blocks: int,
-        say: Callable[[str], None],
+        say: Say,
         between_blocks: Callable[[Callable[[], None]], None],
         node: str = '',
     ) -> None:
@@ -207,10 +208,9 @@ class Recorder:
             thread.join(max(until - time.monotonic(), 0.0))
             if thread.is_alive():
                 self._say(
-                    Warned(
-                        f'{take.folder}: the disk is slow; it is not waited for. '
-                        f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole'
-                    )
+                    f'{take.folder}: the disk is slow; it is not waited for. '
+                    f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole',
+                    WARNING,
                 )
         return None if ended.done() and ended.exception() is not None else folder
 
@@ -254,7 +254,7 @@ class Recorder:
             take.closed.set_result(bag.folder)
             return
         self.failure = why
-        self._say(Failed(f'recording stopped: {why}'))
+        self._say(f'recording stopped: {why}', ERROR)
         take.closed.set_exception(RecordingError(f'recording stopped: {why}'))
 
     def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
@@ -351,7 +351,7 @@ class Recorder:
             if deleted is None:
                 raise _FullError(f'{missing} and there is no older file of this recording to delete')
             self.files_deleted += 1
-            self._say(Warned(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)'))
+            self._say(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)', WARNING)
 
 
 def _look_for(bag: BagWriter) -> None:

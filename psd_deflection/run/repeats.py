@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+
+from psd_deflection.base.log import INFO, Say
 
 FIRST_WAIT_S = 10.0
 LONGEST_WAIT_S = 3600.0
@@ -12,6 +13,7 @@ LONGEST_WAIT_S = 3600.0
 @dataclass(slots=True)
 class _Kind:
     line: str = ''
+    level: int = INFO
     since: int = 0
     next_s: float = 0.0
     wait_s: float = FIRST_WAIT_S
@@ -25,15 +27,15 @@ class Repeats:
     Owns no clock: every time comes from the caller, s.
     """
 
-    def __init__(self, say: Callable[[str], None]) -> None:
+    def __init__(self, say: Say) -> None:
         self._say = say
         self._kinds: dict[str, _Kind] = {}
 
-    def tell(self, kind: str, line: str, now_s: float, at_once: int = 1) -> None:
-        """Say ``line`` now, or count it. ``kind``: one of the program's own few names. ``at_once``: so many are
-        said without waiting."""
+    def tell(self, kind: str, line: str, level: int, now_s: float, at_once: int = 1) -> None:
+        """Say ``line`` now, or count it. ``kind``: one of the program's own few names. ``level``: its severity.
+        ``at_once``: so many are said without waiting."""
         known = self._kinds.setdefault(kind, _Kind())
-        known.line = line
+        known.line, known.level = line, level
         known.since += 1
         if now_s >= known.next_s + known.wait_s:
             known.told, known.wait_s = 0, FIRST_WAIT_S
@@ -51,7 +53,7 @@ class Repeats:
         if now_s < known.next_s:
             return
         more = f' (and {known.since - 1} more like it)' if known.since > 1 else ''
-        self._say(type(known.line)(known.line + more))
+        self._say(known.line + more, known.level)
         known.since = 0
         known.told += 1
         known.next_s = now_s + known.wait_s

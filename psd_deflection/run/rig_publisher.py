@@ -1,23 +1,35 @@
-"""Tells a wire what the rig is: ``/link_tip/rig``."""
+"""Tells a wire what the rig is, and what the pipeline remembers: ``/link_tip/rig``."""
 
 from __future__ import annotations
 
+import threading
 import time
+from collections import deque
 from collections.abc import Mapping
 
 from msg_adapters import to_messages
 from psd_deflection import __version__
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import provenance
-from psd_deflection.records import ENVIRONMENT, KNOWN_LOAD, ParameterChange, RigState
+from psd_deflection.records import ENVIRONMENT, KNOWN_LOAD, ParameterChange, Record, RigState, SampleBlock
+from psd_deflection.rig.config import Rig
 from psd_deflection.run.fanout import Wire
 from psd_deflection.run.session import Session
+
+MEMORY_S = 10.0
+"""What the pipeline remembers is told so often, s, or when a segment of the noise ends after that."""
+LATE = 100
+"""So many blocks later it is told though a segment is under way, if that is not long."""
+MOST_GATHERED = 20_000
+"""Numbers of a segment under way that are told; a longer one is waited for."""
 
 
 class RigPublisher:
     """Publishes rig, zero and hello of ``session``: on activation, at each change, and if the hello changes.
 
-    Changes come in the pipeline thread, between two blocks. Our own recordings hold the same without it.
+    Changes come in the pipeline thread, between two blocks. Our own recordings hold the same without it. As a sink of
+    the session's records it takes what the pipeline remembers, every ``MEMORY_S``, so that whatever recorder joins late
+    replays bit for bit from there; :meth:`tell` encodes and publishes it, in its own thread.
     """
 
     def __init__(self, wire: Wire, session: Session) -> None:
@@ -26,20 +38,61 @@ class RigPublisher:
         self._told: Mapping[str, object] | None = None
         self._last = ParameterChange(0, 0, ())
         self._environment: dict[str, object] = {}
+        rig = session.rig
+        self._every = max(round(MEMORY_S * rig.converter.sample_rate_hz / rig.estimator.block_size), 1)
+        # What holds before the first block is known now; which block that is, when it comes.
+        self._first: ParameterChange | None = self._memory()
+        self._due: int | None = None
+        self._untold: deque[tuple[Rig, ParameterChange]] = deque(maxlen=2)
+        self._lock = threading.Lock()
+
+    def _memory(self) -> ParameterChange:
+        pipeline = self._session.pipeline
+        return pipeline.memory(pipeline.rig) or ParameterChange(0, 0, ())
+
+    def put(self, record: Record) -> None:
+        """Take what the pipeline remembers after the block ``record``, if it is due."""
+        if not isinstance(record, SampleBlock):
+            return
+        pipeline, index = self._session.pipeline, record.index
+        if self._first is not None:
+            first, self._first = self._first, None
+            self._untold.append((pipeline.rig, first._replace(block=index)))
+        due = self._due if self._due is not None else index
+        if index < due:
+            return
+        gathered = pipeline.gathers
+        if not gathered or (index >= due + LATE and gathered <= MOST_GATHERED):
+            self._due = index + self._every
+            self._untold.append((pipeline.rig, self._memory()._replace(block=index + 1)))
 
     def put_change(self, change: ParameterChange) -> None:
         """Publish the rig after ``change``."""
         if all(name == KNOWN_LOAD for name, _ in change.values):
             # A reader has the load from its own topic.
             return
-        self._last = change
-        self._environment |= {name: value for name, value in change.values if name in ENVIRONMENT}
-        self._publish(dict(change.values))
+        # In order: what was remembered is of the rig before.
+        self._tell_memories()
+        with self._lock:
+            self._last = change
+            self._environment |= {name: value for name, value in change.values if name in ENVIRONMENT}
+            self._publish(dict(change.values))
 
     def tell(self, again: bool = True) -> None:
-        """Publish the present rig; with ``again`` False only if the hello is another than the one that was told."""
-        if again or self._hello() != self._told:
-            self._publish(self._environment)
+        """Publish what is remembered, if that is due; the present rig if ``again``, or if the hello is another one."""
+        self._tell_memories()
+        with self._lock:
+            if again or self._hello() != self._told:
+                # A recorder that joins from now on waits for what comes next.
+                self._due = None
+                self._publish(self._environment)
+
+    def _tell_memories(self) -> None:
+        with self._lock:
+            while self._untold:
+                rig, memory = self._untold.popleft()
+                values = dict(memory.values)
+                self._send(self._state(rig, memory, {})._replace(memory=values))
 
     def _hello(self) -> Mapping[str, object] | None:
         hello = self._session.acquisition.hello
@@ -47,7 +100,19 @@ class RigPublisher:
 
     def _publish(self, changed: Mapping[str, object]) -> None:
         self._told = self._hello()
-        rig = self._session.rig.flat()
-        state = RigState(self._last.t_ns, self._last.block, rig, self._told, changed, __version__, provenance())
+        self._send(self._state(self._session.rig, self._last, changed))
+
+    def _state(self, rig: Rig, at: ParameterChange, changed: Mapping[str, object]) -> RigState:
+        return RigState(
+            t_ns=at.t_ns,
+            block=at.block,
+            parameters=rig.flat(),
+            hello=self._told,
+            changed=changed,
+            version=__version__,
+            made_with=provenance(),
+        )
+
+    def _send(self, state: RigState) -> None:
         for message in to_messages(state):
             self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), time.time_ns())

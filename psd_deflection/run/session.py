@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, wait
 from functools import partial
 from pathlib import Path
 
 from msg_adapters import ACCELERATION, LOAD, TOPIC_TYPES, accel_stamped, from_fields, to_messages
-from psd_deflection.base.errors import Failed, Warned, printable
+from psd_deflection.base.log import ERROR, INFO, WARNING, Say
+from psd_deflection.base.printable import printable
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.solvers.registry import check_arrangement, check_live
 from psd_deflection.recordings import cdr
@@ -81,10 +82,10 @@ class Session:
     Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
     """
 
-    def __init__(self, rig: Rig, say: Callable[[str], None], node: str = '', unzeroed: Rig | None = None) -> None:
+    def __init__(self, rig: Rig, say: Say, node: str = '', unzeroed: Rig | None = None) -> None:
         self._simulated: SimulatedRigProcess | None = None
         self._closed = False
-        self.listeners: list[Callable[[str], None]] = [say]
+        self.listeners: list[Say] = [say]
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
         self.refused: Counter[str] = Counter()
@@ -100,10 +101,8 @@ class Session:
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
             say(
-                Warned(
-                    f'no port given: started the simulated rig on {self._simulated.port} '
-                    '(parameter port names a real one)'
-                )
+                f'no port given: started the simulated rig on {self._simulated.port} (parameter port names a real one)',
+                WARNING,
             )
         same = left_as_in_the_thesis(rig.values)
         if same:
@@ -116,9 +115,9 @@ class Session:
             # Our own simulated rig starts unloaded, so no kept zero applies.
             if rig.acquisition.keep_zero and not self.simulated:
                 self._store = ZeroStore(unzeroed or rig, hello.info.get('serial') if hello is not None else None)
-                rig, about = self._store.load(rig)
+                rig, about, level = self._store.load(rig)
                 if about:
-                    say(about)
+                    say(about, level)
                     pipeline = Pipeline(rig)
                     pipeline.tip_loads.zeroed = self._store.loaded
             say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
@@ -138,10 +137,10 @@ class Session:
                 self._simulated.close()
             raise
 
-    def _tell(self, text: str) -> None:
-        text = type(text)(printable(text, LONGEST_LINE))
+    def _tell(self, text: str, level: int = INFO, /) -> None:
+        text = printable(text, LONGEST_LINE)
         for listener in tuple(self.listeners):
-            listener(text)
+            listener(text, level)
 
     @property
     def pipeline(self) -> Pipeline:
@@ -194,7 +193,7 @@ class Session:
                 asked.result()
             else:
                 self._tell(
-                    Warned('the disk does not answer; the recording begins when it does, samples flow meanwhile')
+                    'the disk does not answer; the recording begins when it does, samples flow meanwhile', WARNING
                 )
                 asked.add_done_callback(self._tell_refused)
         self.acquisition.start()
@@ -228,7 +227,7 @@ class Session:
         error = done.exception()
         if error is not None:
             self.recorder.failure = str(error)
-            self._tell(Failed(f'not recorded: {error}'))
+            self._tell(f'not recorded: {error}', ERROR)
 
     def take_input(self, topic: str, message: bytes) -> Record | None:
         """Record an encoded message of another node, and show it.
@@ -296,7 +295,7 @@ class Session:
     def _refuse(self, topic: str, why: str) -> None:
         self.refused[topic] += 1
         self.why_refused[topic] = why
-        self._repeats.tell(f'refused {topic}', Warned(f'{topic}: refused: {why}'), time.monotonic())
+        self._repeats.tell(f'refused {topic}', f'{topic}: refused: {why}', WARNING, time.monotonic())
 
     def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False) -> AppliedLoad:
         """Take down that this load (N, N, N m) acts at the tip from now on, as if it had come on ``/link_tip/load``.
@@ -381,12 +380,12 @@ class Session:
         self.acquisition.stop()
         self.processing.join(JOIN_S)
         if self.processing.alive:
-            self._tell(Warned('a subscriber holds up the last blocks; they are not waited for'))
+            self._tell('a subscriber holds up the last blocks; they are not waited for', WARNING)
         folder = self.recorder.close()
         if self.watcher is not None and not self.watcher.close(KEEP_S):
-            self._tell(Warned('watch: the disk is slow; what was to be kept may lack its end'))
+            self._tell('watch: the disk is slow; what was to be kept may lack its end', WARNING)
         if self._store is not None and not self._store.join(KEEP_S):
-            self._tell(Warned(f'{self._store.path}: the disk is slow; the zero may not be kept'))
+            self._tell(f'{self._store.path}: the disk is slow; the zero may not be kept', WARNING)
         if self._simulated is not None:
             self._simulated.close()
         return folder

@@ -10,12 +10,13 @@ from __future__ import annotations
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from msg_adapters import INPUTS, SAMPLES
-from psd_deflection.base.errors import Failed, RecordingError, Warned
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.log import ERROR, WARNING, Say
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Alarm, Watch
 from psd_deflection.recordings.write.bag_writer import BagWriter
@@ -49,9 +50,7 @@ class Watcher:
     ``hello``: the device's. ``node``: full name of the ROS node, for what is kept.
     """
 
-    def __init__(
-        self, pipeline: Pipeline, say: Callable[[str], None], hello: Mapping[str, object] | None, node: str = ''
-    ) -> None:
+    def __init__(self, pipeline: Pipeline, say: Say, hello: Mapping[str, object] | None, node: str = '') -> None:
         config = pipeline.rig.acquisition
         self.watch = Watch(pipeline.rig, pipeline.tip_loads.compliance)
         self.folder: Path | None = None
@@ -81,7 +80,7 @@ class Watcher:
         t_ns = int(record.t_ns[-1])
         if self.watch.alarms > self._said and self.watch.alarm is not None:
             self._said = self.watch.alarms
-            self._say(Warned(f'watch: since {_clock(self.watch.alarm.since_ns)}: {self.watch.alarm.words}'))
+            self._say(f'watch: since {_clock(self.watch.alarm.since_ns)}: {self.watch.alarm.words}', WARNING)
             if self._parent is not None and self._due_ns is None:
                 self._due_ns = t_ns + AFTER_NS
         if self._due_ns is not None and t_ns >= self._due_ns:
@@ -132,7 +131,7 @@ class Watcher:
         segments = list(self._segments)
         self._segments.clear()
         if self._writing is not None and self._writing.is_alive():
-            self._say(Warned('watch: the disk still writes what was kept before; this is not kept'))
+            self._say('watch: the disk still writes what was kept before; this is not kept', WARNING)
             return
         self._writing = threading.Thread(target=self._write, args=(segments,), name='watch', daemon=True)
         self._writing.start()
@@ -142,7 +141,7 @@ class Watcher:
             self.folder = self._written(segments)
         except RecordingError as error:
             self.failure = f'not kept: {error}'
-            self._say(Failed(f'watch: {self.failure}'))
+            self._say(f'watch: {self.failure}', ERROR)
             return
         self._say(f'watch: kept as {self.folder}; see `psd-deflection discover {self.folder}`')
 

@@ -14,12 +14,12 @@ import json
 import os
 import re
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.base.errors import ConfigError, Failed, Warned
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.files import replace_file
+from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import check_value
@@ -53,8 +53,8 @@ class ZeroStore:
         self._wanted: Rig | None = None
         self._thread: threading.Thread | None = None
 
-    def load(self, rig: Rig) -> tuple[Rig, str]:
-        """The rig with the kept zero, if there is one, and a line to report about it, or ''."""
+    def load(self, rig: Rig) -> tuple[Rig, str, int]:
+        """The rig with the kept zero, if there is one; a line to report about it, or ''; the line's severity."""
         try:
             with self.path.open('rb') as stream:
                 content = stream.read(MAX_BYTES + 1)
@@ -65,17 +65,19 @@ class ZeroStore:
                 raise ValueError('not what ~/zero writes')
             zeros = {name: check_value(BY_NAME[name], kept.get(name), str(self.path)) for name in rig.zeros_by_name}
         except FileNotFoundError:
-            return rig, ''
+            return rig, '', INFO
         except (OSError, ValueError, RecursionError, ConfigError) as error:
-            return rig, Warned(f'{self.path}: the kept zero cannot be used ({error}); the rig file holds')
+            return rig, f'{self.path}: the kept zero cannot be used ({error}); the rig file holds', WARNING
         if kept.get('serial') != self._serial:
-            return rig, Warned(f'{self.path}: the kept zero is that of another device; the rig file holds')
+            return rig, f'{self.path}: the kept zero is that of another device; the rig file holds', WARNING
         if kept['configured'] != self._configured:
-            return rig, Warned(
-                f'{self.path}: the rig file has another zero than when this one was kept; the rig file holds'
+            return (
+                rig,
+                f'{self.path}: the rig file has another zero than when this one was kept; the rig file holds',
+                WARNING,
             )
         self.loaded = True
-        return replace_values(rig, zeros, str(self.path)), f'zero of the last run, from {self.path}'
+        return replace_values(rig, zeros, str(self.path)), f'zero of the last run, from {self.path}', INFO
 
     def save(self, rig: Rig) -> str:
         """Save the zero of ``rig``; return '' or why it failed."""
@@ -87,7 +89,7 @@ class ZeroStore:
             return f'{self.path}: the zero cannot be kept ({error.strerror or error})'
         return ''
 
-    def keep(self, rig: Rig, say: Callable[[str], None]) -> None:
+    def keep(self, rig: Rig, say: Say) -> None:
         """Save the zero of ``rig`` in a separate thread; ``say`` gets a line if it fails. The last zero wins."""
         self._wanted = rig
         self._thread = threading.Thread(target=self._keep, args=(say,), name='zero', daemon=True)
@@ -100,9 +102,9 @@ class ZeroStore:
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
-    def _keep(self, say: Callable[[str], None]) -> None:
+    def _keep(self, say: Say) -> None:
         with self._saving:
             rig, self._wanted = self._wanted, None
             trouble = self.save(rig) if rig is not None else ''
         if trouble:
-            say(Failed(trouble))
+            say(trouble, ERROR)

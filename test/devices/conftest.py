@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import DeviceError
+from psd_deflection.base.log import texts
 from psd_deflection.devices import LineDevice, PortClosedError, dataq, text_lines, thorlabs
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.devices.rig_feed import RigFeed
@@ -151,7 +152,7 @@ class Run:
 
     def __init__(self, rig: Rig) -> None:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.acquisition = Acquisition(rig, self.said.put)
+        self.acquisition = Acquisition(rig, texts(self.said.put))
         self.acquisition.open()
         self.acquisition.start()
 

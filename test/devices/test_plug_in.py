@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 
 from psd_deflection.base.errors import ConfigError, DeviceError
+from psd_deflection.base.log import texts, unsaid
 from psd_deflection.cli.main import main
 from psd_deflection.devices import PowerUp
 from psd_deflection.devices.registry import SIMULATED, find_device, known_devices, make_source, source_names
@@ -81,7 +82,7 @@ def test_help_names_it(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.M
 def test_a_session_without_a_port_runs_on_its_twin() -> None:
     said: list[str] = []
     estimates = Estimates(4)
-    session = Session(load_rig(overrides={'source': NAME}), said.append)
+    session = Session(load_rig(overrides={'source': NAME}), texts(said.append))
     try:
         session.processing.sinks.append(estimates)
         session.start()
@@ -118,7 +119,7 @@ def test_one_without_a_twin_is_refused_where_a_twin_is_needed(
     with pytest.raises(ConfigError, match=rf"source = '{NAME}': cannot be simulated; serial, dataq, .* can"):
         simulated_devices(NAME, load_rig())
     with pytest.raises(DeviceError, match='no such port'):
-        Session(load_rig(overrides={'source': NAME}), lambda _: None)
+        Session(load_rig(overrides={'source': NAME}), unsaid)
 
 
 def test_one_that_declares_another_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:

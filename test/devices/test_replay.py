@@ -10,6 +10,7 @@ import pytest
 
 import psd_deflection
 from psd_deflection.base.errors import ConfigError, DeviceError
+from psd_deflection.base.log import texts
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.replay import Pacer, Replay
 from psd_deflection.devices.source import Sample, SourceEndedError
@@ -90,7 +91,7 @@ def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
     path = tmp_path / 'run.csv'
     path.write_text('t,x1,y1,sum1,x2,y2,sum2\n' + rows)
     said: list[str] = []
-    acquisition = Acquisition(load_rig(overrides={'source': 'replay', 'port': str(path)}), said.append)
+    acquisition = Acquisition(load_rig(overrides={'source': 'replay', 'port': str(path)}), texts(said.append))
     acquisition.open()
     acquisition.start()
     items: list[Any] = []
@@ -113,4 +114,4 @@ def test_a_rig_of_another_rate_is_refused(tmp_path: Path) -> None:
     path = tmp_path / 'slow.csv'
     path.write_text('t,x1,y1,sum1,x2,y2,sum2\n' + rows)
     with pytest.raises(DeviceError, match='sample_rate_hz 500'):
-        Acquisition(load_rig(overrides={'source': 'replay', 'port': str(path)}), print).open()
+        Acquisition(load_rig(overrides={'source': 'replay', 'port': str(path)}), texts(print)).open()

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import (
     BadFrame,
     Frame,
@@ -89,7 +90,7 @@ class Kept:
 
 def test_it_works_unchanged_with_the_daemon(port: str) -> None:
     said: list[str] = []
-    session = Session(load_rig(overrides={'port': port}), said.append)
+    session = Session(load_rig(overrides={'port': port}), texts(said.append))
     kept = Kept()
     estimates = Estimates(40)
     session.processing.sinks += [kept, estimates]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from psd_deflection.base.errors import ConfigError, DeviceError
+from psd_deflection.base.log import texts, unsaid
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
@@ -24,7 +25,7 @@ SLOW: dict[str, object] = {'converter.sample_rate_hz': 25.0, 'block_size': 2, 'm
 def test_estimates_come_of_every_device(source: str, overrides: dict[str, object], described: str) -> None:
     said: list[str] = []
     estimates = Estimates(4)
-    session = Session(load_rig(overrides={'source': source, **overrides}), said.append)
+    session = Session(load_rig(overrides={'source': source, **overrides}), texts(said.append))
     try:
         session.processing.sinks.append(estimates)
         session.start()
@@ -40,9 +41,9 @@ def test_estimates_come_of_every_device(source: str, overrides: dict[str, object
 
 def test_a_rate_that_the_pair_cannot_do_ends_before_it_begins() -> None:
     with pytest.raises(DeviceError, match=r'converter\.sample_rate_hz = 1000 is out of reach'):
-        Session(load_rig(overrides={'source': 'thorlabs'}), lambda _: None)
+        Session(load_rig(overrides={'source': 'thorlabs'}), unsaid)
 
 
 def test_a_device_without_a_twin_needs_a_port() -> None:
     with pytest.raises(ConfigError, match='name the recording'):
-        Session(load_rig(overrides={'source': 'replay'}), lambda _: None)
+        Session(load_rig(overrides={'source': 'replay'}), unsaid)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError, DeviceError
+from psd_deflection.base.log import texts, unsaid
 from psd_deflection.devices import registry as _registry
 from psd_deflection.devices.contract_frames import ContractFrames
 from psd_deflection.devices.protocol.frames import BadFrame, HelloFrame
@@ -89,7 +90,7 @@ def acquisition_of(
     source = Scripted(load_rig())
     source.script, source.clock, source.numbered = script, clock, numbered
     with patch('psd_deflection.run.reading.acquisition.make_source', lambda rig: source):
-        return Acquisition(load_rig(), lambda _: None)
+        return Acquisition(load_rig(), unsaid)
 
 
 def run(acquisition: Acquisition) -> list[Item]:
@@ -214,7 +215,7 @@ def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gi
                 over.set()
 
     said: list[str] = []
-    acquisition = Acquisition(load_rig(overrides={'source': 'scripted'}), said.append)
+    acquisition = Acquisition(load_rig(overrides={'source': 'scripted'}), texts(said.append))
     acquisition.source = source = Patient(load_rig())
     source.script = [PortClosedError('scripted: gone')]
     acquisition.open()

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.measure.pipeline import FROZEN, HELD, Pipeline
+from psd_deflection.measure.estimation import HELD
+from psd_deflection.measure.health import FROZEN
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers.one_psd import OnePsd
 from psd_deflection.records import BlockStatus, Counts, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad

@@ -12,7 +12,8 @@ import numpy.typing as npt
 import pytest
 
 from psd_deflection.cli.main import main
-from psd_deflection.measure.pipeline import FROZEN, Pipeline
+from psd_deflection.measure.health import FROZEN
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation.loads import direct, sidebar
 from psd_deflection.model.simulation.simulator import RigSimulator

@@ -538,12 +538,19 @@ def test_a_rig_of_read_only_maps_is_written_and_one_of_anything_else_is_not() ->
         to_messages(RigState(5, 7, {'bad': {1, 2}}, None, {}, '1'))
 
 
-def test_a_text_of_a_million_characters_is_read_and_a_longer_one_is_not() -> None:
+def test_the_longest_text_is_read_and_a_longer_one_is_not() -> None:
     (m,) = to_messages(RigState(5, 7, {}, None, {}, '1'))
-    text = m.fields['data'].ljust(1_000_000)
+    text = m.fields['data'].ljust(string.MAX_CHARACTERS)
     assert string.to_rig({'data': text}).block == 7
-    with pytest.raises(ValueError, match='has 1000001 characters, more than 1000000'):
+    with pytest.raises(ValueError, match='has 16000001 characters, more than 16000000'):
         string.to_rig({'data': text + ' '})
+
+
+def test_what_the_pipeline_remembers_is_told_or_not() -> None:
+    for memory in (None, {}, {'state.noise': [1.0, 2.5]}):
+        (m,) = to_messages(RigState(5, 7, {}, None, {}, '1', memory=memory))
+        assert ('memory' in m.fields['data']) == (memory is not None)
+        assert string.to_rig(m.fields).memory == memory
 
 
 @pytest.mark.parametrize('text', ['', '[]', '{"version": 1}', '[' * 100_000, 'x' * (string.MAX_CHARACTERS + 1)])

@@ -7,6 +7,8 @@ from typing import Any
 
 import pytest
 
+from psd_deflection.base.log import texts, unsaid
+
 pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
 
@@ -32,13 +34,13 @@ def test_what_was_published_before_is_heard(signals: Signals, peer: Any) -> None
     publisher = peer.node.create_publisher(String, '/left/robot_description', LATCHED)
     publisher.publish(String(data=URDF))
     said: list[str] = []
-    assert robot_description(signals, said.append) == URDF
+    assert robot_description(signals, texts(said.append)) == URDF
     assert said == ['waiting for the robot on /left/robot_description']
 
 
 def test_if_nobody_publishes_it_the_error_says_so(signals: Signals) -> None:
     with pytest.raises(ConfigError, match=r'^/left/robot_description: no description .* \(nobody publishes it\)'):
-        robot_description(signals, lambda line: None, wait_s=0.0)
+        robot_description(signals, unsaid, wait_s=0.0)
 
 
 def test_an_empty_one_is_no_description(signals: Signals, peer: Any) -> None:
@@ -51,10 +53,10 @@ def test_an_empty_one_is_no_description(signals: Signals, peer: Any) -> None:
         return 10.0 * sum('refused' in line for line in told)
 
     with pytest.raises(ConfigError, match='it is empty'):
-        robot_description(signals, told.append, wait_s=5.0, clock=clock)
+        robot_description(signals, texts(told.append), wait_s=5.0, clock=clock)
 
 
 def test_a_signal_ends_the_waiting(signals: Signals) -> None:
     signals.stop = True
     with pytest.raises(StopRequestedError):
-        robot_description(signals, lambda line: None)
+        robot_description(signals, unsaid)

@@ -208,27 +208,32 @@ def test_the_rig_is_latched_and_told_again_when_it_changes(
     peer.until(lambda: len(poses) >= 30, 'estimates')
     # A late subscriber gets what was sent at the start.
     latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    texts = peer.collect(String, '/link_tip/rig', latched)
-    peer.until(lambda: len(texts) >= 1, 'the rig')
-    first = json.loads(texts[0].data)
+    heard = peer.collect(String, '/link_tip/rig', latched)
+    peer.until(lambda: len(heard) >= 1, 'the rig')
+    first = json.loads(heard.pop(0).data)
     assert first['parameters']['link.length'] == 0.6
     assert len(first['parameters']) >= 65
     assert first['hello']['serial'] == 'SIM-0001'
     assert first['zero'] == {'psd_1': [0.0, 0.0], 'psd_2': [0.0, 0.0]}
     peer.zero()
-    peer.until(lambda: len(texts) >= 2, 'the zero')
-    zeroed = json.loads(texts[1].data)
+
+    def changes() -> list[Any]:
+        """Those that do not say what the pipeline remembers, which come now and then."""
+        return [text for text in (json.loads(message.data) for message in heard) if 'memory' not in text]
+
+    peer.until(lambda: len(changes()) >= 1, 'the zero')
+    zeroed = changes()[0]
     assert zeroed['zero'] != first['zero']
     assert zeroed['zero'] == {psd: zeroed['changed'][f'{psd}.zero'] for psd in ('psd_1', 'psd_2')}
     assert zeroed['block'] > first['block']
     value = Parameter('sum_min', value=1.5).to_parameter_msg()
     peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[value]))
-    peer.until(lambda: len(texts) >= 3, 'the change')
-    assert json.loads(texts[2].data)['parameters']['sum_min'] == 1.5
+    peer.until(lambda: len(changes()) >= 2, 'the change')
+    assert changes()[1]['parameters']['sum_min'] == 1.5
     # Once a change, not once a second.
     health = peer.collect(DiagnosticArray, '/diagnostics')
     peer.until(lambda: len(health) >= 3, 'diagnostics')
-    assert len(texts) == 3
+    assert len(changes()) == 2
 
 
 def test_a_disk_that_hangs_holds_up_its_own_requests_alone(

@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from psd_deflection.base.log import unsaid
+
 pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
 
@@ -169,10 +171,11 @@ def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
     cycle(peer, 'deactivate', 'cleanup')
     assert value_of(peer, 'sum_min') == 2.3
     assert put(peer, solver='wls', markers=False) == ''
+    rigs.clear()
     cycle(peer, 'configure', 'activate')
     daemon.until('zero of the last run')
     now = len(poses)
-    peer.until(lambda: len(poses) >= now + 30 and len(rigs) >= 2, 'estimates of wls')
+    peer.until(lambda: len(poses) >= now + 30 and rigs != [], 'estimates of wls')
     told = json.loads(rigs[-1].data)['parameters']
     assert [told[n] for n in ('solver', 'block_size', 'sum_min')] == ['wls', 10, 2.3]
     assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == taken == [told['psd_1.zero'], told['psd_2.zero']]
@@ -257,7 +260,7 @@ def test_an_unforeseen_error_at_the_start_is_not_swallowed(domain: int, monkeypa
 
     monkeypatch.setattr(estimator, 'Session', broken)
     with pytest.raises(ZeroDivisionError, match='of our own making'):
-        estimator.run(['--ros-args'], {}, lambda text: None)
+        estimator.run(['--ros-args'], {}, unsaid)
 
 
 def test_a_refusal_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -266,4 +269,4 @@ def test_a_refusal_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(node, '_ManagedNode', refused)
     with pytest.raises(ConfigError, match=r'^ROS: error creating node: no security libraries Please compile$'):
-        estimator.run(['--ros-args'], {}, lambda text: None)
+        estimator.run(['--ros-args'], {}, unsaid)

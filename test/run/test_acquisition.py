@@ -15,7 +15,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from psd_deflection.base.errors import DeviceError, Warned
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.base.log import INFO, WARNING, texts, unsaid
 from psd_deflection.devices import contract_frames
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
 from psd_deflection.devices.serial_port import SerialPort
@@ -50,17 +51,21 @@ def numbers(items: list[Item]) -> list[int]:
 
 class Run:
     def __init__(self, rig: Rig) -> None:
-        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.acquisition = Acquisition(rig, self.said.put)
+        self.said: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+        self.acquisition = Acquisition(rig, lambda text, level=INFO: self.said.put((text, level)))
         self.acquisition.open()
         self.acquisition.start()
 
     def heard(self, text: str) -> str:
         """Wait for a message that holds ``text``."""
+        return self.heard_with(text)[0]
+
+    def heard_with(self, text: str) -> tuple[str, int]:
+        """The same with its severity."""
         while True:
-            message = self.said.get(timeout=WAIT_S)
+            message, level = self.said.get(timeout=WAIT_S)
             if text in message:
-                return message
+                return message, level
 
 
 @pytest.fixture
@@ -167,27 +172,27 @@ def short_wait(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 def test_a_missing_port_is_named(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match=r'nowhere: no such port; .*psd-deflection devices'):
-        Acquisition(load_rig(overrides={'port': str(tmp_path / 'nowhere')}), print).open()
+        Acquisition(load_rig(overrides={'port': str(tmp_path / 'nowhere')}), texts(print)).open()
 
 
 def test_a_file_is_not_a_serial_port(tmp_path: Path) -> None:
     path = tmp_path / 'file.txt'
     path.write_text('x')
     with pytest.raises(DeviceError, match=r'file\.txt: not a serial port'):
-        Acquisition(load_rig(overrides={'port': str(path)}), print).open()
+        Acquisition(load_rig(overrides={'port': str(path)}), texts(print)).open()
     with pytest.raises(DeviceError, match=r'[^:]*: not a serial port$'):
-        Acquisition(load_rig(overrides={'port': str(tmp_path)}), print).open()
+        Acquisition(load_rig(overrides={'port': str(tmp_path)}), texts(print)).open()
 
 
 def test_a_port_in_use_is_named(run: Run, rig: Rig) -> None:
     with pytest.raises(DeviceError, match='another program has the port open'):
-        Acquisition(rig, print).open()
+        Acquisition(rig, texts(print)).open()
 
 
 def test_a_silent_device_is_named(device: Any, rig: Rig, short_wait: ModuleType) -> None:
     device.answer = b''
     with pytest.raises(DeviceError, match=r'no frame in 0.2 s; is the device powered'):
-        Acquisition(rig, print).open()
+        Acquisition(rig, texts(print)).open()
 
 
 def hear_out(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
@@ -209,14 +214,14 @@ def test_a_device_that_talks_something_else_is_named(device: Any, rig: Rig, monk
     device.answer = b'$GPGGA,123519,4807.038,N\r\n'
     hear_out(monkeypatch, device.answer)
     with pytest.raises(DeviceError, match=r'26 bytes but no frame .* baud rate'):
-        Acquisition(rig, print).open()
+        Acquisition(rig, texts(print)).open()
 
 
 def test_samples_without_hello_are_named(device: Any, rig: Rig, sample: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     device.answer = b'\x00' + encode(sample(1)) + encode(sample(2))
     hear_out(monkeypatch, device.answer)
     with pytest.raises(DeviceError, match='samples come but no HELLO'):
-        Acquisition(rig, print).open()
+        Acquisition(rig, texts(print)).open()
 
 
 @pytest.mark.parametrize(
@@ -235,7 +240,7 @@ def test_a_device_that_does_not_fit_is_named(
 ) -> None:
     device.answer = encode(HelloFrame(version, {**hello.info, **info}))
     with pytest.raises(DeviceError) as error:
-        Acquisition(rig, print).open()
+        Acquisition(rig, texts(print)).open()
     assert said in str(error.value)
     assert rig.acquisition.port in str(error.value)
 
@@ -296,12 +301,12 @@ def test_another_device_on_the_same_port_is_not_taken(device: Any, run: Run) -> 
 
 def test_a_wanted_serial_number_is_held_against_the_first_device_too(device: Any, rig: Rig) -> None:
     with pytest.raises(DeviceError, match="serial number 'T-1' and not 'X'"):
-        Acquisition(load_rig(overrides={'port': rig.acquisition.port, 'serial_number': 'X'}), print).open()
+        Acquisition(load_rig(overrides={'port': rig.acquisition.port, 'serial_number': 'X'}), texts(print)).open()
 
 
 def test_a_pattern_without_a_port_is_named(tmp_path: Path) -> None:
     with pytest.raises(DeviceError, match=r'tty\*: no port of such a name .*psd-deflection devices'):
-        Acquisition(load_rig(overrides={'port': str(tmp_path / 'tty*')}), print).open()
+        Acquisition(load_rig(overrides={'port': str(tmp_path / 'tty*')}), texts(print)).open()
 
 
 def test_a_silent_device_is_woken(device: Any, run: Run, short_wait: ModuleType, sample: Any) -> None:
@@ -323,7 +328,7 @@ def test_a_device_clock_jump_is_reported_and_stamps_increase(
     device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40)])
     before = take(run.acquisition, 40)
     device.send_frames(*[sample(s, t_us=clock[s]) for s in range(40, 80)])
-    assert isinstance(run.heard("the device's clock jumped"), Warned)
+    assert run.heard_with("the device's clock jumped")[1] == WARNING
     items = before + take(run.acquisition, 40)
     t = [int(t) for i in items if isinstance(i, Arrival) for t in i.raw.t_ns]
     assert all(b > a for a, b in itertools.pairwise(t))
@@ -430,7 +435,7 @@ def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
     monkeypatch.setattr(module, 'make_source', lambda rig: source)
     own = {'monotonic': lambda: source.now_ns / 1e9, 'monotonic_ns': lambda: source.now_ns}
     monkeypatch.setattr(module, 'time', SimpleNamespace(**{**vars(time), **own}))
-    acquisition = Acquisition(load_rig(), lambda _: None)
+    acquisition = Acquisition(load_rig(), unsaid)
     acquisition.open()
     acquisition.start()
     while not isinstance(acquisition.queue.get(timeout=WAIT_S), Ended):

@@ -13,6 +13,7 @@ import pytest
 from psd_deflection.arms.chains.chain_file import ChainFile, read_chain
 from psd_deflection.arms.chains.joining import PATIENCE
 from psd_deflection.base.errors import DeviceError
+from psd_deflection.base.log import texts, unsaid
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.run.chain import ChainSession, Composed
 from test.heard import WAIT_S
@@ -52,7 +53,7 @@ class Running:
 
     def __init__(self, file: ChainFile) -> None:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.chain = ChainSession(file, self.said.put)
+        self.chain = ChainSession(file, texts(self.said.put))
         self.composed: queue.SimpleQueue[Composed] = queue.SimpleQueue()
         self.chain.listeners.append(self.composed.put)
         self.chain.start()
@@ -140,5 +141,5 @@ def test_a_link_that_cannot_be_opened_ends_the_others(file: ChainFile, devices: 
     devices[1].unplug()
     before = threading.active_count()
     with pytest.raises(DeviceError, match='port_1'):
-        ChainSession(file, lambda line: None)
+        ChainSession(file, unsaid)
     assert threading.active_count() <= before

@@ -17,6 +17,7 @@ import pytest
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder
+from psd_deflection.base.log import texts
 from psd_deflection.cli.main import main
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.recordings.read.readers import open_recording
@@ -89,7 +90,7 @@ class Live:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.estimates = threading.Semaphore(0)
         values = {'port': str(device.link), 'bag_dir': str(bags), 'zero_file': str(bags.parent / 'zero.json')}
-        self.session = Session(load_rig(overrides={**values, 'realtime': False, **parameters}), self.said.put)
+        self.session = Session(load_rig(overrides={**values, 'realtime': False, **parameters}), texts(self.said.put))
         self.session.processing.sinks.append(self)
         self._device, self._sample, self._sent = device, sample, 0
 
@@ -336,7 +337,7 @@ def test_a_recording_that_the_pipeline_does_not_take_leaves_nothing(tmp_path: Pa
         raise TimeoutError('no data flows')
 
     rig = load_rig(overrides={'bag_dir': str(tmp_path / 'bags')})
-    recorder = Recorder(10, print, busy)
+    recorder = Recorder(10, texts(print), busy)
     started: Future[Path | None] = recorder.start(rig, None, lambda _: None)
     with pytest.raises(TimeoutError, match='no data flows'):
         started.result(WAIT_S)

@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psd_deflection.base.errors import DeviceError
+from psd_deflection.base.log import texts, unsaid
 from psd_deflection.devices.protocol.frames import HelloFrame, SampleFrame
 from psd_deflection.devices.protocol.words import MAX_TEXT
 from psd_deflection.devices.source import Received, Source
@@ -158,7 +159,7 @@ class Quiet(Source):
 
 def opened(monkeypatch: pytest.MonkeyPatch, source: Source, said: list[str], rig: Rig | None = None) -> Acquisition:
     monkeypatch.setattr(module, 'make_source', lambda rig: source)
-    acquisition = Acquisition(load_rig() if rig is None else rig, said.append)
+    acquisition = Acquisition(load_rig() if rig is None else rig, texts(said.append))
     acquisition.open()
     return acquisition
 
@@ -242,7 +243,7 @@ def test_a_clock_that_stands_still_is_told_and_stamps_follow_the_host(monkeypatc
 def test_the_kept_words_are_the_same_for_a_port_of_bytes(device: Any, rig: Rig) -> None:
     body = json.dumps(info(serial='\ud800', firmware='\x1b[31m')).encode()
     device.answer = sealed(b'\x10\x01' + body)
-    acquisition = Acquisition(rig, lambda _: None)
+    acquisition = Acquisition(rig, unsaid)
     acquisition.open()
     try:
         assert acquisition.hello is not None
@@ -256,7 +257,7 @@ def test_no_rate_on_the_wire_ends_the_reader(device: Any, rig: Rig, rate: str) -
     text = json.dumps(info(sample_rate_hz=12345)).replace('12345', rate)
     device.answer = sealed(b'\x10\x01' + text.encode())
     with pytest.raises(DeviceError, match='sample_rate_hz'):
-        Acquisition(rig, lambda _: None).open()
+        Acquisition(rig, unsaid).open()
 
 
 THREE = {**GOOD, 'psds': 3, 'channels': list(channel_names(3))}

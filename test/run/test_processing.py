@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from psd_deflection.base.log import texts
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk, Record
 from psd_deflection.rig.config import load_rig
@@ -48,7 +49,7 @@ class Held:
 def test_a_request_that_was_given_up_is_never_carried_out(
     items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    processing, held, done = Processing(items, Pipeline(load_rig()), print), Held(), list[str]()
+    processing, held, done = Processing(items, Pipeline(load_rig()), texts(print)), Held(), list[str]()
     processing.start()
     with ThreadPoolExecutor(1) as other:
         first = other.submit(processing.request, held)
@@ -68,7 +69,7 @@ def test_a_request_that_was_given_up_is_never_carried_out(
 def test_a_request_that_was_begun_is_waited_for(
     items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    processing, held = Processing(items, Pipeline(load_rig()), print), Held()
+    processing, held = Processing(items, Pipeline(load_rig()), texts(print)), Held()
 
     def impatient(asked: Collection[Future[Any]], timeout: float) -> Any:
         if not held.go_on.is_set():
@@ -88,7 +89,7 @@ def test_a_request_that_was_begun_is_waited_for(
 def test_timeout_of_a_begun_request_says_that_it_was_begun(
     items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    processing, held = Processing(items, Pipeline(load_rig()), print), Held()
+    processing, held = Processing(items, Pipeline(load_rig()), texts(print)), Held()
 
     def impatient(asked: Collection[Future[Any]], timeout: float) -> Any:
         assert held.begun.wait(WAIT_S)
@@ -107,7 +108,7 @@ def test_errors_of_a_request_come_through(items: queue.SimpleQueue[Item]) -> Non
     def refuse() -> None:
         raise TimeoutError('its own')
 
-    processing = Processing(items, Pipeline(load_rig()), print)
+    processing = Processing(items, Pipeline(load_rig()), texts(print))
     with pytest.raises(TimeoutError, match='its own'):
         processing.request(refuse)
     processing.start()
@@ -135,7 +136,7 @@ class Clock:
 def after(items: queue.SimpleQueue[Item], read_and_end_ms: list[tuple[int, int]]) -> tuple[Processing, Clock]:
     """Processing and its clock after blocks that were read and had gone to the sinks at these times."""
     clock = Clock([end * MS for _, end in read_and_end_ms])
-    processing = Processing(items, Pipeline(load_rig()), print, clock)
+    processing = Processing(items, Pipeline(load_rig()), texts(print), clock)
     processing.sinks.append(clock)
     assert processing.latency() is None
     for index, (read, _) in enumerate(read_and_end_ms):

@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from psd_deflection.base.log import texts
 from psd_deflection.run.processing import Spokesman
 from psd_deflection.run.realtime import Watchdog, lock_memory, prefer_reader
 
@@ -98,7 +99,7 @@ def test_refused_system_resources_are_reported(monkeypatch: pytest.MonkeyPatch) 
 
 def test_lines_about_estimates_come_once_a_second_with_counts() -> None:
     said: list[str] = []
-    spokesman = Spokesman(said.append)
+    spokesman = Spokesman(texts(said.append))
     # Fifty blocks a second, every other one without an estimate, for ten seconds.
     for i in range(500):
         lost = i % 2 == 1

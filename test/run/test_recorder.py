@@ -16,6 +16,7 @@ from rosbags.rosbag2 import Reader
 from msg_adapters import to_messages
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder
+from psd_deflection.base.log import texts
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.repair import recover
@@ -51,7 +52,7 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 class Run:
     def __init__(self, rig: Rig, queue_blocks: int = 1000) -> None:
         self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.recorder = Recorder(queue_blocks, self.said.put, lambda action: action())
+        self.recorder = Recorder(queue_blocks, texts(self.said.put), lambda action: action())
         self.folder = self.start(rig)
         self.count = 0
 

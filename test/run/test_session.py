@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from msg_adapters import REFERENCE, to_messages
+from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
@@ -33,7 +34,7 @@ class Running:
         rig = load_rig(
             overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'bag_dir': str(folder)}
         )
-        self.session = Session(rig, self.said.put)
+        self.session = Session(rig, texts(self.said.put))
         estimates = Estimates(5)
         self.session.processing.sinks.append(estimates)
         self.session.start()
@@ -103,7 +104,7 @@ def test_the_start_says_what_another_rig_has_as_in_the_thesis(device: ScriptedDe
     rig = load_rig(
         overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'dynamics.torsion_frequency': 9.0}
     )
-    Session(rig, said.append).close()
+    Session(rig, texts(said.append)).close()
     (line,) = [text for text in said if 'as in the thesis rig' in text]
     assert 'dynamics.bending_frequency = 14.0 Hz' in line
     assert 'torsion_frequency' not in line

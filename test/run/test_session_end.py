@@ -7,6 +7,7 @@ from typing import Any, cast
 
 import pytest
 
+from psd_deflection.base.log import texts
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
@@ -43,7 +44,7 @@ def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
 ) -> None:
     said: list[str] = []
     rig = replace_values(rig, {'bag_dir': str(tmp_path), 'record': True, 'realtime': False, 'keep_zero': False})
-    session = Session(rig, said.append)
+    session = Session(rig, texts(said.append))
     session.start()
     owner = cast(Any, getattr(session, part))
     hanging = Hanging()

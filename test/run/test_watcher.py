@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from msg_adapters import LOAD, to_messages
+from psd_deflection.base.log import texts, unsaid
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.simulator import RigSimulator
@@ -40,7 +41,7 @@ class Chain:
         self.said: list[str] = []
         self.poses: dict[int, tuple[float, float, float]] = {}
         self.pipeline = Pipeline(rig)
-        self.watcher = Watcher(self.pipeline, self.said.append, {'serial': 'abc'}, '/arm/psd_estimator')
+        self.watcher = Watcher(self.pipeline, texts(self.said.append), {'serial': 'abc'}, '/arm/psd_estimator')
         self.fanout = Fanout()
         if self.watcher.keeps:
             self.fanout.wires.append(WatcherWire(self.watcher))
@@ -156,7 +157,7 @@ def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 def test_a_session_feeds_its_watch_and_reports_it(device: ScriptedDevice, sample: Callable[..., SampleFrame]) -> None:
     rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'watch': 'on'})
-    session = Session(rig, lambda _: None)
+    session = Session(rig, unsaid)
     try:
         estimates = Estimates(5)
         session.processing.sinks.append(estimates)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.base.errors import Warned
+from psd_deflection.base.log import INFO, WARNING
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.run.zero_store import ZeroStore
 
@@ -22,11 +22,11 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
 
 def test_kept_zero_applies_only_to_the_same_device(rig: Rig) -> None:
     assert ZeroStore(rig, 'A-1').save(replace_values(rig, ZERO)) == ''
-    back, said = ZeroStore(rig, 'A-1').load(rig)
+    back, said, _ = ZeroStore(rig, 'A-1').load(rig)
     assert 'zero of the last run' in said
     assert {name: back.values[name] for name in ZERO} == ZERO
     assert back.psds[0].zero == (1e-4, -2e-4)
-    assert ZeroStore(rig, 'B-2').load(rig) == (rig, '')
+    assert ZeroStore(rig, 'B-2').load(rig) == (rig, '', INFO)
 
 
 @pytest.mark.parametrize(
@@ -34,26 +34,26 @@ def test_kept_zero_applies_only_to_the_same_device(rig: Rig) -> None:
 )
 def test_two_serial_numbers_never_share_a_zero(rig: Rig, one: str, other: str) -> None:
     assert ZeroStore(rig, one).save(replace_values(rig, ZERO)) == ''
-    assert ZeroStore(rig, other).load(rig) == (rig, '')
+    assert ZeroStore(rig, other).load(rig) == (rig, '', INFO)
     assert ZeroStore(rig, one).load(rig)[0].values['psd_1.zero'] == ZERO['psd_1.zero']
 
 
 def test_a_zero_file_of_another_device_is_passed_over(tmp_path: Path) -> None:
     named = load_rig(overrides={'zero_file': str(tmp_path / 'zero.json')})
     assert ZeroStore(named, 'A').save(replace_values(named, ZERO)) == ''
-    back, said = ZeroStore(named, 'B').load(named)
+    back, said, level = ZeroStore(named, 'B').load(named)
     assert back is named
     assert 'that of another device' in said
-    assert isinstance(said, Warned)
+    assert level == WARNING
 
 
 def test_a_rig_file_that_says_otherwise_now_holds(rig: Rig) -> None:
     ZeroStore(rig, 'A').save(replace_values(rig, ZERO))
     edited = load_rig(overrides={'psd_1.zero': [5e-4, 0.0]})
-    back, said = ZeroStore(edited, 'A').load(edited)
+    back, said, level = ZeroStore(edited, 'A').load(edited)
     assert back is edited
     assert 'the rig file holds' in said
-    assert isinstance(said, Warned)
+    assert level == WARNING
 
 
 @pytest.mark.parametrize('serial', ['../../evil', '/etc/passwd', '..', '', None, 'a' * 500, 'x\x00y', 7])
@@ -80,7 +80,7 @@ def test_a_bad_file_never_stops_a_run(rig: Rig, content: bytes, why: str) -> Non
     store = ZeroStore(rig, 'A')
     store.path.parent.mkdir(parents=True)
     store.path.write_bytes(content)
-    back, said = store.load(rig)
+    back, said, _ = store.load(rig)
     assert back is rig
     assert f'{store.path}: the kept zero cannot be used (' in said
     assert why in said
@@ -94,7 +94,7 @@ def test_a_kept_zero_is_checked_like_any_parameter(rig: Rig, zero: object) -> No
     kept = json.loads(store.path.read_text())
     assert store.load(rig)[0] is not rig
     store.path.write_text(json.dumps({**kept, 'psd_1.zero': zero}))
-    back, said = store.load(rig)
+    back, said, _ = store.load(rig)
     assert back is rig
     assert f'{store.path}: the kept zero cannot be used (' in said
     assert 'psd_1.zero' in said

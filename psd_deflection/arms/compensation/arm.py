@@ -15,8 +15,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, of_position_and_angles, turn
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import text_of_file
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.records import FloatArray
 
 MOST_BYTES = 5_000_000

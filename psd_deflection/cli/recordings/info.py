@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters import SAMPLES
-from psd_deflection.base.errors import printable
+from psd_deflection.base.printable import printable
 from psd_deflection.cli._fleet import (
     ERROR,
     executor_option,

@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.base.errors import RecordingError, UsageError, printable
+from psd_deflection.base.errors import RecordingError, UsageError
+from psd_deflection.base.printable import printable
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, number, picture_name
 from psd_deflection.cli._plot_page import DrawnInputs, plot_page
 from psd_deflection.cli._progress import progress_of, told

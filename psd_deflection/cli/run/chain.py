@@ -25,7 +25,8 @@ from typing import TextIO
 
 from psd_deflection.arms.chains.chain import SLOPES
 from psd_deflection.arms.chains.chain_file import read_chain
-from psd_deflection.base.errors import ConfigError, RecordingError, UsageError, creating
+from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.base.files import creating
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder, whole
 from psd_deflection.cli._report import print_json

@@ -22,6 +22,7 @@ import threading
 from collections.abc import Iterator
 
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.log import INFO
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_parameters, namespace_option, over_file, parameter_option, refuse
 from psd_deflection.cli._report import warn
@@ -122,10 +123,10 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     feed = Feed() if foxglove is None else FeedBeside(foxglove, rig)
     server: MonitorServer | None = None
 
-    def say(text: str) -> None:
-        display.say(text)
+    def say(text: str, level: int = INFO, /) -> None:
+        display.say(text, level)
         if server is not None:
-            server.tell(text)
+            server.tell(text, level)
 
     def find_span() -> tuple[int, int]:
         first = last = None

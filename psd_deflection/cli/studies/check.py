@@ -22,7 +22,9 @@ from __future__ import annotations
 import argparse
 import sys
 
-from psd_deflection.base.errors import UsageError, printable
+from psd_deflection.base.errors import UsageError
+from psd_deflection.base.log import texts
+from psd_deflection.base.printable import printable
 from psd_deflection.cli._options import (
     given_parameters,
     in_the_world,
@@ -93,7 +95,7 @@ def _guided(args: argparse.Namespace) -> Checkup:
     if rig.acquisition.port:
         refuse(args, {'world': []}, 'is for the simulated rig: give no --port')
     shown = GuideDisplay(quiet=args.json)
-    found = run_guided(rig, in_the_world(rig, args.world), shown.say, shown.update)
+    found = run_guided(rig, in_the_world(rig, args.world), texts(shown.say), shown.update)
     shown.end()
     return found
 

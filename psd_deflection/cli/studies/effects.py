@@ -13,7 +13,8 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from psd_deflection.base.errors import UsageError, did_you_mean
+from psd_deflection.base.errors import UsageError
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.base.tables import columns
 from psd_deflection.cli._report import print_json, show, show_text
 from psd_deflection.model.simulation.catalogue import catalogue

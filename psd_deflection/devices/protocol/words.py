@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from psd_deflection.base.errors import printable
+from psd_deflection.base.printable import printable
 
 MAX_TEXT = 200
 """Characters of one text. A longer one is cut."""

@@ -13,12 +13,14 @@ is followed through the gains, so that the covariance of the pose is that of the
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from psd_deflection.base.arithmetic import ARITHMETICS
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.measure.motion.inertia import Forced, Inertia
 from psd_deflection.measure.motion.modal import BlockTables, Oscillator
 from psd_deflection.measure.motion.unseen import UnseenLoads
@@ -44,10 +46,9 @@ LATE_S = 1.0
 AXES = ('dX', 'dY', 'theta')
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 _FIRST, _SECOND = (np.array(side) for side in zip(*_PAIRS, strict=True))
-STATE = 'state.motion'
-"""Name under which :meth:`ModalFilter.memory` is recorded."""
-INERTIA = 'state.inertia'
-"""The same of :meth:`ModalFilter.inertia_memory`."""
+STATE, INERTIA = 'state.motion', 'state.inertia'
+UNSEEN, LOADS = 'state.unseen', 'state.known_loads'
+"""Names under which :meth:`ModalFilter.memory` is recorded; ``LOADS``: while nothing else is known."""
 
 
 class TipState(NamedTuple):
@@ -112,6 +113,9 @@ class ModalFilter:
     ``innovations``: of the run so far. ``coasted``: s since the last sample that was used. ``coasts``: times that the
     filter went on without samples. Raises ConfigError if blocks are too long.
     """
+
+    part = 'the filter of the motion'
+    remembers = (STATE, INERTIA, UNSEEN, LOADS)
 
     def __init__(self, rig: Rig, compliance: tuple[float, float, float], gain: FloatArray, noise: FloatArray) -> None:
         """``compliance``: m/N, m/N, rad/(N m). ``gain`` (3, C): of the solver at rest. ``noise``: :meth:`set_noise`."""
@@ -432,58 +436,73 @@ class ModalFilter:
         """How far the load wanders in a second by what was seen last, by its steps alone: N, N, N m."""
         return tuple((np.sqrt(self._rate()[:, 0]) / self._compliance).tolist())
 
-    def memory(self) -> tuple[float, ...]:
-        """What the next block depends on, besides the noise; () if nothing is known.
-
-        What a load does unseen is gathered anew from here on, as where it is restored.
-        """
-        if self._index is None:
-            return ()
+    def memory(self) -> Memory:
+        """What the next block depends on, besides the noise; {} if nothing is known."""
+        out: Memory = {}
         held = (1.0, *self._held.tolist()) if self._held is not None else (0.0,) * 4
-        times = (float(self._index), *split_ns(self._t_ns), self.coasted)
-        arrays = [self._x, self._p, self._shared, self._weights]
-        self._begin_unseen()
-        if self._unseen is not None:
-            arrays.append(self._unseen.variances)
         waiting = [v for load in self._loads for v in (*split_ns(load.t_ns), *load[1:])]
-        return (*times, *held, *(v for array in arrays for v in array.ravel().tolist()), *waiting)
+        if self._index is not None:
+            times = (float(self._index), *split_ns(self._t_ns), self.coasted)
+            arrays = [self._x, self._p, self._shared, self._weights]
+            if self._unseen is not None:
+                arrays.append(self._unseen.variances)
+                out[UNSEEN] = (*self._swung.ravel().tolist(), *self._unseen.gathered())
+            out[STATE] = (*times, *held, *_flat(arrays), *waiting)
+        elif self._held is not None or waiting:
+            out[LOADS] = (*held, *waiting)
+        if self.inertia.known:
+            told = [v for t_ns, deflection in self.inertia.told for v in (*split_ns(t_ns), *deflection)]
+            arrays = [self._late]
+            if self._taken is not None:
+                arrays += [self._taken.forced.at[..., :2], self._taken.forced.doubt, self._taken.gain]
+            out[INERTIA] = (float(len(told)), *told, *_flat(arrays))
+        return out
 
-    def restore(self, values: tuple[float, ...]) -> None:
-        """Go on from another one's :meth:`memory`. Raises ValueError if it had another number of rates."""
+    def restore(self, values: Mapping[str, Value]) -> None:
+        """Go on from another one's :meth:`memory`. Raises ValueError if it had another number of rates or samples."""
+        if state := numbers(values, STATE, 'the state of the filter'):
+            self._restore_state(state)
+        if unseen := numbers(values, UNSEEN, 'states of the last blocks'):
+            if self._unseen is None or not self._unseen.gather(unseen[12:]):
+                raise misfit(UNSEEN, unseen, 'states of as many blocks as the filter coasts')
+            self._swung = np.reshape(unseen[:12], (3, 4))
+        if loads := numbers(values, LOADS, 'known loads'):
+            self._restore_loads(LOADS, loads)
+        if inertia := numbers(values, INERTIA, 'accelerations of the base'):
+            self._restore_inertia(inertia)
+
+    def _restore_state(self, values: tuple[float, ...]) -> None:
         known = 8 + 12 + 48 + 48 + 3 * self.levels
-        numbers = known + (self._unseen.variances.size if self._unseen is not None else 0)
-        if len(values) < numbers or (len(values) - numbers) % 5:
-            raise ValueError(f'{STATE}: {len(values)} numbers do not tell a filter with {self.levels} rates')
+        end = known + (self._unseen.variances.size if self._unseen is not None else 0)
+        if len(values) < end or (len(values) - end) % 5:
+            raise misfit(
+                STATE, values, f'the state of a filter with {self.levels} rates, {end} numbers and five a load'
+            )
         self._index = int(values[0])
         self._t_ns = joined_ns(*values[1:3])
         self.coasted = values[3]
-        self._held = np.array(values[5:8]) if values[4] else None
         x, p, shared, weights = np.split(np.array(values[8:known]), (12, 60, 108))
         self._x, self._p, self._shared = x.reshape(3, 4), p.reshape(3, 4, 4), shared.reshape(3, 4, 4)
         self._weights = weights.reshape(3, self.levels)
         self._begin_unseen()
         if self._unseen is not None:
-            self._unseen.variances[:] = np.reshape(values[known:numbers], self._unseen.variances.shape)
-        waiting = np.reshape(values[numbers:], (-1, 5)).tolist()
+            self._unseen.variances[:] = np.reshape(values[known:end], self._unseen.variances.shape)
+        self._restore_loads(STATE, (*values[4:8], *values[end:]))
+
+    def _restore_loads(self, name: str, values: tuple[float, ...]) -> None:
+        """The held load with whether there is one, and those that wait, five numbers each."""
+        if len(values) < 4 or (len(values) - 4) % 5:
+            raise misfit(name, values, 'four numbers and five for each load that waits')
+        self._held = np.array(values[1:4]) if values[0] else None
+        waiting = np.reshape(values[4:], (-1, 5)).tolist()
         self._loads = [AppliedLoad(joined_ns(s, ns), fx, fy, tz) for s, ns, fx, fy, tz in waiting]
 
-    def inertia_memory(self) -> tuple[float, ...]:
-        """What the next blocks depend on of the base's accelerations; () if nothing is known of them."""
-        if not self.inertia.known:
-            return ()
-        told = [v for t_ns, deflection in self.inertia.told for v in (*split_ns(t_ns), *deflection)]
-        arrays = [self._late]
-        if self._taken is not None:
-            arrays += [self._taken.forced.at[..., :2], self._taken.forced.doubt, self._taken.gain]
-        return (float(len(told)), *told, *(v for array in arrays for v in array.ravel().tolist()))
-
-    def restore_inertia(self, values: tuple[float, ...]) -> None:
-        """Go on from another one's :meth:`inertia_memory`. Raises ValueError if it had blocks of another size."""
+    def _restore_inertia(self, values: tuple[float, ...]) -> None:
         n = self._size
-        told = int(values[0]) + 1 if values and 0.0 <= values[0] < len(values) and np.isfinite(values).all() else 0
+        told = int(values[0]) + 1 if 0.0 <= values[0] < len(values) and np.isfinite(values).all() else 0
         known, taken = values[told:], 6 * n + 3 + 12 * n
         if told % 5 != 1 or len(known) not in (6, 6 + taken):
-            raise ValueError(f'{INERTIA}: {len(values)} numbers do not tell accelerations in blocks of {n} samples')
+            raise misfit(INERTIA, values, f'accelerations in blocks of {n} samples')
         rows = np.reshape(values[1:told], (-1, 5)).tolist()
         self.inertia.told = [(joined_ns(s, ns), tuple(deflection)) for s, ns, *deflection in rows]
         # Perhaps some came after the last block.
@@ -493,6 +512,10 @@ class ModalFilter:
             moved, doubt, gain = np.split(np.array(known[6:]), (6 * n, 6 * n + 3))
             at = np.concatenate((moved.reshape(3, n, 2), np.zeros((3, n, 2))), axis=2)
             self._taken = _Taken(Forced(at, doubt), gain.reshape(3, 4, n))
+
+
+def _flat(arrays: Sequence[FloatArray]) -> list[float]:
+    return [v for array in arrays for v in array.ravel().tolist()]
 
 
 def split_ns(t_ns: int) -> tuple[float, float]:

@@ -14,6 +14,7 @@ makes three standard deviations a bound, not one of them an rms error.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -65,6 +66,26 @@ class UnseenLoads:
     def begin(self) -> None:
         """Let spans begin at the next block: what is between is not the modes' motion, or is not known to a replay."""
         self._gathered = 0
+
+    def gathered(self) -> tuple[float, ...]:
+        """The states that spans may begin at, the oldest first: mean, covariance and process noise of each block."""
+        count = min(self._gathered, len(self._x))
+        rows = [k % len(self._x) for k in range(self._gathered - count, self._gathered)]
+        states = [v for k in rows for array in (self._x, self._p, self._rate) for v in array[k].ravel().tolist()]
+        return tuple(states)
+
+    def gather(self, values: Sequence[float]) -> bool:
+        """Go on from :meth:`gathered` of another one; False if it does not fit."""
+        axes = self.variances.shape[0]
+        count, rest = divmod(len(values), 22 * axes)
+        if rest or count > len(self._x):
+            return False
+        states = np.reshape(values, (count, 22 * axes))
+        self._x[:count] = states[:, : 4 * axes].reshape(count, axes, 4)
+        self._p[:count] = states[:, 4 * axes : 20 * axes].reshape(count, axes, 4, 4)
+        self._rate[:count] = states[:, 20 * axes :].reshape(count, axes, 2)
+        self._gathered = count
+        return True
 
     def add(self, x: FloatArray, p: FloatArray, rate: FloatArray) -> None:
         """The state after a block with samples: mean (A, 4), covariance (A, 4, 4), process noise (A, 2)."""

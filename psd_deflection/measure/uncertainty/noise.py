@@ -157,9 +157,35 @@ class StreamNoise:
             changed |= self._close()
         return changed
 
-    def forget_segment(self) -> None:
-        """Leave what the segment under way has gathered, so that who starts here gathers the same."""
-        self._blocks = []
+    @property
+    def gathered(self) -> int:
+        """How many numbers :meth:`segment` has."""
+        return sum(2 + len(slots) + dots.size for _, slots, dots in self._blocks)
+
+    def segment(self) -> tuple[float, ...]:
+        """The blocks of the segment under way: number, how many samples, their places, their dots, of each.
+
+        Empty between two segments.
+        """
+        out: list[float] = []
+        for index, slots, dots in self._blocks:
+            out += [index, len(slots), *slots.tolist(), *dots.ravel().tolist()]
+        return tuple(out)
+
+    def set_segment(self, values: tuple[float, ...]) -> None:
+        """Go on with the :meth:`segment` of another one. Raises ValueError if that is of other readings."""
+        blocks = []
+        at = 0
+        while at < len(values):
+            index, count = (int(v) for v in (*values[at : at + 2], 0)[:2])
+            dots = at + 2 + count
+            at = dots + count * self._readings
+            if not 0 < count <= self._size or at > len(values):
+                raise ValueError(f'blocks of {self._readings} readings, {self._size} samples each')
+            slots = np.array(values[dots - count : dots], dtype=np.int64)
+            blocks.append((index, slots, np.array(values[dots:at], dtype=np.float64).reshape(count, -1)))
+        self._blocks = blocks
+        self._segment = blocks[-1][0] // SEGMENT_BLOCKS if blocks else -1
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, Fitted
 from psd_deflection.measure.uncertainty.combinations import Left
 from psd_deflection.measure.uncertainty.consistency import LIMIT, UNMEASURED, Consistency, ConsistencyCheck, Suspect
@@ -24,7 +25,8 @@ from psd_deflection.model.plate.plate import Tilts, flat_points, flat_poses, pla
 from psd_deflection.records import FloatArray, IntArray, dot_names
 from psd_deflection.rig.config import Rig
 
-NOISE, FIT, HELD_RESIDUAL = 'state.noise', 'state.block_fit', 'state.residual'
+NOISE, SEGMENT = 'state.noise', 'state.noise_segment'
+FIT, HELD_RESIDUAL = 'state.block_fit', 'state.residual'
 REDUNDANCY, SOME = 'state.redundancy', 'state.psds.'
 """Names under which :meth:`StampedDots.memory` tells what is remembered; ``SOME`` goes on with the
 PSDs (from 0) that are kept."""
@@ -143,6 +145,9 @@ class StampedDots:
     of the last block's readings, of ``freedom`` degrees. ``left_out``: PSDs (from 1) without which the last block was
     solved.
     """
+
+    part = 'the fit and the noise of the dots'
+    remembers = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY, SOME)
 
     def __init__(self, rig: Rig, flat: bool = True, tilts: Tilts = 'none') -> None:
         """``flat``: the PSDs are on the plate, and the base line between the dots keeps its length.
@@ -344,12 +349,13 @@ class StampedDots:
             for name, a, b, file, mean in rows
         )
 
-    def memory(self) -> dict[str, tuple[float, ...]]:
-        """What the next block depends on. The noise begins a new segment, here as where it is restored."""
-        out: dict[str, tuple[float, ...]] = {}
+    def memory(self) -> Memory:
+        """What the next block depends on."""
+        out: Memory = {}
         if self._measures:
-            self.noise.forget_segment()
             out[NOISE] = self.noise.state()
+            if segment := self.noise.segment():
+                out[SEGMENT] = segment
         if self.active:
             out[FIT] = self._fit.state()
         said = self._consistency
@@ -362,21 +368,34 @@ class StampedDots:
             out[SOME + '_'.join(map(str, kept))] = state
         return out
 
-    def restore(self, values: Mapping[str, tuple[float, ...]]) -> None:
-        """Go on from another one's :meth:`memory`. Raises ValueError if it had another block size."""
-        if NOISE in values:
-            self.noise.set_state(values[NOISE])
+    def restore(self, values: Mapping[str, Value]) -> None:
+        """Go on from another one's :meth:`memory`. Raises ValueError if it had another block size or other PSDs."""
+        if noise := numbers(values, NOISE, 'the noise of this rig'):
+            self.noise.set_state(noise)
+            # Recordings from before segments were told began a new one.
+            self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or ())
             self._fit.set_noise(self.noise.gamma)
-        if FIT in values:
-            self._fit.set_state(values[FIT])
-        if HELD_RESIDUAL in values:
+        if fit := numbers(values, FIT, 'the fit of this rig'):
+            self._fit.set_state(fit)
+        if residual := numbers(values, HELD_RESIDUAL, 'what the residual was lately', 1, 3):
             # Recordings from before the mean was kept have the first alone.
-            held, mean, lasting = (*values[HELD_RESIDUAL], 0.0, 0.0)[:3]
+            held, mean, lasting = (*residual, 0.0, 0.0)[:3]
             self._consistency.held, self._consistency.mean, self._consistency.lasting = held, mean, lasting
-        if REDUNDANCY in values and self._redundancy is not None:
-            self._redundancy.set_state(values[REDUNDANCY])
-        for name, state in values.items():
+        if check := numbers(values, REDUNDANCY, 'the check of more than two PSDs'):
+            if self._redundancy is None:
+                raise misfit(REDUNDANCY, check, 'none with two PSDs')
+            self._redundancy.set_state(check)
+        for name in values:
             if name.startswith(SOME):
-                kept = tuple(map(int, name.removeprefix(SOME).split('_')))
-                self._told[kept] = state
+                kept = self._kept_of(name)
+                count = 3 + (2 + len(self._fit.state()) // len(self._beams)) * len(kept)
+                # They need the method that solves them, so that they begin when they are first asked for.
+                self._told[kept] = numbers(values, name, 'the fit of these PSDs', count) or ()
                 self._some.pop(kept, None)
+
+    def _kept_of(self, name: str) -> tuple[int, ...]:
+        """The PSDs (from 0) of a name that begins with ``SOME``. Raises ValueError if this rig has not got them."""
+        kept = tuple(int(n) for n in name.removeprefix(SOME).split('_'))
+        if len(kept) < 2 or max(kept) >= len(self._beams):
+            raise ValueError(f'{name}: expected two or more of {len(self._beams)} PSDs')
+        return kept

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.base.arithmetic import ARITHMETICS
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.misalignment.model import (
     ALL,
     INDEX,

@@ -24,7 +24,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.simulation import effects as ours
 from psd_deflection.model.simulation.declaration import PSD, ActiveEffect, Effect
 from psd_deflection.rig.config import Rig

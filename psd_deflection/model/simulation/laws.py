@@ -29,8 +29,9 @@ import numpy as np
 import yaml
 from scipy.signal import lfilter
 
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import tree_of_file
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.simulation.declaration import (
     STAGES,
     Effect,

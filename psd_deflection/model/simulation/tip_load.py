@@ -7,13 +7,16 @@ last one first; then the constants give the load, and its effects are traced bac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from psd_deflection.base.arithmetic import ARITHMETICS
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import POINTS, ActiveEffect, Traced
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.rig.config import Rig
+
+TIP_LOADS = 'state.tip_loads'
+"""Name under which :meth:`TipLoads.memory` is recorded."""
 
 
 class TipLoads:
@@ -22,6 +25,9 @@ class TipLoads:
     ``zeroed``: the unloaded dots were measured, so they contain what displaces the tip without a load (its weight, a
     tilted base); otherwise the pose does. Raises ConfigError if an effect fails on a pose.
     """
+
+    part = 'the load at the tip'
+    remembers = (TIP_LOADS,)
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         """``effects``: those of the rig file, in the order in which they act; none: the nominal link."""
@@ -77,24 +83,30 @@ class TipLoads:
         """Deflection for a load of 1 N, 1 N, 1 N m at the tip: m/N, m/N, rad/(N m)."""
         return self._statics.deflection(1.0, 1.0, 1.0)
 
-    def memory(self) -> tuple[float, ...]:
-        """What :meth:`restore` needs to go on from here; empty if the next load depends on the pose alone."""
+    def memory(self) -> dict[str, float | str | tuple[float, ...]]:
+        """What :meth:`restore` needs to go on from here; {} if the next load depends on the pose alone."""
         moved = self.zeroed and any(self._offset)
         if not moved and not any(self._remembered):
-            return ()
+            return {}
         out = [float(self.zeroed), -1.0 if self._last is None else float(self._last)]
         for remembered in self._remembered:
             out += [float(len(remembered)), *remembered]
-        return tuple(out)
+        return {TIP_LOADS: tuple(out)}
 
-    def restore(self, values: tuple[float, ...]) -> None:
+    def restore(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:
         """Go on from another one's :meth:`memory`. Raises ValueError if it had other effects."""
-        zeroed, last, *rest = values
+        told = values.get(TIP_LOADS, ())
+        numbers = told if isinstance(told, tuple) else ()
+        taken: list[list[float]] = []
+        at = 2
+        while 2 <= at < len(numbers):
+            end = at + 1 + int(numbers[at])
+            taken.append(list(numbers[at + 1 : end]))
+            at = end if end > at else 0
+        if at != len(numbers) or len(taken) != len(self._remembered):
+            raise ValueError(
+                f'{TIP_LOADS}: {len(numbers)} numbers; expected the memories of {len(self._remembered)} effects'
+            )
+        zeroed, last = numbers[:2]
         self.zeroed, self._last = bool(zeroed), None if last < 0.0 else int(last)
-        self._forget()
-        for remembered in self._remembered:
-            count = int(rest[0]) if rest else -1
-            if not 0 <= count < len(rest):
-                raise ValueError(f'the loads of {len(self._remembered)} effects are not told by {len(values)} numbers')
-            remembered += rest[1 : 1 + count]
-            rest = rest[1 + count :]
+        self._remembered = taken

@@ -11,7 +11,8 @@ import importlib
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.plate.layout import Geometry
 from psd_deflection.model.solvers.interface import Solver
 from psd_deflection.rig.config import Rig

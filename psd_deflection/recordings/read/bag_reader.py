@@ -40,6 +40,7 @@ from msg_adapters.header import header, stamp_ns
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_file
 from psd_deflection.base.sequence import RecordedSequence
+from psd_deflection.measure.memory import WHOLE
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.allowance import Warnings
@@ -61,11 +62,15 @@ from psd_deflection.records import (
     RawChunk,
     ReferencePose,
     ReferenceWithCovariance,
+    RigState,
     SampleBlock,
     TemperatureReading,
 )
 
 MAX_YAML_BYTES = 16_000_000
+
+MOST_MEMORIES = 4
+"""So many of the states that a pipeline tells are kept: the one from before the first block, and those after it."""
 
 MAX_RESTARTS = 10_000
 """Restarts of one recording that are counted."""
@@ -141,7 +146,7 @@ class BagRecording(Recording):
     @property
     def warnings(self) -> Sequence[str]:
         """One line for each cut or damage, and for samples that were left out."""
-        return [*self._own_warnings.lines(), *(w for s in self._sources for w in s.warnings)]
+        return [*self._own_warnings.lines(), *self._found.lines(), *(w for s in self._sources for w in s.warnings)]
 
     def _warn(self, text: str) -> None:
         self._own_warnings.add(f'{self.path}: {text}')
@@ -172,6 +177,7 @@ class BagRecording(Recording):
             try:
                 state = string.to_rig(cdr.decode(channel.type, message))
                 change = _to_change(state.t_ns, state.block, state.changed)
+                memory = _memory_in(state)
             except (ValueError, TypeError) as error:
                 self._warn(f'{RIG} at log time {log_time} ns is not readable ({error}) and is left out')
                 continue
@@ -187,6 +193,8 @@ class BagRecording(Recording):
                 self._warn(f'another rig starts at log time {log_time} ns; the first one is taken for all')
             if change.values:
                 changes[change] = None
+            if memory is not None and len(self.memories) < MOST_MEMORIES:
+                self.memories = [*self.memories, memory]
         self.changes = sorted(changes, key=lambda change: change.block)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
@@ -396,6 +404,13 @@ def _to_change(t_ns: int, block: int, tree: Mapping[str, object]) -> ParameterCh
         else:
             values.append((key, value if isinstance(value, str) else number(value)))
     return ParameterChange(t_ns, block, tuple(values))
+
+
+def _memory_in(state: RigState) -> ParameterChange | None:
+    """All that the pipeline remembers, as a change from which another one goes on; None if it is not told."""
+    if state.memory is None:
+        return None
+    return _to_change(state.t_ns, state.block, {WHOLE: 1.0, **state.memory})
 
 
 def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]]) -> EstimateSeries:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
-from psd_deflection.base.errors import RecordingError, did_you_mean
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.recordings.mcap_format import MAGIC
 from psd_deflection.recordings.read.bag_reader import BagRecording
 from psd_deflection.recordings.read.csv_reader import CsvRecording

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.base.errors import RecordingError, printable
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.printable import printable
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.csv_rows import MAX_LINE, MAX_SECONDS
 from psd_deflection.recordings.read.readers import open_recording

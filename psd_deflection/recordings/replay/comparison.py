@@ -19,6 +19,7 @@ import numpy as np
 
 from msg_adapters import DIAGNOSTICS, FILTERED, INPUTS, RIG, SAMPLES, pose_stamped, to_messages
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.measure.memory import WHOLE
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import differences, provenance
 from psd_deflection.recordings.recording import Recording
@@ -44,6 +45,9 @@ class ReplayComparison:
     ``different``: messages that differ, ``rounded`` of them by rounding alone. ``rounding_explained``: what computes is
     not what computed the recording, as ``changed`` tells; so rounding may differ.
 
+    ``from_block``: of a recording that starts in mid-run, the block from which on it is compared, because the pipeline
+    said what it remembered there; None: from the start.
+
     ``only_recorded``, ``only_replayed``: messages that the other side lacks. ``missing``: how many of them neither the
     edges of the recording nor a topic that it does not have explains.
 
@@ -62,6 +66,9 @@ class ReplayComparison:
         self.only_recorded = 0
         self.only_replayed = 0
         self.missing = 0
+        self.from_block: int | None = None
+        # Last stamp of each topic before that.
+        self._before: dict[str, int] = {}
         # A recorder of ours writes every message, or counts it; another one may lose some on the way.
         self._gapless = recording.version != '' and not recording.rig_from_messages
         self._between: dict[str, int] = {}
@@ -100,6 +107,8 @@ class ReplayComparison:
         newest = 0
         for record in records:
             if isinstance(record, ParameterChange):
+                if self._newest and any(name == WHOLE for name, _ in record.values):
+                    self._begin(record)
                 continue
             for topic, type_name, t_ns, fields in to_messages(record, self._frame_prefix):
                 if topic in self._replayed:
@@ -113,6 +122,18 @@ class ReplayComparison:
             self._newest = newest
             self._read_until(newest + _LAG_NS)
             self._match()
+
+    def _begin(self, memory: ParameterChange) -> None:
+        """Compare from here on: before, the replay did not know what the run remembered."""
+        self.from_block = memory.block
+        for topic, replayed in self._replayed.items():
+            last = replayed[-1][0] if replayed else self._before.get(topic, 0)
+            self._before[topic] = max(memory.t_ns, last)
+            replayed.clear()
+        self.equal = self.different = self.rounded = self.only_recorded = self.only_replayed = self.missing = 0
+        self._between.clear()
+        self._worst.clear()
+        self._first_difference = ''
 
     def finish(self) -> None:
         """Report messages that are left on either side: they have no counterpart."""
@@ -139,10 +160,16 @@ class ReplayComparison:
             'same_but_for_rounding': self.same_but_for_rounding,
             'only_recorded': self.only_recorded,
             'only_replayed': self.only_replayed,
+            **({} if self.from_block is None else {'from_block': self.from_block}),
         }
 
     def summary(self) -> str:
         """One line, and the largest difference if there is one."""
+        if self.from_block is not None:
+            return f'starts in mid-run; compared from block {self.from_block}\n{self._summary()}'
+        return self._summary()
+
+    def _summary(self) -> str:
         if self.identical:
             return f'compared: {self.equal} messages, no bit differs'
         if self.same:
@@ -206,6 +233,8 @@ class ReplayComparison:
     def _match(self) -> None:
         for topic, recorded in self._recorded.items():
             replayed = self._replayed[topic]
+            while recorded and recorded[0][0] <= self._before.get(topic, -1):
+                recorded.popleft()
             while recorded and replayed:
                 (t_a, a), (t_b, b) = recorded[0], replayed[0]
                 if t_a == t_b:

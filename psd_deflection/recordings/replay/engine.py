@@ -23,6 +23,7 @@ from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,
     DeflectionEstimate,
+    ParameterChange,
     RawChunk,
     Record,
     SampleBlock,
@@ -98,7 +99,11 @@ def replayed(
     loads.reverse()
     accelerations = recording.accelerations() if pipeline.motion_filter is not None else iter(())
     acceleration = next(accelerations, None)
+    begun = False
     for block in recording.blocks() if blocks is None else blocks:
+        if not begun:
+            changes = _with_memory(recording, block.index, changes)
+            begun = True
         while temperatures and temperatures[0].t_ns <= block.t_ns[0]:
             warmer = pipeline.temperature(temperatures.pop(0).celsius)
             if warmer is not None:
@@ -108,6 +113,8 @@ def replayed(
             yield list(pipeline.flush())
             change = changes.pop(0)
             pipeline.apply(change)
+            for misfit in pipeline.misfits:
+                recording.warn(f'block {change.block}: {misfit}')
             yield [change]
         while acceleration is not None and acceleration[0] <= block.t_ns[-1]:
             # The unfinished block belongs to the time before it.
@@ -119,6 +126,21 @@ def replayed(
             pipeline.load(loads.pop())
         yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
     yield list(pipeline.flush())
+
+
+def _with_memory(recording: Recording, first: int, changes: list[ParameterChange]) -> list[ParameterChange]:
+    """``changes`` and, of a recording that starts in mid-run at block ``first``, what the pipeline remembered."""
+    memory = recording.memory_from(first)
+    if memory is not None:
+        before = [change for change in changes if change.block < memory.block]
+        return [*before, memory, *changes[len(before) :]]
+    told = (*recording.memories[:1], *recording.changes[:1]) if recording.rig_from_messages else ()
+    if any(0 < one.block < first for one in told):
+        recording.warn(
+            f'{recording.path}: starts in mid-run, and ends before the pipeline said what it remembers (it does every '
+            '10 s): the estimates may differ from the recorded ones'
+        )
+    return changes
 
 
 def replayed_estimates(recording: Recording, rig: Rig) -> EstimateSeries:

@@ -19,8 +19,8 @@ from typing import Any, BinaryIO, Self
 
 from msg_adapters import LATCHED, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
-from psd_deflection.base.errors import RecordingError, creating
-from psd_deflection.base.files import HeldFolder
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.files import HeldFolder, creating
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import provenance
 from psd_deflection.recordings.write.bag_metadata import (

@@ -13,7 +13,8 @@ from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from psd_deflection.base.errors import RecordingError, creating
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.files import creating
 from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
 from psd_deflection.records import (
     AppliedLoad,

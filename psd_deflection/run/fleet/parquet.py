@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from psd_deflection.base.errors import ConfigError, RecordingError, creating
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.base.files import creating
 
 ENDING = '.parquet'
 RECORDING = 'recording'

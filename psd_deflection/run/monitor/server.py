@@ -29,6 +29,7 @@ from aiohttp import WSCloseCode, WSMsgType, web
 
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.records import BlockStatus, DiagnosticReport, ReferencePose, SampleBlock
 from psd_deflection.rig.declarations import MonitorConfig
 from psd_deflection.run.monitor import access
@@ -81,7 +82,7 @@ _UNHEARD.disabled = True
 class MonitorServer:
     """Serves ``shown``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``say`` gets the address as a line."""
 
-    def __init__(self, shown: Shown, feed: Feed, config: MonitorConfig, say: Callable[[str], None]) -> None:
+    def __init__(self, shown: Shown, feed: Feed, config: MonitorConfig, say: Say) -> None:
         self.token = ''
         self.url = ''
         self._shown = shown
@@ -134,7 +135,7 @@ class MonitorServer:
                 self._loop.call_soon_threadsafe(self._ended.set)
             self._thread.join(CLOSE_S)
 
-    def tell(self, text: str) -> None:
+    def tell(self, text: str, level: int = INFO, /) -> None:
         """Show a message on the page; from any thread."""
         self._message_count += 1
         self._messages.append((self._message_count, time.time(), text))
@@ -146,7 +147,7 @@ class MonitorServer:
             if not self._started.done():
                 self._started.set_exception(error)
             else:
-                self._say(f'monitor: ended: {type(error).__name__}: {error}')
+                self._say(f'monitor: ended: {type(error).__name__}: {error}', ERROR)
 
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -189,7 +190,7 @@ class MonitorServer:
                 if error.errno != errno.EADDRINUSE:
                     raise
                 # An unusual address is better than no page.
-                self._say(f'monitor: port {port} is in use (by another monitor?); taking a free one')
+                self._say(f'monitor: port {port} is in use (by another monitor?); taking a free one', WARNING)
                 await web.TCPSite(runner, address, 0).start()
         except (OSError, UnicodeError) as error:
             reason = error.strerror or str(error) if isinstance(error, OSError) else str(error)
@@ -298,7 +299,7 @@ class MonitorServer:
         except (web.HTTPException, ConnectionError):
             raise
         except Exception as error:
-            self._say(f'monitor: {request.path!r}: {type(error).__name__}: {error}')
+            self._say(f'monitor: {request.path!r}: {type(error).__name__}: {error}', ERROR)
             return web.Response(status=500, text='this should not have happened; the daemon has said what')
 
     async def _index(self, request: web.Request) -> web.StreamResponse:

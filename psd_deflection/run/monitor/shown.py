@@ -12,6 +12,7 @@ from concurrent.futures import Future
 from typing import Any, Protocol
 
 from psd_deflection.base.errors import PsdDeflectionError
+from psd_deflection.base.log import Say
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import (
     RESTART,
@@ -140,7 +141,7 @@ class ShownRecording:
         name: str,
         open_steps: Callable[[], tuple[Pipeline, Iterator[list[Record]]]],
         feed: Feed,
-        say: Callable[[str], None],
+        say: Say,
         *,
         speed: float = 1.0,
         loop: bool = False,
@@ -332,7 +333,7 @@ class ShownRecording:
             self._ended = True
             if not isinstance(error, PsdDeflectionError):
                 raise
-            self._say(str(error))
+            self._say(str(error), ERROR)
 
     def _wait_at_the_end(self) -> None:
         self._ended = True

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import importlib.util
 import threading
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import Say
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.monitor.feed import Feed
@@ -42,7 +42,7 @@ class Views:
             part.close()
 
 
-def start_views(session: Session, say: Callable[[str], None], *, reports: bool = True) -> Views:
+def start_views(session: Session, say: Say, *, reports: bool = True) -> Views:
     """Serve ``session`` as its parameters ``monitor`` and ``foxglove`` say. They add sinks and wires to the session.
 
     ``say`` gets each address as a line. ``reports``: whether Foxglove needs reports of the run's health; False if
@@ -60,7 +60,7 @@ def start_views(session: Session, say: Callable[[str], None], *, reports: bool =
     return views
 
 
-def _start_page(session: Session, say: Callable[[str], None]) -> MonitorServer:
+def _start_page(session: Session, say: Say) -> MonitorServer:
     need_server()
     # Imported here: only the page needs aiohttp.
     from psd_deflection.run.monitor.server import MonitorServer
@@ -75,7 +75,7 @@ def _start_page(session: Session, say: Callable[[str], None]) -> MonitorServer:
     return server
 
 
-def _start_foxglove(session: Session, say: Callable[[str], None], views: Views, reports: bool) -> None:
+def _start_foxglove(session: Session, say: Say, views: Views, reports: bool) -> None:
     server = FoxgloveServer(session.rig)
     views.parts.append(server)
     say(server.words())

@@ -13,12 +13,13 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from psd_deflection.base.errors import DeviceError, Failed, Warned
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.base.sequence import SequenceExtender, Step
 from psd_deflection.devices.protocol.frames import BadFrame, BadReason, HelloFrame, PongFrame, SampleFrame, StatusFrame
 from psd_deflection.devices.registry import make_source
@@ -54,8 +55,6 @@ GATHER_S = 0.018
 GATHER_SAMPLES = 36
 """Longest time that the reader lets samples gather, and most samples: waking up costs more than reading a sample.
 The kernel holds 4096 bytes for us."""
-
-Say = Callable[[str], None]
 
 
 @dataclass(slots=True)
@@ -190,7 +189,7 @@ class Acquisition:
                 self.source.give_up()
                 self._thread.join(READ_TIMEOUT_S)
             else:
-                self._say(Warned(f'{self._name}: the source hangs; it is not waited for'))
+                self._say(f'{self._name}: the source hangs; it is not waited for', WARNING)
                 self.queue.put(Ended())
                 return
         self.source.close()
@@ -291,7 +290,7 @@ class Acquisition:
             most = max(new, key=lambda reason: new[reason], default='')
             why = f'{new[most]} bad frames: {most}' if most and new[most] else 'is the baud rate right?'
             what = f'bytes but no sample ({why})'
-        self._repeats.tell('silent', Warned(f'{self._name}: {what} for {SILENCE_S:g} s; still listening'), now / 1e9)
+        self._repeats.tell('silent', f'{self._name}: {what} for {SILENCE_S:g} s; still listening', WARNING, now / 1e9)
         # It may have been stopped, by itself or by another program.
         self.source.wake()
 
@@ -305,7 +304,7 @@ class Acquisition:
         self._connected = False
         self._was_away = True
         self._refusal = ''
-        self._repeats.tell('away', Failed(f'{error}; waiting for it to come back'), time.monotonic(), NEWS)
+        self._repeats.tell('away', f'{error}; waiting for it to come back', ERROR, time.monotonic(), NEWS)
 
     def _reopen(self) -> None:
         try:
@@ -321,14 +320,14 @@ class Acquisition:
             # Report once why the device is refused; a port that is still missing is not worth a line.
             if 'no such port' not in refusal and refusal != self._refusal:
                 self._refusal = refusal
-                self._repeats.tell('refused', Warned(f'{refusal}; still trying'), time.monotonic(), NEWS)
+                self._repeats.tell('refused', f'{refusal}; still trying', WARNING, time.monotonic(), NEWS)
             return
         self._connected = True
         self._name = self.source.name
         self._bad_since_sample = 0
         if not self.source.numbered:
             self._restarted(self._sequence.restart())
-        self._repeats.tell('back', f'{self._name}: the device is back', time.monotonic(), NEWS)
+        self._repeats.tell('back', f'{self._name}: the device is back', INFO, time.monotonic(), NEWS)
 
     def feed(self, events: Sequence[Event], now: int) -> bool:
         """Sort the frames of one read at ``now`` (CLOCK_MONOTONIC, ns); True if one was a sample.
@@ -366,10 +365,9 @@ class Acquisition:
                     self.counters.clock_jumps += 1
                     self._repeats.tell(
                         'lag',
-                        Warned(
-                            f"{self._name}: the device's clock stands still, or falls behind its sample numbers; "
-                            'the time map starts again'
-                        ),
+                        f"{self._name}: the device's clock stands still, or falls behind its sample numbers; "
+                        'the time map starts again',
+                        WARNING,
                         now / 1e9,
                         NEWS,
                     )
@@ -390,7 +388,7 @@ class Acquisition:
     def _jumped(self, now: int) -> None:
         self.counters.clock_jumps += 1
         self._repeats.tell(
-            'jump', Warned(f"{self._name}: the device's clock jumped; the time map starts again"), now / 1e9, NEWS
+            'jump', f"{self._name}: the device's clock jumped; the time map starts again", WARNING, now / 1e9, NEWS
         )
 
     def _unusual(self, number: int, step: Step, missing: int, flags: int, now: int) -> bool:
@@ -411,7 +409,7 @@ class Acquisition:
             self.counters.count_lost(missing, cause)
         elif step is Step.RESTART:
             self._restarted(number)
-            self._repeats.tell('restart', Warned(f'{self._name}: the device started anew'), now / 1e9, NEWS)
+            self._repeats.tell('restart', f'{self._name}: the device started anew', WARNING, now / 1e9, NEWS)
         return True
 
     def _restarted(self, number: int | None) -> None:
@@ -440,7 +438,7 @@ class Acquisition:
             except AnotherDeviceError:
                 raise
             except DeviceError as error:
-                self._repeats.tell('hello', Warned(f'{error}; kept to the first HELLO'), now / 1e9)
+                self._repeats.tell('hello', f'{error}; kept to the first HELLO', WARNING, now / 1e9)
 
     def _hand_over(self, now: int) -> None:
         gathered = self._gathered

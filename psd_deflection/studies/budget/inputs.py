@@ -13,8 +13,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import cast
 
-from psd_deflection.base.errors import ConfigError, did_you_mean
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import tree_of_file
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.rig.parameters import Parameter, check_value
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.base.errors import printable
+from psd_deflection.base.printable import printable
 from psd_deflection.devices.protocol.frames import BadFrame, FrameDecoder, HelloFrame, encode
 from psd_deflection.devices.protocol.text_lines import Description, parse, positive
 from psd_deflection.devices.protocol.words import MAX_TEXT, device_words, finite

@@ -263,10 +263,10 @@ def test_a_memory_that_is_none_is_refused() -> None:
     filtered = Pipeline(motion.rig_of()).motion_filter
     assert filtered is not None
     one = (5.0, 1.0, 0.0, 0.0, 0.0, 0.0)
-    for values in ((), one, (4.0, *one[1:], *6 * one), (math.inf,), (-4.0, *9 * one), (*one, *5 * (0.0,), math.nan)):
+    for values in (one, (4.0, *one[1:], *6 * one), (math.inf,), (-4.0, *9 * one), (*one, *5 * (0.0,), math.nan)):
         with pytest.raises(ValueError, match=r'state.inertia: .* in blocks of 20 samples'):
-            filtered.restore_inertia(values)
-    filtered.restore_inertia((*one, *one))
+            filtered.restore({INERTIA: values})
+    filtered.restore({INERTIA: (*one, *one)})
     assert filtered.inertia.told == [(1_000_000_000, (0.0, 0.0, 0.0))]
 
 

@@ -141,8 +141,8 @@ def test_a_dead_reading_is_no_better_than_a_converters_step() -> None:
 def test_another_one_goes_on_from_the_state_to_the_bit() -> None:
     one, other = stream(), stream()
     feed(one, coloured(5 * SEGMENT + 7 * SIZE, 0.3, 18))
-    one.forget_segment()
     other.set_state(one.state())
+    other.set_segment(one.segment())
     more = coloured(3 * SEGMENT, 0.3, 19, 1.2 * SIGMA)
     for noise in (one, other):
         feed(noise, more, 5 * SEGMENT_BLOCKS + 7)

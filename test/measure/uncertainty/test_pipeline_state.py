@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 from blind import generator
-from psd_deflection.measure.pipeline import FROZEN, HELD, TIP_LOADS, ZERO_VARIANCES, Pipeline
+from psd_deflection.measure.estimation import HELD, ZERO_VARIANCES
+from psd_deflection.measure.health import FROZEN
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.model.simulation.tip_load import TIP_LOADS
 from psd_deflection.records import (
     ENVIRONMENT,
     KNOWN_LOAD,
@@ -160,10 +163,12 @@ def test_what_was_changed_is_remembered() -> None:
     ('name', 'value'),
     [(HELD, (0.0, 1.0)), (FROZEN, (4.0,)), (ZERO_VARIANCES, (1e-12, 1e-12)), (KNOWN_LOAD, (0.0, 0.0, 1.0, 0.0))],
 )
-def test_a_memory_of_another_length_is_none(name: str, value: tuple[float, ...]) -> None:
+def test_a_memory_of_another_length_is_left_out_and_said(name: str, value: tuple[float, ...]) -> None:
     rig = load_rig(overrides={'filter': 'modal', 'degraded': 'hold'})
     pipeline, fresh = Pipeline(rig), Pipeline(rig)
     pipeline.apply(ParameterChange(0, 0, ((name, value),)))
+    (said,) = pipeline.misfits
+    assert f'{name}: {len(value)} numbers; expected ' in said
     assert pipeline.memory(rig) == fresh.memory(rig)
     assert pipeline.estimation.zero_variances == ()
     samples = chunk(volts(1, 1)[:200])

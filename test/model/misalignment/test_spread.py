@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.measure.pipeline import SYSTEMATIC, ZERO_VARIANCES, Pipeline
+from psd_deflection.measure.estimation import SYSTEMATIC, ZERO_VARIANCES
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.misalignment.model import COUNT, INDEX, readings
 from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
 from psd_deflection.model.misalignment.spread import ParameterSpread

@@ -9,6 +9,7 @@ from types import MappingProxyType
 import pytest
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import texts
 from psd_deflection.cli.main import main
 from psd_deflection.model.solvers import SOLVERS, registry
 from psd_deflection.model.solvers.registry import Entry, check_live, solver_class
@@ -112,7 +113,7 @@ COMPARISON_ONLY = [name for name, entry in SOLVERS.items() if entry.instead]
 def test_a_printed_method_is_no_live_runs_answer(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     said = f"solver = '{name}': a method as printed, for comparison only: for a live run take '{SOLVERS[name].instead}'"
     with pytest.raises(ConfigError, match=said):
-        Session(rig_from_values({'solver': name, 'port': '/dev/nothing_here'}), print)
+        Session(rig_from_values({'solver': name, 'port': '/dev/nothing_here'}), texts(print))
     file = rig_file(tmp_path, f'solver: {name}; port: /dev/nothing_here')
     for command in (['estimator', '--no-ros'], ['monitor', '--http-port', '0']):
         assert main([*command, '--params-file', file]) == 3

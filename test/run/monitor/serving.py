@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.log import texts
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -112,7 +113,7 @@ class Serving:
         self.shown = StillShown(self.rig)
         self.feed = Feed()
         self.said: list[str] = []
-        self.server = MonitorServer(self.shown, self.feed, self.rig.monitor, self.said.append)
+        self.server = MonitorServer(self.shown, self.feed, self.rig.monitor, texts(self.said.append))
         self.url = self.server.start()
         self.port = int(self.url.rstrip('/').rpartition(':')[2])
 

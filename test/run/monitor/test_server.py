@@ -12,6 +12,7 @@ import aiohttp
 import pytest
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import unsaid
 from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, ReferencePose
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.monitor import server
@@ -385,7 +386,7 @@ def test_a_port_in_use_is_reported_and_another_taken(serve: Serve) -> None:
 
 def test_an_address_of_another_machine_is_refused() -> None:
     rig = load_rig(overrides={'monitor_address': '192.0.2.1', 'monitor_port': 0})
-    server = MonitorServer(StillShown(rig), Feed(), rig.monitor, lambda text: None)
+    server = MonitorServer(StillShown(rig), Feed(), rig.monitor, unsaid)
     with pytest.raises(ConfigError, match=r"monitor_address = '192\.0\.2\.1'"):
         server.start()
     server.close()

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from psd_deflection.base.log import INFO
 from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
@@ -26,7 +27,7 @@ def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, sp
         pipeline = Pipeline(rig)
         return pipeline, replayed(recording, pipeline)
 
-    def say(text: str) -> None:
+    def say(text: str, level: int = INFO, /) -> None:
         said.append(text)
         ended.set()
 

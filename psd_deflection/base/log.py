@@ -1,0 +1,31 @@
+"""Lines for people, each with its severity beside it: what formats a line cannot lose it.
+
+The severities are the numbers of :mod:`logging`, which are those of ROS too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+INFO, WARNING, ERROR = 20, 30, 40
+
+
+class Say(Protocol):
+    """Takes one line for people, from any thread."""
+
+    def __call__(self, text: str, level: int = INFO, /) -> None:
+        """``level``: information, ``WARNING`` for what somebody should look at, ``ERROR`` for what does not work."""
+
+
+def texts(take: Callable[[str], object]) -> Say:
+    """What says a line by giving its text alone to ``take``."""
+
+    def say(text: str, level: int = INFO, /) -> None:
+        take(text)
+
+    return say
+
+
+def unsaid(text: str, level: int = INFO, /) -> None:
+    """Say nothing."""
