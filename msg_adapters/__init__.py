@@ -1,6 +1,6 @@
 """Converts records to dicts of message fields and back, one file per message; used by rclpy and MCAP.
 
-:func:`to_messages` decides which record goes to which topics; the fields are plain dicts with the
+:data:`TOPICS` says which record goes to which topics; the fields are plain dicts with the
 names of the ROS message definitions, so that nothing here needs ROS.
 """
 
@@ -26,6 +26,7 @@ from msg_adapters import (
 from msg_adapters.header import Fields
 from msg_adapters.message_type import MessageType
 from psd_deflection.records import (
+    MOST_PSDS,
     AppliedLoad,
     BaseAcceleration,
     BlockStatus,
@@ -48,6 +49,8 @@ Input = AppliedLoad | BaseAcceleration | ReferencePose | ReferenceWithCovariance
 SAMPLES = '/psd/samples'
 DEFLECTION = '/link_tip/deflection'
 DEFLECTION_WITH_COVARIANCE = '/link_tip/deflection_with_covariance'
+SOLVER = '/link_tip/{solver}/deflection'
+"""Each solver's own answer."""
 VELOCITY = '/link_tip/velocity'
 FILTERED = '/link_tip/filtered/deflection'
 DIAGNOSTICS = '/diagnostics'
@@ -70,11 +73,54 @@ SPOTS = spot_topics(2)
 """Of the PSDs that every rig has."""
 
 
-class Topic(NamedTuple):
-    """One topic: the message on it and the record that it is made of.
+Item = tuple[str, int, Any]
+"""A message to be made: its topic, its stamp (ns), and what its fields are made of."""
 
-    ``fields``: of a record. ``to_record``: back again, for a topic that the node subscribes to.
-    ``latched``: a late subscriber gets the last message (durability transient local).
+_MEASURED = (BlockStatus.OK, BlockStatus.OUTSIDE_ACTIVE_AREA, BlockStatus.NOT_SOLVED)
+"""Blocks whose dots are published. If the laser is lost, a channel is saturated or samples are too
+few, the mean is not the place of the dot, and nothing is published.
+"""
+
+
+def _one(name: str, record: Any) -> Iterator[Item]:
+    """One message for each record."""
+    yield name, record.t_ns, record
+
+
+def _parts(name: str, block: SampleBlock) -> Iterator[Item]:
+    """One for each part of a block: a message has its samples within some seconds."""
+    return ((name, int(part.t_ns[0]), part) for part in point_cloud2.parts(block))
+
+
+def _of_primary(name: str, estimate: DeflectionEstimate) -> Iterator[Item]:
+    """Of the primary estimate alone."""
+    if estimate.primary:
+        yield name, estimate.t_ns, estimate
+
+
+def _of_solver(name: str, estimate: DeflectionEstimate) -> Iterator[Item]:
+    """Of each estimate, on its solver's topic."""
+    yield name.format(solver=estimate.solver), estimate.t_ns, estimate
+
+
+def _of_psd(psd: int) -> Callable[[str, SpotMeans], Iterator[Item]]:
+    """Of one PSD, if its dot was seen. With a fault of one the dots of the others are good if they were used."""
+
+    def items(name: str, spots: SpotMeans) -> Iterator[Item]:
+        measured = spots.status in _MEASURED
+        lost = not measured and (not spots.left_out or psd in spots.left_out)
+        if psd <= len(spots.sums) and not lost and all(map(math.isfinite, spots.dots)):
+            yield name, spots.t_ns, spots
+
+    return items
+
+
+class Topic(NamedTuple):
+    """One topic, or one for each solver (``{solver}``): the message on it and the record that it is made of.
+
+    ``fields``: of a record, or of what ``items`` makes of it. ``to_record``: back again, for a topic that the node
+    subscribes to. ``latched``: a late subscriber gets the last message (durability transient local). ``items``: the
+    messages of a record.
     """
 
     name: str
@@ -83,18 +129,24 @@ class Topic(NamedTuple):
     fields: Callable[[Any], Fields]
     to_record: Callable[[Mapping[str, Any]], Input] | None = None
     latched: bool = False
+    items: Callable[[str, Any], Iterator[Item]] = _one
 
 
 TOPICS = (
-    Topic(SAMPLES, point_cloud2.MESSAGE, SampleBlock, point_cloud2.from_block),
-    Topic(SPOTS[0], point_stamped.MESSAGE, SpotMeans, partial(point_stamped.from_spot, psd=1)),
-    Topic(SPOTS[1], point_stamped.MESSAGE, SpotMeans, partial(point_stamped.from_spot, psd=2)),
-    Topic(DEFLECTION, pose_stamped.MESSAGE, DeflectionEstimate, pose_stamped.from_estimate),
+    Topic(SAMPLES, point_cloud2.MESSAGE, SampleBlock, point_cloud2.from_block, items=_parts),
+    *(
+        Topic(name, point_stamped.MESSAGE, SpotMeans, partial(point_stamped.from_spot, psd=n), items=_of_psd(n))
+        for n, name in enumerate(spot_topics(MOST_PSDS), start=1)
+    ),
+    # A controller waits for this message: it comes first.
+    Topic(DEFLECTION, pose_stamped.MESSAGE, DeflectionEstimate, pose_stamped.from_estimate, items=_of_primary),
+    Topic(SOLVER, pose_stamped.MESSAGE, DeflectionEstimate, pose_stamped.from_estimate, items=_of_solver),
     Topic(
         DEFLECTION_WITH_COVARIANCE,
         pose_with_covariance_stamped.MESSAGE,
         DeflectionEstimate,
         pose_with_covariance_stamped.from_estimate,
+        items=_of_primary,
     ),
     Topic('/link_tip/wrench', wrench_stamped.MESSAGE, TipLoad, wrench_stamped.from_load),
     Topic(VELOCITY, twist_stamped.MESSAGE, TipMotion, twist_stamped.from_motion),
@@ -113,10 +165,9 @@ TOPICS = (
     ),
     Topic(TEMPERATURE, temperature.MESSAGE, TemperatureReading, temperature.from_reading, temperature.to_reading),
 )
-"""Every fixed topic: a new message is one line here. Each solver adds :func:`solver_topic`, a PoseStamped,
-each PSD beyond the second one of :func:`spot_topics`, a PointStamped."""
+"""Every topic of a rig's records, in the order in which the messages of one are sent: a new one is one line here."""
 
-TOPIC_TYPES: Mapping[str, str] = {t.name: t.message.name for t in TOPICS}
+TOPIC_TYPES: Mapping[str, str] = {t.name: t.message.name for t in TOPICS if t.name != SOLVER}
 MESSAGE_TYPES: Mapping[str, MessageType] = {t.message.name: t.message for t in TOPICS}
 INPUTS = tuple(t.name for t in TOPICS if t.to_record is not None)
 """The topics that the node subscribes to; :data:`FILTER_INPUTS` only with a filter."""
@@ -130,12 +181,9 @@ FILTER_INPUTS = (ACCELERATION,)
 LATCHED = tuple(t.name for t in TOPICS if t.latched)
 
 _BY_NAME = {t.name: t for t in TOPICS}
-_OF_RECORD = {kind: tuple(t for t in TOPICS if t.record is kind) for kind in {t.record for t in TOPICS}}
-
-_MEASURED = (BlockStatus.OK, BlockStatus.OUTSIDE_ACTIVE_AREA, BlockStatus.NOT_SOLVED)
-"""Blocks whose dots are published. If the laser is lost, a channel is saturated or samples are too
-few, the mean is not the place of the dot, and nothing is published.
-"""
+ROWS: dict[type[Any], tuple[Topic, ...]] = {ParameterChange: ()}
+ROWS |= {kind: tuple(t for t in TOPICS if t.record is kind) for kind in {t.record for t in TOPICS}}
+"""The topics of each kind of record; a change of parameters has none."""
 
 
 class Message(NamedTuple):
@@ -149,7 +197,7 @@ class Message(NamedTuple):
 
 def solver_topic(solver: str) -> str:
     """The topic of one solver's own answer."""
-    return f'/link_tip/{solver}/deflection'
+    return SOLVER.format(solver=solver)
 
 
 def to_messages(record: Record, frame_prefix: str = '') -> tuple[Message, ...]:
@@ -161,58 +209,24 @@ def to_messages(record: Record, frame_prefix: str = '') -> tuple[Message, ...]:
 
 
 def messages(record: Record, frame_prefix: str = '') -> Iterator[Message]:
-    """:func:`to_messages` as a generator: the first message does not wait for the others."""
-    named = None
-    for message in _messages(record):
-        # Topics may share their fields.
-        if frame_prefix and message.fields is not named:
-            named = message.fields
-            header = named.get('header', {})
-            if header.get('frame_id'):
-                header['frame_id'] = frame_prefix + header['frame_id']
-        yield message
+    """:func:`to_messages` as a generator: the first message does not wait for the others.
 
-
-def _messages(record: Record) -> Iterator[Message]:
-    if not isinstance(record, DeflectionEstimate):
-        yield from _of_topics(record)
-        return
-    t_ns = record.t_ns
-    fields = pose_stamped.from_estimate(record)
-    if record.primary:
-        # A controller waits for this message: send it first.
-        yield Message(DEFLECTION, pose_stamped.MESSAGE.name, t_ns, fields)
-    yield Message(solver_topic(record.solver), pose_stamped.MESSAGE.name, t_ns, fields)
-    if record.primary:
-        with_covariance = pose_with_covariance_stamped.from_estimate(record)
-        yield Message(DEFLECTION_WITH_COVARIANCE, pose_with_covariance_stamped.MESSAGE.name, t_ns, with_covariance)
-
-
-def _of_topics(record: Record) -> tuple[Message, ...]:
-    if isinstance(record, SampleBlock):
-        return tuple(
-            Message(SAMPLES, point_cloud2.MESSAGE.name, int(part.t_ns[0]), point_cloud2.from_block(part))
-            for part in point_cloud2.parts(record)
-        )
-    if isinstance(record, ParameterChange):
-        return ()
-    if isinstance(record, SpotMeans):
-        return _of_spots(record)
+    Messages that are made alike of the same share their fields.
+    """
     try:
-        topics = _OF_RECORD[type(record)]
+        rows = ROWS[type(record)]
     except KeyError:
         raise TypeError(f'no message for a {type(record).__name__}') from None
-    return tuple(Message(t.name, t.message.name, record.t_ns, t.fields(record)) for t in topics)
-
-
-def _of_spots(spots: SpotMeans) -> tuple[Message, ...]:
-    if not all(map(math.isfinite, spots.dots)) or not (spots.status in _MEASURED or spots.left_out):
-        return ()
-    # With a fault of one PSD the dots of the others are good if the estimate was made of them.
-    lost = () if spots.status in _MEASURED else spots.left_out
-    seen = [n for n in range(1, len(spots.sums) + 1) if n not in lost]
-    kind = point_stamped.MESSAGE.name
-    return tuple(Message(f'/psd_{n}/spot', kind, spots.t_ns, point_stamped.from_spot(spots, n)) for n in seen)
+    made: tuple[object, object] = (None, None)
+    fields: Fields = {}
+    for row in rows:
+        for name, t_ns, item in row.items(row.name, record):
+            if made[0] is not row.fields or made[1] is not item:
+                made, fields = (row.fields, item), row.fields(item)
+                header = fields.get('header', {})
+                if frame_prefix and header.get('frame_id'):
+                    header['frame_id'] = frame_prefix + header['frame_id']
+            yield Message(name, row.message.name, t_ns, fields)
 
 
 def from_fields(topic: str, fields: Mapping[str, Any]) -> Input:

@@ -9,7 +9,6 @@ from msg_adapters import (
     FILTER_INPUTS,
     FILTER_TOPICS,
     INPUTS,
-    SPOTS,
     TOPIC_TYPES,
     messages,
     solver_topic,
@@ -17,17 +16,17 @@ from msg_adapters import (
 )
 from psd_deflection.model.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.recordings import cdr
-from psd_deflection.records import ParameterChange, Record
+from psd_deflection.records import MOST_PSDS, ParameterChange, Record
 from psd_deflection.rig.config import Rig
 
 
 def published(rig: Rig) -> dict[str, str]:
     """The topics of what a run of ``rig`` puts out, with their types."""
-    outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in INPUTS}
+    others = {*INPUTS, *spot_topics(MOST_PSDS)[len(rig.psds) :]}
+    outputs = {topic: kind for topic, kind in TOPIC_TYPES.items() if topic not in others}
     if rig.estimator.filter == 'none':
         outputs = {topic: kind for topic, kind in outputs.items() if topic not in FILTER_TOPICS}
-    outputs |= {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
-    return outputs | dict.fromkeys(spot_topics(len(rig.psds)), TOPIC_TYPES[SPOTS[0]])
+    return outputs | {solver_topic(s): TOPIC_TYPES[DEFLECTION] for s in (*rig.estimator.solvers, ONE_PSD)}
 
 
 def subscribed(rig: Rig) -> tuple[str, ...]:
