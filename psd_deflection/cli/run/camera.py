@@ -35,11 +35,12 @@ from psd_deflection.base.files import replace_file
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.footage import Footage, Frame, read_image, read_settings
 from psd_deflection.camera.intrinsics import calibrated
+from psd_deflection.camera.kinds import TARGETS
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.preview import preview
-from psd_deflection.camera.print_target import printed, sizes
+from psd_deflection.camera.print_target import printed
 from psd_deflection.camera.reference import CameraReference
-from psd_deflection.camera.settings import TARGETS, CameraSettings
+from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import FOREIGN, need_folder, picture_name, whole
@@ -98,13 +99,14 @@ def _node(args: argparse.Namespace) -> int:
 def _print_target(args: argparse.Namespace, settings: CameraSettings) -> int:
     out = Path(picture_name('.pdf', '.png', '.svg')(args.out))
     need_folder(out)
+    target = target_of(settings)
     with _saved(out):
-        replace_file(out, printed(settings, out.suffix[1:].lower()))
+        replace_file(out, printed(target, out.suffix[1:].lower()))
     if args.json:
-        print_json({'out': args.out, 'parameters': sizes(settings)})
+        print_json({'out': args.out, 'parameters': target.describe()})
         return 0
     show(f'{out}: print it at 100 %, measure the line of 50 mm, and put this into CAMERA.yaml:')
-    show(*sizes(settings))
+    show(*target.describe())
     return 0
 
 
@@ -253,8 +255,7 @@ def _tell(
         sds = f'ΔX {dx * 1e6:.2f} µm, ΔY {dy * 1e6:.2f} µm, θ {math.degrees(theta):.5f}°'
         show(f'one sd, median of the last frames: {sds}')
         show(f'the camera is turned by {math.degrees(reference.turn):+.3f}° in its plane, which is taken off')
-        if settings.target == 'circles':
-            show(f'the discs look {100 * (rest.scale - 1):+.2f} % larger than target.spacing and target.radius say')
+        show(*reference.target.rest_words(rest))
     if not settings.matrix:
         warn(
             'camera.matrix is not given: the scale is that of target.spacing, lens distortion is not corrected; '
