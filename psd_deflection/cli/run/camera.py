@@ -43,10 +43,9 @@ from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import FOREIGN, need_folder, picture_name, whole
+from psd_deflection.cli._options import need_folder, picture_name, recording_name, whole
 from psd_deflection.cli._report import print_json, show, warn
-from psd_deflection.recordings.write.csv_writer import CsvReferenceFile
-from psd_deflection.recordings.write.reference_sink import ReferenceSink
+from psd_deflection.recordings.write.sinks import open_reference_file
 
 PREVIEW_S = 1.0
 
@@ -145,17 +144,14 @@ def _saved(out: Path, option: str = '--out') -> Iterator[None]:
 
 def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
     out = Path(args.out)
-    if out.suffix.lower() in FOREIGN:
-        raise UsageError(f'--out {out}: {out.suffix} cannot be written; use X.csv, X.mcap or a bag folder (X)')
+    recording_name()(args.out)
     need_folder(out)
     opencv()
     footage = Footage(args.what[0], settings.exposure)
     reference = CameraReference(settings, target_of)
     reasons: collections.Counter[str] = collections.Counter()
     found: list[FrameAnswer] = []
-    sink: CsvReferenceFile | ReferenceSink
-    sink = CsvReferenceFile(out) if out.suffix.lower() == '.csv' else ReferenceSink(out)
-    with contextlib.closing(sink):
+    with contextlib.closing(open_reference_file(out)) as sink:
         for answer in _answers(args, footage, reference, _Preview(args.show)):
             reasons[str(answer.status)] += 1
             sink.put(answer.t_ns, answer.as_record(), str(answer.status))
