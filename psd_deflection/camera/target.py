@@ -11,7 +11,7 @@ from psd_deflection.camera.settings import SETTINGS, CameraSettings
 
 
 class Drawing(NamedTuple):
-    """What is on the paper, about the middle of the target: either discs (x, y, radius) m, white on a black
+    """A picture about the middle of the target: either discs (x, y, radius) m, white on a black
     rectangle of ``size`` (m), or a grey ``picture`` (rows, columns) of uint8 that has this size.
     """
 
@@ -43,14 +43,14 @@ class Target(abc.ABC):
 
     @abc.abstractmethod
     def drawing(self) -> Drawing:
-        """What is printed."""
+        """The picture to print."""
 
     def set_rest(self, rest: TargetPose) -> None:
         """Remember where the target is at rest."""
         self._rest = rest
 
     def rest_words(self, rest: TargetPose) -> list[str]:
-        """What the rest tells a person of the target; a line each."""
+        """Lines for a person about the target at rest."""
         return []
 
     def describe(self) -> list[str]:

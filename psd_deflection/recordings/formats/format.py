@@ -33,7 +33,7 @@ class ReferenceFile(Protocol):
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What the user says of a recording that is opened, see :func:`..read.readers.open_recording`."""
+    """The options of a recording that is opened, see :func:`..read.readers.open_recording`."""
 
     block_size: int | None = None
     sample_rate_hz: float | None = None
@@ -42,7 +42,7 @@ class ReadOptions:
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """What goes into a file that is written, see :func:`..write.sinks.open_sink`."""
+    """The options of a file that is written, see :func:`..write.sinks.open_sink`."""
 
     rig_values: Mapping[str, object] = field(default_factory=dict)
     device_hello: Mapping[str, object] | None = None
