@@ -12,17 +12,15 @@ parameters moved by three tolerances, for ``calibrate --check``.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from tqdm import tqdm
 
 from blind import generator, misaligned
+from blind.campaign import options, over
 from blind.generator import Array
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.catalogue import effects_to_values
@@ -292,16 +290,12 @@ def table(scores: Sequence[Score]) -> Iterator[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the tables of docs/calibration.md."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, jobs=2)
     parser.add_argument('--rigs', type=int, default=200)
-    parser.add_argument('--jobs', type=int, default=2, help='processes at once')
     parser.add_argument('--light', action='store_true', help='1 to 4 %% of other light, which changes; --dark is used')
     args = parser.parse_args(argv)
-    with ProcessPoolExecutor(args.jobs) as pool:
-        every = pool.map(partial(score, lit=args.light), range(args.rigs))
-        scores = list(tqdm(every, total=args.rigs, unit=' rigs'))
-    for line in table(scores):
-        print(line)
+    scores = list(over(partial(score, lit=args.light), range(args.rigs), args.jobs, 'rigs'))
+    print('\n'.join(table(scores)))
     for number, s in enumerate(scores):
         if s.moved != s.named or s.unsaid or s.said:
             told = f'moved {s.moved or "nothing"}, named {s.named or "nothing"} {s.like}'

@@ -7,13 +7,12 @@ motion and the dots share no code with the package.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from tqdm import tqdm
 
+from blind.campaign import options, watched
 from blind.generator import Array
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.solvers import solver_from_rig
@@ -122,11 +121,11 @@ def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
 
 def main() -> None:
     """Print the score."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument('--runs', type=int, default=200, metavar='N')
     parser.add_argument('--first', type=int, default=1000, metavar='SEED')
     args = parser.parse_args()
-    score = scored(tqdm(range(args.first, args.first + args.runs), delay=1.0, leave=False, disable=None))
+    score = scored(watched(range(args.first, args.first + args.runs)))
     errors = np.abs(score.errors)
     print(f'offset told         {score.told} of {args.runs}')
     print(f'inside its interval {100.0 * score.inside / args.runs:.1f} % (95 % expected)')

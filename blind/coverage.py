@@ -7,7 +7,6 @@ on and off) with 5 s of ringing each. The truth is the pose at the middle of the
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -18,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blind import generator
+from blind.campaign import options
 from blind.generator import Array
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DeflectionEstimate, RawChunk
@@ -310,8 +310,7 @@ def _job(job: tuple[Row, str]) -> tuple[Row, str, Scored]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table of docs/accuracy.md."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument('--jobs', type=int, default=2, help='processes at once')
+    parser = options(__doc__, jobs=2)
     parser.add_argument(
         '--rows', type=int, help='only the first kinds of noise (of wrong readings with --faults), and only the table'
     )

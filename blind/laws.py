@@ -8,8 +8,6 @@ nothing. Develop on one range of seeds and judge once on another.
 
 from __future__ import annotations
 
-import argparse
-import contextlib
 import itertools
 import json
 import math
@@ -17,14 +15,13 @@ import sys
 import time
 import zlib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from blind import generator, law_forms
+from blind.campaign import bound_line, conclude, options, over
 from blind.cases import designs, gap_of
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import Discovery, discover
@@ -150,19 +147,16 @@ def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
         alone = sum(r[f'{name}_alone'] for r in laws)
         good = n == 0 or k >= WANTED[name] * n
         passed &= good
-        lines.append(
-            f'{"ok  " if good else "MISS"} {words}, named or listed as equivalent: {k}/{n} '
-            f'(wanted {100 * WANTED[name]:.0f} %); named itself: {alone}/{n}'
-        )
+        counted = f'{k}/{n} (wanted {100 * WANTED[name]:.0f} %); named itself: {alone}/{n}'
+        lines.append(bound_line(good, f'{words}, named or listed as equivalent: {counted}'))
     near, n = sum(r['floors'] <= MOST_FLOORS for r in laws), len(laws)
     good = n == 0 or near >= WANTED['gap'] * n
     alarms = sum(r['alarm'] for r in nulls)
     passed &= good and alarms == 0
-    lines.append(
-        f'{"ok  " if good else "MISS"} gap on unseen load cases at most {MOST_FLOORS} floors: {near}/{n} '
-        f'(wanted {100 * WANTED["gap"]:.0f} %)'
-    )
-    lines.append(f'{"ok  " if alarms == 0 else "MISS"} laws where nothing is missing: {alarms}/{len(nulls)} (wanted 0)')
+    share = f'{near}/{n} (wanted {100 * WANTED["gap"]:.0f} %)'
+    lines.append(bound_line(good, f'gap on unseen load cases at most {MOST_FLOORS} floors: {share}'))
+    unwanted = f'{alarms}/{len(nulls)} (wanted 0)'
+    lines.append(bound_line(alarms == 0, f'laws where nothing is missing: {unwanted}'))
     if laws:
         lines.append(
             f'     right kind: {sum(r["kind"] for r in laws)}/{n}; mean set: {np.mean([r["set"] for r in laws]):.1f}'
@@ -174,12 +168,11 @@ def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Draw, let discover answer, count; exit status 1 if a threshold is missed."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, jobs=1)
     parser.add_argument('--out', default='build/blind-laws', help='folder for the answers (default: build/blind-laws)')
     parser.add_argument('--laws', type=int, default=12)
     parser.add_argument('--nulls', type=int, default=12)
     parser.add_argument('--first', type=int, default=0, help='number of the first law: fresh ones')
-    parser.add_argument('--jobs', type=int, default=1, help='processes at once')
     args = parser.parse_args(argv)
     folder = Path(args.out)
     folder.mkdir(parents=True, exist_ok=True)
@@ -187,18 +180,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     jobs: list[tuple[dict[str, Any] | None, int]] = [(law, law['number']) for law in listed]
     jobs += [(None, 100_000 + args.first + i) for i in range(args.nulls)]
     rows = []
-    with contextlib.ExitStack() as open_until_done:
-        stream = open_until_done.enter_context((folder / f'answers-{args.first}.jsonl').open('w'))
-        pool = open_until_done.enter_context(ProcessPoolExecutor(args.jobs)) if args.jobs > 1 else None
-        answers = map(_one, jobs) if pool is None else pool.map(_one, jobs)
-        for row in tqdm(answers, total=len(jobs), desc='answers', file=sys.stderr):
+    with (folder / f'answers-{args.first}.jsonl').open('w') as stream:
+        for row in over(_one, jobs, args.jobs, 'answers'):
             rows.append(row)
             stream.write(json.dumps(row) + '\n')
             stream.flush()
-    text, passed = summary(rows)
-    print(text)
-    (folder / f'summary-{args.first}.txt').write_text(text + '\n')
-    return 0 if passed else 1
+    return conclude(*summary(rows), folder / f'summary-{args.first}.txt')
 
 
 if __name__ == '__main__':

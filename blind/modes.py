@@ -10,15 +10,14 @@ at 100 Hz above 2 Hz, and of its stable poles the one whose frequency is nearest
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.integrate import trapezoid
-from tqdm import tqdm
 
+from blind.campaign import options, watched
 from blind.generator import Array
 from psd_deflection.studies.identify.modes import Mode, modes_of
 
@@ -168,7 +167,7 @@ def report(name: str, score: Score) -> str:
 
 def main() -> None:
     """Print the scores."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__)
     parser.add_argument('--rigs', type=int, default=200, metavar='N')
     parser.add_argument('--first', type=int, default=1000, metavar='SEED')
     parser.add_argument('--pyoma2', action='store_true', help='give the same samples to pyOMA2 too')
@@ -176,7 +175,7 @@ def main() -> None:
     for name, operation in (('ring-down', False), ('operation', True)):
         seeds = range(args.first, args.first + args.rigs)
         for peer in (False, True)[: 1 + args.pyoma2]:
-            score = scored(tqdm(seeds, delay=1.0, leave=False, disable=None), operation=operation, pyoma2=peer)
+            score = scored(watched(seeds), operation=operation, pyoma2=peer)
             print(report(name + ', pyOMA2' * peer, score))
 
 

@@ -16,7 +16,6 @@ mode; and the share of the poses that are inside three standard deviations after
 
 from __future__ import annotations
 
-import argparse
 import copy
 import math
 from collections.abc import Iterable, Mapping
@@ -26,8 +25,8 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.signal import savgol_filter
 from scipy.stats import chi2
-from tqdm import tqdm
 
+from blind.campaign import options, watched
 from blind.generator import EI, GJ, MM_PER_V, PLACES, RATE, SIGMA, Array, output
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import BaseAcceleration, RawChunk, TipMotion
@@ -409,7 +408,7 @@ def table(found: Mapping[str, list[Figures]]) -> str:
 
 def main() -> None:
     """The table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__)
     parser.add_argument('--runs', type=int, default=20, help='of each kind of motion')
     parser.add_argument('--seconds', type=float, default=23.0, help='of a run, the first three at rest')
     parser.add_argument('--seed', type=int, default=0)
@@ -421,7 +420,8 @@ def main() -> None:
     for kind in args.kinds:
         seeds = range(args.seed, args.seed + args.runs)
         judged[kind] = [
-            judge(biased(make(kind, args.seconds, seed), args.bias), rig_of(), args.late) for seed in tqdm(seeds, kind)
+            judge(biased(make(kind, args.seconds, seed), args.bias), rig_of(), args.late)
+            for seed in watched(seeds, kind)
         ]
     print(table({kind: figures(results) for kind, results in judged.items()}))
     if 'chirp' in judged:

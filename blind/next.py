@@ -8,19 +8,17 @@ again: if that separates them, the answer was wrong.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import time
 import zlib
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
+from blind.campaign import conclude, options, over
 from blind.cases import DRAWS, EFFECTS, MIMICKED, gap_of, scaled
 from blind.generator import Array, Generator
 from psd_deflection.rig.config import load_rig, replace_values
@@ -156,26 +154,21 @@ def table(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the campaign; exit status 1 if what is wanted is not met."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, jobs=1)
     parser.add_argument('--only', default='', help='only effects whose name contains this')
     parser.add_argument('--designs', default='', help='only first recordings whose name contains this')
     parser.add_argument('--mimicked', action='store_true', help='only effects that others can replace exactly')
     parser.add_argument('--gap', type=float, default=GAP, help='size of the hidden effect, in floors')
-    parser.add_argument('--jobs', type=int, default=1, help='processes at once')
     parser.add_argument('--out', help='file for the rows, as JSON')
     args = parser.parse_args(argv)
     effects = [n for n in EFFECTS if args.only in n and (n in MIMICKED or not args.mimicked)]
     jobs = [(n, d, args.gap) for d in first_recordings() if args.designs in d for n in effects]
     rows = []
-    with tqdm(total=len(jobs), file=sys.stderr) as bar, ProcessPoolExecutor(args.jobs) as pool:
-        for row in pool.map(one, jobs):
-            rows.append(row)
-            bar.update()
-            if args.out:
-                Path(args.out).write_text(json.dumps(rows, indent=1))
-    text, met = table(rows)
-    print(text)
-    return 0 if met else 1
+    for row in over(one, jobs, args.jobs):
+        rows.append(row)
+        if args.out:
+            Path(args.out).write_text(json.dumps(rows, indent=1))
+    return conclude(*table(rows))
 
 
 if __name__ == '__main__':

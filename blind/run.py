@@ -6,20 +6,17 @@ and temperatures, nothing else. Each answer is saved immediately, and a stopped 
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import hashlib
 import json
 import sys
 import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from blind import score
+from blind.campaign import conclude, options, over
 from blind.cases import Case, all_cases, designs, scaled, short_cases
 from blind.mistakes import observed
 from psd_deflection.rig.config import load_rig, replace_values
@@ -78,7 +75,8 @@ def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:
     return case.key
 
 
-def _sealed(case: Case, path: Path) -> None:
+def _sealed(given: tuple[Case, Path]) -> None:
+    case, path = given
     if path.exists():
         return
     partial = path.with_suffix('.partial')
@@ -91,7 +89,8 @@ def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:
     truths = folder / 'sealed'
     truths.mkdir(parents=True, exist_ok=True)
     paths = [truths / f'{case.key}.json' for case in cases]
-    _all(_sealed, cases, paths, jobs=jobs, desc='sealing truths')
+    for _ in over(_sealed, list(zip(cases, paths, strict=True)), jobs, 'sealing truths'):
+        pass
     digest = hashlib.sha256(json.dumps(score.THRESHOLDS, sort_keys=True).encode())
     for path in paths:
         digest.update(path.read_bytes())
@@ -100,24 +99,10 @@ def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:
     return digest.hexdigest()
 
 
-def _all(work: Callable[..., object], *each: Sequence[object], jobs: int, desc: str) -> None:
-    """``work`` on each, in this process or in ``jobs`` of them, with a progress bar."""
-    with tqdm(total=len(each[0]), desc=desc, file=sys.stderr) as bar:
-        if jobs > 1:
-            with ProcessPoolExecutor(jobs) as pool:
-                for _ in pool.map(work, *each):
-                    bar.update()
-        else:
-            for given in zip(*each, strict=True):
-                work(*given)
-                bar.update()
-
-
 def main(argv: Sequence[str] | None = None) -> int:
     """Seal, run what is missing, score; exit status 1 if a threshold is not met."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, jobs=1)
     parser.add_argument('--out', default='build/blind', help='folder for truths and answers (default: build/blind)')
-    parser.add_argument('--jobs', type=int, default=1, help='processes at once')
     parser.add_argument('--short', action='store_true', help='the slice that runs on every change')
     parser.add_argument('--seeds', type=int, default=4)
     parser.add_argument('--nulls', type=int, default=300)
@@ -145,12 +130,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             if not target.exists():
                 sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
                 jobs.append((sealed['case'], sealed['truth'], str(target)))
-        _all(_one, jobs, jobs=args.jobs, desc='answers')
+        for _ in over(_one, jobs, args.jobs, 'answers'):
+            pass
     rows = score.load(folder, [c.key for c in cases])
-    text, passed = score.summary(rows)
-    print(text)
-    (folder / 'summary.txt').write_text(text + '\n')
-    return 0 if passed else 1
+    return conclude(*score.summary(rows), folder / 'summary.txt')
 
 
 if __name__ == '__main__':

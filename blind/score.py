@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import beta
 
+from blind.campaign import bound_line
 from blind.cases import SHOWS_ACROSS_LENGTHS
 
 THRESHOLDS: dict[str, float] = {
@@ -119,7 +120,7 @@ class _Sheet:
     def check(self, good: bool, text: str) -> None:
         """One line with a threshold."""
         self.passed = self.passed and good
-        self.lines.append(f'  {"ok  " if good else "MISS"}  {text}')
+        self.lines.append(f'  {bound_line(good, " " + text)}')
 
     def rate(self, name: str, rows: Sequence[Row], hits: Sequence[bool], low: float, high: float, note: bool) -> None:
         """The share of ``hits``, wanted from ``low`` to ``high``; with ``note``, misses go to the failures."""

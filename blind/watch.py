@@ -9,17 +9,15 @@ to two seconds late.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
+from blind.campaign import conclude, options, over
 from blind.generator import EI, GJ, LSB, MM_PER_V, SIGMA, Array, Generator
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Alarm, Watch
@@ -203,28 +201,21 @@ def table(runs: Sequence[Run], hours: float, alarms: int, said: Sequence[str], c
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the campaign; exit status 1 if what is wanted is not met."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = options(__doc__, jobs=1)
     parser.add_argument('--runs', type=int, default=100, help='events of each kind')
     parser.add_argument('--hours', type=float, default=24.0, help='quiet hours')
     parser.add_argument('--first', type=int, default=0, help='number of the first seed')
-    parser.add_argument('--jobs', type=int, default=1, help='processes at once')
     args = parser.parse_args(argv)
     jobs = [(kind, args.first + i) for i in range(args.runs) for kind in SIZES]
     parts = [(args.hours / args.jobs, args.first + i) for i in range(args.jobs)] if args.hours else []
-    runs, hours, alarms, costs = list[Run](), 0.0, 0, list[float]()
+    runs = list(over(one, jobs, args.jobs, 'events'))
+    hours, alarms, costs = 0.0, 0, list[float]()
     said: list[str] = []
-    with tqdm(total=len(jobs) + len(parts), file=sys.stderr) as bar, ProcessPoolExecutor(args.jobs) as pool:
-        for run in pool.map(one, jobs):
-            runs.append(run)
-            bar.update()
-        for done, count, words, cost in pool.map(quiet, parts):
-            hours, alarms = hours + done, alarms + count
-            said += words
-            costs.append(cost)
-            bar.update()
-    text, met = table(runs, hours, alarms, said, float(np.mean(costs)) if costs else 0.0)
-    print(text)
-    return 0 if met else 1
+    for done, count, words, cost in over(quiet, parts, args.jobs, 'quiet hours'):
+        hours, alarms = hours + done, alarms + count
+        said += words
+        costs.append(cost)
+    return conclude(*table(runs, hours, alarms, said, float(np.mean(costs)) if costs else 0.0))
 
 
 if __name__ == '__main__':

@@ -63,8 +63,6 @@ ALREADY_LARGE = {
     'cli/studies/discover.py:run',
     'measure/estimation.py:Estimation._estimate',
     'measure/health.py:OpticsHealth.judge',
-    'measure/pipeline.py:Pipeline._block',
-    'measure/pipeline.py:Pipeline.apply',
     'recordings/replay/engine.py:replayed',
     'rig/parameters.py:parameter',
     'run/monitor/shown.py:ShownRecording._lap',

@@ -25,7 +25,7 @@ from scipy.ndimage import gaussian_filter
 
 from blind import render
 from psd_deflection.camera.answer import FrameAnswer, Status
-from psd_deflection.camera.boards import board_of, board_size
+from psd_deflection.camera.boards import Board
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
@@ -303,10 +303,17 @@ VIEWS = {
 """Both targets seen by the same camera from the same place; a board of 70 x 90 mm fills most of the height."""
 
 
+def _board(settings: CameraSettings) -> Board:
+    target = target_of(settings)
+    assert isinstance(target, Board)
+    return target
+
+
 def board_picture(settings: CameraSettings) -> Any:
     """How a board of these settings is drawn: (scene, pose) -> grey levels without noise."""
-    size = board_size(settings)
-    texture = board_of(settings).generateImage((round(size[0] * 2e4), round(size[1] * 2e4)), None, 0, 1) / 255.0
+    target = _board(settings)
+    size = target.size
+    texture = target.board.generateImage((round(size[0] * 2e4), round(size[1] * 2e4)), None, 0, 1) / 255.0
 
     def picture(scene: render.Scene, pose: render.Pose) -> Any:
         return render.board(scene, pose, texture, size)
@@ -334,7 +341,7 @@ def theta_bounds(scene: render.Scene, picture: Any, *nears: Any) -> list[float]:
 
 def near_corners(scene: render.Scene, settings: CameraSettings) -> Any:
     """The pixels around the inner corners of the chessboard that show nothing else."""
-    size = board_size(settings)
+    size = _board(settings).size
     across, up = (np.arange(1, round(s / settings.square)) * settings.square - s / 2 for s in size)
     at = render.seen(scene, render.Pose(), np.array([[x, y] for x in across for y in up]))
     reach = min(7.0, 0.5 * (settings.square - settings.marker) * scene.focal / scene.distance)

@@ -61,7 +61,7 @@ def left_by_a_kill(rig: Rig, bags: Path, after_s: float) -> tuple[Path, int]:
 
 
 def judge(folder: Path, killed_ns: int) -> float:
-    """Seconds between the last sample that is left and the kill; AssertionError where a reader disagrees."""
+    """Seconds between the last sample that is left and the kill; AssertionError if a reader disagrees."""
     before = [int(b.t_ns[-1]) for b in open_recording(folder).blocks()]
     recover(folder)
     after = [int(b.t_ns[-1]) for b in open_recording(folder).blocks()]

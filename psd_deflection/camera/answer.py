@@ -97,7 +97,7 @@ class FrameAnswer(NamedTuple):
     target: TargetPose | None = None
 
     def as_record(self) -> ReferenceWithCovariance | None:
-        """What is recorded and published of it."""
+        """The record that is published and recorded; None without a pose."""
         if self.covariance is None:
             return None
         covariance = tuple(map(float, self.covariance.ravel()))

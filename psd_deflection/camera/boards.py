@@ -7,8 +7,10 @@ Needs OpenCV 4.7 or later (``cv2.aruco`` of ``objdetect``).
 
 from __future__ import annotations
 
+import abc
 import math
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.refine_corners import LEAST_REACH, refined
 from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.camera.target import Drawing, Target
 from psd_deflection.records import FloatArray
 
 LEAST_CORNERS = 8
@@ -36,39 +39,72 @@ CORNER_FLOOR, BLUR_FLOOR = 0.004, 0.05
 
 _STEPS = 20
 _TAG_MODULES = 10
+_PIXELS_A_COLUMN = 320
+"""Of a drawing: a multiple of the modules of a marker, so that their edges are sharp."""
 
 
-class Board:
-    """Finds one board, frame by frame. Raises ConfigError if OpenCV or the dictionary is unknown."""
+class Board(Target):
+    """Finds one board, frame by frame. Raises ConfigError if OpenCV or the dictionary is unknown.
+
+    ``board``: OpenCV's. ``size``: width and height, m.
+    """
+
+    usual: ClassVar[tuple[int, int]]
+    """Columns and rows, if the settings do not say them."""
+    usual_dictionary: ClassVar[str]
+    crossings: ClassVar[bool]
+    """Whether a corner is where two edges cross, as on a chessboard, or that of one dark square."""
 
     def __init__(self, settings: CameraSettings) -> None:
-        self.board = board_of(settings)
-        cv2 = opencv()
-        parameters = cv2.aruco.DetectorParameters()
-        self._charuco: Any = None
-        if settings.target == 'charuco':
-            self._charuco = cv2.aruco.CharucoDetector(self.board)
-        else:
-            parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-            self._tags = cv2.aruco.ArucoDetector(self.board.getDictionary(), parameters)
-            self._by_id = dict(zip(np.ravel(self.board.getIds()).tolist(), self.board.getObjPoints(), strict=True))
+        usual = self.usual
+        settings = replace(
+            settings,
+            columns=settings.columns or usual[0],
+            rows=settings.rows or usual[1],
+            dictionary=settings.dictionary or self.usual_dictionary,
+        )
+        super().__init__(settings)
+        self.board = self._made(_dictionary(settings, self._needed(settings)))
+        wide, high = self.size = self._size()
         # OpenCV's board: origin in the corner, x right, y down as it is seen. Ours: middle, y up.
-        wide, high = board_size(settings)
-        # Around a corner of the chessboard there is nothing up to the markers; a tag has a rim of one of its modules.
-        charuco = settings.target == 'charuco'
-        self._free = (settings.square - settings.marker) / 2 if charuco else settings.marker / _TAG_MODULES
-        # From the corners of a tag (as OpenCV has them, clockwise from the upper left) to its inside, in our axes.
-        self._inwards = np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
         self._middle = np.array([wide / 2, high / 2])
         self._mirror = 1.0 if settings.view == 'outside' else -1.0
-        self._inwards[:, 0] *= self._mirror
         self._spread = np.array([wide, high]) / math.sqrt(12.0)
 
-    def set_rest(self, rest: TargetPose) -> None:
-        """Nothing to remember: the numbers of the markers say it all."""
+    @abc.abstractmethod
+    def _needed(self, settings: CameraSettings) -> int:
+        """Number of markers."""
+
+    @abc.abstractmethod
+    def _made(self, dictionary: Any) -> Any:
+        """OpenCV's board."""
+
+    @abc.abstractmethod
+    def _size(self) -> tuple[float, float]:
+        """Width and height, m."""
+
+    @property
+    @abc.abstractmethod
+    def _free(self) -> float:
+        """Around a corner there is nothing else up to this distance, m."""
+
+    @abc.abstractmethod
+    def _inwards(self) -> FloatArray:
+        """(k, 2): from corner to the inside of what it belongs to, in the board's axes; of k corners in turn."""
+
+    @abc.abstractmethod
+    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+        """Numbers of what is seen, corners in OpenCV's axes (n, 2) m and in the image px, and if any marker is seen."""
+
+    def drawing(self) -> Drawing:
+        """The board as OpenCV draws it."""
+        wide, high = self.size
+        across = self.settings.columns * _PIXELS_A_COLUMN
+        pixels = (across, round(across * high / wide))
+        return Drawing(self.size, picture=np.asarray(self.board.generateImage(pixels, None, 0, 1)))
 
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
-        """The board in one image. Raises RefusedError."""
+        """See :class:`Target`."""
         plane, pixels = self.corners(grey)
         points = np.column_stack([plane, np.zeros(len(plane))])
         rotation, place = self._guess(plane, lens.rays(pixels))
@@ -109,11 +145,10 @@ class Board:
     def _refined(
         self, image: Any, points: FloatArray, pixels: FloatArray, lens: Lens, rotation: FloatArray, place: FloatArray
     ) -> tuple[FloatArray, float]:
-        """Corners by the grey levels around them, and the sd of the motion blur, px. Raises RefusedError."""
+        """Corners by the grey levels around them, and the sd of the motion blur, px. Raises NoPoseError."""
         step = 0.5 * self._free
         here = lens.project(points @ rotation.T + place)
-        towards = np.sign(self._inwards) if self._charuco is None else np.ones((1, 2))
-        towards = np.resize(towards, (len(points), 2))
+        towards = np.resize(self._inwards(), (len(points), 2))
         edges = []
         for axis in (0, 1):
             ahead = points.copy()
@@ -123,35 +158,22 @@ class Board:
         free = self._free * lens.focal / float(place[2])
         if free < LEAST_REACH:
             raise NoPoseError(Status.SMALL)
-        found = refined(image, pixels, np.stack(edges, axis=1), 0.95 * free, self._charuco is not None)
+        found = refined(image, pixels, np.stack(edges, axis=1), 0.95 * free, self.crossings)
         blur = np.sort(np.nanmedian(found.blur, axis=0))
         if blur[1] > MOST_BLUR * free:
             raise NoPoseError(Status.BLURRED)
         return found.pixels, math.sqrt(max(float(blur[1] ** 2 - blur[0] ** 2), 0.0))
 
     def corners(self, grey: Any) -> tuple[FloatArray, FloatArray]:
-        """Corners on the plate (n, 2) m and in the image (n, 2) px. Raises RefusedError."""
-        if self._charuco is not None:
-            found, numbers, _, markers = self._charuco.detectBoard(grey)
-            known = self.board.getChessboardCorners()
-            flat = [] if numbers is None else np.ravel(numbers).tolist()
-            at, pixels = np.array([known[i] for i in flat]), found
-            if len(flat) and len(set(flat)) < len(flat):
-                raise NoPoseError(Status.DOUBLED)
-        else:
-            corners, numbers, _ = self._tags.detectMarkers(grey)
-            markers = numbers
-            flat = [] if numbers is None else np.ravel(numbers).tolist()
-            if len(set(flat)) < len(flat):
-                raise NoPoseError(Status.DOUBLED)
-            ours = [(self._by_id[i], c) for i, c in zip(flat, corners, strict=True) if i in self._by_id]
-            at = np.concatenate([a for a, _ in ours]) if ours else np.zeros((0, 3))
-            pixels = np.concatenate([np.reshape(c, (4, 2)) for _, c in ours]) if ours else None
-        if markers is None or len(markers) == 0:
+        """Corners on the plate (n, 2) m and in the image (n, 2) px. Raises NoPoseError."""
+        numbers, at, pixels, any_marker = self._found(grey)
+        if len(set(numbers)) < len(numbers):
+            raise NoPoseError(Status.DOUBLED)
+        if not any_marker:
             raise NoPoseError(Status.MISSING)
         if len(at) < LEAST_CORNERS or pixels is None:
             raise NoPoseError(Status.HIDDEN)
-        plane = np.asarray(at, dtype=float)[:, :2] - self._middle
+        plane = at - self._middle
         if np.min(plane.std(axis=0) / self._spread) < LEAST_SPREAD:
             raise NoPoseError(Status.HIDDEN)
         return plane * [self._mirror, -1.0], np.reshape(pixels, (-1, 2)).astype(float)
@@ -209,43 +231,114 @@ def _fitted(
     return rotation, place, inverse, residual
 
 
-def board_size(settings: CameraSettings) -> tuple[float, float]:
-    """Width and height of the board, m."""
-    columns, rows = counts(settings)
-    if settings.target == 'charuco':
-        return columns * settings.square, rows * settings.square
-    return tuple(n * settings.marker + (n - 1) * settings.gap for n in (columns, rows))  # type: ignore[return-value]
-
-
-def counts(settings: CameraSettings) -> tuple[int, int]:
-    """Columns and rows of a board."""
-    usual = (7, 9) if settings.target == 'charuco' else (4, 6)
-    return settings.columns or usual[0], settings.rows or usual[1]
-
-
-def dictionary_of(settings: CameraSettings) -> str:
-    """Name of the markers' dictionary in OpenCV."""
-    return settings.dictionary or ('DICT_4X4_100' if settings.target == 'charuco' else 'DICT_APRILTAG_36h11')
-
-
-def board_of(settings: CameraSettings) -> Any:
-    """OpenCV's board. Raises ConfigError."""
+def _dictionary(settings: CameraSettings, needed: int) -> Any:
+    """OpenCV's dictionary, of at least ``needed`` markers. Raises ConfigError."""
     aruco = getattr(opencv(), 'aruco', None)
     if aruco is None or not hasattr(aruco, 'CharucoDetector'):
         raise ConfigError(
             f'OpenCV {opencv().__version__} has no boards; target.kind {settings.target} needs 4.7 or later: '
             '`pip install opencv-python-headless`, or use the target circles'
         )
-    name = dictionary_of(settings)
+    name = settings.dictionary
     if not name.startswith('DICT_') or not hasattr(aruco, name):
         raise ConfigError(f'target.dictionary = {name}: no dictionary of OpenCV')
     dictionary = aruco.getPredefinedDictionary(getattr(aruco, name))
-    columns, rows = counts(settings)
+    columns, rows = settings.columns, settings.rows
     if min(columns, rows) < 3 or max(columns, rows) > 50:
         raise ConfigError(f'target.columns, target.rows = {columns}, {rows}: must be 3 to 50')
-    needed = columns * rows // 2 if settings.target == 'charuco' else columns * rows
     if needed > len(dictionary.bytesList):
         raise ConfigError(f'target.dictionary = {name}: has {len(dictionary.bytesList)} markers, {needed} are needed')
-    if settings.target == 'charuco':
-        return aruco.CharucoBoard((columns, rows), settings.square, settings.marker, dictionary)
-    return aruco.GridBoard((columns, rows), settings.marker, settings.gap, dictionary)
+    return dictionary
+
+
+class Charuco(Board):
+    """A chessboard with a marker in each white square."""
+
+    kind = 'charuco'
+    own = ('columns', 'rows', 'square', 'marker', 'dictionary')
+    usual, usual_dictionary = (7, 9), 'DICT_4X4_100'
+    crossings = True
+
+    @classmethod
+    def check(cls, settings: CameraSettings) -> None:
+        """See :class:`Target`."""
+        marker, square = settings.marker, settings.square
+        if not marker < square:
+            raise ConfigError(f'target.marker = {marker:g} m: must be less than target.square ({square:g} m)')
+
+    def __init__(self, settings: CameraSettings) -> None:
+        super().__init__(settings)
+        self._detector = opencv().aruco.CharucoDetector(self.board)
+
+    def _needed(self, settings: CameraSettings) -> int:
+        return settings.columns * settings.rows // 2
+
+    def _made(self, dictionary: Any) -> Any:
+        s = self.settings
+        return opencv().aruco.CharucoBoard((s.columns, s.rows), s.square, s.marker, dictionary)
+
+    def _size(self) -> tuple[float, float]:
+        s = self.settings
+        return s.columns * s.square, s.rows * s.square
+
+    @property
+    def _free(self) -> float:
+        return (self.settings.square - self.settings.marker) / 2
+
+    def _inwards(self) -> FloatArray:
+        # A crossing has no inside.
+        return np.ones((1, 2))
+
+    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+        pixels, numbers, _, markers = self._detector.detectBoard(grey)
+        flat = [] if numbers is None else np.ravel(numbers).tolist()
+        known = self.board.getChessboardCorners()
+        at = np.array([known[i] for i in flat], dtype=float).reshape(-1, 3)[:, :2]
+        return flat, at, pixels, markers is not None and len(markers) > 0
+
+
+class AprilTags(Board):
+    """A grid of tags."""
+
+    kind = 'apriltag'
+    own = ('columns', 'rows', 'marker', 'gap', 'dictionary')
+    usual, usual_dictionary = (4, 6), 'DICT_APRILTAG_36h11'
+    crossings = False
+
+    def __init__(self, settings: CameraSettings) -> None:
+        super().__init__(settings)
+        aruco = opencv().aruco
+        parameters = aruco.DetectorParameters()
+        parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
+        self._detector = aruco.ArucoDetector(self.board.getDictionary(), parameters)
+        self._by_id = dict(zip(np.ravel(self.board.getIds()).tolist(), self.board.getObjPoints(), strict=True))
+
+    def _needed(self, settings: CameraSettings) -> int:
+        return settings.columns * settings.rows
+
+    def _made(self, dictionary: Any) -> Any:
+        s = self.settings
+        return opencv().aruco.GridBoard((s.columns, s.rows), s.marker, s.gap, dictionary)
+
+    def _size(self) -> tuple[float, float]:
+        s = self.settings
+        wide, high = (n * s.marker + (n - 1) * s.gap for n in (s.columns, s.rows))
+        return wide, high
+
+    @property
+    def _free(self) -> float:
+        # A tag has a rim of one of its modules.
+        return self.settings.marker / _TAG_MODULES
+
+    def _inwards(self) -> FloatArray:
+        # As OpenCV has the corners of a tag: clockwise from the upper left.
+        corners = [[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]]
+        return np.array(corners) * [self._mirror, 1.0]
+
+    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+        corners, numbers, _ = self._detector.detectMarkers(grey)
+        flat = [] if numbers is None else np.ravel(numbers).tolist()
+        ours = [(self._by_id[i], c) for i, c in zip(flat, corners, strict=True) if i in self._by_id]
+        at = np.concatenate([a for a, _ in ours])[:, :2] if ours else np.zeros((0, 2))
+        pixels = np.concatenate([np.reshape(c, (4, 2)) for _, c in ours]) if ours else None
+        return flat, np.asarray(at, dtype=float), pixels, bool(flat)

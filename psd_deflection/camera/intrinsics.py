@@ -12,6 +12,7 @@ from psd_deflection.camera.answer import NoPoseError, Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.camera.targets import target_of
 from psd_deflection.records import FloatArray
 
 LEAST_IMAGES = 5
@@ -70,7 +71,9 @@ def _matrix(name: str, values: FloatArray) -> str:
 
 def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> Intrinsics:
     """The lens by named grey images (None: unreadable) of one size. Raises ConfigError if they do not determine it."""
-    board = Board(settings)
+    board = target_of(settings)
+    if not isinstance(board, Board):
+        raise ConfigError(f'target.kind = {settings.target}: the lens is found by a board: charuco or apriltag')
     points, pixels, left_out = [], [], []
     size: tuple[int, int] | None = None
     for name, image in images:

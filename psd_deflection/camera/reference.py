@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from psd_deflection.camera.answer import FrameAnswer, NoPoseError, Status, TargetPose
 from psd_deflection.camera.lens import AFFINE_FOCAL, Lens
 from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.camera.target import Target
 from psd_deflection.records import FloatArray
 
 MOST_REST = 20
@@ -26,22 +27,12 @@ _MIDDLE = 0.1
 """How far the axis of a lens that is not known may pass from the middle of the image, in image widths."""
 
 
-class Target(Protocol):
-    """A kind of target."""
-
-    def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
-        """The target in one image. Raises RefusedError."""
-
-    def set_rest(self, rest: TargetPose) -> None:
-        """Where the target is at rest."""
-
-
 class CameraReference:
     """Images in, poses of the tip out. One target, one camera, one size of image."""
 
     def __init__(self, settings: CameraSettings, make: Callable[[CameraSettings], Target]) -> None:
         self._settings = settings
-        self._target = make(settings)
+        self.target = make(settings)
         self._lens: Lens | None = None
         self._shape: tuple[int, int] = (0, 0)
         self._waiting: list[tuple[int, TargetPose | Status]] = []
@@ -107,13 +98,13 @@ class CameraReference:
         elif image.shape != self._shape:
             raise NoPoseError(Status.UNREADABLE)
         if image.dtype == np.uint8:
-            return self._target.locate(image, image, self._lens, 255.0)
+            return self.target.locate(image, image, self._lens, 255.0)
         grey = (image >> 8).astype(np.uint8)
-        return self._target.locate(image.astype(float) / 257.0, grey, self._lens, 255.0)
+        return self.target.locate(image.astype(float) / 257.0, grey, self._lens, 255.0)
 
     def _decide(self, good: list[TargetPose]) -> list[FrameAnswer]:
         self._rest = mean_pose(good)
-        self._target.set_rest(self._rest)
+        self.target.set_rest(self._rest)
         waiting, self._waiting = self._waiting, []
         return [self._answer(t_ns, found) for t_ns, found in waiting]
 

@@ -38,8 +38,8 @@ class Refined(NamedTuple):
 def refined(image: Any, pixels: FloatArray, edges: FloatArray, reach: float, crossing: bool) -> Refined:
     """``pixels`` (n, 2) to within a pixel; ``edges`` (n, 2, 2): unit directions of the two edges at each.
 
-    ``reach``: half-width around a corner that shows nothing else, px. ``crossing``: a chessboard's corner; of a tag's
-    the edges go along the tag. What does not converge has NaN.
+    ``reach``: half-width around a corner that shows nothing else, px. ``crossing``: whether the edges
+    cross, as on a chessboard; for the corner of a tag they run along the tag. Corners that do not converge are NaN.
     """
     half = int(min(reach, MOST_REACH))
     offset = np.arange(-half, half + 1)

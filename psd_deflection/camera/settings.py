@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera.kinds import TARGETS, target_class
 from psd_deflection.camera.lens import Lens
 from psd_deflection.rig.parameters import Section, parameter
 
-TARGETS = ('circles', 'charuco', 'apriltag')
 VIEWS = ('outside', 'base')
 _LENGTH: Mapping[str, Any] = {'minimum': 1e-6, 'maximum': 100.0, 'live': True}
 _COUNT: Mapping[str, Any] = {'minimum': 0, 'maximum': 1000, 'live': True}
@@ -25,7 +25,7 @@ class CameraSettings:
     The camera looks at the tip's outer face (``view`` ``outside``: image right is +X, up is +Y) or from the base.
     """
 
-    target: str = parameter('circles', '', 'kind of the target', name='target.kind', choices=TARGETS, live=True)
+    target: str = parameter('circles', '', 'kind of the target', name='target.kind', choices=tuple(TARGETS), live=True)
     spacing: float = parameter(
         0.025, 'm', 'between the centres of neighbouring discs', name='target.spacing', **_LENGTH
     )
@@ -96,12 +96,7 @@ class CameraSettings:
             raise ConfigError(f'camera.matrix has {len(self.matrix)} numbers: must be nine, row by row')
         if self.distortion and not self.matrix:
             raise ConfigError('camera.distortion is given without camera.matrix: give both')
-        if self.target == 'circles' and not 2.05 * self.radius < self.spacing:
-            raise ConfigError(
-                f'target.spacing = {self.spacing:g} m: must be more than twice target.radius ({self.radius:g} m)'
-            )
-        if self.target == 'charuco' and not self.marker < self.square:
-            raise ConfigError(f'target.marker = {self.marker:g} m: must be less than target.square ({self.square:g} m)')
+        target_class(self.target).check(self)
         if self.matrix:
             self.lens((1, 1))
 

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.recordings.formats.registry import formats
 from psd_deflection.recordings.recording import WHOLE, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME
@@ -228,13 +229,20 @@ def in_the_world(rig: Rig, words: Sequence[str]) -> Rig:
         return replace_values(rig, values, '--world')
 
 
-def recording_name(*others: str) -> Callable[[str], str]:
-    """Reads the --out of a recording by its ending, which may be one of ``others``; what it gives raises UsageError."""
+def recording_name(*others: str, to_look_at: bool = False) -> Callable[[str], str]:
+    """Reads the --out of a recording, whose ending may be one of ``others``; what it gives raises UsageError.
+
+    ``to_look_at``: whether it may be of a format that cannot be read back.
+    """
 
     def read(text: str) -> str:
         suffix = Path(text).suffix.lower()
         if suffix in FOREIGN and suffix not in others:
-            files = ', '.join(f'X{ending}' for ending in ('.csv', '.mcap', *others))
+            written = (f for f in formats() if f.write and (to_look_at or f.read))
+            endings = [*(ending for f in written for ending in f.suffixes), *others]
+            if suffix in endings:
+                return text
+            files = ', '.join(f'X{ending}' for ending in endings)
             raise UsageError(f'--out {text}: {suffix} cannot be written; use {files} or a bag folder (X)')
         return text
 

@@ -25,7 +25,7 @@ KEYS = {
     'theta': (('θ', 'theta', 1, True),),
     'load': (('Fx', 'dx', 1, False), ('Fy', 'dy', 2, False), ('Tz', 'theta', 3, False)),
 }
-"""Of each plot: words, colour, series and whether it has a band."""
+"""For each plot: words, colour, series and whether it has a band."""
 
 
 def _keys(psds: int) -> dict[str, tuple[tuple[str, str, int, bool], ...]]:
@@ -46,7 +46,7 @@ CAPTIONS = {
 
 
 class DrawnInputs(NamedTuple):
-    """What came into the recording from outside: known loads, references, and when the zero was taken, ns.
+    """Inputs of the recording: known loads, references, and when the zero was taken, ns.
 
     ``start_ns``: the time from which the page counts.
     """

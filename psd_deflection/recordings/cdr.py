@@ -22,7 +22,8 @@ from msg_adapters.message_type import Constant, MessageType
 Encoder = Callable[[Mapping[str, Any]], bytes]
 _Writer = Callable[[bytearray, Any], None]
 _Reader = Callable[[bytes, int, str], tuple[Any, int]]
-"""Of the bytes behind the encapsulation, an offset and the byte order (< or >): the value, and the offset behind it."""
+"""Reads a value: from the bytes behind the encapsulation, an offset and the byte order (< or >); gives the value and
+the offset behind it."""
 
 _ENCAPSULATION = b'\x00\x01\x00\x00'
 LITTLE = b'\x00\x01'

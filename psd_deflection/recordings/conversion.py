@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from psd_deflection.measure.pipeline import Pipeline, PipelineCounters
+from psd_deflection.recordings.formats.registry import format_of_name
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import replayed
-from psd_deflection.recordings.write.sinks import is_csv, open_sink
+from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, ParameterChange, Record, ReferencePose, SampleBlock, TemperatureReading
 from psd_deflection.rig.config import Rig
 
@@ -42,7 +43,7 @@ def convert(
     """Write ``recording`` and its ``blocks`` to ``out``; returns the number of samples. Raises RecordingError."""
     loads, references, temperatures = beside
     records: Iterable[Convertible] = heapq.merge(recording.changes, loads, references, temperatures, blocks, key=_time)
-    if is_csv(out):
+    if format_of_name(out).is_table:
         # A row takes what is waiting, and a block's last row what came during the block.
         records = itertools.chain(loads, references, temperatures, blocks)
     kinds: list[type[Record]] = [type(found[0]) for found in beside if found]

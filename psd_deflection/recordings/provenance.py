@@ -43,7 +43,7 @@ def provenance() -> Mapping[str, str]:
 
 
 def differences(then: Mapping[str, str], now: Mapping[str, str], *, processor: bool) -> list[str]:
-    """What differs, in words: "numpy 2.3.1, now 2.4.0". ``processor``: also what belongs to the processor."""
+    """The differences in words: "numpy 2.3.1, now 2.4.0". ``processor``: also what belongs to the processor."""
     if not then:
         return ['a version that does not say what computed it']
     return [

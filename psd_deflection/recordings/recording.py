@@ -196,7 +196,7 @@ class Recording(abc.ABC):
         """Known loads, each held until the next."""
 
     def rows_with_load(self) -> tuple[int, int]:
-        """Of a CSV: number of rows that say their load, and the time of the last one, ns; (0, 0) otherwise."""
+        """Number of rows of a CSV that say their load, and the time of the last one, ns; (0, 0) for others."""
         return 0, 0
 
     def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
@@ -356,7 +356,7 @@ class RecordingWindow(Recording):
 
     @property
     def digest(self) -> str:
-        """Of the files of the whole."""
+        """Digest of the whole recording's files."""
         return self._source.digest
 
     def with_block_size(self, block_size: int) -> Self:

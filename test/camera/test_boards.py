@@ -13,10 +13,10 @@ import pytest
 from blind.render import Pose, Scene, board, developed
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import Status
-from psd_deflection.camera.boards import board_of, board_size
+from psd_deflection.camera.boards import Board
 from psd_deflection.camera.intrinsics import calibrated
 from psd_deflection.camera.lens import Lens
-from psd_deflection.camera.print_target import printed, sizes
+from psd_deflection.camera.print_target import printed
 from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
@@ -29,10 +29,11 @@ TAGS = replace(BOARD, target='apriltag', columns=3, rows=3, marker=0.014, gap=0.
 
 
 def shot(scene: Scene, settings: CameraSettings, pose: Pose, rng: np.random.Generator) -> Any:
-    size = board_size(settings)
-    pixels = (round(size[0] * 2e4), round(size[1] * 2e4))
-    texture = board_of(settings).generateImage(pixels, None, 0, 1) / 255.0
-    return developed(scene, board(scene, pose, texture, size), rng)
+    target = target_of(settings)
+    assert isinstance(target, Board)
+    pixels = (round(target.size[0] * 2e4), round(target.size[1] * 2e4))
+    texture = target.board.generateImage(pixels, None, 0, 1) / 255.0
+    return developed(scene, board(scene, pose, texture, target.size), rng)
 
 
 @pytest.mark.parametrize('view', ['outside', 'base'])
@@ -102,8 +103,8 @@ def test_opencv_agrees_about_distortion() -> None:
 
 
 def test_the_printed_discs_have_their_size() -> None:
-    settings = CameraSettings(spacing=0.02, radius=0.006)
-    paper = cv2.imdecode(np.frombuffer(printed(settings, 'png'), np.uint8), cv2.IMREAD_GRAYSCALE)
+    target = target_of(CameraSettings(spacing=0.02, radius=0.006))
+    paper = cv2.imdecode(np.frombuffer(printed(target, 'png'), np.uint8), cv2.IMREAD_GRAYSCALE)
     assert paper is not None
     middle = paper.shape[1] // 2
     edges = np.flatnonzero(np.diff((paper[:, middle] > 128).astype(int)))
@@ -111,16 +112,21 @@ def test_the_printed_discs_have_their_size() -> None:
     rims = edges[1:7] / 600 * 0.0254
     assert np.diff(rims)[::2] == pytest.approx([0.012] * 3, abs=1e-4)
     assert np.diff(rims[::2]) == pytest.approx([0.02] * 2, abs=1e-4)
-    assert sizes(settings) == ['target.spacing: 0.02', 'target.radius: 0.006']
+    assert target.describe() == [
+        'target.kind: circles',
+        'target.spacing: 0.02',
+        'target.radius: 0.006',
+    ]
 
 
 @pytest.mark.parametrize('settings', [BOARD, TAGS], ids=['charuco', 'apriltag'])
 def test_a_printed_board_is_read_again(settings: CameraSettings) -> None:
-    paper = cv2.imdecode(np.frombuffer(printed(settings, 'png'), np.uint8), cv2.IMREAD_GRAYSCALE)
+    target = target_of(settings)
+    paper = cv2.imdecode(np.frombuffer(printed(target, 'png'), np.uint8), cv2.IMREAD_GRAYSCALE)
     assert paper is not None
     small = cv2.resize(paper, None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
     reference = CameraReference(replace(settings, matrix=(), distortion=()), target_of)
     reference.take(0, small)
     (answer,) = reference.finish()
     assert answer.status is Status.OK
-    assert printed(settings, 'pdf').startswith(b'%PDF')
+    assert printed(target, 'pdf').startswith(b'%PDF')

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,11 +16,12 @@ from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.base.log import texts, unsaid
 from psd_deflection.cli.main import main
 from psd_deflection.devices import PowerUp
-from psd_deflection.devices.registry import SIMULATED, find_device, known_devices, make_source, source_names
+from psd_deflection.devices.registry import GROUP, SIMULATED, find_device, known_devices, make_source, source_names
 from psd_deflection.devices.serve import simulated_devices
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
+from test.plug_in import install_plug_in
 from test.run.conftest import Estimates
 
 PAGE = Path(__file__).parent.parent.parent / 'docs' / 'devices' / 'README.md'
@@ -29,18 +29,7 @@ NAME = 'my_converter'
 
 
 def install(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str, entry_point: str) -> None:
-    package = folder / 'my_package'
-    package.mkdir()
-    (package / '__init__.py').touch()
-    (package / 'converter.py').write_text(code)
-    about = folder / 'my_package-1.0.dist-info'
-    about.mkdir()
-    (about / 'METADATA').write_text('Metadata-Version: 2.1\nName: my_package\nVersion: 1.0\n')
-    (about / 'entry_points.txt').write_text(f'[psd_deflection.sources]\n{entry_point}\n')
-    monkeypatch.syspath_prepend(folder)
-    for module in ('my_package', 'my_package.converter'):
-        monkeypatch.delitem(sys.modules, module, raising=False)
-    monkeypatch.setenv('PYTHONPATH', str(folder))
+    install_plug_in(folder, monkeypatch, 'converter', code, f'[{GROUP}]\n{entry_point}\n')
 
 
 @pytest.fixture

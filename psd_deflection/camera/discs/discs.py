@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.discs.find_discs import MIN_RADIUS, Region, find_discs
 from psd_deflection.camera.discs.rim_fit import Fitter
 from psd_deflection.camera.discs.rim_model import PosePrior, turned
 from psd_deflection.camera.lens import Lens
 from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.camera.target import Drawing, Target
 from psd_deflection.records import FloatArray
 
 FIRST_TILT_SD = 0.3
@@ -31,25 +33,36 @@ _OBLIQUE = math.radians(60.0)
 _UNSURE = math.cos(math.radians(75.0))
 
 
-class Discs:
+class Discs(Target):
     """Finds and fits the three discs, frame by frame. What it remembers: which end of the line was up, and the rest."""
 
+    kind = 'circles'
+    own = ('spacing', 'radius')
+
+    @classmethod
+    def check(cls, settings: CameraSettings) -> None:
+        """See :class:`Target`."""
+        spacing, radius = settings.spacing, settings.radius
+        if not 2.05 * radius < spacing:
+            raise ConfigError(f'target.spacing = {spacing:g} m: must be more than twice target.radius ({radius:g} m)')
+
     def __init__(self, settings: CameraSettings) -> None:
+        super().__init__(settings)
         self._spacing, self._radius = settings.spacing, settings.radius
         self._towards = -1.0 if settings.view == 'outside' else 1.0
         self._centres = np.array([[0.0, settings.spacing], [0.0, 0.0], [0.0, -settings.spacing]])
         self._up = np.array([math.sin(settings.turn), -math.cos(settings.turn)])
         self._answered = False
-        self._rest: TargetPose | None = None
         self._plate: FloatArray | None = None
         self._fitter: Fitter | None = None
 
     def set_rest(self, rest: TargetPose) -> None:
         """From now on the plate's tilt is expected near that of its rest."""
-        self._rest, self._plate = rest, rest.rotation
+        super().set_rest(rest)
+        self._plate = rest.rotation
 
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
-        """The target in one image; ``grey`` is its 8-bit form. Raises RefusedError."""
+        """See :class:`Target`."""
         regions = find_discs(grey, self._spacing / self._radius)
         if min(r.axes[0] for r in regions) < MIN_RADIUS:
             raise NoPoseError(Status.SMALL)
@@ -66,6 +79,20 @@ class Discs:
         seen = found.points[0] - found.points[2]
         self._up, self._answered = seen / math.hypot(*seen.tolist()), True
         return found
+
+    def drawing(self) -> Drawing:
+        """Three discs in a line along Y, with as much black around them as the finder needs."""
+        around = 2.2 * self._radius
+        places = (-self._spacing, 0.0, self._spacing)
+        return Drawing(
+            size=(2 * around, 2 * (self._spacing + around)),
+            discs=tuple((0.0, y, self._radius) for y in places),
+        )
+
+    def rest_words(self, rest: TargetPose) -> list[str]:
+        """How large the discs look."""
+        larger = 100 * (rest.scale - 1)
+        return [f'the discs look {larger:+.2f} % larger than target.spacing and target.radius say']
 
     def _fit(self, image: Any, regions: list[Region], lens: Lens, full_scale: float) -> TargetPose:
         rays = lens.rays(np.array([r.centre for r in regions]))

@@ -34,7 +34,7 @@ THINNED = 4
 """The first steps use each pixel whose number is divisible by it."""
 
 LIGHTS = 6
-"""Of each disc: constant and slopes of the light outside, then inside."""
+"""For each disc: constant and slopes of the light outside, then inside."""
 
 RADIUS_SD = 0.03
 """Standard deviation of the radius that is seen against the declared one (print, exposure, response), relative."""
@@ -112,7 +112,7 @@ class Normal(NamedTuple):
 
 
 def covariance_of(normal: Normal, variance: float, stiff: FloatArray) -> FloatArray:
-    """Of the parameters, if a residual has ``variance``. Raises RefusedError."""
+    """Covariance of the parameters, if a residual has ``variance``. Raises RefusedError."""
     hessian = normal.hessian / variance
     diagonal = np.einsum('ii->i', hessian)
     diagonal += stiff

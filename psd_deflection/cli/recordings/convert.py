@@ -20,10 +20,10 @@ from psd_deflection.cli._options import namespace_option, recording_name, span_o
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.recordings.conversion import Beside, convert, convert_computed
+from psd_deflection.recordings.formats.registry import format_of_name
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay
-from psd_deflection.recordings.write.sinks import is_for_viewing
 from psd_deflection.rig.config import load_rig
 
 
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('recording', metavar='REC', help='a bag folder, an .mcap or a .csv')
     parser.add_argument(
         '--out',
-        type=recording_name('.rrd'),
+        type=recording_name(to_look_at=True),
         metavar='OUT',
         required=True,
         help='output: X.csv, X.mcap, X.rrd, or a bag folder (any other name)',
@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Convert and say what was written."""
-    if is_for_viewing(args.out):
+    if format_of_name(args.out).read is None:
         return _to_viewer(args)
     recording = open_recording(args.recording, namespace=args.namespace, span=args.span)
     parameters = recording.parameters if args.params_file is None else load_rig(args.params_file).flat()

@@ -28,6 +28,7 @@ from psd_deflection.cli._plot_page import DrawnInputs, plot_page
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.formats.registry import endings_of_recordings
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay, replayed
 from psd_deflection.records import (
@@ -232,7 +233,7 @@ def run(args: argparse.Namespace) -> int:
 def default_out(recording: str) -> Path:
     """A .png here, named like the recording; a folder's name may have dots in it."""
     path = Path(recording).resolve()
-    is_file = path.suffix.lower() in ('.mcap', '.csv') and not path.is_dir()
+    is_file = path.suffix.lower() in endings_of_recordings() and not path.is_dir()
     return Path(f'{path.stem if is_file else path.name}.png')
 
 

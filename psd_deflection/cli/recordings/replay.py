@@ -37,11 +37,12 @@ from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, show_text, warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries
+from psd_deflection.recordings.formats.format import Sink
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.comparison import ReplayComparison
 from psd_deflection.recordings.replay.engine import GatheredEstimates, nominal_rig, open_for_replay, replayed
 from psd_deflection.recordings.replay.watched import WatchedReplay
-from psd_deflection.recordings.write.sinks import Sink, open_sink
+from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
@@ -58,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--out',
-        type=recording_name('.rrd', ENDING),
+        type=recording_name(ENDING, to_look_at=True),
         metavar='OUT',
         help='write the estimates: X.csv, X.mcap, X.rrd or a bag folder (X); of many recordings X.parquet',
     )

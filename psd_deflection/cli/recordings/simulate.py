@@ -28,8 +28,9 @@ from psd_deflection.cli.run import serve
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.effect_words import with_effects
 from psd_deflection.model.simulation.load_words import HELP, load_history, temperature_history
+from psd_deflection.recordings.formats.registry import format_of_name
 from psd_deflection.recordings.replay.simulated_run import BAG_START_NS, SimulatedRun
-from psd_deflection.recordings.write.sinks import is_csv, open_sink
+from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import AppliedLoad, Record, ReferencePose, SampleBlock, TemperatureReading
 from psd_deflection.rig.config import load_rig
 
@@ -110,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
     sink = open_sink(args.out, known.flat(), samples_with=kinds, psds=len(rig.psds))
     bar = tqdm(total=count, unit=' samples', delay=1.0, leave=False, disable=args.json or None, ncols=80)
     with contextlib.closing(sink), bar:
-        for record in simulated.records(0 if is_csv(args.out) else BAG_START_NS):
+        for record in simulated.records(0 if format_of_name(args.out).is_table else BAG_START_NS):
             sink.put(record)
             if isinstance(record, SampleBlock):
                 bar.update(len(record.seq))

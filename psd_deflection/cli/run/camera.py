@@ -35,17 +35,17 @@ from psd_deflection.base.files import replace_file
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.footage import Footage, Frame, read_image, read_settings
 from psd_deflection.camera.intrinsics import calibrated
+from psd_deflection.camera.kinds import TARGETS
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.preview import preview
-from psd_deflection.camera.print_target import printed, sizes
+from psd_deflection.camera.print_target import printed
 from psd_deflection.camera.reference import CameraReference
-from psd_deflection.camera.settings import TARGETS, CameraSettings
+from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import FOREIGN, need_folder, picture_name, whole
+from psd_deflection.cli._options import need_folder, picture_name, recording_name, whole
 from psd_deflection.cli._report import print_json, show, warn
-from psd_deflection.recordings.write.csv_writer import CsvReferenceFile
-from psd_deflection.recordings.write.reference_sink import ReferenceSink
+from psd_deflection.recordings.write.sinks import open_reference_file
 
 PREVIEW_S = 1.0
 
@@ -98,13 +98,14 @@ def _node(args: argparse.Namespace) -> int:
 def _print_target(args: argparse.Namespace, settings: CameraSettings) -> int:
     out = Path(picture_name('.pdf', '.png', '.svg')(args.out))
     need_folder(out)
+    target = target_of(settings)
     with _saved(out):
-        replace_file(out, printed(settings, out.suffix[1:].lower()))
+        replace_file(out, printed(target, out.suffix[1:].lower()))
     if args.json:
-        print_json({'out': args.out, 'parameters': sizes(settings)})
+        print_json({'out': args.out, 'parameters': target.describe()})
         return 0
     show(f'{out}: print it at 100 %, measure the line of 50 mm, and put this into CAMERA.yaml:')
-    show(*sizes(settings))
+    show(*target.describe())
     return 0
 
 
@@ -143,17 +144,14 @@ def _saved(out: Path, option: str = '--out') -> Iterator[None]:
 
 def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
     out = Path(args.out)
-    if out.suffix.lower() in FOREIGN:
-        raise UsageError(f'--out {out}: {out.suffix} cannot be written; use X.csv, X.mcap or a bag folder (X)')
+    recording_name()(args.out)
     need_folder(out)
     opencv()
     footage = Footage(args.what[0], settings.exposure)
     reference = CameraReference(settings, target_of)
     reasons: collections.Counter[str] = collections.Counter()
     found: list[FrameAnswer] = []
-    sink: CsvReferenceFile | ReferenceSink
-    sink = CsvReferenceFile(out) if out.suffix.lower() == '.csv' else ReferenceSink(out)
-    with contextlib.closing(sink):
+    with contextlib.closing(open_reference_file(out)) as sink:
         for answer in _answers(args, footage, reference, _Preview(args.show)):
             reasons[str(answer.status)] += 1
             sink.put(answer.t_ns, answer.as_record(), str(answer.status))
@@ -253,8 +251,7 @@ def _tell(
         sds = f'ΔX {dx * 1e6:.2f} µm, ΔY {dy * 1e6:.2f} µm, θ {math.degrees(theta):.5f}°'
         show(f'one sd, median of the last frames: {sds}')
         show(f'the camera is turned by {math.degrees(reference.turn):+.3f}° in its plane, which is taken off')
-        if settings.target == 'circles':
-            show(f'the discs look {100 * (rest.scale - 1):+.2f} % larger than target.spacing and target.radius say')
+        show(*reference.target.rest_words(rest))
     if not settings.matrix:
         warn(
             'camera.matrix is not given: the scale is that of target.spacing, lens distortion is not corrected; '

@@ -28,10 +28,10 @@ class SimulatedSamples:
     ``loads`` (3, n): Fx, Fy N, Tz N m. ``static`` (3, n): the pose these loads would settle at,
     without ``physics.at_rest``. ``pose`` (3, n): dX, dY m, theta rad. ``beams`` (2P, n): l_1,
     l_2 ..., m. ``true_dots`` (2P, n): on the plate from the PSD centres. ``dots`` (2P, n): as the PSDs
-    report them. ``sums`` (P, n), ``volts`` (3P, n): V. ``noise`` (3P,): V rms, when ``volts`` are to be the
-    mean over a noise that is not on them; 0 when they are samples as they are. ``between``: during an
-    effect on ``volts``, gives these (3P, n) as they are ``phase`` s after each sample, below the period;
-    ask for the same phases with each samples.
+    report them. ``sums`` (P, n), ``volts`` (3P, n): V. ``noise`` (3P,): V rms of a noise that is not in ``volts``,
+    which are then to be the mean over it; 0 if ``volts`` are single samples. ``between(phase)``: the volts
+    (3P, n) that are there ``phase`` s after each sample, less than a period, for an effect on ``volts``; an
+    effect asks for the same phases in every chunk of a run.
     """
 
     t: FloatArray

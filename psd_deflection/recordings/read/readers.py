@@ -1,4 +1,4 @@
-"""Opens a recording of any kind: every command that reads one takes a bag folder, ``.mcap`` or ``.csv``."""
+"""Opens a recording of any format: every command that reads one does it by this."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from pathlib import Path
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.spelling import did_you_mean
-from psd_deflection.recordings.mcap_format import MAGIC
-from psd_deflection.recordings.read.bag_reader import BagRecording
-from psd_deflection.recordings.read.csv_reader import CsvRecording
+from psd_deflection.recordings.formats.format import ReadOptions
+from psd_deflection.recordings.formats.registry import format_of_content, formats
 from psd_deflection.recordings.recording import WHOLE, Recording, Span
 
 MOST_NAMES = 1000
@@ -29,33 +28,28 @@ def open_recording(
     ``block_size``: samples per block; by default from the recording's own parameters (20 if it has
     none). ``sample_rate_hz``: for a CSV whose times do not determine it.
     ``namespace``: of the recorded node, for a bag of several rigs. ``span``: the part that is meant.
-    Raises RecordingError if it is none of the three, or cannot be read, and as :meth:`Recording.crop` does.
+    Raises RecordingError if no format reads it, and as :meth:`Recording.crop` does; ConfigError for a plug-in that
+    cannot be loaded.
     """
-    whole = _open(Path(path), block_size, sample_rate_hz, namespace)
+    options = ReadOptions(block_size=block_size, sample_rate_hz=sample_rate_hz, namespace=namespace)
+    whole = _open(Path(path), options)
     return whole if span == WHOLE else whole.crop(*span)
 
 
-def _open(path: Path, block_size: int | None, sample_rate_hz: float | None, namespace: str | None) -> Recording:
-    suffix = path.suffix.lower()
+def _open(path: Path, options: ReadOptions) -> Recording:
+    if not path.exists():
+        raise RecordingError(f'{path}: no such recording{_meant(path)}')
+    if not path.is_dir() and not path.is_file():
+        # A pipe would wait for its writer, and it cannot be read twice.
+        raise RecordingError(f'{path}: is no file; write it to one first')
     try:
-        if path.is_dir():
-            return BagRecording(path, block_size, namespace)
-        if not path.exists():
-            raise RecordingError(f'{path}: no such recording{_meant(path)}')
-        if not path.is_file():
-            # A pipe would wait for its writer, and it cannot be read twice.
-            raise RecordingError(f'{path}: is no file; write it to one first')
-        if suffix == '.csv':
-            return CsvRecording(path, block_size, sample_rate_hz)
-        with path.open('rb') as stream:
-            is_mcap = stream.read(len(MAGIC)) == MAGIC
+        form = format_of_content(path)
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-    if is_mcap or suffix == '.mcap':
-        return BagRecording(path, block_size, namespace)
-    if path.name == 'metadata.yaml':
-        return BagRecording(path.parent, block_size, namespace)
-    raise RecordingError(f'{path}: is no recording: a bag folder, an .mcap or a .csv is read')
+    if form is None or form.read is None:
+        *others, last = reversed([f.help for f in formats() if f.read is not None])
+        raise RecordingError(f'{path}: is no recording: {", ".join(others)} or {last} is read')
+    return form.read(path, options)
 
 
 def _meant(path: Path) -> str:

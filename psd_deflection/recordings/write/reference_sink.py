@@ -1,18 +1,16 @@
-"""Writes a camera's poses as a recording: ``/reference/deflection`` and the same with covariance."""
+"""Writes a camera's poses as messages: ``/reference/deflection`` and the same with covariance."""
 
 from __future__ import annotations
-
-from pathlib import Path
 
 from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
 from psd_deflection.records import ReferencePose, ReferenceWithCovariance
 
 
 class ReferenceSink:
-    """An ``.mcap``, else a bag folder. Raises RecordingError if it exists or the disk refuses to write."""
+    """Poses into ``file``, which it closes. Raises RecordingError if the disk refuses to write."""
 
-    def __init__(self, path: Path) -> None:
-        self._file = McapFile(path, rig_values={}) if path.suffix.lower() == '.mcap' else BagWriter(path, rig_values={})
+    def __init__(self, file: McapFile | BagWriter) -> None:
+        self._file = file
 
     def put(self, t_ns: int, reference: ReferenceWithCovariance | None, status: str) -> None:
         """Write the pose of one frame; a frame without one has no message."""

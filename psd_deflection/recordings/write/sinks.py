@@ -1,36 +1,14 @@
-"""Sinks of records: CSV, MCAP, bag and Rerun, chosen by the file name."""
+"""Makes a recording of the format that its name says."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Protocol
 
-from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
-from psd_deflection.recordings.write.csv_writer import CsvEstimateSink, CsvSampleSink
-from psd_deflection.recordings.write.rerun_writer import RerunFile
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.recordings.formats.format import ReferenceFile, Sink, WriteOptions
+from psd_deflection.recordings.formats.registry import format_of_name
 from psd_deflection.records import Record
-from psd_deflection.rig.config import rig_from_values
-
-
-class Sink(Protocol):
-    """Takes records, one thread at a time. Both calls raise RecordingError if the disk refuses to write."""
-
-    def put(self, record: Record) -> None:
-        """Take one record; a sink ignores the kinds that it cannot store."""
-
-    def close(self) -> None:
-        """Write the buffered rest and close; a second call does nothing."""
-
-
-def is_csv(path: str | Path) -> bool:
-    """Whether :func:`open_sink` writes a CSV there."""
-    return Path(path).suffix.lower() == '.csv'
-
-
-def is_for_viewing(path: str | Path) -> bool:
-    """Whether :func:`open_sink` writes a file there that holds what is computed and cannot be read back."""
-    return Path(path).suffix.lower() == '.rrd'
 
 
 def open_sink(
@@ -46,15 +24,25 @@ def open_sink(
 
     ``rig_values``: the flat parameter set. ``samples_with``: a CSV holds the samples, with columns for these
     kinds of records; None: it holds the estimates. ``title``: title of an ``.rrd``. ``psds``: of the samples of a CSV.
-    Raises RecordingError if ``path`` exists or cannot be made, ConfigError if rerun is not installed.
+    Raises RecordingError if ``path`` exists or cannot be made, or if its format is only read; ConfigError if rerun
+    is not installed.
     """
-    path = Path(path)
-    if is_csv(path):
-        if samples_with is not None:
-            return CsvSampleSink(path, samples_with, psds)
-        return CsvEstimateSink(path, rig_from_values(rig_values, str(path)).estimator.solvers)
-    if is_for_viewing(path):
-        return RerunFile(path, rig_from_values(rig_values, str(path)), title)
-    if path.suffix.lower() == '.mcap':
-        return McapFile(path, rig_values=rig_values, device_hello=device_hello)
-    return BagWriter(path, rig_values=rig_values, device_hello=device_hello)
+    form = format_of_name(path)
+    if form.write is None:
+        raise RecordingError(f'{path}: {form.help} is read and not written')
+    options = WriteOptions(
+        rig_values=rig_values,
+        device_hello=device_hello,
+        samples_with=samples_with,
+        title=title,
+        psds=psds,
+    )
+    return form.write(Path(path), options)
+
+
+def open_reference_file(path: str | Path) -> ReferenceFile:
+    """The file for the poses of a camera. Raises as :func:`open_sink` does."""
+    form = format_of_name(path)
+    if form.write_references is None:
+        raise RecordingError(f'{path}: {form.help} does not take the poses of a camera')
+    return form.write_references(Path(path))

@@ -7,14 +7,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.recordings.formats.registry import endings_of_recordings
 
 LIST = '.txt'
 """Ending of a file with one recording or pattern a line."""
 
 LARGEST_LIST = 16 * 2**20
 """Bytes of such a file."""
-
-FILES = ('.mcap', '.csv')
 
 
 def is_plain(word: str) -> bool:
@@ -51,10 +50,11 @@ def _of_word(word: str) -> list[str]:
         return [word]
     matches = sorted(Path(name) for name in glob.iglob(word, recursive=True))  # noqa: PTH207 - Path has no `..` in it
     folders = {path for path in matches if path.is_dir() and _is_bag(path)}
-    files = (p for p in matches if p.suffix.lower() in FILES and p.is_file() and p.parent not in folders)
+    endings = endings_of_recordings()
+    files = (p for p in matches if p.suffix.lower() in endings and p.is_file() and p.parent not in folders)
     found = [str(path) for path in sorted([*folders, *files])]
     if not found:
-        raise RecordingError(f'{word}: matches no recording (bag folders, .mcap, .csv)')
+        raise RecordingError(f'{word}: matches no recording (bag folders, {", ".join(endings)})')
     return found
 
 

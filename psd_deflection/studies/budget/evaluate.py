@@ -28,7 +28,7 @@ class Budget:
     lines: tuple[tuple[Cause, Contribution], ...]
 
     def total(self, *kinds: Kind) -> Contribution:
-        """Of the causes of these kinds (none named: all): biases add with their signs, covariances add."""
+        """Sum over the causes of these kinds (none named: all): biases with their signs, covariances."""
         chosen = [c for cause, c in self.lines if not kinds or cause.kind in kinds]
         bias = np.sum([c.bias for c in chosen], axis=0, dtype=np.float64) + np.zeros(3)
         covariance = np.sum([c.covariance for c in chosen], axis=0, dtype=np.float64) + np.zeros((3, 3))

@@ -20,8 +20,10 @@ from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 
-HALF, DEGREE = 10, 6
-"""Samples to either side of a time, and degree of the polynomial through them."""
+SAMPLES_A_SIDE = 10
+"""Samples before and after a time that are fitted by a polynomial: 21 ms at 1 kHz, a third of a bending period."""
+DEGREE = 6
+"""Degree of this polynomial."""
 LEAST_PRESENT = 17
 SETTLE = 0.5
 """Share of the time that a load is held which is not fitted: the link rings."""
@@ -31,7 +33,7 @@ LEAST_ROWS = 20
 CALM, CALM_LEAST = 0.25, 1.0 / 250.0
 """s, of a mean over a link at rest; the least variance of one over that of a sample."""
 
-_OFFSETS = np.arange(-HALF, HALF + 1) / HALF
+_OFFSETS = np.arange(-SAMPLES_A_SIDE, SAMPLES_A_SIDE + 1) / SAMPLES_A_SIDE
 _BASIS = np.vander(_OFFSETS, DEGREE + 1, increasing=True)
 
 
@@ -112,22 +114,26 @@ def smoothed(dots: FloatArray, period: float, places: FloatArray, exposure: floa
     ``exposure``, s: the dots are the mean over so long about each place.
     """
     middle = np.clip(np.rint(places).astype(np.int64), 0, len(dots) - 1)
-    index = middle[:, None] + np.arange(-HALF, HALF + 1)
+    index = middle[:, None] + np.arange(-SAMPLES_A_SIDE, SAMPLES_A_SIDE + 1)
     inside = (index >= 0) & (index < len(dots))
     window = dots[np.clip(index, 0, len(dots) - 1)]
     present = inside & np.isfinite(window).all(axis=2)
     mask = present.astype(np.float64)
-    good = (present.sum(axis=1) >= LEAST_PRESENT) & present[:, :HALF].any(axis=1) & present[:, HALF + 1 :].any(axis=1)
+    good = (
+        (present.sum(axis=1) >= LEAST_PRESENT)
+        & present[:, :SAMPLES_A_SIDE].any(axis=1)
+        & present[:, SAMPLES_A_SIDE + 1 :].any(axis=1)
+    )
     window = np.where(present[:, :, None], window, 0.0)
     normal = np.einsum('nw,wi,wj->nij', mask, _BASIS, _BASIS)
     normal[~good] = np.eye(DEGREE + 1)
     right = np.einsum('wi,nwc->nic', _BASIS, window)
     inverse = np.linalg.inv(normal)
     coefficients = inverse @ right
-    at = (places - middle) / HALF
+    at = (places - middle) / SAMPLES_A_SIDE
     basis = np.vander(at, DEGREE + 1, increasing=True)
     slope = np.zeros_like(basis)
-    wide = 0.5 * exposure / (HALF * period)
+    wide = 0.5 * exposure / (SAMPLES_A_SIDE * period)
     slope[:, 1:] = basis[:, :-1] * np.arange(1, DEGREE + 1)
     if wide > 0.0:
         power = np.arange(1, DEGREE + 2)
@@ -137,7 +143,7 @@ def smoothed(dots: FloatArray, period: float, places: FloatArray, exposure: floa
     squares = (mask[:, :, None] * (window - fitted) ** 2).sum(axis=1) / freedom[:, None]
     return Smoothed(
         np.einsum('ni,nic->nc', basis, coefficients),
-        np.einsum('ni,nic->nc', slope, coefficients) / (HALF * period),
+        np.einsum('ni,nic->nc', slope, coefficients) / (SAMPLES_A_SIDE * period),
         np.einsum('ni,nij,nj->n', basis, inverse, basis),
         good & (np.abs(places - middle) <= 0.51),
         squares,
@@ -147,7 +153,7 @@ def smoothed(dots: FloatArray, period: float, places: FloatArray, exposure: floa
 def noise_of(run: CalibrationRun, rig: Rig) -> FloatArray:
     """Noise (4,) of a sample of x1, y1, x2, y2, V rms, from what is left of the polynomials."""
     dots = usable_dots(run, rig)
-    places = np.arange(HALF, len(dots) - HALF, 2 * HALF + 1, dtype=np.float64)
+    places = np.arange(SAMPLES_A_SIDE, len(dots) - SAMPLES_A_SIDE, 2 * SAMPLES_A_SIDE + 1, dtype=np.float64)
     s = smoothed(dots, 1.0, places)
     if not s.good.any():
         return rig.noises[:, :2].ravel()
