@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
+import struct
 from typing import Any
 
 import pytest
@@ -44,6 +46,29 @@ def test_bytes_are_those_of_an_independent_encoder(type_name: str, data: st.Data
     ours = cdr.encode(type_name, message)
     assert cdr.decode(type_name, ours) == message
     assert bytes(STORE.serialize_cdr(STORE.deserialize_cdr(ours, type_name), type_name)) == ours
+
+
+@pytest.mark.parametrize('type_name', sorted(MESSAGE_TYPES))
+@given(junk=st.binary(max_size=300), data=st.data())
+def test_bytes_that_are_no_message_are_refused_or_a_message(type_name: str, junk: bytes, data: st.DataObject) -> None:
+    encoded = cdr.encode(type_name, data.draw(values(MESSAGE_TYPES[type_name])))
+    cut = encoded[: data.draw(st.integers(0, len(encoded) - 1))]
+    for wrong in (junk, cut, b'\0\1\0\0' + junk, b'\0\0\0\0' + junk):
+        with contextlib.suppress(ValueError):
+            cdr.decode(type_name, wrong)
+
+
+def test_an_array_that_declares_more_than_there_is_costs_nothing() -> None:
+    four_thousand_million = b'\0\1\0\0' + struct.pack('<iII', 0, 0, 1) + b'\0\0\0\0' + b'\xff' * 4
+    with pytest.raises(ValueError, match='not a diagnostic_msgs/msg/DiagnosticArray'):
+        cdr.decode('diagnostic_msgs/msg/DiagnosticArray', four_thousand_million)
+
+
+def test_big_endian_numbers_are_read() -> None:
+    head = struct.pack('>iII', 3, 4, 2) + b'a\0'
+    fields = cdr.decode('geometry_msgs/msg/PoseStamped', b'\0\0\0\0' + head + b'\0\0' + struct.pack('>7d', *range(7)))
+    assert fields['header'] == {'stamp': {'sec': 3, 'nanosec': 4}, 'frame_id': 'a'}
+    assert [*fields['pose']['position'].values(), *fields['pose']['orientation'].values()] == list(range(7))
 
 
 def test_the_encoder_takes_every_kind_of_field() -> None:

@@ -1,11 +1,8 @@
-"""MCAP files and messages, written and read: the packages ``mcap`` and ``mcap-ros2-support`` are the judges."""
+"""MCAP files, written and read: the package ``mcap`` is the judge."""
 
 from __future__ import annotations
 
-import contextlib
 import io
-import struct
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +15,7 @@ from mcap.records import Channel as JudgesChannel
 from mcap.records import Metadata as JudgesMetadata
 from mcap.records import Schema as JudgesSchema
 from mcap.writer import CompressionType, Writer
-from mcap_ros2.decoder import DecoderFactory
 
-from msg_adapters import MESSAGE_TYPES
-from msg_adapters.message_type import MessageType
-from psd_deflection.recordings import cdr
 from psd_deflection.recordings.mcap_format import RECORD_HEAD, Channel, Metadata, Opcode, Schema, parsed
 from psd_deflection.recordings.read.allowance import DamagedError
 from psd_deflection.recordings.write.mcap_writer import McapWriter
@@ -110,77 +103,6 @@ def test_a_file_has_the_bytes_of_the_judge(calls: list[Call]) -> None:
     judge.start(profile='ros2', library='us')
     wrote(judge, calls)
     assert ours.getvalue() == theirs.getvalue()
-
-
-VALUES: Mapping[str, st.SearchStrategy[Any]] = {
-    'bool': st.booleans(),
-    'float32': st.floats(width=32, allow_nan=False),
-    'float64': st.floats(allow_nan=False),
-    'string': st.text(st.characters(codec='utf-8', exclude_characters='\0'), max_size=5),
-    **{f'int{n}': st.integers(-(2 ** (n - 1)), 2 ** (n - 1) - 1) for n in (8, 16, 32, 64)},
-    **{f'uint{n}': st.integers(0, 2**n - 1) for n in (8, 16, 32, 64)},
-    'byte': st.integers(0, 255),
-    'char': st.integers(0, 255),
-}
-
-
-def values_of(message: MessageType, kind: str = '') -> st.SearchStrategy[Any]:
-    """Any value of a type, an array of one, or a message."""
-    if kind.endswith(']'):
-        inner, _, length = kind[:-1].partition('[')
-        size = int(length) if length else None
-        if inner in ('uint8', 'byte'):
-            return st.binary(min_size=size or 0, max_size=size or 6)
-        return st.lists(values_of(message, inner), min_size=size or 0, max_size=size or 3)
-    if kind in VALUES:
-        return VALUES[kind]
-    return st.fixed_dictionaries({name: values_of(message, inner) for inner, name in message.members(kind)})
-
-
-def plain(value: Any) -> Any:
-    """The judge's objects as dicts and lists."""
-    if isinstance(value, list):
-        return [plain(v) for v in value]
-    names = getattr(value, '__slots__', None)
-    return value if names is None else {name: plain(getattr(value, name)) for name in names}
-
-
-@pytest.mark.parametrize('name', sorted(MESSAGE_TYPES))
-@given(data=st.data())
-def test_a_message_is_read_as_the_judge_reads_it(name: str, data: st.DataObject) -> None:
-    message = MESSAGE_TYPES[name]
-    fields = data.draw(values_of(message))
-    encoded = cdr.encode(name, fields)
-    judge = DecoderFactory().decoder_for(
-        'cdr', JudgesSchema(id=1, name=name, encoding='ros2msg', data=message.definition.encode())
-    )
-    assert judge is not None
-    assert cdr.decode(name, encoded) == plain(judge(encoded)) == fields
-
-
-@pytest.mark.parametrize('name', sorted(MESSAGE_TYPES))
-@given(junk=st.binary(max_size=300), data=st.data())
-def test_bytes_that_are_no_message_are_refused_or_a_message(name: str, junk: bytes, data: st.DataObject) -> None:
-    encoded = cdr.encode(name, data.draw(values_of(MESSAGE_TYPES[name])))
-    cut = encoded[: data.draw(st.integers(0, len(encoded) - 1))]
-    for wrong in (junk, cut, b'\0\1\0\0' + junk, b'\0\0\0\0' + junk):
-        with contextlib.suppress(ValueError):
-            cdr.decode(name, wrong)
-
-
-def test_an_array_that_declares_more_than_there_is_costs_nothing() -> None:
-    four_thousand_million = b'\0\1\0\0' + struct.pack('<iII', 0, 0, 1) + b'\0\0\0\0' + b'\xff' * 4
-    with pytest.raises(ValueError, match='not a diagnostic_msgs/msg/DiagnosticArray'):
-        cdr.decode('diagnostic_msgs/msg/DiagnosticArray', four_thousand_million)
-
-
-def test_big_endian_numbers_are_read() -> None:
-    encoded = (
-        b'\0\0\0\0' + struct.pack('>iI', 3, 4) + struct.pack('>I', 2) + b'a\0' + b'\0\0' + struct.pack('>7d', *range(7))
-    )
-    fields = cdr.decode('geometry_msgs/msg/PoseStamped', encoded)
-    assert fields['header'] == {'stamp': {'sec': 3, 'nanosec': 4}, 'frame_id': 'a'}
-    assert [*fields['pose']['position'].values(), *fields['pose']['orientation'].values()] == list(range(7))
 
 
 @pytest.mark.parametrize('bag', BAGS, ids=lambda p: p.stem)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
+import re
 import threading
 from typing import TYPE_CHECKING
 
@@ -22,11 +24,17 @@ if TYPE_CHECKING:
 
 
 def need_server() -> None:
-    """Raise ConfigError, with the fix, if aiohttp is not installed."""
+    """Raise ConfigError, with the fix, if aiohttp is not installed, or so old that it would not answer."""
     if importlib.util.find_spec('aiohttp') is None:
         raise ConfigError(
             "the live page needs aiohttp: `pip install 'psd_deflection[monitor]'` or `apt install python3-aiohttp`, "
             'or run without monitor'
+        )
+    found = importlib.metadata.version('aiohttp')
+    if tuple(int(n) for n in re.findall(r'\d+', found)[:2]) < (3, 9):
+        raise ConfigError(
+            f"the live page needs aiohttp 3.9 or later, {found} is installed: `pip install 'psd_deflection[monitor]'` "
+            'in a virtual environment, or run without monitor'
         )
 
 
