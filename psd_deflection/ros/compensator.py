@@ -381,9 +381,7 @@ def _order(arm: Arm, joints: Sequence[str]) -> list[int]:
     return [arm.names.index(name) for name in joints]
 
 
-def run_compensator(
-    ros_args: Sequence[str], arm: Arm, settings: CompensatorSettings, say: Say, drive: bool
-) -> int:
+def run_compensator(ros_args: Sequence[str], arm: Arm, settings: CompensatorSettings, say: Say, drive: bool) -> int:
     """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
     if settings.joints == (ALL_JOINTS,):
         settings = dataclasses.replace(settings, joints=arm.names)

@@ -84,21 +84,6 @@ def test_good_ones_are_taken_and_others_counted_and_said(peer: Any, gated: Gated
     assert f'{TOPIC}: refused: {why[1]}' in gated.said
 
 
-@pytest.mark.parametrize('content', [b'\0\1\0\0\xff\xff\xff\x7fx', b'\0\1\0\0\x05\0\0\0ab'])
-def test_bytes_that_are_no_message_end_nothing(peer: Any, gated: Gated, content: bytes) -> None:
-    """A length that is longer than what follows: DDS delivers it, and the type cannot be made of it."""
-    gated.listen()
-    publisher = sender(peer)
-
-    def refused() -> bool:
-        publisher.publish(content)
-        return gated.gate.refused[TOPIC] > 0
-
-    peer.until(refused, 'the refusal')
-    assert gated.gate.why[TOPIC] == f'ValueError: {len(content)} bytes are no message of its type'
-    assert not gated.heard
-
-
 def test_a_text_that_is_no_text_ends_nothing(peer: Any, gated: Gated) -> None:
     gated.listen()
     publisher = sender(peer)
