@@ -174,6 +174,7 @@ def test_what_strangers_send_is_refused_and_moves_nothing(compensator: Program, 
     senders = {
         topic: peer.node.create_publisher(type(message), topic, 5) for message, topic, _ in strange_messages().values()
     }
+    peer.until(lambda: all(s.get_subscription_count() for s in senders.values()), 'that it listens')
     for name, (message, topic, why) in strange_messages().items():
         count = compensator.text.count(why)
         senders[topic].publish(message)
