@@ -40,6 +40,7 @@ from bench.steps import largest_step
 from psd_deflection.arms.compensation.arm import read_arm
 from psd_deflection.arms.compensation.compensator import CompensatorSettings, State
 from psd_deflection.arms.compensation.shaping import ShaperSettings
+from psd_deflection.base.log import unsaid
 from psd_deflection.records import FloatArray
 from psd_deflection.ros.compensator import CompensatorNode
 from psd_deflection.ros.shaper import ShaperNode
@@ -225,10 +226,9 @@ class Inside:
         rclpy.init(args=['messages'])
         # A busy machine is late, and what is right would be stale.
         settings = CompensatorSettings(axes=('x', 'z'), joints=tuple(NAMES), good=1, stale=1.0)
-        said: Counter[str] = Counter()
         self.listener, self.shaped = Listener('/compensator/offsets'), Heard()
-        self.compensator = CompensatorNode(read_arm(URDF, 'tool'), settings, lambda line: said.update([line[:4]]), True)
-        self.shaper = ShaperNode(ShaperSettings(frequency=12.0), lambda line: said.update([line[:4]]))
+        self.compensator = CompensatorNode(read_arm(URDF, 'tool'), settings, unsaid, True)
+        self.shaper = ShaperNode(ShaperSettings(frequency=12.0), unsaid)
         self._executor = SingleThreadedExecutor()
         self._inputs: dict[str, list[Any]] = {}
         for owner in (self.compensator, self.shaper):
