@@ -5,7 +5,7 @@
 # make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
 # make faults   a campaign of faults against the real node, each FAULT_TIMES=20 times (about 20 minutes)
 # make crash    kill -9 at 200 random instants while recording (about 8 minutes)
-# make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames; 10^6 HELLOs
+# make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames; 10^6 HELLOs; 10^6 messages to what moves
 # make soak     SOAK_MINUTES=30 in real time, then SOAK_HOURS=24 of simulated time (a quarter of an hour on an idle core)
 # make fleet    FLEET_RECORDINGS=1000 simulated recordings through a local Dask cluster whose workers are killed (some minutes)
 # make firmware build the example firmware, run it in qemu, join it to the daemon (installs what it needs with apt-get)
@@ -32,7 +32,7 @@
 # make blind-watch  bumps, gains, slips and 24 quiet hours: what the watch sees, and when it is silent (half an hour on an idle core; WATCH='--runs 5 --hours 1' for a look)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (twenty minutes on an idle core)
 # make demo-discover  record a rig with a hidden effect, find it, repair the model: a minute, leaves a report
-# make compensate-faults  how soon the compensator holds after a fault, each HOLD_TIMES=20 times (some minutes)
+# make compensate-faults  faults of compensator and shaper, each HOLD_TIMES=20 times: no step, hold, release (half an hour)
 # make demo-compensate  an arm of two flexible links with and without compensation: seconds, leaves a page
 # make demo-thesis  the experiment of the thesis redone: camera, calibrate, validate on one page (some minutes; THESIS=--short: seconds)
 # make clean    remove what the above made
@@ -134,10 +134,12 @@ crash: $(READY)
 FUZZ_SECONDS ?= 600
 FUZZ_FRAMES ?= 10000000
 FUZZ_HELLOS ?= 1000000
+FUZZ_MESSAGES ?= 1000000
 fuzz: $(READY)
 	$(call INSTALL,$(VENV)) atheris
 	$(BIN)/python -m bench.campaign.fuzz corrupted $(FUZZ_FRAMES)
 	$(BIN)/python -m bench.campaign.hellos $(FUZZ_HELLOS)
+	$(BIN)/python -m bench.campaign.messages $(FUZZ_MESSAGES)
 	for target in frames hello bag records csv parameters yaml; do $(BIN)/python -m bench.campaign.fuzz $$target -max_total_time=$(FUZZ_SECONDS) || exit 1; done
 
 SOAK_MINUTES ?= 30

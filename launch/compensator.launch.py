@@ -19,11 +19,17 @@ ARGUMENTS: dict[str, str] = {
     'output': 'offsets, which your controller adds, or commands, position plus offset (empty: offsets)',
     'max_offset': 'largest offset of a joint, rad or m (empty: 0.05)',
     'max_rate': 'largest rate of an offset, rad/s or m/s (empty: 0.1)',
+    'controller_state': 'type of what an active controller tells on controller_state (empty: not listened to)',
 }
 """Options of the command with their descriptions; the default of each is empty."""
 
-TOPICS = {'offsets': 'compensator/offsets', 'commands': 'compensator/commands', 'applied': 'compensator/applied'}
+TOPICS = {
+    name: f'compensator/{name}'
+    for name in ('offsets', 'commands', 'applied', 'robot_running', 'speed_scaling', 'controller_state')
+}
 """Topics with their names in the namespace."""
+TOPIC_OF = {'controller_state': 'controller_state_topic'}
+"""The argument of a topic, if it has another name."""
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -35,7 +41,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument('params_file', default_value='', description='ROS parameters of the node'),
             *(DeclareLaunchArgument(name, default_value='', description=what) for name, what in ARGUMENTS.items()),
             *(
-                DeclareLaunchArgument(name, default_value=topic, description=f'topic of the {name}')
+                DeclareLaunchArgument(TOPIC_OF.get(name, name), default_value=topic, description=f'topic of the {name}')
                 for name, topic in TOPICS.items()
             ),
             OpaqueFunction(function=compensator),
@@ -61,6 +67,6 @@ def compensator(context: LaunchContext) -> list[Node]:
             output='screen',
             arguments=arguments,
             parameters=[given['params_file']] if given['params_file'] else [],
-            remappings=[(f'~/{name}', LaunchConfiguration(name)) for name in TOPICS],
+            remappings=[(f'~/{name}', LaunchConfiguration(TOPIC_OF.get(name, name))) for name in TOPICS],
         )
     ]

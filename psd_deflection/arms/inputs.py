@@ -11,6 +11,8 @@ LARGEST_POSITION = 1e4
 """Bound of a joint's position, rad or m: a number beyond it is no position."""
 LONGEST_LIST = 1000
 """Joints in a message."""
+KNOWN_S = 0.5
+"""For so long the position of a joint is known after it was told, s."""
 UNIT_WITHIN = 1e-3
 """How far the length of a quaternion may be from 1."""
 
@@ -35,6 +37,31 @@ def joints_fault(names: Sequence[str], positions: Sequence[float], ours: Collect
 def is_position(value: float) -> bool:
     """Whether a number can be a joint's position, rad or m."""
     return abs(value) <= LARGEST_POSITION
+
+
+class KnownJoints:
+    """Where joints are, by name, of ``LONGEST_LIST`` of them at most, however many names are told.
+
+    The times ``now`` are s of a clock that is never set.
+    """
+
+    def __init__(self) -> None:
+        self._told: dict[str, tuple[float, float]] = {}
+
+    def tell(self, now: float, names: Sequence[str], positions: Sequence[float]) -> None:
+        """Take what a message tells; a new name is passed over if there are too many of late."""
+        if len(self._told) + len(names) > LONGEST_LIST:
+            self._told = {name: told for name, told in self._told.items() if now - told[1] <= KNOWN_S}
+        for name, position in zip(names, positions, strict=False):
+            if is_position(position) and (name in self._told or len(self._told) < LONGEST_LIST):
+                self._told[name] = position, now
+
+    def positions(self, now: float) -> dict[str, float]:
+        """Of the joints that were told of late, rad or m."""
+        return {name: at for name, (at, then) in self._told.items() if now - then <= KNOWN_S}
+
+    def __len__(self) -> int:
+        return len(self._told)
 
 
 def quaternion_fault(quaternion: Sequence[float]) -> str:

@@ -6,16 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from psd_deflection.arms.compensation.shaping import SHAPING, shaper_of
 from psd_deflection.arms.shapers import Shaper, in_series, recommended, shaper
+from psd_deflection.cli._options import of_options
 from psd_deflection.cli.main import main, make_parser
-from psd_deflection.cli.run.shaper import shaper_of
 
 CONFIG = Path(__file__).parents[2] / 'config'
 RIG = str(CONFIG / 'thesis_rig.yaml')
 
 
 def chosen(*options: str) -> Shaper:
-    return shaper_of(make_parser(['shaper']).parse_args(['shaper', *options]))[0]
+    return shaper_of(of_options(make_parser(['shaper']).parse_args(['shaper', *options]), SHAPING))[0]
 
 
 def test_the_mode_comes_from_the_rig_file_or_the_options(tmp_path: Path) -> None:
@@ -35,16 +36,15 @@ def test_the_mode_comes_from_the_rig_file_or_the_options(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ('options', 'status', 'message'),
     [
-        ([], 2, 'which mode: give --params-file, or --frequency and --damping-ratio; or --shaper none'),
-        (['--shaper', 'zvx'], 2, '--shaper zvx: must be one of zv, mzv, zvd, ei, recommended, none'),
-        (['--frequency', '9'], 2, '--frequency and --damping-ratio: must be given together'),
-        (['--frequency', '-9', '--damping-ratio', '0'], 2, '--frequency -9: must be a number of at least 0.1'),
-        (['--frequency', '9', '--damping-ratio', '0', '--params-file', RIG], 2, 'must not be given together'),
-        (
-            ['--params-file', RIG, '--modes', 'bending,bending'],
-            2,
-            '--modes bending,bending: must be of bending, torsion',
-        ),
+        ([], 3, 'which mode: give params_file, or frequency and damping_ratio; or shaper: none'),
+        (['--shaper', 'zvx'], 2, "--shaper = 'zvx': must be one of zv, mzv, zvd, ei, recommended, none"),
+        (['--damping-ratio', '0.1'], 2, 'damping_ratio: must be given together with frequency'),
+        (['--frequency', '-9', '--damping-ratio', '0'], 2, '--frequency = -9.0 Hz: must be at least 0'),
+        (['--frequency', '0.01'], 2, '--frequency = 0.01 Hz: must be at least 0.1'),
+        (['--frequency', '9', '--params-file', RIG], 2, 'frequency and params_file: must not be given together'),
+        (['--params-file', RIG, '--modes', 'bending,bending'], 2, 'modes: none may be there twice'),
+        (['--params-file', RIG, '--modes', 'shear'], 2, 'each must be one of bending, torsion'),
+        (['--max-step', 'nan'], 2, '--max-step = nan rad or m: must be finite'),
         (['--params-file', 'gone.yaml'], 3, 'gone.yaml: no such parameter file'),
         (['--shaper', 'none', '--urdf', 'gone.urdf'], 3, 'gone.urdf: no such URDF file'),
     ],

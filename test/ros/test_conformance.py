@@ -32,7 +32,7 @@ NODES: Mapping[str, tuple[str, ...]] = {
     'shaper': ('--shaper', 'none'),
 }
 """Every node, with the words that it needs."""
-WITH_PARAMETERS = ('estimator', 'compensator')
+WITH_PARAMETERS = ('estimator', 'compensator', 'shaper')
 LISTENS_TO_JOINTS = ('chain', 'compensator', 'shaper')
 OF_THEIR_OWN = {
     'gate.py': 'the gate',

@@ -110,7 +110,8 @@ def test_the_shaper_is_launched_with_its_options(launch_modules: None) -> None:
 def test_the_compensator_is_launched_with_its_options(launch_modules: None) -> None:
     names = runpy.run_path(str(LAUNCH / 'compensator.launch.py'))
     declared = {a.words[0]: a for a in names['generate_launch_description']() if hasattr(a, 'description')}
-    assert declared.keys() == {'namespace', 'drive', 'params_file', *names['ARGUMENTS'], *names['TOPICS']}
+    topics = [names['TOPIC_OF'].get(name, name) for name in names['TOPICS']]
+    assert declared.keys() == {'namespace', 'drive', 'params_file', *names['ARGUMENTS'], *topics}
     assert all(a.description for a in declared.values())
     options = make_parser(['compensator']).parse_args(['compensator', 'arm.urdf', '--tip', 'tool'])
     assert set(names['ARGUMENTS']) <= vars(options).keys()
@@ -118,7 +119,9 @@ def test_the_compensator_is_launched_with_its_options(launch_modules: None) -> N
     (node,) = names['compensator'](dict.fromkeys(declared, '') | given)
     assert node.arguments == ['arm.urdf', '--tip', 'tool', '--max-rate', '0.05', '--drive']
     assert node.parameters == ['p.yaml']
-    assert [(a, b.name) for a, b in node.remappings] == [(f'~/{name}', name) for name in names['TOPICS']]
+    assert [(a, b.name) for a, b in node.remappings] == [
+        (f'~/{name}', topic) for name, topic in zip(names['TOPICS'], topics, strict=True)
+    ]
     (dry,) = names['compensator'](dict.fromkeys(declared, '') | {'urdf': 'arm.urdf', 'tip': 'tool'})
     assert dry.arguments == ['arm.urdf', '--tip', 'tool']
 

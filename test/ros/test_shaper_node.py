@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,13 +13,16 @@ pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.duration import Duration  # noqa: E402
+from sensor_msgs.msg import JointState  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from bench.damping import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played  # noqa: E402
 from psd_deflection.arms.compensation.trajectory import checked  # noqa: E402
 from test.ros.conftest import WARNINGS, stamp  # noqa: E402
-from tools.program import PSD_DEFLECTION, ROOT, Program  # noqa: E402
+from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
 ZVD = ('--frequency', str(FREQUENCY), '--damping-ratio', str(RATIO), '--shaper', 'zvd')
 URDF = ROOT / 'config' / 'two_links.urdf'
@@ -41,6 +46,13 @@ def point(seconds: float, positions: list[float]) -> JointTrajectoryPoint:
     return JointTrajectoryPoint(time_from_start=at, positions=positions, velocities=[0.0] * len(positions))
 
 
+def told(peer: Any, **positions: float) -> None:
+    """Let joints be told again and again."""
+    out = peer.node.create_publisher(JointState, '/joint_states', 5)
+    said = JointState(name=list(positions), position=list(positions.values()))
+    peer.node.create_timer(0.02, lambda: out.publish(said))
+
+
 def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> None:
     node.until('publishing /shaper/shaped: ZVD for 12 Hz, damping ratio 0.02; motions take 83 ms longer')
     heard = peer.collect(JointTrajectory, '/shaper/shaped')
@@ -49,7 +61,10 @@ def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> Non
     peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
     peer.until(lambda: peer.node.count_publishers('/shaper/shaped') > 0, 'its answers')
 
-    # Refused.
+    # Refused: a joint of which nobody tells anything, too.
+    given.publish(message(point(0.0, [0.0]), names=('z',)))
+    node.until('trajectory refused: the position of z is not known')
+    told(peer, shoulder=START[0], elbow=START[1])
     given.publish(message(point(0.0, [1.0])))
     node.until('trajectory refused: point 0 has 1 positions, must be 2')
     late = message(point(0.0, START.tolist()))
@@ -59,7 +74,10 @@ def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> Non
     peer.until(lambda: any('was refused: its stamp' in r.status[0].message for r in reports), 'diagnostics')
 
     good = message(point(0.0, START.tolist()), point(MOVE_S, END.tolist()))
+    # Many leave zeros there.
+    good.points[0].effort = [0.0, 0.0]
     # Shaped: stamp and frame are kept, and the link is at rest when the joints are.
+    begun = time.time_ns()
     good.header.stamp = peer.node.get_clock().now().to_msg()
     good.header.frame_id = 'arm'
 
@@ -74,7 +92,8 @@ def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> Non
     shaped = heard[0]
     assert shaped.joint_names == list(NAMES)
     assert shaped.header.frame_id == 'arm'
-    assert stamp(shaped) > 0
+    # It begins when it has arrived, and says so.
+    assert stamp(shaped) >= begun + 100_000_000
     assert list(shaped.points[0].positions) == START.tolist()
     assert list(shaped.points[-1].positions) == END.tolist()
     times = [p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in shaped.points]
@@ -84,9 +103,49 @@ def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> Non
     reports.clear()
     peer.until(lambda: any('ZVD for 12 Hz' in r.status[0].message for r in reports), 'diagnostics')
     values = {v.key: v.value for v in reports[-1].status[0].values}
-    assert (values['shaper'], values['delay (s)'], values['trajectories refused']) == ('zvd', '0.0834', '2')
+    assert (values['shaper'], values['delay (s)'], values['trajectories refused']) == ('zvd', '0.0834', '3')
 
     # A stop goes through.
     heard.clear()
     given.publish(message())
     peer.until(lambda: any(not h.points for h in heard), 'the stop')
+
+
+def test_settings_are_parameters(node: Program, peer: Any) -> None:
+    node.until('publishing /shaper/shaped')
+    asked = GetParameters.Request(names=['shaper', 'frequency', 'max_step', 'lead'])
+    kind, frequency, step, lead = peer.call(GetParameters, '/shaper/get_parameters', asked).values
+    assert (kind.string_value, frequency.double_value) == ('zvd', FREQUENCY)
+    assert (step.double_value, lead.double_value) == (0.05, 0.1)
+
+    def changed(name: str, value: float) -> Any:
+        new = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+        request = SetParameters.Request(parameters=[Parameter(name=name, value=new)])
+        return peer.call(SetParameters, '/shaper/set_parameters', request).results[0]
+
+    assert changed('max_step', 0.01).successful
+    assert not changed('max_step', -1.0).successful
+    assert not changed('frequency', 10.0).successful
+    given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
+    peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
+    told(peer, shoulder=0.0, elbow=0.02)
+    peer.until(
+        lambda: given.publish(message(point(0.0, [0.0, 0.0]))) or 'from where elbow is' in node.text, 'a refusal'
+    )
+    assert 'must be at most 0.01' in node.text
+
+
+@pytest.mark.parametrize(
+    ('words', 'why'),
+    [
+        (['-p', 'max_step:=-1.0'], 'max_step = -1.0 rad or m: must be at least 1e-06'),
+        (['-p', 'shaper:=zvx'], "shaper = 'zvx': must be one of zv"),
+        (['-p', 'params_file:=gone.yaml'], 'frequency and params_file: must not be given together'),
+        (['-p', 'urdf:=gone.urdf'], 'gone.urdf: no such URDF file'),
+    ],
+)
+def test_a_parameter_that_cannot_be_is_refused(domain: int, words: list[str], why: str) -> None:
+    command = [*PSD_DEFLECTION, 'shaper', *ZVD, '--ros-args', *words]
+    ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert ended.returncode == 3
+    assert why in ended.stderr

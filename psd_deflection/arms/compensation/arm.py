@@ -6,6 +6,8 @@ Pinocchio would do the same. Its wheels take 0.35 GB with what they bring along,
 from __future__ import annotations
 
 import math
+import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +23,7 @@ from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.records import FloatArray
 
 MOST_BYTES = 5_000_000
+NUMBER = re.compile(r'[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?', re.ASCII)
 MOVABLE = ('revolute', 'continuous', 'prismatic')
 
 
@@ -97,38 +100,52 @@ class JointLimits(NamedTuple):
 
 def read_limits(path: str | Path) -> dict[str, JointLimits]:
     """The limits of each joint of a URDF file that moves, infinite if it has none. Raises ConfigError."""
-    path = Path(path)
+    return limits_of(text_of_file(Path(path), 'URDF file', MOST_BYTES), str(path))
+
+
+def limits_of(text: str, where: str) -> dict[str, JointLimits]:
+    """The same of the text of one, which comes from ``where``."""
     out = {}
-    for element in _robot(path).iterfind('joint'):
+    for element in _robot(text, where).iterfind('joint'):
         name, kind, limit = element.get('name', ''), element.get('type', ''), element.find('limit')
         if kind in MOVABLE:
-            where = f'{path}: joint {name}'
-            lower, upper = _range(limit, kind, where)
-            speed = limit.get('velocity') if limit is not None else None
-            out[name] = JointLimits(
-                lower, upper, math.inf if speed is None else _numbers(speed, 1, f'{where}: velocity')[0]
-            )
+            at = f'{where}: joint {name}'
+            lower, upper = _range(limit, kind, at)
+            text = '' if limit is None else limit.get('velocity', '')
+            speed = _numbers(text, 1, f'{at}: velocity')[0] if text else math.inf
+            if speed < 0.0:
+                raise ConfigError(f'{at}: velocity = {speed:g}: must be at least 0')
+            out[name] = JointLimits(lower, upper, speed)
     return out
 
 
-def _robot(path: Path) -> ElementTree.Element:
-    """The root of a URDF file."""
-    text = text_of_file(path, 'URDF file', MOST_BYTES)
+def _robot(text: str, where: str) -> ElementTree.Element:
+    """The root of a URDF."""
+    if len(text) > MOST_BYTES:
+        raise ConfigError(f'{where}: {len(text)} characters: must be at most {MOST_BYTES}')
     if '<!DOCTYPE' in text or '<!ENTITY' in text:
-        raise ConfigError(f'{path}: has a document type or entities, which a URDF file does not need')
+        raise ConfigError(f'{where}: has a document type or entities, which a URDF file does not need')
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ConfigError(f'{path}: not XML ({error}); expand xacro files first') from None
+        raise ConfigError(f'{where}: not XML ({error}); expand xacro files first') from None
     if root.tag != 'robot':
-        raise ConfigError(f'{path}: not a URDF file: its root is <{root.tag}>, not <robot>')
+        raise ConfigError(f'{where}: not a URDF file: its root is <{root.tag}>, not <robot>')
+    names = [element.get('name', '') for element in root.iterfind('joint')]
+    twice = next((name for name, count in Counter(names).items() if count > 1), None)
+    if twice is not None:
+        raise ConfigError(f'{where}: joint {twice}: there are two of that name')
     return root
 
 
 def read_arm(path: str | Path, tip: str, base: str = '') -> Arm:
     """The joints from the link ``base`` (default: the root) to the link ``tip`` of a URDF file. Raises ConfigError."""
-    path = Path(path)
-    root = _robot(path)
+    return arm_of(text_of_file(Path(path), 'URDF file', MOST_BYTES), str(path), tip, base)
+
+
+def arm_of(text: str, where: str, tip: str, base: str = '') -> Arm:
+    """The same of the text of one, which comes from ``where``."""
+    root = _robot(text, where)
     links = [link.get('name', '') for link in root.iterfind('link')]
     parents = {}
     for element in root.iterfind('joint'):
@@ -137,25 +154,25 @@ def read_arm(path: str | Path, tip: str, base: str = '') -> Arm:
             parents[child.get('link', '')] = element
     for link, what in ((tip, 'tip'), (base, 'base')):
         if link and link not in links:
-            raise ConfigError(f'{path}: {what}: no link {link}{did_you_mean(link, links)}')
+            raise ConfigError(f'{where}: {what}: no link {link}{did_you_mean(link, links)}')
     joints: list[ArmJoint] = []
     link = tip
     while link != base and link in parents:
         element = parents.pop(link)
-        joints.append(_joint(path, element))
+        joints.append(_joint(where, element))
         parent = element.find('parent')
         link = parent.get('link', '') if parent is not None else ''
     if base and link != base:
-        raise ConfigError(f'{path}: no joints lead from {base} to {tip}')
+        raise ConfigError(f'{where}: no joints lead from {base} to {tip}')
     try:
         return Arm(joints[::-1])
     except ConfigError as error:
-        raise ConfigError(f'{path}: {error}') from None
+        raise ConfigError(f'{where}: {error}') from None
 
 
-def _joint(path: Path, element: ElementTree.Element) -> ArmJoint:
+def _joint(file: str, element: ElementTree.Element) -> ArmJoint:
     name, kind = element.get('name', ''), element.get('type', '')
-    where = f'{path}: joint {name}'
+    where = f'{file}: joint {name}'
     if kind not in (*MOVABLE, 'fixed'):
         raise ConfigError(f'{where}: type {kind}: must be one of {", ".join(MOVABLE)} or fixed')
     if element.find('mimic') is not None:
@@ -189,10 +206,8 @@ def _three(
 
 
 def _numbers(text: str, count: int, where: str) -> list[float]:
-    try:
-        numbers = [float(word) for word in text.split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+    # Python takes 1_0 for 10, and digits of other scripts.
+    numbers = [float(word) for word in text.split() if NUMBER.fullmatch(word)]
+    if len(numbers) != len(text.split()) or len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise ConfigError(f'{where} = {text!r}: must be {count} finite number{"s" * (count > 1)}')
     return numbers

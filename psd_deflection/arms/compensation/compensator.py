@@ -4,10 +4,13 @@ With the joints at q + o, the rigid pose T(q + o) and the measured deflection D,
 is to be at T(q). Each estimate moves o by a damped least squares step (Nakamura & Hanafusa 1986) that lessens the
 difference on the chosen axes; a first-order lag lets the offsets follow a load that is held, and not a vibration.
 
-The offsets hold (they keep their last value) while the deflection is stale, not finite, too uncertain, too large or
-jumping, the joints are not known, leap or do not follow, the robot does not run, or somebody else commands it. They
-move again after some good estimates in a row. When the compensation is switched off they go back to zero. Whatever
-happens, they move by no more than ``max_rate`` times the time since they were taken last.
+Nothing is sent until the compensation is enabled, everything is known and nothing is wrong. Then the offsets begin
+where the controller has them. They hold (they keep their last value) while the deflection is stale, not finite, too
+uncertain, too large or jumping, the joints are not known, leap or do not follow, the robot does not run, or somebody
+else commands it. They move again after some good estimates in a row, and go back to zero if that takes long or when
+the compensation is switched off. A controller that does not tell what it applies, or is elsewhere than it was sent,
+hears nothing until that is mended. Whatever happens, what is sent moves by no more than ``max_rate`` times the time
+since something was sent.
 """
 
 from __future__ import annotations
@@ -35,6 +38,9 @@ FOLLOW_S = 0.3
 """For so long a joint may be away from its command, s: its controller lags."""
 MOVED_SHARE = 0.1
 """Joints that moved by less than this share of what the offsets did do not follow them."""
+LEAST_SD = 1e-10
+"""Nobody measures a deflection to better than this, m or rad: one that says so does not know its uncertainty."""
+UNTOLD = 'the controller does not tell the offsets that it applies'
 
 
 class State(StrEnum):
@@ -69,6 +75,9 @@ class CompensatorSettings:
         True, '', 'with offsets: wait until the controller tells those that it applies, and begin there; false: at 0'
     )
     frame_prefix: str = parameter('', '', 'prefix of the frames of the deflection')
+    controller_state: str = parameter(
+        '', '', "type of what the robot's controller tells again and again on ~/controller_state while it is active"
+    )
     max_offset: float = parameter(0.05, 'rad or m', 'largest offset of a joint', above=0.0, maximum=10.0, live=True)
     max_rate: float = parameter(
         0.1,
@@ -141,6 +150,15 @@ class CompensatorSettings:
         25, '', 'good estimates in a row after which held offsets follow again', minimum=1, maximum=10000, live=True
     )
 
+    release_after: float = parameter(
+        10.0,
+        's',
+        'time after which offsets that are held go back to zero, but not while the robot stands; 0: never',
+        minimum=0.0,
+        maximum=1e6,
+        live=True,
+    )
+
     def __post_init__(self) -> None:
         for name, declared in SETTINGS.parameters.items():
             check_value(declared, getattr(self, name), 'compensator')
@@ -166,8 +184,9 @@ class Observed(NamedTuple):
 class Command(NamedTuple):
     """``offsets`` (n,) of the joints, rad or m; ``why``: of a state that is not ``following``, else ''.
 
-    ``residual``: distance from the rigid pose on the axes that are corrected, m; NaN if it is not known.
-    ``limited``: whether a limit keeps the offsets from what the deflection asks for.
+    ``residual``: distance of the joints, as measured, from the rigid pose on the axes that are corrected, m; NaN if it
+    is not known. ``limited``: whether a limit keeps the offsets from what the deflection asks for. ``positions`` (n,):
+    of the joints with the offsets, None if the output is offsets. ``sends``: whether the controller is to get it.
     """
 
     offsets: FloatArray
@@ -175,6 +194,13 @@ class Command(NamedTuple):
     why: str = ''
     residual: float = math.nan
     limited: bool = False
+    positions: FloatArray | None = None
+    sends: bool = False
+
+    @property
+    def text(self) -> str:
+        """State and reason."""
+        return f'{self.state}: {self.why}' if self.why else str(self.state)
 
 
 class Compensator:
@@ -191,18 +217,24 @@ class Compensator:
         self._offsets = np.zeros(len(arm.names))
         self._wanted = self._offsets
         self._moved_t: float | None = None
+        # Whether the controller gets what we say, and what it got last, when.
+        self._speaks = dry
+        self._sent: tuple[FloatArray, float] | None = None
         self._joints: FloatArray | None = None
         self._joints_t = -math.inf
-        self._held_at: FloatArray | None = None
+        self._last_move = self._offsets
+        # Output of commands: where the joints would be without offsets.
+        self._pose: FloatArray | None = None
+        self._applied: FloatArray | None = None
+        self._applied_t = -math.inf
         self._anchor: tuple[FloatArray, FloatArray] | None = None
         self._away_t: float | None = None
-        self._applied: FloatArray | None = None
-        self._stop = ''
-        self._broken = ''
+        self._stop = self._broken = ''
         self._last: Observed | None = None
         self._last_now = -math.inf
         self._good = settings.good
-        self._fault = 'no deflection yet'
+        self._fault = self._unready = 'no deflection yet'
+        self._held_t: float | None = None
         self._residual = math.nan
         self._limited = False
 
@@ -210,35 +242,31 @@ class Compensator:
     def _rows(self) -> list[int]:
         return [AXES.index(axis) for axis in self.settings.axes]
 
+    @property
+    def _sums(self) -> bool:
+        return self.settings.output == COMMANDS
+
     def enable(self, wanted: bool) -> None:
-        """Let the offsets follow from where they are, or let them go back to zero.
+        """Let the offsets follow from where the controller has them, or let them go back to zero.
 
         Joints that did not follow keep the offsets held until this is called again.
         """
         if wanted == self.enabled and not self._broken:
             return
-        if wanted and not self.enabled and not np.any(self._offsets):
-            # With commands the arm keeps the pose that it has now.
-            self._held_at = None
-            if self._applied is not None and self.settings.output == OFFSETS:
-                self._offsets = self._wanted = self._applied.copy()
         self.enabled = wanted
         self._broken = ''
-        self._anchor = self._away_t = None
+        self._anchor = self._away_t = self._held_t = None
 
     def stop(self, why: str) -> None:
         """Hold for as long as ``why`` is not '': the robot does not run, or somebody else commands it."""
         self._stop = why
 
-    def applied(self, offsets: FloatArray) -> None:
+    def applied(self, now: float, offsets: FloatArray) -> None:
         """The offsets that the controller says it applies: where ours begin when they are enabled."""
-        waited = self.waits
-        self._applied = np.array(offsets, dtype=np.float64)
-        if waited and self.enabled:
-            self._offsets = self._wanted = self._applied.copy()
+        self._applied, self._applied_t = np.array(offsets, dtype=np.float64), now
 
-    def joints(self, now: float, positions: FloatArray) -> None:
-        """Where the joints are, offsets included unless ``dry``, in the order of the arm.
+    def joints(self, now: float, positions: FloatArray, age: float = 0.0) -> None:
+        """Where the joints are, offsets included unless ``dry``, in the order of the arm; ``age``, s, of the positions.
 
         Passed over if one is not finite or beyond ``LARGEST_POSITION``.
         """
@@ -246,117 +274,182 @@ class Compensator:
             return
         seen = np.array(positions, dtype=np.float64)
         before, then = self._joints, self._joints_t
-        self._joints, self._joints_t = seen, now
-        if before is not None:
-            leap = float(np.abs(seen - before).max())
-            if leap > self.settings.max_joint_speed * min(max(now - then, 0.02), 1.0):
-                self._hold(f'the positions of the joints leap by {leap:.3g}')
-        if self.enabled and not self._dry and not self._broken:
-            self._broken = self._not_followed(now, seen)
-            if self._broken:
-                self._hold(self._broken)
+        self._joints, self._joints_t = seen, now - max(age, 0.0)
+        if before is None:
+            return
+        move, settings = seen - before, self.settings
+        leap = float(np.abs(move).max())
+        if leap > settings.max_joint_speed * min(max(self._joints_t - then, 0.02), 1.0):
+            self._hold(f'the positions of the joints leap by {leap:.3g}')
+        # No joint turns round so quickly, but two nodes that tell different positions look like this.
+        turned = np.where(move * self._last_move < 0.0, np.minimum(np.abs(move), np.abs(self._last_move)), 0.0)
+        if turned.max() > settings.follow_error:
+            self._hold(f'the positions of the joints go to and fro by {turned.max():.3g}')
+        self._last_move = move
 
     def observe(self, now: float, seen: Observed) -> Command:
         """Take a deflection at the time ``now``; return what :meth:`watch` gave last, with the state of now."""
         before, fault = self._last, self._refusal(now, seen)
         if fault:
             self._hold(fault)
-            return self._command()
-        if before is not None and seen.t <= before.t:
-            return self._command()
+            return self.command()
+        back = before.t - seen.t if before is not None else -1.0
+        if 0.0 <= back <= self.settings.stale:
+            # Twice the same, or late on the way.
+            return self.command()
         self._last, self._last_now = seen, now - max(seen.age, 0.0)
-        if before is not None:
+        if back > 0.0:
+            self._hold(f'the stamps of the deflections go back by {back:.3g} s')
+        elif before is not None:
             moved = _vector(before.deflection.inverse() @ seen.deflection)[self._rows]
             if np.abs(moved).max() > self.settings.jump:
                 self._hold(f'the deflection jumps by {np.abs(moved).max():.3g}')
         if self._fault:
             self._good += 1
             if self._good < self.settings.good:
-                return self._command()
+                return self.command()
             self._fault = ''
-        nominal = self._nominal() if self.enabled else None
+        nominal = self._nominal() if self.enabled and self._speaks else None
         if nominal is not None:
             elapsed = seen.t - before.t if before is not None else 0.0
             self._follow(nominal, seen.deflection, min(max(elapsed, 0.0), LONGEST_S))
-        return self._command()
+        return self.command()
 
     def watch(self, now: float) -> Command:
-        """The offsets to send at the time ``now``. To be called often: here they move, and deflections are missed."""
-        if not self._fault:
-            stale = self.settings.stale
-            if self._stop or self._broken:
-                self._hold(self._stop or self._broken)
-            elif now - self._last_now > stale:
-                self._hold(f'no deflection for {stale:g} s')
-            elif now - self._joints_t > stale:
-                self._hold(f'no positions of the joints for {stale:g} s')
+        """What to send at the time ``now``. To be called often: here the offsets move, and deflections are missed."""
+        self._look(now)
+        if self.enabled and not self._speaks:
+            self._unready = '' if self._fault else self._begin(now)
+        self._give_up(now)
         elapsed = 0.0 if self._moved_t is None else min(max(now - self._moved_t, 0.0), LONGEST_S)
         self._moved_t = now
         if not self.enabled:
             self._wanted = np.zeros(len(self._offsets))
         elif self._fault:
             self._wanted = self._offsets
+        if not self._speaks:
+            # Nobody has them.
+            self._offsets = self._wanted = np.zeros(len(self._offsets))
         limit = self.settings.max_rate * elapsed
         self._offsets = self._offsets + np.clip(self._wanted - self._offsets, -limit, limit)
-        return self._command()
+        command = self.command()
+        if command.state is State.OFF:
+            # The one of no offset is the last before the silence.
+            self._speaks, self._pose = False, None
+        return command
 
-    @property
-    def waits(self) -> bool:
-        """Whether nothing may be sent yet, because the controller has not told which offsets it applies."""
-        settings = self.settings
-        return settings.takeover and settings.output == OFFSETS and not self._dry and self._applied is None
+    def sent(self, now: float, command: Command) -> None:
+        """``command`` has been sent, at the time ``now``: from then on counts the time for the next step."""
+        self._moved_t = now
+        self._sent = command.offsets if command.positions is None else command.positions, now
 
-    def commands(self) -> FloatArray | None:
-        """Positions (n,) of the joints with the offsets; None as long as the joints' own positions are not known."""
-        return None if self._held_at is None else self._held_at + self._offsets
-
-    def _command(self) -> Command:
+    def command(self) -> Command:
+        """What :meth:`watch` gave last, with the state of now."""
         offsets = self._offsets.copy()
+        positions = self._pose + offsets if self._sums and self._pose is not None else None
+        out = Command(offsets, State.FOLLOWING, '', self._residual, self._limited, positions, self._speaks)
         if not self.enabled:
-            if np.any(offsets):
-                return Command(offsets, State.RELEASING, 'going back to zero')
-            return Command(offsets, State.OFF, self._fault)
-        if self._fault:
-            return Command(offsets, State.HOLDING, self._fault, self._residual)
-        return Command(offsets, State.FOLLOWING, '', self._residual, self._limited)
+            if self._speaks and np.any(offsets):
+                return out._replace(state=State.RELEASING, why='going back to zero', residual=math.nan, limited=False)
+            return out._replace(state=State.OFF, why=self._fault, residual=math.nan, limited=False)
+        why = self._fault or ('' if self._speaks else self._unready)
+        if why or not self._speaks:
+            return out._replace(state=State.HOLDING, why=why, residual=math.nan, limited=False)
+        return out
+
+    def _begin(self, now: float) -> str:
+        """Begin to speak, from where the controller is; the reason why not, or ''."""
+        settings = self.settings
+        offsets, pose = np.zeros(len(self._offsets)), None
+        if self._sums:
+            pose = self._joints
+        elif settings.takeover:
+            if self._applied is None or now - self._applied_t > settings.stale:
+                return UNTOLD
+            offsets = self._applied
+            worst = int(np.abs(offsets).argmax())
+            if abs(offsets[worst]) > settings.max_offset:
+                return f'the controller applies {offsets[worst]:.3g} at {self.arm.names[worst]}: beyond max_offset'
+        if self._sent is not None:
+            sent, then = self._sent
+            if np.abs((offsets if pose is None else pose) - sent).max() > settings.max_rate * (now - then):
+                return 'the controller is elsewhere than it was sent last: the rate allows for it soon'
+        self._offsets = self._wanted = offsets
+        self._pose, self._speaks = pose, True
+        self._anchor = self._away_t = self._held_t = None
+        return ''
+
+    def _look(self, now: float) -> None:
+        """Hold, or be silent, if something is wrong at this time."""
+        stale, why = self.settings.stale, ''
+        if self._speaks and not self._dry:
+            why = self._not_followed(now)
+        why = why or self._stop or self._broken
+        if why:
+            self._hold(why)
+        elif not self._fault:
+            if now - self._last_now > stale:
+                self._hold(f'no deflection for {stale:g} s')
+            elif now - self._joints_t > stale:
+                self._hold(f'no positions of the joints for {stale:g} s')
+
+    def _not_followed(self, now: float) -> str:
+        """Why the joints or the controller do not do what was sent; '' if they do, as far as one can tell."""
+        if self._sums:
+            if self._pose is None or self._joints is None:
+                return ''
+            return self._away(now, self._pose + self._offsets, self._joints)
+        if self.settings.takeover and now - self._applied_t > self.settings.stale:
+            # It may come back with none, so it hears nothing from us until it tells what it has.
+            self._speaks = False
+            return UNTOLD
+        away = '' if self._applied is None else self._away(now, self._offsets, self._applied)
+        return away or self._stands_still()
+
+    def _away(self, now: float, asked: FloatArray, seen: FloatArray) -> str:
+        """Why what is ``seen`` is not what was ``asked``. For ``FOLLOW_S`` it may be late; then nothing is sent."""
+        away = np.abs(seen - asked)
+        worst = int(away.argmax())
+        if away[worst] <= self.settings.follow_error:
+            self._away_t = None
+            return ''
+        self._away_t = now if self._away_t is None else self._away_t
+        why = f'{self.arm.names[worst]} is {away[worst]:.3g} from what it was sent'
+        if now - self._away_t > FOLLOW_S:
+            self._broken, self._speaks = why, False
+        return why
+
+    def _stands_still(self) -> str:
+        """Joints that stand still while the offsets move: nobody adds them, or a protective stop."""
+        if self._joints is None or self._broken or not self.enabled:
+            return ''
+        if self._anchor is None:
+            self._anchor = self._offsets, self._joints
+        offsets, joints = self._anchor
+        sent = np.abs(self._offsets - offsets).max()
+        if sent < self.settings.follow_error:
+            return ''
+        self._anchor = None
+        if np.abs(self._joints - joints).max() < MOVED_SHARE * sent:
+            self._broken = 'the joints do not move with the offsets'
+        return self._broken
+
+    def _give_up(self, now: float) -> None:
+        """Let the offsets go if they were held for long. Those of an arm that stands stay: it would leap later."""
+        if not (self.enabled and self._speaks and self._fault) or self._dry or self._stop or self._broken:
+            self._held_t = None
+            return
+        self._held_t = now if self._held_t is None else self._held_t
+        if 0.0 < self.settings.release_after < now - self._held_t:
+            self.enabled = False
 
     def _nominal(self) -> FloatArray | None:
         """Where the joints are to be without offsets; None if that is not known."""
         if self._joints is None or self._dry:
             return self._joints
-        if self.settings.output == OFFSETS:
-            return self._joints - (self._offsets if self._applied is None else self._applied)
-        if self._held_at is None:
-            self._held_at = self._joints - self._offsets
-        return self._held_at
-
-    def _not_followed(self, now: float, seen: FloatArray) -> str:
-        """Why the joints at ``seen`` do not do what the offsets ask for; '' if they do, as far as one can tell."""
-        allowed = self.settings.follow_error
-        asked = self.commands() if self.settings.output == COMMANDS else None
-        if self.settings.output == OFFSETS and self._applied is not None:
-            asked, seen = self._offsets, self._applied
-        if asked is not None:
-            away = np.abs(seen - asked)
-            if away.max() <= allowed:
-                self._away_t = None
-                return ''
-            self._away_t = now if self._away_t is None else self._away_t
-            worst = int(away.argmax())
-            late = now - self._away_t > FOLLOW_S
-            return f'{self.arm.names[worst]} is {away[worst]:.3g} from what it was sent' if late else ''
-        if self.settings.output == COMMANDS:
-            return ''
-        # A controller that adds the offsets to motions of its own is only caught if the joints stand still.
-        if self._anchor is None:
-            self._anchor = self._offsets.copy(), seen
-        offsets, joints = self._anchor
-        sent = np.abs(self._offsets - offsets).max()
-        if sent < allowed:
-            return ''
-        moved = np.abs(seen - joints).max()
-        self._anchor = None
-        return 'the joints do not move with the offsets' if moved < MOVED_SHARE * sent else ''
+        if self._sums:
+            return self._pose
+        return self._joints - (self._offsets if self._applied is None else self._applied)
 
     def _refusal(self, now: float, seen: Observed) -> str:
         settings = self.settings
@@ -367,17 +460,17 @@ class Compensator:
         if size > settings.max_deflection:
             return f'a deflection of {size:.3g} is more than the links can have'
         variances = np.diag(seen.covariance)[self._rows]
-        if variances.min() <= 0.0:
+        if variances.min() < LEAST_SD**2:
             return 'the deflection does not say how certain it is'
         if math.sqrt(variances.max()) > settings.max_sd:
             return f'the deflection is uncertain by more than {settings.max_sd:g}'
         if abs(seen.age) > settings.stale:
             what = 'is older than' if seen.age > 0.0 else 'has a stamp ahead of our clock by more than'
             return f'the deflection {what} {settings.stale:g} s'
-        if self._joints is None or now - self._joints_t > settings.stale:
+        if self._joints is None:
             return 'the positions of the joints are not known'
-        if self.waits:
-            return 'the controller has not told the offsets that it applies'
+        if now - self._joints_t > settings.stale:
+            return f'no positions of the joints for {settings.stale:g} s'
         return self._stop or self._broken
 
     def _hold(self, fault: str) -> None:
@@ -389,10 +482,7 @@ class Compensator:
         settings, rows = self.settings, self._rows
         wanted = self.arm.pose(nominal)
         error = _vector(wanted.inverse() @ self.arm.pose(nominal + self._offsets) @ deflection)[rows]
-        measured = error
-        if not self._dry and self._joints is not None:
-            measured = _vector(wanted.inverse() @ self.arm.pose(self._joints) @ deflection)[rows]
-        self._residual = float(np.linalg.norm(measured))
+        self._residual = float(np.linalg.norm(self._measured_error(wanted, deflection, error)))
         jacobian = self.arm.jacobian(nominal + self._offsets)
         in_wanted = np.vstack([wanted.rotation.T @ jacobian[:3], wanted.rotation.T @ jacobian[3:]])[rows]
         square = in_wanted.T @ in_wanted + settings.damping**2 * np.eye(len(self._offsets))
@@ -403,6 +493,14 @@ class Compensator:
         self._wanted = np.clip(self._offsets + step, low, high)
         beyond = np.abs(self._offsets + step - self._wanted).max() > 1e-12
         self._limited = bool(beyond or np.abs(step).max() > settings.max_rate * elapsed * (1.0 + 1e-9))
+
+    def _measured_error(self, wanted: Transform, deflection: Transform, error: FloatArray) -> FloatArray:
+        """The difference with the joints where they were measured; not known if nobody tells what is applied."""
+        if self._dry or self._joints is None:
+            return error
+        if not self._sums and self._applied is None:
+            return np.full(1, math.nan)
+        return _vector(wanted.inverse() @ self.arm.pose(self._joints) @ deflection)[self._rows]
 
 
 def _vector(pose: Transform) -> FloatArray:

@@ -6,7 +6,8 @@ motion, begun at the shaper's times. It has a point wherever one of them has one
 exactly. All weights are positive with the sum 1: positions, velocities and accelerations stay within the bounds of
 what was given.
 
-A trajectory that replaces one under way goes on from it: what is shaped is the whole history of the command.
+A trajectory that replaces one under way goes on from it: what is shaped is the whole history of the command. So that
+it makes no step, whoever follows it must begin when we did: :func:`start_of`.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ AT_REST = 1e-6
 """Velocity below which a trajectory ends at rest, rad/s or m/s."""
 PARTS = 8
 """Parts of each piece of a trajectory whose ends are held against the limits."""
+OLDEST_S = 1.0
+"""A trajectory whose start is longer ago than this is refused."""
 QUANTITIES = ('positions', 'velocities', 'accelerations')
 
 
@@ -140,6 +143,17 @@ def checked(names: Sequence[str], times: Sequence[float], points: Sequence[Seque
     return Trajectory(tuple(names), at, states)
 
 
+def start_of(now_ns: int, stamp_ns: int, lead: float) -> int:
+    """When a trajectory with this stamp (0: at once) begins, ns: not before it has arrived, which takes ``lead`` s.
+
+    One that began earlier than it arrived would begin in its middle. Raises ConfigError if its stamp is too old.
+    """
+    ago = (now_ns - stamp_ns) / 1e9
+    if stamp_ns and ago > OLDEST_S:
+        raise ConfigError(f'its stamp is {ago:.3g} s old, must be at most {OLDEST_S:g} s (or 0, for at once)')
+    return max(stamp_ns, now_ns + round(1e9 * lead))
+
+
 class _Piece(NamedTuple):
     """A trajectory that was commanded from ``start_ns`` on, until the next piece."""
 
@@ -150,7 +164,8 @@ class _Piece(NamedTuple):
 class TrajectoryShaper:
     """``max_step``: a trajectory may begin so far from where the joints are, or are commanded, rad or m.
 
-    ``limits``: of joints by name; what is given must be within them. Owns no clock; for one thread.
+    ``limits``: of joints by name; what is given must be within them, and other joints are refused. Owns no clock; for
+    one thread.
     """
 
     def __init__(self, shaper: Shaper, limits: Mapping[str, JointLimits] | None = None, max_step: float = 0.05) -> None:
@@ -171,7 +186,7 @@ class TrajectoryShaper:
         return (t_ns - start_ns) / 1e9 < path.duration + self.shaper.duration
 
     def shape(self, start_ns: int, given: Trajectory, measured: Mapping[str, float]) -> Trajectory:
-        """``given`` shaped, both from ``start_ns`` on. ``measured``: positions of joints, as far as they are known.
+        """``given`` shaped, both from ``start_ns`` on. ``measured``: positions of joints; one that moves must be known.
 
         A trajectory without a point at 0 begins where the one before it is, or at the measured positions.
         Raises ConfigError with the reason; then nothing has changed.
@@ -195,34 +210,37 @@ class TrajectoryShaper:
         self, start_ns: int, given: Trajectory, pieces: Sequence[_Piece], measured: Mapping[str, float]
     ) -> Trajectory:
         """``given`` with a point at 0. Raises ConfigError if it begins elsewhere than the joints are."""
-        known = all(name in measured for name in given.names)
         here = np.zeros_like(given.states[:1])
         if pieces:
             here[0] = _state(pieces, start_ns, np.zeros(1), given.states.shape[1])[0]
-        elif known:
+        else:
+            missing = next((name for name in given.names if name not in measured), None)
+            if missing is not None:
+                raise ConfigError(f'the position of {missing} is not known')
             here[0, 0] = [measured[name] for name in given.names]
         if given.times[0] > 0.0:
-            if not pieces and not known:
-                missing = next(name for name in given.names if name not in measured)
-                raise ConfigError(f'it has no point at 0 s, and the position of {missing} is not known')
             return Trajectory(given.names, np.append(0.0, given.times), np.concatenate([here, given.states]))
-        if pieces or known:
-            away = np.abs(given.states[0, 0] - here[0, 0])
-            joint = int(away.argmax())
-            if away[joint] > self.max_step:
-                where = 'is commanded' if pieces else 'is'
-                raise ConfigError(
-                    f'it begins {away[joint]:.3g} rad or m from where {given.names[joint]} {where}, '
-                    f'must be at most {self.max_step:g}'
-                )
+        away = np.abs(given.states[0, 0] - here[0, 0])
+        joint = int(away.argmax())
+        if away[joint] > self.max_step:
+            where = 'is commanded' if pieces else 'is'
+            raise ConfigError(
+                f'it begins {away[joint]:.3g} rad or m from where {given.names[joint]} {where}, '
+                f'must be at most {self.max_step:g}'
+            )
+        if pieces and len(given.times) > 1:
+            # Its own first point would be a step, if a small one.
+            return Trajectory(given.names, given.times, np.concatenate([here, given.states[1:]]))
         return given
 
     def _check_limits(self, given: Trajectory) -> None:
         low, high, speed = given.fastest()
         for j, name in enumerate(given.names):
+            if not self._limits:
+                return
             limits = self._limits.get(name)
             if limits is None:
-                continue
+                raise ConfigError(f'{name}: the URDF file has no joint of that name that moves')
             for value, bound, word in ((low[j], limits.lower, 'least'), (high[j], limits.upper, 'most')):
                 if (value < bound - AT_REST) if word == 'least' else (value > bound + AT_REST):
                     raise ConfigError(f'{name} goes to {value:.4g}, must be at {word} {bound:g} rad or m')

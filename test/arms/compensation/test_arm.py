@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.arms.chains.chain_file import read_chain
-from psd_deflection.arms.compensation.arm import read_arm
+from psd_deflection.arms.compensation.arm import read_arm, read_limits
 from psd_deflection.base.errors import ConfigError
 
 URDF = Path(__file__).parents[3] / 'config' / 'two_links.urdf'
@@ -60,6 +60,10 @@ def test_the_jacobian_is_the_derivative(tmp_path: Path, base: str) -> None:
         ('xyz="1 2 3"', 'xyz="1 2 nan"', "joint slide: xyz = '1 2 nan': must be 3 finite numbers"),
         ('lower="-1"', 'lower="2"', 'joint turn: lower = 2 is above upper = 1'),
         ('lower="-1"', 'lower="low"', "joint turn: lower = 'low': must be 1 finite number"),
+        ('lower="-1"', 'lower="-1_0"', "joint turn: lower = '-1_0': must be 1 finite number"),
+        ('upper="0.2"', 'upper="٣"', 'joint slide: upper'),
+        ('lower="-1"', 'lower="-1 0"', 'must be 1 finite number'),
+        ('name="end"', 'name="turn"', 'joint turn: there are two of that name'),
         ('<child link="b"/>', '', 'no joints lead from a to d'),
     ],
 )
@@ -70,6 +74,15 @@ def test_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
         read_arm(path, 'd', 'a')
     assert str(caught.value).startswith(str(path))
     assert message in str(caught.value)
+
+
+def test_a_negative_speed_is_no_limit(tmp_path: Path) -> None:
+    path = tmp_path / 'arm.urdf'
+    path.write_text(WRIST.replace('lower="-1"', 'velocity="-1" lower="-1"'))
+    with pytest.raises(ConfigError, match='joint turn: velocity = -1: must be at least 0'):
+        read_limits(path)
+    path.write_text(WRIST.replace('lower="-1"', 'velocity="1.5e0" lower="-1"'))
+    assert read_limits(path)['turn'].speed == 1.5
 
 
 def test_a_tip_that_does_not_move(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.simulated_arm import SimulatedArm
+from bench.steps import largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, shift
 from psd_deflection.arms.compensation.arm import Arm, read_arm
@@ -33,10 +34,15 @@ def arm() -> Arm:
 
 
 class Loop:
-    """A compensator that sees a simulated arm through estimates of noise; ``commands`` is what it said."""
+    """A compensator that sees a simulated arm through estimates of noise; ``offsets`` are those the controller has.
+
+    ``tells``: the controller tells them. ``sent``: when what was sent.
+    """
 
     def __init__(self, arm: Arm, dry: bool = False, **chosen: float) -> None:
         given: dict[str, Any] = {'takeover': False, **chosen}
+        self.tells = bool(given['takeover'])
+        self.sent: list[tuple[float, FloatArray]] = []
         self.compensator = Compensator(arm, CompensatorSettings(axes=('x', 'z'), **given), dry)
         self.plant = SimulatedArm(read_chain(EXAMPLE).chain, ELBOW, damping=0.1)
         self.offsets = np.zeros(2)
@@ -50,12 +56,26 @@ class Loop:
             self.t += PERIOD
             self.plant.step(wanted + (0.0 if self.dry else self.offsets), PERIOD)
             self.compensator.joints(self.t, self.plant.angles)
+            if self.tells:
+                self.compensator.applied(self.t, self.offsets)
             at = self.plant.end().deflection
             noisy = Transform(at.rotation, at.position + self.noise.normal(size=3) * 1e-6)
             self.compensator.observe(self.t, Observed(self.t, noisy, CERTAIN))
-            command = self.compensator.watch(self.t)
-            self.offsets = command.offsets
+            command = self.send(self.t)
         return command
+
+    def send(self, now: float) -> Command:
+        """What the compensator says at a time; the controller takes it, if it is to."""
+        command = self.compensator.watch(now)
+        if command.sends:
+            self.compensator.sent(now, command)
+            self.offsets = command.offsets
+            self.sent.append((now, command.offsets if command.positions is None else command.positions))
+        return command
+
+    def step(self) -> float:
+        """The largest step over what the rate allows."""
+        return largest_step([t for t, _ in self.sent], [v for _, v in self.sent], self.compensator.settings.max_rate)
 
     def error(self, wanted: FloatArray = ELBOW) -> float:
         """Distance of the end effector from where it would be if no link bent."""
@@ -126,6 +146,15 @@ def following(arm: Arm) -> Loop:
     return loop
 
 
+def telling(arm: Arm) -> Loop:
+    """The same with a controller that tells the offsets that it applies."""
+    loop = Loop(arm, takeover=True)
+    loop.plant.force = PAYLOAD
+    loop.compensator.enable(True)
+    assert loop.run(1.6).state is State.FOLLOWING
+    return loop
+
+
 def seen(loop: Loop, **changed: object) -> Observed:
     return Observed(loop.t, loop.plant.end().deflection, CERTAIN)._replace(**changed)  # type: ignore[arg-type]
 
@@ -141,6 +170,7 @@ NAN = shift(math.nan, 0.0, 0.0)
         ({'covariance': np.eye(6) * 1e-4}, 'uncertain by more than 0.001'),
         ({'covariance': -np.eye(6)}, 'does not say how certain'),
         ({'covariance': np.zeros((6, 6))}, 'does not say how certain'),
+        ({'covariance': np.eye(6) * 5e-324}, 'does not say how certain'),
         ({'deflection': shift(0.0, 0.5, 0.0)}, 'a deflection of 0.5 is more than the links can have'),
         ({'deflection': shift(1e308, 0.0, 0.0)}, 'more than the links can have'),
         ({'age': 0.2}, 'older than 0.08 s'),
@@ -257,6 +287,76 @@ def test_joints_that_leap_hold_the_offsets(arm: Arm) -> None:
     assert np.array_equal(command.offsets, before)
 
 
+def test_two_nodes_that_tell_different_joints_hold_the_offsets(arm: Arm) -> None:
+    loop = following(arm)
+    before = loop.offsets
+    for n in range(1, 10):
+        now = loop.t + PERIOD * n
+        loop.compensator.joints(now, loop.plant.angles + (0.05 if n % 2 else 0.0))
+        loop.compensator.observe(now, seen(loop, t=now))
+        command = loop.send(now)
+    assert 'go to and fro by 0.05' in command.why
+    assert np.array_equal(command.offsets[1:], before[1:]) or loop.step() <= 1.0
+
+
+@pytest.mark.parametrize('step', [3600.0, -3600.0])
+def test_a_clock_that_is_set_holds_the_offsets_for_some_estimates_only(arm: Arm, step: float) -> None:
+    """That of the estimator and ours: the stamps change, and their ages do not."""
+    loop = following(arm)
+    before = loop.offsets
+    states = set()
+    for n in range(1, 60):
+        now = loop.t + PERIOD * n
+        loop.compensator.joints(now, loop.plant.angles)
+        loop.compensator.observe(now, seen(loop, t=now + step))
+        command = loop.send(now)
+        states.add(command.state)
+        assert n > 20 or step > 0.0 or np.array_equal(command.offsets, before)
+    assert command.state is State.FOLLOWING
+    assert (State.HOLDING in states) == (step < 0.0)
+    assert loop.step() <= 1.0 + 1e-9
+
+
+def test_positions_that_were_old_when_they_came_are_not_new(arm: Arm) -> None:
+    loop = following(arm)
+    loop.compensator.joints(loop.t, loop.plant.angles, age=0.07)
+    loop.compensator.observe(loop.t + PERIOD, seen(loop, t=loop.t + PERIOD))
+    assert loop.send(loop.t + PERIOD).why == 'no positions of the joints for 0.08 s'
+
+
+def test_offsets_that_are_held_for_long_go_back_to_zero(arm: Arm) -> None:
+    loop = following(arm)
+    held = np.abs(loop.offsets).max()
+    began, now = loop.t, loop.t
+    command = loop.send(now)
+    while command.state is not State.OFF:
+        now += 0.01
+        command = loop.send(now)
+    assert now - began == pytest.approx(0.08 + 10.0 + held / 0.1, abs=0.2)
+    assert not loop.offsets.any()
+    assert not loop.compensator.enabled
+    assert loop.step() <= 1.0 + 1e-9
+
+
+def test_offsets_of_an_arm_that_stands_stay_however_long_it_does(arm: Arm) -> None:
+    """If they went back meanwhile, it would leap by all of them when it runs again."""
+    loop = following(arm)
+    held = loop.offsets
+    loop.compensator.stop('the robot does not run')
+    assert loop.run(30.0).state is State.HOLDING
+    assert np.array_equal(loop.offsets, held)
+
+
+def test_time_counts_from_when_the_last_one_was_sent(arm: Arm) -> None:
+    """One that leaves late is followed by a small step."""
+    loop = following(arm)
+    loop.compensator.enable(False)
+    first = loop.compensator.watch(loop.t + 0.01)
+    loop.compensator.sent(loop.t + 0.05, first)
+    second = loop.compensator.watch(loop.t + 0.06)
+    assert np.abs(second.offsets - first.offsets).max() == pytest.approx(0.1 * 0.01)
+
+
 def test_an_arm_that_stands_still_is_not_asked_for_more(arm: Arm) -> None:
     """A protective stop: the offsets hold after ``follow_error``, and stay so until they are enabled again."""
     loop = following(arm)
@@ -279,61 +379,107 @@ def test_an_arm_that_stands_still_is_not_asked_for_more(arm: Arm) -> None:
 
 
 def test_what_the_controller_applies_is_where_it_begins(arm: Arm) -> None:
-    """After a restart: the controller still has the offsets of before."""
+    """After a kill and a restart the controller still has the offsets of before, and nobody enabled the new one."""
     loop = following(arm)
-    applied = loop.offsets.copy()
+    killed = loop.offsets.copy()
     loop.compensator = again = Compensator(arm, CompensatorSettings(axes=('x', 'z')))
     again.enable(True)
-    assert loop.run(0.6).why == 'the controller has not told the offsets that it applies'
-    assert again.waits
+    assert loop.run(0.6).why == 'the controller does not tell the offsets that it applies'
     again.enable(False)
-    loop.offsets = applied.copy()
-    again.applied(applied)
-    # Nobody has enabled it, so it is silent, whatever the controller has.
-    assert again.watch(loop.t).state is State.OFF
+    loop.tells, count = True, len(loop.sent)
+    assert loop.run(0.6).state is State.OFF
+    assert len(loop.sent) == count
     again.enable(True)
-    assert np.array_equal(again.watch(loop.t).offsets, applied)
-    for _ in range(60):
-        again.applied(loop.offsets)
-        before = loop.offsets
-        command = loop.run(PERIOD)
-        assert np.abs(command.offsets - before).max() <= 0.1 * PERIOD * 1.001
+    command = loop.run(1.2)
+    assert np.array_equal(loop.sent[count][1], killed)
+    assert loop.step() <= 1.0 + 1e-9
     assert command.state is State.FOLLOWING
-    assert command.offsets == pytest.approx(applied, abs=1e-3)
-    # It applies something else: nobody knows why, so the offsets hold.
-    for _ in range(30):
-        again.applied(np.zeros(2))
-        command = loop.run(PERIOD)
-    assert command.state is State.HOLDING
-    assert 'from what it was sent' in command.why
+    assert command.offsets == pytest.approx(killed, abs=1e-3)
+    assert loop.error() == pytest.approx(command.residual, abs=1e-4)
+
+
+def test_a_controller_that_applies_something_else_is_not_sent_more(arm: Arm) -> None:
+    loop = telling(arm)
+    before = loop.offsets
+    for n in range(1, 30):
+        loop.compensator.joints(loop.t + PERIOD * n, loop.plant.angles)
+        loop.compensator.applied(loop.t + PERIOD * n, before + 0.02)
+        loop.compensator.observe(loop.t + PERIOD * n, seen(loop, t=loop.t + PERIOD * n))
+        command = loop.send(loop.t + PERIOD * n)
+        assert command.state is State.HOLDING
+    assert 'is 0.02 from what it was sent' in command.why
+    assert not command.sends
+    assert math.isnan(command.residual)
+    # To go on is a decision of a person; it goes on from where the controller is, when the rate allows for that.
+    loop.t, loop.offsets = loop.t + PERIOD * 30, before + 0.02
+    assert loop.run(1.0).why == command.why
+    loop.compensator.enable(True)
+    assert loop.run(1.0).state is State.FOLLOWING
+    assert loop.step() <= 1.0 + 1e-9
+
+
+def test_a_controller_that_starts_again_without_offsets_is_sent_no_step(arm: Arm) -> None:
+    """It ends, so nothing is sent. It comes back with none, and is led from there to those that are needed."""
+    loop = telling(arm)
+    needed = loop.offsets
+    loop.tells = False
+    assert loop.run(0.1).why == 'the controller does not tell the offsets that it applies'
+    count = len(loop.sent)
+    loop.run(0.2)
+    assert len(loop.sent) == count
+    loop.tells, loop.offsets = True, np.zeros(2)
+    loop.run(2.0)
+    assert not loop.sent[count][1].any()
+    assert loop.offsets == pytest.approx(needed, abs=1e-3)
+    assert loop.step() <= 1.0 + 1e-9
+
+
+def test_offsets_of_the_controller_that_cannot_be_ours_are_not_taken_over(arm: Arm) -> None:
+    loop = Loop(arm, takeover=True)
+    loop.offsets = np.array([0.0, 3.0])
+    loop.compensator.enable(True)
+    assert loop.run(1.0).why == 'the controller applies 3 at elbow: beyond max_offset'
+    assert not loop.sent
+
+
+def test_without_word_of_what_is_applied_the_residual_is_not_known(arm: Arm) -> None:
+    assert math.isnan(following(arm).run(0.2).residual)
 
 
 def test_with_commands_the_arm_keeps_the_pose_that_it_had(arm: Arm) -> None:
     loop = Loop(arm, output='commands')  # type: ignore[arg-type]
     compensator = loop.compensator
     loop.plant.force = PAYLOAD
-    loop.run(0.2)
-    assert compensator.commands() is None
+    assert loop.run(0.2).positions is None
     compensator.enable(True)
-    asked = ELBOW
-    for _ in range(100):
-        before = asked
-        command = loop.run(PERIOD)
-        commanded = compensator.commands()
-        assert commanded is not None
-        asked = commanded
-        assert np.abs(asked - before).max() <= 0.1 * PERIOD * 1.001
+    command = loop.run(2.0)
+    assert command.positions is not None
     assert command.state is State.FOLLOWING
     assert command.residual < 1e-4
-    assert asked == pytest.approx(ELBOW + command.offsets, abs=1e-9)
-    # The arm stops: it is seen at once that the joints are elsewhere.
-    stopped = loop.plant.angles + 0.03
-    for n in range(40):
-        compensator.joints(loop.t + PERIOD * n, stopped)
-        compensator.observe(loop.t + PERIOD * n, Observed(loop.t + PERIOD * n, loop.plant.end().deflection, CERTAIN))
-        command = compensator.watch(loop.t + PERIOD * n)
+    assert command.positions == pytest.approx(ELBOW + command.offsets, abs=1e-9)
+    assert loop.step() <= 1.0 + 1e-9
+
+
+def test_with_commands_an_arm_that_stops_holds_and_one_that_was_moved_is_left_alone(arm: Arm) -> None:
+    """Commands of before would move it back at once when its controller runs again."""
+    loop = Loop(arm, output='commands')  # type: ignore[arg-type]
+    loop.plant.force = PAYLOAD
+    loop.compensator.enable(True)
+    before = loop.run(1.0).offsets
+    stopped, start = loop.plant.angles + 0.03, loop.t
+    for n in range(1, 40):
+        loop.t = start + PERIOD * n
+        loop.compensator.joints(loop.t, stopped)
+        loop.compensator.observe(loop.t, seen(loop, t=loop.t))
+        command = loop.send(loop.t)
+        # At once, and not when it has asked for much more.
+        assert np.array_equal(command.offsets, before) or not command.sends
     assert command.state is State.HOLDING
     assert 'is 0.03 from what it was sent' in command.why
+    assert not command.sends
+    loop.compensator.enable(False)
+    assert loop.send(loop.t + PERIOD).state is State.OFF
+    assert loop.step() <= 1.0 + 1e-9
 
 
 @pytest.mark.parametrize('why', ['the robot does not run', 'another node publishes /compensator/offsets'])
@@ -360,22 +506,27 @@ EVENT = st.one_of(
     st.tuples(st.just('enable'), st.booleans()),
     st.tuples(st.just('stop'), st.sampled_from(['', 'the robot does not run'])),
     st.tuples(st.just('pause'), st.floats(-1.0, 5.0)),
+    st.tuples(st.just('clock'), st.floats(-1e5, 1e5)),
+    st.tuples(st.just('late'), st.floats(0.0, 0.5)),
 )
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.lists(EVENT, max_size=30), st.sampled_from(['offsets', 'commands']))
-def test_whatever_comes_no_step_is_larger_than_the_rate_allows(events: list[tuple[str, Any]], output: str) -> None:
+@given(st.lists(EVENT, max_size=30), st.sampled_from(['offsets', 'commands']), st.booleans())
+def test_whatever_comes_no_step_is_larger_than_the_rate_allows(
+    events: list[tuple[str, Any]], output: str, takeover: bool
+) -> None:
     arm = read_arm(EXAMPLE.with_suffix('.urdf'), 'tool')
-    good = CompensatorSettings(axes=('x', 'z'), output=output, good=2)
+    good = CompensatorSettings(axes=('x', 'z'), output=output, good=2, takeover=takeover)
     compensator = Compensator(arm, good)
     compensator.enable(True)
-    now, sent, began = 0.0, None, False
+    now, clock, has = 0.0, 0.0, np.zeros(2)
+    sent: list[tuple[float, FloatArray]] = []
     good_ones: list[tuple[str, Any]] = [('good', None)] * 3
     for kind, value in [one for event in events for one in (event, *good_ones)]:
-        then = now
         now += 0.02
-        age, covariance, deflection, joints = 0.0, CERTAIN, shift(1e-3, 0.0, 2e-3), ELBOW
+        late = 0.0
+        age, covariance, deflection, joints, applied = 0.0, CERTAIN, shift(1e-3, 0.0, 2e-3), ELBOW, has
         with np.errstate(over='ignore', invalid='ignore'):
             if kind == 'enable':
                 compensator.enable(value)
@@ -383,8 +534,12 @@ def test_whatever_comes_no_step_is_larger_than_the_rate_allows(events: list[tupl
                 compensator.stop(value)
             elif kind == 'pause':
                 now += max(value, 0.0)
+            elif kind == 'clock':
+                clock += value
+            elif kind == 'late':
+                late = value
             elif kind == 'applied':
-                compensator.applied(np.array(value))
+                applied = has = np.array(value)
             elif kind == 'joints':
                 joints = np.array(value)
             elif kind == 'deflection':
@@ -394,11 +549,12 @@ def test_whatever_comes_no_step_is_larger_than_the_rate_allows(events: list[tupl
             elif kind == 'age':
                 age = value
             compensator.joints(now, joints)
-            compensator.observe(now, Observed(now, deflection, covariance, age))
+            compensator.applied(now, applied)
+            compensator.observe(now, Observed(now + clock, deflection, covariance, age))
             command = compensator.watch(now)
-        assert np.all(np.isfinite(command.offsets))
-        # Silent, it may be told where the controller is.
-        if sent is not None and began:
-            assert np.abs(command.offsets - sent).max() <= 0.1 * (now - then) * (1.0 + 1e-9)
-        began = command.state is not State.OFF and not compensator.waits
-        sent = command.offsets
+        if command.sends:
+            has = command.offsets
+            now += late
+            sent.append((now, has if command.positions is None else command.positions))
+            compensator.sent(now, command)
+    assert largest_step([t for t, _ in sent], [v for _, v in sent], 0.1) <= 1.0 + 1e-6

@@ -1,0 +1,226 @@
+"""The shaper's part of :mod:`bench.campaign.hold`: what it does when something goes wrong, over real DDS.
+
+The shaper moves a stand-in of joint_trajectory_controller by trajectories that replace each other. A fault comes while
+one is under way: the shaper must refuse it, or go on without a step. Judged is the largest step of the command, sampled
+500 times a second, over what the fastest trajectory that was given allows.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import rclpy
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from sensor_msgs.msg import JointState
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from bench.steps import largest_step
+from bench.trajectory_controller import TrajectoryController
+from psd_deflection.arms.compensation.trajectory import Trajectory, checked
+from psd_deflection.records import FloatArray
+from tools.program import PSD_DEFLECTION, Program
+
+NAMES = ('shoulder', 'elbow')
+MOVE_S = 0.6
+LARGEST = 0.4
+"""Of a joint, rad."""
+FASTEST = 1.5 * 2.0 * LARGEST / (MOVE_S - 0.1)
+"""Of a cubic from one end to the other within the time that is left of it, rad/s."""
+STEP_S = 0.002
+LONGEST_S = 60.0
+
+Change = Callable[[Any], None]
+
+
+def _nan(message: Any) -> None:
+    message.points[-1].positions = [math.nan, 0.0]
+
+
+def _huge(message: Any) -> None:
+    message.points[-1].positions = [1e300, 0.0]
+
+
+def _before_1970(message: Any) -> None:
+    message.header.stamp.sec = -1
+
+
+def _old(message: Any) -> None:
+    message.header.stamp.sec = 1
+
+
+def _unknown(message: Any) -> None:
+    message.joint_names = ['shoulder', 'z']
+
+
+def _leap(message: Any) -> None:
+    message.points.insert(0, JointTrajectoryPoint(positions=[3.0, 0.0], velocities=[0.0, 0.0]))
+
+
+def _backwards(message: Any) -> None:
+    message.points.append(copy.deepcopy(message.points[0]))
+
+
+def _efforts(message: Any) -> None:
+    message.points[-1].effort = [1.0, 0.0]
+
+
+def _in_motion(message: Any) -> None:
+    message.points[-1].velocities = [1.0, 0.0]
+
+
+REFUSED: dict[str, Change] = {
+    'not finite': _nan,
+    '1e300': _huge,
+    'before 1970': _before_1970,
+    'old stamp': _old,
+    'unknown joint': _unknown,
+    'begins elsewhere': _leap,
+    'times that fall': _backwards,
+    'efforts': _efforts,
+    'ends in motion': _in_motion,
+}
+"""What is sent while a trajectory is under way, and must change nothing."""
+OTHERS = ('replaced again and again', 'joints not told', 'killed and started again', 'stopped for 0.2 s')
+
+
+class Moved:
+    """The graph: the shaper, and what it moves."""
+
+    def __init__(self) -> None:
+        rclpy.init()
+        self.node = rclpy.create_node('moved')
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
+        self.controller = TrajectoryController(np.zeros(2))
+        self.tells = True
+        self.heard = 0
+        self.stamps: list[float] = []
+        self.commands: list[FloatArray] = []
+        self._rng = np.random.default_rng(2)
+        self._joints = self.node.create_publisher(JointState, '/joint_states', 5)
+        self.given = self.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
+        self.node.create_subscription(JointTrajectory, '/shaper/shaped', self._arrived, 5)
+        self.node.create_timer(STEP_S, self._step)
+        self.shaper = self.started()
+
+    def started(self) -> Program:
+        """The shaper, when it is known on the graph."""
+        out = Program([*PSD_DEFLECTION, 'shaper', '--frequency', '12', '--shaper', 'zvd'])
+        out.until('publishing /shaper/shaped')
+        return out
+
+    def _arrived(self, message: Any) -> None:
+        self.heard += 1
+        if not message.points:
+            return
+        times = [p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points]
+        points = [[p.positions, p.velocities, p.accelerations] for p in message.points]
+        stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
+        order = [list(message.joint_names).index(name) for name in NAMES]
+        path = checked(message.joint_names, times, points)
+        path = Trajectory(NAMES, path.times, path.states[:, :, order])
+        self.controller.arrive(time.time(), stamp, path)
+
+    def _step(self) -> None:
+        now = time.time()
+        self.stamps.append(now)
+        self.commands.append(self.controller.state(now)[0])
+        if self.tells and len(self.stamps) % 5 == 0:
+            self._joints.publish(JointState(name=list(NAMES), position=self.commands[-1].tolist()))
+
+    def spin(self, seconds: float, condition: Callable[[], bool] = lambda: False, what: str = '') -> None:
+        """Spin until ``condition``, or for ``seconds``; then it is an error if there is a ``what``."""
+        until = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > until:
+                if what:
+                    raise RuntimeError(f'waited {seconds:g} s for {what}\n{self.shaper.text[-1000:]}')
+                return
+            self.executor.spin_once(timeout_sec=STEP_S)
+
+    def move(self, change: Change = lambda message: None) -> None:
+        """Give a trajectory to somewhere else, changed."""
+        end = self._rng.uniform(-LARGEST, LARGEST, 2).tolist()
+        at = Duration(seconds=MOVE_S).to_msg()
+        point = JointTrajectoryPoint(positions=end, velocities=[0.0, 0.0], time_from_start=at)
+        message = JointTrajectory(joint_names=list(NAMES), points=[point])
+        change(message)
+        self.given.publish(message)
+
+    def under_way(self) -> None:
+        """Give trajectories until one is under way."""
+        heard = self.heard
+        until = time.monotonic() + LONGEST_S
+        while self.heard == heard and time.monotonic() < until:
+            self.move()
+            self.spin(0.5, lambda: self.heard > heard)
+        self.spin(0.3)
+
+    def inject(self, name: str) -> None:
+        """One fault while a trajectory is under way."""
+        self.under_way()
+        heard = self.heard
+        if name in REFUSED:
+            self.move(REFUSED[name])
+            self.spin(0.2)
+            if self.heard != heard:
+                raise RuntimeError(f'{name}: was not refused')
+        elif name == 'replaced again and again':
+            for _ in range(5):
+                self.move()
+                self.spin(float(self._rng.uniform(0.02, 0.2)))
+        elif name == 'joints not told':
+            self.tells = False
+            self.spin(1.5)
+            self.move()
+            self.spin(0.3)
+            self.tells = True
+            if self.heard != heard:
+                raise RuntimeError(f'{name}: was not refused')
+        elif name == 'killed and started again':
+            self.shaper.process.kill()
+            self.shaper.wait()
+            self.shaper = self.started()
+            self.spin(1.0)
+        else:
+            self.shaper.process.send_signal(signal.SIGSTOP)
+            self.move()
+            self.spin(0.2)
+            self.shaper.process.send_signal(signal.SIGCONT)
+        self.under_way()
+        self.spin(1.5)
+
+    def close(self) -> None:
+        """End everything."""
+        self.shaper.end()
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def shaper_faults(times: int) -> float:
+    """Inject each of them so often, and print a line for each; the largest step over what is allowed."""
+    moved, worst = Moved(), 0.0
+    try:
+        for name in (*REFUSED, *OTHERS):
+            since = len(moved.stamps)
+            for _ in range(times):
+                moved.inject(name)
+            step = largest_step(moved.stamps[since:], moved.commands[since:], FASTEST)
+            worst = max(worst, step)
+            print(f'shaper: {name:26}{times:4} times: largest step {step:.3f} of speed * dt', flush=True)
+    finally:
+        moved.close()
+    return worst
+
+
+if __name__ == '__main__':
+    sys.exit(shaper_faults(1) > 1.0)

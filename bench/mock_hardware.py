@@ -1,0 +1,193 @@
+"""Compensator and shaper with the real controllers of ros2_control, on hardware that is mock_components/GenericSystem.
+
+  python3 -m bench.mock_hardware
+
+It wants ROS 2 from apt with ros-jazzy-ros2-control and ros-jazzy-ros2-controllers; the workflow has them. First the
+shaper moves the arm by joint_trajectory_controller, with trajectories that replace each other. Then the compensator
+drives forward_position_controller with sums, while a simulated arm bends. Judged are the steps of the joints.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import rclpy
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import String
+from std_srvs.srv import SetBool
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from bench.simulated_arm import SimulatedArm
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.records import FloatArray
+from tools.program import ROOT, Program
+
+HERE = ROOT / 'bench' / 'ros2_control'
+URDF = ROOT / 'config' / 'two_links.urdf'
+NAMES = ('shoulder', 'elbow')
+PERIOD_S = 0.02
+NOISE = 1e-6
+LONGEST_S = 60.0
+FASTEST = 4.0
+"""Bound of the shaped motion, rad/s: it goes at most 0.4 rad in 0.4 s, from a motion of as much."""
+STATES_S = 0.002
+"""Time between two messages of the joints."""
+
+
+class Arm:
+    """The arm on the graph: the mock's joints, with a deflection under a load. ``positions``: all joints that came."""
+
+    def __init__(self) -> None:
+        self.node = rclpy.create_node('mock_hardware')
+        self.bent = SimulatedArm(read_chain(ROOT / 'config' / 'two_links.yaml').chain, np.array([1.2, 0.6]))
+        self.bent.force = np.array([0.0, 0.0, -20.0])
+        self.positions: list[FloatArray] = []
+        self._noise = np.random.default_rng(0)
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._description = self.node.create_publisher(String, '/robot_description', latched)
+        text, hardware = URDF.read_text(), (HERE / 'hardware.xml').read_text()
+        self._description.publish(String(data=text.replace('</robot>', hardware + '</robot>')))
+        self._deflections = self.node.create_publisher(PoseWithCovarianceStamped, '/end_effector/deflection', 5)
+        self.given = self.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
+        self.node.create_subscription(JointState, '/joint_states', self._joints, 50)
+        self.node.create_timer(PERIOD_S, self._bend)
+
+    def _joints(self, message: Any) -> None:
+        at = dict(zip(message.name, message.position, strict=True))
+        if set(NAMES) <= at.keys():
+            self.positions.append(np.array([at[name] for name in NAMES]))
+
+    def _bend(self) -> None:
+        if not self.positions:
+            return
+        self.bent.angles = self.positions[-1].copy()
+        self.bent.settle()
+        deflection = self.bent.end().deflection
+        message = PoseWithCovarianceStamped()
+        message.header.frame_id = 'end_effector_rest'
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
+        place, turned = message.pose.pose.position, message.pose.pose.orientation
+        place.x, place.y, place.z = (deflection.position + self._noise.normal(size=3) * NOISE).tolist()
+        turned.x, turned.y, turned.z, turned.w = deflection.quaternion.tolist()
+        message.pose.covariance = (np.eye(6) * NOISE**2).ravel()
+        self._deflections.publish(message)
+
+    def error(self, rigid: FloatArray) -> float:
+        """Distance of the end effector from where it would be on a rigid arm with its joints at ``rigid``, m."""
+        wanted = self.bent.chain.rigid(rigid.tolist()).position
+        return float(np.linalg.norm(self.bent.end().deflected.position - wanted))
+
+    def step(self, since: int) -> float:
+        """The largest step of the joints from one message to the next, rad."""
+        return float(np.abs(np.diff(self.positions[since:], axis=0)).max())
+
+    def spin(self, seconds: float, condition: Callable[[], bool] = lambda: False, what: str = '') -> None:
+        """Spin until ``condition``, or for ``seconds``; then it is an error if there is a ``what``."""
+        until = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > until:
+                if what:
+                    raise SystemExit(f'waited {seconds:g} s for {what}')
+                return
+            rclpy.spin_once(self.node, timeout_sec=0.01)
+
+
+def run(*words: str) -> None:
+    """A command that must succeed."""
+    subprocess.run(words, check=True, timeout=LONGEST_S)
+
+
+def started(*words: str, until: str) -> Program:
+    """A program that has said ``until``."""
+    out = Program(list(words))
+    out.until(until)
+    return out
+
+
+def shaped(arm: Arm, programs: list[Program]) -> None:
+    """Trajectories that replace each other, through the shaper. SystemExit if the joints make a step."""
+    words = ['ros2', 'run', 'psd_deflection', 'shaper', '--frequency', '12', '--ros-args', '-r']
+    remap = '~/shaped:=/joint_trajectory_controller/joint_trajectory'
+    programs.append(started(*words, remap, until='publishing /joint_trajectory_controller/joint_trajectory'))
+    arm.spin(LONGEST_S, lambda: arm.given.get_subscription_count() > 0, 'the shaper')
+    since, chance = len(arm.positions), np.random.default_rng(1)
+    for _ in range(20):
+        end = np.array([1.2, 0.6]) + chance.uniform(-0.2, 0.2, 2)
+        at = Duration(nanoseconds=400_000_000).to_msg()
+        point = JointTrajectoryPoint(positions=end.tolist(), velocities=[0.0, 0.0], time_from_start=at)
+        arm.given.publish(JointTrajectory(joint_names=list(NAMES), points=[point]))
+        arm.spin(float(chance.uniform(0.1, 0.4)))
+    arm.spin(1.0)
+    moved, step = float(np.ptp(arm.positions[since:], axis=0).max()), arm.step(since)
+    print(f'shaper: the joints moved {moved:.3f} rad, the largest step is {step:.5f} rad')
+    # A message of the joints may be missed.
+    if moved < 0.05 or step > 5.0 * FASTEST * STATES_S:
+        raise SystemExit('shaper: a step, or no motion')
+
+
+def compensated(arm: Arm, programs: list[Program]) -> None:
+    """The arm keeps its pose under its load. SystemExit if it does not, or if a command makes a step."""
+    run(
+        'ros2',
+        'control',
+        'switch_controllers',
+        '--deactivate',
+        'joint_trajectory_controller',
+        '--activate',
+        'forward_position_controller',
+    )
+    words = ['urdf:=' + str(URDF), 'tip:=tool', 'axes:=x,z', 'drive:=true', 'output:=commands']
+    remap = 'commands:=/forward_position_controller/commands'
+    launch = ['ros2', 'launch', 'psd_deflection', 'compensator.launch.py']
+    programs.append(started(*launch, *words, remap, until='once it is enabled'))
+    arm.spin(0.5)
+    begun, since = arm.positions[-1], len(arm.positions)
+    before = arm.error(begun)
+    client = arm.node.create_client(SetBool, '/compensator/enable')
+    arm.spin(LONGEST_S, client.service_is_ready, 'the service')
+    answer = client.call_async(SetBool.Request(data=True))
+    arm.spin(LONGEST_S, answer.done, 'its answer')
+    arm.spin(LONGEST_S, lambda: arm.error(begun) < 0.05 * before, 'the rigid pose')
+    answer = client.call_async(SetBool.Request(data=False))
+    arm.spin(LONGEST_S, answer.done, 'its answer')
+    arm.spin(LONGEST_S, lambda: bool(np.abs(arm.positions[-1] - begun).max() < 1e-4), 'no offset')
+    step = arm.step(since)
+    print(f'compensator: {before * 1e3:.2f} mm without; the largest step of the joints is {step:.5f} rad')
+    # 0.1 rad/s and 10 ms; two commands may come within one cycle of a busy machine.
+    if step > 5.0 * 0.1 * 0.01:
+        raise SystemExit('compensator: a step')
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Start it all, judge, end it."""
+    rclpy.init(args=argv)
+    arm, programs = Arm(), list[Program]()
+    try:
+        control = ['ros2', 'run', 'controller_manager', 'ros2_control_node', '--ros-args', '--params-file']
+        described = '~/robot_description:=/robot_description'
+        programs.append(Program([*control, str(HERE / 'controllers.yaml'), '-r', described]))
+        spawn = ['ros2', 'run', 'controller_manager', 'spawner']
+        run(*spawn, 'joint_state_broadcaster', 'joint_trajectory_controller')
+        run(*spawn, '--inactive', 'forward_position_controller')
+        arm.spin(LONGEST_S, lambda: len(arm.positions) > 100, 'the joints')
+        shaped(arm, programs)
+        compensated(arm, programs)
+    finally:
+        for one in reversed(programs):
+            one.end()
+            print(*one.lines[-20:], sep='\n')
+        arm.node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
