@@ -4,6 +4,7 @@
 # make test     set-up, then lint, types, import contracts and every test
 # make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
 # make faults   a campaign of faults against the real node, each FAULT_TIMES=20 times (about 20 minutes)
+# make nodes    what every ROS node does alike: a table of check and node (five minutes)
 # make crash    kill -9 at 200 random instants while recording (about 8 minutes)
 # make fuzz     coverage-guided fuzzing of all that reads strangers' bytes, FUZZ_SECONDS=600 each; 10^7 damaged frames; 10^6 HELLOs; 10^6 messages to what moves
 # make soak     SOAK_MINUTES=30 in real time, then SOAK_HOURS=24 of simulated time (a quarter of an hour on an idle core)
@@ -59,7 +60,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -121,6 +122,11 @@ bench: $(READY)
 	$(BIN)/python -m bench.page
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
 	$(BIN)/python bench/accuracy.py $(BENCH_ACCURACY)
+
+# Words for pytest, e.g. NODES='-k camera' for one node.
+NODES ?=
+nodes: $(READY)
+	$(BIN)/python -m tools.nodes $(NODES)
 
 FAULT_TIMES ?= 20
 FAULTS ?=

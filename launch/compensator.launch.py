@@ -12,7 +12,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 ARGUMENTS: dict[str, str] = {
-    'urdf': 'kinematics of the arm',
+    'urdf': 'kinematics of the arm (empty: the topic robot_description)',
     'tip': 'link of the end effector',
     'base': 'link from which on joints count (empty: the root)',
     'axes': "axes of the end effector's pose that are corrected, of x,y,z,rx,ry,rz (empty: x,y,z)",
@@ -52,7 +52,7 @@ def generate_launch_description() -> LaunchDescription:
 def compensator(context: LaunchContext) -> list[Node]:
     """The node, with the arguments that were given."""
     given = {name: LaunchConfiguration(name).perform(context) for name in (*ARGUMENTS, 'drive', 'params_file')}
-    arguments = [given['urdf']]
+    arguments = [given['urdf']] if given['urdf'] else []
     for name in ARGUMENTS:
         if name != 'urdf' and given[name]:
             arguments += ['--' + name.replace('_', '-'), given[name]]

@@ -14,11 +14,12 @@ However the node ends or is deactivated, also by an error of its own, the offset
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -29,7 +30,7 @@ from std_srvs.srv import SetBool
 
 from msg_adapters import DEFLECTION_WITH_COVARIANCE, END_EFFECTOR, TOPIC_TYPES
 from psd_deflection.arms.chains.transform import Transform
-from psd_deflection.arms.compensation.arm import Arm
+from psd_deflection.arms.compensation.arm import Arm, arm_of
 from psd_deflection.arms.compensation.compensator import (
     ALL_JOINTS,
     COMMANDS,
@@ -45,12 +46,15 @@ from psd_deflection.arms.inputs import LARGEST_POSITION, frame_fault, joints_fau
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.records import FloatArray
+from psd_deflection.ros.description import TOPIC as ROBOT_DESCRIPTION
+from psd_deflection.ros.description import robot_description
 from psd_deflection.ros.names import END_REST, JOINT_STATES
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.wires import message_class, relative
 from psd_deflection.run.diagnostics import ERROR, OK, WARN
 from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.signals import StopRequestedError
 
 NODE_NAME = 'compensator'
 ENABLE = '~/enable'
@@ -381,11 +385,27 @@ def _order(arm: Arm, joints: Sequence[str]) -> list[int]:
     return [arm.names.index(name) for name in joints]
 
 
-def run_compensator(ros_args: Sequence[str], arm: Arm, settings: CompensatorSettings, say: Say, drive: bool) -> int:
+class Described(NamedTuple):
+    """An arm that ``robot_description`` describes, to the link ``tip`` from the link ``base``, '' for the root."""
+
+    tip: str
+    base: str
+
+
+def run_compensator(
+    ros_args: Sequence[str],
+    robot: Arm | Described,
+    settings: CompensatorSettings,
+    say: Say,
+    drive: bool,
+) -> int:
     """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
-    if settings.joints == (ALL_JOINTS,):
-        settings = dataclasses.replace(settings, joints=arm.names)
-    with ros(NODE_NAME, ros_args) as signals:
+    with ros(NODE_NAME, ros_args) as signals, contextlib.suppress(StopRequestedError):
+        arm = robot
+        if isinstance(arm, Described):
+            arm = arm_of(robot_description(signals, say), ROBOT_DESCRIPTION, arm.tip, arm.base)
+        if settings.joints == (ALL_JOINTS,):
+            settings = dataclasses.replace(settings, joints=arm.names)
         owner = CompensatorNode(arm, settings, say, drive, lambda: bool(signals.stop))
         try:
             serve(owner, signals, owner.runs)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rclpy.exceptions import ParameterException, ParameterNotDeclaredException
+from rclpy.exceptions import ParameterNotDeclaredException
 from rclpy.node import Node
 from rclpy.parameter import Parameter as RosParameter
 
@@ -85,14 +85,6 @@ def meant(node: Node, changed: list[RosParameter], known: Mapping[str, Parameter
     return out
 
 
-def node_with_overrides(name: str) -> Node:
-    """A node that has what was given to it as parameters. Raises ConfigError if one cannot be read."""
-    try:
-        return Node(name, automatically_declare_parameters_from_overrides=True)
-    except (ParameterException, ValueError) as error:
-        raise ConfigError(f'{SOURCE}: {error}') from None
-
-
 class DeclaredParameters(Generic[T]):
     """The parameters of ``node`` that ``section`` declares, at ``values`` unless ROS was given others.
 
@@ -148,7 +140,7 @@ def refuse_unknown(node: Node, known: Mapping[str, Parameter]) -> dict[str, Any]
     given = {name: plain(p) for name, p in node.get_parameters_by_prefix('').items() if not _is_ros_own(name)}
     for name, value in given.items():
         if name not in known:
-            there = did_you_mean(name, known) or ('' if known else '; this node has none')
+            there = did_you_mean(name, known)
             raise ConfigError(f'{SOURCE}: {name} = {value!r}: no parameter of that name{there}')
     return given
 

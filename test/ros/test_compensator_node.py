@@ -25,7 +25,7 @@ from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa:
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
-from std_msgs.msg import Bool, Float64  # noqa: E402
+from std_msgs.msg import Bool, Float64, String  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
 from bench.campaign.hold import BREAKS, DEFLECTIONS, JOINTS, URDF, WITHIN, Plant, faithful  # noqa: E402
@@ -339,3 +339,21 @@ def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> No
         for one in (first, second):
             if one is not None:
                 one.end()
+
+
+def test_without_a_file_the_arm_is_the_one_of_robot_description(domain: int, peer: Any) -> None:
+    words = (*PSD_DEFLECTION, 'compensator', '--tip', 'tool')
+    node = Program(words, env={'PYTHONWARNINGS': WARNINGS})
+    try:
+        node.until('waiting for the robot on /robot_description')
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        peer.node.create_publisher(String, '/robot_description', latched).publish(String(data=URDF.read_text()))
+        node.until('publishing /compensator/proposed for shoulder, elbow')
+    finally:
+        assert node.end() == 0
+
+
+def test_a_signal_ends_the_waiting_for_robot_description(domain: int) -> None:
+    node = Program((*PSD_DEFLECTION, 'compensator', '--tip', 'tool'), env={'PYTHONWARNINGS': WARNINGS})
+    node.until('waiting for the robot on /robot_description')
+    assert node.end() == 0, node.lines

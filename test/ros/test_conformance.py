@@ -1,110 +1,617 @@
-"""What every node does alike. A new node is in the table, or the first test fails."""
+"""What every node does alike: a row a check, a column a node. ``make nodes`` prints the table.
+
+The nodes are those executables of setup.py whose command uses rclpy. A new one has no profile, and fails every check.
+A profile says what a node is asked with; a text in its place says why the check does not apply, and is in the table.
+"""
 
 from __future__ import annotations
 
 import ast
 import importlib
+import math
+import signal
 import subprocess
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 pytestmark = pytest.mark.ros
-pytest.importorskip('rclpy')
+rclpy = pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from rcl_interfaces.msg import Log  # noqa: E402
-from rcl_interfaces.srv import DescribeParameters, ListParameters  # noqa: E402
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, WrenchStamped  # noqa: E402
+from lifecycle_msgs.msg import State, Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState, GetState  # noqa: E402
+from rcl_interfaces.msg import Log, ParameterValue  # noqa: E402
+from rcl_interfaces.msg import Parameter as ParameterMessage  # noqa: E402
+from rcl_interfaces.srv import (  # noqa: E402
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+)
+from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from sensor_msgs.msg import JointState  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image, JointState  # noqa: E402
+from std_msgs.msg import Float64MultiArray, String  # noqa: E402
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
-from test.ros.conftest import WARNINGS  # noqa: E402
+from blind.render import Pose, Scene, photograph  # noqa: E402
+from test.ros.conftest import WARNINGS, Peer, stamp  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
 ROS = ROOT / 'psd_deflection' / 'ros'
-NODES: Mapping[str, tuple[str, ...]] = {
-    'estimator': (),
-    'camera': (),
-    'chain': (str(ROOT / 'config' / 'two_links.yaml'),),
-    'compensator': (str(ROOT / 'config' / 'two_links.urdf'), '--tip', 'tool', '--axes', 'x,z'),
-    'shaper': ('--shaper', 'none'),
-}
-"""Every node, with the words that it needs."""
-WITH_PARAMETERS = ('estimator', 'compensator', 'shaper')
-LISTENS_TO_JOINTS = ('chain', 'compensator', 'shaper')
-OF_THEIR_OWN = {
-    'gate.py': 'the gate',
-    'wires.py': 'inputs of a session, which judges each message',
-    'camera.py': 'images, each of which is judged as a frame',
-}
-"""Files that may subscribe."""
+NAMESPACE = '/left'
+OWN_INPUT = 'gate.py'
+"""The one file that may subscribe."""
+GRAPH = ('/rosout', '/parameter_events', '/diagnostics', '/tf', '/tf_static', '/clock')
+"""Topics that have one name for all nodes."""
+ROS_OWN = ('use_sim_time', 'qos_overrides.', 'start_type_description_service')
 
 
-def modules() -> dict[str, ast.Module]:
-    return {path.name: ast.parse(path.read_text()) for path in sorted(ROS.glob('*.py'))}
+def nodes_of_setup() -> list[str]:
+    """The executables of setup.py whose command imports our ROS room."""
+    tree = ast.parse((ROOT / 'setup.py').read_text())
+    (names,) = (
+        ast.literal_eval(statement.value)
+        for statement in tree.body
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == 'EXECUTABLES'
+    )
+    files = {path.stem: path for path in (ROOT / 'psd_deflection' / 'cli').rglob('*.py')}
+    return [name for name in names if 'psd_deflection.ros' in files[name].read_text()]
 
 
-def test_every_node_is_in_the_table() -> None:
-    names = {
-        importlib.import_module(f'psd_deflection.ros.{Path(name).stem}').NODE_NAME
-        for name, tree in modules().items()
-        for node in tree.body
-        if isinstance(node, ast.Assign) and [ast.unparse(t) for t in node.targets] == ['NODE_NAME']
+Sent = tuple[type, str, Any]
+"""A message: its class, its topic in the namespace, itself."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What a node is asked with; a text instead says why it is not.
+
+    ``words``: what the command needs. ``params``: the parameter file of the run. ``published``: a topic of its own.
+    ``fixed``: a parameter that is read at the start; ``live``: one that may be set; each with another value than it
+    has. ``used``: whether that of ``live`` acts. ``beyond``: a value out of bounds. ``refused``: messages by check.
+    ``frames``: whether the prefix among the parameters acts.
+    """
+
+    published: tuple[type, str]
+    fixed: tuple[str, object]
+    beyond: tuple[str, object]
+    refused: Mapping[str, Sent | str]
+    live: tuple[str, object] | str
+    frames: Callable[[Running], bool] | str
+    words: tuple[str, ...] = ()
+    params: Mapping[str, object] = field(default_factory=dict)
+    used: Callable[[Running], bool] = lambda running: False
+    sim_time: str = 'works'
+
+
+class Running:
+    """One node in a namespace, and what it says."""
+
+    def __init__(self, name: str, peer: Peer, folder: Path) -> None:
+        self.name, self.peer, self.profile = name, peer, PROFILES[name]
+        file = folder / 'params.yaml'
+        lines = [f'    {key}: {value}' for key, value in self.profile.params.items()]
+        file.write_text('\n'.join([f'{NAMESPACE}/{name}:', '  ros__parameters:', *lines]) + '\n')
+        latched = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self.logged: list[Log] = peer.collect(Log, '/rosout', latched)
+        self.reports: list[DiagnosticArray] = peer.collect(DiagnosticArray, '/diagnostics')
+        words = (*self.profile.words, '--ros-args', '-r', f'__ns:={NAMESPACE}', '--params-file', str(file))
+        self.program = Program([*PSD_DEFLECTION, name, *words], env={'PYTHONWARNINGS': WARNINGS}, cwd=folder)
+        self._publishers: dict[str, Any] = {}
+        self._clients: dict[str, Any] = {}
+
+    def call(self, kind: Any, service: str, request: Any) -> Any:
+        """With one client a service: DDS now and then loses one that comes and goes often."""
+        name = f'{NAMESPACE}/{self.name}/{service}'
+        if service not in self._clients:
+            self._clients[service] = self.peer.node.create_client(kind, name)
+        client = self._clients[service]
+        self.peer.until(client.service_is_ready, name)
+        future = client.call_async(request)
+        self.peer.until(future.done, f'the answer of {name}')
+        return future.result()
+
+    def set(self, name: str, value: object) -> Any:
+        message = Parameter(name, value=value).to_parameter_msg()
+        return self.call(SetParameters, 'set_parameters', SetParameters.Request(parameters=[message])).results[0]
+
+    def get(self, name: str) -> Any:
+        values = self.call(GetParameters, 'get_parameters', GetParameters.Request(names=[name])).values
+        return parameter_value_to_python(values[0])
+
+    def described(self) -> list[Any]:
+        names = self.call(ListParameters, 'list_parameters', ListParameters.Request()).result.names
+        own = [name for name in names if not name.startswith(ROS_OWN)]
+        request = DescribeParameters.Request(names=own)
+        return list(self.call(DescribeParameters, 'describe_parameters', request).descriptors)
+
+    def state(self) -> int:
+        return int(self.call(GetState, 'get_state', GetState.Request()).current_state.id)
+
+    def change(self, transition: int) -> bool:
+        request = ChangeState.Request()
+        request.transition.id = transition
+        return bool(self.call(ChangeState, 'change_state', request).success)
+
+    def send(self, sent: Sent) -> None:
+        kind, topic, message = sent
+        if topic not in self._publishers:
+            self._publishers[topic] = self.peer.node.create_publisher(kind, f'{NAMESPACE}/{topic}', 5)
+        self._publishers[topic].publish(message)
+
+    def said(self, text: str, level: int = 0) -> bool:
+        return any(text in line.msg and line.level >= level for line in self.logged)
+
+    def texts(self, since: int) -> str:
+        """All that its diagnostics have said from report number ``since`` on."""
+        statuses = [s for report in self.reports[since:] for s in report.status]
+        return ' '.join([s.message for s in statuses] + [v.value for s in statuses for v in s.values])
+
+    def refusals(self) -> int:
+        """As its diagnostics count them."""
+        own = f'{NAMESPACE}/{self.name}'.removeprefix('/')
+        last = {s.name: s for report in self.reports for s in report.status if s.name.startswith(own)}
+        counts = (v.value for s in last.values() for v in s.values if 's refused' in v.key)
+        return sum(int(count) for count in counts)
+
+
+def wrench(sec: int | None = None, frame: str = '', **force: float) -> WrenchStamped:
+    message = WrenchStamped()
+    message.header.frame_id = frame
+    message.header.stamp.sec = int(time.time()) if sec is None else sec
+    for axis, value in force.items():
+        setattr(message.wrench.force, axis, value)
+    return message
+
+
+def loads_at(topic: str) -> dict[str, Sent | str]:
+    return {
+        'nan': (WrenchStamped, topic, wrench(x=math.nan)),
+        'huge': (WrenchStamped, topic, wrench(x=1e300)),
+        'frame': (WrenchStamped, topic, wrench(x=7.0, frame='tool0')),
+        'stamp': (WrenchStamped, topic, wrench(sec=-(2**31), x=7.0)),
+        'size': (WrenchStamped, topic, wrench(frame='x' * 10_000)),
     }
-    assert names == set(NODES)
-    setup = (ROOT / 'setup.py').read_text()
-    assert all(f'{name} = ' in setup or f"'{name}'" in setup for name in NODES)
 
 
-def test_messages_come_in_through_the_gate() -> None:
-    own = {
-        name
-        for name, tree in modules().items()
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Attribute) and node.attr == 'create_subscription'
-    }
-    assert own <= set(OF_THEIR_OWN)
+def deflection(x: float = 0.0, frame: str = 'end_effector_rest', sec: int | None = None) -> PoseWithCovarianceStamped:
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id = frame
+    message.header.stamp.sec = int(time.time()) if sec is None else sec
+    message.pose.pose.position.x = x
+    return message
 
 
-@pytest.mark.parametrize('name', NODES)
-def test_an_unknown_parameter_is_refused_by_name(name: str, domain: int, tmp_path: Path) -> None:
-    command = [*PSD_DEFLECTION, name, *NODES[name], '--ros-args', '-p', 'max_ofset:=0.5']
+def trajectory(position: float, names: int = 1, sec: int = 0) -> JointTrajectory:
+    point = JointTrajectoryPoint(positions=[position] * names)
+    message = JointTrajectory(joint_names=[f'joint_{i}' for i in range(names)], points=[point])
+    message.header.stamp.sec = sec
+    return message
+
+
+def photo(sec: int, size: int = 0) -> Image:
+    if size:
+        return Image(height=1, width=size, encoding='mono8', step=size, data=bytes(size))
+    image = photograph(Scene(), [Pose()], np.random.default_rng(0))
+    out = Image(height=image.shape[0], width=image.shape[1], encoding='mono8', step=image.shape[1])
+    out.data = image.tobytes()
+    out.header.stamp.sec = sec
+    return out
+
+
+def sum_min_acts(running: Running) -> bool:
+    """The rig that the node tells has it."""
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    told = running.peer.collect(String, f'{NAMESPACE}/link_tip/rig', latched)
+    running.peer.until(lambda: bool(told), 'the rig')
+    return '"sum_min": 2.25' in told[-1].data or '"sum_min":2.25' in told[-1].data
+
+
+def exposure_acts(running: Running) -> bool:
+    """The stamp is that of the middle of the exposure."""
+    poses = running.peer.collect(PoseStamped, f'{NAMESPACE}/reference/deflection')
+
+    def answered() -> bool:
+        running.send((Image, 'image', photo(5)))
+        return bool(poses)
+
+    running.peer.until(answered, 'a reference')
+    return stamp(poses[-1]) == 5_250_000_000
+
+
+def lead_acts(running: Running) -> bool:
+    """What has no stamp begins later by the lead."""
+    shaped = running.peer.collect(JointTrajectory, f'{NAMESPACE}/shaper/shaped')
+
+    def answered() -> bool:
+        running.send((JointState, 'joint_states', JointState(name=['joint_0'], position=[0.5])))
+        running.send((JointTrajectory, 'shaper/trajectory', trajectory(0.5)))
+        return bool(shaped)
+
+    running.peer.until(answered, 'a shaped trajectory')
+    heard_ns = time.time_ns()
+    return stamp(shaped[-1]) > heard_ns + 300_000_000
+
+
+def age_acts(running: Running) -> bool:
+    """Joints that are older than they had been allowed to be are taken, still older ones are refused."""
+
+    def old(seconds: int) -> JointState:
+        message = JointState(name=['shoulder', 'elbow'], position=[0.1, 0.2])
+        message.header.stamp.sec = int(time.time()) - seconds
+        return message
+
+    running.send((JointState, 'joint_states', old(3)))
+    count = running.refusals()
+    subscribers = running.peer.node.count_subscribers
+    running.peer.until(lambda: subscribers(f'{NAMESPACE}/joint_states') > 0, 'the subscription')
+    for _ in range(50):
+        running.send((JointState, 'joint_states', old(3)))
+    told = 0
+
+    def refused() -> bool:
+        nonlocal told
+        running.send((JointState, 'joint_states', old(30)))
+        told += 1
+        return running.refusals() > count
+
+    running.peer.until(refused, 'a refusal')
+    return running.refusals() - count <= told
+
+
+def frame_of(kind: type, topic: str, frame: str) -> Callable[[Running], bool]:
+    """Whether what the node publishes is in this frame."""
+
+    def framed(running: Running) -> bool:
+        heard = running.peer.collect(kind, f'{NAMESPACE}/{topic}')
+
+        def published() -> bool:
+            if running.name == 'camera':
+                running.send((Image, 'image', photo(7)))
+            return bool(heard)
+
+        running.peer.until(published, topic)
+        return {message.header.frame_id for message in heard} == {frame}
+
+    return framed
+
+
+def taken_in_the_prefixed_frame_alone(running: Running) -> bool:
+    """A deflection in the frame without the prefix is refused."""
+    sent = PoseWithCovarianceStamped, 'end_effector/deflection', deflection()
+    return refuses(running, sent, ("'end_effector_rest': must be left_end_effector_rest",))
+
+
+PREFIX = 'left_'
+PROFILES: Mapping[str, Profile] = {
+    'estimator': Profile(
+        params={'sum_min': 2.0, 'frame_prefix': PREFIX, 'keep_zero': False},
+        published=(PoseStamped, 'link_tip/deflection'),
+        fixed=('link.length', 0.4),
+        live=('sum_min', 2.25),
+        used=sum_min_acts,
+        beyond=('amplifier.noise', -1.0),
+        refused=loads_at('link_tip/load'),
+        frames=frame_of(PoseStamped, 'link_tip/deflection', 'left_link_tip_rest'),
+        sim_time='refused',
+    ),
+    'camera': Profile(
+        params={'target.spacing': 0.025, 'rest.frames': 1, 'frame_prefix': PREFIX},
+        published=(PoseStamped, 'reference/deflection'),
+        fixed=('frame_prefix', 'right_'),
+        live=('camera.exposure', 0.5),
+        used=exposure_acts,
+        beyond=('target.radius', -1.0),
+        refused={
+            'nan': (CameraInfo, 'camera_info', CameraInfo(k=[math.nan] * 9)),
+            'huge': (CameraInfo, 'camera_info', CameraInfo(k=[1e300] * 9)),
+            'frame': 'an image is in the frame of its camera, whatever its name is',
+            'stamp': (Image, 'image', photo(-5)),
+            'size': (CameraInfo, 'camera_info', CameraInfo(d=[0.0] * 200_000)),
+        },
+        frames=frame_of(PoseStamped, 'reference/deflection', 'left_link_tip_rest'),
+    ),
+    'chain': Profile(
+        words=(str(ROOT / 'config' / 'two_links.yaml'),),
+        params={'slopes': 'ratio', 'frame_prefix': PREFIX},
+        published=(PoseWithCovarianceStamped, 'end_effector/deflection'),
+        fixed=('base_frame', 'stand'),
+        live='all its parameters are read at the start',
+        beyond=('slopes', 'none'),
+        refused=loads_at('upper/link_tip/load'),
+        frames=frame_of(PoseWithCovarianceStamped, 'end_effector/deflection', 'left_end_effector_rest'),
+        sim_time='refused',
+    ),
+    'compensator': Profile(
+        words=(str(ROOT / 'config' / 'two_links.urdf'), '--tip', 'tool', '--axes', 'x,z'),
+        params={'max_offset': 0.01, 'frame_prefix': PREFIX},
+        published=(Float64MultiArray, 'compensator/proposed'),
+        fixed=('output', 'commands'),
+        live=('stale', 10.0),
+        used=age_acts,
+        beyond=('max_rate', -1.0),
+        refused={
+            'nan': (JointState, 'joint_states', JointState(name=['shoulder'], position=[math.nan])),
+            'huge': (JointState, 'joint_states', JointState(name=['elbow'], position=[1e300])),
+            'frame': (PoseWithCovarianceStamped, 'end_effector/deflection', deflection(frame='world')),
+            'stamp': (PoseWithCovarianceStamped, 'end_effector/deflection', deflection(sec=-5, frame='')),
+            'size': (PoseWithCovarianceStamped, 'end_effector/deflection', deflection(frame='x' * 2_000_000)),
+        },
+        frames=taken_in_the_prefixed_frame_alone,
+    ),
+    'shaper': Profile(
+        words=('--shaper', 'none'),
+        params={'max_step': 0.04},
+        published=(JointTrajectory, 'shaper/shaped'),
+        fixed=('shaper', 'zv'),
+        live=('lead', 0.9),
+        used=lead_acts,
+        beyond=('max_step', -1.0),
+        refused={
+            'nan': (JointTrajectory, 'shaper/trajectory', trajectory(math.nan)),
+            'huge': (JointTrajectory, 'shaper/trajectory', trajectory(1e300)),
+            'frame': 'joint positions are in no frame; that of a trajectory is passed on',
+            'stamp': (JointTrajectory, 'shaper/trajectory', trajectory(0.0, sec=-5)),
+            'size': (JointTrajectory, 'shaper/trajectory', trajectory(0.0, names=60_000)),
+        },
+        frames='joint positions are in no frame',
+    ),
+}
+
+
+@pytest.fixture(scope='module')
+def whole_peer(domain: int) -> Iterator[Peer]:
+    one = Peer()
+    yield one
+    one.close()
+
+
+@pytest.fixture(scope='module', params=nodes_of_setup())
+def running(
+    request: pytest.FixtureRequest, whole_peer: Peer, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Running]:
+    name = request.param
+    assert name in PROFILES, f'{name} is a node without a profile'
+    one = Running(name, whole_peer, tmp_path_factory.mktemp(name))
+    whole_peer.until(lambda: bool(one.reports), f'diagnostics of {name}')
+    yield one
+    one.program.end()
+    print(*one.program.lines[-30:], sep='\n')
+
+
+def refuses(running: Running, sent: Sent, words: tuple[str, ...]) -> bool:
+    """Whether the message is counted as refused in the node's diagnostics, for a reason with one of ``words``."""
+    before, reports = running.refusals(), len(running.reports)
+
+    def counted() -> bool:
+        running.send(sent)
+        if running.name == 'shaper':
+            # Without it every trajectory is refused.
+            running.send((JointState, 'joint_states', JointState(name=['joint_0'], position=[0.5])))
+        why = running.texts(reports)
+        return running.refusals() > before and any(word in why for word in words)
+
+    running.peer.until(counted, f'the refusal of {sent[1]} for one of {words}')
+    return running.program.process.poll() is None
+
+
+def refused_kind(running: Running, kind: str, *words: str) -> None:
+    sent = running.profile.refused[kind]
+    if isinstance(sent, str):
+        pytest.skip(sent)
+    assert refuses(running, sent, words)
+
+
+def test_parameters_are_described(running: Running) -> None:
+    described = running.described()
+    assert described
+    assert [d.name for d in described if not d.description] == []
+
+
+def test_numbers_have_bounds(running: Running) -> None:
+    numbers = [d for d in running.described() if d.type in (Parameter.Type.DOUBLE.value, Parameter.Type.INTEGER.value)]
+    if not numbers:
+        pytest.skip('none of its parameters is a number')
+    assert [
+        d.name for d in numbers if not (d.floating_point_range or d.integer_range or d.additional_constraints)
+    ] == []
+
+
+def test_parameter_file_is_read(running: Running) -> None:
+    assert {name: running.get(name) for name in running.profile.params} == dict(running.profile.params)
+
+
+@pytest.mark.parametrize('name', nodes_of_setup())
+def test_unknown_parameter_ends_the_start(name: str, domain: int, tmp_path: Path) -> None:
+    command = [*PSD_DEFLECTION, name, *PROFILES[name].words, '--ros-args', '-p', 'max_ofset:=0.5']
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3, ended.stderr
     assert 'max_ofset' in ended.stderr
 
 
-@pytest.mark.parametrize('name', NODES)
-def test_a_node_logs_reports_and_survives_strangers(name: str, peer: Any, tmp_path: Path) -> None:
-    logged: list[Log] = []
-    latched = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    subscription = peer.node.create_subscription(Log, '/rosout', logged.append, latched)
-    reports = peer.collect(DiagnosticArray, '/diagnostics')
-    joints = peer.node.create_publisher(JointState, '/joint_states', 5)
-    node = Program([*PSD_DEFLECTION, name, *NODES[name]], env={'PYTHONWARNINGS': WARNINGS}, cwd=tmp_path)
+@pytest.mark.parametrize('name', nodes_of_setup())
+def test_value_out_of_bounds_ends_the_start(name: str, domain: int, tmp_path: Path) -> None:
+    parameter, value = PROFILES[name].beyond
+    command = [*PSD_DEFLECTION, name, *PROFILES[name].words, '--ros-args', '-p', f'{parameter}:={value}']
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert ended.returncode == 3, ended.stderr
+    assert parameter in ended.stderr
+    assert 'must be' in ended.stderr
+
+
+def test_unknown_parameter_cannot_be_set(running: Running) -> None:
+    answer = running.set('max_ofset', 0.5)
+    assert not answer.successful
+    assert 'max_ofset' in answer.reason
+
+
+def test_value_out_of_bounds_cannot_be_set(running: Running) -> None:
+    name, value = running.profile.beyond
+    before = running.get(name)
+    answer = running.set(name, value)
+    assert not answer.successful
+    assert name in answer.reason
+    assert running.get(name) == before
+
+
+def test_invalid_type_is_answered(running: Running) -> None:
+    strange = ParameterMessage(name=running.profile.fixed[0], value=ParameterValue(type=77))
+    request = SetParameters.Request(parameters=[strange])
+    answers = running.call(SetParameters, 'set_parameters', request).results
+    assert [(a.successful, '77' in a.reason) for a in answers] == [(False, True)]
+
+
+def test_what_is_read_at_the_start_says_so(running: Running) -> None:
+    name, value = running.profile.fixed
+    (constraint,) = (d.additional_constraints for d in running.described() if d.name == name)
+    assert 'read ' in constraint
+    before = running.get(name)
+    answer = running.set(name, value)
+    assert not answer.successful
+    assert 'read ' in answer.reason
+    assert running.get(name) == before
+
+
+def test_live_parameter_acts(running: Running) -> None:
+    if isinstance(running.profile.live, str):
+        pytest.skip(running.profile.live)
+    name, value = running.profile.live
+    assert running.get(name) != value
+    answer = running.set(name, value)
+    assert answer.successful, answer.reason
+    assert running.get(name) == value
+    assert running.profile.used(running)
+
+
+def test_log_is_on_rosout(running: Running) -> None:
+    running.peer.until(lambda: any(line.name == f'left.{running.name}' for line in running.logged), 'its log')
+
+
+def test_diagnostics_are_named_after_the_node(running: Running) -> None:
+    names = {status.name for report in running.reports for status in report.status}
+    own = f'left/{running.name}'
+    assert [name for name in names if not name.startswith((f'{own}: ', f'{own}/'))] == []
+
+
+def test_namespace_holds_its_topics(running: Running) -> None:
+    node = running.peer.node
+    mine = node.get_publisher_names_and_types_by_node(running.name, NAMESPACE)
+    mine += node.get_subscriber_names_and_types_by_node(running.name, NAMESPACE)
+    assert mine
+    assert [topic for topic, _ in mine if not topic.startswith(f'{NAMESPACE}/') and topic not in GRAPH] == []
+
+
+def test_frame_prefix_acts(running: Running) -> None:
+    framed = running.profile.frames
+    if isinstance(framed, str):
+        pytest.skip(framed)
+    assert framed(running)
+
+
+def test_simulated_time_acts_or_is_refused(running: Running) -> None:
+    answer = running.set('use_sim_time', True)
+    if running.profile.sim_time == 'refused':
+        assert not answer.successful
+        assert 'system clock' in answer.reason
+        return
+    assert answer.successful, answer.reason
+    clock = running.peer.node.create_publisher(Clock, '/clock', 5)
+    seen = len(running.reports)
+
+    def of_that_time() -> bool:
+        message = Clock()
+        message.clock.sec = 1234
+        clock.publish(message)
+        return any(report.header.stamp.sec == 1234 for report in running.reports[seen:])
+
     try:
-        peer.until(lambda: any(line.name == name for line in logged), f'a line of {name} on /rosout')
-        peer.until(lambda: bool(reports), 'diagnostics')
-        names = peer.call(ListParameters, f'/{name}/list_parameters', ListParameters.Request()).result.names
-        own = [n for n in names if n != 'use_sim_time' and not n.startswith(('qos_overrides', 'start_type'))]
-        if name in WITH_PARAMETERS:
-            request = DescribeParameters.Request(names=own)
-            described = peer.call(DescribeParameters, f'/{name}/describe_parameters', request).descriptors
-            assert [d.name for d in described if not d.description] == []
-        if name in LISTENS_TO_JOINTS:
-            strange = ('shoulder', 'elbow'), [1e300, 1e300]
-
-            def refused() -> bool:
-                joints.publish(JointState(name=strange[0], position=strange[1]))
-                values = {v.key: v.value for report in reports[-3:] for s in report.status for v in s.values}
-                return name == 'shaper' or int(values.get('messages refused: joint_states', '0')) > 0
-
-            peer.until(refused, 'the refusal of joints at 1e300')
-        count = len(reports)
-        peer.until(lambda: len(reports) > count, 'diagnostics after it')
-        assert node.process.poll() is None
+        running.peer.until(of_that_time, 'diagnostics in simulated time')
     finally:
-        node.end()
-        peer.node.destroy_subscription(subscription)
+        running.peer.node.destroy_publisher(clock)
+        assert running.set('use_sim_time', False).successful
+
+
+def test_not_a_number_is_refused(running: Running) -> None:
+    refused_kind(running, 'nan', 'nan', 'finite')
+
+
+def test_absurd_number_is_refused(running: Running) -> None:
+    refused_kind(running, 'huge', '1e+300', 'beyond')
+
+
+def test_other_frame_is_refused(running: Running) -> None:
+    refused_kind(running, 'frame', 'frame_id')
+
+
+def test_stamp_that_is_no_time_is_refused(running: Running) -> None:
+    refused_kind(running, 'stamp', 'is no time')
+
+
+def test_oversized_message_is_refused(running: Running) -> None:
+    refused_kind(running, 'size', ' bytes: must be at most')
+
+
+def test_refusals_are_warnings(running: Running) -> None:
+    running.peer.until(lambda: running.said('refused', 30), 'a warning')
+    levels = {line.level for line in running.logged if 'refused: ' in line.msg}
+    assert levels == {30}
+
+
+def test_second_publisher_is_told(running: Running) -> None:
+    kind, topic = running.profile.published
+    name = f'{NAMESPACE}/{topic}'
+    rival = running.peer.node.create_publisher(kind, name, 5)
+    try:
+        running.peer.until(lambda: running.said(f'another node publishes on {name} too', 30), 'the warning')
+    finally:
+        running.peer.node.destroy_publisher(rival)
+
+
+def test_lifecycle_goes_down_and_up_again(running: Running) -> None:
+    assert running.state() == State.PRIMARY_STATE_ACTIVE
+    assert running.change(Transition.TRANSITION_DEACTIVATE)
+    assert running.state() == State.PRIMARY_STATE_INACTIVE
+    assert running.change(Transition.TRANSITION_CLEANUP)
+    assert running.change(Transition.TRANSITION_CONFIGURE)
+    assert running.change(Transition.TRANSITION_ACTIVATE)
+    assert not running.change(Transition.TRANSITION_ACTIVATE)
+    assert running.state() == State.PRIMARY_STATE_ACTIVE
+
+
+def test_interrupt_ends_it_with_status_0(running: Running) -> None:
+    running.program.send(signal.SIGINT)
+    assert running.program.wait() == 0, running.program.lines
+    assert not any('Traceback' in line for line in running.program.lines)
+
+
+# Of the source, not of a node.
+
+
+def test_every_node_of_the_room_is_an_executable() -> None:
+    modules = {path.stem: ast.parse(path.read_text()) for path in ROS.glob('*.py')}
+    names = {
+        importlib.import_module(f'psd_deflection.ros.{name}').NODE_NAME
+        for name, tree in modules.items()
+        for statement in tree.body
+        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == 'NODE_NAME'
+    }
+    assert names == set(nodes_of_setup()) == set(PROFILES)
+
+
+def test_messages_come_in_through_the_gate() -> None:
+    own = {
+        path.name
+        for path in ROS.glob('*.py')
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute) and node.attr == 'create_subscription'
+    }
+    assert own == {OWN_INPUT}
