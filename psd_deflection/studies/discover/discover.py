@@ -22,6 +22,7 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import suggest
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals as propose
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
@@ -33,7 +34,6 @@ from psd_deflection.studies.discover.search.search import BIC_ACCEPT, Search, Se
 from psd_deflection.studies.discover.search.signatures import SignatureBank, candidates, signatures_beside
 from psd_deflection.studies.discover.search.weighing import (
     UNSAID,
-    Conclusion,
     NamedEffect,
     accept,
     credible,
@@ -50,32 +50,6 @@ from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, beginning, mistakes
 from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, noise_finding, said, wire
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Discovery(Conclusion):
-    """The answer for the rig. Gaps in m (rms of block means over x1 y1 x2 y2).
-
-    ``setup``: mistakes of the set-up and the recording, with ``lines`` that put the rig file right; ``known``: the
-    effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
-    ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
-    set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
-    ``moves``: by how much at most the effects change an estimate that does not know of them: dX m, dY m, theta rad.
-    """
-
-    workspace: Workspace
-    setup: tuple[Finding, ...]
-    lines: Mapping[str, object]
-    known: tuple[ActiveEffect, ...]
-    law: FoundLaw | None
-    rivals: tuple[Fit, ...]
-    unsettled: tuple[str, ...]
-    moves: tuple[float, float, float]
-
-    @property
-    def active_effects(self) -> list[ActiveEffect]:
-        """The effects to add to the rig file."""
-        return [*self.known, *(e.active for e in self.effects)]
 
 
 def _proposals(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> dict[str, list[float]]:
@@ -109,6 +83,7 @@ def discover(
     rig's effects are malformed.
     """
     rig = recordings[0].rig if rig is None else rig
+    given = rig
     rates = {o.rig.converter.sample_rate_hz for o in recordings if o.stated_rate_hz}
     lines: dict[str, object] = {'converter.sample_rate_hz': rates.pop()} if len(rates) == 1 else {}
     rng = np.random.default_rng(seed)
@@ -194,7 +169,7 @@ def discover(
     fit, heldout, left = credible(search, result, fit, heldout, seen, look)
     if lattice is not None:
         workspace.base = tuple(a for a in workspace.base if a is not lattice)
-    checked = _Checked(findings, lines, tuple(base), before)
+    checked = _Checked(findings, lines, tuple(base), before, given)
     return _answer(workspace, search, result, fit, heldout, left, lattice, rng, seed, progress, checked)
 
 
@@ -219,6 +194,7 @@ class _Checked:
     lines: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
     gap: float
+    rig: Rig
 
 
 def _lattice(
@@ -311,32 +287,33 @@ def _answer(
     verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
     held = heldout_tables(ws, fit)
     return Discovery(
-        verdict,
-        tuple(named),
-        unknown,
-        before,
-        left,
-        gap_before,
-        gap_after,
-        floor,
-        gap_before,
-        ws.gap(held),
-        per_channel_of(ws, null.difference, fit.difference),
-        heldout_per_channel_of(ws, held),
-        waterfall_of(ws, fit, gap_before, gap_after),
-        ws.simulations,
-        result,
-        fit,
-        ws,
-        seed,
-        (),
-        tuple(setup),
-        lines,
-        checked.known,
-        law if verdict == 'unknown_effect' else None,
-        rivals,
-        unsettled,
-        pose_change(ws, fit) if named else (0.0, 0.0, 0.0),
+        verdict=verdict,
+        effects=tuple(named),
+        unknown=unknown,
+        where=before,
+        left=left,
+        gap_before=gap_before,
+        gap_after=gap_after,
+        gap_floor=floor,
+        gap_heldout_before=gap_before,
+        gap_heldout_after=ws.gap(held),
+        per_channel=per_channel_of(ws, null.difference, fit.difference),
+        heldout_per_channel=heldout_per_channel_of(ws, held),
+        waterfall=waterfall_of(ws, fit, gap_before, gap_after),
+        simulations=ws.simulations,
+        search=result,
+        fit=fit,
+        workspace=ws,
+        seed=seed,
+        nuisance=(),
+        setup=tuple(setup),
+        values=lines,
+        known=checked.known,
+        law=law if verdict == 'unknown_effect' else None,
+        rivals=rivals,
+        unsettled=unsettled,
+        moves=pose_change(ws, fit) if named else (0.0, 0.0, 0.0),
+        rig=checked.rig,
     )
 
 

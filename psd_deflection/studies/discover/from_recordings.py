@@ -5,6 +5,7 @@ readings.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,12 @@ from psd_deflection.recordings.replay.engine import check_psds, nominal_rig, rig
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.readings import Readings
+from psd_deflection.studies.discover.plants import PlantDiscovery, discover_in
+from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
+from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.study import Tell, warn_caller
 
 
 def read_observation(
@@ -240,3 +245,56 @@ def read_tables(
     if rig is None and warn is not None:
         warn('a table of readings says nothing of its rig: the nominal rig is taken; give --params-file')
     return [read_readings(Path(str(s)), rig, overrides, where, warn) for s, overrides, where in listed]
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoverOptions:
+    """What is asked of a search; it goes to a worker process.
+
+    ``known``: the rig as it is known, or its parameter file; None: the rig in the first recording. ``without``:
+    effects that are not looked for. ``span``: the part of each recording.
+    """
+
+    known: Rig | str | Path | None = None
+    namespace: str | None = None
+    seed: int = 0
+    without: tuple[str, ...] = ()
+    span: Span = WHOLE
+
+    @property
+    def params_file(self) -> str | Path | None:
+        """The rig's, if there is one."""
+        return None if isinstance(self.known, Rig) else self.known
+
+    def rig(self) -> Rig | None:
+        """The rig as it is known, if it is. Raises ConfigError."""
+        return self.known if self.known is None or isinstance(self.known, Rig) else load_rig(self.known)
+
+    def read(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Observation]:
+        """The recordings; ``tell`` gets what is odd."""
+        return read_observations(
+            sources, self.rig(), namespace=self.namespace, span=self.span, warn=tell, any_rate=True
+        )
+
+    def tables(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Readings]:
+        """The tables of readings; none if ``sources`` are recordings."""
+        return read_tables(sources, self.rig(), tell)
+
+    def discovered(
+        self,
+        observations: Sequence[Observation],
+        progress: Callable[[str], None] = lambda _: None,
+        tell: Tell = warn_caller,
+    ) -> Discovery:
+        """The answer; ``tell`` gets a warning if the rig file cannot be edited."""
+        found = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
+        return replace(found, params_file=self.params_file, tell=tell)
+
+    def discovered_in_tables(self, tables: Sequence[Readings], tell: Tell = warn_caller) -> PlantDiscovery:
+        """The answer of tables of readings; ``tell`` gets a warning if the rig file cannot be edited.
+
+        Raises RecordingError if a part of a table is asked for.
+        """
+        if self.span != WHOLE:
+            raise RecordingError(f'{tables[0].name}: is a table of readings, which has no times: take all of it')
+        return discover_in(ReadingsPlant(tables, self.without, self.params_file, tell), seed=self.seed)

@@ -19,6 +19,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.studies.discover.result import Conclusion
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
@@ -28,7 +29,6 @@ from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.signatures import candidates, signatures_beside
 from psd_deflection.studies.discover.search.weighing import (
-    Conclusion,
     accept,
     credible,
     heldout_per_channel_of,
@@ -109,6 +109,10 @@ class Plant(ABC):
     def simulate_effects(self, effects: Sequence[ActiveEffect]) -> Sequence[FloatArray]:
         """What the search calls: :meth:`simulate`, unless a plant may have one effect several times."""
         return self.simulate({a.effect.name: dict(a.values) for a in effects})
+
+    def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
+        """Files by name that describe the machine with the ``effects`` found; they are saved with the answer."""
+        return {}
 
     def parts(self) -> Sequence[IntArray]:
         """Of each case, the part (n,), from 0, that each column is in. A part is left out of the fit in one piece to
@@ -369,13 +373,17 @@ class PlantComparison(Comparison):
         self.renoise([*self.base, *null.whole])
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PlantDiscovery(Conclusion):
     """The answer for a plant. If the units of its channels differ, the gaps are shares of the gap before;
     ``per_channel`` always has the units of the channels. ``gap_floor`` is NaN if the plant states no noise.
     """
 
     workspace: PlantComparison
+
+    def files(self) -> dict[str, str]:
+        """The page, the JSON, and what the plant itself writes of the effects."""
+        return {**self.workspace.plant.files([e.active for e in self.effects]), **super().files()}
 
 
 def _powers(name: str, values: Sequence[FloatArray]) -> dict[str, Sequence[FloatArray]]:
@@ -479,23 +487,23 @@ def discover_in(plant: Plant, *, seed: int = 0, progress: Callable[[str], None] 
     )
     held = heldout_tables(ws, fit)
     return PlantDiscovery(
-        'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing',
-        tuple(named),
-        unknown,
-        first,
-        left,
-        before,
-        after,
-        ws.floor(),
-        ws.gap(heldout_tables(ws, null)),
-        ws.gap(held),
-        per_channel_of(ws, null.difference, fit.difference),
-        heldout_per_channel_of(ws, held),
-        waterfall_of(ws, fit, before, after),
-        ws.simulations,
-        result,
-        fit,
-        ws,
-        seed,
-        tuple((a, sd_of(ws, fit, i - len(fit.nuisance))) for i, a in enumerate(fit.nuisance)),
+        verdict='unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing',
+        effects=tuple(named),
+        unknown=unknown,
+        where=first,
+        left=left,
+        gap_before=before,
+        gap_after=after,
+        gap_floor=ws.floor(),
+        gap_heldout_before=ws.gap(heldout_tables(ws, null)),
+        gap_heldout_after=ws.gap(held),
+        per_channel=per_channel_of(ws, null.difference, fit.difference),
+        heldout_per_channel=heldout_per_channel_of(ws, held),
+        waterfall=waterfall_of(ws, fit, before, after),
+        simulations=ws.simulations,
+        search=result,
+        fit=fit,
+        workspace=ws,
+        seed=seed,
+        nuisance=tuple((a, sd_of(ws, fit, i - len(fit.nuisance))) for i, a in enumerate(fit.nuisance)),
     )

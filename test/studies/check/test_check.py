@@ -225,7 +225,7 @@ def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> Non
     (told,) = [text for text in found.sentences() if text.startswith(channel)]
     assert re.fullmatch(rf'{channel}: [^:]+: .+', told)
     assert '  ' not in told
-    assert any(line.startswith(f'  {channel}: ') for line in found.lines())
+    assert any(line.startswith(f'  {channel}: ') for line in found.values())
 
 
 def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() -> None:

@@ -23,10 +23,11 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover import discover as answer
 from psd_deflection.studies.discover import planning
 from psd_deflection.studies.discover import result as told
-from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Setting
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.planning import Plan, Suggestion, Told
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals, weighing
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
@@ -774,7 +775,7 @@ def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> No
         ('+ sensor_rotation', found.gap_after),
         ('noise alone', found.gap_floor),
     )
-    assert (found.verdict, found.unknown, found.setup, found.law, found.lines) == ('effects_found', (), (), None, {})
+    assert (found.verdict, found.unknown, found.setup, found.law, found.values) == ('effects_found', (), (), None, {})
     assert (found.seed, found.known, found.rivals, found.unsettled) == (0, (), (), ())
     assert found.active_effects == [named.active]
     # One picture, whose length is the deviation: of the turn about the centre of the PSD.

@@ -21,7 +21,6 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover import plants
 from psd_deflection.studies.discover.plants import Model, Plant, PlantComparison, discover_in, plant_effect
-from psd_deflection.studies.discover.result import sentence
 from psd_deflection.studies.discover.search.fit import refit
 
 LENGTHS = (10, 7, 13)
@@ -541,7 +540,7 @@ def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
     # Where it was before the effect, and where nothing is left after it.
     assert max(c.statistic for c in found.where.cells) > 8.0 > max(c.statistic for c in found.left.cells)
     assert found.left.p > 1e-4
-    assert sentence(found).startswith('b is missing from the model; adding it closes the gap from')
+    assert found.sentence.startswith('b is missing from the model; adding it closes the gap from')
     assert repr(found) == (
         f'<PlantDiscovery effects_found: b; gap {found.gap_before:.3g} N → {found.gap_after:.3g} N '
         '(noise alone: 0.02 N)>'

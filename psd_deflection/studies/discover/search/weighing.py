@@ -86,45 +86,6 @@ class Unknown:
     rms: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Conclusion:
-    """The answer of a search. Gaps are rms values of measured minus simulated in the unit of ``workspace``.
-
-    ``per_channel``: before and after; ``heldout_per_channel``: after, on load cases that the fit has not seen.
-    ``nuisance``: what every model has, each with the standard deviations of its parameters.
-    """
-
-    verdict: str
-    effects: tuple[NamedEffect, ...]
-    unknown: tuple[Unknown, ...]
-    where: Localisation
-    left: Localisation
-    gap_before: float
-    gap_after: float
-    gap_floor: float
-    gap_heldout_before: float
-    gap_heldout_after: float
-    per_channel: Mapping[str, tuple[float, float]]
-    heldout_per_channel: Mapping[str, float]
-    waterfall: tuple[tuple[str, float], ...]
-    simulations: int
-    search: SearchResult
-    fit: Fit
-    workspace: Comparison
-    seed: int
-    nuisance: tuple[tuple[ActiveEffect, Mapping[str, float]], ...]
-
-    @property
-    def floors(self) -> float:
-        """The gap that remains, in units of the gap that noise alone leaves; 0 if nobody knows the noise."""
-        return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
-
-    def __repr__(self) -> str:
-        named = ', '.join(e.active.label for e in self.effects) or 'no effect'
-        before, after, floor = (self.workspace.worded(v) for v in (self.gap_before, self.gap_after, self.gap_floor))
-        return f'<{type(self).__name__} {self.verdict}: {named}; gap {before} → {after} (noise alone: {floor})>'
-
-
 def credible(
     search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, look: Look
 ) -> tuple[Fit, list[HeldOut], Localisation]:
