@@ -20,7 +20,6 @@ from psd_deflection.studies.discover import discover as answer
 from psd_deflection.studies.discover.discover import Discovery, discover, pose_change
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import result
 from psd_deflection.studies.discover.search import proposals, weighing
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
@@ -345,7 +344,7 @@ def test_starting_values_come_from_the_residual_and_the_readings(monkeypatch: py
 @pytest.mark.repeatable
 def test_the_same_seed_gives_the_same_answer_whatever_is_kept(named: Discovery) -> None:
     seen, bank, few = observed(9, (ROTATION,), warm=None), SignatureBank(), without('sensor_rotation')
-    answers = [named.tree(), *(result(discover([seen], RIG, without=few, bank=bank)) for _ in range(2))]
+    answers = [named.tree(), *(discover([seen], RIG, without=few, bank=bank).tree() for _ in range(2))]
     costs = [a.pop('provenance')['forward_simulations'] for a in answers]
     assert answers[0] == answers[1] == answers[2]
     # The second time nothing need be simulated anew.

@@ -80,7 +80,7 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
     q, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
     columns = [ws.split(c) for c in np.ascontiguousarray(q.T)]
     out = []
-    ws.simulations += 1
+    ws.tally.count += 1
     for i, size in enumerate(ws.fine):
         model, s = _variables(ws, fit.effects, i)
         p = model.physics

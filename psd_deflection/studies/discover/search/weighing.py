@@ -1,8 +1,4 @@
-"""The verdict: which effects of a search hold, with their uncertainty and their rivals, and what remains unknown.
-
-An effect is named only if all of these hold: library-wide p <= 0.01, a BIC better by more than 10, a gain of more than
-two standard errors on held-out load cases, and parameters within their bounds.
-"""
+"""The parts of the verdict: named effects with their uncertainty and their rivals, gaps, and what remains unknown."""
 
 from __future__ import annotations
 
@@ -16,10 +12,10 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.planning import Suggestion
 from psd_deflection.studies.discover.search.coincidence import Coincidence
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, scatter
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.hold_out import HeldOut, scatter
 from psd_deflection.studies.discover.search.localise import Localisation
-from psd_deflection.studies.discover.search.search import BIC_ACCEPT, P_ACCEPT, Search, SearchResult, unphysical
+from psd_deflection.studies.discover.search.search import SearchResult
 
 EQUIVALENT = 21.6
 """Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
@@ -36,10 +32,6 @@ UNSAID = 1.5
 """A gap of more floors than this never remains without being reported as unknown."""
 RIVAL_BIC = 10.0
 """An effect in place of the named one counts as its rival up to this loss in BIC."""
-Look = Callable[[Fit, Fit], Localisation]
-"""Where what a fit leaves has structure, given the fit without any effect."""
-Suggest = Callable[[Fit, Sequence[Fit]], Suggestion | None]
-"""The experiment that tells a fit from others that are as good."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,94 +76,6 @@ class Unknown:
     explains: float
     remains: bool = True
     rms: float = 0.0
-
-
-def credible(
-    search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, look: Look
-) -> tuple[Fit, list[HeldOut], Localisation]:
-    """Remove effects that explain less than the unknown remainder: they probably stand in for it."""
-    while True:
-        left = look(fit, result.null)
-        if not fit.effects or not unknown_of(left, 0.0, steps=seen):
-            break
-        weakest = int(np.argmin(result.delta_chi2))
-        if result.delta_chi2[weakest] >= left.excess:
-            break
-        search.trace.append(f'{fit.effects[weakest].label} explains less than what remains unknown')
-        fit = without_one(search, result, fit, weakest)
-        heldout = [h for j, h in enumerate(heldout) if j != weakest]
-    return fit, heldout, left
-
-
-def accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
-    """The joint rule: remove the effects that fail it, the weakest first, and refit the rest."""
-    ws, fit = search.workspace, result.fit
-    while True:
-        heldout = []
-        fails: list[tuple[float, int]] = []
-        for i, without in enumerate(search.without_each(fit, result.null)):
-            gain = heldout_gain(ws, without, fit, rng)
-            heldout.append(gain)
-            columns = fit.columns_of(i)
-            chi2 = without.chi2 - fit.chi2
-            bic = chi2 - search.penalty * len(columns)
-            if (
-                not gain.holds
-                or unphysical(ws, fit, i)
-                or search.library_p(chi2, len(columns)) > P_ACCEPT
-                or bic <= BIC_ACCEPT
-            ):
-                fails.append((bic, i))
-        if not fails:
-            break
-        _, worst = min(fails)
-        search.trace.append(f'{fit.effects[worst].label} fails the joint rule')
-        fit = without_one(search, result, fit, worst)
-    return heldout, fit
-
-
-def without_one(search: Search, result: SearchResult, fit: Fit, index: int) -> Fit:
-    """``fit`` refitted without one effect; ``result`` weighs the rest anew."""
-    rest = [a for j, a in enumerate(fit.effects) if j != index]
-    left = refit(search.workspace, rest, iterations=6) if rest else result.null
-    result.p[:], result.delta_bic[:], result.delta_chi2[:] = search.weigh(result.null, left)
-    return left
-
-
-def named_effects(
-    search: Search, result: SearchResult, fit: Fit, heldout: Sequence[HeldOut], suggestion: Suggest | None = None
-) -> list[NamedEffect]:
-    """The effects of ``fit`` with their standard deviations and the equally good alternatives."""
-    ws = search.workspace
-    # If the joint rule has removed effects, their alternatives are no longer comparable.
-    as_found = fit is result.fit
-    named: list[NamedEffect] = []
-    for i, active in enumerate(fit.effects):
-        fits = result.alternatives[i] if as_found else search.alternatives(result.null, fit, i, result.delta_chi2[i])
-        rows, equal, rivals = [], [], []
-        for f in fits:
-            loss = f.chi2 - fit.chi2
-            bic = loss + search.penalty * (f.parameters - fit.parameters)
-            rows.append((f.effects[-1].effect.name, loss, bic))
-            if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
-                equal.append(f)
-            if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
-                rivals.append(Rival(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
-        names = tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal))
-        named.append(
-            NamedEffect(
-                active,
-                sd_of(ws, fit, i),
-                result.p[i],
-                result.delta_bic[i],
-                heldout[i],
-                names,
-                tuple(sorted(rivals, key=lambda r: r.delta_bic)),
-                tuple(rows),
-                suggestion(fit, equal) if equal and suggestion is not None else None,
-            )
-        )
-    return named
 
 
 def sd_of(workspace: Comparison, fit: Fit, index: int) -> dict[str, float]:
