@@ -16,6 +16,7 @@ from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.rig.config import Rig
+from psd_deflection.studies.check.judges import noise_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.observation import Observation
@@ -35,7 +36,7 @@ from psd_deflection.studies.discover.search.signatures import SignatureBank, can
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, mistakes
-from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_finding, said
+from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
 
 
@@ -202,7 +203,7 @@ def set_up(problem: Problem) -> Problem:
             values |= lines
     named = [n for n in problem.named if n.active.effect.name not in SETUP]
     if machine.recorded.lattice is None:
-        setup += noise_finding(ws)
+        setup += noise_findings(ws.observations[0].rig, noise_of(ws))[0]
     else:
         named.append(_named_lattice(ws, machine.recorded.lattice))
     return replace(

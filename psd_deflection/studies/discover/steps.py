@@ -74,7 +74,7 @@ def weigh(problem: Problem) -> Problem:
         p, delta_bic, delta_chi2 = found.weigh(null, fit)
         result = replace(problem.result, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others)
         problem = accepted(replace(problem, result=result, fit=fit))
-    problem = _credible(problem)
+    problem = credible(problem)
     bare = problem.bare
     return problem if bare is problem.comparison else replace(problem, null=refit(bare, ()))
 
@@ -103,7 +103,7 @@ def accepted(problem: Problem) -> Problem:
         problem = without_one(problem, min(fails)[1], 'fails the joint rule')
 
 
-def _credible(problem: Problem) -> Problem:
+def credible(problem: Problem) -> Problem:
     """Without effects that explain less than the unknown remainder: they probably stand in for it."""
     while True:
         left = problem.machine.look(problem.comparison, problem.fit, problem.result.null, problem.rng)

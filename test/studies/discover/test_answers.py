@@ -20,7 +20,6 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import nested
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.discover import discover as answer
 from psd_deflection.studies.discover import planning
 from psd_deflection.studies.discover import result as told
 from psd_deflection.studies.discover.discover import discover
@@ -658,43 +657,6 @@ def test_a_waterfall_falls_effect_by_effect() -> None:
             steps[-1] = (steps[-1][0], 1.0)
         got = weighing.waterfall_of(cast(Workspace, fake), fit, 20.0, 1.0)
         assert got == (*steps, ('noise alone', 0.5))
-
-
-def test_the_end_of_late_loads_and_what_is_between_steps_goes() -> None:
-    o = observed()
-    cut = answer._without_end(o, 0.0105)
-    assert np.flatnonzero(np.isnan(cut.volts).all(axis=1)).tolist() == list(range(1200 - 12, 1200))
-    assert not np.isnan(cut.volts[: 1200 - 12]).any()
-    snapped = answer._snapped(o, 0.01)
-    assert np.abs(snapped.volts - o.volts).max() <= 0.005 + 1e-12
-    np.testing.assert_allclose(snapped.volts / 0.01, np.rint(o.volts / 0.01))
-    assert (cut.digest, snapped.digest) == (o.hashed(), o.hashed())
-    assert answer._snapped(dataclasses.replace(o, digest='x'), 0.01).digest == 'x'
-
-
-def test_coarse_steps_are_as_likely_as_all_readings_on_them(workspace: Workspace) -> None:
-    """Each by chance with the converter's step over theirs; the likelihood is the product."""
-    lsb = RIG.converter.volts_per_count
-    lattice = make_active('quantisation', {'step': 8.0 * lsb}, 'test')
-    samples = sum(o.volts.size for o in workspace.observations)
-    assert answer._lattice_gain(workspace, lattice) == pytest.approx(samples * math.log(8.0))
-    assert answer._lattice_gain(workspace, make_active('quantisation', {'step': 0.5 * lsb}, 'test')) == 0.0
-    coarse = [dataclasses.replace(o, volts=np.rint(o.volts / (8 * lsb)) * 8 * lsb) for o in workspace.observations]
-    effects, physics = [e for e in EVERY.values() if e.lattice], Physics.of(RIG)
-    found = answer._lattice(coarse, physics, (), effects)
-    assert found is not None
-    assert found.values['step'] == pytest.approx(8.0 * lsb, rel=1e-3)
-    # One recording without them, or an effect that has them already, and they are none.
-    assert answer._lattice([coarse[0], workspace.observations[1]], physics, (), effects) is None
-    assert answer._lattice(coarse, physics, (lattice,), effects) is None
-    assert answer._lattice(coarse, physics, (), []) is None
-    named = answer._named_lattice(Workspace(coarse), lattice)
-    gain = answer._lattice_gain(workspace, lattice)
-    steps = [s for o in coarse if (s := proposals.coarse_step(o)) is not None]
-    assert named.sd == {'step': min(s[1] for s in steps)}
-    assert named.p == 0.0
-    assert named.delta_bic == pytest.approx(2.0 * gain)
-    assert dataclasses.astuple(named.heldout) == pytest.approx((gain, math.sqrt(2.0 * gain)))
 
 
 # The files.

@@ -25,7 +25,6 @@ from psd_deflection.studies.discover.search import workspace as whitened
 from psd_deflection.studies.discover.search.coincidence import Coincidence
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Dependence
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import SearchResult
@@ -38,7 +37,7 @@ from psd_deflection.studies.discover.setup.noise import NoiseModel, _filled, _ke
 from psd_deflection.studies.discover.setup.setup import likely_delays
 
 from .test_formulas import HISTORY, RIG, observed
-from .test_rules import CASES, FINE, SIGMA, Plant, active, columns, noise, nowhere, pictures, without_noise
+from .test_rules import CASES, FINE, SIGMA, Plant, active, columns, noise, nowhere, pictures
 
 A, B = ('a', 'x'), ('b', 'x')
 DOTS = [0, 1, 3, 4]
@@ -624,48 +623,6 @@ def test_gaps_of_channels_are_before_and_after() -> None:
     assert weighing.per_channel_of(fake, before, after) == {'p': (3.0, 1.0), 'q': (6.0, 2.0)}
     assert weighing.heldout_per_channel_of(fake, after) == {'p': 1.0, 'q': 2.0}
     assert weighing._beyond(5.0, math.nan) == 5.0
-
-
-def test_each_effect_has_its_own_weight_and_alternatives() -> None:
-    """Those that the search found; anew if the rule has taken effects out. The nearest rival comes first."""
-    shown = pictures(A, B)
-    plant = Plant(shown, without_noise((shown[A], 500.0), (shown[B], 300.0)))
-    fit = refit(plant, [active('a', x=0.0), active('b', x=0.0)])
-    jacobian = np.eye(fit.residual.size)[:, :2]
-
-    def other(name: str, loss: float) -> Fit:
-        effects = (fit.effects[0], active(name, x=0.1))
-        return dataclasses.replace(fit, effects=effects, chi2=fit.chi2 + loss, jacobian=jacobian)
-
-    lists = [[other('p', 9.0), other('q', 2.0), other('q', 3.0)], [other('r', 50.0)]]
-    held = [HeldOut(1.0, 2.0), HeldOut(3.0, 4.0)]
-    result = SearchResult(refit(plant, ()), fit, [0.1, 0.2], [3.0, 4.0], [5.0, 6.0], [], lists)
-    asked: list[tuple[int, float]] = []
-
-    def alternatives(null: Fit, current: Fit, index: int, gain: float) -> list[Fit]:
-        asked.append((index, gain))
-        return lists[1 - index]
-
-    search = cast(Any, SimpleNamespace(workspace=plant, penalty=3.0, alternatives=alternatives))
-    first, second = weighing.named_effects(search, result, fit, held)
-    assert (first.p, first.delta_bic, first.heldout) == (0.1, 3.0, held[0])
-    assert (second.p, second.delta_bic, second.heldout) == (0.2, 4.0, held[1])
-    assert first.equivalent == ('p', 'q')
-    assert [r.active.effect.name for r in first.rivals] == ['q', 'q', 'p']
-    assert [r.delta_bic for r in first.rivals] == pytest.approx([2.0, 3.0, 9.0])
-    assert [(n, round(a, 6), round(b, 6)) for n, a, b in first.alternatives] == [
-        ('p', 9.0, 9.0),
-        ('q', 2.0, 2.0),
-        ('q', 3.0, 3.0),
-    ]
-    assert (second.equivalent, second.rivals, second.alternatives[0][0]) == ((), (), 'r')
-    assert first.suggestion is None
-    assert asked == []
-    again = dataclasses.replace(fit)
-    first, second = weighing.named_effects(search, result, again, held)
-    assert asked == [(0, 5.0), (1, 6.0)]
-    assert second.equivalent == ('p', 'q')
-    assert first.alternatives[0][0] == 'r'
 
 
 # Where.

@@ -177,7 +177,8 @@ class Search:
         full = [refit(self.workspace, f.effects, iterations=iterations) for f in fits[:keep]]
         return min(full, key=self._bic, default=None)
 
-    def _passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
+    def passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
+        """Whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
         gain = smaller.chi2 - larger.chi2
         if not self.workspace.open_level:
             explained = null.residual - smaller.residual
@@ -229,7 +230,7 @@ class Search:
         """What :meth:`run` gives beside itself; it changes this search."""
         scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
-        current = self._mistake(null, scores)
+        current = self.mistake(null, scores)
         for _ in range(ROUNDS):
             null, current = self._grown(null, current)
             current = self._drop(null, current)
@@ -273,7 +274,7 @@ class Search:
             if slot(s.candidate.effect, s.candidate.start) not in taken and s.candidate.effect.name not in ws.first
         ]
         better = self._further(current, scores)
-        passes = better is not None and self._passes(current, better, null)
+        passes = better is not None and self.passes(current, better, null)
         if better is not None and passes and not self._stands_in(current, better):
             self._say('adding ' + better.effects[-1].label)
             return better
@@ -281,7 +282,7 @@ class Search:
         if len(current.effects) >= 2 or not (ws.open_level or passes):
             return None
         better = self._try_pairs(null, current)
-        holds = better is not current and self._passes(current, better, null)
+        holds = better is not current and self.passes(current, better, null)
         return better if holds and not self._stands_in(current, better) else None
 
     def _further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
@@ -293,7 +294,7 @@ class Search:
         starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
         return self._best_of(starts, 2, 6) if current.effects else self._best_of(starts, 4, 12)
 
-    def _mistake(self, null: Fit, scores: Sequence[Score]) -> Fit:
+    def mistake(self, null: Fit, scores: Sequence[Score]) -> Fit:
         """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
         if not scores or min(s.p for s in scores) > P_ACCEPT:
             return null
@@ -312,7 +313,7 @@ class Search:
                 starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
         found = self._best_of(starts, 2, 12)
         size = self.workspace.size
-        if found is None or not self._passes(null, found, null):
+        if found is None or not self.passes(null, found, null):
             return null
         if found.chi2 - size > NEARLY_ALL * (null.chi2 - size):
             return null
@@ -363,7 +364,7 @@ class Search:
     def _drop(self, null: Fit, current: Fit) -> Fit:
         while len(current.effects) > 1:
             best = min(self.without_each(current, null), key=self._bic)
-            if self._passes(best, current, null):
+            if self.passes(best, current, null):
                 break
             self._say('dropping to ' + ', '.join(a.label for a in best.effects))
             current = best
