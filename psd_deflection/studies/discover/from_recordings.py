@@ -64,16 +64,7 @@ def read_observation(
     check_psds(recording, rig)
     recording = recording.with_block_size(rig.estimator.block_size)
     samples = recording.samples
-    rate = recording.sample_rate_hz
-    stated = 0.0
-    if rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01 and any_rate:
-        stated = rig.converter.sample_rate_hz
-        rig = replace_values(rig, {'converter.sample_rate_hz': float(f'{rate:.5g}')}, where)
-    elif rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01:
-        raise RecordingError(
-            f'{path}: {rate:.1f} samples/s, but the rig file says converter.sample_rate_hz = '
-            f'{rig.converter.sample_rate_hz:g}; set it to what was recorded'
-        )
+    rig, stated = _at_its_rate(recording, rig, where, any_rate)
     first = int(samples['seq'][0])
     n = int(samples['seq'][-1]) - first + 1
     if n > MAX_SAMPLES:
@@ -85,42 +76,68 @@ def read_observation(
     period = 1e9 / rig.converter.sample_rate_hz
     # Times of the whole grid, lost samples included: straight lines between the samples present.
     t_ns = np.rint(np.interp(np.arange(n), place, (samples['t_ns'] - samples['t_ns'][0]).astype(np.float64)))
-    start = int(samples['t_ns'][0])
-    grace = 0.25 * period
-    applied = recording.loads()
-    if not applied:
-        raise RecordingError(
-            f'{path}: holds no loads; they are needed to compare it with a simulation '
-            f'(CSV columns load_fx, load_fy, load_tz, or the topic /link_tip/load)'
-        )
-    times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
-    held = held_at(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
-    before, after = int(np.count_nonzero(t_ns + grace < times.min())), 0
-    count, last = recording.rows_with_load()
-    later = t_ns > last - start + grace
-    # Rows of a CSV say their load, one after the other, and then no more: it may have changed unseen.
-    if count > 0.9 * np.count_nonzero(~later):
-        after = int(np.count_nonzero(later))
-    temperatures = recording.temperatures()
-    warm: FloatArray | None = None
-    if temperatures:
-        at = np.array([r.t_ns - start for r in temperatures], dtype=np.int64)
-        celsius = np.array([r.celsius for r in temperatures])
-        if recording.temperatures_held:
-            # A row's value holds until the next differs; a thermometer's messages are points on a curve.
-            warm = held_at(at, celsius, t_ns, grace, celsius[0])
-        else:
-            warm = np.interp(t_ns, at.astype(np.float64), celsius)
+    held, unknown = _held_loads(recording, t_ns, 0.25 * period)
     return Observation(
         path.name,
         rig,
         Wiring.from_rig(rig).to_psds(volts),
         held,
-        warm,
+        _held_temperature(recording, t_ns, 0.25 * period),
         digest=recording.digest,
-        unknown_load=(before, after),
+        unknown_load=unknown,
         stated_rate_hz=stated,
     )
+
+
+def _at_its_rate(recording: Recording, rig: Rig, where: str, any_rate: bool) -> tuple[Rig, float]:
+    """The rig with the sample rate that the recording's times say, and the one that the rig file states, else 0.
+
+    Raises RecordingError if they differ and not ``any_rate`` will do.
+    """
+    rate, stated = recording.sample_rate_hz, rig.converter.sample_rate_hz
+    if rate <= 0.0 or abs(rate / stated - 1.0) <= 0.01:
+        return rig, 0.0
+    if not any_rate:
+        raise RecordingError(
+            f'{recording.path}: {rate:.1f} samples/s, but the rig file says converter.sample_rate_hz = '
+            f'{stated:g}; set it to what was recorded'
+        )
+    return replace_values(rig, {'converter.sample_rate_hz': float(f'{rate:.5g}')}, where), stated
+
+
+def _held_loads(recording: Recording, t_ns: FloatArray, grace: float) -> tuple[FloatArray, tuple[int, int]]:
+    """Loads (n, 3) at ``t_ns`` (n,) from the first sample; numbers of samples before the first known and after.
+
+    Raises RecordingError if there are none.
+    """
+    applied = recording.loads()
+    if not applied:
+        raise RecordingError(
+            f'{recording.path}: holds no loads; they are needed to compare it with a simulation '
+            f'(CSV columns load_fx, load_fy, load_tz, or the topic /link_tip/load)'
+        )
+    start = int(recording.samples['t_ns'][0])
+    times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
+    held = held_at(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
+    count, last = recording.rows_with_load()
+    later = t_ns > last - start + grace
+    # Rows of a CSV say their load, one after the other, and then no more: it may have changed unseen.
+    after = int(np.count_nonzero(later)) if count > 0.9 * np.count_nonzero(~later) else 0
+    return held, (int(np.count_nonzero(t_ns + grace < times.min())), after)
+
+
+def _held_temperature(recording: Recording, t_ns: FloatArray, grace: float) -> FloatArray | None:
+    """Degrees Celsius (n,) at ``t_ns`` (n,) from the first sample, None if the recording has none."""
+    temperatures = recording.temperatures()
+    if not temperatures:
+        return None
+    start = int(recording.samples['t_ns'][0])
+    at = np.array([r.t_ns - start for r in temperatures], dtype=np.int64)
+    celsius = np.array([r.celsius for r in temperatures])
+    if recording.temperatures_held:
+        # A row's value holds until the next differs; a thermometer's messages are points on a curve.
+        return held_at(at, celsius, t_ns, grace, celsius[0])
+    return np.interp(t_ns, at.astype(np.float64), celsius)
 
 
 def read_observations(

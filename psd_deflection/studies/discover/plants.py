@@ -121,6 +121,32 @@ def _table(rows: object, source: str) -> FloatArray:
     return table
 
 
+def _measured(plant: Plant) -> list[FloatArray]:
+    """The tables of ``plant``. Raises ConfigError if they do not fit its channels and cases."""
+    tables = plant.measured()
+    if len(tables) != len(plant.cases):
+        raise ConfigError(f'measured: {len(tables)} tables for {len(plant.cases)} cases')
+    measured = [_table(t, f'measured, {c}') for c, t in zip(plant.cases, tables, strict=True)]
+    if not measured:
+        raise ConfigError('cases: there is none; discover_in needs at least one')
+    for name, rows in zip(plant.cases, measured, strict=True):
+        if rows.ndim != 2 or len(rows) != len(plant.channels) or rows.shape[1] < 1:
+            raise ConfigError(f'measured, {name}: has the shape {rows.shape}: must be ({len(plant.channels)}, n)')
+    return measured
+
+
+def _check_plant(plant: Plant) -> None:
+    """Raise ConfigError if units, noise and library contradict each other."""
+    if len(plant.units) != len(plant.channels):
+        raise ConfigError(f'units: {len(plant.units)} of them for {len(plant.channels)} channels')
+    if plant.noise and (len(plant.noise) != len(plant.channels) or min(plant.noise) <= 0.0):
+        raise ConfigError(f'noise = {plant.noise}: must be one number above 0 for each channel, or none at all')
+    names = [e.name for e in (*plant.library, *plant.nuisance)]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ConfigError(f'library: {", ".join(twice)} is there twice, in library or nuisance')
+
+
 class PlantComparison(Comparison):
     """A plant's cases, measured and simulated. Raises ConfigError if its tables do not fit each other."""
 
@@ -133,23 +159,8 @@ class PlantComparison(Comparison):
         self.tally = Tally()
         self.base = ()
         self.nuisance = tuple(ActiveEffect(e, e.off_values(plant.physics, next(e.variants()))) for e in plant.nuisance)
-        tables = plant.measured()
-        if len(tables) != len(plant.cases):
-            raise ConfigError(f'measured: {len(tables)} tables for {len(plant.cases)} cases')
-        self.measured = [_table(t, f'measured, {c}') for c, t in zip(plant.cases, tables, strict=True)]
-        if not self.measured:
-            raise ConfigError('cases: there is none; discover_in needs at least one')
-        for name, rows in zip(plant.cases, self.measured, strict=True):
-            if rows.ndim != 2 or len(rows) != len(plant.channels) or rows.shape[1] < 1:
-                raise ConfigError(f'measured, {name}: has the shape {rows.shape}: must be ({len(plant.channels)}, n)')
-        if len(plant.units) != len(plant.channels):
-            raise ConfigError(f'units: {len(plant.units)} of them for {len(plant.channels)} channels')
-        if plant.noise and (len(plant.noise) != len(plant.channels) or min(plant.noise) <= 0.0):
-            raise ConfigError(f'noise = {plant.noise}: must be one number above 0 for each channel, or none at all')
-        names = [e.name for e in (*plant.library, *plant.nuisance)]
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if twice:
-            raise ConfigError(f'library: {", ".join(twice)} is there twice, in library or nuisance')
+        self.measured = _measured(plant)
+        _check_plant(plant)
         self.there = [np.isfinite(m) for m in self.measured]
         self.total = np.sum([t.sum(axis=1) for t in self.there], axis=0)
         for name, count in zip(plant.channels, self.total.tolist(), strict=True):

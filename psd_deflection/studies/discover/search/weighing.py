@@ -14,7 +14,7 @@ from psd_deflection.studies.discover.search.coincidence import Coincidence
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.hold_out import HeldOut, scatter
-from psd_deflection.studies.discover.search.localise import Localisation
+from psd_deflection.studies.discover.search.localise import Dependence, Localisation
 from psd_deflection.studies.discover.search.search import SearchResult
 
 EQUIVALENT = 21.6
@@ -143,16 +143,24 @@ def unknown_of(
     if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
         return ()
     strong = [d for d in left.dependences if d.p < 1e-3][:6]
+    size = _beyond(gap, floor)
+    words = _place_of(left, strong)
+    if size > 0.0:
+        times = f' ({gap / floor:.1f} times the noise remain)' if floor > 0.0 else ''
+        words.insert(1, f'{worded(size)} rms{times}')
+    share = left.excess / (left.excess + explained)
+    names = tuple(dict.fromkeys(d.regressor for d in strong))
+    return (Unknown('; '.join(words), names, share, rms=size),)
+
+
+def _place_of(left: Localisation, strong: Sequence[Dependence]) -> list[str]:
+    """On which channels, what it follows and how, and when it is strongest."""
     channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))
     names = tuple(dict.fromkeys(d.regressor for d in strong))
     even = sum(d.gain for d in strong if _even(d.regressor))
     odd = sum(d.gain for d in strong if not _even(d.regressor))
     lagging = any('history' in d.regressor for d in strong[:2])
-    size = _beyond(gap, floor)
     words = [f'on {", ".join(channels) or "no single channel"}']
-    if size > 0.0:
-        times = f' ({gap / floor:.1f} times the noise remain)' if floor > 0.0 else ''
-        words.append(f'{worded(size)} rms{times}')
     if strong:
         words.append(f'follows {", ".join(names[:3])}')
         words.append('mostly even' if even > 2.0 * odd else 'mostly odd' if odd > 2.0 * even else 'odd and even parts')
@@ -161,8 +169,7 @@ def unknown_of(
     if left.cells:
         c = left.cells[0]
         words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
-    share = left.excess / (left.excess + explained)
-    return (Unknown('; '.join(words), names, share, rms=size),)
+    return words
 
 
 def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Localisation) -> tuple[Unknown, ...]:
