@@ -53,7 +53,7 @@ from psd_deflection.cli._options import make_writable, namespace_option, refuse,
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save_all, show, warn
 from psd_deflection.cli.studies._answer import print_answer
-from psd_deflection.model.simulation.catalogue import effect_names
+from psd_deflection.model.simulation.catalogue import effect_folders, effect_names
 from psd_deflection.recordings.recording import WHOLE
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.fleet.parquet import Field
@@ -214,7 +214,7 @@ def _hints(args: argparse.Namespace, answer: Discovery | Settled) -> list[str]:
     if args.adopt is not None and not found.laws:
         hints.append(f'--adopt {args.adopt}: there is no law to adopt')
     elif args.adopt is not None:
-        hints += [f'{law.name} is an effect now: {adopting_folder(law.name)}' for law in found.laws]
+        hints += [f'{law.name} is an effect now: {effect_folders()[0] / law.name}.yaml' for law in found.laws]
     elif found.laws:
         hints.append(f'law: {out / "law.yaml"}; --adopt NAME makes it an effect')
     if isinstance(answer, Settled):

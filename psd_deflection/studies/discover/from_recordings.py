@@ -137,7 +137,7 @@ def _held_temperature(recording: Recording, t_ns: FloatArray, grace: float) -> F
     if recording.temperatures_held:
         # A row's value holds until the next differs; a thermometer's messages are points on a curve.
         return held_at(at, celsius, t_ns, grace, celsius[0])
-    return np.interp(t_ns, at.astype(np.float64), celsius)
+    return np.asarray(np.interp(t_ns, at.astype(np.float64), celsius))
 
 
 def read_observations(

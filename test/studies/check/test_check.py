@@ -207,7 +207,10 @@ def test_the_sign_of_one_load_is_named_and_no_wire(i: int, load: str) -> None:
 def test_loads_in_kilograms_are_named() -> None:
     loads = pushes(50.0)
     found = checked(recorded(loads, 1), loads / 9.80665)
-    assert [(f.name, round(f.value or 0.0, 2)) for f in found.findings] == [('load_unit', 9.81)]
+    assert [(f.name, f.where, round(f.value or 0.0, 2)) for f in found.findings] == [
+        ('load_unit', 'fx fy', 9.81),
+        ('load_unit', 'tz', 9.81),
+    ]
     assert found.verdict == WRONG
 
 
@@ -225,7 +228,7 @@ def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> Non
     (told,) = [text for text in found.sentences() if text.startswith(channel)]
     assert re.fullmatch(rf'{channel}: [^:]+: .+', told)
     assert '  ' not in told
-    assert any(line.startswith(f'  {channel}: ') for line in found.values())
+    assert any(line.startswith(f'  {channel}: ') for line in found.lines())
 
 
 def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() -> None:

@@ -262,11 +262,11 @@ def test_a_candidate_counts_from_a_thousandth_of_sigma_on_and_on_its_own_side_on
     plant = Plant(shown, 5.0 * unit)
     for size, seen in ((0.5, True), (1.01e-3, True), (0.99e-3, False)):
         screen = Screen(plant, [(candidate('a', 'x'), [[size * unit]])])
-        got = screen.score(plant.data)
+        got = screen.score(plant.whiten(plant.measured))
         assert [s.gain for s in got] == ([pytest.approx(25.0, rel=1e-4)] if seen else [])
     for size, least, gain in ((1.0, 0.0, 25.0), (10.0, 0.0, 25.0), (-1.0, 0.0, 0.0), (-1.0, -1.0, 25.0)):
         screen = Screen(plant, [(candidate('a', 'x', least=least), [[size * unit]])])
-        assert screen.score(plant.data)[0].gain == pytest.approx(gain, rel=1e-4)
+        assert screen.score(plant.whiten(plant.measured))[0].gain == pytest.approx(gain, rel=1e-4)
 
 
 # Wiring, jumps and places.
@@ -366,7 +366,7 @@ def test_a_table_is_tried_with_a_small_size_and_the_first_shape() -> None:
 
 def test_where_something_is_left_does_not_depend_on_the_units_of_what_is_fitted() -> None:
     workspace = Workspace([observed(warm=None)])
-    known = np.random.default_rng(3).standard_normal((len(workspace.data), 2))
+    known = np.random.default_rng(3).standard_normal((len(workspace.whiten(workspace.measured)), 2))
     residual = workspace.residual([])[0]
     one, other = (
         localise.localise(workspace, residual, k, np.random.default_rng(0)) for k in (known, known * [1e6, 1e-6])
@@ -513,7 +513,7 @@ def test_what_the_model_has_already_is_followed_by_nothing(rest: float, listed: 
     aside = np.zeros((6, FINE))
     aside[1] = values
     known = (math.sqrt(1.0 - rest) * row + math.sqrt(rest) * aside).reshape(-1, 1)
-    found = dependences(plant, [('x1', {'wave': [values]})], plant.data, known)
+    found = dependences(plant, [('x1', {'wave': [values]})], plant.whiten(plant.measured), known)
     assert bool(found) == listed
 
 

@@ -185,8 +185,9 @@ class Searches:
 
     def settle(self, most: int | None = None) -> loop.Settled:
         first, made = cast(Observation, object()), cast(Observation, object())
-        allowed = {} if most is None else {'most': most}
-        return loop.settle([first], self.search, lambda plan, number: made, **allowed)
+        if most is None:
+            return loop.settle([first], self.search, lambda plan, number: made)
+        return loop.settle([first], self.search, lambda plan, number: made, most=most)
 
 
 def test_the_loop_ends_when_the_answer_is_unique(monkeypatch: pytest.MonkeyPatch) -> None:

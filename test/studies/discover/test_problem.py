@@ -18,7 +18,7 @@ from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
 
-from .test_rules import A, B, Lone, Plant, candidate, noise, nowhere, pictures, without_noise
+from .test_rules import A, B, Lone, Plant, active, candidate, noise, nowhere, pictures, without_noise
 
 STEPS = (search, weigh, alternatives, where)
 
@@ -141,8 +141,10 @@ def test_the_gap_before_is_that_of_the_recording_as_it_was_stated() -> None:
 def test_a_comparison_does_not_change() -> None:
     shown = pictures(A)
     plant = Plant(shown, noise())
-    other = plant.replaced(base=('x',), first=frozenset())
-    assert (plant.base, plant.first, other.base) == ((), FIRST, ('x',))
+    more = (active('a', x=0.1),)
+    other = plant.replaced(base=more, first=frozenset())
+    assert (plant.base, plant.first) == ((), FIRST)
+    assert (other.base, other.first) == (more, frozenset())
     # What it costs is counted for all of them.
     other.replaced(base=()).simulate(())
     assert plant.simulations == other.simulations == 1
