@@ -7,7 +7,6 @@ maker's model. ``--null`` gives each model what is published. result.json and re
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,8 +16,7 @@ from blind.boom import Boom
 from blind.emps import Emps
 from blind.measured import DATA
 from psd_deflection.studies.discover.plants import Plant, PlantDiscovery, discover_in
-from psd_deflection.studies.discover.report import report_html
-from psd_deflection.studies.discover.result import result, sentence, size_of
+from psd_deflection.studies.discover.result import size_of
 
 MACHINES: Mapping[str, tuple[Callable[[Path], Plant], Callable[[Path], Plant] | None]] = {
     'boom': (lambda folder: Boom(folder), lambda folder: Boom(folder, weighed=True)),
@@ -30,7 +28,7 @@ FOLDERS = {'boom': 'boom', 'emps': 'emps', 'arm': 'two_link_arm'}
 
 def lines(found: PlantDiscovery) -> list[str]:
     """The answer in words."""
-    out = [sentence(found)]
+    out = [found.sentence]
     for e in found.effects:
         unseen = f'unseen cases {e.heldout.gain:+.1f} ± {e.heldout.error:.1f}'
         out.append(f'  {e.active.label} ({size_of(e)}): BIC better by {e.delta_bic:.1f}, {unseen}')
@@ -63,11 +61,7 @@ def main() -> int:
         found = discover_in(plant, progress=lambda words: print(f'... {words}', file=sys.stderr))
         print('\n'.join([f'{name}: {lines(found)[0]}', *lines(found)[1:]]))
         if args.out is not None:
-            folder = args.out / name
-            folder.mkdir(parents=True, exist_ok=True)
-            tree = json.dumps(result(found), indent=1, allow_nan=False)
-            (folder / 'result.json').write_text(tree + '\n', encoding='utf-8')
-            (folder / 'report.html').write_text(report_html(found), encoding='utf-8')
+            found.save(args.out / name)
     return 0
 
 

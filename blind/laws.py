@@ -24,9 +24,9 @@ from blind import generator, law_forms
 from blind.campaign import bound_line, conclude, options, over
 from blind.cases import designs, gap_of
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import result
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.signatures import SignatureBank
 
 _BANK = SignatureBank()
@@ -92,7 +92,7 @@ def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
 def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Discovery]:
     """discover's result.json."""
     found = discover(observe(law, seed), load_rig(), seed=0, bank=_BANK)
-    return result(found), found
+    return found.tree(), found
 
 
 def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:

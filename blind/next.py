@@ -94,7 +94,7 @@ def one(job: tuple[str, str, float]) -> dict[str, Any]:
         made.append(observed([hidden], plan.loads, warm, length, seed + number, f'next {number}'))
         return made[-1]
 
-    done = settle([first], RIG, record, most=MOST)
+    done = settle([first], lambda known: discover(known, RIG), record, most=MOST)
     named = [*(e.active.effect.name for e in done.found.effects), *(f.name for f in done.found.setup)]
     together = sorted(done.found.unsettled)
     row |= {

@@ -20,9 +20,9 @@ from blind.campaign import conclude, options, over
 from blind.cases import Case, all_cases, designs, scaled, short_cases
 from blind.mistakes import observed
 from psd_deflection.rig.config import load_rig, replace_values
-from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import result
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.signatures import SignatureBank
 
 _BANKS: dict[str, SignatureBank] = {}
@@ -52,7 +52,7 @@ def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any],
     bank = None if case.mistake[0] else _BANKS.setdefault(case.design, SignatureBank())
     seen = observe(case, truth)
     found = discover(seen, seen[0].rig if case.mistake[0] else load_rig(), seed=0, without=case.without, bank=bank)
-    return result(found), found
+    return found.tree(), found
 
 
 def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:

@@ -26,7 +26,6 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import sentence
 
 SETTLE = 14.0
 """s under load before the figures are read: the modes have decayed, and creep is complete."""
@@ -145,7 +144,7 @@ def named_b1() -> list[str]:
     counts = RigSimulator(truth, 1).step(history.loads).counts
     volts = counts.astype(np.float64) * rig.converter.volts_per_count
     found = discover([Observation('as in Table B1', rig, volts, history.loads)], rig)
-    lines = ['discover, on a recording with the bending and the twist of that row:', '  ' + sentence(found)]
+    lines = ['discover, on a recording with the bending and the twist of that row:', '  ' + found.sentence]
     for e in found.effects:
         values = ', '.join(f'{k} {e.active.values[k]:.5g} +- {sd:.2g}' for k, sd in e.sd.items())
         lines.append(f'  {e.active.label}: {values}; equivalent: {", ".join(e.equivalent) or "none"}')

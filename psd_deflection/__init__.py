@@ -15,10 +15,10 @@
     pd.validate(recording, 'tracker.csv')                # against an independent reference
     pd.calibrate([recording]).save('calibrated')         # how the rig differs from its file; writes rig.yaml
     pd.budget(rig).tree()                                # what each source of error does
-    pd.discover([recording], rig)                        # the effects that the simulation lacks
+    pd.discover([recording], rig).save('found')          # the effects that the simulation lacks; writes model.yaml
     pd.discover_in(plant)                                # the same for a machine of yours that simulates itself
 
-The answers of check, identify, validate, calibrate and budget are :class:`psd_deflection.studies.study.StudyResult`:
+The answers of these studies are :class:`psd_deflection.studies.study.StudyResult`:
 ``sentences()`` for a person, ``tree()`` for a program, ``report()`` is the page, ``save(folder)`` writes what the
 command writes.
 
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
     from psd_deflection.studies.budget.result import Budgeted
     from psd_deflection.studies.calibrate.result import Calibrated
     from psd_deflection.studies.check.result import Checkup
-    from psd_deflection.studies.discover.discover import Discovery
     from psd_deflection.studies.discover.plants import Plant, PlantDiscovery
+    from psd_deflection.studies.discover.result import Discovery
     from psd_deflection.studies.identify.result import Identified
     from psd_deflection.studies.validate.result import Validated
 
@@ -355,25 +355,23 @@ def discover(
 
     ``recordings``: with loads; from :func:`open` or :func:`simulate`, or paths, or ``.yaml`` lists of them.
     ``rig``: the known rig, or its parameter file; by default the parameters in the recordings. The same
-    ``seed`` gives the same answer. ``psd_deflection.studies.discover.result`` turns the answer into
-    ``result.json`` and ``model.yaml``. Raises :class:`psd_deflection.base.errors.RecordingError` if a
+    ``seed`` gives the same answer. Its ``save(folder)`` writes ``model.yaml``, ``result.json`` and ``report.html``.
+    Raises :class:`psd_deflection.base.errors.RecordingError` if a
     recording cannot be read or holds no loads, :class:`~psd_deflection.base.errors.ConfigError` for a bad
     parameter.
     """
-    from psd_deflection.studies.discover.discover import discover as of_observations
-    from psd_deflection.studies.discover.from_recordings import read_observations
+    from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 
-    known = None if rig is None else _rig(rig)
-    return of_observations(read_observations(recordings, known, any_rate=True), known, seed=seed)
+    asked = DiscoverOptions(rig, seed=seed)
+    return asked.discovered(asked.read(recordings))
 
 
 def discover_in(plant: Plant, *, seed: int = 0) -> PlantDiscovery:
     """Name the effects that the simulation of ``plant``, a machine of yours, lacks to explain what was measured.
 
     ``plant``: a :class:`psd_deflection.studies.discover.plants.Plant`, which has measured tables, a simulation and a
-    library of effects that may be missing. Search, rules and answer are those of :func:`discover`;
-    ``psd_deflection.studies.discover.result.result`` and ``psd_deflection.studies.discover.report.report_html`` turn
-    the answer into ``result.json`` and a page. The same ``seed`` gives the same answer. Raises
+    library of effects that may be missing. Search, rules and answer are those of :func:`discover`; ``save(folder)``
+    writes ``result.json`` and a page. The same ``seed`` gives the same answer. Raises
     :class:`psd_deflection.base.errors.ConfigError` if the plant contradicts itself.
     """
     from psd_deflection.studies.discover.plants import discover_in as of_plant

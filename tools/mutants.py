@@ -165,7 +165,7 @@ ROOMS: Mapping[str, Room] = {
                 f'test/studies/discover/test_{n}.py'
                 for n in (
                     *('formulas', 'law_formulas', 'plant_formulas', 'answers', 'rules', 'steps', 'parts'),
-                    *('discover_parts', 'search_parts', 'limits', 'ties'),
+                    *('problem', 'limits', 'ties'),
                 )
             ),
             # Their pieces: a whole discovery of the catalogue takes seconds.

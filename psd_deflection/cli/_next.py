@@ -1,4 +1,4 @@
-"""``discover --next`` and ``--run``: the limits in words, the plan as text and files, recordings of a simulated rig."""
+"""``discover --next`` and ``--run``: the limits in words, what to type, recordings of a simulated rig."""
 
 from __future__ import annotations
 
@@ -10,13 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import yaml
-
 from psd_deflection.base.errors import UsageError
-from psd_deflection.base.tables import columns
-from psd_deflection.cli._options import given_as_option, in_the_world, whole, world_option
-from psd_deflection.cli._report import save
+from psd_deflection.cli._options import given_as_option, in_the_world, refuse, whole, world_option
 from psd_deflection.model.simulation.effect_words import with_effects
 from psd_deflection.recordings.replay.simulated_run import SimulatedRun
 from psd_deflection.recordings.write.sinks import open_sink
@@ -24,10 +19,10 @@ from psd_deflection.records import AppliedLoad, Record, TemperatureReading
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.from_recordings import read_observation
+from psd_deflection.studies.discover.loop import LISTED, SCRIPT, recorded_name
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan
 
-SCRIPT, LISTED = 'next_loads.csv', 'next.yaml'
 HELP = """\
 limits of --next (--limit NAME=VALUE), with what holds if they are not given:
   force=50         largest force, N
@@ -79,6 +74,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     world_option(group)
 
 
+def limits(args: argparse.Namespace) -> Limits:
+    """The limits of --limit. Raises UsageError for options that do not belong together."""
+    if args.make_it and not args.next:
+        raise UsageError('--run is for --next')
+    if not args.next:
+        refuse(args, {'limit': []}, 'is for --next')
+    if not args.make_it:
+        refuse(args, {'effect': [], 'world': [], 'at_most': 3}, 'is for the simulated rig of --next --run')
+    return limits_from_words(args.limit)
+
+
 def limits_from_words(words: Sequence[str]) -> Limits:
     """The limits of ``--limit``. Raises UsageError naming the word and its bounds."""
     given: dict[str, Any] = {}
@@ -104,27 +110,8 @@ def limits_from_words(words: Sequence[str]) -> Limits:
     return dataclasses.replace(Limits(), **given)
 
 
-def plan_table(plan: Plan) -> str:
-    """The loads of a plan that is worth it, one row for each that is held or swept; and what becomes of each rival."""
-    rows: list[tuple[str, ...]] = [('load', 'Fx / N', 'Fy / N', 'Tz / N m', 'for / s')]
-    for script in plan.script:
-        kind, loads, *rest = script.split(':')
-        said = 'hold' if kind != 'chirp' else f'sweep {rest[0].replace(",", " to ")} Hz, up to'
-        rows += [(said, *load.split(','), rest[-1]) for load in loads.split(';')]
-    rivals = [('instead of', 'rival', 'expected chi-square', 'if the rival is true', 'at most')]
-    rivals += [(t.named, t.rival, f'{t.separation:.0f}', f'{t.reverse:.0f}', f'{t.possible:.0f}') for t in plan.told]
-    loads = f'{columns(rows)}\n\n' if plan.useful else ''
-    return loads + columns(rivals, left=2)
-
-
-def write_plan(plan: Plan, out: Path) -> list[str]:
-    """Write the load script and the list for the next search; the lines that say what to type."""
-    loads = plan.loads
-    t = np.arange(len(loads)) / plan.rate
-    lines = ['t,load_fx,load_fy,load_tz']
-    lines += [','.join(f'{v:.9g}' for v in row) for row in np.column_stack((t, loads)).tolist()]
-    save(('\n'.join(lines) + '\n').encode(), out / SCRIPT)
-    write_list([('next.csv', plan)], out)
+def how(plan: Plan, out: Path) -> list[str]:
+    """What to type to make a planned recording, whose loads are in the folder ``out``."""
     words = ['psd-deflection', 'simulate', '--out', str(out / 'next.csv'), '--loads', str(out / SCRIPT)]
     if plan.setting.swing:
         words += ['--temperature', ','.join(f'{k:g}' for k in plan.setting.knots)]
@@ -135,12 +122,6 @@ def write_plan(plan: Plan, out: Path) -> list[str]:
         f'  {shlex.join(words)}',
         f'then search again in the recordings so far and {out / LISTED}',
     ]
-
-
-def write_list(made: Sequence[tuple[str, Plan]], out: Path) -> None:
-    """Write the list of recordings that were made or are to be made, with the parameters that differ in each."""
-    tree = [{'recording': name, 'overrides': dict(plan.setting.changes)} for name, plan in made]
-    save(yaml.safe_dump(tree, sort_keys=False).encode(), out / LISTED)
 
 
 def simulated(args: argparse.Namespace, rig: Rig, out: Path) -> Callable[[Plan, int], Observation]:
@@ -158,7 +139,7 @@ def simulated(args: argparse.Namespace, rig: Rig, out: Path) -> Callable[[Plan, 
         warm = plan.setting.temperature(len(loads))
         kinds: list[type[Record]] = [AppliedLoad]
         kinds += [TemperatureReading] * (warm is not None)
-        path = out / f'next_{number}.csv'
+        path = out / recorded_name(number)
         run = SimulatedRun(true, known, loads, warm, args.seed + number)
         with contextlib.closing(open_sink(path, known.flat(), samples_with=kinds, psds=len(known.psds))) as sink:
             for each in run.records(0):

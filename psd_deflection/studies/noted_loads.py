@@ -10,7 +10,7 @@ so a wrong wiring, sign or unit changes no time.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -162,6 +162,17 @@ def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | N
     late = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
     if _alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
         return None
+    mended, notes = _as_acted(loads, changes, fitted, period)
+    left, rest = _left(rig, dots, mended)
+    if BETTER * left > _left(rig, dots, loads)[0]:
+        return None
+    return _without_rough_motion(rig, mended, notes, rest)
+
+
+def _as_acted(
+    loads: FloatArray, changes: IntArray, fitted: Mapping[int, tuple[float, float]], period: float
+) -> tuple[FloatArray, list[MendedNote]]:
+    """The loads with change ``i`` from the time ``fitted[i]`` says, in the time that it took; the notes that differ."""
     mended = np.tile(loads[0], (len(loads), 1))
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
     notes = []
@@ -172,10 +183,13 @@ def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | N
         if abs(noted - start) > ALIKE_S or took > GRADUAL_S:
             fx, fy, tz = loads[at].tolist()
             notes.append(MendedNote(i + 1, (fx, fy, tz), noted, start, took if took > GRADUAL_S else 0.0))
-    left, rest = _left(rig, dots, mended)
-    if BETTER * left > _left(rig, dots, loads)[0]:
-        return None
-    unused = np.zeros(len(loads), dtype=bool)
+    return mended, notes
+
+
+def _without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNote], rest: FloatArray) -> MendedLoads:
+    """The mended loads; the motion under one applied slowly is left out if it is not what ``rest`` (n, 4), m, shows."""
+    t: FloatArray = np.arange(len(mended), dtype=np.float64) / rig.converter.sample_rate_hz
+    unused = np.zeros(len(mended), dtype=bool)
     told = []
     for note in notes:
         moving = _moving(rig, note, t)

@@ -13,7 +13,6 @@ from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import sentence
 from psd_deflection.studies.noted_loads import ALIKE_S, MendedLoads, mend_loads, ordinal
 
 RIG = load_rig()
@@ -168,6 +167,6 @@ def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
     assert found.verdict == 'effects_found'
     assert found.floors < 1.05
     assert {f.name for f in found.setup} == {'load_time'}
-    assert not found.lines
-    assert '; load 3, 3.4 s late; load 4, ' in sentence(found)
+    assert not found.values
+    assert '; load 3, 3.4 s late; load 4, ' in found.sentence
     assert found.gap_before > 100.0 * found.gap_after

@@ -11,7 +11,8 @@ import numpy as np
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.levels import NOISE_FACTOR, SUM_FACTOR, Levels, levels
+from psd_deflection.studies.check.judges import noise_findings, unit_findings, wiring_findings
+from psd_deflection.studies.check.levels import SUM_FACTOR, Levels, levels
 from psd_deflection.studies.check.responses import responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
 from psd_deflection.studies.check.wirings import (
@@ -22,10 +23,7 @@ from psd_deflection.studies.check.wirings import (
     WiringFit,
     differences,
     fitting_wirings,
-    fix_of,
-    line,
     misfit,
-    parameters,
 )
 from psd_deflection.studies.noted_loads import MendedNote, mend_loads
 
@@ -35,8 +33,7 @@ DEAD = 0.1
 SIZE_FACTOR = 1.1
 """A movement that is so many times the expected one, or so many times less, is told."""
 
-UNITS = {9.80665: 'kg for N', 1.0 / 9.80665: 'N for kg', 1000.0: 'kN for N', 1e-3: 'mN for N'}
-UNIT_TOLERANCE = 0.1
+_LOADS = ('fx', 'fy', 'tz')
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -118,24 +115,14 @@ def _wiring_findings(
     """How ``best`` differs from the rig file's wiring; nothing if that explains the pushes too."""
     if any(c.wiring == file for c in found):
         return []
-    right = parameters(best.wiring, file)
     gained = misfit(file, seen, best.reversed_loads)[0] - best.misfit
     also = _same_to_first_order(file, seen, best)
+    if len(found) > 1:
+        also += (f'{len(found) - 1} other wirings that these pushes cannot tell from it',)
+    findings, right = wiring_findings(best.wiring, file, gained, also)
     if len(found) == 1:
         lines.update(right)
-    else:
-        also += (f'{len(found) - 1} other wirings that these pushes cannot tell from it',)
-    return [
-        Finding(
-            d.name,
-            d.where,
-            -1.0 if d.name == 'channel_sign' else None,
-            fix_of(d, best.wiring, right),
-            gained,
-            also,
-        )
-        for d in differences(best.wiring, file)
-    ]
+    return findings
 
 
 def _same_to_first_order(file: Wiring, seen: Sequence[PushResponse], best: WiringFit) -> tuple[str, ...]:
@@ -148,39 +135,20 @@ def _same_to_first_order(file: Wiring, seen: Sequence[PushResponse], best: Wirin
 
 def _load_findings(seen: Sequence[PushResponse], found: WiringFit) -> list[Finding]:
     out = [Finding('load_sign', load, -1.0, f'the sign of load_{load} is turned') for load in found.reversed_loads]
-    sizes = [p.misfit(found.wiring)[1] for p in seen if p.sized]
-    for factor, words in UNITS.items():
-        if sizes and all(abs(abs(s) / factor - 1.0) < UNIT_TOLERANCE for s in sizes):
-            out.append(Finding('load_unit', ' '.join(k for p in seen for k in p.loads), factor, f'loads say {words}'))
-    return out
+    sizes = np.full(3, math.nan)
+    for p in seen:
+        if p.sized:
+            sizes[[_LOADS.index(load) for load in p.loads]] = p.misfit(found.wiring)[1]
+    return out + unit_findings(sizes)[0]
 
 
 def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str, object]) -> list[Finding]:
-    if any(any(psd.noise) for psd in rig.psds):
-        return [f for psd in (1, 2) for f in _channel_findings(rig, measured, wiring, psd, lines)]
-    factor = measured.noise_factor
-    if not factor or 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR:
-        return []
-    level = float(f'{factor * rig.amplifier.noise:.2g}')
-    lines['amplifier.noise'] = level
-    return [Finding('noise_level', 'x1 y1 x2 y2', round(factor, 3), line('amplifier.noise', level))]
-
-
-def _channel_findings(rig: Rig, measured: Levels, wiring: Wiring, psd: int, lines: dict[str, object]) -> list[Finding]:
-    """The noise of one PSD's x and y against a rig file that says it for each."""
-    step = rig.converter.volts_per_count
-    stated = np.hypot(rig.noises[psd - 1, :2], step / np.sqrt(12.0))
-    columns = list(wiring.columns[3 * psd - 3 : 3 * psd - 1])
-    if any(CHANNELS[c] in measured.stuck for c in columns):
-        return []
-    factors = measured.noise[columns] / stated
-    far = np.maximum(factors, 1.0 / factors)
-    if (far <= NOISE_FACTOR).all():
-        return []
-    worst = int(np.argmax(far))
-    name, level = f'psd_{psd}.noise', [float(f'{v:.2g}') for v in measured.noise[columns].tolist()]
-    lines[name] = level
-    return [Finding('noise_level', f'{"xy"[worst]}{psd}', round(float(factors[worst]), 3), line(name, level))]
+    """The noise of each PSD's x and y against the rig file."""
+    columns = [wiring.columns[c] for c in DOT_CHANNELS]
+    noise = [math.nan if CHANNELS[c] in measured.stuck else measured.noise[c] for c in columns]
+    found, right = noise_findings(rig, np.array(noise))
+    lines |= right
+    return found
 
 
 def _coverage(

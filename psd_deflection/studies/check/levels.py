@@ -7,14 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 
 MAINS = (50.0, 60.0)
 """Hz."""
-
-NOISE_FACTOR = 1.5
-"""Noise that is so many times the rig file's, or so many times less, is told."""
 
 SUM_FACTOR = 1.15
 """A sum that is so many times the nominal one, or so many times less, is told."""
@@ -53,12 +50,6 @@ class Levels:
     hum_hz: float
     sums: FloatArray
     stuck: tuple[str, ...]
-
-    @property
-    def noise_factor(self) -> float:
-        """Noise of the dots' channels (rms over those that move) over the rig file's."""
-        moving = [i for i in DOT_CHANNELS if CHANNELS[i] not in self.stuck]
-        return float(np.sqrt(np.mean(self.noise[moving] ** 2)) / self.stated) if moving else 0.0
 
 
 def levels(rig: Rig, volts: FloatArray) -> Levels:

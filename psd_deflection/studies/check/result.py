@@ -56,6 +56,18 @@ class Finding:
     equivalent: tuple[str, ...] = ()
 
 
+def finding_tree(finding: Finding) -> dict[str, Any]:
+    """A finding as JSON has it."""
+    return {
+        'name': finding.name,
+        'where': finding.where,
+        'value': finding.value,
+        'fix': finding.fix,
+        'evidence': finding.evidence,
+        'equivalent': list(finding.equivalent),
+    }
+
+
 @dataclass(frozen=True, eq=False)
 class Checkup(StudyResult):
     """``findings``: what is wrong. ``values``: parameters for the rig file. ``sizes``: movement of each push over
@@ -116,17 +128,7 @@ class Checkup(StudyResult):
         measured = self.levels
         return {
             'verdict': self.verdict,
-            'setup': [
-                {
-                    'name': f.name,
-                    'where': f.where,
-                    'value': f.value,
-                    'fix': f.fix,
-                    'evidence': f.evidence,
-                    'equivalent': list(f.equivalent),
-                }
-                for f in self.findings
-            ],
+            'setup': [finding_tree(f) for f in self.findings],
             'lines': dict(self.values),
             'wirings_that_fit': [_wiring_json(c.wiring) for c in self.found],
             'pushes': [

@@ -1,4 +1,4 @@
-"""Compare, localise, name, add, show: :func:`discover` runs all steps for the rig.
+"""Compare, localise, name, add, show: :func:`discover` runs all steps for the rig with its recordings.
 
 The default answer is "nothing missing". A discrepancy that no effect explains is described as unknown.
 """
@@ -6,76 +6,213 @@ The default answer is "nothing missing". A discrepancy that no effect explains i
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
-from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
-from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
-from psd_deflection.rig.config import Rig, replace_values
-from psd_deflection.studies.check.result import Finding
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.check.judges import noise_findings
+from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.planning import suggest
+from psd_deflection.studies.discover.planning import Suggestion, suggest
+from psd_deflection.studies.discover.problem import Machine, Problem, Progress
+from psd_deflection.studies.discover.recorded import Recorded
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals as propose
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_tables
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Localisation, localise
 from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.search import BIC_ACCEPT, Search, SearchResult, far
+from psd_deflection.studies.discover.search.search import far
 from psd_deflection.studies.discover.search.signatures import SignatureBank, candidates, signatures_beside
-from psd_deflection.studies.discover.search.weighing import (
-    UNSAID,
-    Conclusion,
-    NamedEffect,
-    accept,
-    credible,
-    heldout_per_channel_of,
-    named_effects,
-    per_channel_of,
-    tied,
-    unknown_of,
-    unsaid,
-    waterfall_of,
-    without_one,
-)
+from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
-from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, beginning, mistakes
-from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, noise_finding, said, wire
+from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, mistakes
+from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
+from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Discovery(Conclusion):
-    """The answer for the rig. Gaps in m (rms of block means over x1 y1 x2 y2).
+def discover(
+    recordings: Sequence[Observation],
+    rig: Rig | None = None,
+    *,
+    seed: int = 0,
+    without: Sequence[str] = (),
+    bank: SignatureBank | None = None,
+    progress: Progress = lambda _: None,
+) -> Discovery:
+    """Name the effects that the simulation of ``rig`` lacks to explain ``recordings``.
 
-    ``setup``: mistakes of the set-up and the recording, with ``lines`` that put the rig file right; ``known``: the
-    effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
-    ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
-    set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
-    ``moves``: by how much at most the effects change an estimate that does not know of them: dX m, dY m, theta rad.
+    Each recording carries its rig with its own overrides; ``rig`` is the common one (that of the
+    first by default), whose effects count as known. ``without``: effects to leave out of the
+    library. ``bank``: signatures of the same design from an earlier call. Raises ConfigError if the
+    rig's effects are malformed.
+    """
+    known = recordings[0].rig if rig is None else rig
+    machine = RecordedRig.of(recordings, known, without, bank, progress)
+    problem = solve(machine, (search, weigh, law, alternatives, set_up, where), seed, progress)
+    return Discovery(
+        **fields_of(problem),
+        setup=problem.setup,
+        values=problem.values,
+        known=machine.recorded.known,
+        law=problem.law if problem.unknown else None,
+        rivals=problem.rivals,
+        unsettled=problem.unsettled,
+        moves=pose_change(workspace_of(problem.bare), problem.fit) if problem.named else (0.0, 0.0, 0.0),
+        rig=known,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedRig(Machine):
+    """The rig with its recordings. ``workspace``: these against its simulation. ``proposals``: starting values that the
+    residual shows, by name. ``bank``: signatures beside nothing.
     """
 
+    recorded: Recorded
     workspace: Workspace
-    setup: tuple[Finding, ...]
-    lines: Mapping[str, object]
-    known: tuple[ActiveEffect, ...]
-    law: FoundLaw | None
-    rivals: tuple[Fit, ...]
-    unsettled: tuple[str, ...]
-    moves: tuple[float, float, float]
+    proposals: Mapping[str, Sequence[float]]
+    bank: SignatureBank
 
-    @property
-    def active_effects(self) -> list[ActiveEffect]:
-        """The effects to add to the rig file."""
-        return [*self.known, *(e.active for e in self.effects)]
+    @classmethod
+    def of(
+        cls,
+        recordings: Sequence[Observation],
+        rig: Rig,
+        without: Sequence[str],
+        bank: SignatureBank | None,
+        progress: Progress,
+    ) -> RecordedRig:
+        """The recordings made ready. ``bank``: see :func:`discover`."""
+        progress('checking the recording')
+        recorded = Recorded(tuple(recordings), rig, tuple(effects_of_rig(rig)), tuple(without))
+        for step in recordings_ready.STEPS:
+            recorded = step(recorded)
+        progress('simulating the rig as it is described')
+        recorded, workspace = recordings_ready.compared(recorded)
+        # Signatures that are kept are those of recordings as they were, from rest.
+        changed = bool(recorded.findings or workspace.nuisance) or any(d > 0.0 for d in recorded.delays)
+        kept = SignatureBank() if bank is None or changed else bank
+        kept.nominal(workspace)
+        found = _proposals(workspace)
+        if recorded.lattice is not None:
+            workspace = workspace.replaced(base=(*workspace.base, recorded.lattice))
+        return cls(recorded=recorded, workspace=workspace, proposals=found, bank=kept)
+
+    def compared(self) -> Workspace:
+        """The recordings against the simulation."""
+        return self.workspace
+
+    def bare(self, comparison: Comparison) -> Comparison:
+        """Without the coarse steps."""
+        if self.recorded.lattice is None:
+            return comparison
+        return comparison.replaced(base=tuple(a for a in comparison.base if a is not self.recorded.lattice))
+
+    def seen(self, comparison: Comparison) -> float:
+        """Chi-square that the coarse steps explain."""
+        lattice = self.recorded.lattice
+        return 0.0 if lattice is None else 2.0 * lattice_gain(workspace_of(comparison), lattice)
+
+    def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
+        """The catalogue's effects and the mistakes of the set-up, beside ``fit`` if that leaves much."""
+        ws = workspace_of(comparison)
+        residual = ws.residual([*ws.base, *ws.nuisance])[0] if fit is None else fit.residual
+        more = mistakes(len(ws.observations), self.recorded.delays, likely_jumps(ws, residual))
+        more = [e for e in more if e.name not in FIRST or e.name in ws.first]
+        library = [e for e in catalogue().values() if e.name not in self.recorded.without and not e.lattice]
+        values = self.proposals
+        if fit is not None and fit.effects:
+            # A large effect hides the spectral lines of a small one.
+            beside = _proposals(ws, fit.effects)
+            values = {name: [*seen, *(v for v in beside[name] if v not in seen)] for name, seen in values.items()}
+        listed = candidates([*library, *more], self.recorded.physics, values)
+        if fit is None or not far(fit):
+            return Screen(ws, [(c, self.bank.get(c, ws)) for c in listed])
+        # A large effect changes the signatures of the others.
+        return Screen(ws, signatures_beside(ws, listed, fit))
+
+    def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
+        """By load case, channel and frequency band, and what it follows."""
+        ws = workspace_of(comparison)
+        if null is None or not fit.free:
+            return localise(ws, fit.residual, None, rng)
+        return localise(ws, fit.residual, fit.jacobian, rng, explained=null.residual - fit.residual)
+
+    def suggest(self, comparison: Comparison, fit: Fit, equal: Sequence[Fit]) -> Suggestion | None:
+        """The recording that tells them apart."""
+        return suggest(workspace_of(comparison), fit, equal[: 3 if comparison.simulations < comparison.budget else 1])
+
+
+def workspace_of(comparison: Comparison) -> Workspace:
+    """``comparison``, which is that of the rig."""
+    if not isinstance(comparison, Workspace):
+        raise TypeError(f'{type(comparison).__name__}: not the rig with its recordings')
+    return comparison
+
+
+def rig_of(problem: Problem) -> RecordedRig:
+    """The machine of ``problem``, which is the rig."""
+    if not isinstance(problem.machine, RecordedRig):
+        raise TypeError(f'{type(problem.machine).__name__}: not the rig with its recordings')
+    return problem.machine
+
+
+def law(problem: Problem) -> Problem:
+    """A law for what remains, and the fit without the effects that only stood in for it."""
+    ws, fit = workspace_of(problem.comparison), problem.fit
+    # Coarse steps cause noise that varies with the signal, which is no law.
+    if rig_of(problem).recorded.lattice is not None:
+        return problem
+    much = ws.gap(fit.difference) > UNSAID * ws.floor()
+    if not (unknown_of(problem.left, 1.0) or much or coincidences(fit, ws.physics)):
+        return problem
+    found = find_law(ws, problem.null, fit, problem.search.penalty, problem.left.excess, problem.rng, problem.progress)
+    if found is None:
+        return problem
+    problem = _beside(replace(problem, law=found), found)
+    return replace(problem, left=problem.machine.look(ws, problem.fit, problem.result.null, problem.rng))
+
+
+def _beside(problem: Problem, found: FoundLaw) -> Problem:
+    kept = {(a.effect.name, a.choices) for a in found.beside}
+    for i in reversed(range(len(problem.fit.effects))):
+        active = problem.fit.effects[i]
+        if (active.effect.name, active.choices) not in kept:
+            problem = without_one(problem, i, 'only stood in for the law')
+    return problem
+
+
+def set_up(problem: Problem) -> Problem:
+    """What is wrong with the set-up, beside the named effects that are physics; and the coarse steps."""
+    machine, ws = rig_of(problem), workspace_of(problem.comparison)
+    setup, values = list(machine.recorded.findings), dict(machine.recorded.values)
+    for i, effect in enumerate(problem.named):
+        if effect.active.effect.name in SETUP:
+            more, lines = said(ws, problem.fit, i, effect.delta_bic)
+            setup += [dataclasses.replace(f, equivalent=effect.equivalent) for f in more]
+            values |= lines
+    named = [n for n in problem.named if n.active.effect.name not in SETUP]
+    if machine.recorded.lattice is None:
+        setup += noise_findings(ws.observations[0].rig, noise_of(ws))[0]
+    else:
+        named.append(_named_lattice(ws, machine.recorded.lattice))
+    return replace(
+        problem,
+        named=tuple(named),
+        setup=tuple(setup),
+        values=values,
+        stated_gap=machine.recorded.stated_gap,
+    )
 
 
 def _proposals(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> dict[str, list[float]]:
@@ -90,254 +227,6 @@ def _proposals(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> di
         'highest': propose.highest_voltages(observations, True, noise),
         'highest_dots': propose.highest_voltages(observations, False, noise),
     }
-
-
-def discover(
-    recordings: Sequence[Observation],
-    rig: Rig | None = None,
-    *,
-    seed: int = 0,
-    without: Sequence[str] = (),
-    bank: SignatureBank | None = None,
-    progress: Callable[[str], None] = lambda _: None,
-) -> Discovery:
-    """Name the effects that the simulation of ``rig`` lacks to explain ``recordings``.
-
-    Each recording carries its rig with its own overrides; ``rig`` is the common one (that of the
-    first by default), whose effects count as known. ``without``: effects to leave out of the
-    library. ``bank``: signatures of the same design from an earlier call. Raises ConfigError if the
-    rig's effects are malformed.
-    """
-    rig = recordings[0].rig if rig is None else rig
-    rates = {o.rig.converter.sample_rate_hz for o in recordings if o.stated_rate_hz}
-    lines: dict[str, object] = {'converter.sample_rate_hz': rates.pop()} if len(rates) == 1 else {}
-    rng = np.random.default_rng(seed)
-    base = effects_of_rig(rig)
-    progress('checking the recording')
-    cleaned = [clean(o, base) for o in recordings]
-    timed = [time_loads(o) for o, _ in cleaned]
-    late = [f for _, found in timed for f in found]
-    observations, findings, rewired = wire([o for o, _ in timed], base)
-    before = 0.0
-    if findings or late:
-        stated = Workspace([o for o, _ in cleaned], base)
-        before = stated.gap(stated.residual(base)[1])
-    findings = [*late, *(f for _, found in cleaned for f in found), *findings]
-    lines.update(rewired)
-    if lines:
-        rig = replace_values(rig, lines)
-    physics = Physics.of(rig)
-    of_lattice = [e for e in catalogue().values() if e.lattice]
-    lattice = _lattice(observations, physics, base, [e for e in of_lattice if e.name not in without])
-    if lattice is not None:
-        observations = [_snapped(o, lattice.values[lattice.effect.lattice]) for o in observations]
-    progress('simulating the rig as it is described')
-    workspace = Workspace(observations, base)
-    delays = likely_delays(workspace)
-    if any(d > 0.0 for d in delays):
-        # The loads of the last moments are noted after the end.
-        observations = [_without_end(o, max(delays)) for o in observations]
-        workspace = Workspace(observations, base)
-    workspace.nuisance = tuple(_beginnings(workspace))
-    # Signatures that are kept are those of recordings as they were, from rest.
-    changed = bool(findings) or bool(workspace.nuisance) or any(d > 0.0 for d in delays)
-    kept = SignatureBank() if bank is None or changed else bank
-    kept.nominal(workspace)
-    found = _proposals(workspace)
-    if lattice is not None:
-        workspace.base = (*workspace.base, lattice)
-
-    looked_for = set(FIRST)
-
-    def screen(_: Comparison, current: Fit | None) -> Screen:
-        ws = workspace
-        residual = ws.residual([*ws.base, *ws.nuisance])[0] if current is None else current.residual
-        more = mistakes(len(observations), delays, likely_jumps(ws, residual))
-        more = [e for e in more if e.name not in FIRST or e.name in looked_for]
-        library = [e for e in catalogue().values() if e.name not in without and not e.lattice]
-        values: Mapping[str, list[float]] = found
-        if current is not None and current.effects:
-            # A large effect hides the spectral lines of a small one.
-            beside = _proposals(workspace, current.effects)
-            values = {name: [*seen, *(v for v in beside[name] if v not in seen)] for name, seen in found.items()}
-        listed = candidates([*library, *more], physics, values)
-        if current is None or not far(current):
-            return Screen(ws, [(c, kept.get(c, ws)) for c in listed])
-        # A large effect changes the signatures of the others.
-        return Screen(ws, signatures_beside(ws, listed, current))
-
-    progress('signatures of every effect')
-    search = Search(workspace, screen, progress)
-    result = search.run()
-    names = {a.effect.name for a in result.fit.effects}
-    if names & FIRST and names - SETUP:
-        # A mistake that needs an effect beside it must be much better than effects alone.
-        looked_for.clear()
-        noise = workspace.noise
-        other = Search(workspace, screen, progress)
-        plain = other.run()
-        if plain.fit.chi2 + other.penalty * plain.fit.parameters < (
-            result.fit.chi2 + search.penalty * result.fit.parameters + BIC_ACCEPT
-        ):
-            search, result = other, plain
-        else:
-            workspace.noise = noise
-    workspace.nuisance = result.fit.nuisance
-    progress('weighing')
-    heldout, fit = accept(search, result, rng)
-    seen = 0.0 if lattice is None else 2.0 * _lattice_gain(workspace, lattice)
-
-    def look(fit: Fit, null: Fit) -> Localisation:
-        explained = null.residual - fit.residual if fit.free else None
-        return localise(workspace, fit.residual, fit.jacobian if fit.free else None, rng, explained=explained)
-
-    fit, heldout, left = credible(search, result, fit, heldout, seen, look)
-    if lattice is not None:
-        workspace.base = tuple(a for a in workspace.base if a is not lattice)
-    checked = _Checked(findings, lines, tuple(base), before)
-    return _answer(workspace, search, result, fit, heldout, left, lattice, rng, seed, progress, checked)
-
-
-def _beginnings(workspace: Workspace) -> list[ActiveEffect]:
-    """How the link moved when the loads of a recording became known, if it was not unloaded and at rest."""
-    starts = [o.unknown_load[0] * o.period for o in workspace.observations]
-    effect = beginning(starts)
-    out = []
-    for o, choice in zip(workspace.observations, effect.variants(), strict=True):
-        if o.unknown_load[0] or np.any(o.loads[0] != 0.0):
-            out.append(ActiveEffect(effect, effect.off_values(workspace.physics, choice)))
-    return list(refit(workspace, out, iterations=3).effects) if out else []
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Checked:
-    """What the check of the recordings found, the lines for the rig file, the effects that the rig file has, and the
-    gap before the wiring was put right, m, 0 if that was right.
-    """
-
-    findings: Sequence[Finding]
-    lines: Mapping[str, object]
-    known: tuple[ActiveEffect, ...]
-    gap: float
-
-
-def _lattice(
-    observations: Sequence[Observation], physics: Physics, base: Sequence[ActiveEffect], effects: Sequence[Effect]
-) -> ActiveEffect | None:
-    """The first of ``effects`` with the step that the readings themselves show, if there is one."""
-    if not effects or any(a.effect.lattice for a in base):
-        return None
-    found = [propose.coarse_step(o) for o in observations]
-    steps = [s for s in found if s is not None]
-    if len(steps) < len(found):
-        return None
-    effect = effects[0]
-    values = effect.off_values(physics, next(effect.variants()))
-    # The recording with the widest range of values determines it best.
-    return ActiveEffect(effect, {**values, effect.lattice: min(steps, key=lambda s: s[1])[0]})
-
-
-def _snapped(o: Observation, step: float) -> Observation:
-    """The readings as multiples of ``step``, V: the converter has rounded each of them once more."""
-    return dataclasses.replace(o, volts=np.rint(o.volts / step) * step, digest=o.digest or o.hashed())
-
-
-def _without_end(o: Observation, seconds: float) -> Observation:
-    volts = o.volts.copy()
-    volts[len(volts) - math.ceil(seconds / o.period) - 1 :] = np.nan
-    return dataclasses.replace(o, volts=volts, digest=o.digest or o.hashed())
-
-
-def _answer(
-    ws: Workspace,
-    search: Search,
-    result: SearchResult,
-    fit: Fit,
-    heldout: list[HeldOut],
-    left: Localisation,
-    lattice: ActiveEffect | None,
-    rng: np.random.Generator,
-    seed: int,
-    progress: Callable[[str], None],
-    checked: _Checked,
-) -> Discovery:
-    null = result.null
-    if lattice is not None:
-        null = refit(ws, ())
-        ws.base = (*ws.base, lattice)
-    law = None
-    # Coarse steps cause noise that varies with the signal, which is no law.
-    if lattice is None and (
-        unknown_of(left, 1.0) or ws.gap(fit.difference) > UNSAID * ws.floor() or coincidences(fit, ws.physics)
-    ):
-        law = find_law(ws, null, fit, search.penalty, left.excess, rng, progress)
-    if law is not None:
-        fit, heldout = _beside(law, search, result, fit, heldout)
-        explains = null.residual - fit.residual if fit.free else None
-        left = localise(ws, fit.residual, fit.jacobian if fit.free else None, rng, explained=explains)
-    progress('alternatives')
-    named = named_effects(
-        search,
-        result,
-        fit,
-        heldout,
-        lambda best, equal: suggest(ws, best, equal[: 3 if ws.simulations < ws.budget else 1]),
-    )
-    setup, lines = list(checked.findings), dict(checked.lines)
-    for i, effect in enumerate(named):
-        if effect.active.effect.name in SETUP:
-            more, own = said(ws, fit, i, effect.delta_bic)
-            setup += [dataclasses.replace(f, equivalent=effect.equivalent) for f in more]
-            lines.update(own)
-    rivals = tuple(r.fit for e in named for r in e.rivals)
-    unsettled = tuple(dict.fromkeys(name for e in named for name in e.equivalent))
-    named = [n for n in named if n.active.effect.name not in SETUP]
-    setup += noise_finding(ws) if lattice is None else []
-    if lattice is not None:
-        named.append(_named_lattice(ws, lattice))
-        ws.base = ws.base[:-1]
-    progress('where')
-    before = left if fit is null else localise(ws, null.residual, None, rng)
-    floor = ws.floor()
-    # Coarse steps cause noise that varies with the signal; compare what they explain with it.
-    steps = 0.0 if lattice is None else 2.0 * _lattice_gain(ws, lattice)
-    explained = max(null.chi2 - fit.chi2, 0.0) + steps
-    gap_before, gap_after = checked.gap or ws.gap(null.difference), ws.gap(fit.difference)
-    unknown = (
-        unknown_of(left, explained, gap_after, floor, steps, ws.worded)
-        or unsaid(ws, gap_before, gap_after)
-        or tied(coincidences(fit, ws.physics), fit, result, before)
-    )
-    verdict = 'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing'
-    held = heldout_tables(ws, fit)
-    return Discovery(
-        verdict,
-        tuple(named),
-        unknown,
-        before,
-        left,
-        gap_before,
-        gap_after,
-        floor,
-        gap_before,
-        ws.gap(held),
-        per_channel_of(ws, null.difference, fit.difference),
-        heldout_per_channel_of(ws, held),
-        waterfall_of(ws, fit, gap_before, gap_after),
-        ws.simulations,
-        result,
-        fit,
-        ws,
-        seed,
-        (),
-        tuple(setup),
-        lines,
-        checked.known,
-        law if verdict == 'unknown_effect' else None,
-        rivals,
-        unsettled,
-        pose_change(ws, fit) if named else (0.0, 0.0, 0.0),
-    )
 
 
 def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
@@ -355,21 +244,7 @@ def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
     return (float(most[0]), float(most[1]), float(most[2]))
 
 
-def _beside(
-    law: FoundLaw, search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut]
-) -> tuple[Fit, list[HeldOut]]:
-    """``fit`` without the effects that only stood in for the law."""
-    kept = {(a.effect.name, a.choices) for a in law.beside}
-    for i in reversed(range(len(fit.effects))):
-        active = fit.effects[i]
-        if (active.effect.name, active.choices) not in kept:
-            search.trace.append(f'{active.label} only stood in for the law')
-            fit = without_one(search, result, fit, i)
-            heldout = [h for j, h in enumerate(heldout) if j != i]
-    return fit, heldout
-
-
-def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
+def lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
     """Log-likelihood of all readings lying on the lattice: by chance each does so with probability LSB/step."""
     lsb = workspace.observations[0].rig.converter.volts_per_count
     return workspace.size * workspace.fine[0] * float(np.log(max(lattice.values[lattice.effect.lattice] / lsb, 1.0)))
@@ -377,7 +252,16 @@ def _lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
 
 def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
     """The named effect of coarse steps, which the readings themselves show."""
-    gain = _lattice_gain(workspace, lattice)
+    gain = lattice_gain(workspace, lattice)
     sd = min(s[1] for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
-    heldout = HeldOut(gain, float(np.sqrt(2.0 * gain)))
-    return NamedEffect(lattice, {lattice.effect.lattice: sd}, 0.0, 2.0 * gain, heldout, (), (), (), None)
+    return NamedEffect(
+        active=lattice,
+        sd={lattice.effect.lattice: sd},
+        p=0.0,
+        delta_bic=2.0 * gain,
+        heldout=HeldOut(gain, float(np.sqrt(2.0 * gain))),
+        equivalent=(),
+        rivals=(),
+        alternatives=(),
+        suggestion=None,
+    )

@@ -266,7 +266,7 @@ def shown(
     number = len(workspace.observations)
 
     def white(effects: Sequence[ActiveEffect]) -> FloatArray:
-        workspace.simulations += 1
+        workspace.tally.count += 1
         active = only_in(sort_effects([*workspace.base, *effects]), number)
         chunk = ForwardModel(rig, active).expect(loads, temperature)
         return (fine_means(chunk.volts, size) / sigma[:, None]).ravel()

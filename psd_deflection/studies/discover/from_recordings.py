@@ -5,6 +5,7 @@ readings.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,12 @@ from psd_deflection.recordings.replay.engine import check_psds, nominal_rig, rig
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.readings import Readings
+from psd_deflection.studies.discover.plants import PlantDiscovery, discover_in
+from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
+from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.study import Tell, warn_caller
 
 
 def read_observation(
@@ -59,16 +64,7 @@ def read_observation(
     check_psds(recording, rig)
     recording = recording.with_block_size(rig.estimator.block_size)
     samples = recording.samples
-    rate = recording.sample_rate_hz
-    stated = 0.0
-    if rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01 and any_rate:
-        stated = rig.converter.sample_rate_hz
-        rig = replace_values(rig, {'converter.sample_rate_hz': float(f'{rate:.5g}')}, where)
-    elif rate > 0.0 and abs(rate / rig.converter.sample_rate_hz - 1.0) > 0.01:
-        raise RecordingError(
-            f'{path}: {rate:.1f} samples/s, but the rig file says converter.sample_rate_hz = '
-            f'{rig.converter.sample_rate_hz:g}; set it to what was recorded'
-        )
+    rig, stated = _at_its_rate(recording, rig, where, any_rate)
     first = int(samples['seq'][0])
     n = int(samples['seq'][-1]) - first + 1
     if n > MAX_SAMPLES:
@@ -80,42 +76,68 @@ def read_observation(
     period = 1e9 / rig.converter.sample_rate_hz
     # Times of the whole grid, lost samples included: straight lines between the samples present.
     t_ns = np.rint(np.interp(np.arange(n), place, (samples['t_ns'] - samples['t_ns'][0]).astype(np.float64)))
-    start = int(samples['t_ns'][0])
-    grace = 0.25 * period
-    applied = recording.loads()
-    if not applied:
-        raise RecordingError(
-            f'{path}: holds no loads; they are needed to compare it with a simulation '
-            f'(CSV columns load_fx, load_fy, load_tz, or the topic /link_tip/load)'
-        )
-    times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
-    held = held_at(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
-    before, after = int(np.count_nonzero(t_ns + grace < times.min())), 0
-    count, last = recording.rows_with_load()
-    later = t_ns > last - start + grace
-    # Rows of a CSV say their load, one after the other, and then no more: it may have changed unseen.
-    if count > 0.9 * np.count_nonzero(~later):
-        after = int(np.count_nonzero(later))
-    temperatures = recording.temperatures()
-    warm: FloatArray | None = None
-    if temperatures:
-        at = np.array([r.t_ns - start for r in temperatures], dtype=np.int64)
-        celsius = np.array([r.celsius for r in temperatures])
-        if recording.temperatures_held:
-            # A row's value holds until the next differs; a thermometer's messages are points on a curve.
-            warm = held_at(at, celsius, t_ns, grace, celsius[0])
-        else:
-            warm = np.interp(t_ns, at.astype(np.float64), celsius)
+    held, unknown = _held_loads(recording, t_ns, 0.25 * period)
     return Observation(
         path.name,
         rig,
         Wiring.from_rig(rig).to_psds(volts),
         held,
-        warm,
+        _held_temperature(recording, t_ns, 0.25 * period),
         digest=recording.digest,
-        unknown_load=(before, after),
+        unknown_load=unknown,
         stated_rate_hz=stated,
     )
+
+
+def _at_its_rate(recording: Recording, rig: Rig, where: str, any_rate: bool) -> tuple[Rig, float]:
+    """The rig with the sample rate that the recording's times say, and the one that the rig file states, else 0.
+
+    Raises RecordingError if they differ and not ``any_rate`` will do.
+    """
+    rate, stated = recording.sample_rate_hz, rig.converter.sample_rate_hz
+    if rate <= 0.0 or abs(rate / stated - 1.0) <= 0.01:
+        return rig, 0.0
+    if not any_rate:
+        raise RecordingError(
+            f'{recording.path}: {rate:.1f} samples/s, but the rig file says converter.sample_rate_hz = '
+            f'{stated:g}; set it to what was recorded'
+        )
+    return replace_values(rig, {'converter.sample_rate_hz': float(f'{rate:.5g}')}, where), stated
+
+
+def _held_loads(recording: Recording, t_ns: FloatArray, grace: float) -> tuple[FloatArray, tuple[int, int]]:
+    """Loads (n, 3) at ``t_ns`` (n,) from the first sample; numbers of samples before the first known and after.
+
+    Raises RecordingError if there are none.
+    """
+    applied = recording.loads()
+    if not applied:
+        raise RecordingError(
+            f'{recording.path}: holds no loads; they are needed to compare it with a simulation '
+            f'(CSV columns load_fx, load_fy, load_tz, or the topic /link_tip/load)'
+        )
+    start = int(recording.samples['t_ns'][0])
+    times = np.array([a.t_ns - start for a in applied], dtype=np.int64)
+    held = held_at(times, np.array([a[1:] for a in applied]), t_ns, grace, np.zeros(3))
+    count, last = recording.rows_with_load()
+    later = t_ns > last - start + grace
+    # Rows of a CSV say their load, one after the other, and then no more: it may have changed unseen.
+    after = int(np.count_nonzero(later)) if count > 0.9 * np.count_nonzero(~later) else 0
+    return held, (int(np.count_nonzero(t_ns + grace < times.min())), after)
+
+
+def _held_temperature(recording: Recording, t_ns: FloatArray, grace: float) -> FloatArray | None:
+    """Degrees Celsius (n,) at ``t_ns`` (n,) from the first sample, None if the recording has none."""
+    temperatures = recording.temperatures()
+    if not temperatures:
+        return None
+    start = int(recording.samples['t_ns'][0])
+    at = np.array([r.t_ns - start for r in temperatures], dtype=np.int64)
+    celsius = np.array([r.celsius for r in temperatures])
+    if recording.temperatures_held:
+        # A row's value holds until the next differs; a thermometer's messages are points on a curve.
+        return held_at(at, celsius, t_ns, grace, celsius[0])
+    return np.asarray(np.interp(t_ns, at.astype(np.float64), celsius))
 
 
 def read_observations(
@@ -240,3 +262,56 @@ def read_tables(
     if rig is None and warn is not None:
         warn('a table of readings says nothing of its rig: the nominal rig is taken; give --params-file')
     return [read_readings(Path(str(s)), rig, overrides, where, warn) for s, overrides, where in listed]
+
+
+@dataclass(frozen=True, slots=True)
+class DiscoverOptions:
+    """What is asked of a search; it goes to a worker process.
+
+    ``known``: the rig as it is known, or its parameter file; None: the rig in the first recording. ``without``:
+    effects that are not looked for. ``span``: the part of each recording.
+    """
+
+    known: Rig | str | Path | None = None
+    namespace: str | None = None
+    seed: int = 0
+    without: tuple[str, ...] = ()
+    span: Span = WHOLE
+
+    @property
+    def params_file(self) -> str | Path | None:
+        """The rig's, if there is one."""
+        return None if isinstance(self.known, Rig) else self.known
+
+    def rig(self) -> Rig | None:
+        """The rig as it is known, if it is. Raises ConfigError."""
+        return self.known if self.known is None or isinstance(self.known, Rig) else load_rig(self.known)
+
+    def read(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Observation]:
+        """The recordings; ``tell`` gets what is odd."""
+        return read_observations(
+            sources, self.rig(), namespace=self.namespace, span=self.span, warn=tell, any_rate=True
+        )
+
+    def tables(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Readings]:
+        """The tables of readings; none if ``sources`` are recordings."""
+        return read_tables(sources, self.rig(), tell)
+
+    def discovered(
+        self,
+        observations: Sequence[Observation],
+        progress: Callable[[str], None] = lambda _: None,
+        tell: Tell = warn_caller,
+    ) -> Discovery:
+        """The answer; ``tell`` gets a warning if the rig file cannot be edited."""
+        found = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
+        return replace(found, params_file=self.params_file, tell=tell)
+
+    def discovered_in_tables(self, tables: Sequence[Readings], tell: Tell = warn_caller) -> PlantDiscovery:
+        """The answer of tables of readings; ``tell`` gets a warning if the rig file cannot be edited.
+
+        Raises RecordingError if a part of a table is asked for.
+        """
+        if self.span != WHOLE:
+            raise RecordingError(f'{tables[0].name}: is a table of readings, which has no times: take all of it')
+        return discover_in(ReadingsPlant(tables, self.without, self.params_file, tell), seed=self.seed)

@@ -2,41 +2,107 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
-from psd_deflection.rig.config import Rig
-from psd_deflection.studies.discover.discover import Discovery, discover
+import yaml
+
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan, plan_next
+from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.study import PageSection, StudyResult
 
 Outcome = Literal['unique', 'limits', 'recordings']
+SCRIPT, LISTED = 'next_loads.csv', 'next.yaml'
+"""Files of the loads that are planned, and of the list for the next search."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Settled:
+@dataclass(frozen=True, eq=False)
+class Settled(StudyResult):
     """``found``: the last answer. ``plans``: those that were carried out. ``open``: the one that was not, if rivals
     are left. ``outcome``: one explanation is left; no recording within the limits tells the rest apart; or no more
-    recordings were allowed.
+    recordings were allowed. None: it was only planned.
     """
+
+    study, json_name = 'discover', 'result.json'
+    title = Discovery.title
 
     found: Discovery
     plans: tuple[Plan, ...]
     open: Plan | None
-    outcome: Outcome
+    outcome: Outcome | None
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """Those of the answer."""
+        return self.found.sources
 
     @property
     def sentence(self) -> str:
-        """The outcome in one sentence."""
+        """The outcome, or the plan, in one sentence."""
         count = len(self.plans)
         after = f'after {count} more recording{"" if count == 1 else "s"}' if count else 'without a further recording'
+        if self.outcome is None:
+            if self.open is None:
+                return (
+                    'No other effect explains the recordings as well: there is nothing to tell apart by a further one.'
+                )
+            return self.open.sentence
         if self.outcome == 'unique':
             return f'The answer is unique {after}.'
         if self.outcome == 'limits' and self.open is not None:
             return f'The answer is as far as it can be {after}. {self.open.sentence}'
         return f'The answer is not unique {after}, and no more were allowed.'
+
+    def sentences(self) -> list[str]:
+        """Those of the answer, then the outcome."""
+        return [*self.found.sentences(), self.sentence]
+
+    def lines(self) -> list[str]:
+        """Those of the answer, what was recorded, the outcome or the plan with its table."""
+        made = [f'{recorded_name(i)}: {p.words}' for i, p in enumerate(self.plans, start=1)]
+        out = [*self.found.lines(), *made]
+        if self.outcome is None and self.open is not None:
+            return [*out, '', self.sentence, '', *self.open.table.split('\n')]
+        return [*out, self.sentence]
+
+    def tree(self) -> dict[str, Any]:
+        """That of the answer, with the plan and what was recorded."""
+        out = {**self.found.tree(), 'next': None if self.open is None else self.open.tree()}
+        if self.outcome is not None:
+            made = [{'file': recorded_name(i), **p.tree()} for i, p in enumerate(self.plans, start=1)]
+            out['run'] = {'outcome': self.outcome, 'sentence': self.sentence, 'recordings': made}
+        return out
+
+    def sections(self) -> Iterable[PageSection]:
+        """Those of the answer."""
+        return self.found.sections()
+
+    def adopt(self, name: str) -> Settled:
+        """See :meth:`Discovery.adopt`."""
+        return replace(self, found=self.found.adopt(name))
+
+    def files(self) -> dict[str, str]:
+        """Those of the answer; the list for the next search, and the loads that are planned."""
+        out = {**self.found.files(), self.json_name: self.json()}
+        if self.outcome is not None:
+            return {**out, LISTED: _listed([(recorded_name(i), p) for i, p in enumerate(self.plans, start=1)])}
+        if self.open is not None and self.open.useful:
+            out |= {SCRIPT: self.open.loads_csv, LISTED: _listed([('next.csv', self.open)])}
+        return out
+
+
+def recorded_name(number: int) -> str:
+    """The file of a recording that was planned and made; ``number`` counts from 1."""
+    return f'next_{number}.csv'
+
+
+def _listed(made: Sequence[tuple[str, Plan]]) -> str:
+    """The list of recordings that were made or are to be made, with the parameters that differ in each."""
+    tree = [{'recording': name, 'overrides': dict(plan.setting.changes)} for name, plan in made]
+    return yaml.safe_dump(tree, sort_keys=False)
 
 
 def next_of(found: Discovery, limits: Limits | None = None) -> Plan | None:
@@ -44,24 +110,27 @@ def next_of(found: Discovery, limits: Limits | None = None) -> Plan | None:
     return plan_next(found.workspace, found.fit, found.rivals, limits)
 
 
+def planned(found: Discovery, limits: Limits | None = None) -> Settled:
+    """The answer with the plan of the next recording, which nobody makes here."""
+    return Settled(found, (), next_of(found, limits), None)
+
+
 def settle(
     recordings: Sequence[Observation],
-    rig: Rig | None,
+    search: Callable[[Sequence[Observation]], Discovery],
     record: Callable[[Plan, int], Observation],
     *,
     limits: Limits | None = None,
     most: int = 3,
-    seed: int = 0,
-    without: Sequence[str] = (),
     progress: Callable[[str], None] = lambda _: None,
 ) -> Settled:
-    """Search ``recordings``, and ``record`` what is planned (its number counts from 1) until the answer is unique.
+    """``search`` ``recordings``, and ``record`` what is planned (its number counts from 1) until the answer is unique.
 
-    ``most``: how many further recordings are made. Other arguments as for :func:`discover`.
+    ``most``: how many further recordings are made.
     """
     known, plans = list(recordings), list[Plan]()
     while True:
-        found = discover(known, rig, seed=seed, without=without, progress=progress)
+        found = search(known)
         progress('planning')
         plan = next_of(found, limits)
         # A rival with more parameters that came out as the named effect would be has nothing left that could be tested:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.tables import columns
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.discover.experiment import (
@@ -131,6 +132,30 @@ class Plan:
         )
         lasting = [t.rival for t in self.told if not t.separable]
         return f'{out}; nothing within the limits tells {", ".join(lasting)} apart.' if lasting else f'{out}.'
+
+    @property
+    def table(self) -> str:
+        """The loads, one row for each that is held or swept, if the plan is worth it; what becomes of each rival."""
+        rows: list[tuple[str, ...]] = [('load', 'Fx / N', 'Fy / N', 'Tz / N m', 'for / s')]
+        for script in self.script:
+            kind, loads, *rest = script.split(':')
+            words = 'hold' if kind != 'chirp' else f'sweep {rest[0].replace(",", " to ")} Hz, up to'
+            rows += [(words, *load.split(','), rest[-1]) for load in loads.split(';')]
+        rivals = [('instead of', 'rival', 'expected chi-square', 'if the rival is true', 'at most')]
+        rivals += [
+            (t.named, t.rival, f'{t.separation:.0f}', f'{t.reverse:.0f}', f'{t.possible:.0f}') for t in self.told
+        ]
+        held = f'{columns(rows)}\n\n' if self.useful else ''
+        return held + columns(rivals, left=2)
+
+    @property
+    def loads_csv(self) -> str:
+        """The loads as ``simulate --loads`` takes them from a file."""
+        loads = self.loads
+        t = np.arange(len(loads)) / self.rate
+        lines = ['t,load_fx,load_fy,load_tz']
+        lines += [','.join(f'{v:.9g}' for v in row) for row in np.column_stack((t, loads)).tolist()]
+        return '\n'.join(lines) + '\n'
 
     def tree(self) -> dict[str, Any]:
         """The plan as result.json has it."""

@@ -8,8 +8,9 @@ counts correlation times. Everything else is the search of :mod:`.search` and th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.special import ndtri, stdtrit
@@ -19,27 +20,16 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
-from psd_deflection.studies.discover.search.coincidence import coincidences
-from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.problem import Machine, Progress
+from psd_deflection.studies.discover.result import Conclusion
+from psd_deflection.studies.discover.search.comparison import Comparison, Tally
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_tables
 from psd_deflection.studies.discover.search.localise import Cell, Localisation, dependences
 from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.signatures import candidates, signatures_beside
-from psd_deflection.studies.discover.search.weighing import (
-    Conclusion,
-    accept,
-    credible,
-    heldout_per_channel_of,
-    named_effects,
-    per_channel_of,
-    sd_of,
-    tied,
-    unknown_of,
-    unsaid,
-    waterfall_of,
-)
+from psd_deflection.studies.discover.search.weighing import sd_of
+from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where
 
 BUDGET = 4000
 FOLDS = 4
@@ -110,6 +100,10 @@ class Plant(ABC):
         """What the search calls: :meth:`simulate`, unless a plant may have one effect several times."""
         return self.simulate({a.effect.name: dict(a.values) for a in effects})
 
+    def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
+        """Files by name that describe the machine with the ``effects`` found; they are saved with the answer."""
+        return {}
+
     def parts(self) -> Sequence[IntArray]:
         """Of each case, the part (n,), from 0, that each column is in. A part is left out of the fit in one piece to
         test it: by default the whole case, or a piece of it where there are few cases.
@@ -127,6 +121,32 @@ def _table(rows: object, source: str) -> FloatArray:
     return table
 
 
+def _measured(plant: Plant) -> list[FloatArray]:
+    """The tables of ``plant``. Raises ConfigError if they do not fit its channels and cases."""
+    tables = plant.measured()
+    if len(tables) != len(plant.cases):
+        raise ConfigError(f'measured: {len(tables)} tables for {len(plant.cases)} cases')
+    measured = [_table(t, f'measured, {c}') for c, t in zip(plant.cases, tables, strict=True)]
+    if not measured:
+        raise ConfigError('cases: there is none; discover_in needs at least one')
+    for name, rows in zip(plant.cases, measured, strict=True):
+        if rows.ndim != 2 or len(rows) != len(plant.channels) or rows.shape[1] < 1:
+            raise ConfigError(f'measured, {name}: has the shape {rows.shape}: must be ({len(plant.channels)}, n)')
+    return measured
+
+
+def _check_plant(plant: Plant) -> None:
+    """Raise ConfigError if units, noise and library contradict each other."""
+    if len(plant.units) != len(plant.channels):
+        raise ConfigError(f'units: {len(plant.units)} of them for {len(plant.channels)} channels')
+    if plant.noise and (len(plant.noise) != len(plant.channels) or min(plant.noise) <= 0.0):
+        raise ConfigError(f'noise = {plant.noise}: must be one number above 0 for each channel, or none at all')
+    names = [e.name for e in (*plant.library, *plant.nuisance)]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ConfigError(f'library: {", ".join(twice)} is there twice, in library or nuisance')
+
+
 class PlantComparison(Comparison):
     """A plant's cases, measured and simulated. Raises ConfigError if its tables do not fit each other."""
 
@@ -136,26 +156,11 @@ class PlantComparison(Comparison):
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.physics = plant.physics
-        self.simulations = 0
+        self.tally = Tally()
         self.base = ()
         self.nuisance = tuple(ActiveEffect(e, e.off_values(plant.physics, next(e.variants()))) for e in plant.nuisance)
-        tables = plant.measured()
-        if len(tables) != len(plant.cases):
-            raise ConfigError(f'measured: {len(tables)} tables for {len(plant.cases)} cases')
-        self.measured = [_table(t, f'measured, {c}') for c, t in zip(plant.cases, tables, strict=True)]
-        if not self.measured:
-            raise ConfigError('cases: there is none; discover_in needs at least one')
-        for name, rows in zip(plant.cases, self.measured, strict=True):
-            if rows.ndim != 2 or len(rows) != len(plant.channels) or rows.shape[1] < 1:
-                raise ConfigError(f'measured, {name}: has the shape {rows.shape}: must be ({len(plant.channels)}, n)')
-        if len(plant.units) != len(plant.channels):
-            raise ConfigError(f'units: {len(plant.units)} of them for {len(plant.channels)} channels')
-        if plant.noise and (len(plant.noise) != len(plant.channels) or min(plant.noise) <= 0.0):
-            raise ConfigError(f'noise = {plant.noise}: must be one number above 0 for each channel, or none at all')
-        names = [e.name for e in (*plant.library, *plant.nuisance)]
-        twice = sorted({n for n in names if names.count(n) > 1})
-        if twice:
-            raise ConfigError(f'library: {", ".join(twice)} is there twice, in library or nuisance')
+        self.measured = _measured(plant)
+        _check_plant(plant)
         self.there = [np.isfinite(m) for m in self.measured]
         self.total = np.sum([t.sum(axis=1) for t in self.there], axis=0)
         for name, count in zip(plant.channels, self.total.tolist(), strict=True):
@@ -169,7 +174,7 @@ class PlantComparison(Comparison):
         self.whole = np.ones(len(plant.channels))
         self.level = np.ones(len(plant.channels))
         self.independent = np.ones(len(plant.channels))
-        self.renoise(self.nuisance)
+        self.level, self.independent = self._noise_beside(self.nuisance)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -198,7 +203,7 @@ class PlantComparison(Comparison):
 
     def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """The plant's own simulation. Raises ConfigError if it does not fit what was measured or is not finite."""
-        self.simulations += 1
+        self.tally.count += 1
         simulated = self.plant.simulate_effects(effects)
         if len(simulated) != len(self.measured):
             raise ConfigError(f'simulate: {len(simulated)} tables for {len(self.measured)} cases')
@@ -219,19 +224,23 @@ class PlantComparison(Comparison):
         parts = [np.where(t, x / scale, 0.0).ravel() for x, t in zip(tables, self.there, strict=True)]
         return np.concatenate(parts)
 
-    def renoise(self, effects: Sequence[ActiveEffect]) -> bool:
-        """Level and independent values of what remains with ``effects``; False, and nothing changes, if the same."""
+    def _noise_beside(self, effects: Sequence[ActiveEffect]) -> tuple[FloatArray, FloatArray]:
+        """Level (channels,) and number of independent values (channels,) of what remains with ``effects``."""
         difference = [m - s for m, s in zip(self.measured, self.simulate(effects), strict=True)]
         squares = np.sum([np.where(t, d**2, 0.0).sum(axis=1) for d, t in zip(difference, self.there, strict=True)], 0)
         level = np.maximum(np.sqrt(squares / self.total), np.maximum(self.known, 1e-300))
         independent = np.array([self._independent(difference, c) for c in range(len(self.channels))])
+        return level, independent
+
+    def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
+        """With level and independent values of what remains with ``effects``; this one if they are the same."""
+        level, independent = self._noise_beside(effects)
         # Relative alone: a level in metres may be far below the 1e-8 that allclose lets pass.
         if all(
             np.allclose(a, b, rtol=SAME, atol=0.0) for a, b in ((level, self.level), (independent, self.independent))
         ):
-            return False
-        self.level, self.independent = level, independent
-        return True
+            return self
+        return self.replaced(level=level, independent=independent)
 
     def _independent(self, difference: Sequence[FloatArray], channel: int) -> float:
         """Values over the integrated correlation time, which ends at its first zero."""
@@ -363,19 +372,23 @@ class PlantComparison(Comparison):
             for name, t in zip(self.names, self.there, strict=True)
         ]
 
-    def beginning(self, null: Fit) -> None:
-        """What the fit without any effect leaves becomes the gap before."""
-        self.whole = np.maximum(self.gap_per_channel(null.difference), 1e-300)
-        self.renoise([*self.base, *null.whole])
+    def begun(self, null: Fit) -> Self:
+        """With what the fit without any effect leaves as the gap before."""
+        whole = np.maximum(self.gap_per_channel(null.difference), 1e-300)
+        return self.replaced(whole=whole).renoised([*self.base, *null.whole])
 
 
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class PlantDiscovery(Conclusion):
     """The answer for a plant. If the units of its channels differ, the gaps are shares of the gap before;
     ``per_channel`` always has the units of the channels. ``gap_floor`` is NaN if the plant states no noise.
     """
 
     workspace: PlantComparison
+
+    def files(self) -> dict[str, str]:
+        """The page, the JSON, and what the plant itself writes of the effects."""
+        return {**self.workspace.plant.files([e.active for e in self.effects]), **super().files()}
 
 
 def _powers(name: str, values: Sequence[FloatArray]) -> dict[str, Sequence[FloatArray]]:
@@ -432,7 +445,39 @@ def _where(ws: PlantComparison, fit: Fit, known: FloatArray | None) -> Localisat
     return Localisation(tuple(cells), tuple(depends), excess, p, shown, spans)
 
 
-def discover_in(plant: Plant, *, seed: int = 0, progress: Callable[[str], None] = lambda _: None) -> PlantDiscovery:
+@dataclass(frozen=True, slots=True, eq=False)
+class SimulatedPlant(Machine):
+    """A plant as the steps ask for it. ``start``: its comparison; ``nuisance``: as fitted without any effect."""
+
+    plant: Plant
+    start: PlantComparison
+    nuisance: tuple[ActiveEffect, ...]
+
+    @classmethod
+    def of(cls, plant: Plant) -> SimulatedPlant:
+        """``plant`` as it is described. Raises ConfigError if it contradicts itself."""
+        ws = PlantComparison(plant)
+        null = refit(ws, (), iterations=12)
+        return cls(plant=plant, start=ws.begun(null), nuisance=null.nuisance)
+
+    def compared(self) -> PlantComparison:
+        """Measured against simulated."""
+        return self.start
+
+    def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
+        """The plant's library, always beside what the model has already: a rough machine is far from linear."""
+        beside = refit(comparison, (), nuisance=self.nuisance) if fit is None else fit
+        listed = candidates(self.plant.library, self.plant.physics, {})
+        return Screen(comparison, signatures_beside(comparison, listed, beside))
+
+    def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
+        """By case and channel, and what it follows."""
+        if not isinstance(comparison, PlantComparison):
+            raise TypeError(f'{type(comparison).__name__}: not that of a plant')
+        return _where(comparison, fit, fit.jacobian if fit.free else None)
+
+
+def discover_in(plant: Plant, *, seed: int = 0, progress: Progress = lambda _: None) -> PlantDiscovery:
     """Name the effects that the simulation of ``plant`` lacks to explain what was measured.
 
     The search, the rules and the answer are those of :func:`psd_deflection.discover`; the whole cases are left out in
@@ -440,62 +485,13 @@ def discover_in(plant: Plant, *, seed: int = 0, progress: Callable[[str], None] 
     """
     rng = np.random.default_rng(seed)
     progress('simulating the plant as it is described')
-    ws = PlantComparison(plant)
-    null = refit(ws, (), iterations=12)
-    ws.beginning(null)
-
-    def screen(_: Comparison, current: Fit | None) -> Screen:
-        beside = refit(ws, (), nuisance=null.nuisance) if current is None else current
-        return Screen(ws, signatures_beside(ws, candidates(plant.library, plant.physics, {}), beside))
-
-    def look(fit: Fit, _: Fit) -> Localisation:
-        return _where(ws, fit, fit.jacobian if fit.free else None)
-
-    progress('signatures of every effect')
-    search = Search(ws, screen, progress)
-    result = search.run()
-    progress('weighing')
-    heldout, fit = accept(search, result, rng)
-    for _ in range(2):
-        if fit is result.fit or not fit.effects:
-            break
-        # Without what did not hold, another effect may be the better one.
-        fit, others = search.swap(result.null, fit)
-        weights = search.weigh(result.null, fit)
-        result = SearchResult(result.null, fit, *weights, result.first_scores, others, search.trace)
-        heldout, fit = accept(search, result, rng)
-    fit, heldout, left = credible(search, result, fit, heldout, 0.0, look)
-    progress('alternatives')
-    named = named_effects(search, result, fit, heldout)
-    progress('where')
-    null = result.null
-    before, after = ws.gap(null.difference), ws.gap(fit.difference)
-    first = left if fit is null else look(null, null)
-    explained = max(null.chi2 - fit.chi2, 0.0)
-    unknown = (
-        unknown_of(left, explained, after, ws.floor(), worded=ws.worded)
-        or unsaid(ws, before, after)
-        or tied(coincidences(fit, plant.physics), fit, result, first)
-    )
-    held = heldout_tables(ws, fit)
+    machine = SimulatedPlant.of(plant)
+    problem = solve(machine, (search, weigh, alternatives, where), seed, progress, rng)
+    ws, fit = problem.comparison, problem.fit
     return PlantDiscovery(
-        'unknown_effect' if unknown else 'effects_found' if named else 'nothing_missing',
-        tuple(named),
-        unknown,
-        first,
-        left,
-        before,
-        after,
-        ws.floor(),
-        ws.gap(heldout_tables(ws, null)),
-        ws.gap(held),
-        per_channel_of(ws, null.difference, fit.difference),
-        heldout_per_channel_of(ws, held),
-        waterfall_of(ws, fit, before, after),
-        ws.simulations,
-        result,
-        fit,
-        ws,
-        seed,
-        tuple((a, sd_of(ws, fit, i - len(fit.nuisance))) for i, a in enumerate(fit.nuisance)),
+        **fields_of(problem)
+        | {
+            'gap_heldout_before': ws.gap(heldout_tables(ws, problem.null)),
+            'nuisance': tuple((a, sd_of(ws, fit, i - len(fit.nuisance))) for i, a in enumerate(fit.nuisance)),
+        }
     )

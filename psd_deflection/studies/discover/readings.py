@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -23,6 +24,8 @@ from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.plants import Model, Plant
+from psd_deflection.studies.discover.result import model_yaml
+from psd_deflection.studies.study import Tell, warn_caller
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {
     'dots': ('x1', 'y1', 'x2', 'y2'),
@@ -74,12 +77,20 @@ class ReadingsPlant(Plant):
     ``known``: the effects that the rig file has already. Raises RecordingError if the tables differ in kind.
     """
 
-    def __init__(self, tables: Sequence[Readings], without: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        tables: Sequence[Readings],
+        without: Sequence[str] = (),
+        params_file: str | Path | None = None,
+        tell: Tell = warn_caller,
+    ) -> None:
+        """``params_file``: of the rig, if it has one. ``tell`` gets a warning if that cannot be edited."""
         kinds = {t.kind for t in tables}
         if len(kinds) > 1:
             words = ' and '.join(','.join(CHANNELS[k]) for k in sorted(kinds))
             raise RecordingError(f'{", ".join(t.name for t in tables)}: one has {words}: search them one by one')
         self.tables = tuple(tables)
+        self._params_file, self._tell = params_file, tell
         self.kind = tables[0].kind
         self.channels, self.units = CHANNELS[self.kind], UNITS[self.kind]
         self.cases = tuple(t.name for t in tables)
@@ -120,6 +131,11 @@ class ReadingsPlant(Plant):
             _, index = np.unique(t.loads, axis=0, return_inverse=True)
             out.append(np.asarray(index.ravel() % min(FOLDS, len(t.distinct)), dtype=np.int64))
         return out
+
+    def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
+        """The rig file with the effects."""
+        rig = self.tables[0].rig
+        return {'model.yaml': model_yaml(self._params_file, rig, [*self.known, *effects], {}, self._tell)}
 
     def _rows(self, table: Readings, effects: Sequence[ActiveEffect], order: IntArray) -> FloatArray:
         """The readings (channels, n) of the rows, which are simulated in ``order``."""

@@ -1,25 +1,23 @@
-"""report.html: one self-contained page for readers who have not seen the experiment."""
+"""The sections of the page of discover, for readers who have not seen the experiment."""
 
 from __future__ import annotations
 
 import html
 import itertools
-import json
-from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from psd_deflection.base.pages import page, picture, table
+from psd_deflection.base.pages import picture, table
 from psd_deflection.model.simulation.laws import VARIABLES
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
-from psd_deflection.studies.discover.discover import Discovery
 from psd_deflection.studies.discover.laws.law_features import known_values
 from psd_deflection.studies.discover.laws.laws import FoundLaw
-from psd_deflection.studies.discover.result import parameters_of, provenance, sentence, size_of
+from psd_deflection.studies.discover.result import Conclusion, Discovery, parameters_of, size_of
 from psd_deflection.studies.discover.search.screen import Score
 from psd_deflection.studies.discover.search.trust import BANDS
-from psd_deflection.studies.discover.search.weighing import Conclusion, NamedEffect
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
+from psd_deflection.studies.study import PageSection
 
 BEFORE, AFTER, HELD, FLOOR = '#c44e52', '#4c72b0', '#55a868', '#8c8c8c'
 DOTS = ('x1', 'y1', 'x2', 'y2')
@@ -268,68 +266,70 @@ def _where_table(discovery: Conclusion) -> str:
     return table(('channel', 'recording', 'when', 'band', 'depends on', 'σ', 'p'), rows)
 
 
-def report_html(discovery: Conclusion) -> str:
-    """The page, pictures inside."""
+def sections(discovery: Conclusion) -> list[PageSection]:
+    """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
     of_rig = discovery if isinstance(discovery, Discovery) else None
-    body = ['<h1>What the model lacks</h1>', f'<p class=verdict>{html.escape(sentence(discovery))}</p>']
-    body.append(picture(_waterfall_figure(discovery), 'the gap, step by step'))
+    out = [PageSection('', (picture(_waterfall_figure(discovery), 'the gap, step by step'),))]
     if of_rig is not None and of_rig.setup:
-        body.append('<h2>Set-up</h2>')
         wrong = [(f.name, f.where, '' if f.value is None else f'{f.value:.5g}', f.fix) for f in of_rig.setup]
-        body.append(table(('mistake', 'where', 'value', 'what puts it right'), wrong))
-    body.append('<h2>What</h2>')
-    body.append(''.join(_effect_section(e) for e in discovery.effects) or '<p>No effect is named.</p>')
-    if discovery.nuisance:
-        body.append('<p>Fitted in every model, and no finding:</p>')
-        fitted = [
-            (a.label, name, f'{a.values[name]:.6g}', f'{sd:.2g}', a.effect.parameter(name).unit)
-            for a, sds in discovery.nuisance
-            for name, sd in sds.items()
-        ]
-        body.append(table(('effect', 'parameter', 'value', '± sd', 'unit'), fitted))
-    if discovery.unknown:
-        body.append('<h2>Unknown</h2>')
-    for u in discovery.unknown:
-        where = 'is not in the model' if u.remains else 'the effects stand in for it in the model'
-        body.append(
-            f'<p>{html.escape(u.signature)}. It is {100 * u.explains:.0f} % of what was to be explained; {where}.</p>'
-        )
-    if of_rig is not None and of_rig.law is not None:
-        body.append(_law_section(of_rig, of_rig.law))
-    body.append('<h2>Before and after</h2>')
-    body.append(picture(_residual_figure(discovery), 'residual before and after'))
+        out.append(PageSection('Set-up', (table(('mistake', 'where', 'value', 'what puts it right'), wrong),)))
+    effects = [_effect_section(e) for e in discovery.effects] or ['<p>No effect is named.</p>']
+    out.append(PageSection('What', (*effects, *_nuisance(discovery))))
+    law = () if of_rig is None or of_rig.law is None else (_law_section(of_rig, of_rig.law),)
+    if discovery.unknown or law:
+        out.append(PageSection('Unknown', (*map(_unknown, discovery.unknown), *law)))
+    out.append(PageSection('Before and after', tuple(_before_and_after(discovery))))
+    out.append(PageSection('How it was found', tuple(_how(discovery))))
+    return out
+
+
+def _nuisance(discovery: Conclusion) -> list[str]:
+    if not discovery.nuisance:
+        return []
+    fitted = [
+        (a.label, name, f'{a.values[name]:.6g}', f'{sd:.2g}', a.effect.parameter(name).unit)
+        for a, sds in discovery.nuisance
+        for name, sd in sds.items()
+    ]
+    head = ('effect', 'parameter', 'value', '± sd', 'unit')
+    return ['<p>Fitted in every model, and no finding:</p>', table(head, fitted)]
+
+
+def _unknown(u: Unknown) -> str:
+    where = 'is not in the model' if u.remains else 'the effects stand in for it in the model'
+    share = f'{100 * u.explains:.0f} % of what was to be explained'
+    return f'<p>{html.escape(u.signature)}. It is {share}; {where}.</p>'
+
+
+def _before_and_after(discovery: Conclusion) -> list[str]:
+    out = [picture(_residual_figure(discovery), 'residual before and after')]
     against = _against_figure(discovery)
     if against is not None:
-        body.append(picture(against, 'residual before and after against loads and position'))
-    if of_rig is not None:
-        body.append(picture(_spectrum_figure(of_rig), 'spectrum before and after'))
-    factor = 1.0 if of_rig is None else discovery.workspace.scale_shown[0]
+        out.append(picture(against, 'residual before and after against loads and position'))
+    factor = 1.0
+    if isinstance(discovery, Discovery):
+        out.append(picture(_spectrum_figure(discovery), 'spectrum before and after'))
+        factor = discovery.workspace.scale_shown[0]
     channels = [
         (n, *(f'{factor * v:.4g}' for v in (*gaps, discovery.heldout_per_channel[n])), unit)
         for (n, gaps), unit in zip(discovery.per_channel.items(), discovery.workspace.units_shown, strict=True)
     ]
-    body.append(table(('gap, rms', 'before', 'after', 'on unseen load cases', 'unit'), channels))
-    body.append('<h2>How it was found</h2><details><summary>Where simulation and data part</summary>')
-    body.append(picture(_where_figure(discovery), 'where simulation and data part'))
-    body.append(_where_table(discovery))
+    return [*out, table(('gap, rms', 'before', 'after', 'on unseen load cases', 'unit'), channels)]
+
+
+def _how(discovery: Conclusion) -> list[str]:
     first: dict[str, Score] = {}
     for score in discovery.search.first_scores:
         first.setdefault(score.candidate.effect.name, score)
     rows = [(n, f'{s.gain:.1f}', s.dof, f'{s.p:.2g}') for n, s in list(first.items())[:10]]
-    body.append('</details><details><summary>Candidates at first sight</summary>')
-    body.append('<p class=quiet>Gain in chi-square if added alone, to first order.</p>')
-    body.append(table(('effect', 'gain', 'parameters', 'p'), rows))
     trace = '; '.join(discovery.search.trace) or 'nothing passed the screen'
-    body.append('</details><details><summary>Steps and provenance</summary>')
-    body.append(f'<p class=quiet>Steps: {html.escape(trace)}.</p>')
-    source = html.escape(json.dumps(_plain(provenance(discovery)), indent=1))
-    body.append(f'<pre role="group" tabindex="0" aria-label="provenance">{source}</pre></details>')
-    return page('psd-deflection discover', body)
-
-
-def _plain(tree: Any) -> Any:
-    if isinstance(tree, dict):
-        return {k: _plain(v) for k, v in tree.items()}
-    if isinstance(tree, list):
-        return [_plain(v) for v in tree]
-    return float(f'{tree:.6g}') if isinstance(tree, float) else tree
+    return [
+        '<details><summary>Where simulation and data part</summary>',
+        picture(_where_figure(discovery), 'where simulation and data part'),
+        _where_table(discovery),
+        '</details><details><summary>Candidates at first sight</summary>',
+        '<p class=quiet>Gain in chi-square if added alone, to first order.</p>',
+        table(('effect', 'gain', 'parameters', 'p'), rows),
+        '</details><details><summary>Steps</summary>',
+        f'<p class=quiet>{html.escape(trace)}; {discovery.simulations} forward simulations.</p></details>',
+    ]

@@ -1,18 +1,313 @@
-"""The output of discover: result.json and model.yaml (docs/discover.md)."""
+"""The answer of discover: sentences, result.json, the page, model.yaml, the files of a law (docs/discover.md)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from psd_deflection import __version__
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.base.files import replace_file
+from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.discover.discover import Discovery
+from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.parameter_files import with_effects_section, with_values
+from psd_deflection.studies.check.result import Finding, finding_tree
 from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.localise import Localisation
+from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.ties import ties
-from psd_deflection.studies.discover.search.weighing import Conclusion, NamedEffect, Rival
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.study import PageSection, StudyResult, Tell, described, edited_rig_file, named, warn_caller
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Conclusion(StudyResult):
+    """The answer of a search. Gaps are rms values of measured minus simulated in the unit of ``workspace``.
+
+    ``per_channel``: before and after; ``heldout_per_channel``: after, on load cases that the fit has not seen.
+    ``nuisance``: what every model has, each with the standard deviations of its parameters.
+    """
+
+    study, json_name = 'discover', 'result.json'
+    title = 'What the model lacks'
+
+    verdict: str
+    effects: tuple[NamedEffect, ...]
+    unknown: tuple[Unknown, ...]
+    where: Localisation
+    left: Localisation
+    gap_before: float
+    gap_after: float
+    gap_floor: float
+    gap_heldout_before: float
+    gap_heldout_after: float
+    per_channel: Mapping[str, tuple[float, float]]
+    heldout_per_channel: Mapping[str, float]
+    waterfall: tuple[tuple[str, float], ...]
+    simulations: int
+    search: SearchResult
+    fit: Fit
+    workspace: Comparison
+    seed: int
+    nuisance: tuple[tuple[ActiveEffect, Mapping[str, float]], ...]
+
+    @property
+    def floors(self) -> float:
+        """The gap that remains, in units of the gap that noise alone leaves; 0 if nobody knows the noise."""
+        return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
+
+    def __repr__(self) -> str:
+        effects = ', '.join(e.active.label for e in self.effects) or 'no effect'
+        before, after, floor = (self.workspace.worded(v) for v in (self.gap_before, self.gap_after, self.gap_floor))
+        return f'<{type(self).__name__} {self.verdict}: {effects}; gap {before} → {after} (noise alone: {floor})>'
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """Version and recordings, with their digests."""
+        seen = self.workspace.provenance()
+        of = {f'recording {n}': named(str(r['name']), str(r.get('sha256', '')), 64) for n, r in enumerate(seen, 1)}
+        return {'version': __version__, 'seed': str(self.seed), **of}
+
+    @property
+    def sentence(self) -> str:
+        """The whole answer as one text."""
+        return ' '.join(self.sentences())
+
+    def sentences(self) -> list[str]:
+        """What is missing, or that nothing is, and which effects may have one cause."""
+        return [_missing(self), *(t.sentence for t in ties(self.effects))]
+
+    def lines(self) -> list[str]:
+        """The sentences in one line, then what is unknown."""
+        unknown = [f'unknown: {u.signature}' for u in self.unknown]
+        return [self.sentence, *unknown, f'{self.simulations} forward simulations']
+
+    def sections(self) -> Iterable[PageSection]:
+        """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
+        from psd_deflection.studies.discover.report import sections
+
+        return sections(self)
+
+    def tree(self) -> dict[str, Any]:
+        """Verdict, places, effects, unknown, gaps, provenance."""
+        return {
+            'verdict': self.verdict,
+            'where': self._where(),
+            'effects': [_effect_tree(e) for e in self.effects],
+            'unknown': [
+                {
+                    'signature': u.signature,
+                    'depends_on': list(u.depends_on),
+                    'explains': u.explains,
+                    'rms': u.rms,
+                    'law': None,
+                }
+                for u in self.unknown
+            ],
+            'ties': self._ties(),
+            'setup': [],
+            'moves': None,
+            'remaining': {'rms': self.gap_after, 'floors': self.floors},
+            'gap': self._gap(),
+            'nuisance': [{'name': a.effect.name, 'parameters': _fitted(a, sd)} for a, sd in self.nuisance],
+            'provenance': {
+                'version': __version__,
+                'seed': self.seed,
+                'forward_simulations': self.simulations,
+                'recordings': self.workspace.provenance(),
+            },
+        }
+
+    def _where(self) -> list[dict[str, Any]]:
+        return [
+            {
+                'channel': c.channel,
+                'recording': self.workspace.names[c.recording],
+                'when': [c.when[0], c.when[1]],
+                'band_hz': [c.band[0], c.band[1]],
+                'depends_on': list(c.depends_on),
+                'statistic': _number(c.statistic),
+                'p': min(max(c.p, 0.0), 1.0),
+            }
+            for c in self.where.cells
+            if c.p < 0.05
+        ]
+
+    def _ties(self) -> list[dict[str, Any]]:
+        return [
+            {
+                'share': {'value': t.share, 'sd': t.sd},
+                'frequencies_moved': t.moves,
+                'causes': [{'name': c.name, 'factor': {'value': c.factor, 'sd': c.sd}} for c in t.causes],
+                'sentence': t.sentence,
+            }
+            for t in ties(self.effects)
+        ]
+
+    def _gap(self) -> dict[str, Any]:
+        return {
+            'unit': self.workspace.unit,
+            'before': self.gap_before,
+            'after': self.gap_after,
+            'floor': self.gap_floor if math.isfinite(self.gap_floor) else None,
+            'heldout_before': self.gap_heldout_before,
+            'heldout_after': self.gap_heldout_after,
+            'per_channel': {
+                k: {'before': a, 'after': b, 'heldout': self.heldout_per_channel[k]}
+                for k, (a, b) in self.per_channel.items()
+            },
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Discovery(Conclusion):
+    """The answer for the rig. Gaps in m (rms of block means over x1 y1 x2 y2).
+
+    ``setup``: mistakes of the set-up and the recording, with ``values`` that put the rig file right; ``known``: the
+    effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
+    ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
+    set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
+    ``moves``: by how much at most the effects change an estimate that does not know of them: dX m, dY m, theta rad.
+    ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
+    became, '' if it is none. ``tell``: takes warnings.
+    """
+
+    workspace: Workspace
+    setup: tuple[Finding, ...]
+    values: Mapping[str, object]
+    known: tuple[ActiveEffect, ...]
+    law: FoundLaw | None
+    rivals: tuple[Fit, ...]
+    unsettled: tuple[str, ...]
+    moves: tuple[float, float, float]
+    rig: Rig
+    params_file: str | Path | None = None
+    adopted: str = ''
+    tell: Tell = warn_caller
+
+    @property
+    def active_effects(self) -> list[ActiveEffect]:
+        """The effects to add to the rig file."""
+        return [*self.known, *(e.active for e in self.effects)]
+
+    @property
+    def laws(self) -> list[Law]:
+        """The law's parts, by the name that they get."""
+        return [] if self.law is None else self.law.adopted(self.adopted or 'law')
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """Version, recordings, rig."""
+        rig = 'the parameters in the recording' if self.params_file is None else str(self.params_file)
+        return {**super().sources, 'rig': rig}
+
+    def sentences(self) -> list[str]:
+        """What is wrong with the set-up, what is missing besides, what that does to an estimate, the law."""
+        missing = _missing(self, ' besides' if self.setup else '')
+        tied = [t.sentence for t in ties(self.effects)]
+        return [s for s in (_setup(self), missing, *tied, _moved(self), _law(self)) if s]
+
+    def lines(self) -> list[str]:
+        """The sentences in one line, what puts the set-up right, what would decide, what is unknown."""
+        first, *others = super().lines()
+        out = [first, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
+        for e in self.effects:
+            if e.suggestion is not None:
+                out.append(f'to tell {e.active.effect.name} from {", ".join(e.equivalent)}: {e.suggestion.text}')
+        return out + others
+
+    def tree(self) -> dict[str, Any]:
+        """As for any machine, with set-up, moves and law."""
+        out = super().tree()
+        for unknown, law in zip(out['unknown'], [self.law] if self.law is not None else [], strict=False):
+            unknown['law'] = _law_tree(law)
+        out['setup'] = [{**finding_tree(f), 'evidence': _number(f.evidence)} for f in self.setup]
+        out['moves'] = dict(zip(('dx_m', 'dy_m', 'theta_rad'), self.moves, strict=True))
+        return out
+
+    def adopt(self, name: str) -> Discovery:
+        """The answer with its law as the effect ``name``, written to the folder of the user's effects.
+
+        Without a law nothing happens. Raises ConfigError for a name that cannot be, RecordingError if the disk refuses.
+        """
+        folder = adopting_folder(name)
+        if self.law is None:
+            return self
+        out = replace(self, adopted=name)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for law in out.laws:
+                replace_file(folder / f'{law.name}.yaml', _law_file(law).encode())
+        except OSError as error:
+            raise RecordingError(f'{folder}: cannot be written ({error.strerror or error})') from None
+        return out
+
+    def model_yaml(self) -> str:
+        """The user's parameter file with the effects, comments kept; without one what describes the rig."""
+        effects = self.active_effects
+        if self.adopted and self.law is not None:
+            beside = [a for a in self.law.beside if a.effect.name in effect_names()]
+            laws = [ActiveEffect(effect_of(law), values_of(law)) for law in self.laws]
+            effects = [*self.known, *beside, *laws]
+        return model_yaml(self.params_file, self.rig, effects, self.values, self.tell)
+
+    def files(self) -> dict[str, str]:
+        """The rig file with the effects, the page, the JSON, and the law as an effect that can be adopted."""
+        named = {law.name.replace(self.adopted, 'law', 1) if self.adopted else law.name: law for law in self.laws}
+        laws = {f'{name}.yaml': _law_file(law) for name, law in named.items()}
+        return {'model.yaml': self.model_yaml(), **super().files(), **laws}
+
+
+def adopting_folder(name: str) -> Path:
+    """The folder of the user's effects, for an effect ``name``. Raises ConfigError if there cannot be one."""
+    if not name.isidentifier() or name.startswith('_'):
+        raise ConfigError(f'{name}: must be a name of letters, digits and underscores, such as base_yields')
+    if name in effect_names():
+        raise ConfigError(f'{name}: there is an effect of that name; give another')
+    folders = effect_folders()
+    if not folders:
+        raise ConfigError(f'{name}: there is no folder for your effects; set {FOLDERS}')
+    return folders[0]
+
+
+def _law_file(law: Law) -> str:
+    return law_text(
+        law,
+        (
+            f'Found by psd-deflection discover {__version__}: no effect of the catalogue explains this.',
+            f'Edit it, and put it as NAME.yaml, with name: NAME, into a folder of effects ({FOLDERS}).',
+        ),
+    )
+
+
+def model_yaml(
+    params_file: str | Path | None,
+    rig: Rig,
+    effects: Iterable[ActiveEffect],
+    values: Mapping[str, object],
+    tell: Tell = warn_caller,
+) -> str:
+    """The user's parameter file with ``effects``, comments kept; without one what describes ``rig``.
+
+    ``values``: what was wrong in the rig file, put right. ``tell`` gets a warning if the file cannot be edited.
+    """
+    given = list(effects)
+
+    def edit(text: str, path: Path) -> str:
+        text = with_effects_section(text, effects_to_values(given), path)
+        if not values:
+            return text
+        return with_values(text, values, f'Put right by psd-deflection {__version__}', path)
+
+    return edited_rig_file(params_file, 'model.yaml', lambda: described(rig, given), edit, tell)
 
 
 def _number(value: float) -> float:
@@ -38,102 +333,31 @@ def _fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
     return out
 
 
-def result(discovery: Conclusion) -> dict[str, Any]:
-    """The tree of result.json: the same for the rig and for another plant, which has neither set-up nor law."""
-    of_rig = discovery if isinstance(discovery, Discovery) else None
-    law = None if of_rig is None else of_rig.law
-    where = [
-        {
-            'channel': c.channel,
-            'recording': discovery.workspace.names[c.recording],
-            'when': [c.when[0], c.when[1]],
-            'band_hz': [c.band[0], c.band[1]],
-            'depends_on': list(c.depends_on),
-            'statistic': _number(c.statistic),
-            'p': min(max(c.p, 0.0), 1.0),
-        }
-        for c in discovery.where.cells
-        if c.p < 0.05
-    ]
-    effects = [
-        {
-            'name': e.active.effect.name,
-            'stage': e.active.effect.stage,
-            'parameters': parameters_of(e),
-            'equivalent': list(e.equivalent),
-            'evidence': {
-                'delta_bic': _number(e.delta_bic),
-                'p': _number(e.p),
-                'heldout_gain': _number(e.heldout.gain),
-                'heldout_gain_error': _number(e.heldout.error),
-            },
-            'suggested_experiment': None if e.suggestion is None else e.suggestion.text,
-            'rivals': [
-                {
-                    'name': r.active.effect.name,
-                    'parameters': parameters_of(r),
-                    'delta_bic': _number(r.delta_bic),
-                }
-                for r in e.rivals
-            ],
-        }
-        for e in discovery.effects
-    ]
-    unknown = [
-        {
-            'signature': u.signature,
-            'depends_on': list(u.depends_on),
-            'explains': u.explains,
-            'rms': u.rms,
-            'law': None if i or law is None else law_of(law),
-        }
-        for i, u in enumerate(discovery.unknown)
-    ]
+def _effect_tree(e: NamedEffect) -> dict[str, Any]:
     return {
-        'verdict': discovery.verdict,
-        'where': where,
-        'effects': effects,
-        'unknown': unknown,
-        'ties': [
-            {
-                'share': {'value': t.share, 'sd': t.sd},
-                'frequencies_moved': t.moves,
-                'causes': [{'name': c.name, 'factor': {'value': c.factor, 'sd': c.sd}} for c in t.causes],
-                'sentence': t.sentence,
-            }
-            for t in ties(discovery.effects)
-        ],
-        'setup': [
-            {
-                'name': f.name,
-                'where': f.where,
-                'value': f.value,
-                'fix': f.fix,
-                'evidence': _number(f.evidence),
-                'equivalent': list(f.equivalent),
-            }
-            for f in (() if of_rig is None else of_rig.setup)
-        ],
-        'moves': None if of_rig is None else dict(zip(('dx_m', 'dy_m', 'theta_rad'), of_rig.moves, strict=True)),
-        'remaining': {'rms': discovery.gap_after, 'floors': discovery.floors},
-        'gap': {
-            'unit': discovery.workspace.unit,
-            'before': discovery.gap_before,
-            'after': discovery.gap_after,
-            'floor': discovery.gap_floor if math.isfinite(discovery.gap_floor) else None,
-            'heldout_before': discovery.gap_heldout_before,
-            'heldout_after': discovery.gap_heldout_after,
-            'per_channel': {
-                k: {'before': a, 'after': b, 'heldout': discovery.heldout_per_channel[k]}
-                for k, (a, b) in discovery.per_channel.items()
-            },
+        'name': e.active.effect.name,
+        'stage': e.active.effect.stage,
+        'parameters': parameters_of(e),
+        'equivalent': list(e.equivalent),
+        'evidence': {
+            'delta_bic': _number(e.delta_bic),
+            'p': _number(e.p),
+            'heldout_gain': _number(e.heldout.gain),
+            'heldout_gain_error': _number(e.heldout.error),
         },
-        'nuisance': [{'name': a.effect.name, 'parameters': _fitted(a, sd)} for a, sd in discovery.nuisance],
-        'provenance': provenance(discovery),
+        'suggested_experiment': None if e.suggestion is None else e.suggestion.text,
+        'rivals': [
+            {
+                'name': r.active.effect.name,
+                'parameters': parameters_of(r),
+                'delta_bic': _number(r.delta_bic),
+            }
+            for r in e.rivals
+        ],
     }
 
 
-def law_of(found: FoundLaw) -> dict[str, Any]:
+def _law_tree(found: FoundLaw) -> dict[str, Any]:
     """The tree of ``law``."""
     law = found.law
     return {
@@ -156,16 +380,6 @@ def law_of(found: FoundLaw) -> dict[str, Any]:
             'heldout_gain': _number(found.heldout.gain),
             'heldout_gain_error': _number(found.heldout.error),
         },
-    }
-
-
-def provenance(discovery: Conclusion) -> dict[str, Any]:
-    """Hashes, seed, version and cost."""
-    return {
-        'version': __version__,
-        'seed': discovery.seed,
-        'forward_simulations': discovery.simulations,
-        'recordings': discovery.workspace.provenance(),
     }
 
 
@@ -196,7 +410,7 @@ def _setup(discovery: Discovery) -> str:
     for f in discovery.setup:
         where.setdefault(f.name, {})[f'{f.where}{_seconds(f)}'] = None
     names = [f'{name} ({"; ".join(places)})' for name, places in where.items()]
-    return f'The set-up is not as the rig file or the recording says: {", ".join(names)}. ' if names else ''
+    return f'The set-up is not as the rig file or the recording says: {", ".join(names)}.' if names else ''
 
 
 def _seconds(finding: Finding) -> str:
@@ -207,31 +421,13 @@ def _seconds(finding: Finding) -> str:
     return f', {abs(finding.value):.2g} s{late}'
 
 
-def sentence(discovery: Conclusion) -> str:
-    """The verdict in one sentence, after one about the set-up if that is wrong."""
-    if not isinstance(discovery, Discovery):
-        return _missing(discovery) + _tied(discovery)
-    return (
-        _setup(discovery)
-        + _missing(discovery, ' besides' if discovery.setup else '')
-        + _tied(discovery)
-        + _moved(discovery)
-        + _law(discovery)
-    )
-
-
-def _tied(discovery: Conclusion) -> str:
-    """The one cause that two effects may have, in two sentences, or nothing."""
-    return ''.join(' ' + t.sentence for t in ties(discovery.effects))
-
-
 def _moved(discovery: Discovery) -> str:
     """What the effects do to an estimate, in a sentence, or nothing."""
     if not discovery.effects:
         return ''
     dx, dy, theta = (1e6 * v for v in discovery.moves)
     them = 'it' if len(discovery.effects) == 1 else 'them'
-    return f' Without {them} an estimate is wrong by up to ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad.'
+    return f'Without {them} an estimate is wrong by up to ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad.'
 
 
 def _law(discovery: Discovery) -> str:
@@ -240,7 +436,7 @@ def _law(discovery: Discovery) -> str:
         return ''
     found = discovery.law
     expressions = '; '.join(e.expression for e in found.laws)
-    words = f' What remains follows a law ({found.law.stage}, {found.law.kind}): {expressions}'
+    words = f'What remains follows a law ({found.law.stage}, {found.law.kind}): {expressions}'
     beside = [a.effect.name for a in found.beside]
     named = {e.active.effect.name for e in discovery.effects}
     with_law = f'; on unseen load cases it leaves {1e6 * found.heldout_gap:.3f} µm'

@@ -207,7 +207,10 @@ def test_the_sign_of_one_load_is_named_and_no_wire(i: int, load: str) -> None:
 def test_loads_in_kilograms_are_named() -> None:
     loads = pushes(50.0)
     found = checked(recorded(loads, 1), loads / 9.80665)
-    assert [(f.name, round(f.value or 0.0, 2)) for f in found.findings] == [('load_unit', 9.81)]
+    assert [(f.name, f.where, round(f.value or 0.0, 2)) for f in found.findings] == [
+        ('load_unit', 'fx fy', 9.81),
+        ('load_unit', 'tz', 9.81),
+    ]
     assert found.verdict == WRONG
 
 
@@ -274,14 +277,14 @@ def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
 
 def test_noise_that_the_rig_file_says_for_each_channel_is_held_against_each() -> None:
     loads = pushes(50.0)
-    volts = recorded(loads, 5, sigmas=(1e-3, 2e-3, 2e-3, 8e-3, 2e-3, 2e-3))
+    volts = recorded(loads, 5, sigmas=(1e-3, 2e-3, 2e-3, 1e-2, 2e-3, 2e-3))
     rig = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]})
     found = checked(volts, loads, rig)
     (noisy,) = found.findings
     assert (noisy.name, noisy.where) == ('noise_level', 'x2')
-    assert noisy.value == pytest.approx(2.0, rel=0.05)
-    assert found.values == {'psd_2.noise': pytest.approx([8e-3, 2e-3], rel=0.05)}
-    right = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [8e-3, 2e-3]})
+    assert noisy.value == pytest.approx(2.5, rel=0.05)
+    assert found.values == {'psd_2.noise': pytest.approx([1e-2, 2e-3], rel=0.05)}
+    right = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [1e-2, 2e-3]})
     assert not checked(volts, loads, right).findings
 
 

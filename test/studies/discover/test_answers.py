@@ -20,13 +20,13 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import nested
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.discover import discover as answer
 from psd_deflection.studies.discover import planning
 from psd_deflection.studies.discover import result as told
-from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Setting
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.planning import Plan, Suggestion, Told
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals, weighing
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
@@ -38,10 +38,8 @@ from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes, only_in
 from psd_deflection.studies.discover.setup.setup import (
     _blocks,
-    _units,
     likely_delays,
     likely_jumps,
-    noise_finding,
     said,
 )
 
@@ -197,48 +195,6 @@ def test_a_mistake_is_said_with_its_line(workspace: Workspace) -> None:
     finding, lines = words('zero', recording=2.0, x1=1e-4, y1=-2e-4, x2=0.0, y2=5e-5)
     assert (finding.where, finding.value, lines) == ('second', 2e-4, {})
     assert finding.fix == 'overrides of second: psd_1.zero: [0.0001, -0.0002], psd_2.zero: [0.0, 5e-05]'
-
-
-@pytest.mark.parametrize(('factor', 'is_told'), [(2.1, True), (1.9, False), (0.52, False), (0.48, True)])
-def test_noise_is_told_from_twice_or_half_of_the_files_on(factor: float, is_told: bool) -> None:
-    """With the converter's own rounding, which the file's noise does not hold."""
-    o = observed()
-    stated = math.sqrt(np.mean(RIG.noises[:, :2] ** 2) + RIG.converter.volts_per_count**2 / 12.0)
-    fake = SimpleNamespace(
-        observations=[o], noise=[SimpleNamespace(sigma=np.array([factor, factor, 9.0] * 2) * stated)]
-    )
-    found = noise_finding(cast(Workspace, fake))
-    assert bool(found) == is_told
-    if found:
-        assert (found[0].name, found[0].where, found[0].value) == ('noise_level', 'x1 y1 x2 y2', round(factor, 3))
-        assert found[0].evidence == pytest.approx(abs(math.log(factor)))
-        assert found[0].fix == f'amplifier.noise: {float(f"{factor * RIG.amplifier.noise:.2g}")}'
-
-
-NAN = math.nan
-
-
-@pytest.mark.parametrize(
-    ('sizes', 'units'),
-    [
-        ((1.0, 1.0, 1.0), {}),
-        ((9.80665, 9.7, NAN), {0: 'kg instead of N', 1: 'kg instead of N'}),
-        ((NAN, 9.80665 * 0.971, 1.0), {1: 'kg instead of N'}),
-        ((NAN, 9.80665 * 0.969, 1.0), {}),
-        ((9.80665, 1.0, 1.0), {}),
-        ((1e3, NAN, 1e3), {0: 'kN instead of N', 2: 'kN m instead of N m'}),
-        ((4.45, 4.44, 0.0981), {0: 'lbf instead of N', 1: 'lbf instead of N', 2: 'kg cm instead of N m'}),
-        ((NAN, 1 / 9.80665, NAN), {1: 'N, and then converted from kg once more'}),
-        ((NAN, NAN, 0.01), {2: 'N cm instead of N m'}),
-        ((NAN, NAN, 100.0), {2: 'N m, and then converted from N cm once more'}),
-        # A digit of Young's modulus is no unit: the forces alone, by ten.
-        ((10.0, 10.05, 1.0), {}),
-        ((0.1, 0.1, 1.05), {}),
-        ((10.0, 10.0, 1.2), {0: 'kg instead of N', 1: 'kg instead of N'}),
-    ],
-)
-def test_a_size_is_a_unit_within_three_per_cent(sizes: tuple[float, float, float], units: dict[int, str]) -> None:
-    assert {k: unit for k, (_, unit) in _units(np.array(sizes)).items()} == units
 
 
 def test_a_block_counts_from_half_of_its_samples_on() -> None:
@@ -659,43 +615,6 @@ def test_a_waterfall_falls_effect_by_effect() -> None:
         assert got == (*steps, ('noise alone', 0.5))
 
 
-def test_the_end_of_late_loads_and_what_is_between_steps_goes() -> None:
-    o = observed()
-    cut = answer._without_end(o, 0.0105)
-    assert np.flatnonzero(np.isnan(cut.volts).all(axis=1)).tolist() == list(range(1200 - 12, 1200))
-    assert not np.isnan(cut.volts[: 1200 - 12]).any()
-    snapped = answer._snapped(o, 0.01)
-    assert np.abs(snapped.volts - o.volts).max() <= 0.005 + 1e-12
-    np.testing.assert_allclose(snapped.volts / 0.01, np.rint(o.volts / 0.01))
-    assert (cut.digest, snapped.digest) == (o.hashed(), o.hashed())
-    assert answer._snapped(dataclasses.replace(o, digest='x'), 0.01).digest == 'x'
-
-
-def test_coarse_steps_are_as_likely_as_all_readings_on_them(workspace: Workspace) -> None:
-    """Each by chance with the converter's step over theirs; the likelihood is the product."""
-    lsb = RIG.converter.volts_per_count
-    lattice = make_active('quantisation', {'step': 8.0 * lsb}, 'test')
-    samples = sum(o.volts.size for o in workspace.observations)
-    assert answer._lattice_gain(workspace, lattice) == pytest.approx(samples * math.log(8.0))
-    assert answer._lattice_gain(workspace, make_active('quantisation', {'step': 0.5 * lsb}, 'test')) == 0.0
-    coarse = [dataclasses.replace(o, volts=np.rint(o.volts / (8 * lsb)) * 8 * lsb) for o in workspace.observations]
-    effects, physics = [e for e in EVERY.values() if e.lattice], Physics.of(RIG)
-    found = answer._lattice(coarse, physics, (), effects)
-    assert found is not None
-    assert found.values['step'] == pytest.approx(8.0 * lsb, rel=1e-3)
-    # One recording without them, or an effect that has them already, and they are none.
-    assert answer._lattice([coarse[0], workspace.observations[1]], physics, (), effects) is None
-    assert answer._lattice(coarse, physics, (lattice,), effects) is None
-    assert answer._lattice(coarse, physics, (), []) is None
-    named = answer._named_lattice(Workspace(coarse), lattice)
-    gain = answer._lattice_gain(workspace, lattice)
-    steps = [s for o in coarse if (s := proposals.coarse_step(o)) is not None]
-    assert named.sd == {'step': min(s[1] for s in steps)}
-    assert named.p == 0.0
-    assert named.delta_bic == pytest.approx(2.0 * gain)
-    assert dataclasses.astuple(named.heldout) == pytest.approx((gain, math.sqrt(2.0 * gain)))
-
-
 # The files.
 
 
@@ -774,7 +693,7 @@ def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> No
         ('+ sensor_rotation', found.gap_after),
         ('noise alone', found.gap_floor),
     )
-    assert (found.verdict, found.unknown, found.setup, found.law, found.lines) == ('effects_found', (), (), None, {})
+    assert (found.verdict, found.unknown, found.setup, found.law, found.values) == ('effects_found', (), (), None, {})
     assert (found.seed, found.known, found.rivals, found.unsettled) == (0, (), (), ())
     assert found.active_effects == [named.active]
     # One picture, whose length is the deviation: of the turn about the centre of the PSD.
@@ -801,7 +720,7 @@ def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> No
 
 
 def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
-    tree = told.result(found)
+    tree = found.tree()
     (named,) = found.effects
     assert tree['gap'] == {
         'unit': 'm',
@@ -844,7 +763,7 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
     size = told.size_of(named)
     dx, dy, theta = (1e6 * v for v in found.moves)
     off = f'ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad'
-    assert told.sentence(found) == (
+    assert found.sentence == (
         f'sensor_rotation (psd 2) is missing from the model; adding it closes the gap from {before:.3f} to {left:.3f} '
         f'µm, {found.floors:.2f} times what noise alone leaves ({1e6 * found.gap_floor:.3f} µm). '
         f'Fitted: sensor_rotation {size}. Without it an estimate is wrong by up to {off}.'
@@ -855,8 +774,8 @@ def test_places_are_told_if_one_in_twenty_by_chance(found: Discovery) -> None:
     first = found.where.cells[0]
     cells = tuple(dataclasses.replace(first, p=p) for p in (0.0, 0.0499, 0.05, 1.0))
     changed = dataclasses.replace(found, where=dataclasses.replace(found.where, cells=cells))
-    assert [place['p'] for place in told.result(changed)['where']] == [0.0, 0.0499]
-    assert told.result(found)['moves'] == dict(zip(('dx_m', 'dy_m', 'theta_rad'), found.moves, strict=True))
+    assert [place['p'] for place in changed.tree()['where']] == [0.0, 0.0499]
+    assert found.tree()['moves'] == dict(zip(('dx_m', 'dy_m', 'theta_rad'), found.moves, strict=True))
 
 
 def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
@@ -876,7 +795,7 @@ def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
         3e-7,
     )
     unknown = (Unknown('first', ('load_fx',), 0.75, rms=2e-6), Unknown('second', (), 0.5))
-    first, second = told.result(dataclasses.replace(found, unknown=unknown, law=of_law))['unknown']
+    first, second = dataclasses.replace(found, unknown=unknown, law=of_law).tree()['unknown']
     assert second == {'signature': 'second', 'depends_on': [], 'explains': 0.5, 'rms': 0.0, 'law': None}
     written = first.pop('law')
     assert first == {'signature': 'first', 'depends_on': ['load_fx'], 'explains': 0.75, 'rms': 2e-6}
@@ -895,7 +814,7 @@ def test_the_law_is_written_with_the_first_unknown(found: Discovery) -> None:
         ],
         'evidence': {'delta_bic': 30.0, 'p': 1e-9, 'heldout_gain': 9.0, 'heldout_gain_error': 2.0},
     }
-    assert told.result(dataclasses.replace(found, unknown=unknown))['unknown'][0]['law'] is None
+    assert dataclasses.replace(found, unknown=unknown).tree()['unknown'][0]['law'] is None
 
 
 def test_other_answers_have_other_sentences(found: Discovery) -> None:
@@ -906,7 +825,7 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
 
     def sentence(**given: Any) -> str:
         """Without what the effects do to an estimate."""
-        return told.sentence(dataclasses.replace(found, **given)).partition(' Without ')[0]
+        return dataclasses.replace(found, **given).sentence.partition(' Without ')[0]
 
     assert sentence(verdict='nothing_missing', effects=()) == f'Nothing is missing: the gap is {left}.'
     # Without a stated noise nothing says that nothing is missing.
@@ -936,13 +855,13 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
         'The set-up is not as the rig file or the recording says: channel_sign (y1). '
         f'Nothing is missing besides: the gap is {left}.'
     )
-    tree = told.result(dataclasses.replace(found, setup=setup[:1], unknown=(Unknown('s', ('d',), 0.4, True, 2e-6),)))
+    tree = dataclasses.replace(found, setup=setup[:1], unknown=(Unknown('s', ('d',), 0.4, True, 2e-6),)).tree()
     assert tree['unknown'] == [{'signature': 's', 'depends_on': ['d'], 'explains': 0.4, 'rms': 2e-6, 'law': None}]
     assert tree['setup'] == [
         {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
     ]
     rival = Rival(named.active, {'angle': 1e-3}, 4.0, found.fit)
-    listed_rivals = told.result(dataclasses.replace(found, effects=(dataclasses.replace(named, rivals=(rival,)),)))
+    listed_rivals = dataclasses.replace(found, effects=(dataclasses.replace(named, rivals=(rival,)),)).tree()
     assert listed_rivals['effects'][0]['rivals'] == [
         {
             'name': 'sensor_rotation',

@@ -22,9 +22,9 @@ from psd_deflection.records import FloatArray, ParameterChange
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import read_parameter_file
-from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation, load_cases
-from psd_deflection.studies.discover.result import result, sentence
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import refit
@@ -66,7 +66,7 @@ def test_nothing_missing_is_the_answer_to_noise() -> None:
     assert found.verdict == 'nothing_missing'
     assert found.effects == ()
     assert found.gap_after == pytest.approx(found.gap_floor, rel=0.05)
-    assert sentence(found).startswith('Nothing is missing')
+    assert found.sentence.startswith('Nothing is missing')
 
 
 def test_the_hidden_effect_is_named_with_its_size(rotated: Discovery) -> None:
@@ -107,9 +107,9 @@ def test_a_small_effect_behind_a_large_one_is_named_too(large: dict[str, object]
     assert found.verdict == 'effects_found'
     assert {e.active.effect.name for e in found.effects} == {large['name'], small['name']}
     assert found.floors < 1.05
-    tree = result(found)
+    tree = found.tree()
     assert tree['remaining'] == {'rms': found.gap_after, 'floors': found.floors}
-    assert f'{found.floors:.2f} times what noise alone leaves' in sentence(found)
+    assert f'{found.floors:.2f} times what noise alone leaves' in found.sentence
 
 
 def test_where_is_the_turned_sensor(rotated: Discovery) -> None:
@@ -135,7 +135,7 @@ def check_schema(tree: dict[str, Any]) -> None:
 
 
 def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
-    tree = result(rotated)
+    tree = rotated.tree()
     check_schema(tree)
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
 
@@ -173,7 +173,7 @@ def test_a_load_cell_with_a_wrong_zero_is_named_from_two_lengths() -> None:
         assert abs(effect.active.values[name] - force) < 4.0 * effect.sd[name] < 0.01
     # 0.1 N bends the link of 0.585 m by 4.5 um.
     assert found.moves[1] == pytest.approx(0.1 * 0.585**3 / (3.0 * RIG.link.bending_stiffness), rel=0.2)
-    assert 'Without it an estimate is wrong by up to' in sentence(found)
+    assert 'Without it an estimate is wrong by up to' in found.sentence
 
 
 @pytest.mark.statistics
@@ -185,7 +185,7 @@ def test_what_is_not_in_the_library_is_unknown_and_not_merged() -> None:
     found = discover([Observation('alien', RIG, volts, seen.loads, seen.temperature)], RIG, bank=BANK)
     assert found.verdict == 'unknown_effect'
     assert 'x2' in found.unknown[0].signature
-    check_schema(result(found))
+    check_schema(found.tree())
 
 
 def two_effects(first: dict[str, object], second: dict[str, object]) -> Rig:
@@ -203,7 +203,7 @@ def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
     assert not found.unknown[0].remains
     assert 'agree in size (delay 3' in found.unknown[0].signature
     assert found.unknown[0].explains > 0.9
-    assert 'their sizes are tied' in sentence(found)
+    assert 'their sizes are tied' in found.sentence
     # With the cause in the library it is named alone.
     assert [e.active.effect.name for e in discover([lag], RIG, bank=BANK).effects] == ['amplifier_lag']
 

@@ -301,7 +301,7 @@ def test_a_regressor_has_a_plain_word(regressor: str, word: str) -> None:
 def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
     """By masks on the full spectrum (Parseval); the gain in a band counts if it is beyond what may be wrong there."""
     rng = np.random.default_rng(2)
-    one, other, explained = (rng.standard_normal(len(workspace.data)) for _ in range(3))
+    one, other, explained = (rng.standard_normal(sum(m.size for m in workspace.measured)) for _ in range(3))
     edges = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, math.inf)
 
     def bands(vector: FloatArray) -> FloatArray:

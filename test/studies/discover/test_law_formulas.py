@@ -534,7 +534,7 @@ def test_a_search_is_done_when_noise_is_left_or_enough_was_tried() -> None:
     """Of 200 values four deviations of their chi-square, 4 sqrt(400) = 80."""
     seeker = Given({})
     for chi2, simulations, done in ((279.0, 0, True), (281.0, 0, False), (281.0, 600, False), (281.0, 601, True)):
-        seeker.chi2, seeker.ws.simulations = chi2, simulations
+        seeker.chi2, seeker.ws = chi2, cast(Workspace, SimpleNamespace(size=200, simulations=simulations))
         assert seeker.done(seeker.trial([law_of('dx')], (), 1)) == done
 
 

@@ -12,23 +12,17 @@ import pytest
 
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.model.simulation.laws import Law, LawTerm
-from psd_deflection.model.simulation.loads import SIDEBAR_ARM
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences
-from psd_deflection.studies.discover import discover, experiment, observation, planning, plants, readings, result
+from psd_deflection.studies.discover import experiment, planning, readings, result
 from psd_deflection.studies.discover.experiment import ModelSums
 from psd_deflection.studies.discover.laws import law_features, laws
 from psd_deflection.studies.discover.laws.law_features import SOUGHT, Response
-from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.search import coincidence, localise, proposals, ties, trust, weighing
-from psd_deflection.studies.discover.search import fit as fits
+from psd_deflection.studies.discover.search import coincidence, localise, proposals, weighing
 from psd_deflection.studies.discover.search import hold_out as validate
-from psd_deflection.studies.discover.search import screen as screens
-from psd_deflection.studies.discover.search import search as steps
-from psd_deflection.studies.discover.search import workspace as whitened
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.localise import dependences
@@ -37,31 +31,12 @@ from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import cleaning, hidden, setup
-from psd_deflection.studies.discover.setup import noise as noises
 
 from .test_formulas import RIG, observed
 from .test_law_formulas import Given
 from .test_rules import FINE, SIGMA, A, N, Plant, active, candidate, noise, pictures
-from .test_search_parts import Asked, given_scores, nothing_found, scored
 
 # Wiring and units.
-
-
-def test_each_unit_has_its_factor() -> None:
-    """In N and N m: the standard acceleration is 9.80665 m/s^2, a pound 0.45359237 kg, an ounce a sixteenth of it."""
-    g, pound = 9.80665, 0.45359237
-    force = {'kg': g, 'g': g / 1000, 'lbf': g * pound, 'kN': 1000, 'mN': 1 / 1000, 'ozf': g * pound / 16}
-    torque = {'kg m': g, 'kg cm': g / 100, 'kg mm': g / 1000, 'kN m': 1000, 'N mm': 1 / 1000, 'N cm': 1 / 100}
-    for units, own, wanted in ((setup.FORCE_UNITS, 'N', force), (setup.TORQUE_UNITS, 'N m', torque)):
-        told = {words: factor for factor, words in setup._both_ways(units, own)}
-        there = {f'{unit} instead of {own}': factor for unit, factor in wanted.items()}
-        # What is a thousand times one way is it the other way too.
-        back = {
-            f'{own}, and then converted from {unit} once more': 1 / factor
-            for unit, factor in wanted.items()
-            if factor not in (1000, 1 / 1000)
-        }
-        assert told == pytest.approx({**there, **back}, rel=2e-7)
 
 
 def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,34 +101,6 @@ def test_what_is_coupled_to_nothing_is_none(main: float, coupled: float) -> None
     assert found.values['with_it'] == pytest.approx(coupled)
 
 
-@pytest.mark.parametrize(
-    ('gain', 'least'), [(99.9, 49.95), (100.0, 50.0), (100.1, 40.1), (149.9, 89.9), (150.1, 90.06), (3.0, 1.5)]
-)
-def test_an_alternative_must_explain_its_share(monkeypatch: pytest.MonkeyPatch, gain: float, least: float) -> None:
-    """Half; above 100 all but 60; from 150 on six tenths."""
-    search = nothing_found()
-    asked = Asked(monkeypatch, steps, search, a=0.0)
-    one = asked.fit(active('a', x=0.1))
-    given_scores(search, scored('b', least + 1e-6), scored('c', least - 1e-6))
-    search.alternatives(asked.plain, one, 0, gain)
-    assert [n for n, _ in asked.seen][:1] == ['b']
-    assert 'c' not in [n for n, _ in asked.seen]
-
-
-def test_what_fails_goes_and_the_rest_is_fitted_anew(monkeypatch: pytest.MonkeyPatch) -> None:
-    search = nothing_found()
-    asked = Asked(monkeypatch, weighing, search, a=50.0, ab=40.0)
-    both = asked.fit(active('a', x=0.1), active('b', x=0.1))
-    null = dataclasses.replace(asked.plain, chi2=70.0)
-    monkeypatch.setattr(search, 'weigh', lambda null, left: ([0.1], [2.0], [null.chi2 - left.chi2]))
-    result = cast(SearchResult, SimpleNamespace(null=null, p=[0, 0], delta_bic=[0, 0], delta_chi2=[0, 0]))
-    left = weighing.without_one(search, result, both, 1)
-    assert asked.seen == [('a', 6)]
-    assert (result.p, result.delta_bic, result.delta_chi2) == ([0.1], [2.0], [20.0])
-    assert weighing.without_one(search, result, left, 0) is null
-    assert len(asked.seen) == 1
-
-
 def test_a_size_that_shows_nothing_stays_where_it_is() -> None:
     shown = pictures(A)
     shown['b', 'x'] = np.zeros_like(shown[A])
@@ -198,23 +145,6 @@ def response(weight: np.ndarray, length: np.ndarray, values: np.ndarray, columns
     known = {'time': np.arange(n) * 1e-3, 'load_fx': values, 'load_fy': values, 'load_tz': values}
     flat = np.zeros((rows, n))
     return Response(known, 1e-3, 1, weight, length, flat, flat, (), (1, 1))
-
-
-@pytest.mark.parametrize(('rest', 'seen'), [(2.1e-6, True), (0.9e-6, False)])
-def test_a_term_that_is_explained_already_is_not_scored(rest: float, seen: bool) -> None:
-    """A millionth of its squared length must be left beside the columns that are in the model."""
-    rng = np.random.default_rng(2)
-    n, rows = 40, len(SOUGHT)
-    for size in (1e-4, 1.0, 1e4):
-        values = size * rng.standard_normal(n)
-        column = values / np.linalg.norm(values) * math.sqrt(1.0 - rest)
-        weight = np.zeros((n, rows, 2))
-        weight[:, :, 0], weight[:, :, 1] = values[:, None], column[:, None]
-        r = response(weight.reshape(n, -1), np.ones((n, rows)), values)
-        got = law_features.score([r], [LawTerm('product', ('load_fx',))], ('y1',))
-        assert bool(got) == seen
-        for s in got:
-            assert s.gain == pytest.approx((values @ values) / rest, rel=1e-3)
 
 
 def test_noise_of_a_sum_is_no_gap() -> None:
@@ -276,15 +206,6 @@ def test_two_levels_are_fitted_in_turn_four_times(monkeypatch: pytest.MonkeyPatc
     assert asked == pytest.approx([9.0] * 4)
 
 
-def test_the_steps_of_readings_are_weighed_by_the_first_recordings_converter() -> None:
-    def converter(step: float) -> Any:
-        return SimpleNamespace(rig=SimpleNamespace(converter=SimpleNamespace(volts_per_count=step)))
-
-    ws = SimpleNamespace(observations=[converter(1e-3), converter(2e-3)], size=10, fine=[4, 5])
-    lattice = SimpleNamespace(effect=SimpleNamespace(lattice='step'), values={'step': 0.01})
-    assert discover._lattice_gain(cast(Any, ws), cast(Any, lattice)) == pytest.approx(40.0 * math.log(10.0))
-
-
 def test_loads_keep_the_dots_within_what_the_converter_can_read() -> None:
     """Here 0.1 mm a volt: the ends of the converter's range come before the edge of the sensor."""
     rig = replace_values(RIG, {'amplifier.sensitivity': 1e-4, 'link.youngs_modulus': 7e9})
@@ -341,17 +262,11 @@ def test_a_candidate_counts_from_a_thousandth_of_sigma_on_and_on_its_own_side_on
     plant = Plant(shown, 5.0 * unit)
     for size, seen in ((0.5, True), (1.01e-3, True), (0.99e-3, False)):
         screen = Screen(plant, [(candidate('a', 'x'), [[size * unit]])])
-        got = screen.score(plant.data)
+        got = screen.score(plant.whiten(plant.measured))
         assert [s.gain for s in got] == ([pytest.approx(25.0, rel=1e-4)] if seen else [])
     for size, least, gain in ((1.0, 0.0, 25.0), (10.0, 0.0, 25.0), (-1.0, 0.0, 0.0), (-1.0, -1.0, 25.0)):
         screen = Screen(plant, [(candidate('a', 'x', least=least), [[size * unit]])])
-        assert screen.score(plant.data)[0].gain == pytest.approx(gain, rel=1e-4)
-
-
-def test_of_those_that_gain_a_share_the_limit_itself_is_tried() -> None:
-    scores = [scored('a', 100.0), scored('b', 30.0), scored('c', 29.999), scored('d', 0.0)]
-    assert [s.candidate.effect.name for s in steps.promising(scores, 3.0, 0.3, 9)] == ['a', 'b']
-    assert [s.candidate.effect.name for s in steps.promising(scores, 3.0, 0.0, 9)] == ['a', 'b', 'c']
+        assert screen.score(plant.whiten(plant.measured))[0].gain == pytest.approx(gain, rel=1e-4)
 
 
 # Wiring, jumps and places.
@@ -412,97 +327,6 @@ def test_what_a_law_leaves_is_told_in_micrometres() -> None:
         assert words in result._law(cast(Any, answer))
 
 
-LIMITS: dict[Any, dict[str, Any]] = {
-    cleaning: {'FAR': 8.0, 'PASSES': 6, '_TO_SD': 1.4826, 'STUCK_S': 0.03, 'UNKNOWN_SHARE': 0.05},
-    coincidence: {'DECADES': 2.0, 'ODDS': 20.0, 'EXACT': 0.003},
-    experiment: {
-        'ROOM': 0.8,
-        'START_CELSIUS': 20.0,
-        'SWINGS': (0.0, 0.5, 1.0, 0.5, 0.0, -0.5, -1.0, -0.5, 0.0),
-    },
-    law_features: {'_BATCH': 64, 'LEVELS': 24, 'MOST_TIMES': 12, 'REFINED': 4, 'TOGGLE_COST': 24.0},
-    laws: {
-        'TRIED': 12,
-        'FOLLOWED': 3,
-        'MAX_TERMS': 4,
-        'BUDGET': 600,
-        'ALTOGETHER': 1800,
-        'TIED': 21.6,
-        'UNDETERMINED': 100.0,
-        'EXPLAINS': 0.5,
-    },
-    localise: {'CLIP': 6.0, 'DRAWS': 39},
-    planning: {'TELLS_APART': 21.6, 'SURE': 60.0, 'WORTH': 0.02, 'EFFORT_OF_A_MINUTE': 0.03},
-    plants: {'BUDGET': 4000, 'FOLDS': 4, 'SAME': 0.02},
-    proposals: {'PEAK': 40.0},
-    setup: {
-        'BETTER': 10.0,
-        'AS_GOOD': 2.0,
-        'UNIT_TOLERANCE': 0.03,
-        'NOISE_FACTOR': 2.0,
-        'SEEN': 100.0,
-        'SMALL': 1e-4,
-        'FARTHEST_S': 1.0,
-    },
-    steps: {
-        'P_ACCEPT': 0.01,
-        'BIC_ACCEPT': 10.0,
-        'FAR': 10.0,
-        'LIKELY': 0.3,
-        'NEARLY_ALL': 0.01,
-        'STANDS_IN': 0.2,
-        'NEAR': 0.1,
-        'MAX_EFFECTS': 4,
-        'ROUNDS': 3,
-        'TRIALS': 7,
-        'PAIRS': 5,
-        'PAIRS_OPEN': 15,
-        'SWAP_REACH': 0.6,
-        'OTHER_RATES': (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25),
-        'TOO_FAR': -0.7,
-        'HALF': -0.5,
-    },
-    ties: {'SAME': 3.0, 'EXACT': 0.003, 'CLEAR': 5.0},
-    trust: {'RELATIVE': 0.002, 'BANDS': (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)},
-    weighing: {
-        'EQUIVALENT': 21.6,
-        'EQUIVALENT_BIC': 6.0,
-        'UNKNOWN_P': 1e-4,
-        'UNKNOWN_EXCESS': 60.0,
-        'STEPS_SHARE': 0.02,
-        'UNSAID': 1.5,
-        'RIVAL_BIC': 10.0,
-    },
-    whitened: {'LEAST_NOISE': 0.05, 'FINE_SECONDS': 0.004, 'FOLDS': 4, 'PIECE_SECONDS': 0.5, 'MAX_FINE': 60_000},
-    fits: {'STEP': 0.05, 'STOP': 0.05},
-    screens: {'SEEN': 1e-6},
-    validate: {'BOOTSTRAPS': 400},
-    noises: {'ORDER': 2, 'SIGNIFICANT': 5.0},
-    readings: {'MICRO': 1e6, 'LEAST_LOADS': 4, 'FOLDS': 6},
-    observation: {'QUIET': 0.25},
-}
-
-
-@pytest.mark.parametrize('module', list(LIMITS), ids=lambda m: m.__name__.rpartition('.')[2])
-def test_the_limits_are_those_that_the_campaigns_were_run_with(module: Any) -> None:
-    """The figures of docs/discover.md hold for these: after a change `make blind` is to be run again."""
-    assert {name: getattr(module, name) for name in LIMITS[module]} == LIMITS[module]
-
-
-def test_what_is_not_said_is_as_stated() -> None:
-    """Defaults: nothing more is known, nothing more is there."""
-    o = Observation('x', RIG, np.zeros((80, 6)), np.zeros((80, 3)))
-    assert (o.temperature, o.digest, o.unknown_load, o.stated_rate_hz) == (None, '', (0, 0), 0.0)
-    assert experiment.Limits() == experiment.Limits(50.0, 29.25, SIDEBAR_ARM, True, 150.0, 10.0, None, (), 60.0)
-    assert experiment.Setting() == experiment.Setting('', {}, 0.0, 0.0)
-    assert weighing.Unknown('', (), 0.5) == weighing.Unknown('', (), 0.5, remains=True, rms=0.0)
-    given = Comparison
-    assert (given.nuisance, given.first, given.setup, given.open_level) == ((), frozenset(), frozenset(), False)
-    assert (given.budget, plants.PlantComparison.open_level, plants.PlantComparison.budget) == (700, True, 4000)
-    assert (plants.Plant.nuisance, plants.Plant.noise, plants.Plant.period, plants.Plant.physics) == ((), (), 0.0, None)
-    assert not plants.plant_effect('a', EffectParameter('x', 'V', -1.0, 1.0, 0.1, '')).finite
-
-
 def test_the_error_of_an_unseen_gain_is_that_of_four_hundred_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     pieces = np.random.default_rng(1).normal(40.0, 1.0, 12)
     monkeypatch.setattr(validate, 'heldout_residual', lambda *_: np.zeros(1))
@@ -542,7 +366,7 @@ def test_a_table_is_tried_with_a_small_size_and_the_first_shape() -> None:
 
 def test_where_something_is_left_does_not_depend_on_the_units_of_what_is_fitted() -> None:
     workspace = Workspace([observed(warm=None)])
-    known = np.random.default_rng(3).standard_normal((len(workspace.data), 2))
+    known = np.random.default_rng(3).standard_normal((len(workspace.whiten(workspace.measured)), 2))
     residual = workspace.residual([])[0]
     one, other = (
         localise.localise(workspace, residual, k, np.random.default_rng(0)) for k in (known, known * [1e6, 1e-6])
@@ -614,16 +438,6 @@ def test_a_law_of_the_noise_passes_at_the_p_of_its_limit_and_not_at_the_bic(monk
     assert laws.find_jitter(workspace, fit, 3.0) is not None
     monkeypatch.setattr(laws, 'BIC_ACCEPT', found.delta_bic + 1e-9 * abs(found.delta_bic))
     assert laws.find_jitter(workspace, fit, 3.0) is None
-
-
-def test_another_noise_is_told_to_three_decimals() -> None:
-    o = observed(warm=None)
-    stated = float(np.mean(RIG.noises[:, :2] ** 2)) + RIG.converter.volts_per_count**2 / 12.0
-    for factor, told in ((2.34567, 2.346), (0.123456, 0.123)):
-        ws = SimpleNamespace(observations=[o], noise=[SimpleNamespace(sigma=np.full(6, factor * math.sqrt(stated)))])
-        (finding,) = setup.noise_finding(cast(Workspace, ws))
-        assert finding.value == told
-        assert finding.evidence == pytest.approx(abs(math.log(factor)))
 
 
 @pytest.mark.parametrize(('gains', 'share'), [((-5.0, 1.0), 0.0), ((3.0, 2.0), 0.5), ((30.0, 2.0), 1.0)])
@@ -699,7 +513,7 @@ def test_what_the_model_has_already_is_followed_by_nothing(rest: float, listed: 
     aside = np.zeros((6, FINE))
     aside[1] = values
     known = (math.sqrt(1.0 - rest) * row + math.sqrt(rest) * aside).reshape(-1, 1)
-    found = dependences(plant, [('x1', {'wave': [values]})], plant.data, known)
+    found = dependences(plant, [('x1', {'wave': [values]})], plant.whiten(plant.measured), known)
     assert bool(found) == listed
 
 
@@ -709,17 +523,6 @@ def test_of_two_that_are_one_the_sum_is_known() -> None:
         fit, jacobian=np.repeat(fit.jacobian, 2, axis=1), free=((0, 'x'), (1, 'x')), effects=fit.effects * 2
     )
     np.testing.assert_allclose(twice.covariance(), 0.25 * fit.covariance()[0, 0] * np.ones((2, 2)), rtol=1e-6)
-
-
-@pytest.mark.parametrize(('worse', 'refits'), [(59.9, 2), (60.0, 1), (60.1, 1)])
-def test_an_alternative_within_sixty_is_refitted_in_full(
-    monkeypatch: pytest.MonkeyPatch, worse: float, refits: int
-) -> None:
-    search = nothing_found()
-    asked = Asked(monkeypatch, steps, search, a=0.0, b=worse)
-    given_scores(search, scored('b', 90.0))
-    search.alternatives(asked.plain, asked.fit(active('a', x=0.1)), 0, 50.0)
-    assert [n for n, _ in asked.seen] == ['b'] * refits
 
 
 def test_a_variable_is_known_as_means_of_the_blocks_of_an_estimate() -> None:

@@ -25,7 +25,6 @@ from psd_deflection.studies.discover.search import workspace as whitened
 from psd_deflection.studies.discover.search.coincidence import Coincidence
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Dependence
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import SearchResult
@@ -34,11 +33,11 @@ from psd_deflection.studies.discover.search.trust import energies
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import cleaning
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes
-from psd_deflection.studies.discover.setup.noise import NoiseModel, _filled, _kept, _level, estimate_noise
+from psd_deflection.studies.discover.setup.noise import _filled, _kept, _level, estimate_noise
 from psd_deflection.studies.discover.setup.setup import likely_delays
 
 from .test_formulas import HISTORY, RIG, observed
-from .test_rules import CASES, FINE, SIGMA, Plant, active, columns, noise, nowhere, pictures, without_noise
+from .test_rules import CASES, FINE, SIGMA, Plant, active, columns, noise, nowhere, pictures
 
 A, B = ('a', 'x'), ('b', 'x')
 DOTS = [0, 1, 3, 4]
@@ -199,32 +198,19 @@ def test_long_recordings_have_longer_fine_blocks(monkeypatch: pytest.MonkeyPatch
     assert Workspace([o, o]).fine == [20, 20]
 
 
-def test_noise_has_a_floor_of_its_file_and_of_the_converter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A twentieth of the file's; a quarter where coarse steps hide it; rounding to counts in any case."""
-    seen: list[FloatArray] = []
-    real = estimate_noise
-
-    def noted(o: Observation, residual: FloatArray, fine: int, floors: FloatArray) -> NoiseModel:
-        seen.append(floors)
-        return real(o, residual, fine, floors)
-
-    monkeypatch.setattr(whitened, 'estimate_noise', noted)
+def test_noise_has_a_floor_of_its_file() -> None:
+    """A twentieth of the file's; a quarter where coarse steps hide it."""
     loud = replace_values(RIG, {'amplifier.noise': 0.1})
-    o = dataclasses.replace(observed(warm=None), rig=loud)
-    ws = Workspace([o])
-    ws.estimate_noise([make_active('quantisation', {'step': 0.01}, 't')])
-    ws.estimate_noise([make_active('creep', {'amplitude': 0.01}, 't')])
-    rounding = RIG.converter.volts_per_count / math.sqrt(12.0)
-    for floors, share in zip(seen, (0.05, 0.25, 0.05), strict=True):
-        np.testing.assert_allclose(floors, np.maximum(share * loud.noises.ravel(), rounding))
-    quiet = replace_values(RIG, {'amplifier.noise': 1e-6})
-    Workspace([dataclasses.replace(o, rig=quiet)])
-    np.testing.assert_allclose(seen[-1], rounding)
+    ws = Workspace([dataclasses.replace(observed(warm=None), rig=loud)])
+    np.testing.assert_allclose(ws.noise[0].sigma, 0.05 * loud.noises.ravel())
+    coarse = ws.renoised([make_active('quantisation', {'step': 0.01}, 't')])
+    np.testing.assert_allclose(coarse.noise[0].sigma, 0.25 * loud.noises.ravel())
+    assert ws.renoised([make_active('creep', {'amplitude': 0.01}, 't')]) is ws
 
 
 def test_pieces_of_a_recording_are_half_seconds(gappy: Workspace) -> None:
     rng = np.random.default_rng(0)
-    a, b = (rng.standard_normal(len(gappy.data)) for _ in range(2))
+    a, b = (rng.standard_normal(sum(m.size for m in gappy.measured)) for _ in range(2))
     want: list[float] = []
     for x, y in zip(gappy.split(a), gappy.split(b), strict=True):
         gain = 0.5 * (x**2 - y**2).sum(axis=0)
@@ -236,7 +222,7 @@ def test_pieces_of_a_recording_are_half_seconds(gappy: Workspace) -> None:
 def test_a_slow_change_is_unwhitened_by_what_is_left_of_a_constant() -> None:
     ws = Workspace([observed(warm=None)])
     ar = np.array([[0.5, -0.2], [0.3, 0.0], [0.97, 0.0], [0.0, 0.0], [-0.6, 0.1], [0.2, 0.2]])
-    ws.noise = [dataclasses.replace(ws.noise[0], ar=ar)]
+    ws = ws.replaced(noise=(dataclasses.replace(ws.noise[0], ar=ar),))
     constant = np.ones((6, 300)) * np.arange(1.0, 7.0)[:, None]
     (back,) = ws.unwhitened(ws.whiten([constant]))
     # But for the first blocks, which have no past; a memory of more than 0.95 is taken as 0.95.
@@ -289,7 +275,7 @@ def test_a_row_of_a_channel_is_whitened_as_the_readings_are(gappy: Workspace) ->
     np.testing.assert_array_equal(gappy.row(3, values), want)
     assert want.shape == (700,)
     np.testing.assert_array_equal(gappy.row_cases(), np.concatenate([np.tile(c, 6) for c in gappy.case]))
-    vector = np.arange(float(len(gappy.data)))
+    vector = np.arange(float(sum(m.size for m in gappy.measured)))
     first, second = gappy.split(vector)
     np.testing.assert_array_equal(first, np.arange(1800.0).reshape(6, 300))
     np.testing.assert_array_equal(second, 1800.0 + np.arange(2400.0).reshape(6, 400))
@@ -624,48 +610,6 @@ def test_gaps_of_channels_are_before_and_after() -> None:
     assert weighing.per_channel_of(fake, before, after) == {'p': (3.0, 1.0), 'q': (6.0, 2.0)}
     assert weighing.heldout_per_channel_of(fake, after) == {'p': 1.0, 'q': 2.0}
     assert weighing._beyond(5.0, math.nan) == 5.0
-
-
-def test_each_effect_has_its_own_weight_and_alternatives() -> None:
-    """Those that the search found; anew if the rule has taken effects out. The nearest rival comes first."""
-    shown = pictures(A, B)
-    plant = Plant(shown, without_noise((shown[A], 500.0), (shown[B], 300.0)))
-    fit = refit(plant, [active('a', x=0.0), active('b', x=0.0)])
-    jacobian = np.eye(fit.residual.size)[:, :2]
-
-    def other(name: str, loss: float) -> Fit:
-        effects = (fit.effects[0], active(name, x=0.1))
-        return dataclasses.replace(fit, effects=effects, chi2=fit.chi2 + loss, jacobian=jacobian)
-
-    lists = [[other('p', 9.0), other('q', 2.0), other('q', 3.0)], [other('r', 50.0)]]
-    held = [HeldOut(1.0, 2.0), HeldOut(3.0, 4.0)]
-    result = SearchResult(refit(plant, ()), fit, [0.1, 0.2], [3.0, 4.0], [5.0, 6.0], [], lists)
-    asked: list[tuple[int, float]] = []
-
-    def alternatives(null: Fit, current: Fit, index: int, gain: float) -> list[Fit]:
-        asked.append((index, gain))
-        return lists[1 - index]
-
-    search = cast(Any, SimpleNamespace(workspace=plant, penalty=3.0, alternatives=alternatives))
-    first, second = weighing.named_effects(search, result, fit, held)
-    assert (first.p, first.delta_bic, first.heldout) == (0.1, 3.0, held[0])
-    assert (second.p, second.delta_bic, second.heldout) == (0.2, 4.0, held[1])
-    assert first.equivalent == ('p', 'q')
-    assert [r.active.effect.name for r in first.rivals] == ['q', 'q', 'p']
-    assert [r.delta_bic for r in first.rivals] == pytest.approx([2.0, 3.0, 9.0])
-    assert [(n, round(a, 6), round(b, 6)) for n, a, b in first.alternatives] == [
-        ('p', 9.0, 9.0),
-        ('q', 2.0, 2.0),
-        ('q', 3.0, 3.0),
-    ]
-    assert (second.equivalent, second.rivals, second.alternatives[0][0]) == ((), (), 'r')
-    assert first.suggestion is None
-    assert asked == []
-    again = dataclasses.replace(fit)
-    first, second = weighing.named_effects(search, result, again, held)
-    assert asked == [(0, 5.0), (1, 6.0)]
-    assert second.equivalent == ('p', 'q')
-    assert first.alternatives[0][0] == 'r'
 
 
 # Where.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,7 +15,7 @@ import pytest
 
 from blind.next import table
 from psd_deflection.base.errors import UsageError
-from psd_deflection.cli._next import limits_from_words, plan_table, write_plan
+from psd_deflection.cli._next import how, limits_from_words
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import make_active
@@ -26,6 +27,7 @@ from psd_deflection.studies.discover.experiment import Limits, Setting, pieces, 
 from psd_deflection.studies.discover.from_recordings import read_observations
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import TELLS_APART, Plan, plan_next
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
@@ -168,24 +170,24 @@ class Searches:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, equivalents: int, useful: bool = True, free: int = 1) -> None:
         self.seen: list[int] = []
-
-        def discover(known: list[object], rig: Rig, seed: int, **_: object) -> object:
-            assert seed == 0
-            self.seen.append(len(known))
-            left = ('other',) * max(equivalents - len(known) + 1, 0)
-            rivals = [SimpleNamespace(parameters=free)] * len(left)
-            return SimpleNamespace(unsettled=left, rivals=rivals, fit=SimpleNamespace(parameters=1))
-
-        monkeypatch.setattr(loop, 'discover', discover)
+        self.equivalents, self.free = equivalents, free
         monkeypatch.setattr(
             loop,
             'next_of',
             lambda found, _: SimpleNamespace(useful=useful and bool(found.unsettled), sentence='Nothing helps.'),
         )
 
-    def settle(self, most: int = 3) -> loop.Settled:
+    def search(self, known: Sequence[Observation]) -> Discovery:
+        self.seen.append(len(known))
+        left = ('other',) * max(self.equivalents - len(known) + 1, 0)
+        rivals = [SimpleNamespace(parameters=self.free)] * len(left)
+        return cast(Discovery, SimpleNamespace(unsettled=left, rivals=rivals, fit=SimpleNamespace(parameters=1)))
+
+    def settle(self, most: int | None = None) -> loop.Settled:
         first, made = cast(Observation, object()), cast(Observation, object())
-        return loop.settle([first], RIG, lambda plan, number: made, most=most)
+        if most is None:
+            return loop.settle([first], self.search, lambda plan, number: made)
+        return loop.settle([first], self.search, lambda plan, number: made, most=most)
 
 
 def test_the_loop_ends_when_the_answer_is_unique(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -208,8 +210,7 @@ def test_the_loop_ends_when_nothing_would_help_or_no_more_is_allowed(monkeypatch
     assert (done.outcome, len(done.plans)) == ('recordings', 1)
     assert done.sentence == 'The answer is not unique after 1 more recording, and no more were allowed.'
     # Three more are allowed if nobody says otherwise.
-    first = cast(Observation, object())
-    assert len(loop.settle([first], RIG, lambda plan, number: first).plans) == 3
+    assert len(Searches(monkeypatch, 9).settle().plans) == 3
 
 
 @pytest.fixture(scope='module')
@@ -239,11 +240,24 @@ def test_the_command_settles_what_one_length_leaves_open(
     assert (seen.name, seen.rig.link.length) == (made['file'], 0.409)
 
 
+class Nothing:
+    """Stands for an answer that writes nothing."""
+
+    def files(self) -> dict[str, str]:
+        return {}
+
+    def tree(self) -> dict[str, object]:
+        return {}
+
+
 def test_a_plan_is_written_as_files_that_the_commands_take(
     plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     warm = dataclasses.replace(plan, setting=dataclasses.replace(plan.setting, swing=2.0))
-    lines = write_plan(warm, tmp_path)
+    files = loop.Settled(cast(Discovery, Nothing()), (), warm, None).files()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    lines = how(warm, tmp_path)
     script = load_history(str(tmp_path / 'next_loads.csv'), 1000.0).loads
     assert np.array_equal(script, plan.loads)
     command = shlex.split(lines[1])
@@ -254,7 +268,7 @@ def test_a_plan_is_written_as_files_that_the_commands_take(
     assert np.array_equal(seen.loads, plan.loads)
     assert seen.temperature is not None
     assert np.ptp(seen.temperature) == pytest.approx(4.0, abs=0.01)
-    shown_table = plan_table(plan)
+    shown_table = plan.table
     assert 'hold' in shown_table
     assert 'clamp_bending_compliance' in shown_table
 

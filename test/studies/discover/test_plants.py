@@ -14,8 +14,6 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plants import Model, Plant, PlantComparison, plant_effect
-from psd_deflection.studies.discover.report import report_html
-from psd_deflection.studies.discover.result import result, sentence
 
 STIFFNESS = plant_effect('stiffness', EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'))
 CUBIC = plant_effect('cubic', EffectParameter('c', 'N/mm^3', -9.0, 9.0, 0.1, 'of u^3'), equation='F += c u^3')
@@ -62,7 +60,7 @@ def test_what_the_spring_lacks_is_named_with_its_size() -> None:
     assert 1e-4 < cubic.sd['c'] < 1e-2
     assert found.gap_heldout_after == pytest.approx(NOISE, rel=0.1)
     assert found.where.cells[0].recording == 5
-    assert sentence(found).startswith('cubic is missing from the model; adding it closes the gap from')
+    assert found.sentence.startswith('cubic is missing from the model; adding it closes the gap from')
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -98,8 +96,8 @@ def test_lost_values_cost_precision_and_nothing_else() -> None:
     found = psd_deflection.discover_in(plant)
     (cubic,) = found.effects
     assert abs(cubic.active.values['c'] - 0.3) < 4.0 * cubic.sd['c']
-    assert sum(r['lost'] for r in result(found)['provenance']['recordings']) == pytest.approx(90, abs=30)
-    assert '<img' in report_html(found)
+    assert sum(r['lost'] for r in found.tree()['provenance']['recordings']) == pytest.approx(90, abs=30)
+    assert '<img' in found.report()
 
 
 def test_what_remains_is_unknown_if_it_follows_something() -> None:
@@ -140,7 +138,7 @@ def test_channels_with_units_of_their_own() -> None:
     found = psd_deflection.discover_in(Warm(0.3))
     assert [e.active.effect for e in found.effects] == [CUBIC]
     assert found.gap_before == pytest.approx(1.0)
-    tree = json.loads(json.dumps(result(found), allow_nan=False))
+    tree = json.loads(json.dumps(found.tree(), allow_nan=False))
     assert tree['gap']['unit'] == 'share of the gap before'
     assert tree['gap']['floor'] is None
     assert set(tree['gap']['per_channel']) == {'force', 'temperature'}
@@ -151,9 +149,8 @@ def test_channels_with_units_of_their_own() -> None:
 
 @pytest.mark.repeatable
 def test_the_answer_is_the_same_again() -> None:
-    assert result(psd_deflection.discover_in(Spring(0.1), seed=3)) == result(
-        psd_deflection.discover_in(Spring(0.1), seed=3)
-    )
+    first, second = (psd_deflection.discover_in(Spring(0.1), seed=3).tree() for _ in range(2))
+    assert first == second
 
 
 def test_few_cases_are_cut_into_pieces() -> None:

@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import numpy as np
 import pytest
@@ -25,10 +25,13 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover import experiment, planning
 from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.problem import Machine, Problem
 from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.comparison import Comparison, Tally
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap, heldout_residual
 from psd_deflection.studies.discover.search.localise import (
+    NOWHERE,
     Dependence,
     Localisation,
     _energies,
@@ -40,7 +43,7 @@ from psd_deflection.studies.discover.search.localise import (
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate
-from psd_deflection.studies.discover.search.weighing import accept, credible, named_effects, tied, unknown_of
+from psd_deflection.studies.discover.search.weighing import tied, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace, fine_means
 from psd_deflection.studies.discover.setup.noise import (
     NoiseModel,
@@ -49,6 +52,7 @@ from psd_deflection.studies.discover.setup.noise import (
     _level,
     estimate_noise,
 )
+from psd_deflection.studies.discover.steps import accepted, alternatives, credible
 
 RIG = load_rig()
 SIGMA = 1e-3
@@ -85,26 +89,66 @@ class Plant(Workspace):
         self.pictures = pictures
         self.observations = (Observation('plant', RIG, nothing, nothing[:, :3]),)
         self.physics = Physics.of(RIG)
-        self.simulations = 0
+        self.tally = Tally()
         self.base = ()
         self.fine = [size]
         self.measured = [measured]
         self.count = [np.ones((6, FINE))]
         self.case = [np.arange(FINE) * CASES // FINE]
         level = np.full(6, SIGMA)
-        self.noise = [NoiseModel(2 * level, np.zeros((6, 2)), level, level / math.sqrt(5.0), 1.0, (False,) * 6)]
-        self.data = self.whiten(self.measured)
+        self.noise = (NoiseModel(2 * level, np.zeros((6, 2)), level, level / math.sqrt(5.0), 1.0, (False,) * 6),)
 
     def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
-        self.simulations += 1
+        self.tally.count += 1
         total = np.zeros((6, FINE))
         for a in effects:
             for name, value in a.values.items():
                 total += value * self.pictures[a.effect.name, name]
         return [total]
 
-    def estimate_noise(self, effects: Sequence[ActiveEffect]) -> None:
-        pass
+    def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
+        return self
+
+
+class Lone(Machine):
+    """A machine with nothing but a comparison. ``left``: where every fit leaves structure."""
+
+    def __init__(self, plant: Workspace, left: Localisation = NOWHERE) -> None:
+        self.plant, self.left = plant, left
+
+    def compared(self) -> Workspace:
+        return self.plant
+
+    def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
+        return Screen(comparison, [])
+
+    def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
+        return self.left
+
+    def suggest(self, comparison: Comparison, fit: Fit, equal: Sequence[Fit]) -> planning.Suggestion | None:
+        return planning.Suggestion(f'try {len(equal)}', 1.0)
+
+
+def problem_of(
+    search: Search, result: SearchResult, heldout: Sequence[HeldOut] = (), left: Localisation = NOWHERE
+) -> Problem:
+    """What the search of a lone machine found, before it is weighed."""
+    return Problem(
+        machine=Lone(cast(Workspace, search.workspace), left),
+        search=search,
+        result=result,
+        fit=result.fit,
+        null=result.null,
+        rng=np.random.default_rng(0),
+        seed=0,
+        progress=lambda _: None,
+        heldout=tuple(heldout),
+    )
+
+
+def ran(search: Search) -> SearchResult:
+    """What a search finds."""
+    return search.run(refit(search.workspace, ()))[1]
 
 
 def pictures(*names: tuple[str, str], seed: int = 1) -> dict[tuple[str, str], FloatArray]:
@@ -136,7 +180,7 @@ def search_of(plant: Plant, library: int = 1, penalty: float = 3.0) -> Search:
 def result_of(search: Search, effects: Sequence[ActiveEffect], others: Sequence[Sequence[Fit]] = ()) -> SearchResult:
     null, fit = refit(search.workspace, ()), refit(search.workspace, effects)
     p, bic, gains = search.weigh(null, fit)
-    return SearchResult(null, fit, p, bic, gains, [], [list(o) for o in others])
+    return SearchResult(null, fit, p, bic, gains, alternatives=[list(o) for o in others])
 
 
 # Fits.
@@ -189,7 +233,7 @@ def test_the_sd_of_a_named_effect_is_that_of_least_squares() -> None:
     result = result_of(search, [active('a', x=0.0), active('b', x=0.0)], [[], []])
     matrix = columns(shown, A, B)
     want = np.sqrt(np.diag(np.linalg.inv(matrix.T @ matrix)))
-    named = named_effects(search, result, result.fit, [HeldOut(9.0, 1.0)] * 2)
+    named = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)] * 2)).named
     assert [n.sd['x'] for n in named] == pytest.approx(want.tolist(), rel=1e-6)
     assert [n.active.effect.name for n in named] == ['a', 'b']
 
@@ -200,19 +244,18 @@ def test_a_model_that_is_not_exact_has_the_sd_of_its_scatter_over_load_cases() -
     plant = Plant(shown, noise())
     fold = np.tile(plant.case[0] % 4, 6).reshape(6, FINE)
     plant.measured[0] += np.array([3e-3, 5e-3, 9e-3, 4e-3])[fold] * shown[A]
-    plant.data = plant.whiten(plant.measured)
     result = result_of(search_of(plant), [active('a', x=0.0)], [[]])
     sizes = []
     for k in range(4):
         rest = fold != k
         sizes.append(np.sum(plant.measured[0][rest] * shown[A][rest]) / np.sum(shown[A][rest] ** 2))
     want = math.sqrt(3 / 4 * np.sum((np.array(sizes) - np.mean(sizes)) ** 2))
-    (named,) = named_effects(search_of(plant), result, result.fit, [HeldOut(9.0, 1.0)])
+    (named,) = alternatives(problem_of(search_of(plant), result, [HeldOut(9.0, 1.0)])).named
     assert named.sd['x'] == pytest.approx(want, rel=1e-3)
     # Nothing but noise: the sd of least squares.
     exact = Plant(shown, 5e-3 * shown[A] + noise())
     result = result_of(search_of(exact), [active('a', x=0.0)], [[]])
-    (named,) = named_effects(search_of(exact), result, result.fit, [HeldOut(9.0, 1.0)])
+    (named,) = alternatives(problem_of(search_of(exact), result, [HeldOut(9.0, 1.0)])).named
     assert named.sd['x'] == pytest.approx(SIGMA / np.linalg.norm(shown[A]), rel=1e-6)
 
 
@@ -263,9 +306,10 @@ def test_an_effect_is_named_from_stated_limits_on(gain: float, penalty: float, l
     search = search_of(Plant(shown, without_noise((shown[A], gain))), library, penalty)
     result = result_of(search, [active('a', x=0.0)])
     assert result.delta_chi2 == pytest.approx([gain], rel=1e-6)
-    heldout, fit = accept(search, result, np.random.default_rng(0))
-    assert [a.effect.name for a in fit.effects] == (['a'] if named else [])
-    assert len(heldout) == len(result.p) == len(result.delta_bic) == len(result.delta_chi2) == named
+    after = accepted(problem_of(search, result))
+    assert [a.effect.name for a in after.fit.effects] == (['a'] if named else [])
+    weighed = after.result
+    assert len(after.heldout) == len(weighed.p) == len(weighed.delta_bic) == len(weighed.delta_chi2) == named
     assert bool(search.trace) == (not named)
 
 
@@ -278,7 +322,7 @@ def test_what_does_not_hold_on_unseen_load_cases_is_not_named(cases: Sequence[in
     search = search_of(Plant(shown, without_noise((shown[A], 60.0)) * inside / share))
     result = result_of(search, [active('a', x=0.0)])
     assert result.delta_chi2 == pytest.approx([60.0], rel=1e-3)
-    _, fit = accept(search, result, np.random.default_rng(0))
+    fit = accepted(problem_of(search, result)).fit
     assert bool(fit.effects) == named
 
 
@@ -290,7 +334,7 @@ def test_an_effect_with_an_amplitude_at_a_bound_is_not_named_unless_it_is_off_th
         if least == 0.0:
             search = search_of(Plant(shown, 5e-3 * shown['a', 'x'] - 1e-3 * shown['a', 'y'] + noise()))
         start = active('a', least, most, x=0.0, y=0.0)
-        _, fit = accept(search, result_of(search, [start]), np.random.default_rng(0))
+        fit = accepted(problem_of(search, result_of(search, [start]))).fit
         assert bool(fit.effects) == named
 
 
@@ -301,12 +345,12 @@ def test_the_weakest_effect_goes_first_and_the_other_is_weighed_again() -> None:
     search = search_of(Plant(shown, without_noise((shown[A], 300.0)) + noise()))
     result = result_of(search, [active('b', x=0.0), active('a', x=0.0)])
     assert max(result.delta_bic) < 10.0
-    heldout, fit = accept(search, result, np.random.default_rng(0))
+    after = accepted(problem_of(search, result))
     weakest = int(
         np.argmin([result_of(search, [active('a', x=0.0)]).fit.chi2, result_of(search, [active('b', x=0.0)]).fit.chi2])
     )
-    assert [a.effect.name for a in fit.effects] == ['ab'[weakest]]
-    assert len(heldout) == 1
+    assert [a.effect.name for a in after.fit.effects] == ['ab'[weakest]]
+    assert len(after.heldout) == 1
 
 
 @pytest.mark.parametrize(('gain', 'stays'), [(13.5, True), (12.5, False)])
@@ -314,7 +358,7 @@ def test_a_step_of_the_search_passes_from_the_same_limit_on(gain: float, stays: 
     shown = pictures(A)
     search = search_of(Plant(shown, without_noise((shown[A], gain))))
     null, fit = refit(search.workspace, ()), refit(search.workspace, [active('a', x=0.0)])
-    assert search._passes(null, fit, null) == stays
+    assert search.passes(null, fit, null) == stays
 
 
 @pytest.mark.parametrize(('gain', 'channel', 'stays'), [(480.0, 0, True), (320.0, 0, False), (20.0, 1, True)])
@@ -330,7 +374,7 @@ def test_what_the_simulation_may_be_wrong_by_counts_only_where_it_explains_somet
     null, one = refit(search.workspace, ()), refit(search.workspace, [active('a', x=0.0)])
     both = refit(search.workspace, [active('a', x=0.0), active('b', x=0.0)])
     assert one.chi2 - both.chi2 == pytest.approx(gain, rel=1e-3)
-    assert search._passes(one, both, null) == stays
+    assert search.passes(one, both, null) == stays
 
 
 @pytest.mark.parametrize(
@@ -356,8 +400,7 @@ def test_an_alternative_is_equivalent_up_to_a_stated_loss(loss: float, names: tu
     )
     result = result_of(search, [active('a', x=0.0)], [[other]])
     result = dataclasses.replace(result, fit=fit)
-    suggestion = planning.Suggestion('try this', 1.0)
-    (named,) = named_effects(search, result, fit, [HeldOut(9.0, 1.0)], lambda *_: suggestion)
+    (named,) = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)])).named
     assert named.equivalent == (('b',) if equal else ())
     assert (named.suggestion is not None) == equal
     ((name, lost, bic),) = named.alternatives
@@ -402,7 +445,7 @@ def test_a_search_adds_what_passes_and_nothing_else() -> None:
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
     found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b', 'c')]
     said: list[str] = []
-    result = Search(plant, lambda workspace, _: Screen(workspace, found), said.append).run()
+    result = ran(Search(plant, lambda workspace, _: Screen(workspace, found), said.append))
     assert sorted(a.effect.name for a in result.fit.effects) == ['a', 'b']
     assert said[:2] == ['adding a', 'adding b']
     lost = {a.effect.name: g for a, g in zip(result.fit.effects, result.delta_chi2, strict=True)}
@@ -410,7 +453,7 @@ def test_a_search_adds_what_passes_and_nothing_else() -> None:
     assert lost['a'] == pytest.approx(4000.0, abs=4 * 2 * math.sqrt(4000.0))
     assert lost['b'] == pytest.approx(500.0, abs=4 * 2 * math.sqrt(500.0))
     assert [s.candidate.effect.name for s in result.first_scores[:2]] == ['a', 'b']
-    quiet = Search(Plant(shown, noise()), lambda workspace, _: Screen(workspace, found)).run()
+    quiet = ran(Search(Plant(shown, noise()), lambda workspace, _: Screen(workspace, found)))
     assert quiet.fit.effects == ()
 
 
@@ -628,9 +671,9 @@ def test_effects_weaker_than_the_unknown_remainder_are_taken_out() -> None:
         result = result_of(search, effects)
         left = nowhere(p=p, excess=excess)
         unheld = [HeldOut(1.0, 1.0)] * 2
-        fit, heldout, _ = credible(search, result, result.fit, unheld, 0.0, lambda *_, found=left: found)
-        assert [a.effect.name for a in fit.effects] == kept
-        assert len(heldout) == len(kept) == len(result.delta_chi2)
+        after = credible(problem_of(search, result, unheld, left))
+        assert [a.effect.name for a in after.fit.effects] == kept
+        assert len(after.heldout) == len(kept) == len(after.result.delta_chi2)
 
 
 def test_tied_effects_are_told_with_what_they_explain() -> None:
@@ -692,7 +735,7 @@ def test_a_dependence_is_the_chi_square_that_a_regressor_explains() -> None:
     rng = np.random.default_rng(4)
     seen = Observation('seen', RIG, volts + 2e-3 * rng.standard_normal(volts.shape), history)
     workspace = Workspace([seen])
-    residual = rng.standard_normal(len(workspace.data))
+    residual = rng.standard_normal(sum(m.size for m in workspace.measured))
     chunk = ForwardModel(RIG, []).run(history, None)
     size = workspace.fine[0]
     dot = fine_means(chunk.dots, size)

@@ -16,10 +16,10 @@ from psd_deflection.model.simulation.catalogue import effect_names
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.discover.discover import Discovery, discover
+from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.from_recordings import read_observation
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import result, sentence
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, outliers, stuck
 from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, wire
@@ -130,7 +130,7 @@ NEAR = (
 
 def found_in(*observations: Observation, whole: bool = False) -> Discovery:
     found = discover(observations, RIG, without=() if whole else [n for n in effect_names() if n not in NEAR])
-    tree = result(found)
+    tree = found.tree()
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
     return found
 
@@ -144,7 +144,7 @@ def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
     assert mistake.value == pytest.approx(1.02, abs=1e-4)
     assert mistake.fix.startswith('link.length: 0.596')
     assert found.floors < 1.05
-    assert 'The set-up is not as' in sentence(found)
+    assert 'The set-up is not as' in found.sentence
 
 
 def test_an_effect_behind_a_mistake_is_named_beside_it() -> None:

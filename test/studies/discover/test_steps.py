@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Sequence
 from types import SimpleNamespace
-from typing import cast
+from typing import Self, cast
 
 import numpy as np
 import pytest
@@ -29,12 +29,26 @@ from psd_deflection.studies.discover.search.proposals import coarse_step
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.signatures import Candidate
-from psd_deflection.studies.discover.search.weighing import named_effects
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.setup import _changes, _movement, _noise_energy, _sizes, _words, wire
+from psd_deflection.studies.discover.steps import alternatives
 
 from .test_formulas import RIG, observed
-from .test_rules import CASES, FINE, SIGMA, Pictures, Plant, active, candidate, columns, noise, pictures, without_noise
+from .test_rules import (
+    CASES,
+    FINE,
+    SIGMA,
+    Pictures,
+    Plant,
+    active,
+    candidate,
+    columns,
+    noise,
+    pictures,
+    problem_of,
+    ran,
+    without_noise,
+)
 
 A, B, C = ('a', 'x'), ('b', 'x'), ('c', 'x')
 
@@ -65,7 +79,7 @@ def test_a_stand_in_is_dropped_once_the_causes_are_there() -> None:
     shown[C] = shown[A] + shown[B] + 0.6 * across(shown[C], shown[A], shown[B])
     plant = Plant(shown, without_noise((shown[A], 3000.0), (shown[B], 3000.0)) + noise())
     said: list[str] = []
-    result = searching(plant, shown, 'abc', said).run()
+    result = ran(searching(plant, shown, 'abc', said))
     assert said[0] == 'adding c'
     assert named(result.fit) == ['a', 'b']
     assert len(result.p) == len(result.delta_bic) == len(result.delta_chi2) == len(result.alternatives) == 2
@@ -83,7 +97,7 @@ def test_two_that_hide_each_other_are_found_as_a_pair() -> None:
     shown[C], shown['d', 'x'] = 0.5 * b + d, 0.5 * b + e
     plant = Plant(shown, without_noise((b, 5000.0)) + noise())
     said: list[str] = []
-    result = searching(plant, shown, 'abcd', said).run()
+    result = ran(searching(plant, shown, 'abcd', said))
     assert 'a better pair: ' in ''.join(said)
     assert named(result.fit) == ['a', 'b']
 
@@ -101,20 +115,20 @@ def test_a_mistake_is_taken_first_if_it_explains_nearly_all(left: float, taken: 
     search = searching(plant, shown, ['link_length', 'b'], said)
     null = refit(plant, ())
     scores = search.screen.score(null.residual)
-    first = search._mistake(null, scores)
+    first = search.mistake(null, scores)
     assert named(first) == (['link_length'] if taken else [])
     assert said == (['the set-up: link_length'] if taken else [])
     if taken:
-        assert named(searching(plant, shown, ['link_length', 'b']).run().fit) == ['b', 'link_length']
+        assert named(ran(searching(plant, shown, ['link_length', 'b'])).fit) == ['b', 'link_length']
     # One that is weaker than the best by more than the third of it is not even tried.
     weak = [
         dataclasses.replace(s, gain=0.29 * scores[0].gain) if s.candidate.effect.name == 'link_length' else s
         for s in scores
     ]
     best = dataclasses.replace(scores[0], candidate=candidate('b', 'x'))
-    assert search._mistake(null, [best, *weak[:1]]) is null
-    assert search._mistake(null, [dataclasses.replace(s, p=0.011) for s in scores]) is null
-    assert search._mistake(null, []) is null
+    assert search.mistake(null, [best, *weak[:1]]) is null
+    assert search.mistake(null, [dataclasses.replace(s, p=0.011) for s in scores]) is null
+    assert search.mistake(null, []) is null
 
 
 def test_another_sample_rate_is_tried_from_afar() -> None:
@@ -131,7 +145,7 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
     found = [(candidate('sample_rate', 'error'), [[1e-3 * shown['sample_rate', 'error']]])]
     search = Search(plant, lambda ws, _: Screen(ws, found))
     null = refit(plant, ())
-    first = search._mistake(null, search.screen.score(null.residual))
+    first = search.mistake(null, search.screen.score(null.residual))
     assert named(first) == ['sample_rate']
     assert {-0.2, -0.1, -0.04, 0.04, 0.1, 0.25} <= set(tried)
 
@@ -140,23 +154,23 @@ def test_at_most_four_effects_are_added_and_none_beyond_the_budget(monkeypatch: 
     names = 'abcdef'
     shown = pictures(*((n, 'x') for n in names))
     plant = Plant(shown, without_noise(*((shown[n, 'x'], 900.0) for n in names)) + noise())
-    assert len(searching(plant, shown, names).run().fit.effects) == 4
+    assert len(ran(searching(plant, shown, names)).fit.effects) == 4
     # The fit of no effect is one simulation; after the first effect there are more than two.
     for budget, effects in ((1, 0), (2, 1)):
         monkeypatch.setattr(plant, 'budget', budget)
-        assert len(searching(plant, shown, names).run().fit.effects) == effects
+        assert len(ran(searching(plant, shown, names)).fit.effects) == effects
 
 
 def test_a_model_of_two_effects_may_cost_twice_as_much(monkeypatch: pytest.MonkeyPatch) -> None:
     shown = pictures(A, B, C)
     plant = Plant(shown, without_noise(*((shown[n], 900.0) for n in (A, B, C))) + noise())
-    trace = searching(plant, shown, 'abc').run().trace
+    trace = ran(searching(plant, shown, 'abc')).trace
     first, second, third = (int(line.split('[')[1].rstrip(']')) for line in trace if line.startswith('adding'))
     budget = third // 2 + 1
     assert first < budget <= second
-    plant.simulations = 0
+    plant.tally.count = 0
     monkeypatch.setattr(plant, 'budget', budget)
-    assert named(searching(plant, shown, 'abc').run().fit) == ['a', 'b', 'c']
+    assert named(ran(searching(plant, shown, 'abc')).fit) == ['a', 'b', 'c']
 
 
 def test_noise_estimated_beside_a_large_effect_hides_no_small_one() -> None:
@@ -166,15 +180,16 @@ def test_noise_estimated_beside_a_large_effect_hides_no_small_one() -> None:
     class Rough(Plant):
         estimates = 0
 
-        def estimate_noise(self, effects: Sequence[ActiveEffect]) -> None:
+        def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
             # The first estimate takes what is left for noise, the next ones are right.
-            self.estimates += 1
-            level = np.full(6, SIGMA * (30.0 if self.estimates == 1 else 1.0))
-            self.noise = [dataclasses.replace(self.noise[0], innovation=level)]
+            level = np.full(6, SIGMA * (1.0 if self.estimates else 30.0))
+            noise = (dataclasses.replace(self.noise[0], innovation=level),)
+            return self.replaced(noise=noise, estimates=self.estimates + 1)
 
     plant = Rough(shown, without_noise((shown[A], 9e6), (shown[B], 900.0)) + noise())
-    assert named(searching(plant, shown, 'ab').run().fit) == ['a', 'b']
-    assert plant.estimates >= 2
+    search, result = searching(plant, shown, 'ab').run(refit(plant, ()))
+    assert named(result.fit) == ['a', 'b']
+    assert cast(Rough, search.workspace).estimates >= 2
 
 
 def test_of_two_that_explain_alike_the_better_one_stays_and_the_other_is_its_alternative() -> None:
@@ -182,7 +197,7 @@ def test_of_two_that_explain_alike_the_better_one_stays_and_the_other_is_its_alt
     shown[B] = shown[A] + 0.3 * across(shown[B], shown[A])
     plant = Plant(shown, without_noise((shown[A], 900.0)) + noise())
     search = searching(plant, shown, 'ab')
-    result = search.run()
+    result = ran(search)
     assert named(result.fit) == ['a']
     ((other,),) = result.alternatives
     assert named(other) == ['b']
@@ -194,30 +209,26 @@ def test_of_two_that_explain_alike_the_better_one_stays_and_the_other_is_its_alt
     better, others = search.swap(null, worse)
     assert named(better) == ['a']
     assert [named(f) for f in others[0]] == [['b']]
-    assert search.spent == plant.simulations - search._begun
     assert search.library_p(9.0, 1) == pytest.approx(1.0 - (1.0 - chi2_law.sf(9.0, 1)) ** 2)
     assert search.library_p(-1.0, 1) == 1.0
     assert search.penalty == pytest.approx(math.log(size * 4 / 20))
 
 
-def test_noise_is_estimated_again_and_kept_if_it_is_the_same() -> None:
+def test_a_search_goes_on_with_other_noise() -> None:
     shown = pictures(A)
-    plant = Plant(shown, without_noise((shown[A], 900.0)) + noise())
+
+    class Louder(Plant):
+        def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
+            return self.replaced(noise=(dataclasses.replace(self.noise[0], innovation=1.5 * self.noise[0].innovation),))
+
+    plant = Louder(shown, without_noise((shown[A], 900.0)) + noise())
     search = searching(plant, shown, 'a')
-    fit, before = refit(plant, [active('a', x=0.0)]), plant.noise
-    for factor, again in ((1.019, False), (0.981, False), (1.03, True), (0.97, True)):
-        louder = [dataclasses.replace(before[0], innovation=factor * before[0].innovation)]
-
-        def estimate(effects: object, louder: object = louder) -> None:
-            plant.noise = louder  # type: ignore[assignment]
-
-        plant.estimate_noise = estimate  # type: ignore[method-assign]
-        plant.noise = before
-        got = search.renoise(fit)
-        assert (got is not fit) == again
-        assert (plant.noise is louder) == again
-        if again:
-            assert got.chi2 == pytest.approx(fit.chi2 / factor**2, rel=1e-6)
+    fit = refit(plant, [active('a', x=0.0)])
+    got = search.renoise(fit)
+    assert got.chi2 == pytest.approx(fit.chi2 / 1.5**2, rel=1e-6)
+    assert search.workspace is not plant
+    # The comparison that it began with has the noise that it had.
+    assert refit(plant, fit.effects).chi2 == pytest.approx(fit.chi2, rel=1e-9)
 
 
 EDGES = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, math.inf)
@@ -322,7 +333,10 @@ def test_what_the_simulation_may_be_wrong_by_is_no_dependence() -> None:
     """A five-hundredth of the length of what is explained on that channel is taken off each product."""
     workspace = Workspace([observed()])
     rng = np.random.default_rng(2)
-    residual, explained = rng.standard_normal(len(workspace.data)), rng.standard_normal(len(workspace.data))
+    residual, explained = (
+        rng.standard_normal(sum(m.size for m in workspace.measured)),
+        rng.standard_normal(sum(m.size for m in workspace.measured)),
+    )
     table = regressors(workspace)
     plain = {(d.channel, d.regressor): d.gain for d in dependences(workspace, table, residual, None)}
     assert len(plain) == 6 * 27
@@ -478,7 +492,7 @@ def test_a_step_that_makes_it_worse_is_shortened_five_times() -> None:
 
     class Kink(Plant):
         def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
-            self.simulations += 1
+            self.tally.count += 1
             (value,) = (a.values['x'] for a in effects)
             return [shown[A] * (0.0 if value == 0.0 else value if abs(value - 5e-5) < 1e-12 else -1.0)]
 
@@ -501,15 +515,16 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None
         fit, effects=(active('b', x=0.1, y=0.1),), chi2=fit.chi2 + loss, free=((0, 'x'), (0, 'y')), jacobian=jacobian
     )
     null = refit(search.workspace, ())
-    result = steps.SearchResult(null, fit, [0.0], [99.0], [500.0], [], [[other]])
-    (found,) = named_effects(search, result, fit, [HeldOut(9.0, 1.0)])
+    result = steps.SearchResult(null, fit, [0.0], [99.0], [500.0], alternatives=[[other]])
+    (found,) = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)])).named
     assert found.equivalent == ()
     assert [(r.active.effect.name, r.delta_bic, r.fit) for r in found.rivals] == [('b', loss + 3.0, other)] * is_rival
     if is_rival:
         assert found.rivals[0].sd == pytest.approx({'x': 1.0, 'y': 1.0})
     # One that ran into its bound is none.
     stopped = dataclasses.replace(other, at_bound=((0, 'x'), (0, 'y')))
-    (found,) = named_effects(search, dataclasses.replace(result, alternatives=[[stopped]]), fit, [HeldOut(9.0, 1.0)])
+    without = dataclasses.replace(result, alternatives=[[stopped]])
+    (found,) = alternatives(problem_of(search, without, [HeldOut(9.0, 1.0)])).named
     assert found.rivals == ()
 
 

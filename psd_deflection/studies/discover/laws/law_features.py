@@ -80,7 +80,7 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
     q, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
     columns = [ws.split(c) for c in np.ascontiguousarray(q.T)]
     out = []
-    ws.simulations += 1
+    ws.tally.count += 1
     for i, size in enumerate(ws.fine):
         model, s = _variables(ws, fit.effects, i)
         p = model.physics
@@ -170,41 +170,50 @@ def terms(found: Sequence[Response]) -> Iterator[LawTerm]:
             if k < 3 or len(set(several)) == 1:
                 yield LawTerm('product', several)
     for name in placed:
-        yield LawTerm('absolute', (name,))
-        yield LawTerm('signed_square', (name,))
-        levels = _levels(parts[name], 8)
-        for level in levels:
-            yield LawTerm('above', (name,), shapes={'threshold': level})
-            yield LawTerm('below', (name,), shapes={'threshold': level})
-        for share in (0.05, 0.15, 0.3, 0.5, 0.7):
-            yield LawTerm('beyond', (name,), shapes={'threshold': share * size[name]})
-            yield LawTerm('within', (name,), shapes={'threshold': share * size[name]})
-        # Held loads take few values, and any threshold between two of them is the same.
-        distinct = np.unique(np.concatenate(parts[name]))
-        few = [0.5 * (a + b) for a, b in itertools.pairwise(distinct.tolist())] if len(distinct) <= LEVELS else []
-        for level in few or _levels(parts[name], LEVELS):
-            yield LawTerm('over', (name,), shapes={'threshold': level})
-            yield LawTerm('under', (name,), shapes={'threshold': level})
+        yield from _where_it_is(name, parts[name], size[name])
     for name in placed:
-        if name not in LOADS:
-            yield LawTerm('rate', (name,))
-            yield LawTerm('rate_absolute', (name,))
-            yield LawTerm('drag', (name,))
-        if name in LOADS or name in POSE:
-            yield LawTerm('direction', (name,))
-        for share in (0.02, 0.1, 0.3):
-            yield LawTerm('play', (name,), shapes={'half_width': share * size[name]})
-        for tau in (0.02, 0.1, 0.3, 1.0, 3.0, 10.0):
-            yield LawTerm('relaxed', (name,), shapes={'tau': tau})
-            yield LawTerm('relaxed', (name, name), shapes={'tau': tau})
-        if name in DOTS or name in POSE:
-            for share in (0.2, 0.3, 0.45, 0.7, 1.0, 1.5):
-                for phase in (0.0, 0.5 * math.pi):
-                    yield LawTerm('wave', (name,), shapes={'period': share * size[name], 'phase': phase})
+        yield from _how_it_moves(name, size[name])
     for name in LOADS:
         if name in moving:
             for f in np.geomspace(2.0, 180.0, 48).tolist():
                 yield LawTerm('resonance', (name,), shapes={'natural_frequency': f, 'zeta': 0.04})
+
+
+def _where_it_is(name: str, parts: Sequence[FloatArray], size: float) -> Iterator[LawTerm]:
+    """Terms of the value of one variable: its size and its thresholds."""
+    yield LawTerm('absolute', (name,))
+    yield LawTerm('signed_square', (name,))
+    for level in _levels(parts, 8):
+        yield LawTerm('above', (name,), shapes={'threshold': level})
+        yield LawTerm('below', (name,), shapes={'threshold': level})
+    for share in (0.05, 0.15, 0.3, 0.5, 0.7):
+        yield LawTerm('beyond', (name,), shapes={'threshold': share * size})
+        yield LawTerm('within', (name,), shapes={'threshold': share * size})
+    # Held loads take few values, and any threshold between two of them is the same.
+    distinct = np.unique(np.concatenate(parts))
+    few = [0.5 * (a + b) for a, b in itertools.pairwise(distinct.tolist())] if len(distinct) <= LEVELS else []
+    for level in few or _levels(parts, LEVELS):
+        yield LawTerm('over', (name,), shapes={'threshold': level})
+        yield LawTerm('under', (name,), shapes={'threshold': level})
+
+
+def _how_it_moves(name: str, size: float) -> Iterator[LawTerm]:
+    """Terms of the rate and the history of one variable, and waves over it."""
+    if name not in LOADS:
+        yield LawTerm('rate', (name,))
+        yield LawTerm('rate_absolute', (name,))
+        yield LawTerm('drag', (name,))
+    if name in LOADS or name in POSE:
+        yield LawTerm('direction', (name,))
+    for share in (0.02, 0.1, 0.3):
+        yield LawTerm('play', (name,), shapes={'half_width': share * size})
+    for tau in (0.02, 0.1, 0.3, 1.0, 3.0, 10.0):
+        yield LawTerm('relaxed', (name,), shapes={'tau': tau})
+        yield LawTerm('relaxed', (name, name), shapes={'tau': tau})
+    if name in DOTS or name in POSE:
+        for share in (0.2, 0.3, 0.45, 0.7, 1.0, 1.5):
+            for phase in (0.0, 0.5 * math.pi):
+                yield LawTerm('wave', (name,), shapes={'period': share * size, 'phase': phase})
 
 
 @dataclass(frozen=True, slots=True)

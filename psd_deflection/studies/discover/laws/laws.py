@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -352,23 +352,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     known = {name: known_fine(ws, fit.effects, name) for name in VARIABLES}
     folds = [ws.folds()[case] for case in ws.case]
     fold = np.concatenate(folds)
-    best: tuple[float, str, str, float, float] | None = None
-    tried = 0
-    for c, channel in enumerate(CHANNELS):
-        squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
-        there = squares > 0.0
-        for name, values in known.items():
-            v2 = np.concatenate(values) ** 2
-            full = float(v2.max())
-            if full <= 0.0:
-                continue
-            tried += 1
-            a, b = _variance(squares[there], v2[there] / full)
-            gain = _likelihood(squares[there], a + b * v2[there] / full) - _likelihood(
-                squares[there], squares[there].mean()
-            )
-            if best is None or gain > best[0]:
-                best = gain, channel, name, b / full, full
+    best, tried = _most_jitter(ws, fit, known)
     if best is None:
         return None
     gain, channel, name, slope, full = best
@@ -410,6 +394,32 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         heldout,
         math.sqrt(max(heldout_gap(ws, fit) ** 2 - added, 0.0)),
     )
+
+
+def _most_jitter(
+    ws: Workspace, fit: Fit, known: Mapping[str, Sequence[FloatArray]]
+) -> tuple[tuple[float, str, str, float, float] | None, int]:
+    """Gain, channel, variable, slope and its greatest square, where the noise follows a variable most; how many were
+    tried.
+    """
+    best: tuple[float, str, str, float, float] | None = None
+    tried = 0
+    for c, channel in enumerate(CHANNELS):
+        squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
+        there = squares > 0.0
+        for name, values in known.items():
+            v2 = np.concatenate(values) ** 2
+            full = float(v2.max())
+            if full <= 0.0:
+                continue
+            tried += 1
+            a, b = _variance(squares[there], v2[there] / full)
+            gain = _likelihood(squares[there], a + b * v2[there] / full) - _likelihood(
+                squares[there], squares[there].mean()
+            )
+            if best is None or gain > best[0]:
+                best = gain, channel, name, b / full, full
+    return best, tried
 
 
 def _likelihood(squares: FloatArray, variance: FloatArray | float) -> float:

@@ -7,8 +7,10 @@ hold-out and verdict know neither.
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Any, Self
 
 import numpy as np
 
@@ -17,10 +19,18 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
 
 
+class Tally:
+    """Counts the forward simulations of all comparisons that come from one."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+
 class Comparison(ABC):
     """One or several recordings (or cases), each a table ``measured`` (channels, n); a *vector* (D,) joins all of them.
 
-    ``simulations`` counts forward runs of all recordings. ``base``: effects that every model has, with fixed values.
+    It does not change: :meth:`replaced` and :meth:`renoised` give another. ``tally`` counts forward runs of all
+    recordings, also of those others. ``base``: effects that every model has, with fixed values.
     ``nuisance``: effects that every model has and that every refit adjusts; they are never named. ``case``: the load
     case of each column, counted over all recordings. ``first``: names of effects that are only looked for before any
     other is found; ``setup``: of those that are mistakes of the set-up. ``open_level``: the level of what remains is
@@ -30,7 +40,7 @@ class Comparison(ABC):
     """
 
     physics: Physics | None
-    simulations: int
+    tally: Tally
     base: tuple[ActiveEffect, ...]
     nuisance: tuple[ActiveEffect, ...] = ()
     measured: list[FloatArray]
@@ -40,6 +50,18 @@ class Comparison(ABC):
     open_level: bool = False
     budget: int = 700
     digits: str = '.4g'
+
+    @property
+    def simulations(self) -> int:
+        """Forward runs of all recordings so far."""
+        return self.tally.count
+
+    def replaced(self, **changes: Any) -> Self:
+        """A copy with other attributes, such as ``base``, ``nuisance`` or ``noise``."""
+        out = copy.copy(self)
+        for name, value in changes.items():
+            setattr(out, name, value)
+        return out
 
     @property
     @abstractmethod
@@ -70,8 +92,8 @@ class Comparison(ABC):
         """One vector, of unit variance if the noise model holds; 0 where nothing was measured."""
 
     @abstractmethod
-    def renoise(self, effects: Sequence[ActiveEffect]) -> bool:
-        """Estimate the noise with ``effects`` in the model; False, and nothing changes, if it is the same."""
+    def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
+        """With the noise as it is with ``effects`` in the model; this one if that is the same."""
 
     @abstractmethod
     def effective_size(self) -> float:

@@ -7,7 +7,7 @@ screening. Steps are taken in each parameter's own scale.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,6 +85,21 @@ def _unseen(parameters: Sequence[EffectParameter], lengths: FloatArray, ranges: 
     return np.asarray(sizes & (lengths * ranges < 1.0))
 
 
+def _differentiate(
+    workspace: Comparison,
+    model: Callable[[FloatArray], list[FloatArray]],
+    x: FloatArray,
+    steps: FloatArray,
+    simulated: list[FloatArray],
+    into: FloatArray,
+) -> None:
+    """Whitened derivatives (D, p) of ``model``, which is ``simulated`` at ``x``, by one of the ``steps`` (p,) each."""
+    for j, h in enumerate(steps.tolist()):
+        moved = x.copy()
+        moved[j] += h
+        into[:, j] = workspace.whiten([(a - b) / h for a, b in zip(model(moved), simulated, strict=True)])
+
+
 def refit(
     workspace: Comparison,
     effects: Sequence[ActiveEffect],
@@ -105,8 +120,11 @@ def refit(
     x = np.clip(x, low, high)
     base = list(workspace.base)
 
+    def model(v: FloatArray) -> list[FloatArray]:
+        return workspace.simulate([*base, *_moved(effects, free, v)])
+
     def evaluate(v: FloatArray) -> tuple[FloatArray, list[FloatArray], list[FloatArray]]:
-        simulated = workspace.simulate([*base, *_moved(effects, free, v)])
+        simulated = model(v)
         difference = [m - s for m, s in zip(workspace.measured, simulated, strict=True)]
         return workspace.whiten(difference), difference, simulated
 
@@ -117,14 +135,8 @@ def refit(
     off = np.clip([p.off(workspace.physics) for _, p in free], low, high)
     unseen = np.zeros(len(free), dtype=bool)
     for _ in range(iterations if free else 0):
-        for j in range(len(free)):
-            h = STEP * scale[j]
-            if x[j] + h > high[j]:
-                h = -h
-            moved = x.copy()
-            moved[j] += h
-            there = workspace.simulate([*base, *_moved(effects, free, moved)])
-            jacobian[:, j] = workspace.whiten([(a - b) / h for a, b in zip(there, simulated, strict=True)])
+        steps = np.where(x + STEP * scale > high, -STEP * scale, STEP * scale)
+        _differentiate(workspace, model, x, steps, simulated, jacobian)
         lengths = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-150)
         # A size that is off at a bound stays there by itself, and a column of zeros may be a threshold's before it.
         loose = (off > low) & (off < high) & ((lengths > 1e-150) | (x <= low) | (x >= high))

@@ -67,6 +67,10 @@ class Localisation:
     spans: tuple[tuple[int, float, float], ...]
 
 
+NOWHERE = Localisation((), (), 0.0, 1.0, np.zeros((0, 0, 0)), ())
+"""Nobody has looked."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
     recording: int

@@ -8,8 +8,9 @@ significant.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2 as chi2_law
@@ -49,7 +50,7 @@ SWAP_REACH = 0.6
 """An alternative is refitted only if it explains this fraction of what the named effect explains."""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class SearchResult:
     """``fit``: the model chosen. ``null``: the rig file's own. ``p``: library-wide, per effect.
     ``delta_bic``: loss of BIC if each effect were dropped. ``alternatives``: for each effect of
@@ -58,12 +59,12 @@ class SearchResult:
 
     null: Fit
     fit: Fit
-    p: list[float]
-    delta_bic: list[float]
-    delta_chi2: list[float]
-    first_scores: list[Score]
-    alternatives: list[list[Fit]]
-    trace: list[str] = field(default_factory=list)
+    p: Sequence[float] = ()
+    delta_bic: Sequence[float] = ()
+    delta_chi2: Sequence[float] = ()
+    first_scores: Sequence[Score] = ()
+    alternatives: Sequence[Sequence[Fit]] = ()
+    trace: Sequence[str] = ()
 
 
 def key_of(active: ActiveEffect) -> tuple[object, ...]:
@@ -121,7 +122,10 @@ def promising(scores: Sequence[Score], penalty: float, share: float, limit: int)
 
 
 class Search:
-    """One search over one workspace. ``progress`` is told each step in words."""
+    """One search over one comparison, which :meth:`run` gives with the noise that it estimated last.
+
+    ``screen`` gives the signatures beside a fit; ``progress`` takes each step in words.
+    """
 
     def __init__(
         self,
@@ -136,7 +140,7 @@ class Search:
         self.screen = screen(workspace, None)
         self.penalty = float(np.log(workspace.effective_size()))
         self.trace: list[str] = []
-        self._without: dict[int, tuple[Fit, list[Fit]]] = {}
+        self.dropped: dict[int, tuple[Fit, list[Fit]]] = {}
 
     @property
     def spent(self) -> int:
@@ -149,14 +153,14 @@ class Search:
 
     def without_each(self, fit: Fit, null: Fit) -> list[Fit]:
         """``fit`` refitted without each of its effects in turn; ``null``: the fit of no effect."""
-        kept = self._without.get(id(fit))
+        kept = self.dropped.get(id(fit))
         if kept is None:
             fits = []
             for i in range(len(fit.effects)):
                 rest = [a for j, a in enumerate(fit.effects) if j != i]
                 fits.append(refit(self.workspace, rest, iterations=6) if rest else null)
             # Keep the fit itself too, so that no other object gets its id.
-            kept = self._without[id(fit)] = (fit, fits)
+            kept = self.dropped[id(fit)] = (fit, fits)
         return kept[1]
 
     def _say(self, text: str) -> None:
@@ -173,7 +177,8 @@ class Search:
         full = [refit(self.workspace, f.effects, iterations=iterations) for f in fits[:keep]]
         return min(full, key=self._bic, default=None)
 
-    def _passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
+    def passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
+        """Whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
         gain = smaller.chi2 - larger.chi2
         if not self.workspace.open_level:
             explained = null.residual - smaller.residual
@@ -195,29 +200,44 @@ class Search:
 
     def renoise(self, fit: Fit) -> Fit:
         """Estimate the noise again, now that most of the discrepancy is explained; refit if it differs."""
-        if not self.workspace.renoise([*self.workspace.base, *fit.whole]):
+        renoised = self.workspace.renoised([*self.workspace.base, *fit.whole])
+        if renoised is self.workspace:
             return fit
-        self._without.clear()
+        self.workspace = renoised
+        self.dropped.clear()
         if self.workspace.open_level:
             self.penalty = float(np.log(self.workspace.effective_size()))
         fit = refit(self.workspace, fit.effects, iterations=6)
         self.screen = self._make_screen(self.workspace, fit)
         return fit
 
-    def run(self) -> SearchResult:
-        """Search; the answer may be that nothing is missing."""
-        ws = self.workspace
-        null = refit(ws, ())
+    def at(self, workspace: Comparison) -> Search:
+        """The same search over another comparison of the same recordings."""
+        out = copy.copy(self)
+        out.workspace = workspace
+        return out
+
+    def run(self, null: Fit) -> tuple[Search, SearchResult]:
+        """The search after it ran, and what it found: perhaps that nothing is missing. ``null``: the fit of no effect.
+
+        This one stays as it is.
+        """
+        out = copy.copy(self)
+        out.trace, out.dropped = [], {}
+        return out, out.searched(null)
+
+    def searched(self, null: Fit) -> SearchResult:
+        """What :meth:`run` gives beside itself; it changes this search."""
         scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
-        current = self._mistake(null, scores)
+        current = self.mistake(null, scores)
         for _ in range(ROUNDS):
             null, current = self._grown(null, current)
             current = self._drop(null, current)
             if not current.effects:
                 break
             calmer = self.renoise(current)
-            null = refit(ws, ())
+            null = refit(self.workspace, ())
             if calmer is current:
                 break
             # Noise that was estimated beside a large discrepancy may have hidden what is small.
@@ -228,36 +248,42 @@ class Search:
 
     def _grown(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
         """The fit of no effect, and ``current`` with all that passes added."""
-        ws = self.workspace
         renoised = bool(current.effects)
         while len(current.effects) < MAX_EFFECTS and self.spent < self._budget(current):
-            scores = self.screen.score(current.residual, unbound(current))
-            taken = {slot(a.effect, a.values) for a in current.effects}
-            scores = [
-                s
-                for s in scores
-                if slot(s.candidate.effect, s.candidate.start) not in taken and s.candidate.effect.name not in ws.first
-            ]
-            better = self._further(current, scores)
-            passes = better is not None and self._passes(current, better, null)
-            if better is None or not passes or self._stands_in(current, better):
-                # Of two causes of a rough machine neither may help alone, and a wrong first effect hides a pair.
-                pair = len(current.effects) < 2 and (ws.open_level or passes)
-                better = self._try_pairs(null, current) if pair else current
-                if better is current or not self._passes(current, better, null) or self._stands_in(current, better):
-                    break
-            else:
-                self._say('adding ' + better.effects[-1].label)
+            better = self._added(null, current)
+            if better is None:
+                break
             current = better
-            if not renoised or ws.open_level:
+            if not renoised or self.workspace.open_level:
                 renoised = True
                 current = self.renoise(current)
-                null = refit(ws, ())
-            if (far(current) or ws.open_level) and self.spent < self._budget(current):
-                self.screen = self._make_screen(ws, current)
+                null = refit(self.workspace, ())
+            if (far(current) or self.workspace.open_level) and self.spent < self._budget(current):
+                self.screen = self._make_screen(self.workspace, current)
             if len(current.effects) == 2 and self.spent < self._budget(current):
                 current = self._try_pairs(null, current)
         return null, current
+
+    def _added(self, null: Fit, current: Fit) -> Fit | None:
+        """``current`` with the effect that passes best, or a better pair; None if nothing passes."""
+        ws = self.workspace
+        taken = {slot(a.effect, a.values) for a in current.effects}
+        scores = [
+            s
+            for s in self.screen.score(current.residual, unbound(current))
+            if slot(s.candidate.effect, s.candidate.start) not in taken and s.candidate.effect.name not in ws.first
+        ]
+        better = self._further(current, scores)
+        passes = better is not None and self.passes(current, better, null)
+        if better is not None and passes and not self._stands_in(current, better):
+            self._say('adding ' + better.effects[-1].label)
+            return better
+        # Of two causes of a rough machine neither may help alone, and a wrong first effect hides a pair.
+        if len(current.effects) >= 2 or not (ws.open_level or passes):
+            return None
+        better = self._try_pairs(null, current)
+        holds = better is not current and self.passes(current, better, null)
+        return better if holds and not self._stands_in(current, better) else None
 
     def _further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
         """``current`` with the best further effect."""
@@ -268,7 +294,7 @@ class Search:
         starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
         return self._best_of(starts, 2, 6) if current.effects else self._best_of(starts, 4, 12)
 
-    def _mistake(self, null: Fit, scores: Sequence[Score]) -> Fit:
+    def mistake(self, null: Fit, scores: Sequence[Score]) -> Fit:
         """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
         if not scores or min(s.p for s in scores) > P_ACCEPT:
             return null
@@ -287,7 +313,7 @@ class Search:
                 starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
         found = self._best_of(starts, 2, 12)
         size = self.workspace.size
-        if found is None or not self._passes(null, found, null):
+        if found is None or not self.passes(null, found, null):
             return null
         if found.chi2 - size > NEARLY_ALL * (null.chi2 - size):
             return null
@@ -338,7 +364,7 @@ class Search:
     def _drop(self, null: Fit, current: Fit) -> Fit:
         while len(current.effects) > 1:
             best = min(self.without_each(current, null), key=self._bic)
-            if self._passes(best, current, null):
+            if self.passes(best, current, null):
                 break
             self._say('dropping to ' + ', '.join(a.label for a in best.effects))
             current = best

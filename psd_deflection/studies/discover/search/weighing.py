@@ -1,8 +1,4 @@
-"""The verdict: which effects of a search hold, with their uncertainty and their rivals, and what remains unknown.
-
-An effect is named only if all of these hold: library-wide p <= 0.01, a BIC better by more than 10, a gain of more than
-two standard errors on held-out load cases, and parameters within their bounds.
-"""
+"""The parts of the verdict: named effects with their uncertainty and their rivals, gaps, and what remains unknown."""
 
 from __future__ import annotations
 
@@ -16,10 +12,10 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.planning import Suggestion
 from psd_deflection.studies.discover.search.coincidence import Coincidence
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, scatter
-from psd_deflection.studies.discover.search.localise import Localisation
-from psd_deflection.studies.discover.search.search import BIC_ACCEPT, P_ACCEPT, Search, SearchResult, unphysical
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.hold_out import HeldOut, scatter
+from psd_deflection.studies.discover.search.localise import Dependence, Localisation
+from psd_deflection.studies.discover.search.search import SearchResult
 
 EQUIVALENT = 21.6
 """Loss in chi-square below which an alternative of no more parameters counts as equivalent: at
@@ -36,10 +32,6 @@ UNSAID = 1.5
 """A gap of more floors than this never remains without being reported as unknown."""
 RIVAL_BIC = 10.0
 """An effect in place of the named one counts as its rival up to this loss in BIC."""
-Look = Callable[[Fit, Fit], Localisation]
-"""Where what a fit leaves has structure, given the fit without any effect."""
-Suggest = Callable[[Fit, Sequence[Fit]], Suggestion | None]
-"""The experiment that tells a fit from others that are as good."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,133 +76,6 @@ class Unknown:
     explains: float
     remains: bool = True
     rms: float = 0.0
-
-
-@dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Conclusion:
-    """The answer of a search. Gaps are rms values of measured minus simulated in the unit of ``workspace``.
-
-    ``per_channel``: before and after; ``heldout_per_channel``: after, on load cases that the fit has not seen.
-    ``nuisance``: what every model has, each with the standard deviations of its parameters.
-    """
-
-    verdict: str
-    effects: tuple[NamedEffect, ...]
-    unknown: tuple[Unknown, ...]
-    where: Localisation
-    left: Localisation
-    gap_before: float
-    gap_after: float
-    gap_floor: float
-    gap_heldout_before: float
-    gap_heldout_after: float
-    per_channel: Mapping[str, tuple[float, float]]
-    heldout_per_channel: Mapping[str, float]
-    waterfall: tuple[tuple[str, float], ...]
-    simulations: int
-    search: SearchResult
-    fit: Fit
-    workspace: Comparison
-    seed: int
-    nuisance: tuple[tuple[ActiveEffect, Mapping[str, float]], ...]
-
-    @property
-    def floors(self) -> float:
-        """The gap that remains, in units of the gap that noise alone leaves; 0 if nobody knows the noise."""
-        return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
-
-    def __repr__(self) -> str:
-        named = ', '.join(e.active.label for e in self.effects) or 'no effect'
-        before, after, floor = (self.workspace.worded(v) for v in (self.gap_before, self.gap_after, self.gap_floor))
-        return f'<{type(self).__name__} {self.verdict}: {named}; gap {before} → {after} (noise alone: {floor})>'
-
-
-def credible(
-    search: Search, result: SearchResult, fit: Fit, heldout: list[HeldOut], seen: float, look: Look
-) -> tuple[Fit, list[HeldOut], Localisation]:
-    """Remove effects that explain less than the unknown remainder: they probably stand in for it."""
-    while True:
-        left = look(fit, result.null)
-        if not fit.effects or not unknown_of(left, 0.0, steps=seen):
-            break
-        weakest = int(np.argmin(result.delta_chi2))
-        if result.delta_chi2[weakest] >= left.excess:
-            break
-        search.trace.append(f'{fit.effects[weakest].label} explains less than what remains unknown')
-        fit = without_one(search, result, fit, weakest)
-        heldout = [h for j, h in enumerate(heldout) if j != weakest]
-    return fit, heldout, left
-
-
-def accept(search: Search, result: SearchResult, rng: np.random.Generator) -> tuple[list[HeldOut], Fit]:
-    """The joint rule: remove the effects that fail it, the weakest first, and refit the rest."""
-    ws, fit = search.workspace, result.fit
-    while True:
-        heldout = []
-        fails: list[tuple[float, int]] = []
-        for i, without in enumerate(search.without_each(fit, result.null)):
-            gain = heldout_gain(ws, without, fit, rng)
-            heldout.append(gain)
-            columns = fit.columns_of(i)
-            chi2 = without.chi2 - fit.chi2
-            bic = chi2 - search.penalty * len(columns)
-            if (
-                not gain.holds
-                or unphysical(ws, fit, i)
-                or search.library_p(chi2, len(columns)) > P_ACCEPT
-                or bic <= BIC_ACCEPT
-            ):
-                fails.append((bic, i))
-        if not fails:
-            break
-        _, worst = min(fails)
-        search.trace.append(f'{fit.effects[worst].label} fails the joint rule')
-        fit = without_one(search, result, fit, worst)
-    return heldout, fit
-
-
-def without_one(search: Search, result: SearchResult, fit: Fit, index: int) -> Fit:
-    """``fit`` refitted without one effect; ``result`` weighs the rest anew."""
-    rest = [a for j, a in enumerate(fit.effects) if j != index]
-    left = refit(search.workspace, rest, iterations=6) if rest else result.null
-    result.p[:], result.delta_bic[:], result.delta_chi2[:] = search.weigh(result.null, left)
-    return left
-
-
-def named_effects(
-    search: Search, result: SearchResult, fit: Fit, heldout: Sequence[HeldOut], suggestion: Suggest | None = None
-) -> list[NamedEffect]:
-    """The effects of ``fit`` with their standard deviations and the equally good alternatives."""
-    ws = search.workspace
-    # If the joint rule has removed effects, their alternatives are no longer comparable.
-    as_found = fit is result.fit
-    named: list[NamedEffect] = []
-    for i, active in enumerate(fit.effects):
-        fits = result.alternatives[i] if as_found else search.alternatives(result.null, fit, i, result.delta_chi2[i])
-        rows, equal, rivals = [], [], []
-        for f in fits:
-            loss = f.chi2 - fit.chi2
-            bic = loss + search.penalty * (f.parameters - fit.parameters)
-            rows.append((f.effects[-1].effect.name, loss, bic))
-            if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
-                equal.append(f)
-            if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
-                rivals.append(Rival(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
-        names = tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal))
-        named.append(
-            NamedEffect(
-                active,
-                sd_of(ws, fit, i),
-                result.p[i],
-                result.delta_bic[i],
-                heldout[i],
-                names,
-                tuple(sorted(rivals, key=lambda r: r.delta_bic)),
-                tuple(rows),
-                suggestion(fit, equal) if equal and suggestion is not None else None,
-            )
-        )
-    return named
 
 
 def sd_of(workspace: Comparison, fit: Fit, index: int) -> dict[str, float]:
@@ -278,16 +143,24 @@ def unknown_of(
     if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
         return ()
     strong = [d for d in left.dependences if d.p < 1e-3][:6]
+    size = _beyond(gap, floor)
+    words = _place_of(left, strong)
+    if size > 0.0:
+        times = f' ({gap / floor:.1f} times the noise remain)' if floor > 0.0 else ''
+        words.insert(1, f'{worded(size)} rms{times}')
+    share = left.excess / (left.excess + explained)
+    names = tuple(dict.fromkeys(d.regressor for d in strong))
+    return (Unknown('; '.join(words), names, share, rms=size),)
+
+
+def _place_of(left: Localisation, strong: Sequence[Dependence]) -> list[str]:
+    """On which channels, what it follows and how, and when it is strongest."""
     channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))
     names = tuple(dict.fromkeys(d.regressor for d in strong))
     even = sum(d.gain for d in strong if _even(d.regressor))
     odd = sum(d.gain for d in strong if not _even(d.regressor))
     lagging = any('history' in d.regressor for d in strong[:2])
-    size = _beyond(gap, floor)
     words = [f'on {", ".join(channels) or "no single channel"}']
-    if size > 0.0:
-        times = f' ({gap / floor:.1f} times the noise remain)' if floor > 0.0 else ''
-        words.append(f'{worded(size)} rms{times}')
     if strong:
         words.append(f'follows {", ".join(names[:3])}')
         words.append('mostly even' if even > 2.0 * odd else 'mostly odd' if odd > 2.0 * even else 'odd and even parts')
@@ -296,8 +169,7 @@ def unknown_of(
     if left.cells:
         c = left.cells[0]
         words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
-    share = left.excess / (left.excess + explained)
-    return (Unknown('; '.join(words), names, share, rms=size),)
+    return words
 
 
 def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Localisation) -> tuple[Unknown, ...]:

@@ -9,6 +9,7 @@ and counted here.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.studies.discover.observation import Observation, load_cases
-from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.comparison import Comparison, Tally
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
 from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
 
@@ -65,14 +66,13 @@ class Workspace(Comparison):
     def __init__(self, observations: Sequence[Observation], base: Sequence[ActiveEffect] = ()) -> None:
         self.observations = tuple(observations)
         self.physics = Physics.of(observations[0].rig)
-        self.simulations = 0
+        self.tally = Tally()
         self.base = tuple(base)
         self.fine: list[int] = []
         self.measured: list[FloatArray] = []
         self.count: list[FloatArray] = []
         self._present: list[FloatArray | None] = []
         self.case: list[IntArray] = []
-        self.noise: list[NoiseModel] = []
         next_case = 0
         longest = sum(o.duration for o in self.observations) / MAX_FINE
         for o in self.observations:
@@ -90,19 +90,19 @@ class Workspace(Comparison):
             case = load_cases(o.loads, o.period)[: means.shape[1] * size : size] + next_case
             next_case = int(case.max()) + 1
             self.case.append(case)
-        self.estimate_noise(self.base)
-        self.data = self.whiten(self.measured)
+        self.noise = self._noise_beside(self.base)
 
-    def estimate_noise(self, effects: Sequence[ActiveEffect]) -> None:
-        """Estimate the noise (again), with the link's motion simulated with ``effects``."""
-        self.noise = []
-        self.simulations += 1
+    def _noise_beside(self, effects: Sequence[ActiveEffect]) -> tuple[NoiseModel, ...]:
+        """The noise, with the link's motion simulated with ``effects``."""
+        out = []
+        self.tally.count += 1
         for i, (o, size) in enumerate(zip(self.observations, self.fine, strict=True)):
             chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
             # Coarse steps hide the noise of a reading that rests.
             share = 0.25 if any(a.effect.lattice for a in effects) else LEAST_NOISE
             floors = np.maximum(share * o.rig.noises.ravel(), o.rig.converter.volts_per_count / np.sqrt(12.0))
-            self.noise.append(estimate_noise(o, o.volts - chunk.volts.T, size, floors))
+            out.append(estimate_noise(o, o.volts - chunk.volts.T, size, floors))
+        return tuple(out)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -119,21 +119,19 @@ class Workspace(Comparison):
         """s between the fine blocks of each recording."""
         return [o.period * size for o, size in zip(self.observations, self.fine, strict=True)]
 
-    def renoise(self, effects: Sequence[ActiveEffect]) -> bool:
-        """Estimate the noise with ``effects`` in the model; False, and nothing changes, if it is the same."""
-        before = self.noise
-        self.estimate_noise(effects)
+    def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
+        """With the noise as it is with ``effects`` in the model; this one if that is the same."""
+        noise = self._noise_beside(effects)
         if all(
             a.coloured == b.coloured and np.allclose(a.innovation, b.innovation, rtol=0.02)
-            for a, b in zip(before, self.noise, strict=True)
+            for a, b in zip(self.noise, noise, strict=True)
         ):
-            self.noise = before
-            return False
-        return True
+            return self
+        return self.replaced(noise=noise)
 
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
-        self.simulations += 1
+        self.tally.count += 1
         out = []
         for i, o in enumerate(self.observations):
             chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
@@ -143,7 +141,7 @@ class Workspace(Comparison):
 
     def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """Fine-block means (6, nf) V of each recording, simulated without noise."""
-        self.simulations += 1
+        self.tally.count += 1
         out = []
         for i, (o, size, present) in enumerate(zip(self.observations, self.fine, self._present, strict=True)):
             model = ForwardModel(o.rig, only_in(sort_effects(effects), i))

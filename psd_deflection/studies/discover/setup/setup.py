@@ -8,7 +8,6 @@ sizes tell the sign and the unit of each load. A wiring that is not the rig file
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,24 +19,18 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.judges import LOADS, unit_findings, wiring_findings
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, line, parameters
+from psd_deflection.studies.check.wirings import WIRINGS, differences, line
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
-LOADS = ('load_fx', 'load_fy', 'load_tz')
 BETTER = 10.0
 """Another wiring or sign must leave so many times less of the movement than the rig file's."""
 AS_GOOD = 2.0
 """Wirings that leave up to this much more than the best one count as equally good; the one with the fewest changes is
 taken."""
-FORCE_UNITS = {9.80665: 'kg', 9.80665e-3: 'g', 4.4482216: 'lbf', 1e3: 'kN', 1e-3: 'mN', 0.2780139: 'ozf'}
-TORQUE_UNITS = {9.80665: 'kg m', 0.0980665: 'kg cm', 9.80665e-3: 'kg mm', 1e3: 'kN m', 1e-3: 'N mm', 1e-2: 'N cm'}
-UNIT_TOLERANCE = 0.03
-"""Share by which the size of a load may differ from another unit's; the rest is stiffness."""
-NOISE_FACTOR = 2.0
-"""Noise that is so many times the rig file's, or so many times less, is told."""
 SEEN = 100.0
 """A load whose movement has less than so many times the energy of one block's noise says nothing."""
 SMALL = 1e-4
@@ -149,18 +142,7 @@ def wire(
     loads = np.ones(3)
     if plain > BETTER * left:
         others = tuple(_words(tried[i][1], file, tried[i][2]) for _, _, i in sorted(as_good)[1:3])
-        lines = parameters(wiring, file)
-        findings = [
-            Finding(
-                d.name,
-                d.where,
-                -1.0 if d.name == 'channel_sign' else None,
-                fix_of(d, wiring, lines),
-                plain / left,
-                others,
-            )
-            for d in differences(wiring, file)
-        ]
+        findings, lines = wiring_findings(wiring, file, plain / left, others)
         turned = [k for k in range(3) if sizes[k] < 0.0]
         loads[turned] = -1.0
         findings += [
@@ -169,21 +151,9 @@ def wire(
             )
             for k in turned
         ]
-    units = _units(np.abs(sizes))
-    for k, (factor, _) in units.items():
-        loads[k] *= factor
-    for factor, unit in dict.fromkeys(units.values()):
-        which = [k for k in units if units[k] == (factor, unit)]
-        names = ' '.join(LOADS[k] for k in which)
-        findings.append(
-            Finding(
-                'load_unit',
-                ' '.join(LOADS[k][5:] for k in which),
-                factor,
-                f'multiply {names} in the recording by {factor:g}: it is noted in {unit}',
-                plain / left,
-            )
-        )
+    units, factors = unit_findings(sizes, plain / left)
+    findings += units
+    loads = loads * factors
     if not findings:
         return list(observations), [], {}
     return [_mended(o, lines, loads) for o in observations], findings, lines
@@ -207,39 +177,6 @@ def _words(wiring: Wiring, file: Wiring, sizes: FloatArray) -> str:
     out = [f'{d.name} of {d.where}' for d in differences(wiring, file)]
     out += [f'load_sign of {LOADS[k][5:]}' for k in range(3) if sizes[k] < 0.0]
     return ' and '.join(out) or 'as the rig file says'
-
-
-def _units(sizes: FloatArray) -> dict[int, tuple[float, str]]:
-    """Of each load that is noted in another unit the factor to multiply it with, and the unit."""
-    out: dict[int, tuple[float, str]] = {}
-    force = [float(s) for s in sizes[:2] if math.isfinite(s)]
-    torque = float(sizes[2])
-    if force and not _power_of_ten(force, torque) and (found := _nearest(force, FORCE_UNITS, 'N')):
-        out.update({k: found for k in range(2) if math.isfinite(sizes[k])})
-    if math.isfinite(torque) and (found := _nearest([torque], TORQUE_UNITS, 'N m')):
-        out[2] = found
-    return out
-
-
-def _nearest(sizes: Sequence[float], units: dict[float, str], own: str) -> tuple[float, str] | None:
-    """The factor and unit within ``UNIT_TOLERANCE`` of all ``sizes`` that is nearest to them: kg mm and N cm are 2 %
-    apart.
-    """
-    fitting = [u for u in _both_ways(units, own) if all(abs(s / u[0] - 1.0) < UNIT_TOLERANCE for s in sizes)]
-    return min(fitting, key=lambda u: sum(abs(math.log(s / u[0])) for s in sizes), default=None)
-
-
-def _both_ways(units: dict[float, str], own: str) -> list[tuple[float, str]]:
-    return [(f, f'{unit} instead of {own}') for f, unit in units.items()] + [
-        (1.0 / f, f'{own}, and then converted from {unit} once more')
-        for f, unit in units.items()
-        if f not in (1e3, 1e-3)
-    ]
-
-
-def _power_of_ten(force: Sequence[float], torque: float) -> bool:
-    """Whether only the forces are off, and by ten: a digit of Young's modulus, not a unit."""
-    return abs(torque - 1.0) < 0.1 and all(min(abs(10.0 * s - 1.0), abs(0.1 * s - 1.0)) < 0.01 for s in force)
 
 
 def _mended(o: Observation, lines: dict[str, object], loads: FloatArray) -> Observation:
@@ -322,16 +259,7 @@ def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[l
     return [Finding(name, key, factor, line(key, value), evidence)], {key: value}
 
 
-def noise_finding(workspace: Workspace) -> list[Finding]:
-    """Noise that is many times the rig file's, or many times less."""
-    stated, measured = 0.0, 0.0
-    for o, n in zip(workspace.observations, workspace.noise, strict=True):
-        dots = list(DOT_CHANNELS)
-        stated += float(np.mean(o.rig.noises.ravel()[dots] ** 2) + o.rig.converter.volts_per_count**2 / 12.0)
-        measured += float(np.mean(n.sigma[dots] ** 2))
-    factor = math.sqrt(measured / stated)
-    if 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR:
-        return []
-    level = float(f'{factor * workspace.observations[0].rig.amplifier.noise:.2g}')
-    fix = line('amplifier.noise', level)
-    return [Finding('noise_level', 'x1 y1 x2 y2', round(factor, 3), fix, abs(math.log(factor)))]
+def noise_of(workspace: Workspace) -> FloatArray:
+    """Noise (2, 2) of x and y of each PSD, V rms a sample, over all recordings."""
+    squares = [n.sigma[list(DOT_CHANNELS)] ** 2 for n in workspace.noise]
+    return np.asarray(np.sqrt(np.mean(squares, axis=0)).reshape(2, 2))

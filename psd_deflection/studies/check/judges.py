@@ -1,0 +1,140 @@
+"""What check and discover both judge, once: noise and the unit of the loads against what file and recording say."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.result import Finding
+from psd_deflection.studies.check.wirings import differences, fix_of, line, parameters
+
+NOISE_FACTOR = 2.0
+"""Report noise that differs from the rig file's by more than this factor.
+
+The noise of a healthy rig changes by half with light and temperature, and the noise between neighbouring samples, which
+check measures, is down to 0.6 of the whole if it has a memory. Neither is a mistake.
+"""
+FORCE_UNITS = {9.80665: 'kg', 9.80665e-3: 'g', 4.4482216: 'lbf', 1e3: 'kN', 1e-3: 'mN', 0.2780139: 'ozf'}
+TORQUE_UNITS = {9.80665: 'kg m', 0.0980665: 'kg cm', 9.80665e-3: 'kg mm', 1e3: 'kN m', 1e-3: 'N mm', 1e-2: 'N cm'}
+"""Newtons and newton metres of each unit."""
+UNIT_TOLERANCE = 0.03
+"""Share by which the size of a load may differ from another unit's. The rest is stiffness: a modulus that is wrong by a
+digit makes forces ten times too large, which is 2 % from kilograms.
+"""
+LOADS = ('load_fx', 'load_fy', 'load_tz')
+
+
+def noise_findings(rig: Rig, noise: FloatArray) -> tuple[list[Finding], dict[str, object]]:
+    """Whether ``noise`` (2, 2), V rms a sample of x and y of each PSD, is the rig file's; lines that put it right.
+
+    NaN for a channel that is stuck. A rig file that says the noise of each channel is held against each.
+    """
+    dots = np.asarray(noise, dtype=np.float64).reshape(2, 2)
+    stated = np.hypot(rig.noises[:, :2], rig.converter.volts_per_count / math.sqrt(12.0))
+    if any(any(psd.noise) for psd in rig.psds):
+        return _of_each_channel(dots, stated)
+    there = np.isfinite(dots)
+    if not there.any():
+        return [], {}
+    factor = math.sqrt(float(np.mean(dots[there] ** 2)) / float(np.mean(stated**2)))
+    if not _far(factor):
+        return [], {}
+    level = float(f'{factor * rig.amplifier.noise:.2g}')
+    fix = line('amplifier.noise', level)
+    found = Finding('noise_level', 'x1 y1 x2 y2', round(factor, 3), fix, abs(math.log(factor)))
+    return [found], {'amplifier.noise': level}
+
+
+def _of_each_channel(noise: FloatArray, stated: FloatArray) -> tuple[list[Finding], dict[str, object]]:
+    findings, lines = [], dict[str, object]()
+    for psd in (1, 2):
+        own = noise[psd - 1]
+        factors = own / stated[psd - 1]
+        if not np.isfinite(own).all() or not any(map(_far, factors.tolist())):
+            continue
+        worst = int(np.argmax(np.abs(np.log(factors))))
+        name, level = f'psd_{psd}.noise', [float(f'{v:.2g}') for v in own.tolist()]
+        lines[name] = level
+        factor = float(factors[worst])
+        found = Finding(
+            'noise_level', f'{"xy"[worst]}{psd}', round(factor, 3), line(name, level), abs(math.log(factor))
+        )
+        findings.append(found)
+    return findings, lines
+
+
+def _far(factor: float) -> bool:
+    return factor > 0.0 and not 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR
+
+
+def unit_findings(sizes: FloatArray, evidence: float = 0.0) -> tuple[list[Finding], FloatArray]:
+    """Loads that are noted in another unit; by what each of the noted loads (3,) is to be multiplied.
+
+    ``sizes`` (3,): of the movement under each load over that of the noted load, NaN where nothing tells.
+    """
+    factors = np.ones(3)
+    units = _units(np.abs(sizes))
+    findings = []
+    for factor, unit in dict.fromkeys(units.values()):
+        which = [k for k in units if units[k] == (factor, unit)]
+        factors[which] = factor
+        names = ' '.join(LOADS[k] for k in which)
+        words = f'multiply {names} in the recording by {factor:g}: it is noted in {unit}'
+        findings.append(Finding('load_unit', ' '.join(LOADS[k][5:] for k in which), factor, words, evidence))
+    return findings, factors
+
+
+def _units(sizes: FloatArray) -> dict[int, tuple[float, str]]:
+    """Of each load that is noted in another unit the factor to multiply it with, and the unit."""
+    out: dict[int, tuple[float, str]] = {}
+    force = [float(s) for s in sizes[:2] if math.isfinite(s)]
+    torque = float(sizes[2])
+    if force and not _power_of_ten(force, torque) and (found := _nearest(force, FORCE_UNITS, 'N')):
+        out.update({k: found for k in range(2) if math.isfinite(sizes[k])})
+    if math.isfinite(torque) and (found := _nearest([torque], TORQUE_UNITS, 'N m')):
+        out[2] = found
+    return out
+
+
+def _nearest(sizes: Sequence[float], units: Mapping[float, str], own: str) -> tuple[float, str] | None:
+    """The factor and unit within ``UNIT_TOLERANCE`` of all ``sizes`` that is nearest: kg mm and N cm are 2 % apart."""
+    fitting = [u for u in both_ways(units, own) if all(abs(s / u[0] - 1.0) < UNIT_TOLERANCE for s in sizes)]
+    return min(fitting, key=lambda u: sum(abs(math.log(s / u[0])) for s in sizes), default=None)
+
+
+def both_ways(units: Mapping[float, str], own: str) -> list[tuple[float, str]]:
+    """Each unit instead of ``own``, and ``own`` converted once more; with the factor that puts it right."""
+    return [(f, f'{unit} instead of {own}') for f, unit in units.items()] + [
+        (1.0 / f, f'{own}, and then converted from {unit} once more')
+        for f, unit in units.items()
+        if f not in (1e3, 1e-3)
+    ]
+
+
+def _power_of_ten(force: Sequence[float], torque: float) -> bool:
+    """Whether only the forces are off, and by ten: a digit of Young's modulus, not a unit."""
+    return abs(torque - 1.0) < 0.1 and all(min(abs(10.0 * s - 1.0), abs(0.1 * s - 1.0)) < 0.01 for s in force)
+
+
+def wiring_findings(
+    wiring: Wiring, file: Wiring, evidence: float, equivalent: tuple[str, ...] = ()
+) -> tuple[list[Finding], dict[str, object]]:
+    """How ``wiring``, which is the right one, differs from that of the rig file; lines that put it right."""
+    lines = parameters(wiring, file)
+    findings = [
+        Finding(
+            name=d.name,
+            where=d.where,
+            value=-1.0 if d.name == 'channel_sign' else None,
+            fix=fix_of(d, wiring, lines),
+            evidence=evidence,
+            equivalent=equivalent,
+        )
+        for d in differences(wiring, file)
+    ]
+    return findings, lines

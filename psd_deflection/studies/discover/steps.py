@@ -1,0 +1,219 @@
+"""The steps of discover: search, weigh, name the alternatives, say where. Each gives the next problem.
+
+An effect is named only if all of these hold: library-wide p <= 0.01, a BIC better by more than 10, a gain of more than
+two standard errors on held-out load cases, and parameters within their bounds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from psd_deflection.studies.discover.problem import Machine, Problem, Progress, Step
+from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldout_tables
+from psd_deflection.studies.discover.search.search import BIC_ACCEPT, P_ACCEPT, Search, unphysical
+from psd_deflection.studies.discover.search.weighing import (
+    EQUIVALENT,
+    EQUIVALENT_BIC,
+    RIVAL_BIC,
+    NamedEffect,
+    Rival,
+    heldout_per_channel_of,
+    per_channel_of,
+    sd_of,
+    tied,
+    unknown_of,
+    unsaid,
+    waterfall_of,
+)
+
+
+def solve(
+    machine: Machine, steps: Sequence[Step], seed: int, progress: Progress, rng: np.random.Generator | None = None
+) -> Problem:
+    """The problem of ``machine`` after ``steps``. The same ``seed`` gives the same answer."""
+    problem = Problem.of(machine, seed, progress, np.random.default_rng(seed) if rng is None else rng)
+    for step in steps:
+        problem = step(problem)
+    return problem
+
+
+def search(problem: Problem) -> Problem:
+    """The model that the search chooses, beside its alternatives."""
+    start = problem.comparison
+    found, result = problem.search.run(problem.null)
+    names = {a.effect.name for a in result.fit.effects}
+    if names & start.first and names - start.setup:
+        # A mistake that needs an effect beside it must be much better than effects alone.
+        plain = found.workspace.replaced(first=frozenset())
+        other = Search(plain, problem.machine.screen, problem.progress)
+        other, others = other.run(refit(plain, ()))
+        cost = others.fit.chi2 + other.penalty * others.fit.parameters
+        if cost < result.fit.chi2 + found.penalty * result.fit.parameters + BIC_ACCEPT:
+            found, result = other, others
+    if not start.open_level:
+        found = found.at(found.workspace.replaced(nuisance=result.fit.nuisance))
+    return replace(problem, search=found, result=result, fit=result.fit, null=result.null)
+
+
+def weigh(problem: Problem) -> Problem:
+    """The effects that hold, with where what they leave has structure."""
+    problem.progress('weighing')
+    problem = accepted(problem)
+    for _ in range(2 if problem.comparison.open_level else 0):
+        if problem.fit is problem.result.fit or not problem.fit.effects:
+            break
+        # Without what did not hold, another effect may be the better one.
+        null, found = problem.result.null, problem.search
+        fit, others = found.swap(null, problem.fit)
+        p, delta_bic, delta_chi2 = found.weigh(null, fit)
+        result = replace(problem.result, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others)
+        problem = accepted(replace(problem, result=result, fit=fit))
+    problem = credible(problem)
+    bare = problem.bare
+    return problem if bare is problem.comparison else replace(problem, null=refit(bare, ()))
+
+
+def accepted(problem: Problem) -> Problem:
+    """The joint rule: without the effects that fail it, the weakest first, the rest fitted anew."""
+    while True:
+        heldout, fails = [], []
+        ws, found, fit = problem.comparison, problem.search, problem.fit
+        for i, without in enumerate(found.without_each(fit, problem.result.null)):
+            gain = heldout_gain(ws, without, fit, problem.rng)
+            heldout.append(gain)
+            columns = fit.columns_of(i)
+            chi2 = without.chi2 - fit.chi2
+            bic = chi2 - found.penalty * len(columns)
+            if (
+                not gain.holds
+                or unphysical(ws, fit, i)
+                or found.library_p(chi2, len(columns)) > P_ACCEPT
+                or bic <= BIC_ACCEPT
+            ):
+                fails.append((bic, i))
+        problem = replace(problem, heldout=tuple(heldout))
+        if not fails:
+            return problem
+        problem = without_one(problem, min(fails)[1], 'fails the joint rule')
+
+
+def credible(problem: Problem) -> Problem:
+    """Without effects that explain less than the unknown remainder: they probably stand in for it."""
+    while True:
+        left = problem.machine.look(problem.comparison, problem.fit, problem.result.null, problem.rng)
+        problem = replace(problem, left=left)
+        steps = problem.machine.seen(problem.comparison)
+        if not problem.fit.effects or not unknown_of(left, 0.0, steps=steps):
+            return problem
+        weakest = int(np.argmin(problem.result.delta_chi2))
+        if problem.result.delta_chi2[weakest] >= left.excess:
+            return problem
+        problem = without_one(problem, weakest, 'explains less than what remains unknown')
+
+
+def without_one(problem: Problem, index: int, why: str) -> Problem:
+    """``problem`` without one effect of its fit, the rest fitted and weighed anew; ``why`` goes into the trace."""
+    found, null, fit = problem.search, problem.result.null, problem.fit
+    found.trace.append(f'{fit.effects[index].label} {why}')
+    rest = [a for j, a in enumerate(fit.effects) if j != index]
+    left = refit(problem.comparison, rest, iterations=6) if rest else null
+    p, delta_bic, delta_chi2 = found.weigh(null, left)
+    result = replace(problem.result, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2)
+    heldout = tuple(h for j, h in enumerate(problem.heldout) if j != index)
+    return replace(problem, result=result, fit=left, heldout=heldout)
+
+
+def alternatives(problem: Problem) -> Problem:
+    """The effects of the fit with their standard deviations and what explains the data as well in their place."""
+    problem.progress('alternatives')
+    result, fit = problem.result, problem.fit
+    named = []
+    for i in range(len(fit.effects)):
+        # If the joint rule has removed effects, their alternatives are no longer comparable.
+        as_found = fit is result.fit
+        fits = (
+            result.alternatives[i]
+            if as_found
+            else problem.search.alternatives(result.null, fit, i, result.delta_chi2[i])
+        )
+        named.append(_named(problem, i, fits))
+    return replace(
+        problem,
+        named=tuple(named),
+        rivals=tuple(r.fit for e in named for r in e.rivals),
+        unsettled=tuple(dict.fromkeys(name for e in named for name in e.equivalent)),
+    )
+
+
+def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
+    ws, result, fit = problem.comparison, problem.result, problem.fit
+    rows, equal, rivals = [], [], []
+    for f in fits:
+        loss = f.chi2 - fit.chi2
+        bic = loss + problem.search.penalty * (f.parameters - fit.parameters)
+        rows.append((f.effects[-1].effect.name, loss, bic))
+        if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
+            equal.append(f)
+        if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
+            rivals.append(Rival(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
+    return NamedEffect(
+        active=fit.effects[index],
+        sd=sd_of(ws, fit, index),
+        p=result.p[index],
+        delta_bic=result.delta_bic[index],
+        heldout=problem.heldout[index],
+        equivalent=tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal)),
+        rivals=tuple(sorted(rivals, key=lambda r: r.delta_bic)),
+        alternatives=tuple(rows),
+        suggestion=problem.machine.suggest(ws, fit, equal) if equal else None,
+    )
+
+
+def where(problem: Problem) -> Problem:
+    """Where the described model and the fit leave structure, and what of it remains unknown."""
+    problem.progress('where')
+    ws, null, fit, left = problem.bare, problem.null, problem.fit, problem.left
+    before = left if fit is null else problem.machine.look(ws, null, None, problem.rng)
+    # Coarse steps cause noise that varies with the signal; compare what they explain with it.
+    steps = problem.machine.seen(ws)
+    explained = max(null.chi2 - fit.chi2, 0.0) + steps
+    gap_after = ws.gap(fit.difference)
+    unknown = (
+        unknown_of(left, explained, gap_after, ws.floor(), steps, ws.worded)
+        or unsaid(ws, problem.gap_before, gap_after)
+        or tied(coincidences(fit, ws.physics), fit, problem.result, before)
+    )
+    return replace(problem, before=before, unknown=unknown)
+
+
+def fields_of(problem: Problem) -> dict[str, Any]:
+    """The fields of :class:`~psd_deflection.studies.discover.result.Conclusion` after the last step, by name."""
+    ws, null, fit = problem.bare, problem.null, problem.fit
+    after, held = ws.gap(fit.difference), heldout_tables(ws, fit)
+    return {
+        'verdict': 'unknown_effect' if problem.unknown else 'effects_found' if problem.named else 'nothing_missing',
+        'effects': problem.named,
+        'unknown': problem.unknown,
+        'where': problem.before,
+        'left': problem.left,
+        'gap_before': problem.gap_before,
+        'gap_after': after,
+        'gap_floor': ws.floor(),
+        'gap_heldout_before': problem.gap_before,
+        'gap_heldout_after': ws.gap(held),
+        'per_channel': per_channel_of(ws, null.difference, fit.difference),
+        'heldout_per_channel': heldout_per_channel_of(ws, held),
+        'waterfall': waterfall_of(ws, fit, problem.gap_before, after),
+        'simulations': ws.simulations,
+        'search': problem.result,
+        'fit': fit,
+        'workspace': ws,
+        'seed': problem.seed,
+        'nuisance': (),
+    }

@@ -1,0 +1,134 @@
+"""What check and discover both judge: the same recording gets the same words."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psd_deflection.cli.main import main
+from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check import judges
+from psd_deflection.studies.check.wirings import WIRINGS
+
+RIG = load_rig()
+
+
+@pytest.mark.parametrize(('noise', 'told'), [(0.0034, False), (0.006, True), (0.0007, True)])
+def test_check_and_discover_say_the_same_of_the_noise(
+    noise: float, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, found = tmp_path / 'run.csv', tmp_path / 'found'
+    world = ['--world', f'amplifier.noise={noise}']
+    assert main(['simulate', '--out', str(run), '--loads', 'thesis:1', *world]) == 0
+    assert main(['discover', str(run), '--out', str(found), '--quiet']) == 0
+    capsys.readouterr()
+    assert main(['check', str(run), '--json']) == 0
+    checked = json.loads(capsys.readouterr().out)['setup']
+    searched = json.loads((found / 'result.json').read_text())['setup']
+    levels = [[f for f in said if f['name'] == 'noise_level'] for said in (checked, searched)]
+    assert [len(one) for one in levels] == [told, told]
+    if told:
+        (of_check,), (of_search,) = levels
+        assert of_check['value'] == pytest.approx(of_search['value'], rel=0.03)
+        levels_told = [float(f['fix'].removeprefix('amplifier.noise: ')) for f in (of_check, of_search)]
+        assert levels_told == pytest.approx([noise, noise], rel=0.05)
+
+
+@pytest.mark.parametrize(('factor', 'told'), [(0.49, True), (0.51, False), (1.0, False), (1.99, False), (2.01, True)])
+def test_noise_is_reported_from_twice_or_half_of_the_files_on(factor: float, told: bool) -> None:
+    stated = math.hypot(RIG.amplifier.noise, RIG.converter.volts_per_count / math.sqrt(12.0))
+    findings, lines = judges.noise_findings(RIG, np.full(4, factor * stated))
+    assert [f.name for f in findings] == ['noise_level'] * told
+    assert list(lines) == ['amplifier.noise'] * told
+    # A stuck channel says nothing of the noise of the others.
+    some, _ = judges.noise_findings(RIG, np.array([math.nan, *[factor * stated] * 3]))
+    assert [f.value for f in some] == [f.value for f in findings]
+    assert judges.noise_findings(RIG, np.full(4, math.nan)) == ([], {})
+
+
+def test_a_rig_file_with_the_noise_of_each_channel_is_put_right_channel_by_channel() -> None:
+    rig = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]})
+    findings, lines = judges.noise_findings(rig, np.array([1e-3, 2e-3, 9e-3, 2e-3]))
+    assert [(f.name, f.where) for f in findings] == [('noise_level', 'x2')]
+    assert lines == {'psd_2.noise': [9e-3, 2e-3]}
+
+
+@pytest.mark.parametrize(
+    ('sizes', 'told', 'factors'),
+    [
+        ((9.80665, 9.80665, 1.0), ['fx fy'], (9.80665, 9.80665, 1.0)),
+        ((9.6, math.nan, 1.0), ['fx'], (9.80665, 1.0, 1.0)),
+        ((9.4, 9.8, 1.0), [], (1.0, 1.0, 1.0)),
+        # A modulus that is wrong by a digit is no unit; forces and torque in kilograms are.
+        ((10.0, 10.0, 1.0), [], (1.0, 1.0, 1.0)),
+        ((9.8, 9.8, 9.8), ['fx fy', 'tz'], (9.80665, 9.80665, 9.80665)),
+        ((1.0, 1.0, 0.0098), ['tz'], (1.0, 1.0, 9.80665e-3)),
+        ((1.0, 1.0, 0.00995), ['tz'], (1.0, 1.0, 1e-2)),
+        ((1.02, 0.98, math.nan), [], (1.0, 1.0, 1.0)),
+    ],
+)
+def test_a_unit_is_told_from_a_stiffness(sizes: tuple[float, ...], told: list[str], factors: tuple[float, ...]) -> None:
+    findings, found = judges.unit_findings(np.array(sizes))
+    assert [f.where for f in findings] == told
+    assert found.tolist() == list(factors)
+
+
+def test_a_wiring_is_told_by_its_differences_with_lines_that_put_it_right() -> None:
+    file = Wiring.from_rig(RIG)
+    assert judges.wiring_findings(file, file, 1.0) == ([], {})
+    for wiring in WIRINGS:
+        findings, lines = judges.wiring_findings(wiring, file, 7.0, ('another',))
+        assert Wiring.from_rig(load_rig(overrides=lines)) == wiring
+        assert all((f.evidence, f.equivalent) == (7.0, ('another',)) for f in findings)
+        assert bool(findings) == (wiring != file)
+
+
+def test_each_unit_has_its_factor() -> None:
+    """In N and N m: the standard acceleration is 9.80665 m/s^2, a pound 0.45359237 kg, an ounce a sixteenth of it."""
+    g, pound = 9.80665, 0.45359237
+    force = {'kg': g, 'g': g / 1000, 'lbf': g * pound, 'kN': 1000, 'mN': 1 / 1000, 'ozf': g * pound / 16}
+    torque = {'kg m': g, 'kg cm': g / 100, 'kg mm': g / 1000, 'kN m': 1000, 'N mm': 1 / 1000, 'N cm': 1 / 100}
+    for units, own, wanted in ((judges.FORCE_UNITS, 'N', force), (judges.TORQUE_UNITS, 'N m', torque)):
+        told = {words: factor for factor, words in judges.both_ways(units, own)}
+        there = {f'{unit} instead of {own}': factor for unit, factor in wanted.items()}
+        # What is a thousand times one way is it the other way too.
+        back = {
+            f'{own}, and then converted from {unit} once more': 1 / factor
+            for unit, factor in wanted.items()
+            if factor not in (1000, 1 / 1000)
+        }
+        assert told == pytest.approx({**there, **back}, rel=2e-7)
+
+
+NAN = math.nan
+
+
+@pytest.mark.parametrize(
+    ('sizes', 'units'),
+    [
+        ((1.0, 1.0, 1.0), {}),
+        ((9.80665, 9.7, NAN), {0: 'kg instead of N', 1: 'kg instead of N'}),
+        ((NAN, 9.80665 * 0.971, 1.0), {1: 'kg instead of N'}),
+        ((NAN, 9.80665 * 0.969, 1.0), {}),
+        ((9.80665, 1.0, 1.0), {}),
+        ((1e3, NAN, 1e3), {0: 'kN instead of N', 2: 'kN m instead of N m'}),
+        ((4.45, 4.44, 0.0981), {0: 'lbf instead of N', 1: 'lbf instead of N', 2: 'kg cm instead of N m'}),
+        ((NAN, 1 / 9.80665, NAN), {1: 'N, and then converted from kg once more'}),
+        ((NAN, NAN, 0.01), {2: 'N cm instead of N m'}),
+        ((NAN, NAN, 100.0), {2: 'N m, and then converted from N cm once more'}),
+        # A digit of Young's modulus is no unit: the forces alone, by ten.
+        ((10.0, 10.05, 1.0), {}),
+        ((0.1, 0.1, 1.05), {}),
+        ((10.0, 10.0, 1.2), {0: 'kg instead of N', 1: 'kg instead of N'}),
+    ],
+)
+def test_a_size_is_a_unit_within_three_per_cent(sizes: tuple[float, float, float], units: dict[int, str]) -> None:
+    findings, _ = judges.unit_findings(np.array(sizes))
+    places = {'fx': 0, 'fy': 1, 'tz': 2}
+    told = {places[load]: f.fix.partition('it is noted in ')[2] for f in findings for load in f.where.split()}
+    assert told == units

@@ -1,0 +1,151 @@
+"""The steps of discover: given a problem, the next one has what was found, and the first stays as it was."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.problem import Problem
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.localise import NOWHERE, Localisation
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.hidden import FIRST
+from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
+
+from .test_rules import A, B, Lone, Plant, active, candidate, noise, nowhere, pictures, without_noise
+
+STEPS = (search, weigh, alternatives, where)
+
+
+class Library(Lone):
+    """A lone machine whose library are the plant's pictures; mistakes are looked for only if the comparison says so."""
+
+    def __init__(self, plant: Plant, left: Localisation = NOWHERE) -> None:
+        super().__init__(plant, left)
+        self.shown: Mapping[tuple[str, str], FloatArray] = plant.pictures
+
+    def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
+        names = [n for n in self.shown if n[0] not in FIRST or n[0] in comparison.first]
+        return Screen(comparison, [(candidate(*n), [[1e-3 * self.shown[n]]]) for n in names])
+
+
+def begun(machine: Library) -> Problem:
+    return Problem.of(machine, 0, lambda _: None, np.random.default_rng(0))
+
+
+def names(fit: Fit) -> list[str]:
+    return sorted(a.effect.name for a in fit.effects)
+
+
+def apart(shown: dict[tuple[str, str], FloatArray], first: tuple[str, str], other: tuple[str, str]) -> None:
+    """Take what is in the picture of ``first`` out of that of ``other``."""
+    a = shown[first] / np.linalg.norm(shown[first])
+    shown[other] = shown[other] - a * np.sum(a * shown[other])
+
+
+def test_each_step_adds_what_it_finds_and_changes_nothing_before_it() -> None:
+    shown = pictures(A, B, ('c', 'x'))
+    plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
+    first = begun(Library(plant))
+    assert first.fit is first.null
+    assert first.comparison is plant
+    seen = [first]
+    for step in STEPS:
+        kept = {f.name: getattr(seen[-1], f.name) for f in dataclasses.fields(Problem)}
+        seen.append(step(seen[-1]))
+        assert all(getattr(seen[-2], name) is value for name, value in kept.items())
+    assert first.comparison is plant
+    _, searched, weighed, named, last = seen
+    assert names(searched.fit) == names(searched.result.fit) == ['a', 'b']
+    assert not searched.heldout
+    assert len(weighed.heldout) == 2
+    assert [n.active.effect.name for n in named.named] == [a.effect.name for a in weighed.fit.effects]
+    assert (last.unknown, last.rivals, last.unsettled) == ((), (), ())
+    fields = fields_of(last)
+    assert (fields['verdict'], fields['effects'], fields['fit']) == ('effects_found', last.named, last.fit)
+    assert fields['gap_after'] < fields['gap_before']
+    assert [name for name, _ in fields['waterfall']] == ['as described', '+ a', '+ b', 'noise alone']
+    again = fields_of(solve(Library(Plant(shown, plant.measured[0])), STEPS, 0, lambda _: None))
+    assert (again['gap_after'], again['simulations']) == (fields['gap_after'], fields['simulations'])
+
+
+def test_nothing_is_missing_in_noise() -> None:
+    shown = pictures(A, B)
+    last = solve(Library(Plant(shown, noise())), STEPS, 0, lambda _: None)
+    fields = fields_of(last)
+    assert (fields['verdict'], last.named, last.fit) == ('nothing_missing', (), last.null)
+    assert fields['gap_before'] == fields['gap_after'] == fields['gap_heldout_after']
+
+
+def test_what_remains_somewhere_is_unknown_and_takes_weak_effects_with_it() -> None:
+    shown = pictures(A)
+    plant = Plant(shown, without_noise((shown[A], 200.0)) + noise())
+    left = nowhere(p=0.0, excess=900.0)
+    last = solve(Library(plant, left), STEPS, 0, lambda _: None)
+    assert (fields_of(last)['verdict'], names(last.fit), last.left) == ('unknown_effect', [], left)
+    assert last.search.trace[-1].endswith('explains less than what remains unknown')
+    strong = Plant(shown, without_noise((shown[A], 2000.0)) + noise())
+    kept = solve(Library(strong, left), STEPS, 0, lambda _: None)
+    assert (fields_of(kept)['verdict'], names(kept.fit)) == ('unknown_effect', ['a'])
+
+
+@pytest.mark.parametrize(('of_effect', 'found'), [(0.0, ['link_length']), (0.3, ['b', 'c'])])
+def test_a_mistake_with_an_effect_beside_it_must_be_better_than_effects_alone(
+    of_effect: float, found: Sequence[str]
+) -> None:
+    """Length and one effect explain as much as two effects do: then it is the effects."""
+    length, b, c = ('link_length', 'x'), ('b', 'x'), ('c', 'x')
+    shown = pictures(length, b, c)
+    apart(shown, b, c)
+    total = 1e5
+    if of_effect:
+        # What is there is b and c; the length shows as b does but for a little.
+        shown[length] = shown[b] + 1e-3 * shown[length]
+        plant = Plant(shown, without_noise((shown[b], total), (shown[c], 500.0)) + noise())
+    else:
+        plant = Plant(shown, without_noise((shown[length], total)) + noise())
+    after = search(begun(Library(plant)))
+    assert names(after.fit) == found
+    assert after.comparison.first == (frozenset() if of_effect else FIRST)
+    assert plant.first == FIRST
+
+
+def test_without_one_effect_the_others_are_fitted_and_weighed_anew() -> None:
+    shown = pictures(A, B)
+    plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
+    both = weigh(search(begun(Library(plant))))
+    at = [a.effect.name for a in both.fit.effects].index('a')
+    one = without_one(both, at, 'is not wanted')
+    assert names(one.fit) == ['b']
+    assert one.heldout == (both.heldout[1 - at],)
+    assert len(one.result.delta_chi2) == 1
+    assert one.result.fit is both.fit
+    assert one.search.trace[-1] == 'a is not wanted'
+    none = without_one(one, 0, 'neither')
+    assert none.fit is one.result.null
+
+
+def test_the_gap_before_is_that_of_the_recording_as_it_was_stated() -> None:
+    shown = pictures(A)
+    last = solve(Library(Plant(shown, noise())), STEPS, 0, lambda _: None)
+    assert dataclasses.replace(last, stated_gap=7.0).gap_before == 7.0
+    assert last.gap_before == last.bare.gap(last.null.difference)
+
+
+def test_a_comparison_does_not_change() -> None:
+    shown = pictures(A)
+    plant = Plant(shown, noise())
+    more = (active('a', x=0.1),)
+    other = plant.replaced(base=more, first=frozenset())
+    assert (plant.base, plant.first) == ((), FIRST)
+    assert (other.base, other.first) == (more, frozenset())
+    # What it costs is counted for all of them.
+    other.replaced(base=()).simulate(())
+    assert plant.simulations == other.simulations == 1
+    assert isinstance(other, Workspace)
