@@ -61,7 +61,6 @@ def test_what_the_lines_allow_is_kept() -> None:
 
 ALREADY_LARGE = {
     'cli/studies/discover.py:run',
-    'measure/estimation.py:Estimation._estimate',
     'measure/health.py:OpticsHealth.judge',
     'recordings/replay/engine.py:replayed',
     'rig/parameters.py:parameter',

@@ -322,37 +322,53 @@ class Estimation:
     def _estimate(self, number: int, block: SeenBlock, s: Solution, readings: BlockReadings) -> DeflectionEstimate:
         """An answer with its covariance."""
         name, _, primary = self._solvers[number]
-        solver = self._solver(number, readings.kept)
-        dots, variances, spread, checked = readings.dots, readings.variances, readings.spread, readings.checked
-        rms = self._by.root(self._by.total(r * r for r in s.residual) / len(s.residual))
-        covariance: tuple[float, ...] = s.covariance
-        possible = () if checked is None or self._rig.estimator.consistency != 'widen' else checked.possible
-        factor = readings.factor
+        checked = readings.checked
+        covariance, systematic = self._covariance(number, s, readings)
         if primary:
-            self.systematic = None
-        # A printed threshold method has no covariance, and no slope either.
-        known = solver is not None and covariance[0] == covariance[0]
-        if solver is not None and known and (spread is not None or any(possible) or factor is not None):
-            gain = solver.gain(dots, variances, s)
-            if spread is not None:
-                own = self._by.einsum('ic,ck,jk->ij', gain, spread, gain)
-                allowance = solver.allowance(dots, variances)
-                own = own if allowance is None else own + allowance
-            else:
-                own = np.array(covariance).reshape(3, 3)
-            noise = own
-            if factor is not None:
-                own = own + _through(gain, factor, self._by)
-            if any(possible):
-                # A check that was made with all PSDs tells nothing of some of them.
-                own = widened(own, gain, possible, self._by) if len(possible) == gain.shape[1] else own
-            if primary and own is not noise:
-                self.systematic = own - noise
-            covariance = tuple(own.ravel().tolist())
-        chi_square = checked.chi_square if primary and checked is not None and checked.freedom else nan
+            self.systematic = systematic
         return DeflectionEstimate(
-            block.t_ns, block.index, name, s.dx, s.dy, s.theta, s.phi, s.omega, covariance, rms, primary, chi_square
+            t_ns=block.t_ns,
+            block=block.index,
+            solver=name,
+            dx=s.dx,
+            dy=s.dy,
+            theta=s.theta,
+            phi=s.phi,
+            omega=s.omega,
+            covariance=covariance,
+            residual_rms=self._by.root(self._by.total(r * r for r in s.residual) / len(s.residual)),
+            primary=primary,
+            chi_square=checked.chi_square if primary and checked is not None and checked.freedom else nan,
         )
+
+    def _covariance(
+        self, number: int, s: Solution, readings: BlockReadings
+    ) -> tuple[tuple[float, ...], FloatArray | None]:
+        """The covariance of an answer, and what it holds besides noise, None if nothing."""
+        solver = self._solver(number, readings.kept)
+        checked, factor = readings.checked, readings.factor
+        possible = () if checked is None or self._rig.estimator.consistency != 'widen' else checked.possible
+        # A printed threshold method has no covariance, and no slope either.
+        if solver is None or s.covariance[0] != s.covariance[0]:
+            return s.covariance, None
+        if readings.spread is None and factor is None and not any(possible):
+            return s.covariance, None
+        gain = solver.gain(readings.dots, readings.variances, s)
+        noise = own = self._noise_of(solver, gain, s, readings)
+        if factor is not None:
+            own = own + _through(gain, factor, self._by)
+        # A check that was made with all PSDs tells nothing of some of them.
+        if any(possible) and len(possible) == gain.shape[1]:
+            own = widened(own, gain, possible, self._by)
+        return tuple(own.ravel().tolist()), own - noise if own is not noise else None
+
+    def _noise_of(self, solver: Solver, gain: FloatArray, s: Solution, readings: BlockReadings) -> FloatArray:
+        """The covariance (3, 3) by the noise of the readings alone."""
+        if readings.spread is None:
+            return np.array(s.covariance).reshape(3, 3)
+        own = self._by.einsum('ic,ck,jk->ij', gain, readings.spread, gain)
+        allowance = solver.allowance(readings.dots, readings.variances)
+        return own if allowance is None else own + allowance
 
     def _spread_of(self, block: SeenBlock, covariance: FloatArray, columns: Sequence[int] | None = None) -> FloatArray:
         """:meth:`_variances_of` for the fit's own covariance (C, C), of the readings ``columns`` or of all."""
@@ -395,7 +411,19 @@ class Estimation:
             gain[:2, 2 * psd : 2 * psd + 2] = [[-c, s], [-s, -c]]
             own = np.array(cov).reshape(3, 3) + _through(gain, self.spread.factor(dx, dy, theta), by)
             cov = tuple(own.ravel().tolist())
-        return DeflectionEstimate(block.t_ns, block.index, ONE_PSD, dx, dy, theta, 0.0, 0.0, cov, 0.0, True)
+        return DeflectionEstimate(
+            t_ns=block.t_ns,
+            block=block.index,
+            solver=ONE_PSD,
+            dx=dx,
+            dy=dy,
+            theta=theta,
+            phi=0.0,
+            omega=0.0,
+            covariance=cov,
+            residual_rms=0.0,
+            primary=True,
+        )
 
 
 def _through(gain: FloatArray, factor: FloatArray, by: Arithmetic) -> FloatArray:
