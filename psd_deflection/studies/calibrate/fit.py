@@ -161,7 +161,7 @@ def pose_of_readings(dots: FloatArray, variances: FloatArray, p: FloatArray, len
 
     def step(slopes: FloatArray, pose: FloatArray) -> FloatArray:
         left = root * (dots - readings(p, pose.T, length).T)
-        return np.einsum('nij,nj->ni', np.linalg.pinv(root[:, :, None] * slopes), left)
+        return np.asarray(np.einsum('nij,nj->ni', np.linalg.pinv(root[:, :, None] * slopes), left))
 
     pose = np.zeros((len(dots), 3))
     pose = pose + step(by_pose(p, pose[:1].T, length).transpose(2, 0, 1), pose)
