@@ -188,12 +188,12 @@ def record(
     every: int = 33,
     spread: Sequence[float] = CAMERA,
     outliers: float = 0.0,
-    sigma: float = generator.SIGMA,
+    sigma: float | Array = generator.SIGMA,
     light: tuple[Light, Light] | None = None,
 ) -> Recorded:
     """What the converter and a reference say of the motion ``pose`` (n, 3); ``outliers``: share of wrong frames.
 
-    ``light``: besides that of the lasers.
+    ``sigma``: V, of all channels or of each (6,). ``light``: besides that of the lasers.
     """
     read = dots(rig, pose) / generator.MM_PER_V
     both = (DARK, DARK) if light is None else light

@@ -1,8 +1,9 @@
 """How well ``identify`` tells the modes of a link: ``python -m blind.modes --rigs 200``.
 
 Each rig has a frequency of 5 to 40 Hz and a damping ratio of 0.003 to 0.06, drawn at random, and noise of 2 µm. Its
-link rings after steps at times that nobody tells, or a random force drives it all the time. The motion is computed
-here, from the closed form or step by step, and shares no code with the package.
+link rings after steps at times that nobody tells, of random sizes or one weight on and off, in white noise or in one
+of 20 µm that remembers (0.9 from sample to sample), with one mode or with two that beat; or a random force drives it
+all the time. The motion is computed here, from the closed form or step by step, and shares no code with the package.
 
 ``--pyoma2`` gives the same samples to pyOMA2 too (``pip install pyoma-2``): covariance-driven subspace identification
 at 100 Hz above 2 Hz, and of its stable poles the one whose frequency is nearest to the truth.
@@ -13,9 +14,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import trapezoid
+from scipy.signal import lfilter
 
 from blind.campaign import options, watched
 from blind.generator import Array
@@ -26,18 +29,25 @@ RATE = 1000.0
 
 @dataclass(frozen=True)
 class Link:
-    """``modes``: Hz, damping ratio and share of the step that the mode rings with."""
+    """``modes``: Hz, damping ratio and share of the step that the mode rings with.
+
+    ``noise``: m; ``memory``: of one sample for the one before it.
+    """
 
     modes: tuple[tuple[float, float, float], ...]
     noise: float = 2e-6
+    memory: float = 0.0
 
 
-def rung(link: Link, rng: np.random.Generator, seconds: float = 10.0, steps: int = 4) -> Array:
-    """Samples (n,), m, of a link whose load changes ``steps`` times."""
+def rung(link: Link, rng: np.random.Generator, seconds: float = 10.0, steps: int = 4, equal: bool = False) -> Array:
+    """Samples (n,), m, of a link whose load changes ``steps`` times; ``equal``: one weight is hung on and off."""
     t = np.arange(int(seconds * RATE)) / RATE
     out = np.zeros(len(t))
-    for start in np.sort(rng.uniform(0.2, seconds - 2.0, steps)):
+    weight = float(rng.uniform(0.5e-3, 3e-3)) if equal else math.nan
+    for i, start in enumerate(np.sort(rng.uniform(0.2, seconds - 2.0, steps))):
         size = float(rng.uniform(0.5e-3, 3e-3)) * float(rng.choice([-1.0, 1.0]))
+        if equal:
+            size = weight * (-1.0) ** i
         since = np.clip(t - start, 0.0, None)
         moved = np.ones(len(t))
         for hertz, zeta, share in link.modes:
@@ -46,7 +56,16 @@ def rung(link: Link, rng: np.random.Generator, seconds: float = 10.0, steps: int
             ring = np.cos(turned * since) + zeta * w / turned * np.sin(turned * since)
             moved -= share * np.exp(-zeta * w * since) * ring
         out += size * np.where(t > start, moved, 0.0)
-    return out + rng.normal(0.0, link.noise, len(t))
+    return out + link.noise * noise(len(t), link.memory, rng)
+
+
+def noise(n: int, memory: float, rng: np.random.Generator) -> Array:
+    """(n,) of variance 1: an autoregression of the first order."""
+    if not memory:
+        return rng.normal(0.0, 1.0, n)
+    kicks = rng.normal(0.0, math.sqrt(1.0 - memory**2), n)
+    kicks[0] = rng.normal()
+    return np.asarray(lfilter([1.0], [1.0, -memory], kicks))
 
 
 def driven(link: Link, rng: np.random.Generator, seconds: float = 60.0, rms: float = 200e-6) -> Array:
@@ -139,16 +158,41 @@ def by_pyoma2(samples: Array, hertz: float) -> tuple[Mode, ...]:
     return (Mode(float(found.Fn_poles[row, column]), math.inf, float(found.Xi_poles[row, column]), math.inf, 0.0),)
 
 
-def scored(seeds: Iterable[int], *, operation: bool = False, pyoma2: bool = False) -> Score:
+class Case(NamedTuple):
+    """``operation``: driven all the time. ``equal``: see :func:`rung`. ``memory``: of the noise, which is then 20 µm.
+
+    ``beside``: the second of two modes is so many times as high, each with half of the step.
+    """
+
+    operation: bool = False
+    equal: bool = False
+    memory: float = 0.0
+    beside: float = 0.0
+
+
+CASES = {
+    'ring-down': Case(),
+    'equal releases': Case(equal=True),
+    'noise of memory 0.9': Case(memory=0.9),
+    'two modes, 5 % apart': Case(equal=True, beside=1.05),
+    'two modes, 2 % apart': Case(equal=True, beside=1.02),
+    'operation': Case(operation=True),
+}
+
+
+def scored(seeds: Iterable[int], case: Case, *, pyoma2: bool = False) -> Score:
     """One rig for each seed, by ``identify`` or by pyOMA2."""
     score = Score()
     for seed in seeds:
         rng = np.random.default_rng(seed)
         hertz, zeta = float(rng.uniform(5.0, 40.0)), float(np.exp(rng.uniform(np.log(0.003), np.log(0.06))))
-        link = Link(((hertz, zeta, 1.0),))
-        samples = driven(link, rng) if operation else rung(link, rng)
+        link = Link(((hertz, zeta, 1.0),), *((20e-6, case.memory) if case.memory else ()))
+        if case.beside:
+            link = Link(((hertz, zeta, 0.5), (case.beside * hertz, zeta, 0.5)))
+        samples = driven(link, rng) if case.operation else rung(link, rng, equal=case.equal)
         found = by_pyoma2(samples, hertz) if pyoma2 else modes_of(samples, RATE).modes
-        score.add(found, hertz, zeta)
+        # Of two modes the one that is nearest.
+        score.add(tuple(sorted(found, key=lambda m: abs(m.frequency - hertz)) if case.beside else found), hertz, zeta)
     return score
 
 
@@ -159,7 +203,7 @@ def report(name: str, score: Score) -> str:
     if score.inside:
         held = [f', {100.0 * share:.1f} % inside' for share in np.mean(score.inside, axis=0)]
     return (
-        f'{name:20} frequency {100 * np.median(f):.4f} % median, {100 * f.max():.4f} % at most'
+        f'{name:30} frequency {100 * np.median(f):.4f} % median, {100 * f.max():.4f} % at most'
         f'{held[0]}; '
         f'damping {100 * np.median(z):.2f} %, {100 * z.max():.2f} %{held[1]}; missed {score.missed}'
     )
@@ -171,12 +215,13 @@ def main() -> None:
     parser.add_argument('--rigs', type=int, default=200, metavar='N')
     parser.add_argument('--first', type=int, default=1000, metavar='SEED')
     parser.add_argument('--pyoma2', action='store_true', help='give the same samples to pyOMA2 too')
+    parser.add_argument('--cases', nargs='+', choices=CASES, default=list(CASES))
     args = parser.parse_args()
-    for name, operation in (('ring-down', False), ('operation', True)):
+    for name in args.cases:
         seeds = range(args.first, args.first + args.rigs)
         for peer in (False, True)[: 1 + args.pyoma2]:
-            score = scored(watched(seeds), operation=operation, pyoma2=peer)
-            print(report(name + ', pyOMA2' * peer, score))
+            score = scored(watched(seeds), CASES[name], pyoma2=peer)
+            print(report(name + ', pyOMA2' * peer, score), flush=True)
 
 
 if __name__ == '__main__':

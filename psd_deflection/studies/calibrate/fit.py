@@ -134,7 +134,7 @@ def linearised(rows: Rows, z: FloatArray, rig: Rig, kind: Kind) -> Linear:
     length = rig.link.length
     p = z[:COUNT]
     slopes = np.zeros((len(rows), 4, SIZE))
-    pose = pose_of_readings(rows.dots, p, length)
+    pose = pose_of_readings(rows.dots, rows.variances, p, length)
     turned = by_pose(p, pose.T, length).transpose(2, 0, 1)
     slopes[:, :, :COUNT] = by_parameters(p, pose.T, length).transpose(2, 0, 1)
     residual = rows.dots - readings(p, pose.T, length).T
@@ -151,14 +151,24 @@ def linearised(rows: Rows, z: FloatArray, rig: Rig, kind: Kind) -> Linear:
     return Linear(residual, slopes, turned)
 
 
-def pose_of_readings(dots: FloatArray, p: FloatArray, length: float) -> FloatArray:
-    """Poses (n, 3) that fit the readings (n, 4) best, each reading with the same weight."""
-    rest = np.zeros((3, 1))
-    pose = (dots - readings(p, rest, length).T) @ np.linalg.pinv(by_pose(p, rest, length)[:, :, 0]).T
-    inverse = np.linalg.pinv(by_pose(p, pose.T, length).transpose(2, 0, 1))
+def pose_of_readings(dots: FloatArray, variances: FloatArray, p: FloatArray, length: float) -> FloatArray:
+    """Poses (n, 3) that fit the readings (n, 4) best; each reading weighs as its ``variances`` (n, 4), m^2, say.
+
+    With other weights the pose's errors and those of the redundant residual would be correlated, and with the
+    derivatives at the pose the gains would be drawn off.
+    """
+    root = 1.0 / np.sqrt(variances)
+
+    def step(slopes: FloatArray, pose: FloatArray) -> FloatArray:
+        left = root * (dots - readings(p, pose.T, length).T)
+        return np.asarray(np.einsum('nij,nj->ni', np.linalg.pinv(root[:, :, None] * slopes), left))
+
+    pose = np.zeros((len(dots), 3))
+    pose = pose + step(by_pose(p, pose[:1].T, length).transpose(2, 0, 1), pose)
+    slopes = by_pose(p, pose.T, length).transpose(2, 0, 1)
     # Each step leaves what the derivatives have changed since, a thousandth.
     for _ in range(3):
-        pose = pose + np.einsum('nij,nj->ni', inverse, dots - readings(p, pose.T, length).T)
+        pose = pose + step(slopes, pose)
     return pose
 
 
@@ -345,7 +355,7 @@ def _moved(rows: Rows, rig: Rig, z: FloatArray, offsets: FloatArray) -> Rows:
         own = rows.run == run
         moved = z[:COUNT].copy()
         moved[ZERO:] += offset
-        pose = pose_of_readings(rows.dots[own], moved, length).T
+        pose = pose_of_readings(rows.dots[own], rows.variances[own], moved, length).T
         dots[own] -= (readings(moved, pose, length) - readings(z[:COUNT], pose, length)).T
     return replace(rows, dots=dots)
 

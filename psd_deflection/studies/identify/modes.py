@@ -6,25 +6,27 @@ A link that is left alone rings down: after a step of the load, or a knock,
 
 Stretches of a recording in which this holds to the noise are found, and frequency and damping of each mode are
 fitted to all of them at once. What is linear (c, e, a, b of each stretch) is solved for on the way (variable
-projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973).
+projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973). The search begins where most of the motion is
+ringing. How many modes there are is told by what a fit leaves: two that beat look like one for a few periods only.
 
 If the link never rings alone, it is driven by what nobody measured. Then the spectrum is fitted with that of a mode
-that white noise drives:
+that noise of an unknown colour drives:
 
-    S(f) = A / ((f0^2 - f^2)^2 + (2 zeta f0 f)^2) + B
+    S(f) = A (f/f0)^-s / ((f0^2 - f^2)^2 + (2 zeta f0 f)^2) + B
 
 by the likelihood of its periodogram (Whittle, Arkiv for Matematik 2, 423, 1953), which gives the uncertainties too.
+A spectrum that does not look like this gives no mode.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import least_squares, minimize
 
 from psd_deflection.records import FloatArray
@@ -32,9 +34,9 @@ from psd_deflection.records import FloatArray
 LOWEST, HIGHEST = 0.5, 200.0
 """Hz. Of the modes that are looked for; at most a quarter of the sample rate."""
 PEAK = 25.0
-"""A peak of the spectrum counts if it stands so many times above the level about it."""
+"""A peak of the spectrum counts if it stands so many times above the noise..."""
 STANDS_OUT = 30.0
-"""A further peak stands so many times above the spectrum about it: of steps alone the spectrum ripples too."""
+"""...and a further one so many times above the spectrum about it: of steps alone the spectrum ripples too."""
 MOST_MODES = 3
 WINDOW = 6.0
 """Periods of the first window of a stretch."""
@@ -45,12 +47,24 @@ LOUD = 8.0
 MISFIT = 1.25
 """What a stretch leaves may be so many times the noise..."""
 SHARE = 0.01
-"""...plus this share of the ringing, because no link is linear to the last digit."""
-
+"""...plus this share of the ringing, because no link is linear to the last digit. A smaller mode is none either."""
+SEEDS, GROWN = 30, 3
+"""Windows that are tried as the beginning of a stretch, and of those that fit so many are let grow."""
+APART = (0.01, 0.025, 0.06)
+"""Two modes that look like one may lie so far to either side of it, as a share of its frequency."""
+LEAST_DAMPING, MOST_DAMPING = 1e-6, 0.7
+"""Bounds of the fit. A damping ratio at one of them is no answer."""
+RESCANS = 3
+"""Times that the stretches are sought again if there is a mode more than the search knew."""
 TRIMS = 3
 """Times that the ends of the stretches are cut and the modes fitted again."""
+SLOPE_SD = 1.0
+"""What drives a link has a spectrum that falls as frequency^-s; s before anything is known."""
+ODDS = 1e-3
+"""A spectrum that a driven mode has less often than that is not one of a driven mode."""
 
-Boolean = npt.NDArray[np.bool_]
+Modes = list[tuple[float, float]]
+"""Frequency, Hz, and damping ratio of each."""
 
 
 @dataclass(frozen=True)
@@ -87,24 +101,27 @@ class AxisModes:
 def modes_of(samples: FloatArray, rate: float) -> AxisModes:
     """The modes in ``samples`` (n,), m or rad, NaN if lost, taken ``rate`` times a second."""
     nothing = np.full(len(samples), np.nan)
-    there = np.isfinite(samples)
-    if there.sum() < 100:
+    if np.isfinite(samples).sum() < 100:
         return AxisModes((), 'none', (), nothing, math.nan)
-    noise = _noise(samples)
-    found = _peak(_filled(samples), rate, noise)
-    if found is None:
-        return AxisModes((), 'none', (), nothing, noise)
-    modes = [(found, 0.01)]
-    while len(modes) < MOST_MODES:
-        another = _peak(_filled(samples), rate, noise, [f for f, _ in modes])
+    filled, white = _filled(samples), _noise(samples)
+    peaks: list[float] = []
+    while len(peaks) < MOST_MODES:
+        another = _peak(filled, rate, white, peaks)
         if another is None:
             break
-        modes.append((another, 0.01))
-    stretches = _stretches(samples, rate, modes, noise)
+        peaks.append(another)
+    if not peaks:
+        return AxisModes((), 'none', (), nothing, white)
+    noise = _coloured(filled, rate, peaks)
+    modes = [(f, 0.01) for f in peaks if _stands_above(filled, rate, f, noise)]
+    if not modes:
+        return AxisModes((), 'none', (), nothing, white)
+    level = noise.deviation(modes[0][0] / 3.0, rate)
+    stretches, modes = _stretches(samples, filled, rate, modes, level)
     if stretches:
-        return _rung(samples, rate, modes, stretches, noise)
-    mode = _in_operation(_filled(samples), rate, found)
-    return AxisModes(() if mode is None else (mode,), 'operation' if mode else 'none', (), nothing, noise)
+        return _rung(samples, rate, modes, stretches)
+    mode = _in_operation(filled, rate, modes[0][0])
+    return AxisModes(() if mode is None else (mode,), 'operation' if mode else 'none', (), nothing, white)
 
 
 def _filled(samples: FloatArray) -> FloatArray:
@@ -150,6 +167,58 @@ def _peak(samples: FloatArray, rate: float, noise: float, beside: Sequence[float
     return float(f[at])
 
 
+@dataclass(frozen=True)
+class _Coloured:
+    """Noise of the density ``white`` + ``walk`` / (2 - 2 cos w), one-sided: at least that of an autoregression."""
+
+    white: float
+    walk: float
+
+    def density(self, f: FloatArray, rate: float) -> FloatArray:
+        return self.white + self.walk / np.maximum(2.0 - 2.0 * np.cos(2.0 * np.pi * f / rate), 1e-9)
+
+    def deviation(self, lowest: float, rate: float) -> float:
+        """Standard deviation of a sample, of what lies above ``lowest`` Hz."""
+        f = np.linspace(lowest, 0.5 * rate, 2000)
+        return math.sqrt(float(self.density(f, rate).mean()) * (0.5 * rate - lowest))
+
+
+def _coloured(filled: FloatArray, rate: float, peaks: Sequence[float]) -> _Coloured:
+    """The noise, from the spectrum of the quieter times above the modes that have their ``peaks`` there, Hz.
+
+    A mode falls off faster above its frequency than noise that remembers.
+    """
+    from scipy.optimize import nnls
+    from scipy.signal import stft
+
+    # A window whose side lobes are below the noise of a ringing a thousand times as loud.
+    length = min(len(filled), max(64, round(4.0 * rate / min(peaks))))
+    f, _, z = stft(filled, rate, 'blackmanharris', length, scaling='psd', boundary=None, padded=False)
+    # Of noise a quarter of the squares lie below this share of their mean.
+    p = 2.0 * np.quantile(np.abs(z) ** 2, 0.25, axis=1) / -math.log(0.75)
+    edges = np.geomspace(2.5 * peaks[0], 0.48 * rate, 25)
+    bands = [
+        (at, p[at].mean())
+        for low, high in itertools.pairwise(edges)
+        if (at := (f >= low) & (f < high) & np.all([np.abs(f - k) > 0.4 * k for k in peaks], axis=0)).any()
+    ]
+    if len(bands) < 4 or min(power for _, power in bands) <= 0.0:
+        return _Coloured(float(np.median(p)), 0.0)
+    shapes = [_Coloured(1.0, 0.0).density(f, rate), _Coloured(0.0, 1.0).density(f, rate)]
+    shapes += [1.0 / ((k * k - f * f) ** 2 + 1e-2 * k**4) for k in peaks]
+    matrix = np.array([[shape[at].mean() / power for shape in shapes] for at, power in bands])
+    sizes = np.linalg.norm(matrix, axis=0)
+    found, _ = nnls(matrix / sizes, np.ones(len(bands)))
+    white, walk = (found / sizes)[:2]
+    return _Coloured(float(white), float(walk))
+
+
+def _stands_above(filled: FloatArray, rate: float, frequency: float, noise: _Coloured) -> bool:
+    f, p = _spectrum(filled, rate)
+    floor = noise.density(f[1:], rate) * rate**2 * (2.0 - 2.0 * np.cos(2.0 * np.pi * f[1:] / rate))
+    return bool(np.interp(frequency, f, p) > PEAK * np.interp(frequency, f[1:], floor))
+
+
 def _basis(t: FloatArray, modes: Sequence[tuple[float, float]]) -> FloatArray:
     """Columns (n, 2 + 2 m): 1, t from the middle, and of each mode (Hz, ratio) the damped cosine and sine."""
     columns = [np.ones_like(t), t - 0.5 * t[-1]]
@@ -165,7 +234,7 @@ class _Stretch:
     """Samples first to last (not included) of a stretch; lost ones are left out."""
 
     def __init__(self, samples: FloatArray, first: int, last: int, rate: float) -> None:
-        self.first, self.last = first, last
+        self.first, self.last, self.rate = first, last, rate
         there = np.isfinite(samples[first:last])
         self.t: FloatArray = np.flatnonzero(there) / np.float64(rate)
         self.y = samples[first:last][there]
@@ -180,137 +249,276 @@ class _Stretch:
         left: FloatArray = self.y - basis @ terms
         return left, np.asarray(terms, dtype=np.float64)
 
+    def loud(self, modes: Modes) -> float:
+        """The amplitude of the loudest mode at the start."""
+        terms = self.solved(modes)[1]
+        return max(math.hypot(*terms[2 + 2 * i : 4 + 2 * i]) for i in range(len(modes)))
 
-def _fit(
-    stretches: Sequence[_Stretch], start: Sequence[tuple[float, float]]
-) -> tuple[list[tuple[float, float]], FloatArray, FloatArray]:
-    """Modes, what they leave, and the covariance of (frequency, damping, ...) for a unit of variance left."""
 
+class _Fit(NamedTuple):
+    """``modes``, what they leave, and the covariance of (frequency, damping, ...) for a unit of variance left."""
+
+    modes: Modes
+    left: FloatArray
+    covariance: FloatArray
+
+    @property
+    def deviation(self) -> float:
+        return _rms(self.left)
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a damping ratio is at its bound."""
+        return any(not 10.0 * LEAST_DAMPING < z < 0.99 * MOST_DAMPING for _, z in self.modes)
+
+
+def _rms(values: FloatArray) -> float:
+    return math.sqrt(float(np.mean(values * values))) if len(values) else 0.0
+
+
+def _fit(stretches: Sequence[_Stretch], start: Modes, steps: int = 100) -> _Fit:
     def left(x: FloatArray) -> FloatArray:
         modes = [(float(f), float(z)) for f, z in x.reshape(-1, 2)]
         return np.concatenate([s.solved(modes)[0] for s in stretches])
 
     x0 = np.array(start, dtype=np.float64).ravel()
     scale = np.column_stack([x0[0::2], np.full(len(start), 0.01)]).ravel()
-    size = max(float(np.sqrt(np.mean(left(x0) ** 2))), 1e-300)
-    low = np.column_stack([0.7 * x0[0::2], np.full(len(start), 1e-6)]).ravel()
-    high = np.column_stack([1.4 * x0[0::2], np.full(len(start), 0.7)]).ravel()
+    size = max(_rms(left(x0)), 1e-300)
+    low = np.column_stack([0.7 * x0[0::2], np.full(len(start), LEAST_DAMPING)]).ravel()
+    high = np.column_stack([1.4 * x0[0::2], np.full(len(start), MOST_DAMPING)]).ravel()
 
     def scaled(x: FloatArray) -> FloatArray:
         return left(x) / size
 
     x0 = np.clip(x0, low * 1.001, high * 0.999)
-    found = least_squares(scaled, x0, x_scale=scale, bounds=(low, high), xtol=1e-13)
+    found = least_squares(scaled, x0, x_scale=scale, bounds=(low, high), xtol=1e-13, max_nfev=steps)
     jacobian = np.asarray(found.jac, dtype=np.float64) * size
     covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
-    return [(float(f), float(z)) for f, z in found.x.reshape(-1, 2)], left(found.x), covariance
+    return _Fit([(float(f), float(z)) for f, z in found.x.reshape(-1, 2)], left(found.x), covariance)
 
 
-def _stretches(samples: FloatArray, rate: float, modes: list[tuple[float, float]], noise: float) -> list[_Stretch]:
-    """Where the link rings alone. ``modes`` is refined on the way.
+def _split(stretches: Sequence[_Stretch], modes: Modes) -> _Fit:
+    """The best fit with one more mode close to one of ``modes``."""
+    starts = [
+        [*modes[:i], (f * (1.0 - apart), z), (f * (1.0 + apart), z), *modes[i + 1 :]]
+        for i, (f, z) in enumerate(modes)
+        for apart in APART
+    ]
+    best = min((_fit(stretches, start, 25) for start in starts), key=lambda fit: fit.deviation)
+    return _fit(stretches, best.modes)
+
+
+def _hints(stretches: Sequence[_Stretch], fit: _Fit, enough: float) -> bool:
+    """Whether modes to both sides of one of ``fit`` would take ``enough`` off the squares that are left."""
+    for f, z in fit.modes:
+        for apart in APART:
+            pair = [(f * (1.0 - apart), max(z, 0.01)), (f * (1.0 + apart), max(z, 0.01))]
+            left = np.concatenate([s.solved([*fit.modes, *pair])[0] for s in stretches])
+            if float(fit.left @ fit.left - left @ left) > enough:
+                return True
+    return False
+
+
+def _ringing(filled: FloatArray, rate: float, modes: Modes, starts: Sequence[int], window: int) -> FloatArray:
+    """(k,): how much louder the ringing is in the window from each of ``starts`` than all else, but steady motion.
+
+    Linear in frequency and damping about ``modes``, which need not be known well.
+    """
+    t = np.arange(window) / np.float64(rate)
+    columns = [_basis(t, [(f, z)])[:, 2:] for f, _ in modes for z in (0.003, 0.02, 0.06)]
+    ringing = np.hstack([*columns, *(t[:, None] * c for c in columns)])
+    steady = np.linalg.qr(_basis(t, []))[0]
+    ringing -= steady @ (steady.T @ ringing)
+    u, sizes, _ = np.linalg.svd(ringing / np.linalg.norm(ringing, axis=0), full_matrices=False)
+    u = u[:, sizes > 1e-6 * sizes[0]]
+    out = np.empty((len(starts), 2))
+    for i, first in enumerate(starts):
+        y = filled[first : first + window] - filled[first]
+        y = y - steady @ (steady.T @ y)
+        out[i] = math.sqrt(2.0) * _rms(y), _rms(y - u @ (u.T @ y))
+    return out
+
+
+def _seeds(
+    samples: FloatArray, filled: FloatArray, rate: float, modes: Modes, level: float, window: int, hop: int
+) -> list[_Stretch]:
+    """Windows in which most of the motion is ringing, the clearest first; none overlaps another by half."""
+    starts = range(0, len(samples) - window, hop)
+    loud, rest = _ringing(filled, rate, modes, starts, window).T
+    out: list[_Stretch] = []
+    for i in np.argsort(-loud / (rest + level)):
+        if len(out) == SEEDS:
+            break
+        stretch = _Stretch(samples, starts[i], starts[i] + window, rate)
+        apart = all(abs(s.first - stretch.first) >= window // 2 for s in out)
+        if apart and loud[i] > LOUD * level and len(stretch.y) >= 0.8 * window:
+            out.append(stretch)
+    return out
+
+
+def _ends_well(stretch: _Stretch, left: FloatArray, window: int, level: float, early: bool = False) -> bool:
+    """Whether the last half of a window fits by itself too, or the first: a small blow would be lost in the mean."""
+    half = 0.5 * window / stretch.rate
+    end = stretch.t < stretch.t[0] + half if early else stretch.t > stretch.t[-1] - half
+    return _rms(left[end]) < 1.5 * MISFIT * level + SHARE * float(np.ptp(stretch.y[end]))
+
+
+def _grown(samples: FloatArray, seed: _Stretch, start: _Fit, window: int, level: float) -> tuple[_Stretch, _Fit]:
+    """``seed`` made longer, forward and then back to louder times, as long as the modes fit.
+
+    If two that looked like one come apart, with both.
+    """
+    stretch, fit = seed, start
+    for early in (False, True):
+        while True:
+            step = max(window // 2, (stretch.last - stretch.first) // 3)
+            ends = (stretch.first - step, stretch.last) if early else (stretch.first, stretch.last + step)
+            if ends[0] < 0 or ends[1] > len(samples):
+                break
+            longer = _Stretch(samples, *ends, stretch.rate)
+            tried = _fit([longer], fit.modes)
+            if not _good(longer, tried, level) or not _ends_well(longer, tried.left, window, level, early):
+                worth = 0.25 * float(tried.left @ tried.left)
+                if len(fit.modes) == MOST_MODES or not _hints([longer], tried, worth):
+                    break
+                tried = _split([longer], fit.modes)
+                if not _good(longer, tried, level) or not _ends_well(longer, tried.left, window, level, early):
+                    break
+            stretch, fit = longer, tried
+    return stretch, fit
+
+
+def _good(stretch: _Stretch, fit: _Fit, level: float) -> bool:
+    loud = stretch.loud(fit.modes)
+    swing = float(np.ptp(stretch.y))
+    return not fit.bounded and fit.deviation < MISFIT * level + 0.3 * SHARE * swing and loud > LOUD * level
+
+
+def _stretches(
+    samples: FloatArray, filled: FloatArray, rate: float, modes: Modes, level: float
+) -> tuple[list[_Stretch], Modes]:
+    """Where the link rings alone, and the modes by the longest of these.
 
     A window moves over the recording. Where it fits, it grows until it does not fit any more, so that a stretch
     ends before the next blow.
     """
     period = rate / modes[0][0]
     window, hop = round(WINDOW * period), max(1, round(0.5 * period))
-    least = round(SHORTEST * period)
+    seeds = _seeds(samples, filled, rate, modes, level, window, hop)
+    tried = ((s, _fit([s], modes)) for s in seeds)
+    good = list(itertools.islice(((s, fit) for s, fit in tried if _good(s, fit, level)), GROWN))
+    if not good:
+        tried = ((s, _split([s], modes)) for s in seeds[: SEEDS // 3])
+        good = list(itertools.islice(((s, fit) for s, fit in tried if _good(s, fit, level)), GROWN))
+    if not good:
+        return [], modes
+    grown = [_grown(samples, s, fit, window, level) for s, fit in good]
+    _, best = max(grown, key=lambda g: g[0].last - g[0].first)
+    level = max(level, best.deviation)
+    return _scanned(samples, rate, best.modes, level, window, hop), best.modes
 
-    def fits(stretch: _Stretch, tried: Sequence[tuple[float, float]]) -> tuple[bool, float]:
+
+def _scanned(samples: FloatArray, rate: float, modes: Modes, level: float, window: int, hop: int) -> list[_Stretch]:
+    def fits(stretch: _Stretch) -> bool:
         if len(stretch.y) < 0.5 * (stretch.last - stretch.first) or len(stretch.y) < 12:
-            return False, 0.0
-        left, terms = stretch.solved(tried)
-        loud = max(math.hypot(*terms[2 + 2 * i : 4 + 2 * i]) for i in range(len(tried)))
-        allowed = MISFIT * noise + SHARE * loud * math.exp(-tried[0][1] * 2.0 * math.pi * WINDOW / 2.0)
-        return float(np.sqrt(np.mean(left * left))) < allowed and loud > LOUD * noise, loud
+            return False
+        left, _ = stretch.solved(modes)
+        loud = stretch.loud(modes)
+        allowed = MISFIT * level + SHARE * loud * math.exp(-modes[0][1] * 2.0 * math.pi * WINDOW / 2.0)
+        return _rms(left) < allowed and loud > LOUD * level and _ends_well(stretch, left, window, level)
 
-    # The loudest windows first: they tell the modes best. In each the modes are fitted anew.
-    starts = range(0, len(samples) - window, hop)
-    swing = np.array(
-        [
-            np.nanmax(samples[i : i + window], initial=-np.inf) - np.nanmin(samples[i : i + window], initial=np.inf)
-            for i in starts
-        ]
-    )
-    for i in np.argsort(-swing)[:40]:
-        stretch = _Stretch(samples, starts[i], starts[i] + window, rate)
-        if len(stretch.y) < 0.8 * window:
-            continue
-        tried, left, _ = _fit([stretch], modes)
-        loud = float(np.ptp(stretch.y))
-        if float(np.sqrt(np.mean(left * left))) < MISFIT * noise + SHARE * 0.3 * loud and loud > LOUD * noise:
-            modes[:] = tried
-            break
-    else:
-        return []
     found: list[_Stretch] = []
     at = 0
     while at + window < len(samples):
         stretch = _Stretch(samples, at, at + window, rate)
-        good, _ = fits(stretch, modes)
-        if not good:
+        if not fits(stretch):
             at += hop
             continue
         while stretch.last + window // 2 <= len(samples):
             longer = _Stretch(samples, at, stretch.last + window // 2, rate)
-            end = _Stretch(samples, longer.last - window // 2, longer.last, rate)
-            good, _ = fits(longer, modes)
-            left = longer.solved(modes)[0][-len(end.y) :] if len(end.y) else np.zeros(0)
-            # The tail by itself too: a small blow late in a long stretch would be lost in the mean.
-            if not good or (
-                len(left) and float(np.sqrt(np.mean(left * left))) > 1.5 * MISFIT * noise + SHARE * float(np.ptp(end.y))
-            ):
+            if not fits(longer):
                 break
             stretch = longer
-        if stretch.last - stretch.first >= least:
-            found.append(stretch)
+        found.append(stretch)
         at = stretch.last
     return found
 
 
-def _rung(
-    samples: FloatArray, rate: float, start: list[tuple[float, float]], stretches: list[_Stretch], noise: float
-) -> AxisModes:
-    modes, left, covariance = _fit(stretches, start)
-    for _ in range(TRIMS):
-        kept = [k for k in (_trimmed(s, samples, rate, modes) for s in stretches) if k is not None]
-        if not kept:
-            break
-        stretches = kept
-        modes, left, covariance = _fit(stretches, modes)
-    while len(modes) > 1:
-        # A mode without which the fit is as good is none; the loudest stays.
-        fewer = [[m for k, m in enumerate(modes) if k != i] for i in range(1, len(modes))]
-        without = [_fit(stretches, some) for some in fewer]
-        worth = [len(left) * math.log(float(r @ r) / float(left @ left)) for _, r, _ in without]
-        least = int(np.argmin(worth))
-        if worth[least] > 30.0 + 4.0 * len(stretches):
-            break
-        modes, left, covariance = without[least]
-    free = max(len(left) - sum(2 + 2 * len(modes) for _ in stretches) - 2 * len(modes), 1)
-    variance = float(left @ left) / free
+def _rung(samples: FloatArray, rate: float, start: Modes, stretches: list[_Stretch]) -> AxisModes:
+    stretches, fit = _settled(samples, rate, stretches, start)
+    if len(fit.modes) > len(start):
+        # With the mode that was missing the stretches are longer.
+        period = rate / fit.modes[0][0]
+        window, hop = round(WINDOW * period), max(1, round(0.5 * period))
+        for _ in range(RESCANS):
+            again = _scanned(samples, rate, fit.modes, fit.deviation, window, hop)
+            if sum(s.last - s.first for s in again) <= sum(s.last - s.first for s in stretches):
+                break
+            stretches, fit = _settled(samples, rate, again, fit.modes)
+
     fitted = np.full(len(samples), np.nan)
-    sizes = np.zeros(len(modes))
+    if fit.bounded:
+        return AxisModes((), 'none', (), fitted, fit.deviation)
+    sizes = _sizes(stretches, fit.modes)
     for stretch in stretches:
         t = np.arange(stretch.last - stretch.first) / np.float64(rate)
-        _, terms = stretch.solved(modes)
-        fitted[stretch.first : stretch.last] = _basis(t, modes) @ terms
-        sizes = np.maximum(sizes, [math.hypot(*terms[2 + 2 * i : 4 + 2 * i]) for i in range(len(modes))])
+        fitted[stretch.first : stretch.last] = _basis(t, fit.modes) @ stretch.solved(fit.modes)[1]
     out = []
-    for i, (frequency, damping) in enumerate(modes):
+    for i, (frequency, damping) in enumerate(fit.modes):
         # What is left need not be white: what counts is its density at the mode.
-        coloured = variance * _colour(left, rate, frequency)
-        out.append(
-            Mode(
-                frequency,
-                math.sqrt(coloured * covariance[2 * i, 2 * i]),
-                damping,
-                math.sqrt(coloured * covariance[2 * i + 1, 2 * i + 1]),
-                float(sizes[i]),
-            )
-        )
+        variance = _variance_at(fit, stretches, rate, frequency)
+        by_frequency, by_damping = (math.sqrt(variance * fit.covariance[k, k]) for k in (2 * i, 2 * i + 1))
+        out.append(Mode(frequency, by_frequency, damping, by_damping, float(sizes[i])))
     out.sort(key=lambda m: -m.amplitude)
-    return AxisModes(tuple(out), 'ring-down', tuple((s.first, s.last) for s in stretches), fitted, noise)
+    places = tuple((s.first, s.last) for s in stretches)
+    return AxisModes(tuple(out), 'ring-down', places, fitted, fit.deviation)
+
+
+def _settled(samples: FloatArray, rate: float, stretches: list[_Stretch], start: Modes) -> tuple[list[_Stretch], _Fit]:
+    """The stretches without their bad ends, and the fit to them with as many modes as it needs."""
+    fit = _fit(stretches, start)
+    for _ in range(TRIMS):
+        kept = [k for k in (_trimmed(s, samples, rate, fit.modes) for s in stretches) if k is not None]
+        if not kept or [(s.first, s.last) for s in kept] == [(s.first, s.last) for s in stretches]:
+            break
+        stretches = kept
+        fit = _fit(stretches, fit.modes)
+    return stretches, _of_right_order(stretches, fit, rate)
+
+
+def _sizes(stretches: Sequence[_Stretch], modes: Modes) -> FloatArray:
+    """Largest amplitude of each mode at the start of a stretch."""
+    terms = np.array([s.solved(modes)[1][2:] for s in stretches]).reshape(len(stretches), -1, 2)
+    return np.asarray(np.hypot(terms[..., 0], terms[..., 1]).max(axis=0))
+
+
+def _of_right_order(stretches: Sequence[_Stretch], fit: _Fit, rate: float) -> _Fit:
+    """With another mode as long as what is left asks for it; without those that make no difference."""
+
+    odds = 30.0 + 4.0 * len(stretches)
+
+    def needs(more: _Fit, fewer: _Fit, frequency: float) -> bool:
+        saved = float(fewer.left @ fewer.left - more.left @ more.left)
+        return saved > odds * _variance_at(more, stretches, rate, frequency)
+
+    while len(fit.modes) > 1:
+        # The loudest stays.
+        loudest = int(np.argmax(_sizes(stretches, fit.modes)))
+        others = [i for i in range(len(fit.modes)) if i != loudest]
+        without = [_fit(stretches, [m for k, m in enumerate(fit.modes) if k != i]) for i in others]
+        least = int(np.argmin([w.deviation for w in without]))
+        if needs(fit, without[least], fit.modes[others[least]][0]):
+            break
+        fit = without[least]
+    while len(fit.modes) < MOST_MODES and _hints(
+        stretches, fit, 0.3 * odds * _variance_at(fit, stretches, rate, fit.modes[0][0])
+    ):
+        more = _split(stretches, fit.modes)
+        sizes = _sizes(stretches, more.modes)
+        if more.bounded or sizes.min() < SHARE * sizes.max() or not needs(more, fit, fit.modes[0][0]):
+            break
+        fit = more
+    return fit
 
 
 def _trimmed(
@@ -323,12 +531,15 @@ def _trimmed(
     period = rate / modes[0][0]
     piece = max(4, round(0.25 * period))
     left, _ = stretch.solved(modes)
+    # Noise that remembers has fewer samples than it seems.
+    memory = min(max(float(left[1:] @ left[:-1]) / float(left @ left), 0.0), 0.95)
+    worth = max(piece * (1.0 - memory) / (1.0 + memory), 1.0)
     at = np.rint(stretch.t * rate).astype(np.int64) // piece
     count = np.bincount(at)
     scatter = np.sqrt(np.bincount(at, left * left) / np.maximum(count, 1))
     usual = float(np.median(scatter[count > 0]))
-    # Of a piece of n samples the scatter itself scatters by 1/sqrt(2 n).
-    bad = (scatter > usual * (1.0 + 4.0 / math.sqrt(2.0 * piece))) & (count > 0)
+    # Of a piece worth n samples the scatter itself scatters by 1/sqrt(2 n).
+    bad = (scatter > usual * (1.0 + 4.0 / math.sqrt(2.0 * worth))) & (count > 0)
     middle = len(scatter) // 2
     before, after = np.flatnonzero(bad[:middle]), np.flatnonzero(bad[middle:])
     first = stretch.first + (int(before[-1]) + 1) * piece if len(before) else stretch.first
@@ -338,13 +549,25 @@ def _trimmed(
     return _Stretch(samples, first, last, rate)
 
 
-def _colour(left: FloatArray, rate: float, frequency: float) -> float:
-    """Power density of ``left`` about ``frequency`` over its mean; at least 1."""
+def _variance_of(fit: _Fit, stretches: Sequence[_Stretch]) -> float:
+    """Of what is left, for the freedom that it has."""
+    taken = sum(2 + 2 * len(fit.modes) for _ in stretches) + 2 * len(fit.modes)
+    return float(fit.left @ fit.left) / max(len(fit.left) - taken, 1)
+
+
+def _variance_at(fit: _Fit, stretches: Sequence[_Stretch], rate: float, frequency: float) -> float:
+    """Variance of white noise with the density that what is left has about ``frequency``.
+
+    At least the variance of what is left. The modes have taken away their part of it, there and in all.
+    """
     from scipy.signal import periodogram
 
-    f, p = periodogram(left, rate)
-    near = np.abs(f - frequency) < max(0.15 * frequency, 5.0 * rate / len(left))
-    return max(1.0, float(p[near].mean() / p[1:].mean()))
+    f, p = periodogram(fit.left, rate)
+    near = np.abs(f - frequency) < max(0.3 * frequency, 5.0 * rate / len(fit.left))
+    close = sum(abs(k - frequency) < 0.3 * frequency for k, _ in fit.modes)
+    free = 2 * int(near.sum()) - 2 * close * (len(stretches) + 1)
+    share = 2 * int(near.sum()) / max(free, 2)
+    return max(_variance_of(fit, stretches), float(p[near].mean()) * 0.5 * rate * share)
 
 
 def _in_operation(samples: FloatArray, rate: float, frequency: float) -> Mode | None:
@@ -360,31 +583,50 @@ def _in_operation(samples: FloatArray, rate: float, frequency: float) -> Mode | 
     top = float(np.max(p))
 
     def density(x: FloatArray) -> FloatArray:
-        a, f0, zeta, b = np.exp(x)
-        out: FloatArray = a / ((f0**2 - f**2) ** 2 + (2.0 * zeta * f0 * f) ** 2) + b
+        a, f0, zeta, b = np.exp(x[:4])
+        out: FloatArray = a * (f / f0) ** -x[4] / ((f0**2 - f**2) ** 2 + (2.0 * zeta * f0 * f) ** 2) + b
         return out
 
     def loss(x: FloatArray) -> float:
         s = density(x)
-        return float(np.sum(np.log(s) + p / s))
+        return float(np.sum(np.log(s) + p / s)) + 0.5 * float(x[4] / SLOPE_SD) ** 2
 
     best = None
     for zeta in (0.005, 0.02, 0.08):
-        start = np.log([top * 4.0 * zeta**2 * frequency**4 * 0.3, frequency, zeta, float(np.median(p)) * 0.1 + 1e-30])
-        tried = minimize(loss, start, method='Nelder-Mead', options={'maxiter': 4000, 'xatol': 1e-6, 'fatol': 1e-6})
+        sizes = [top * 4.0 * zeta**2 * frequency**4 * 0.3, frequency, zeta, float(np.median(p)) * 0.1 + 1e-30]
+        start = np.array([*np.log(sizes), 0.0])
+        tried = minimize(
+            loss,
+            start,
+            method='Nelder-Mead',
+            options={'maxiter': 6000, 'maxfev': 6000, 'xatol': 1e-6, 'fatol': 1e-6},
+        )
         if best is None or tried.fun < best.fun:
             best = tried
-    if best is None:
+    if best is None or not _scatters_as_it_should(p / density(best.x)):
         return None
-    _, f0, zeta, _ = (float(v) for v in np.exp(best.x))
-    if not 0.7 * frequency < f0 < 1.4 * frequency or not zeta < 0.5:
+    a, f0, zeta, _ = (float(v) for v in np.exp(best.x[:4]))
+    if not 0.7 * frequency < f0 < 1.4 * frequency or not 10.0 * LEAST_DAMPING < zeta < 0.5:
         return None
     information = _information(density, best.x)
+    information[4, 4] += SLOPE_SD**-2
     covariance = np.linalg.pinv(information)
-    a = float(np.exp(best.x[0]))
     # The area under the mode's density.
     rms = math.sqrt(a * math.pi / (4.0 * zeta * f0**3))
     return Mode(f0, f0 * math.sqrt(covariance[1, 1]), zeta, zeta * math.sqrt(covariance[2, 2]), rms)
+
+
+def _scatters_as_it_should(ratios: FloatArray) -> bool:
+    """Whether ``ratios`` (n,) of a periodogram to a density are as the right one leaves them: exponential, mean 1."""
+    from scipy.stats import gamma
+
+    worst = 1.0
+    for length in (4, max(len(ratios) // 8, 5)):
+        parts = np.array_split(ratios, max(len(ratios) // length, 1))
+        for part in parts:
+            below = float(gamma.cdf(part.sum(), len(part)))
+            worst = min(worst, 2.0 * len(parts) * min(below, 1.0 - below))
+    return worst > 0.5 * ODDS
 
 
 def _information(density: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:

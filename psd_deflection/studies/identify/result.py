@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,8 +16,17 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import with_values
 from psd_deflection.studies.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.modes import AxisModes
+from psd_deflection.studies.identify.modes import AxisModes, Mode
 from psd_deflection.studies.study import PageSection, StudyResult, described, edited_rig_file, named
+
+KINDS = {'bending': (0, 1), 'torsion': (2,)}
+"""Modes of the rig file, and the axes that show them."""
+CLOSE = 0.3
+"""Modes within this share of the loudest one's frequency are close to it: neither rings alone."""
+AGREE = 0.005
+"""X and Y agree within this share of the frequency."""
+KNOWN = (0.01, 0.34)
+"""Standard deviations of frequency and damping ratio, as shares, beyond which the rig file keeps what it has."""
 
 
 @dataclass(frozen=True)
@@ -42,22 +51,46 @@ class Identified(StudyResult):
 
     @property
     def values(self) -> dict[str, float]:
-        """Parameters of the rig file. Bending is the surer of X and Y, for which the file has one value."""
+        """Parameters of the rig file. Bending is the surer of X and Y, for which the file has one value.
+
+        None of a mode that is not known well, that has another close to it, or that X and Y do not agree on.
+        """
         out: dict[str, float] = {}
-        bending = [m for a in self.axes[:2] for m in a.modes[:1]]
-        for name, modes in (('bending', bending), ('torsion', list(self.axes[2].modes[:1]))):
-            if modes:
+        for name, axes in KINDS.items():
+            modes = [self.axes[i].modes[0] for i in axes if self.axes[i].modes]
+            if modes and self._withheld(name) is None:
                 best = min(modes, key=lambda m: m.frequency_sd / m.frequency)
                 out[f'dynamics.{name}_frequency'] = float(f'{best.frequency:.8g}')
                 out[f'dynamics.{name}_damping_ratio'] = float(f'{best.damping:.6g}')
         return out
 
-    def shaper_of(self, axis: int) -> Shaper | None:
-        """The shaper that is recommended for the loudest mode of an axis; None if it has none."""
-        if not self.axes[axis].modes:
+    def _withheld(self, name: str) -> str | None:
+        """Why the rig file does not get the mode of this kind; None if it does, or if none was found."""
+        found = [self.axes[i].modes for i in KINDS[name] if self.axes[i].modes]
+        if not found:
             return None
-        mode = self.axes[axis].modes[0]
-        return recommended(mode.frequency, mode.frequency_sd, mode.damping)
+        if any(len(_close(modes)) > 1 for modes in found):
+            return 'two modes close to each other, and the rig file describes one'
+        first = [modes[0] for modes in found]
+        apart = abs(first[0].frequency - first[-1].frequency)
+        if apart > max(3.0 * math.hypot(first[0].frequency_sd, first[-1].frequency_sd), AGREE * first[0].frequency):
+            return f'{SYMBOLS[0]} and {SYMBOLS[1]} ring at different frequencies, and the rig file has one for both'
+        best = min(first, key=lambda m: m.frequency_sd / m.frequency)
+        if best.frequency_sd >= KNOWN[0] * best.frequency or best.damping_sd >= KNOWN[1] * best.damping:
+            return 'not known well enough; knock on the link, or release a load'
+        return None
+
+    def shaper_of(self, axis: int) -> Shaper | None:
+        """The shaper that is recommended for the loudest mode of an axis; None if there is none, or not known well.
+
+        Of modes close to each other it works for all.
+        """
+        modes = _close(self.axes[axis].modes)
+        if not modes or min(m.damping / m.damping_sd if m.damping_sd else 0.0 for m in modes) < 1.0 / KNOWN[1]:
+            return None
+        low, high = min(m.frequency for m in modes), max(m.frequency for m in modes)
+        sd = max(m.frequency_sd for m in modes)
+        return recommended(0.5 * (low + high), sd + (high - low) / 6.0, modes[0].damping)
 
     @property
     def sources(self) -> dict[str, str]:
@@ -82,6 +115,10 @@ class Identified(StudyResult):
             if best is not None:
                 pairs = ', '.join(f'{s:.4f} at {1e3 * t:.1f} ms' for t, s in zip(best.times, best.sizes, strict=True))
                 out.append(f'{SYMBOLS[i]}: input shaper {best.name.upper()}: {pairs}')
+        for name in KINDS:
+            why = self._withheld(name)
+            if why is not None:
+                out.append(f'Nothing for dynamics.{name}_*: {why}.')
         return out
 
     def lines(self) -> list[str]:
@@ -140,6 +177,11 @@ class Identified(StudyResult):
     def files(self) -> dict[str, str]:
         """The page, the JSON, and ``rig.yaml`` with the modes in it."""
         return {**super().files(), 'rig.yaml': self.rig_yaml()}
+
+
+def _close(modes: Sequence[Mode]) -> list[Mode]:
+    """The loudest mode and those that are close to it; empty if there is none."""
+    return [m for m in modes if abs(m.frequency - modes[0].frequency) < CLOSE * modes[0].frequency]
 
 
 def _pm(value: float, sd: float) -> str:

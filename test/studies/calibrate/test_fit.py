@@ -1,0 +1,37 @@
+"""The fit's own pieces against a minimiser that is not ours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+from blind import misaligned
+from psd_deflection.model.misalignment.rig import vector_of_rig
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import rig_from_values
+from psd_deflection.studies.calibrate.fit import pose_of_readings
+
+
+def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
+    """The pose has the least sum of squares, each reading over its own variance: no other pose is as likely."""
+    rig = rig_from_values({})
+    p, length = vector_of_rig(rig).values, rig.link.length
+    rng = np.random.default_rng(2)
+    true = rng.uniform(-1.0, 1.0, (3, 3)) * (1e-3, 1e-3, 5e-3)
+    sd = np.array([2e-6, 20e-6, 8e-6, 1e-6]) * rng.uniform(0.5, 2.0, (3, 4))
+    dots = misaligned.dots(misaligned.nominal(), true) + sd * rng.normal(size=sd.shape)
+    found = pose_of_readings(dots, sd**2, p, length)
+
+    def misfit(pose: FloatArray, row: int) -> float:
+        left = (dots[row] - misaligned.dots(misaligned.nominal(), pose[None])[0]) / sd[row]
+        return float(left @ left)
+
+    for row, pose in enumerate(found):
+
+        def of(x: FloatArray, pose: FloatArray = pose, row: int = row) -> float:
+            return misfit(pose + x * (1e-6, 1e-6, 1e-5), row)
+
+        best = minimize(of, np.zeros(3), method='Nelder-Mead', options={'xatol': 1e-4, 'fatol': 1e-9})
+        np.testing.assert_allclose(best.x, 0.0, atol=0.02)
+        assert misfit(pose, row) == pytest.approx(best.fun, abs=1e-3)

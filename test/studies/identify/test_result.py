@@ -1,0 +1,95 @@
+"""What of the modes reaches the rig file and the shaper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blind.modes import RATE, Link, driven, rung
+from psd_deflection.cli.main import main
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.identify.from_recordings import IdentifyProblem
+from psd_deflection.studies.identify.identify import identify
+from psd_deflection.studies.identify.modes import AxisModes, Mode
+from psd_deflection.studies.identify.result import Identified
+from psd_deflection.studies.study import Opened, opened
+
+
+@pytest.fixture(scope='module')
+def source(tmp_path_factory: pytest.TempPathFactory) -> Opened:
+    """A recording for the answer to be of; its samples are not used."""
+    path = tmp_path_factory.mktemp('run') / 'run.csv'
+    assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:0.1']) == 0
+    with pytest.warns(UserWarning, match='nominal rig'):
+        return opened(path)
+
+
+def found(source: Opened, *axes: tuple[Mode, ...]) -> Identified:
+    nothing = np.full(3, np.nan)
+    three = [AxisModes(modes, 'ring-down' if modes else 'none', ((0, 3),), nothing, 1e-6) for modes in axes]
+    return Identified(IdentifyProblem(source, np.zeros((3, 3)), RATE), (three[0], three[1], three[2]))
+
+
+def mode(frequency: float, damping: float = 0.02, *, sd: float = 1e-4, damping_sd: float = 1e-4) -> Mode:
+    return Mode(frequency, sd, damping, damping_sd, 1e-3)
+
+
+def test_modes_known_well_reach_the_rig_file(source: Opened) -> None:
+    answer = found(source, (mode(14.001, sd=1e-3),), (mode(14.0, 0.021),), (mode(21.0), mode(40.0)))
+    assert answer.values == {
+        'dynamics.bending_frequency': 14.0,
+        'dynamics.bending_damping_ratio': 0.021,
+        'dynamics.torsion_frequency': 21.0,
+        'dynamics.torsion_damping_ratio': 0.02,
+    }
+    assert not any('Nothing for' in line for line in answer.lines())
+
+
+@pytest.mark.parametrize(
+    ('x', 'y', 'why'),
+    [
+        ((mode(14.0), mode(14.7)), (mode(14.0),), 'two modes close to each other'),
+        ((mode(14.0),), (mode(14.7),), 'different frequencies'),
+        ((mode(14.0, 0.0033, damping_sd=0.0016),), (), 'not known well enough'),
+        ((), (mode(14.0, sd=0.2),), 'not known well enough'),
+    ],
+)
+def test_doubtful_modes_do_not(source: Opened, x: tuple[Mode, ...], y: tuple[Mode, ...], why: str) -> None:
+    answer = found(source, x, y, (mode(21.0),))
+    assert set(answer.values) == {'dynamics.torsion_frequency', 'dynamics.torsion_damping_ratio'}
+    (said,) = [line for line in answer.sentences() if 'Nothing for' in line]
+    assert said.startswith('Nothing for dynamics.bending_*: ')
+    assert why in said
+    text = answer.rig_yaml()
+    assert 'torsion_frequency: 21.0' in text
+    assert 'bending_frequency: 14.0' in found(source, (mode(14.0),), (), ()).rig_yaml()
+
+
+def test_the_shaper_of_two_close_modes_works_for_both(source: Opened) -> None:
+    shaper = found(source, (mode(14.0), mode(15.4)), (), ()).shaper_of(0)
+    assert shaper is not None
+    assert float(shaper.residual(np.array([14.0, 14.7, 15.4]), 0.02).max()) <= 0.05
+    # One mode far off is none of its business.
+    alone, beside = (found(source, modes, (), ()).shaper_of(0) for modes in ((mode(14.0),), (mode(14.0), mode(40.0))))
+    assert alone == beside
+
+
+def test_a_damping_ratio_that_may_be_anything_has_no_shaper(source: Opened) -> None:
+    answer = found(source, (mode(14.0, 0.02, damping_sd=0.01),), (), ())
+    assert answer.shaper_of(0) is None
+    assert answer.tree()['axes']['dx']['shaper'] is None
+
+
+def test_turned_bending_planes_leave_the_rig_file_alone(source: Opened) -> None:
+    """Both axes ring with both modes."""
+    link = Link(((14.0, 0.02, 0.5), (14.7, 0.02, 0.5)))
+    x, y = (rung(link, np.random.default_rng(seed), 8.0, 2) for seed in (1, 2))
+    twist = driven(Link(((21.0, 0.02, 1.0),)), np.random.default_rng(3), 8.0)
+    poses: FloatArray = np.column_stack((x, y, twist))
+    answer = identify(IdentifyProblem(source, poses, RATE))
+    assert [len(a.modes) for a in answer.axes[:2]] == [2, 2]
+    assert not any(name.startswith('dynamics.bending') for name in answer.values)
+
+
+def test_a_damping_ratio_of_nothing_is_no_answer(source: Opened) -> None:
+    assert found(source, (mode(14.0, 0.0, damping_sd=0.0),), (), ()).values == {}
