@@ -73,7 +73,8 @@ from psd_deflection.ros.compensator import CompensatorNode
 told = CompensatorNode.health
 def health(self):
     if Path(sys.argv[1]).exists():
-        Path(sys.argv[1]).write_text(repr(time.time()))
+        if not Path(sys.argv[1]).read_text():
+            Path(sys.argv[1]).write_text(repr(time.time()))
         raise RuntimeError('an error of its own')
     return told(self)
 CompensatorNode.health = health
@@ -433,7 +434,7 @@ class Campaign:
         if name == 'an error of its own':
             largest = float(np.abs(plant.offsets[-1]).max())
             self._flag.touch()
-            self.compensator.wait()
+            self.spin(lambda: self.compensator.process.poll() is not None, LONGEST_S, 'its end')
             self.spin(lambda: not np.any(plant.offsets[-1]), 1.0)
             failed = float(self._flag.read_text())
             self._flag.unlink()
