@@ -32,6 +32,7 @@ UNBOUNDED = {
 GROWS = {'append', 'appendleft', 'add', 'setdefault', 'extend', 'update', 'put', 'put_nowait', 'insert'}
 
 BOUNDED_BY = {
+    'arms/inputs.py:_told': 'LONGEST_LIST',
     'camera/lens.py:_grids': 'one size of image a camera',
     'camera/reference.py:_waiting': 'decides after 400 frames',
     'devices/contract_frames.py:_early': 'what comes before START is answered, in 2 s',
