@@ -224,7 +224,7 @@ wheel: $(READY)
 	$(PYTHON) -m venv build/wheel/use && build/wheel/use/bin/pip install --quiet --disable-pip-version-check dist/*.whl
 	cd build/wheel && use/bin/psd-deflection --help && use/bin/psd-deflection info ../../bags/clean
 	cd build/wheel && use/bin/psd-deflection simulate --loads 'steps:0,0,0;0,-10,-5.85:2' --out rec && use/bin/psd-deflection replay rec --compare
-	$(call INSTALL,build/wheel/use) 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]' 'psd_deflection[foxglove]' 'psd_deflection[dask]' 'psd_deflection[parquet]'
+	$(call INSTALL,build/wheel/use) 'psd_deflection[monitor]' 'psd_deflection[ros]' 'psd_deflection[pandas]' 'psd_deflection[camera]' 'psd_deflection[dask]' 'psd_deflection[parquet]'
 	build/wheel/use/bin/pip install --quiet --disable-pip-version-check --no-deps --force-reinstall dist/*.tar.gz
 	cd build/wheel && use/bin/psd-deflection --version && use/lib/psd_deflection/replay --help > log
 

@@ -85,7 +85,7 @@ FROM_PYPI = {
 ROS_PACKAGES = {'rclpy', 'rcl_interfaces', 'launch', 'launch_ros'}
 
 UNNAMED = {
-    **dict.fromkeys(('rerun', 'pandas', 'xarray', 'foxglove', 'distributed', 'pyarrow', 'cv2'), 'an extra'),
+    **dict.fromkeys(('rerun', 'pandas', 'xarray', 'distributed', 'pyarrow', 'cv2'), 'an extra'),
     'shtab': 'completion in the shell, which says that it is missing; not in rosdep',
     **dict.fromkeys(('cobs', 'mcap', 'mcap_ros2'), 'frames, files and messages as judges; from PyPI'),
     'cyclonedds': 'another DDS as judge; not in rosdep',

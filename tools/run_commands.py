@@ -55,7 +55,7 @@ CI_RUNS = (
     ),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
-        r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|foxglove|dask|parquet)\]'$",
+        r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|dask|parquet)\]'$",
         'Makefile',
         "INSTALL,build/wheel/use) 'psd_deflection[",
     ),

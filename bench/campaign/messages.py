@@ -360,7 +360,7 @@ def main() -> int:
         inside.close()
     took = time.monotonic() - began
     followed = inside.states[State.FOLLOWING] / max(inside.states.total(), 1)
-    refused = sum((inside.compensator.gate.refused + inside.shaper.gate.refused).values())
+    refused = inside.compensator.gate.refused.total() + inside.shaper.gate.refused.total()
     print(
         f'{args.count} messages in {took:.0f} s, {refused} refused at the gate; {inside.shaped.count} trajectories '
         f'shaped; the offsets followed {followed:.0%} of the time; largest step {inside.listener.step:.4f} of '

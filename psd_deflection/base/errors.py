@@ -20,6 +20,7 @@ EXIT_STATUSES: Mapping[int, str] = {
     6: 'the geometry of the rig cannot be solved',
     7: 'a running daemon or a Dask scheduler: none answers, or it refuses',
     8: 'of many recordings some failed; the others are done',
+    9: 'the run ended as it was asked to, and samples were dropped here: the machine was too slow, or something hung',
     71: 'the machine: too little memory, or no further thread',
     INTERRUPTED: 'Ctrl-C before it was done (what runs until Ctrl-C ends with 0)',
 }
@@ -93,6 +94,15 @@ class SomeFailedError(PsdDeflectionError):
     """
 
     exit_status = 8
+
+
+class SamplesDroppedError(PsdDeflectionError):
+    """A run has ended, and samples that had been read were not processed. The log said when and why.
+
+    Example: ``17252 samples were read and not processed: this machine is too slow``.
+    """
+
+    exit_status = 9
 
 
 class MachineError(PsdDeflectionError):

@@ -24,6 +24,7 @@ MAX_SCALAR = 200
 """Characters of a number, a date or what else is no text. A text may have any length."""
 
 _TEXT = 'tag:yaml.org,2002:str'
+_MERGE = 'tag:yaml.org,2002:merge'
 _Loader: type[yaml.SafeLoader] = getattr(yaml, 'CSafeLoader', yaml.SafeLoader)
 
 
@@ -56,9 +57,12 @@ def text_of_file(path: Path, what: str, most: int = MAX_FILE_BYTES) -> str:
 
 
 def tree_of_text(text: str, path: Path) -> object:
-    """The tree of the text of the file ``path``. Raises ConfigError naming file, line and column."""
+    """The tree of the text of the file ``path``.
+
+    Raises ConfigError naming file, line and column; also for a key that is in one map twice.
+    """
     try:
-        return parse_yaml(text)
+        return parse_yaml(text, unique=True)
     except YamlError as error:
         raise ConfigError(f'{path}{error.where}: {error}') from None
 
@@ -78,8 +82,11 @@ def read_text(path: Path, most: int) -> str:
         raise YamlError('it is no text') from None
 
 
-def parse_yaml(text: str) -> object:
-    """The tree of one YAML document, None for an empty one. Raises YamlError."""
+def parse_yaml(text: str, *, unique: bool = False) -> object:
+    """The tree of one YAML document, None for an empty one. Raises YamlError.
+
+    ``unique``: a key that is in one map twice is refused; otherwise the last one holds.
+    """
     try:
         _count(text)
         loader = _Loader(text)
@@ -88,6 +95,8 @@ def parse_yaml(text: str) -> object:
             if root is None:
                 return None
             _measure(root, {}, set())
+            if unique:
+                _refuse_doubles(root)
             return loader.construct_document(root)
         finally:
             loader.dispose()
@@ -137,6 +146,30 @@ def _count(text: str) -> None:
             raise YamlError(f'malformed YAML: nested deeper than {MAX_DEPTH}', event.start_mark)
         if nodes > MAX_NODES:
             raise YamlError(f'malformed YAML: more than {MAX_NODES} keys and values', event.start_mark)
+
+
+def _refuse_doubles(root: yaml.Node) -> None:
+    """Refuse a key that is in one map twice: one of its values would be lost without a word. Merge keys may repeat."""
+    seen: set[int] = set()
+    waiting = [root]
+    while waiting:
+        node = waiting.pop()
+        if id(node) in seen or isinstance(node, yaml.ScalarNode):
+            continue
+        seen.add(id(node))
+        if not isinstance(node, yaml.MappingNode):
+            waiting += node.value
+            continue
+        lines: dict[tuple[str, str], int] = {}
+        for key, value in node.value:
+            waiting += key, value
+            if not isinstance(key, yaml.ScalarNode) or key.tag == _MERGE:
+                continue
+            line = key.start_mark.line + 1
+            if (key.tag, key.value) in lines:
+                first = lines[key.tag, key.value]
+                raise YamlError(f'{key.value[:MAX_SCALAR]} is there twice, in lines {first} and {line}', key.start_mark)
+            lines[key.tag, key.value] = line
 
 
 def _measure(node: yaml.Node, known: dict[int, int], inside: set[int]) -> int:

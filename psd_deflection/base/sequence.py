@@ -31,18 +31,24 @@ class Step(Enum):
 NEARBY = 64
 """A number this close to the last one counts as its neighbour, whatever the clock says."""
 
+FASTEST = 20.0
+"""Times as fast as its declared rate a device may be, and its gaps are still taken for losses."""
+
 
 class SequenceExtender:
     """Extends u32 sequence numbers to 64 bits.
 
     A number just ahead of the last one follows it, even if the device's clock jumped. A number
-    further ahead (modulo 2^32, less than half way round) is a gap if device time advanced. The last
+    further ahead (modulo 2^32, less than half way round) is a gap if device time advanced, and, if ``period`` says how
+    far it advances from sample to sample, by at least a twentieth of what the gap takes: numbers at random are no
+    losses. The last
     number again, or one just behind it with a device time that is not newer, is a duplicated frame.
     Anything else means that the device restarted.
     """
 
-    def __init__(self, alignment: int) -> None:
+    def __init__(self, alignment: int, period: float = 0.0) -> None:
         self._alignment = alignment
+        self._period = period
         self._last: int | None = None
         self._last_time = 0
         self._offset = 0
@@ -58,7 +64,7 @@ class SequenceExtender:
             self._last, self._last_time = seq, t_device_us
             return seq, Step.FIRST, 0
         ahead = (seq + self._offset - last) % WRAP
-        if 0 < ahead < (WRAP // 2 if t_device_us > self._last_time else NEARBY):
+        if 0 < ahead < self._reach(t_device_us - self._last_time):
             self._last, self._last_time = last + ahead, t_device_us
             return last + ahead, (Step.NEXT if ahead == 1 else Step.GAP), ahead - 1
         behind = -ahead % WRAP
@@ -68,6 +74,12 @@ class SequenceExtender:
         self._offset = (number - seq) % WRAP
         self._last, self._last_time = number, t_device_us
         return number, Step.RESTART, 0
+
+    def _reach(self, passed: int) -> float:
+        """How far ahead a number may be that belongs to the same run, ``passed`` of device time after the last."""
+        if passed <= 0:
+            return NEARBY
+        return min(NEARBY + FASTEST * passed / self._period, WRAP // 2) if self._period else WRAP // 2
 
     def restart(self) -> int | None:
         """The next sample is number 0 again; for devices whose samples the host numbers.

@@ -15,6 +15,9 @@ class Status(StrEnum):
 
     OK = 'ok'
     UNREADABLE = 'unreadable image'
+    TOO_LARGE = 'image too large'
+    OTHER_SIZE = 'not of the size of the first image'
+    CLUTTERED = 'too many outlines'
     MISSING = 'no target'
     HIDDEN = 'partly hidden'
     OUTSIDE = 'outside the image'
@@ -30,10 +33,10 @@ class Status(StrEnum):
 
 
 class NoPoseError(Exception):
-    """This frame has no answer, for the reason ``status``."""
+    """This frame has no answer, for the reason ``status``; ``note``: a number or a size that belongs to it, or ''."""
 
-    def __init__(self, status: Status) -> None:
-        super().__init__(str(status))
+    def __init__(self, status: Status, note: str = '') -> None:
+        super().__init__(f'{status} ({note})' if note else str(status))
         self.status = status
 
 
@@ -83,7 +86,7 @@ class FrameAnswer(NamedTuple):
     """The tip in ``link_tip_rest`` at the middle of the exposure.
 
     ``dx``, ``dy`` m, ``theta``, ``phi``, ``omega`` rad (NaN without an answer);
-    ``covariance`` (3, 3) of (dx, dy, theta).
+    ``covariance`` (3, 3) of (dx, dy, theta). ``words``: the status, with the number or size that belongs to it.
     """
 
     t_ns: int
@@ -95,6 +98,7 @@ class FrameAnswer(NamedTuple):
     omega: float = float('nan')
     covariance: FloatArray | None = None
     target: TargetPose | None = None
+    words: str = str(Status.OK)
 
     def as_record(self) -> ReferenceWithCovariance | None:
         """The record that is published and recorded; None without a pose."""

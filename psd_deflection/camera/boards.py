@@ -237,7 +237,8 @@ def _dictionary(settings: CameraSettings, needed: int) -> Any:
     if aruco is None or not hasattr(aruco, 'CharucoDetector'):
         raise ConfigError(
             f'OpenCV {opencv().__version__} has no boards; target.kind {settings.target} needs 4.7 or later: '
-            '`pip install opencv-python-headless`, or use the target circles'
+            "`pip install 'psd_deflection[camera]'` in a virtual environment (Ubuntu's own pip refuses it; see "
+            'docs/camera.md), or use the target circles'
         )
     name = settings.dictionary
     if not name.startswith('DICT_') or not hasattr(aruco, name):

@@ -17,19 +17,24 @@ import numpy as np
 
 from psd_deflection.base.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_text
+from psd_deflection.base.numbers import plain_number
+from psd_deflection.camera.answer import NoPoseError
+from psd_deflection.camera.image_size import MOST_BYTES, MOST_PIXELS, checked
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.settings import CameraSettings, settings_from
 from psd_deflection.rig.parameter_files import flattened, parameter_text
 
 FRAMES = 'frames.csv'
 SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.webp')
-MOST_PIXELS = 200_000_000
 _MOST_SECONDS = 9.2e9
 _SILENT_READS = 50
 
 
 class Frame(NamedTuple):
-    """One frame: ``t_ns`` is the middle of its exposure; ``image`` grey, uint8 or uint16, None if it cannot be read."""
+    """One frame: ``t_ns`` is the middle of its exposure; ``image`` grey, uint8 or uint16.
+
+    If it cannot be read it is None, or the NoPoseError that says why.
+    """
 
     name: str
     t_ns: int
@@ -93,7 +98,11 @@ class Footage:
             self._video = opencv().VideoCapture(str(path))
             if not self._video.isOpened():
                 raise RecordingError(f'{path}: not a video that OpenCV can read; a single image goes into a folder')
-            count = int(self._video.get(opencv().CAP_PROP_FRAME_COUNT))
+            cv2 = opencv()
+            columns, rows = (int(self._video.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            if columns * rows > MOST_PIXELS:
+                raise RecordingError(f'{path}: frames of {columns} x {rows} px: more than {MOST_PIXELS} pixels')
+            count = int(self._video.get(cv2.CAP_PROP_FRAME_COUNT))
             self.total = count if count > 0 else None
             self._frames = self._of_video(path)
         elif path.exists() or source.isdecimal():
@@ -111,8 +120,7 @@ class Footage:
     def _of_folder(self) -> Iterator[Frame]:
         cv2 = opencv()
         for path, t_ns, exposure_ns in self._listed:
-            content = np.frombuffer(path.read_bytes() if path.is_file() else b'', dtype=np.uint8)
-            yield Frame(path.name, t_ns + exposure_ns // 2, decoded(content, cv2))
+            yield Frame(path.name, t_ns + exposure_ns // 2, decoded(_content(path) if path.is_file() else b'', cv2))
 
     def _of_video(self, path: Path) -> Iterator[Frame]:
         cv2 = opencv()
@@ -176,7 +184,7 @@ def _listed(folder: Path) -> list[tuple[Path, int, int]]:
 def _seconds(text: str | None, where: str, column: str) -> int:
     """Seconds as ns, exactly for as many decimals as there are. Raises RecordingError."""
     try:
-        value = float(text or '')
+        value = plain_number(text or '')
     except ValueError:
         value = math.nan
     if not abs(value) < _MOST_SECONDS:
@@ -188,21 +196,34 @@ def _seconds(text: str | None, where: str, column: str) -> int:
     return round(value * 1e9)
 
 
+def _content(path: Path) -> bytes:
+    """The bytes of a file; one more than may be if there are more. Raises OSError."""
+    with path.open('rb') as stream:
+        return stream.read(MOST_BYTES + 1)
+
+
 def read_image(path: str | Path) -> Any:
-    """The grey image in a file, None if it is none. Raises RecordingError if the file cannot be read."""
+    """The image in a file, as of :func:`decoded`. Raises RecordingError if the file cannot be read."""
     try:
-        content = Path(path).read_bytes()
+        content = _content(Path(path))
     except OSError as error:
         raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-    return decoded(np.frombuffer(content, dtype=np.uint8), opencv())
+    return decoded(content, opencv())
 
 
-def decoded(content: Any, cv2: Any) -> Any:
-    """A grey image of the bytes of a file (PNG, JPEG …), None if they are none."""
+def decoded(content: bytes, cv2: Any) -> Any:
+    """A grey image of the bytes of a file (PNG, JPEG …).
+
+    None if they are none; the NoPoseError that says so if they declare an image that is too large: nothing is unpacked
+    then.
+    """
     if not len(content):
         return None
     try:
-        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+        checked(content)
+        image = cv2.imdecode(np.frombuffer(content, dtype=np.uint8), cv2.IMREAD_UNCHANGED)
+    except NoPoseError as error:
+        return error.with_traceback(None)
     except cv2.error:
         return None
     return None if image is None else grey(image)
@@ -211,7 +232,7 @@ def decoded(content: Any, cv2: Any) -> Any:
 def grey(image: Any) -> Any:
     """An image as grey uint8 or uint16; None if it is of another kind."""
     cv2 = opencv()
-    if image is None or image.dtype not in (np.uint8, np.uint16) or image.size > MOST_PIXELS:
+    if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
     if image.ndim == 2:
         return image
@@ -244,7 +265,12 @@ def of_ros_image(height: int, width: int, encoding: str, big_endian: bool, step:
         return None
     kind, channels, conversion = found
     wide = width * channels * np.dtype(kind).itemsize
-    if not (0 < wide <= step and height > 0 and step * height <= len(content) <= MOST_PIXELS):
+    if not (
+        0 < wide <= step
+        and height > 0
+        and step * height <= len(content) <= MOST_BYTES
+        and height * width <= MOST_PIXELS
+    ):
         return None
     rows = np.frombuffer(content, dtype=np.uint8, count=step * height).reshape(height, step)[:, :wide]
     image = np.ascontiguousarray(rows).view(np.dtype(kind).newbyteorder('>' if big_endian else '<')).astype(kind)

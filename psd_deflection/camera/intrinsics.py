@@ -70,7 +70,10 @@ def _matrix(name: str, values: FloatArray) -> str:
 
 
 def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> Intrinsics:
-    """The lens by named grey images (None: unreadable) of one size. Raises ConfigError if they do not determine it."""
+    """The lens by named grey images of one size (None or a NoPoseError: unreadable).
+
+    Raises ConfigError if they do not determine it.
+    """
     board = target_of(settings)
     if not isinstance(board, Board):
         raise ConfigError(f'target.kind = {settings.target}: the lens is found by a board: charuco or apriltag')
@@ -78,8 +81,8 @@ def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> I
     size: tuple[int, int] | None = None
     for name, image in images:
         try:
-            if image is None:
-                raise NoPoseError(Status.UNREADABLE)
+            if image is None or isinstance(image, NoPoseError):
+                raise NoPoseError(Status.UNREADABLE) if image is None else image
             shape = (int(image.shape[1]), int(image.shape[0]))
             size = size or shape
             if shape != size:
@@ -87,7 +90,7 @@ def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> I
                 continue
             plane, seen = board.corners(image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8))
         except NoPoseError as error:
-            left_out.append((name, str(error.status)))
+            left_out.append((name, str(error)))
             continue
         points.append(np.column_stack([plane, np.zeros(len(plane))]).astype(np.float32))
         pixels.append(seen.astype(np.float32))

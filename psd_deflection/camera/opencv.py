@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import functools
+import os
 from typing import Any
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera.image_size import MOST_PIXELS
 
 
 @functools.cache
 def opencv() -> Any:
     """The module ``cv2``. Raises ConfigError, with the fix, if it is not installed."""
+    # OpenCV reads it once, when it is imported; its own bound is 2^30.
+    os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(MOST_PIXELS))
     try:
         import cv2
     except ImportError:
         raise ConfigError(
-            "the camera needs OpenCV: `pip install opencv-python-headless`, `pip install 'psd_deflection[camera]'`, "
-            'or on ROS `apt install python3-opencv`'
+            'the camera needs OpenCV: on Ubuntu and ROS `apt install python3-opencv`, in a virtual environment '
+            "`pip install 'psd_deflection[camera]'`"
         ) from None
     return cv2

@@ -35,7 +35,7 @@ class CameraReference:
         self.target = make(settings)
         self._lens: Lens | None = None
         self._shape: tuple[int, int] = (0, 0)
-        self._waiting: list[tuple[int, TargetPose | Status]] = []
+        self._waiting: list[tuple[int, TargetPose | NoPoseError]] = []
         self._rest: TargetPose | None = None
 
     @property
@@ -59,14 +59,16 @@ class CameraReference:
     def take(self, t_ns: int, image: Any) -> list[FrameAnswer]:
         """The answers that are known now, in the order of the frames.
 
-        ``t_ns``: middle of the exposure. ``image``: (rows, columns) of uint8 or uint16, None if it cannot be read.
+        ``t_ns``: middle of the exposure. ``image``: (rows, columns) of uint8 or uint16, None if it cannot be read,
+        or the NoPoseError that says why.
         """
-        found: TargetPose | Status
+        found: TargetPose | NoPoseError
         try:
             found = self._locate(image)
         except NoPoseError as error:
-            found = error.status
-        if self._rest is not None:
+            found = error.with_traceback(None)
+        # A frame without a target waits only behind one that waits for the rest.
+        if self._rest is not None or (not self._waiting and isinstance(found, NoPoseError)):
             return [self._answer(t_ns, found)]
         self._waiting.append((t_ns, found))
         good = [f for _, f in self._waiting if isinstance(f, TargetPose)]
@@ -76,8 +78,7 @@ class CameraReference:
             complete = len(good) >= MOST_REST or (len(good) > 1 and not _still(good[:-1], good[-1]))
             if complete and len(good) < MOST_REST:
                 good = good[:-1]
-        # Frames without a target are not kept for ever.
-        if complete or (good and len(self._waiting) > 20 * MOST_REST):
+        if complete or len(self._waiting) > 20 * MOST_REST:
             return self._decide(good)
         return []
 
@@ -90,13 +91,17 @@ class CameraReference:
         return [self._answer(t_ns, found) for t_ns, found in waiting]
 
     def _locate(self, image: Any) -> TargetPose:
+        if isinstance(image, NoPoseError):
+            raise image
         if image is None or image.ndim != 2 or min(image.shape) < 16:
             raise NoPoseError(Status.UNREADABLE)
         if self._lens is None:
             self._shape = image.shape
             self._lens = self._settings.lens(image.shape)
         elif image.shape != self._shape:
-            raise NoPoseError(Status.UNREADABLE)
+            (rows, columns), (first_rows, first_columns) = image.shape, self._shape
+            sizes = f'{columns} x {rows} px instead of {first_columns} x {first_rows}'
+            raise NoPoseError(Status.OTHER_SIZE, sizes)
         if image.dtype == np.uint8:
             return self.target.locate(image, image, self._lens, 255.0)
         grey = (image >> 8).astype(np.uint8)
@@ -108,9 +113,9 @@ class CameraReference:
         waiting, self._waiting = self._waiting, []
         return [self._answer(t_ns, found) for t_ns, found in waiting]
 
-    def _answer(self, t_ns: int, found: TargetPose | Status) -> FrameAnswer:
-        if isinstance(found, Status):
-            return FrameAnswer(t_ns, found)
+    def _answer(self, t_ns: int, found: TargetPose | NoPoseError) -> FrameAnswer:
+        if isinstance(found, NoPoseError):
+            return FrameAnswer(t_ns, found.status, words=str(found))
         if self._rest is None:
             raise RuntimeError('a pose is answered before the rest is known')
         dx, dy, theta, phi, omega = relative(self._rest, found)

@@ -8,9 +8,10 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from psd_deflection.base.errors import SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING
 from psd_deflection.cli._program import program
 from psd_deflection.run.session import Session
@@ -45,7 +46,17 @@ class Display:
         if folder is not None and folder not in self._recorded:
             self._recorded.append(folder)
 
-    def tell_recorded(self) -> None:
+    @contextlib.contextmanager
+    def telling_recorded(self) -> Iterator[None]:
+        """At the end of a run print the recordings that were made, also if it could not keep up."""
+        try:
+            yield
+        except SamplesDroppedError:
+            self._tell_recorded()
+            raise
+        self._tell_recorded()
+
+    def _tell_recorded(self) -> None:
         """Print the recordings that were made, and how to replay them."""
         for folder in (f for f in self._recorded if f.is_dir()):
             self.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')

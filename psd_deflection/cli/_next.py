@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._options import given_as_option, in_the_world, refuse, whole, world_option
 from psd_deflection.model.simulation.effect_words import with_effects
 from psd_deflection.recordings.replay.simulated_run import SimulatedRun
@@ -100,7 +101,7 @@ def limits_from_words(words: Sequence[str]) -> Limits:
             continue
         low, high = {**_BOUNDS, **_LISTS}[name]
         try:
-            values = tuple(float(t) for t in text.split(',')) if text else ()
+            values = tuple(plain_number(t) for t in text.split(',')) if text else ()
         except ValueError:
             values = (float('nan'),)
         if not all(low <= v <= high for v in values) or (name in _BOUNDS and len(values) != 1):

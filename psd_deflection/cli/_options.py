@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.recordings.formats.registry import formats
 from psd_deflection.recordings.recording import WHOLE, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
@@ -189,7 +190,7 @@ class _SpanEnd(argparse.Action):
 
 def _bound(option: str, text: str) -> Bound:
     try:
-        seconds = float(text)
+        seconds = plain_number(text)
     except ValueError:
         try:
             return datetime.fromisoformat(text).astimezone()

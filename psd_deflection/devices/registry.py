@@ -17,6 +17,7 @@ from importlib.metadata import entry_points
 from types import MappingProxyType
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.plugins import loaded
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.devices.device import Device
 from psd_deflection.devices.source import Source
@@ -48,11 +49,7 @@ def find_device(name: str) -> Device:
     if not points:
         known = source_names()
         raise ConfigError(f'source = {name!r}: must be one of {", ".join(known)}{did_you_mean(name, known)}')
-    try:
-        found: object = points[0].load()
-    except Exception as error:
-        # A plug-in may raise anything on import; the user needs its name and the cause.
-        raise ConfigError(f'source = {name!r}: {points[0].value} cannot be loaded ({error!r})') from error
+    found: object = loaded(f'source = {name!r}: {points[0].value} cannot be loaded', points[0].load)
     if isinstance(found, type) and issubclass(found, Source):
         return Device(name, f'plug-in {points[0].value}', found)
     if not isinstance(found, Device):

@@ -71,6 +71,7 @@ class Recording(abc.ABC):
     none. ``hello``: the device's, or None. ``version``: of the software that recorded, or ''.
     ``made_with``: what computed it (:func:`psd_deflection.recordings.provenance.provenance`), {} if it does not say.
     ``node``: full name of the ROS node that recorded itself, or ''.
+    ``dropped_here``: samples and messages that it lacks because the machine that recorded did not keep up.
     ``rig_from_messages``: whether these come from messages, because the file lacks our metadata.
     ``changes``: of parameters during the run, in order. ``memories``: the first few times that the pipeline said all
     that it remembered, each with the block before which that was. ``restarts``: of the device, each as the last sample
@@ -89,6 +90,7 @@ class Recording(abc.ABC):
         self.version = ''
         self.made_with: Mapping[str, str] = {}
         self.node = ''
+        self.dropped_here = (0, 0)
         self.rig_from_messages = False
         self.changes: Sequence[ParameterChange] = ()
         self.memories: Sequence[ParameterChange] = ()

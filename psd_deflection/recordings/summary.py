@@ -74,6 +74,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'duration_s': (last[1] - first[1]) * 1e-9,
         'samples': samples,
         'lost': recording.lost(first[0], last[0], samples) if samples else 0,
+        'dropped_here': {'samples': recording.dropped_here[0], 'messages': recording.dropped_here[1]},
         'restarts': len(recording.restarts),
         'flagged': flagged,
         'sample_rate_hz': counted * 1e9 / lasted if lasted else 0.0,

@@ -419,6 +419,27 @@ class AcquisitionConfig:
     watch_minutes: float = parameter(
         5.0, 'min', 'how long before an alarm what is kept begins', minimum=0.5, maximum=60.0
     )
+    watch_memory: int = parameter(
+        100_000_000,
+        'bytes',
+        'memory for the minutes before an alarm; if it is full, the oldest half minute goes first',
+        minimum=1_000_000,
+        maximum=100_000_000_000,
+    )
+    watch_dir_max_bytes: int = parameter(
+        2_000_000_000,
+        'bytes',
+        'of what the watch has kept in watch_dir the oldest is deleted if it is more than this',
+        minimum=1_000_000,
+        maximum=1_000_000_000_000,
+    )
+    watch_dir_max_recordings: int = parameter(
+        100,
+        '',
+        'recordings of the watch in watch_dir; the oldest is deleted if there are more',
+        minimum=1,
+        maximum=100_000,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -459,6 +480,11 @@ class MonitorConfig:
     foxglove_address: str = parameter('127.0.0.1', '', 'address of that; 0.0.0.0 shows it to the network')
     foxglove_port: int = parameter(
         8765, '', 'port of that; 0, or one that is in use, takes any free one', minimum=0, maximum=65535
+    )
+    foxglove_origins: tuple[str, ...] = parameter(
+        ('https://app.foxglove.dev', 'file://'),
+        '',
+        'pages from which a browser may connect to that: the web application, the desktop application (file://)',
     )
 
 

@@ -176,6 +176,8 @@ def _flatten(tree: Mapping[Any, Any], prefix: str, out: dict[str, object], sourc
         name = f'{prefix}{key}'
         if isinstance(value, Mapping):
             _flatten(value, name + '.', out, source, depth + 1)
+        elif name in out:
+            raise ConfigError(f'{source}: {name} is there twice, as a dotted key and in a map')
         else:
             out[name] = value
         if len(out) > MAX_KEYS:

@@ -25,6 +25,7 @@ from typing import Any, Generic, Literal, TypeVar, cast
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.spelling import did_you_mean
 
 Kind = Literal['double', 'integer', 'bool', 'string', 'double_array', 'string_array']
@@ -191,7 +192,7 @@ def _number(parameter: Parameter, value: object) -> float:
     if isinstance(value, str):
         # YAML 1.1 reads 69e9 as a string. ROS reads it as a number, so this does too.
         try:
-            value = float(value)
+            value = plain_number(value)
         except ValueError:
             raise _RefusedError('must be a number') from None
     if isinstance(value, bool) or not isinstance(value, (int, float)):

@@ -15,7 +15,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from msg_adapters import REFERENCE, REFERENCE_WITH_COVARIANCE, TOPIC_TYPES, to_messages
@@ -123,7 +122,7 @@ class CameraNode(BaseNode):
         self._take(message.header.stamp, image)
 
     def _compressed(self, message: Any) -> None:
-        self._take(message.header.stamp, decoded(np.frombuffer(message.data, dtype=np.uint8), opencv()))
+        self._take(message.header.stamp, decoded(bytes(message.data), opencv()))
 
     def _take(self, stamp: Any, image: Any) -> None:
         if not self.active:
@@ -148,7 +147,7 @@ class CameraNode(BaseNode):
         return CameraReference(settings, target_of)
 
     def _publish(self, answer: FrameAnswer) -> None:
-        self._since[str(answer.status)] += 1
+        self._since[answer.words] += 1
         record = answer.as_record()
         if record is not None:
             self._last = answer

@@ -264,7 +264,11 @@ def run(
             pass
         finally:
             watchdog.stopping()
+            last = owner.session
             owner.close()
+        if failed is None and last is not None:
+            # Samples that were dropped here are told at the end.
+            failed = last.failed
         if failed is not None:
             raise failed
     return 0

@@ -7,7 +7,6 @@ message is refused, or ''. A message that makes a node's own code fail is refuse
 from __future__ import annotations
 
 import time
-from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -18,6 +17,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverriding
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
+from psd_deflection.base.bounds import BoundedMap, Tally
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError
 from psd_deflection.base.log import WARNING, Say
 from psd_deflection.base.printable import printable
@@ -44,8 +44,8 @@ class InputGate:
     def __init__(self, node: Node, say: Say, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
         self._repeats = Repeats(say)
-        self.refused: Counter[str] = Counter()
-        self.why: dict[str, str] = {}
+        self.refused = Tally()
+        self.why: BoundedMap[str, str] = BoundedMap()
 
     def listen(
         self,
@@ -91,7 +91,7 @@ class InputGate:
 
     def refuse(self, topic: str, why: str) -> None:
         """Count a message and say why it is refused."""
-        self.refused[topic] += 1
+        self.refused.add(topic)
         self.why[topic] = printable(why, LONGEST)
         self._repeats.tell(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
 

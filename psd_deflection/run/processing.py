@@ -19,12 +19,16 @@ from typing import Any, Protocol, TypeVar
 from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
+from psd_deflection.run.behind import why_behind
 from psd_deflection.run.reading.acquisition import Arrival, Item, Restarted
 
 T = TypeVar('T')
 
 REQUEST_TIMEOUT_S = 2.0
 """Time limit for a request to begin, and again for it to end, s."""
+
+MOST_WAITING = 10_000
+"""Requests that may wait while something holds up the pipeline."""
 
 LATENCY_NS = 1_000_000_000
 """Latencies are reported over this time."""
@@ -82,6 +86,7 @@ class Spokesman:
 class Processing:
     """Runs ``pipeline`` over ``items`` until one of them is Ended; ``sinks`` get the records in this order.
 
+    ``dropped_before``: samples that were dropped on the way here, before those that were processed last.
     ``clock``: monotonic time, ns; the same clock as that of the chunks' ``read_ns``.
     """
 
@@ -96,6 +101,8 @@ class Processing:
         self.sinks: list[RecordSink] = []
         self.failed: BaseException | None = None
         self.beat = time.monotonic()
+        self.dropped_before = 0
+        self.requests_dropped = 0
         self._items = items
         self._clock = clock
         self._requests: queue.SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = queue.SimpleQueue()
@@ -112,6 +119,10 @@ class Processing:
         """Wait until everything that was read is processed. Stop the acquisition first."""
         if self._thread.ident is not None:
             self._thread.join(timeout)
+
+    def why_behind(self) -> str:
+        """Why blocks wait for it, in words."""
+        return why_behind(self._thread, time.monotonic() - self.beat)
 
     @property
     def alive(self) -> bool:
@@ -146,8 +157,11 @@ class Processing:
         return asked.result()
 
     def later(self, action: Callable[[], object]) -> None:
-        """Run ``action`` between two blocks and do not wait for it."""
-        self._requests.put((Future(), action))
+        """Run ``action`` between two blocks and do not wait for it; it is dropped if ``MOST_WAITING`` wait already."""
+        if self._requests.qsize() >= MOST_WAITING:
+            self.requests_dropped += 1
+        else:
+            self._requests.put((Future(), action))
 
     def give(self, records: Iterable[Record]) -> int:
         """Hand each record to every sink as it comes; return the number of records."""
@@ -169,6 +183,7 @@ class Processing:
                     continue
                 if isinstance(item, Arrival):
                     self._heard_ns = item.read_ns
+                    self.dropped_before = item.dropped_before
                     if self.give(self.pipeline.process(item.raw)):
                         self._note_latency(item.read_ns)
                         self._tell_refusals()

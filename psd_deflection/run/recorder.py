@@ -22,18 +22,26 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 
+from psd_deflection.base.bounds import MESSAGE_BYTES, ByteBudget
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.log import ERROR, WARNING, Say
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.declarations import AcquisitionConfig
+from psd_deflection.run.behind import SLOW, why_behind
 
 MESSAGES_PER_BLOCK = 100
 """The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes about
 ten messages, so the disk may pause ten times as long as the pipeline: 50 s by default, in 25 MB."""
+MOST_THREADS = 8
+"""Recordings that may hang at a time: each has its thread."""
+QUEUE_BYTES = 100_000_000
+"""The recorder's queue holds no more bytes than this."""
 JOIN_S = 1.0
-"""How long the program waits at its end for recordings that are still being written."""
+"""How long the program waits at its end for a recording that takes nothing more."""
+PATIENCE_S = 3.0
+"""How long it waits for recordings that are still being written."""
 
 IDLE_S = 0.5
 LOOK_EVERY = 250
@@ -45,9 +53,9 @@ QueuedMessage = tuple[str, str, bytes, int]
 Item = QueuedMessage | ParameterChange | None
 
 
-def new_folder(parent: Path) -> Path:
-    """A folder that does not exist yet: ``psd_`` and the time, then ``_2``, ``_3`` ..."""
-    stem = time.strftime('psd_%Y%m%d_%H%M%S')
+def new_folder(parent: Path, stem: str = 'psd') -> Path:
+    """A folder that does not exist yet: ``stem``, ``_`` and the time, then ``_2``, ``_3`` ..."""
+    stem += time.strftime('_%Y%m%d_%H%M%S')
     folder = parent / stem
     count = 1
     while folder.exists():
@@ -75,9 +83,14 @@ class Take:
         self.config = config
         self.folder: Path | None = None
         self.attached = False
+        self.beat = time.monotonic()
         self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
         self.opened: Future[Path | None] = Future()
         self.closed: Future[Path | None] = Future()
+        # What waits is bounded in bytes too: others may send long messages.
+        self.budget = ByteBudget(QUEUE_BYTES)
+        # Samples that the run had dropped when it began and when it ended, messages that it could not take.
+        self.dropped_before = self.dropped_until = self.dropped_messages = 0
         for answer in (self.opened, self.closed):
             answer.set_running_or_notify_cancel()
 
@@ -85,7 +98,9 @@ class Take:
 class Recorder:
     """Makes one recording at a time; a wire like any other. ``say`` gets a line if a recording ends by itself.
 
-    ``between_blocks`` runs an action in the thread that calls the wires (``Processing.request``).
+    ``dropped_samples``: how many the run has dropped so far, before those that it processed last; a recording says how
+    many it lacks because of that. ``between_blocks`` runs an action in the thread that calls the wires
+    (``Processing.request``).
     ``node``: full name of the recorded ROS node. ``failure``: why the last recording
     ended by itself, empty while all is well; for diagnostics.
     """
@@ -95,9 +110,11 @@ class Recorder:
         queue_blocks: int,
         say: Say,
         between_blocks: Callable[[Callable[[], None]], None],
+        dropped_samples: Callable[[], int] = lambda: 0,
         node: str = '',
     ) -> None:
         self._node = node
+        self._dropped_samples = dropped_samples
         self.dropped = 0
         self.written = 0
         self.files_deleted = 0
@@ -112,6 +129,7 @@ class Recorder:
         self._opening: Take | None = None
         self._take: Take | None = None
         self._writing: dict[Take, threading.Thread] = {}
+        self._threads: list[threading.Thread] = []
         self._ended = False
 
     @property
@@ -151,10 +169,16 @@ class Recorder:
                 if self._ended:
                     take.opened.set_exception(RecordingError('not recorded: the run has ended'))
                     return take.opened
+                self._threads = [thread for thread in self._threads if thread.is_alive()]
+                if len(self._threads) >= MOST_THREADS:
+                    why = f'not recorded: {MOST_THREADS} recordings wait for the disk already'
+                    take.opened.set_exception(RecordingError(why))
+                    return take.opened
                 thread = threading.Thread(
                     target=self._run, args=(take, rig, hello, memory), name='recorder', daemon=True
                 )
                 thread.start()
+                self._threads = [*self._threads, thread]
                 self._opening = take
             return take.opened
 
@@ -163,8 +187,11 @@ class Recorder:
         take = self._take
         if take is None:
             return
-        if take.queue.qsize() >= self._limit:
+        if take.queue.qsize() >= self._limit or not take.budget.take(len(cdr) + MESSAGE_BYTES):
+            take.dropped_messages += 1
             self.dropped += 1
+            if self.dropped == 1:
+                self._say(f'{take.folder}: messages are dropped: {self._why_behind(take)}', WARNING)
         else:
             take.queue.put((topic, type_name, cdr, t_ns))
 
@@ -188,6 +215,7 @@ class Recorder:
                 RecordingError('the recording was ended before the disk answered; nothing was recorded')
             )
         if take is not None:
+            take.dropped_until = self._dropped_samples()
             take.queue.put(None)
             return take.closed
         none: Future[Path | None] = Future()
@@ -195,7 +223,7 @@ class Recorder:
         return none
 
     def close(self) -> Path | None:
-        """End for good; wait at most ``JOIN_S`` for the disk.
+        """End for good; wait ``JOIN_S`` for a disk that takes nothing, ``PATIENCE_S`` for one that is slow.
 
         Return the folder of the recording that ran, None if there was none or if its end went wrong.
         """
@@ -203,16 +231,27 @@ class Recorder:
         with self._lock:
             self._ended = True
         ended = self.stop()
-        until = time.monotonic() + JOIN_S
+        until = time.monotonic() + PATIENCE_S
         for take, thread in tuple(self._writing.items()):
-            thread.join(max(until - time.monotonic(), 0.0))
+            waits = take.queue.qsize() + 1
+            while thread.is_alive() and time.monotonic() < until:
+                before = waits
+                thread.join(JOIN_S)
+                waits = take.queue.qsize()
+                if waits >= before:
+                    break
             if thread.is_alive():
+                waiting = f'it is not waited for, and {take.budget.holders} messages are not written'
                 self._say(
-                    f'{take.folder}: the disk is slow; it is not waited for. '
+                    f'{take.folder}: {self._why_behind(take)}; {waiting}. '
                     f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole',
                     WARNING,
                 )
         return None if ended.done() and ended.exception() is not None else folder
+
+    def _why_behind(self, take: Take) -> str:
+        thread = self._writing.get(take)
+        return why_behind(thread, time.monotonic() - take.beat) if thread is not None else SLOW
 
     def _run(
         self,
@@ -237,6 +276,7 @@ class Recorder:
                 if first is not None:
                     take.queue.put(first)
                 self._writing[take] = thread
+                take.dropped_before = take.dropped_until = self._dropped_samples()
                 self._opening, self._take, take.attached, self.failure = None, take, True, ''
 
         try:
@@ -290,7 +330,7 @@ class Recorder:
         try:
             try:
                 try:
-                    self._write(bag, take.queue, take.config)
+                    self._write(bag, take)
                 finally:
                     # Before waiting for the disk again: a new start must not be told that this recording runs.
                     with self._lock:
@@ -301,6 +341,9 @@ class Recorder:
                 bag.close()
                 return f'{bag.folder}: {error}; it is complete up to here'
             _look_for(bag)
+            samples = take.dropped_until - take.dropped_before
+            if samples or take.dropped_messages:
+                bag.note_dropped(samples, take.dropped_messages)
             bag.close()
         except _GoneError as error:
             with contextlib.suppress(RecordingError):
@@ -317,10 +360,12 @@ class Recorder:
             return f'{bag.folder}: {type(error).__name__}: {error}'
         return ''
 
-    def _write(self, bag: BagWriter, items: queue.SimpleQueue[Item], config: AcquisitionConfig) -> None:
+    def _write(self, bag: BagWriter, take: Take) -> None:
+        items, config = take.queue, take.config
         since_look = 0
         unwritten = False
         while True:
+            take.beat = time.monotonic()
             try:
                 item = items.get(timeout=IDLE_S)
             except queue.Empty:
@@ -334,6 +379,7 @@ class Recorder:
                 bag.put(item)
             else:
                 bag.write_encoded(*item)
+                take.budget.give_back(len(item[2]) + MESSAGE_BYTES)
                 with self._lock:
                     self.written += 1
             unwritten = True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from psd_deflection.base.bounds import BoundedMap
 from psd_deflection.base.log import INFO, Say
 
 FIRST_WAIT_S = 10.0
@@ -29,7 +30,7 @@ class Repeats:
 
     def __init__(self, say: Say) -> None:
         self._say = say
-        self._kinds: dict[str, _Kind] = {}
+        self._kinds: BoundedMap[str, _Kind] = BoundedMap()
 
     def tell(self, kind: str, line: str, level: int, now_s: float, at_once: int = 1) -> None:
         """Say ``line`` now, or count it. ``kind``: one of the program's own few names. ``level``: its severity.

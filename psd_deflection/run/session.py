@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
 from collections.abc import Mapping
 from concurrent.futures import Future, wait
 from functools import partial
 from pathlib import Path
 
 from msg_adapters import ACCELERATION, LOAD, TOPIC_TYPES, accel_stamped, from_fields, to_messages
+from psd_deflection.base.bounds import BoundedMap, Tally
+from psd_deflection.base.errors import SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.base.printable import printable
 from psd_deflection.measure.pipeline import Pipeline
@@ -41,6 +42,9 @@ SILENT_S = 5.0
 """Dots older than this plus two blocks are out of date."""
 
 JOIN_S = 0.5
+"""How long the end waits for a pipeline that takes none of the last blocks."""
+
+PATIENCE_S = 3.0
 """Time limit for the last blocks at the end."""
 
 KEEP_S = 0.2
@@ -85,11 +89,12 @@ class Session:
     def __init__(self, rig: Rig, say: Say, node: str = '', unzeroed: Rig | None = None) -> None:
         self._simulated: SimulatedRigProcess | None = None
         self._closed = False
+        self._short: SamplesDroppedError | None = None
         self.listeners: list[Say] = [say]
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
-        self.refused: Counter[str] = Counter()
-        self.why_refused: dict[str, str] = {}
+        self.refused = Tally()
+        self.why_refused: BoundedMap[str, str] = BoundedMap()
         say = self._tell
         self._repeats = Repeats(say)
         check_live(rig.estimator.solver)
@@ -122,7 +127,10 @@ class Session:
                     pipeline.tip_loads.zeroed = self._store.loaded
             say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
             self.processing = Processing(self.acquisition.queue, pipeline, say)
-            self.recorder = Recorder(rig.acquisition.queue_blocks, say, self.processing.request, node)
+            self.acquisition.why_full = self.processing.why_behind
+            self.recorder = Recorder(
+                rig.acquisition.queue_blocks, say, self.processing.request, lambda: self.processing.dropped_before, node
+            )
             self.fanout = Fanout(rig.monitor.frame_prefix)
             self.fanout.change_wires.append(self.recorder)
             self.processing.sinks.append(self.fanout)
@@ -164,8 +172,11 @@ class Session:
 
     @property
     def failed(self) -> BaseException | None:
-        """The error that ended the pipeline or the reader thread, or None."""
-        return self.processing.failed or self.acquisition.failed
+        """The error that ended the pipeline or the reader thread, or None.
+
+        After :meth:`close` it is a SamplesDroppedError if samples were read and not processed.
+        """
+        return self.processing.failed or self.acquisition.failed or self._short
 
     def responsive(self) -> bool:
         """Whether reader and pipeline completed a round lately; they do so even while the device is away."""
@@ -293,7 +304,7 @@ class Session:
         self.processing.later(partial(self._refuse, topic, why))
 
     def _refuse(self, topic: str, why: str) -> None:
-        self.refused[topic] += 1
+        self.refused.add(topic)
         self.why_refused[topic] = why
         self._repeats.tell(f'refused {topic}', f'{topic}: refused: {why}', WARNING, time.monotonic())
 
@@ -370,7 +381,8 @@ class Session:
     def close(self) -> Path | None:
         """Stop reading, process what was read, end the recording; return its folder.
 
-        Ends within two seconds even if a part hangs. A second call does nothing.
+        Ends within two seconds even if a part hangs; what makes progress gets ``PATIENCE_S``. A second call does
+        nothing.
         """
         if self._closed:
             return None
@@ -378,14 +390,39 @@ class Session:
         if self._simulated is not None:
             self._simulated.hang_up()
         self.acquisition.stop()
-        self.processing.join(JOIN_S)
-        if self.processing.alive:
-            self._tell('a subscriber holds up the last blocks; they are not waited for', WARNING)
+        self._finish()
         folder = self.recorder.close()
         if self.watcher is not None and not self.watcher.close(KEEP_S):
-            self._tell('watch: the disk is slow; what was to be kept may lack its end', WARNING)
+            self._tell(f'watch: not written within {KEEP_S:g} s; what was to be kept may lack its end', WARNING)
         if self._store is not None and not self._store.join(KEEP_S):
-            self._tell(f'{self._store.path}: the disk is slow; the zero may not be kept', WARNING)
+            self._tell(f'{self._store.path}: not written within {KEEP_S:g} s; the zero may not be kept', WARNING)
         if self._simulated is not None:
             self._simulated.close()
         return folder
+
+    def _finish(self) -> None:
+        """Let the pipeline process what was read; give up what it cannot, and say how much, and why."""
+        until = time.monotonic() + PATIENCE_S
+        waits = self.acquisition.queue.qsize()
+        self.processing.join(JOIN_S)
+        while self.processing.alive and time.monotonic() < until:
+            before, waits = waits, self.acquisition.queue.qsize()
+            if waits >= before:
+                break
+            self.processing.join(JOIN_S)
+        counters = self.acquisition.counters
+        if self.processing.alive:
+            why = self.processing.why_behind()
+            samples = self.acquisition.abandon()
+            self.processing.join(JOIN_S)
+            if samples:
+                counters.dropped_why = why
+                self._tell(f'{why}: the last {samples} samples were read and not processed', WARNING)
+            if self.processing.alive:
+                self._tell(f'{self.processing.why_behind()}: the last block is not waited for', WARNING)
+        self.processing.dropped_before = counters.dropped_here
+        if counters.dropped_here:
+            self._short = SamplesDroppedError(
+                f'{counters.dropped_here} samples were read and not processed ({counters.queue_dropped} while it ran, '
+                f'{counters.abandoned} at the end): {counters.dropped_why}'
+            )

@@ -3,10 +3,14 @@
 The samples and inputs of the last minutes are kept in memory as they were encoded, in segments; each begins with the
 rig and the pipeline's memory, so that a replay of what is kept computes what the run did. Nothing is kept unless
 ``watch_dir`` names a folder, and nothing is written unless there is an alarm. A thread of its own writes.
+
+Memory is bounded in bytes (``watch_memory``) and in time, whether blocks come or not; the folder in bytes and in
+number (``watch_dir_max_bytes``, ``watch_dir_max_recordings``). The oldest goes first.
 """
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -15,7 +19,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from msg_adapters import INPUTS, SAMPLES
+from psd_deflection.base.bounds import MESSAGE_BYTES, ByteBudget
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.files import HeldFolder
 from psd_deflection.base.log import ERROR, WARNING, Say
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Alarm, Watch
@@ -28,6 +34,8 @@ SEGMENT_NS = 30_000_000_000
 AFTER_NS = 60_000_000_000
 """What follows the alarm is kept too."""
 NAME = 'psd_deflection: watch'
+STEM = 'watch'
+"""What is kept is called so, and then the time: nothing else in the folder is ever deleted."""
 OK, WARN = 0, 1
 
 Kept = ParameterChange | tuple[str, str, bytes, int]
@@ -35,13 +43,14 @@ Kept = ParameterChange | tuple[str, str, bytes, int]
 
 @dataclass(slots=True)
 class _Segment:
-    """``began_ns``: of its first block. ``memory``, ``load``: as they were before it."""
+    """``began_ns``: of its first block. ``memory``, ``load``: as they were before it. ``bytes``: held by ``items``."""
 
     rig: Rig
     began_ns: int
     memory: ParameterChange | None
     load: AppliedLoad | None
     items: list[Kept] = field(default_factory=list)
+    bytes: int = 0
 
 
 class Watcher:
@@ -57,8 +66,14 @@ class Watcher:
         self.failure = ''
         self._pipeline, self._say, self._hello, self._node = pipeline, say, hello, node
         self._parent = Path(config.watch_dir).expanduser() if config.watch_dir else None
-        self._reserve = config.disk_reserve
-        self._segments: deque[_Segment] = deque(maxlen=2 + round(60e9 * config.watch_minutes / SEGMENT_NS))
+        self._config = config
+        self._window_ns = round(60e9 * config.watch_minutes) + 2 * SEGMENT_NS
+        self._memory = ByteBudget(config.watch_memory)
+        self._forgotten = 0
+        # Held to change the segments; never while waiting for the disk.
+        self._lock = threading.Lock()
+        self._segments: deque[_Segment] = deque()
+        self._last_ns = 0
         self._due_ns: int | None = None
         self._said = 0
         self._writing: threading.Thread | None = None
@@ -86,19 +101,60 @@ class Watcher:
         if self._due_ns is not None and t_ns >= self._due_ns:
             self._keep()
         # A block's last record: the next one begins with what the pipeline remembers now.
-        if self.keeps and (not self._segments or t_ns - self._segments[-1].began_ns >= SEGMENT_NS):
-            rig = self._pipeline.rig
-            self._segments.append(_Segment(rig, t_ns, self._pipeline.memory(rig), self.watch.load))
+        if self.keeps:
+            self._last_ns = t_ns
+            if not self._segments or t_ns - self._segments[-1].began_ns >= SEGMENT_NS:
+                rig = self._pipeline.rig
+                segment = _Segment(rig, t_ns, self._pipeline.memory(rig), self.watch.load)
+                with self._lock:
+                    self._segments.append(segment)
+                    self._forget_older(t_ns)
 
     def put_message(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         """An encoded message; of samples and inputs from any thread."""
-        if self._segments and (topic == SAMPLES or topic in INPUTS):
-            self._segments[-1].items.append((topic, type_name, message, t_ns))
+        if topic == SAMPLES or topic in INPUTS:
+            self._hold((topic, type_name, message, t_ns), len(message), t_ns)
 
     def put_change(self, change: ParameterChange) -> None:
         """A change of parameters."""
-        if self._segments:
-            self._segments[-1].items.append(change)
+        self._hold(change, MESSAGE_BYTES * len(change.values), change.t_ns)
+
+    def _hold(self, item: Kept, size: int, t_ns: int) -> None:
+        size += MESSAGE_BYTES
+        full = False
+        with self._lock:
+            if t_ns - self._last_ns > self._window_ns:
+                # No block for so long: of all that is held nothing would be kept.
+                self._drop(len(self._segments))
+            while self._segments and not self._memory.take(size):
+                full = True
+                self._drop(1)
+            # If all is dropped, the next block begins anew, with the pipeline's memory.
+            if self._segments:
+                self._segments[-1].items.append(item)
+                self._segments[-1].bytes += size
+        if full:
+            self._forgotten += 1
+            if self._forgotten == 1:
+                self._say(
+                    f'watch: {self._memory.most / 1e6:g} MB are full (watch_memory): '
+                    'what is kept begins later than watch_minutes says',
+                    WARNING,
+                )
+
+    def _forget_older(self, t_ns: int) -> None:
+        while len(self._segments) > 1 and t_ns - self._segments[1].began_ns > self._window_ns:
+            self._drop(1)
+
+    def _drop(self, count: int) -> None:
+        for _ in range(count):
+            segment = self._segments.popleft()
+            self._memory.give_back(segment.bytes, len(segment.items))
+
+    @property
+    def held_bytes(self) -> int:
+        """What is held in memory, with what Python needs for it."""
+        return self._memory.held
 
     def close(self, patience_s: float) -> bool:
         """Write what is still to be kept; whether the disk has taken it within ``patience_s``."""
@@ -118,6 +174,8 @@ class Watcher:
             ('spoilt by motion', str(watch.spoilt)),
             ('alarms', str(watch.alarms)),
             ('kept', str(self.folder or '')),
+            ('held in memory (MB)', f'{self.held_bytes / 1e6:.1f}'),
+            ('dropped from memory, because it was full', str(self._forgotten)),
         ]
         if alarm is not None:
             values += _told(alarm)
@@ -128,9 +186,11 @@ class Watcher:
 
     def _keep(self) -> None:
         self._due_ns = None
-        segments = list(self._segments)
-        self._segments.clear()
+        with self._lock:
+            segments = list(self._segments)
+            self._segments.clear()
         if self._writing is not None and self._writing.is_alive():
+            self._memory.give_back(sum(s.bytes for s in segments), sum(len(s.items) for s in segments))
             self._say('watch: the disk still writes what was kept before; this is not kept', WARNING)
             return
         self._writing = threading.Thread(target=self._write, args=(segments,), name='watch', daemon=True)
@@ -139,17 +199,20 @@ class Watcher:
     def _write(self, segments: list[_Segment]) -> None:
         try:
             self.folder = self._written(segments)
+            self._empty_folder()
         except RecordingError as error:
             self.failure = f'not kept: {error}'
             self._say(f'watch: {self.failure}', ERROR)
             return
+        finally:
+            self._memory.give_back(sum(s.bytes for s in segments), sum(len(s.items) for s in segments))
         self._say(f'watch: kept as {self.folder}; see `psd-deflection discover {self.folder}`')
 
     def _written(self, segments: list[_Segment]) -> Path:
         if self._parent is None or not segments:
             raise RecordingError('no block has come since the last alarm was kept')
-        folder = new_folder(self._parent)
-        if missing := missing_room(folder, self._reserve):
+        folder = new_folder(self._parent, STEM)
+        if missing := missing_room(folder, self._config.disk_reserve):
             raise RecordingError(f'{folder}: {missing}; make room, or name another folder (parameter watch_dir)')
         first = segments[0]
         bag = BagWriter(folder, rig_values=first.rig.flat(), device_hello=self._hello, node=self._node)
@@ -166,6 +229,49 @@ class Watcher:
         finally:
             bag.close()
         return folder
+
+    def _empty_folder(self) -> None:
+        """Delete the oldest of what was kept, until the folder is within its bounds; the newest always stays."""
+        if self._parent is None:
+            return
+        most, most_bytes = self._config.watch_dir_max_recordings, self._config.watch_dir_max_bytes
+        kept = [(path, size) for path in sorted(self._parent.glob(f'{STEM}_*'), key=_made) if (size := _size_of(path))]
+        total = sum(size for _, size in kept)
+        for number, (path, size) in enumerate(kept[:-1]):
+            if len(kept) - number <= most and total <= most_bytes:
+                break
+            total -= size
+            try:
+                names = [file.name for file in path.iterdir()]
+                with HeldFolder(path, follow=False) as held:
+                    for name in names:
+                        held.remove(name)
+                path.rmdir()
+            except OSError as error:
+                self._say(f'watch: {path}: cannot be deleted ({error.strerror or error})', WARNING)
+                continue
+            bounds = f'at most {most} recordings and {most_bytes / 1e6:g} MB stay in watch_dir'
+            self._say(f'watch: {path}: deleted, the oldest of what was kept ({bounds})')
+
+
+def _made(path: Path) -> tuple[int, str]:
+    """By time; of one second ``_2`` after ``_10`` would be wrong."""
+    with contextlib.suppress(OSError):
+        return path.lstat().st_mtime_ns, path.name
+    return 0, path.name
+
+
+def _size_of(path: Path) -> int:
+    """Bytes of a recording of the watch; 0 if it is none, or if somebody put something else into it."""
+    size = 0
+    with contextlib.suppress(OSError):
+        if path.is_symlink() or not path.is_dir():
+            return 0
+        for file in path.iterdir():
+            if file.is_symlink() or not (file.suffix == '.mcap' or file.name == 'metadata.yaml'):
+                return 0
+            size += file.stat().st_size
+    return size
 
 
 class WatcherWire:

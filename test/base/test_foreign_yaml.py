@@ -100,6 +100,32 @@ def test_the_place_is_named(tmp_path: Path) -> None:
         load_rig(path)
 
 
+@pytest.mark.parametrize(
+    ('body', 'said'),
+    [
+        ('    baud: 9600\n    port: x\n    baud: 115200\n', r'mine\.yaml:5:5: baud is there twice, in lines 3 and 5'),
+        ('    link: {length: 1.0, length: 2.0}\n', r'mine\.yaml:3:25: length is there twice, in lines 3 and 3'),
+        (
+            '    link.length: 1.0\n    link: {length: 2.0}\n',
+            r'mine\.yaml: link\.length is there twice, as a dotted key',
+        ),
+    ],
+)
+def test_a_key_that_is_there_twice_is_refused_with_its_lines(tmp_path: Path, body: str, said: str) -> None:
+    path = tmp_path / 'mine.yaml'
+    path.write_text('/**:\n  ros__parameters:\n' + body)
+    with pytest.raises(ConfigError, match=said):
+        load_rig(path)
+
+
+def test_a_merge_key_and_what_overrides_it_are_not_doubled() -> None:
+    assert parse_yaml('a: &a {x: 1, y: 2}\nb: {<<: *a, x: 3}\nc: {<<: *a}\n', unique=True) == {
+        'a': {'x': 1, 'y': 2},
+        'b': {'x': 3, 'y': 2},
+        'c': {'x': 1, 'y': 2},
+    }
+
+
 def test_a_file_without_an_end_is_read_no_further_than_its_bound() -> None:
     with pytest.raises(YamlError, match=f'more than {MAX_FILE_BYTES} bytes'):
         read_text(Path('/dev/zero'), MAX_FILE_BYTES)

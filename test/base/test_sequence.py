@@ -55,6 +55,30 @@ def test_a_restart_from_any_number_leaves_out_less_than_two_blocks(last: int, se
         assert s.extend((seq + 1) % WRAP, 1000) == (number + 1, Step.NEXT, 0)
 
 
+@given(st.lists(st.integers(0, WRAP - 1), min_size=2, max_size=50))
+def test_numbers_at_random_are_no_losses(numbers: list[int]) -> None:
+    s = SequenceExtender(20, 1000.0)
+    # The device's clock goes on as it should.
+    missing = sum(s.extend(seq, 1000 * n)[2] for n, seq in enumerate(numbers))
+    assert missing <= len(numbers) * 64 + 20 * len(numbers)
+
+
+@pytest.mark.parametrize('missing', [1, 63, 1000, 86_400_000, 2**31 - 2])
+@pytest.mark.parametrize('fast', [0.5, 1.0, 10.0])
+def test_a_gap_that_the_clock_confirms_is_a_loss(missing: int, fast: float) -> None:
+    s = SequenceExtender(20, 1000.0)
+    s.extend(5, 5000)
+    seq = 5 + 1 + missing
+    assert s.extend(seq, 5000 + round((1 + missing) * 1000 / fast)) == (seq, Step.GAP, missing)
+
+
+def test_a_leap_that_the_clock_does_not_confirm_is_a_restart() -> None:
+    s = SequenceExtender(20, 1000.0)
+    s.extend(5, 5000)
+    assert s.extend(2**30, 6000) == (20 + 2**30 % 20, Step.RESTART, 0)
+    assert s.extend(2**30 + 1, 7000)[1:] == (Step.NEXT, 0)
+
+
 HALF = WRAP // 2
 
 

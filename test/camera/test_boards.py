@@ -70,8 +70,7 @@ def test_half_a_board_and_none_are_refused() -> None:
     hidden[:, 150:] = 128
     for picture, status in ((hidden, Status.HIDDEN), (np.full_like(image, 90), Status.MISSING)):
         reference = CameraReference(BOARD, target_of)
-        reference.take(0, picture)
-        assert [a.status for a in reference.finish()] == [status]
+        assert [a.status for a in reference.take(0, picture)] == [status]
 
 
 def test_the_lens_is_found_again() -> None:

@@ -161,8 +161,7 @@ def test_a_small_thing_beside_a_disc_is_noticed_in_a_large_image() -> None:
     middle = 960 + 100 + 30
     image[np.hypot(columns - middle, rows - 520) < 24] = 200
     reference = CameraReference(settings_of(scene), target_of)
-    reference.take(0, image)
-    assert [a.status for a in reference.finish()] == [Status.DOUBLED]
+    assert [a.status for a in reference.take(0, image)] == [Status.DOUBLED]
 
 
 @pytest.mark.parametrize(
@@ -185,14 +184,12 @@ def test_what_cannot_be_measured_is_refused_with_the_reason(status: Status, scen
 def test_an_overexposed_target_is_refused() -> None:
     scene, rng = Scene(black=60.0, white=900.0), np.random.default_rng(1)
     reference = CameraReference(settings_of(scene), target_of)
-    assert reference.take(0, photograph(scene, [Pose()], rng)) == []
-    (answer,) = reference.finish()
+    (answer,) = reference.take(0, photograph(scene, [Pose()], rng))
     assert answer.status == Status.SATURATED
 
 
 def test_two_places_in_one_exposure_are_not_a_motion() -> None:
     scene, rng = Scene(), np.random.default_rng(2)
     reference = CameraReference(settings_of(scene), target_of)
-    reference.take(0, photograph(scene, [Pose(), Pose(dx=1.5e-3)], rng))
-    (answer,) = reference.finish()
+    (answer,) = reference.take(0, photograph(scene, [Pose(), Pose(dx=1.5e-3)], rng))
     assert answer.status == Status.GHOST

@@ -83,8 +83,7 @@ def test_effects_are_put_into_the_users_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('text', 'why'),
     [
-        # Twice the same key: our reader takes the last, the editor none.
-        ('/**:\n  ros__parameters:\n    block_size: 10\n    block_size: 20\n', 'cannot be written again'),
+        ('/**:\n  ros__parameters:\n    block_size: 10\n    block_size: 20\n', 'block_size is there twice'),
         ('/**:\n  ros__parameters: {a: &a [x, x, x, x, x, x, x, x, x], ' + ', '.join(
             f'{chr(98 + i)}: &{chr(98 + i)} [{", ".join([f"*{chr(97 + i)}"] * 9)}]' for i in range(6)) + '}\n',
          'aliases stand for more than'),

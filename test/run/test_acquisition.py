@@ -246,7 +246,7 @@ def test_a_device_that_does_not_fit_is_named(
 
 
 def loss_of(run: Run) -> dict[str, int]:
-    return run.acquisition.counters.lost_by
+    return dict(run.acquisition.counters.lost_by)
 
 
 def test_every_lost_sample_has_a_cause(device: Any, run: Run, sample: Any) -> None:

@@ -274,6 +274,19 @@ def test_a_start_that_hangs_does_not_hold_up_the_end_of_the_run(live: Live, disk
     assert not disk.go_on.is_set()
 
 
+def test_starts_and_ends_without_end_on_a_disk_that_hangs_make_a_few_threads(live: Live, disk: Disk) -> None:
+    disk.hang('open')
+    before = threading.active_count()
+    refusals = []
+    for _ in range(50):
+        started = live.session.record(True)
+        live.session.record(False).result(WAIT_S)
+        refusals.append(str(started.exception(WAIT_S)))
+    assert threading.active_count() - before <= recorder_module.MOST_THREADS
+    assert refusals[-1] == f'not recorded: {recorder_module.MOST_THREADS} recordings wait for the disk already'
+    disk.go_on.set()
+
+
 @pytest.mark.parametrize('asked_for', [False, True])
 def test_an_end_that_hangs_holds_up_the_end_of_the_run_for_its_time_alone(
     live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch, asked_for: bool
@@ -284,7 +297,8 @@ def test_an_end_that_hangs_holds_up_the_end_of_the_run_for_its_time_alone(
     if asked_for:
         live.session.record(False)
     live.session.close()
-    assert live.heard('the disk is slow; it is not waited for').startswith(str(folder))
+    told = live.heard('it is not waited for, and 0 messages are not written')
+    assert told.startswith(f'{folder}: ')
     assert not disk.go_on.is_set()
 
 

@@ -1,14 +1,26 @@
-"""How a run ends when a part of it hangs: it is waited for, and not for long."""
+"""How a run ends when a part of it hangs, or does not keep up: it is waited for, not for long, and losses are told."""
 
 from __future__ import annotations
 
+import json
+import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
+import yaml
 
+from psd_deflection.base.errors import EXIT_STATUSES, SamplesDroppedError
 from psd_deflection.base.log import texts
+from psd_deflection.cli.main import main
+from psd_deflection.devices.protocol.frames import SampleFrame
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.records import Record
 from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.run import behind
+from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
 
@@ -18,7 +30,8 @@ ALLOWED_S = 2.0
 class Hanging:
     """A thread that never ends, and the time for which it was waited for."""
 
-    ident = 1
+    ident = native_id = 1
+    name = 'a part'
 
     def __init__(self) -> None:
         self.waited_s = 0.0
@@ -35,8 +48,8 @@ class Hanging:
     ('part', 'told'),
     [
         ('acquisition', 'the source hangs; it is not waited for'),
-        ('processing', 'a subscriber holds up the last blocks; they are not waited for'),
-        ('recorder', 'the disk is slow; it is not waited for'),
+        ('processing', 'the last block is not waited for'),
+        ('recorder', 'it is not waited for, and 0 messages are not written.'),
     ],
 )
 def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
@@ -61,3 +74,118 @@ def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
     thread.join(WAIT_S)
     assert not thread.is_alive()
     session.acquisition.source.close()
+
+
+class Held:
+    """A sink that takes nothing until it is let go."""
+
+    def __init__(self) -> None:
+        self.holds = threading.Event()
+        self.go = threading.Event()
+
+    def put(self, record: Record) -> None:
+        self.holds.set()
+        assert self.go.wait(WAIT_S)
+
+
+def run_of(rig: Rig, folder: Path, said: list[str], **values: object) -> tuple[Session, Held]:
+    given = {'bag_dir': str(folder), 'record': True, 'realtime': False, 'keep_zero': False, 'block_size': 20, **values}
+    session, held = Session(replace_values(rig, cast(Any, given)), texts(said.append)), Held()
+    session.processing.sinks.append(held)
+    session.start()
+    return session, held
+
+
+def until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.001)
+
+
+def ended_with(session: Session) -> list[BaseException]:
+    return [] if session.failed is None else [session.failed]
+
+
+def test_samples_that_found_no_room_are_told_and_counted_everywhere(
+    device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame], capsys: pytest.CaptureFixture[str]
+) -> None:
+    said: list[str] = []
+    session, held = run_of(rig, tmp_path, said, queue_blocks=2)
+    device.send_frames(*(sample(seq) for seq in range(20)))
+    assert held.holds.wait(WAIT_S)
+    device.send_frames(*(sample(seq) for seq in range(20, 400)))
+    until(lambda: session.acquisition.counters.samples == 400)
+    held.go.set()
+    until(lambda: session.acquisition.queue.empty())
+    device.send_frames(*(sample(seq) for seq in range(400, 440)))
+    until(lambda: session.processing.pipeline.counters.blocks >= 5)
+    (told,) = (line for line in said if 'dropped here' in line)
+    assert told == 'this machine is too slow: 20 samples dropped here so far (2 blocks wait, queue_blocks)'
+    values = {k: v for e in HealthReporter(session).report(0).entries for k, v in e.values}
+    assert values['dropped by a full queue'] == '340'
+    assert not ended_with(session)
+    folder = session.close()
+    assert folder is not None
+    (failed,) = ended_with(session)
+    assert isinstance(failed, SamplesDroppedError)
+    assert str(failed) == (
+        '340 samples were read and not processed (340 while it ran, 0 at the end): this machine is too slow'
+    )
+    assert failed.exit_status == 9
+    assert 9 in EXIT_STATUSES
+    recording = open_recording(folder)
+    taken = sum(len(block.seq) for block in recording.blocks())
+    assert taken + 340 == 440
+    assert recording.dropped_here == (340, 0)
+    custom = yaml.safe_load((folder / 'metadata.yaml').read_text())['rosbag2_bagfile_information']['custom_data']
+    assert json.loads(custom['psd_deflection.dropped_here']) == {'samples': '340', 'messages': '0'}
+    assert main(['info', str(folder)]) == 0
+    shown = capsys.readouterr().out
+    assert '340 samples, 0 messages: the host that recorded was too slow' in shown
+    assert f'{taken} present, 340 lost' in shown
+    # On the wire nothing was lost.
+    assert session.acquisition.counters.lost == 0
+
+
+def test_what_waits_at_the_end_behind_a_part_that_hangs_is_counted_and_the_part_named(
+    device: Any,
+    rig: Rig,
+    tmp_path: Path,
+    sample: Callable[..., SampleFrame],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(behind, 'HELD_S', 0.0)
+    said: list[str] = []
+    session, held = run_of(rig, tmp_path, said)
+    device.send_frames(*(sample(seq) for seq in range(20)))
+    assert held.holds.wait(WAIT_S)
+    device.send_frames(*(sample(seq) for seq in range(20, 100)))
+    until(lambda: session.acquisition.counters.samples == 100)
+    session.close()
+    assert any(
+        line == 'pipeline is held up in run.processing.give: the last 80 samples were read and not processed'
+        for line in said
+    ), said
+    assert 'pipeline is held up in run.processing.give: the last block is not waited for' in said
+    assert not any('subscriber' in line or 'the disk' in line for line in said)
+    assert '80 samples were read and not processed (0 while it ran, 80 at the end)' in str(session.failed)
+    (folder,) = tmp_path.glob('psd_*')
+    assert open_recording(folder).dropped_here == (80, 0)
+    held.go.set()
+    session.processing.join(WAIT_S)
+    assert not session.alive
+
+
+def test_a_run_that_lost_nothing_here_ends_well(
+    device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame]
+) -> None:
+    session, held = run_of(rig, tmp_path, [])
+    held.go.set()
+    device.send_frames(*(sample(seq) for seq in range(100)))
+    until(lambda: session.acquisition.counters.samples == 100)
+    folder = session.close()
+    assert session.failed is None
+    assert folder is not None
+    assert open_recording(folder).dropped_here == (0, 0)
+    assert 'dropped_here' not in (folder / 'metadata.yaml').read_text()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -153,6 +154,106 @@ def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert not list(tmp_path.iterdir())
     assert 'disk_reserve' in chain.said[-1]
     assert 'disk_reserve' in chain.watcher.failure
+
+
+def a_load(t_ns: int) -> tuple[str, str, bytes, int]:
+    (message,) = to_messages(AppliedLoad(t_ns, 0.0, -1.0, 0.0))
+    return LOAD, message.type, cdr.encode(message.type, message.fields), t_ns
+
+
+def test_ten_thousand_inputs_a_second_with_the_device_away_do_not_fill_the_memory(tmp_path: Path) -> None:
+    chain = Chain(tmp_path, watch_memory=1_000_000)
+    chain.feed(1.0)
+    topic, kind, message, _ = a_load(START_NS)
+    most = 0
+    # A minute of the clock of the inputs, no block in it.
+    for n in range(600_000):
+        chain.watcher.put_message(topic, kind, message, START_NS + 1_000_000_000 + n * 100_000)
+        if n % 1000 == 0:
+            most = max(most, chain.watcher.held_bytes)
+    assert 0 < most <= 1_000_000
+    assert [line for line in chain.said if 'watch_memory' in line] == [
+        'watch: 1 MB are full (watch_memory): what is kept begins later than watch_minutes says'
+    ]
+    assert int(dict(chain.watcher.entry().values)['dropped from memory, because it was full']) > 0
+
+
+def test_nothing_is_held_of_a_device_that_has_been_away_for_long(tmp_path: Path) -> None:
+    chain = Chain(tmp_path, watch_minutes=0.5)
+    chain.feed(1.0)
+    for n in range(90):
+        chain.watcher.put_message(*a_load(START_NS + n * 1_000_000_000))
+    assert chain.watcher.held_bytes > 0
+    chain.watcher.put_message(*a_load(START_NS + 100_000_000_000))
+    assert chain.watcher.held_bytes == 0
+    assert not chain.said
+
+
+def test_after_full_memory_what_is_kept_replays_as_the_run_computed_it(tmp_path: Path) -> None:
+    chain = Chain(tmp_path, watch_memory=1_000_000)
+    chain.feed(1.0)
+    chain.load(0.0, 0.0, 0.0)
+    chain.feed(14.0)
+    for n in range(10_000):
+        chain.watcher.put_message(*a_load(START_NS + 15_000_000_000 + n))
+    assert any('watch_memory' in line for line in chain.said)
+    chain.feed(3.0)
+    chain.feed(6.0, BUMP)
+    assert chain.watcher.watch.alarms == 1
+    assert chain.watcher.close(60.0)
+    assert chain.watcher.folder is not None
+    assert chain.watcher.held_bytes == 0
+    recording = open_recording(chain.watcher.folder)
+    again = replayed_estimates(recording, rig_at_start(recording))
+    assert len(again.t_ns) > 300
+    assert [chain.poses[t] for t in again.t_ns.tolist()] == [tuple(p) for p in again.pose.tolist()]
+
+
+def keep(folder: Path, name: str, age: int, *extra: str) -> Path:
+    """A recording of the watch of 1000 bytes, made ``age`` seconds ago."""
+    made = folder / name
+    made.mkdir(parents=True)
+    for file in (f'{name}_0.mcap', *extra):
+        (made / file).write_bytes(bytes(1000))
+    os.utime(made, ns=(START_NS - age * 10**9,) * 2)
+    return made
+
+
+def an_alarm(chain: Chain) -> Path:
+    chain.load(0.0, 0.0, 0.0)
+    chain.feed(8.0)
+    chain.feed(6.0, BUMP)
+    assert chain.watcher.close(60.0)
+    assert chain.watcher.folder is not None
+    return chain.watcher.folder
+
+
+def test_the_oldest_of_what_was_kept_is_deleted_and_nothing_else(tmp_path: Path) -> None:
+    older = [keep(tmp_path, f'watch_2023_{n}', 100 - n) for n in range(5)]
+    recorded = keep(tmp_path, 'psd_20230101_000000', 1000)
+    noted = keep(tmp_path, 'watch_2022', 2000, 'what I saw.txt')
+    elsewhere = keep(tmp_path / 'deep', 'watch_2021', 3000)
+    (tmp_path / 'watch_2020').symlink_to(elsewhere)
+    chain = Chain(tmp_path, watch_dir_max_recordings=3)
+    chain.feed(0.2)
+    folder = an_alarm(chain)
+    assert [path.exists() for path in older] == [False, False, False, True, True]
+    assert all(path.exists() for path in (folder, recorded, noted, elsewhere / 'watch_2021_0.mcap'))
+    told = [line for line in chain.said if 'deleted' in line]
+    assert len(told) == 3
+    assert told[0].startswith(f'watch: {older[0]}: deleted, the oldest')
+
+
+def test_what_was_kept_is_bounded_in_bytes(tmp_path: Path) -> None:
+    big = keep(tmp_path, 'watch_big', 5)
+    (big / 'watch_big_0.mcap').write_bytes(bytes(2_000_000))
+    os.utime(big, ns=(START_NS,) * 2)
+    chain = Chain(tmp_path, watch_dir_max_bytes=1_500_000)
+    chain.feed(0.2)
+    folder = an_alarm(chain)
+    assert not big.exists()
+    # The newest stays, however large.
+    assert folder.exists()
 
 
 def test_a_session_feeds_its_watch_and_reports_it(device: ScriptedDevice, sample: Callable[..., SampleFrame]) -> None:

@@ -6,7 +6,6 @@ Pinocchio would do the same. Its wheels take 0.35 GB with what they bring along,
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,11 +18,11 @@ import numpy as np
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, of_position_and_angles, turn
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import text_of_file
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.records import FloatArray
 
 MOST_BYTES = 5_000_000
-NUMBER = re.compile(r'[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?', re.ASCII)
 MOVABLE = ('revolute', 'continuous', 'prismatic')
 
 
@@ -206,8 +205,10 @@ def _three(
 
 
 def _numbers(text: str, count: int, where: str) -> list[float]:
-    # Python takes 1_0 for 10, and digits of other scripts.
-    numbers = [float(word) for word in text.split() if NUMBER.fullmatch(word)]
-    if len(numbers) != len(text.split()) or len(numbers) != count or not all(map(math.isfinite, numbers)):
+    try:
+        numbers = [plain_number(word) for word in text.split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
         raise ConfigError(f'{where} = {text!r}: must be {count} finite number{"s" * (count > 1)}')
     return numbers

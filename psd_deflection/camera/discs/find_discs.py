@@ -30,6 +30,8 @@ _MIDDLE_TOLERANCE = 0.25
 _RATIO_TOLERANCE = 0.12
 _SIZE_TOLERANCE = 0.25
 _MAX_REGIONS = 400
+_MOST_EDGES = 1_000_000
+"""Changes between bright and dark along the rows: what costs time is the number of outlines, not of pixels."""
 _MIN_CONTRAST = 8.0
 
 
@@ -89,6 +91,9 @@ def find_discs(grey: Any, ratio: float) -> list[Region]:
 def _found(binaries: Iterable[Any], ratio: float, clear: float) -> list[Region]:
     best: tuple[int, Status] = (0, Status.MISSING)
     for binary in binaries:
+        if np.count_nonzero(binary[:, 1:] != binary[:, :-1]) > _MOST_EDGES:
+            best = (5, Status.CLUTTERED)
+            continue
         regions = _regions(binary)
         lines = _lines([r for r in regions if r.round and not r.at_border], ratio)
         if len(lines) > 1:
@@ -125,12 +130,13 @@ def _binaries(grey: Any, *, smooth: bool = True) -> Iterator[Any]:
 
 def _regions(binary: Any) -> list[Region]:
     cv2 = opencv()
-    outlines, tree = cv2.findContours(binary, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    # As a list: to find out which hole is in which outline takes the square of their number.
+    outlines, _ = cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     rows, columns = binary.shape
     found = []
-    for outline, links in zip(outlines, tree.reshape(-1, 4) if tree is not None else (), strict=True):
-        # The second level has the holes.
-        if links[3] != -1 or len(outline) < 12:
+    for outline in outlines:
+        # A hole goes around the other way.
+        if len(outline) < 12 or cv2.contourArea(outline, True) > 0.0:
             continue
         m = cv2.moments(outline)
         area = m['m00']

@@ -189,6 +189,14 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
         row('duration', f'{found["duration_s"]:.3f} s'),
         row('samples', f'{samples} present, {lost} lost ({share}), {found["flagged"]} flagged'),
     ]
+    here = found['dropped_here']
+    if here['samples'] or here['messages']:
+        out.append(
+            row(
+                'dropped',
+                f'{here["samples"]} samples, {here["messages"]} messages: the host that recorded was too slow',
+            )
+        )
     if found['restarts']:
         out.append(row('restarts', f'{found["restarts"]} of the device'))
     out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))

@@ -22,6 +22,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._options import given_as_option, in_the_world, recording_name, refuse, seed, world_option
 from psd_deflection.cli._report import print_json, show
 from psd_deflection.cli.run import serve
@@ -126,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
 def _reference_noise(text: str) -> tuple[float, float, float]:
     """The value of --reference-noise, for dX, dY and theta; raises UsageError."""
     try:
-        across, twist = map(float, text.split(','))
+        across, twist = map(plain_number, text.split(','))
     except ValueError:
         across = twist = -1.0
     if not (0.0 <= across <= 1.0 and 0.0 <= twist <= 1.0):

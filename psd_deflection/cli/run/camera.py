@@ -19,7 +19,6 @@ bag folder have /reference/deflection and /reference/deflection_with_covariance.
 from __future__ import annotations
 
 import argparse
-import collections
 import contextlib
 import importlib.util
 import math
@@ -30,6 +29,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from psd_deflection.base.bounds import Tally
 from psd_deflection.base.errors import RecordingError, UsageError
 from psd_deflection.base.files import replace_file
 from psd_deflection.camera.answer import FrameAnswer, Status
@@ -149,12 +149,12 @@ def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
     opencv()
     footage = Footage(args.what[0], settings.exposure)
     reference = CameraReference(settings, target_of)
-    reasons: collections.Counter[str] = collections.Counter()
+    reasons = Tally()
     found: list[FrameAnswer] = []
     with contextlib.closing(open_reference_file(out)) as sink:
         for answer in _answers(args, footage, reference, _Preview(args.show)):
-            reasons[str(answer.status)] += 1
-            sink.put(answer.t_ns, answer.as_record(), str(answer.status))
+            reasons.add(answer.words)
+            sink.put(answer.t_ns, answer.as_record(), answer.words)
             found = [*found[-999:], answer] if answer.status is Status.OK else found
     _tell(args, settings, reference, reasons, found)
     return 0
@@ -219,10 +219,11 @@ def _tell(
     args: argparse.Namespace,
     settings: CameraSettings,
     reference: CameraReference,
-    reasons: collections.Counter[str],
+    reasons: Tally,
     found: list[FrameAnswer],
 ) -> None:
-    frames, good = sum(reasons.values()), reasons.pop(str(Status.OK), 0)
+    good = reasons[str(Status.OK)]
+    frames, refused = reasons.total(), {words: count for words, count in reasons.most_common() if words != Status.OK}
     median = [
         sorted(math.sqrt(float(a.covariance[i, i])) for a in found if a.covariance is not None)[len(found) // 2]
         for i in range(3)
@@ -235,7 +236,7 @@ def _tell(
                 'out': args.out,
                 'frames': frames,
                 'answers': good,
-                'refused': dict(reasons.most_common()),
+                'refused': refused,
                 'sd': dict(zip(('dx', 'dy', 'theta'), median, strict=False)),
                 'turn': None if rest is None else reference.turn,
                 'radius_scale': None if rest is None else rest.scale,
@@ -244,7 +245,7 @@ def _tell(
         )
         return
     show(f'{args.out}: {good} of {frames} frames have an answer')
-    for reason, count in reasons.most_common():
+    for reason, count in refused.items():
         show(f'  {count} refused: {reason}')
     if rest is not None and median:
         dx, dy, theta = median

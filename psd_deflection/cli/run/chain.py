@@ -69,20 +69,18 @@ def run(args: argparse.Namespace) -> int:
     file = read_chain(args.chain, given, args.slopes)
     display = Display()
     if args.no_ros:
-        with _written(args.out) as stream:
+        with display.telling_recorded(), _written(args.out) as stream:
             teller = _Teller(args, display, stream)
-            status = run_until_signal(lambda: ChainSession(file, display.say), teller.watch, teller.listen)
-    elif importlib.util.find_spec('rclpy') is None:
+            return run_until_signal(lambda: ChainSession(file, display.say), teller.watch, teller.listen)
+    if importlib.util.find_spec('rclpy') is None:
         raise ConfigError(
             "rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`, or run with --no-ros"
         )
-    else:
-        from psd_deflection.ros.chain import run_chain
+    from psd_deflection.ros.chain import run_chain
 
+    with display.telling_recorded():
         teller = _Teller(args, display, None)
-        status = run_chain(args.ros_arguments, file, display.say, teller.watch)
-    display.tell_recorded()
-    return status
+        return run_chain(args.ros_arguments, file, display.say, teller.watch)
 
 
 @contextlib.contextmanager

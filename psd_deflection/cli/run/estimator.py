@@ -81,10 +81,8 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
     overrides = over_file(args.params_file, given_parameters(args))
     display = Display()
-    with started_early(simulates_at_once(overrides, args.ros_arguments)):
-        status = _run(args, overrides, display)
-    display.tell_recorded()
-    return status
+    with display.telling_recorded(), started_early(simulates_at_once(overrides, args.ros_arguments)):
+        return _run(args, overrides, display)
 
 
 def _run(args: argparse.Namespace, overrides: dict[str, object], display: Display) -> int:

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._daemon import request, url_option
 from psd_deflection.cli._options import need_finite
 
@@ -24,7 +25,7 @@ from psd_deflection.cli._options import need_finite
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     for name, unit in (('FX', 'N'), ('FY', 'N'), ('TZ', 'N m')):
-        parser.add_argument(name.lower(), metavar=name, type=float, help=unit)
+        parser.add_argument(name.lower(), metavar=name, type=plain_number, help=unit)
     parser.add_argument('--add', action='store_true', help='this load acts beside the one that was noted last')
     url_option(parser)
 

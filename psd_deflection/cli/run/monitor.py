@@ -23,6 +23,7 @@ from collections.abc import Iterator
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import INFO
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import given_parameters, namespace_option, over_file, parameter_option, refuse
 from psd_deflection.cli._report import warn
@@ -34,7 +35,6 @@ from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.declarations import MONITOR
 from psd_deflection.run.headless import run_headless
 from psd_deflection.run.monitor.feed import Feed
-from psd_deflection.run.monitor.foxglove import FeedBeside, FoxgloveServer
 from psd_deflection.run.monitor.shown import ShownRecording
 from psd_deflection.run.monitor.start import need_server, start_views
 from psd_deflection.run.simulated_rig import simulates, started_early
@@ -70,7 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     play = parser.add_argument_group('a recording (with REC)')
     namespace_option(play)
-    play.add_argument('--speed', type=float, default=1.0, metavar='X', help='times as fast as recorded (default 1)')
+    play.add_argument(
+        '--speed', type=plain_number, default=1, metavar='X', help='times as fast as recorded (default 1)'
+    )
     play.add_argument('--loop', action='store_true', help='start again at the end')
 
 
@@ -93,13 +95,12 @@ def run(args: argparse.Namespace) -> int:
         return _play(args, overrides)
     values = over_file(args.params_file, overrides)
     display = Display()
-    with started_early(simulates(values)):
-        status = run_headless(values, display.say, display.watch, start_views)
-    display.tell_recorded()
-    return status
+    with display.telling_recorded(), started_early(simulates(values)):
+        return run_headless(values, display.say, display.watch, start_views)
 
 
 def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
+    from psd_deflection.run.monitor.foxglove import FeedBeside, FoxgloveServer
     from psd_deflection.run.monitor.server import MonitorServer
 
     opened, rig = open_for_replay(args.recording, args.params_file, args.namespace)
@@ -119,7 +120,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     display = Display()
-    foxglove = FoxgloveServer(rig) if rig.monitor.foxglove else None
+    foxglove = FoxgloveServer(rig, display.say) if rig.monitor.foxglove else None
     feed = Feed() if foxglove is None else FeedBeside(foxglove, rig)
     server: MonitorServer | None = None
 

@@ -22,6 +22,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._options import (
     PICTURES,
     given_as_option,
@@ -54,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--params-file', metavar='RIG.yaml', help='a ROS 2 parameter file (default: the thesis rig)')
     parser.add_argument(
         '--load',
-        type=float,
+        type=plain_number,
         nargs=3,
         metavar=('FX', 'FY', 'TZ'),
         help='tip load at which the errors are computed, N, N, N m (default: a weight on a sidebar as long as the '

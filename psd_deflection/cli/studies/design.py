@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.tables import columns
 from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, picture_name, refuse
 from psd_deflection.cli._report import print_json, save_figure, show, show_text
@@ -41,26 +42,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     parser.add_argument(
         '--sigma',
-        type=float,
+        type=plain_number,
         metavar='M',
         help='standard deviation of a dot reading, m (default: amplifier noise of a block mean)',
     )
     parser.add_argument(
         '--radius',
-        type=float,
+        type=plain_number,
         metavar='M',
         help='sensor centres at most this far from the tip centre, m (default: as in the rig)',
     )
     parser.add_argument(
         '--keep-out',
-        type=float,
+        type=plain_number,
         default=0.0,
         metavar='M',
         help='sensor centres at least this far from it, m (default 0)',
     )
     parser.add_argument(
         '--box',
-        type=float,
+        type=plain_number,
         nargs=4,
         metavar=('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX'),
         help='sensor centres inside this box, m',

@@ -25,6 +25,8 @@ HOLD_NS = 100_000_000
 """An acceleration holds until the next one, but no longer than this. Then it is 0."""
 AHEAD_NS = 10_000_000_000
 """One may be told at most so long before it acts."""
+MOST_TOLD = 100_000
+"""So many may wait for their samples."""
 SHARE = 0.05
 """Share by which a change of what accelerations do may differ from this model, one standard deviation."""
 TENTH = 0.1
@@ -88,6 +90,8 @@ class Inertia:
                 f'header.stamp is {away_ns / 1e9:.3f} s after the last sample; one may come {AHEAD_NS / 1e9:g} s '
                 'before it acts'
             )
+        if len(self.told) >= MOST_TOLD:
+            raise ValueError(f'{MOST_TOLD} accelerations wait already for their samples')
         self.count += 1
         self.late += new.t_ns < there_ns
         (bx, by, _), (ax, ay, az) = new.linear, new.angular

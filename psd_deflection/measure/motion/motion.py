@@ -43,6 +43,9 @@ KNOWN_LOAD = 0.05
 """Share by which the deflection of a known load may differ from the rig file's link, one standard deviation."""
 LATE_S = 1.0
 """What late accelerations change fades to 1/e in this time."""
+MOST_LOADS = 1000
+"""So many known loads may wait for samples."""
+
 AXES = ('dX', 'dY', 'theta')
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 _FIRST, _SECOND = (np.array(side) for side in zip(*_PAIRS, strict=True))
@@ -200,8 +203,12 @@ class ModalFilter:
         return self._held is None or load[1:] != tuple(self._held.tolist())
 
     def load(self, load: AppliedLoad) -> None:
-        """A known load that acts from its stamp on. One from before the samples that were used is seen in them."""
+        """A known load that acts from its stamp on. One from before the samples that were used is seen in them.
+
+        If more than ``MOST_LOADS`` wait for samples, the oldest is forgotten.
+        """
         self._loads.append(load)
+        del self._loads[:-MOST_LOADS]
 
     def block(self, index: int, t_ns: int, slots: IntArray | None, poses: FloatArray | None) -> TipState | None:
         """The motion at the end of block ``index``, or None if nothing is known.

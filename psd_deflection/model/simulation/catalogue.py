@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.plugins import loaded
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.simulation import effects as ours
 from psd_deflection.model.simulation.declaration import PSD, ActiveEffect, Effect
@@ -107,13 +108,9 @@ def _of_file(path: Path) -> object:
 
 
 def _load(name: str, place: Place) -> Effect:
-    try:
-        found = _of_file(place) if isinstance(place, Path) else place.load()
-    except ConfigError:
-        raise
-    except (Exception, SystemExit) as error:
-        # A user's file may raise anything; the message names the file and the cause.
-        raise ConfigError(f'{_words(place)}: holds no effect ({type(error).__name__}: {error})') from error
+    found = loaded(
+        f'{_words(place)}: holds no effect', lambda: _of_file(place) if isinstance(place, Path) else place.load()
+    )
     if not isinstance(found, Effect):
         raise ConfigError(f'{_words(place)}: EFFECT = {found!r}: must be an Effect')
     if found.name != name:

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.loads import LoadHistory
 from psd_deflection.records import FloatArray
@@ -30,7 +31,7 @@ MAX_SECONDS = 86_400.0
 
 def _numbers(text: str, count: int | None, source: str) -> tuple[float, ...]:
     try:
-        out = tuple(float(v) for v in text.split(','))
+        out = tuple(plain_number(v) for v in text.split(','))
     except ValueError:
         raise ConfigError(f'{source}: {text!r} is not a list of numbers') from None
     if not all(math.isfinite(v) for v in out):

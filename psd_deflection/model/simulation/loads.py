@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.records import FloatArray
 
 SIDEBAR_ARM = 0.585
@@ -129,8 +130,8 @@ def from_csv(path: str | Path, rate: float = 1000.0) -> LoadHistory:
                 numbers = []
                 for name in names:
                     try:
-                        numbers.append(float(row[name]))
-                    except (TypeError, ValueError):
+                        numbers.append(plain_number(row[name]))
+                    except (TypeError, AttributeError, ValueError):
                         raise RecordingError(
                             f'{path}:{reader.line_num}: column {name} holds {row[name]!r}, which is not a number'
                         ) from None

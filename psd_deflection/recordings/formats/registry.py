@@ -12,6 +12,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.plugins import loaded
 from psd_deflection.recordings.formats.format import Format
 
 GROUP = 'psd_deflection.formats'
@@ -39,11 +40,7 @@ def formats() -> Iterator[Format]:
     yield from map(find_format, FORMATS)
     for point in sorted(entry_points(group=GROUP), key=lambda e: e.name):
         at = f'format {point.name!r}: {point.value}'
-        try:
-            found: object = point.load()
-        except Exception as error:
-            # A plug-in may raise anything on import; the user needs its name and the cause.
-            raise ConfigError(f'{at} cannot be loaded ({error!r})') from error
+        found: object = loaded(f'{at} cannot be loaded', point.load)
         if not isinstance(found, Format):
             raise ConfigError(f'{at}: {found!r} is no psd_deflection.recordings.formats.format.Format')
         yield found

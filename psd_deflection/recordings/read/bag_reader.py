@@ -49,6 +49,7 @@ from psd_deflection.recordings.read.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import Recording, from_json
 from psd_deflection.recordings.write.bag_writer import (
     META_CHANGE,
+    META_DROPPED,
     META_HELLO,
     META_MADE_WITH,
     META_NODE,
@@ -103,6 +104,7 @@ class BagRecording(Recording):
         software = metadata.get(META_SOFTWARE, {})
         self.version, self.node = software.get('version', ''), software.get(META_NODE, '')
         self.made_with = metadata.get(META_MADE_WITH, {})
+        self.dropped_here = _dropped(metadata.get(META_DROPPED, {}))
         self.changes = self._changes_in(metadata)
         if META_PARAMETERS not in metadata:
             self._take_rig_of_messages()
@@ -442,3 +444,9 @@ def read_information(path: Path) -> dict[str, Any]:
     if not isinstance(information, dict):
         raise RecordingError(f'{path}: has no rosbag2_bagfile_information; {way_out}')
     return information
+
+
+def _dropped(entry: Mapping[str, str]) -> tuple[int, int]:
+    counts = [entry.get(name, '0') for name in ('samples', 'messages')]
+    samples, messages = (int(c) if c.isascii() and c.isdecimal() and len(c) < 16 else 0 for c in counts)
+    return samples, messages

@@ -14,8 +14,9 @@ import numpy as np
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.numbers import NUMBER
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.read.csv_rows import NUMBER, CsvRows, CsvTable
+from psd_deflection.recordings.read.csv_rows import CsvRows, CsvTable
 from psd_deflection.recordings.read.mcap_reader import RawMessage
 from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
 from psd_deflection.records import (

@@ -15,16 +15,13 @@ from pathlib import Path
 from typing import BinaryIO, NamedTuple, TextIO
 
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.numbers import NUMBER
 
 MAX_LINE = 10_000
 """Maximum characters of a line; a longer line is not a row of samples."""
 
 MAX_SECONDS = 2**31
 """A ROS stamp has 31 bits of seconds."""
-
-NUMBER = re.compile(
-    r'[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]{1,4})?|[+-]?(?:nan|inf|infinity)', re.ASCII | re.IGNORECASE
-)
 
 _SECONDS = re.compile(r'(1?[0-9]{1,9})\.([0-9]{1,9})', re.ASCII)
 """Seconds that are below the bound and whole nanoseconds, as most loggers write them."""

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
 from psd_deflection.records import FloatArray
 
@@ -100,8 +101,7 @@ class ReadingsTable:
                 out.append(math.nan)
                 continue
             try:
-                # Python takes `1_000` and digits of every script; in a table they are typing errors.
-                value = float(cell) if cell.isascii() and '_' not in cell else math.nan
+                value = plain_number(cell)
             except ValueError:
                 value = math.nan
             if not math.isfinite(value):

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.printable import printable
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.csv_rows import MAX_LINE, MAX_SECONDS
@@ -155,7 +156,7 @@ def _table(path: Path, columns: Mapping[str, int]) -> References:
 
 def _number(path: Path, line: int, cell: str) -> float:
     try:
-        value = float(cell)
+        value = plain_number(cell)
     except ValueError:
         value = math.nan
     if not abs(value) < MAX_SECONDS:

@@ -46,8 +46,9 @@ META_NODE = 'node'
 META_MADE_WITH = 'psd_deflection.made_with'
 META_PARAMETERS = 'psd_deflection.parameters'
 META_HELLO = 'psd_deflection.device_hello'
+META_DROPPED = 'psd_deflection.dropped_here'
 META_CHANGE = 'psd_deflection.change.'
-"""Names of the MCAP metadata records, and of a value in the first; every value in the last three is JSON."""
+"""Names of the MCAP metadata records, and of a value in the first; those of parameters, hello and change are JSON."""
 
 CUSTOM = {'psd_deflection_version': __version__}
 
@@ -124,6 +125,7 @@ class McapFile(_RecordSink):
         self._chunk_first: int | None = None
         self._chunk_last = 0
         self.changes: list[ParameterChange] = []
+        self.custom = dict(CUSTOM)
         self._present = dict(rig_values)
         self._hello = device_hello
         # Written with the next message, whose time is then known.
@@ -253,6 +255,13 @@ class McapFile(_RecordSink):
         self.topics[topic] = TopicCount(topic, type_name, qos, message.type_hash)
         return channel
 
+    def note_dropped(self, samples: int, messages: int) -> None:
+        """Note what the recording lacks because the machine that recorded did not keep up; the last note holds."""
+        dropped = {'samples': str(samples), 'messages': str(messages)}
+        self.custom[META_DROPPED] = json.dumps(dropped)
+        with self._guard():
+            self._writer.add_metadata(META_DROPPED, dropped)
+
     def count(self) -> FileCount:
         """The file's entry for ``metadata.yaml``."""
         messages = sum(t.messages for t in self.topics.values())
@@ -265,7 +274,7 @@ class McapFile(_RecordSink):
         if self._untold and self.topics:
             self._tell_rig(self.end_ns)
         with self._guard():
-            information = bag_information([self.count()], list(self.topics.values()), CUSTOM)
+            information = bag_information([self.count()], list(self.topics.values()), self.custom)
             self._writer.add_metadata('rosbag2', {'serialized_metadata': to_yaml(information)})
             self._writer.finish()
             if self._durable:
@@ -372,11 +381,15 @@ class BagWriter(_RecordSink):
         """End the chunk, so that a crash from now on does not cost it."""
         self._file.flush()
 
+    def note_dropped(self, samples: int, messages: int) -> None:
+        """As of :class:`McapFile`, for the whole bag."""
+        self._file.note_dropped(samples, messages)
+
     def information(self) -> dict[str, Any]:
         """The tree of ``metadata.yaml`` for the messages written so far."""
         parts = [*self._ended, (self._file.count(), list(self._file.topics.values()))]
         topics = totals(t for _, counts in parts for t in counts)
-        return bag_information([count for count, _ in parts], topics, CUSTOM)
+        return bag_information([count for count, _ in parts], topics, self._file.custom)
 
     def close(self) -> None:
         """Close the file, then write ``metadata.yaml``; a second call does nothing.

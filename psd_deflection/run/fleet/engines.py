@@ -22,13 +22,13 @@ from psd_deflection.base.errors import ConfigError, DaemonError, UsageError
 T = TypeVar('T')
 
 SERIAL = 'serial'
-FORMS = 'serial, processes, processes:N or dask://HOST:PORT'
+FORMS = 'serial, processes, processes:N, dask://HOST:PORT or dask+tls://HOST:PORT'
 CONNECT_S = 10.0
 DASK_SLOTS = 256
 """Tasks that a scheduler is given at a time: enough that a cluster that grows with its work does."""
 
 _PROCESSES = re.compile(r'processes(?::([1-9]\d{0,3}))?')
-_DASK = re.compile(r'dask://([^\s/]+:\d{1,5})/?')
+_DASK = re.compile(r'dask(?:\+tls)?://([^\s/]+:\d{1,5})/?')
 
 
 class Engine(Protocol):
@@ -152,9 +152,13 @@ def _connected(word: str) -> Iterator[Any]:
         raise ConfigError(
             f"--executor {word} needs Dask: `pip install 'psd_deflection[dask]'` or `pip install distributed`"
         ) from None
-    address = word.removeprefix('dask://').rstrip('/')
+    scheme, _, address = word.rstrip('/').partition('://')
+    # The certificates are in Dask's own configuration.
+    protocol = 'tls' if scheme.endswith('tls') else 'tcp'
+    if protocol == 'tls' and distributed.Security().get_connection_args('client')['ssl_context'] is None:
+        raise ConfigError(f"--executor {word}: Dask's configuration has no certificates (distributed.comm.tls)")
     try:
-        client = distributed.Client(f'tcp://{address}', timeout=CONNECT_S, set_as_default=False)
+        client = distributed.Client(f'{protocol}://{address}', timeout=CONNECT_S, set_as_default=False)
     except (OSError, TimeoutError, concurrent.futures.TimeoutError) as error:
         raise DaemonError(f'{word}: no Dask scheduler answers ({error}); start one with `dask scheduler`') from None
     with client:

@@ -1,125 +1,192 @@
 """Serves what is measured to Foxglove, without ROS: the messages of the graph, over Foxglove's WebSocket protocol.
 
-The protocol is foxglove-sdk's (https://docs.foxglove.dev/docs/sdk). Messages are the ones that ROS and the recording
-get: the same topics, types (``ros2msg``) and bytes (CDR). A slow viewer loses its oldest messages; we wait for none.
+The protocol is ``foxglove.websocket.v1`` (https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md), as far as
+a viewer needs it. Messages are the ones that ROS and the recording get: the same topics, types (``ros2msg``) and
+bytes (CDR). A slow viewer loses its oldest messages, and one that does not read is dropped; we wait for none.
 Viewers can only look: the server offers neither publishing nor services nor parameters.
 """
 
 from __future__ import annotations
 
-import logging
-import math
+import asyncio
+import contextlib
+import json
+import secrets
+import struct
 import threading
-import time
-from typing import TYPE_CHECKING
+from collections import deque
+from collections.abc import Coroutine
+from typing import Any
+
+from aiohttp import WSMessage, WSMsgType, web
 
 from msg_adapters import MESSAGE_TYPES, RIG, TOPIC_TYPES
 from psd_deflection import __version__
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.bounds import MESSAGE_BYTES, ByteBudget
+from psd_deflection.base.log import Say, unsaid
 from psd_deflection.recordings.provenance import provenance
 from psd_deflection.records import ParameterChange, Record, RigState, SpotMeans
 from psd_deflection.rig.config import Rig
-from psd_deflection.rig.declarations import MonitorConfig
 from psd_deflection.run.fanout import Fanout, published, subscribed
 from psd_deflection.run.monitor.feed import Feed
-
-if TYPE_CHECKING:
-    import foxglove
-    from foxglove.websocket import ChannelView, Client, WebSocketServer
+from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer
 
 VIEWER = 'in Foxglove: Open connection'
+PROTOCOLS = ('foxglove.websocket.v1', 'foxglove.sdk.v1')
+"""The second is what newer viewers call it."""
+
+BACKLOG_BYTES = 8_000_000
+"""What waits for one viewer: a minute and more."""
+
+REQUEST_BYTES = 65_536
+PUMP_S = 0.02
+_MESSAGE = struct.Struct('<BIQ')
+_MESSAGE_DATA = 1
 
 
-SETTLED_S = 0.2
-"""So long after a viewer has asked for a topic it gets what is sent."""
+class _Viewer:
+    """What one viewer looks at, and what waits for it; messages may come from any thread."""
+
+    def __init__(self) -> None:
+        self.told = 0
+        self.subscriptions: dict[int, int] = {}
+        self._budget = ByteBudget(BACKLOG_BYTES)
+        self._waiting: deque[bytes] = deque()
+
+    def offer(self, channel: int, message: bytes, t_ns: int) -> None:
+        """Let a message wait, if the viewer looks at its channel; if there is no room, the oldest is dropped."""
+        subscription = self.subscriptions.get(channel)
+        if subscription is None:
+            return
+        size = _MESSAGE.size + len(message) + MESSAGE_BYTES
+        while not self._budget.take(size):
+            if self.take() is None:
+                return
+        self._waiting.append(_MESSAGE.pack(_MESSAGE_DATA, subscription, t_ns) + message)
+
+    def take(self) -> bytes | None:
+        """The next message to send, or None."""
+        with contextlib.suppress(IndexError):
+            message = self._waiting.popleft()
+            self._budget.give_back(len(message) + MESSAGE_BYTES)
+            return message
+        return None
 
 
-class FoxgloveServer:
+class FoxgloveServer(GatedServer):
     """A wire of the fan-out. Serves from construction on; ``address``: its WebSocket URL.
 
-    Raises ConfigError if foxglove-sdk is not installed or the address cannot be served on.
+    ``say`` gets what is out of the ordinary. Raises ConfigError if the address cannot be served on.
     """
 
-    def __init__(self, rig: Rig) -> None:
-        # Imported here: only this view needs it.
-        try:
-            import foxglove
-        except ImportError:
-            raise ConfigError(
-                "foxglove needs foxglove-sdk: `pip install 'psd_deflection[foxglove]'`, or run without it and open the "
-                "recording's .mcap"
-            ) from None
-        # It logs each viewer that comes and goes.
-        logging.getLogger('foxglove').setLevel(logging.ERROR)
-        self._sdk = foxglove
-        self._context = foxglove.Context()
+    websocket_path = '/'
+
+    def __init__(self, rig: Rig, say: Say = unsaid) -> None:
+        config = rig.monitor
+        super().__init__('foxglove', config.foxglove_address, config.foxglove_port, say, config.foxglove_origins)
+        # A viewer forgets what it has of another one.
+        self._session = secrets.token_hex(8)
         self._lock = threading.Lock()
-        self._channels: dict[str, foxglove.Channel] = {}
+        # Both for as long as the server lives: one entry a topic of our own.
+        self._numbers: dict[str, int] = {}
+        self._channels: list[dict[str, object]] = []
+        self._looking: dict[web.WebSocketResponse, _Viewer] = {}
         self._rig: tuple[bytes, int] | None = None
-        self._repeat_at = math.inf
-        # Before anybody looks: foxglove-sdk offers a new channel to a viewer that it does not let subscribe to it yet.
         for topic, type_name in (published(rig) | {name: TOPIC_TYPES[name] for name in subscribed(rig)}).items():
             self._offer(topic, type_name)
-        self._server = self._serve(rig.monitor)
-        self.address = f'ws://{rig.monitor.foxglove_address}:{self._server.port}'
+        self.address = f'ws:{self.start_thread()}'
 
-    def _serve(self, config: MonitorConfig) -> WebSocketServer:
-        server = self
+    def add_routes(self, application: web.Application) -> None:
+        """The websocket alone."""
+        application.router.add_get(self.websocket_path, self._websocket)
 
-        class Listener(self._sdk.ServerListener):  # type: ignore[misc, name-defined]
-            """The server's thread tells it of each viewer that looks at a topic."""
+    def jobs(self) -> list[Coroutine[Any, Any, None]]:
+        """Wakes the senders."""
+        return [self._pump()]
 
-            def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-                if channel.topic == RIG:
-                    # What is sent now would not reach it: it is told before its subscription holds.
-                    server._repeat_at = time.monotonic() + SETTLED_S
+    async def _pump(self) -> None:
+        while True:
+            self.wake()
+            await asyncio.sleep(PUMP_S)
 
-        ports = [config.foxglove_port] + [0] * (config.foxglove_port != 0)
-        for port in ports:
-            try:
-                return self._sdk.start_server(
-                    name='psd_deflection',
-                    host=config.foxglove_address,
-                    port=port,
-                    context=self._context,
-                    server_listener=Listener(),
-                )
-            except RuntimeError as error:
-                reason = str(error)
-        raise ConfigError(f'foxglove_address {config.foxglove_address}: {reason}')
-
-    def _offer(self, topic: str, type_name: str) -> None:
+    def _offer(self, topic: str, type_name: str) -> int:
         with self._lock:
-            if topic not in self._channels:
-                self._channels[topic] = self._sdk.Channel(
-                    topic,
-                    schema=self._sdk.Schema(
-                        name=type_name, encoding='ros2msg', data=MESSAGE_TYPES[type_name].definition.encode()
-                    ),
-                    message_encoding='cdr',
-                    context=self._context,
+            if topic not in self._numbers:
+                number = self._numbers[topic] = len(self._channels) + 1
+                self._channels.append(
+                    {
+                        'id': number,
+                        'topic': topic,
+                        'encoding': 'cdr',
+                        'schemaName': type_name,
+                        'schemaEncoding': 'ros2msg',
+                        'schema': MESSAGE_TYPES[type_name].definition,
+                    }
                 )
+            return self._numbers[topic]
 
     def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
         """Send a message to those who look at its topic."""
-        if topic not in self._channels:
-            self._offer(topic, type_name)
+        number = self._numbers.get(topic) or self._offer(topic, type_name)
         if topic == RIG:
             # Sent again to who comes later, as a latched topic is.
             self._rig = cdr, t_ns
-        self._channels[topic].log(cdr, log_time=t_ns)
-        if time.monotonic() >= self._repeat_at and self._rig is not None:
-            self._repeat_at = math.inf
-            message, t_ns = self._rig
-            self._channels[RIG].log(message, log_time=t_ns)
+        for viewer in tuple(self._looking.values()):
+            viewer.offer(number, cdr, t_ns)
+
+    async def _websocket(self, request: web.Request) -> web.StreamResponse:
+        # Not compressed: aiohttp compresses in a task that outlives a viewer that has left.
+        socket = web.WebSocketResponse(
+            protocols=PROTOCOLS, heartbeat=HEARTBEAT_S, max_msg_size=REQUEST_BYTES, compress=False
+        )
+        viewer = _Viewer()
+
+        async def send(socket: web.WebSocketResponse, event: asyncio.Event) -> None:
+            self._looking[socket] = viewer
+            await socket.send_json(
+                {'op': 'serverInfo', 'name': 'psd_deflection', 'capabilities': [], 'sessionId': self._session}
+            )
+            while True:
+                if viewer.told < len(self._channels):
+                    new = self._channels[viewer.told :]
+                    viewer.told += len(new)
+                    await socket.send_json({'op': 'advertise', 'channels': new})
+                while (message := viewer.take()) is not None:
+                    await socket.send_bytes(message)
+                await event.wait()
+                event.clear()
+
+        try:
+            return await self.look_on(request, socket, send, lambda message: self._hear(viewer, message))
+        finally:
+            self._looking.pop(socket, None)
+
+    def _hear(self, viewer: _Viewer, message: WSMessage) -> None:
+        """What a viewer asks for; what is not understood is not answered."""
+        if message.type is not WSMsgType.TEXT:
+            return
+        with contextlib.suppress(ValueError, TypeError, KeyError, AttributeError, RecursionError):
+            asked = json.loads(message.data)
+            if asked['op'] == 'subscribe':
+                for one in asked['subscriptions']:
+                    self._subscribe(viewer, one['channelId'], one['id'])
+            elif asked['op'] == 'unsubscribe':
+                gone = frozenset(asked['subscriptionIds'])
+                for channel in [c for c, s in viewer.subscriptions.items() if s in gone]:
+                    del viewer.subscriptions[channel]
+
+    def _subscribe(self, viewer: _Viewer, channel: object, subscription: object) -> None:
+        if type(channel) is not int or type(subscription) is not int:
+            return
+        if not (0 < channel <= len(self._channels) and 0 <= subscription < 2**32):
+            return
+        viewer.subscriptions[channel] = subscription
+        if channel == self._numbers.get(RIG) and self._rig is not None:
+            viewer.offer(channel, *self._rig)
 
     def words(self) -> str:
         """The address, and where to open it, as a line."""
         return f'foxglove: {self.address} ({VIEWER})'
-
-    def close(self) -> None:
-        """End the connections."""
-        self._server.stop()
 
 
 class FeedBeside(Feed):

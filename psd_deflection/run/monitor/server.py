@@ -9,31 +9,25 @@ traceback in the log. Idle connections are closed before they use up the daemon'
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import errno
 import json
-import logging
 import math
 import os
 import secrets
-import socket
-import threading
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
-from concurrent.futures import Future
+from collections.abc import Awaitable, Callable, Coroutine
 from pathlib import Path
 from typing import Any
 
-from aiohttp import WSCloseCode, WSMsgType, web
+from aiohttp import web
 
 from psd_deflection import __version__
-from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.log import ERROR, INFO, WARNING, Say
+from psd_deflection.base.log import INFO, Say
 from psd_deflection.records import BlockStatus, DiagnosticReport, ReferencePose, SampleBlock
 from psd_deflection.rig.declarations import MonitorConfig
 from psd_deflection.run.monitor import access
 from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
+from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer
 from psd_deflection.run.monitor.served import Served, announce, withdraw
 from psd_deflection.run.monitor.shown import RefusedError, Shown
 from psd_deflection.run.monitor.spectrum import Spectrum, density_json
@@ -54,14 +48,6 @@ MAX_SEEK_S = 1e8
 MAX_FORCE = 1e6
 """Largest load that is taken down, N and N m: a slip of the hand is refused."""
 
-BROWSERS = 16
-CONNECTIONS = 100
-"""Maximum plain HTTP connections, in addition to websockets; a browser opens at most six."""
-
-PATH_CHARACTERS = 100
-START_S = 10.0
-CLOSE_S = 3.0
-
 HEADERS = {
     'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -72,23 +58,17 @@ HEADERS = {
     'Cache-Control': 'no-cache',
 }
 
-Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
-# aiohttp logs each malformed request with a traceback: an attacker could fill the journal.
-_UNHEARD = logging.getLogger('psd_deflection.run.monitor.http')
-_UNHEARD.disabled = True
-
-
-class MonitorServer:
+class MonitorServer(GatedServer):
     """Serves ``shown``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``say`` gets the address as a line."""
 
     def __init__(self, shown: Shown, feed: Feed, config: MonitorConfig, say: Say) -> None:
+        super().__init__('monitor', config.address, config.port, say)
         self.token = ''
         self.url = ''
         self._shown = shown
         self._feed = feed
         self._config = config
-        self._say = say
         self._instance = secrets.token_hex(8)
         rate = shown.rig.converter.sample_rate_hz / shown.rig.estimator.block_size
         self._rows: deque[str] = deque(maxlen=max(100, round(HISTORY_S * rate)))
@@ -107,12 +87,6 @@ class MonitorServer:
         self._report_at = 0.0
         self._spectrum = Spectrum(shown.rig)
         self._density: tuple[int, str] = (0, 'null')
-        self._browsers: dict[web.WebSocketResponse, asyncio.Event] = {}
-        self._looked_through: set[web.RequestHandler] = set()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._ended: asyncio.Event | None = None
-        self._started: Future[str] = Future()
-        self._thread = threading.Thread(target=self._run, name='monitor', daemon=True)
         alone = access.is_loopback(config.address)
         self._control = config.control == 'on' or (config.control == 'local' and alone)
         self._announced: Path | None = None
@@ -121,96 +95,41 @@ class MonitorServer:
 
     def start(self) -> str:
         """Start the thread; return the page's address. Raises ConfigError if it cannot be served."""
-        self._thread.start()
-        self.url = self._started.result(START_S)
+        self.url = f'http:{self.start_thread()}/'
         self._announced = announce(Served(self.url, self.token, str(self._shown.describe()['name']), os.getpid()))
-        self._say(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
+        self.say(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
         return self.url
 
     def close(self) -> None:
         """Close the connections to the browsers and end the thread; a second call does nothing."""
         withdraw(self._announced)
-        if self._loop is not None and self._ended is not None and self._thread.is_alive():
-            with contextlib.suppress(RuntimeError):
-                self._loop.call_soon_threadsafe(self._ended.set)
-            self._thread.join(CLOSE_S)
+        super().close()
 
     def tell(self, text: str, level: int = INFO, /) -> None:
         """Show a message on the page; from any thread."""
         self._message_count += 1
         self._messages.append((self._message_count, time.time(), text))
 
-    def _run(self) -> None:
-        try:
-            asyncio.run(self._serve())
-        except Exception as error:
-            if not self._started.done():
-                self._started.set_exception(error)
-            else:
-                self._say(f'monitor: ended: {type(error).__name__}: {error}', ERROR)
-
-    async def _serve(self) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._ended = asyncio.Event()
-        application = web.Application(middlewares=[self._guard], client_max_size=4096)
+    def add_routes(self, application: web.Application) -> None:
+        """The page, its websocket, its buttons."""
         application.router.add_get('/', self._index)
-        application.router.add_get('/ws', self._websocket)
+        application.router.add_get(self.websocket_path, self._websocket)
         application.router.add_post('/api/zero', self._zero)
         application.router.add_post('/api/record', self._record)
         application.router.add_post('/api/load', self._load)
         application.router.add_post('/api/play', self._play)
         application.router.add_static('/page', PAGE)
         application.on_response_prepare.append(_add_headers)
-        runner = web.AppRunner(
-            application, handle_signals=False, access_log=None, logger=_UNHEARD, shutdown_timeout=1.0
-        )
-        await runner.setup()
-        tasks: list[asyncio.Task[None]] = []
-        try:
-            self._started.set_result(await self._listen(runner))
-            tasks = [asyncio.create_task(self._pump(runner)), asyncio.create_task(self._once_a_second())]
-            ended = asyncio.create_task(self._ended.wait())
-            done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
-            for task in done - {ended}:
-                task.result()
-        finally:
-            for task in tasks:
-                task.cancel()
-            for browser in list(self._browsers):
-                with contextlib.suppress(ConnectionError, TimeoutError):
-                    await asyncio.wait_for(browser.close(code=WSCloseCode.GOING_AWAY), 1.0)
-            await runner.cleanup()
 
-    async def _listen(self, runner: web.AppRunner) -> str:
-        address, port = self._config.address, self._config.port
-        try:
-            try:
-                await web.TCPSite(runner, address, port).start()
-            except OSError as error:
-                if error.errno != errno.EADDRINUSE:
-                    raise
-                # An unusual address is better than no page.
-                self._say(f'monitor: port {port} is in use (by another monitor?); taking a free one', WARNING)
-                await web.TCPSite(runner, address, 0).start()
-        except (OSError, UnicodeError) as error:
-            reason = error.strerror or str(error) if isinstance(error, OSError) else str(error)
-            raise ConfigError(
-                f'monitor_address = {address!r}, monitor_port = {port}: cannot be served there ({reason}); '
-                'monitor_address is an address of this machine, 127.0.0.1 for itself, 0.0.0.0 for all'
-            ) from None
-        port = runner.addresses[0][1]
-        name = {'0.0.0.0': socket.gethostname(), '::': socket.gethostname()}.get(address, address)
-        return f'http://{f"[{name}]" if ":" in name else name}:{port}/'
+    def jobs(self) -> list[Coroutine[Any, Any, None]]:
+        """What comes from the run, and its health."""
+        return [self._pump(), self._once_a_second()]
 
     # Data from the threads of the run.
 
-    async def _pump(self, runner: web.AppRunner) -> None:
+    async def _pump(self) -> None:
         due = 0.0
         while True:
-            if runner.server is not None:
-                others = [c for c in runner.server.connections if c not in self._looked_through]
-                for oldest in others[:-CONNECTIONS]:
-                    oldest.force_close()
             new = False
             for item in self._feed.take():
                 if isinstance(item, BlockResult):
@@ -226,12 +145,12 @@ class MonitorServer:
                     self._mark_count += 1
                     new = True
             now = time.monotonic()
-            if self._browsers and now >= due:
+            if self.viewers and now >= due:
                 due = now + SPECTRUM_EVERY_S
                 self._density = (self._density[0] + 1, density_json(self._spectrum.density()))
                 new = True
             if new:
-                self._wake()
+                self.wake()
             await asyncio.sleep(PUMP_S)
 
     def _take_reference(self, reference: ReferencePose) -> bool:
@@ -245,7 +164,7 @@ class MonitorServer:
 
     async def _once_a_second(self) -> None:
         while True:
-            if self._browsers:
+            if self.viewers:
                 self._take_health()
             await asyncio.sleep(1.0)
 
@@ -255,11 +174,7 @@ class MonitorServer:
             # A report covers the time since the last one: over a very short time it would show no samples.
             self._report, self._report_at = self._shown.health(time.time_ns()), now
         self._health = (self._health[0] + 1, self._health_json(self._report))
-        self._wake()
-
-    def _wake(self) -> None:
-        for event in self._browsers.values():
-            event.set()
+        self.wake()
 
     def _health_json(self, report: DiagnosticReport) -> str:
         entries = [
@@ -276,7 +191,7 @@ class MonitorServer:
                 't': report.t_ns / 1e9,
                 'entries': entries,
                 'dropped': self._feed.dropped,
-                'browsers': len(self._browsers),
+                'browsers': len(self.viewers),
                 'sum_min': self._shown.rig.estimator.sum_min,
                 **self._shown.describe(),
             }
@@ -284,55 +199,20 @@ class MonitorServer:
 
     # Requests of browsers.
 
-    @web.middleware
-    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        if not access.is_own_host(request.headers.get('Host', ''), self._config.address):
-            return web.Response(status=403, text='this is not the name of this machine')
-        if (request.method != 'GET' or request.path == '/ws') and not access.is_own_page(request.headers):
-            return web.Response(status=403, text='refused: asked for by another site')
-        if 'Content-Encoding' in request.headers:
-            return web.Response(status=415, text='refused: a body must not be encoded')
-        if len(request.path) > PATH_CHARACTERS:
-            return web.Response(status=404, text='not found')
-        try:
-            return await handler(request)
-        except (web.HTTPException, ConnectionError):
-            raise
-        except Exception as error:
-            self._say(f'monitor: {request.path!r}: {type(error).__name__}: {error}', ERROR)
-            return web.Response(status=500, text='this should not have happened; the daemon has said what')
-
     async def _index(self, request: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / 'index.html')
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
         # A browser that does not read for this long is gone.
         # Not compressed: aiohttp compresses long messages in a separate task, which outlives a browser that has left.
-        browser = web.WebSocketResponse(heartbeat=10.0, max_msg_size=1024, compress=False)
-        await browser.prepare(request)
-        if len(self._browsers) >= BROWSERS:
-            # A page learns the reason of a close, but not that of a failed handshake.
-            await browser.close(
-                code=WSCloseCode.TRY_AGAIN_LATER, message=f'{BROWSERS} browsers look on already'.encode()
-            )
-            return browser
-        event = asyncio.Event()
-        self._browsers[browser] = event
-        self._looked_through.add(request.protocol)
+        browser = web.WebSocketResponse(heartbeat=HEARTBEAT_S, max_msg_size=1024, compress=False)
         history = request.query.get('history') != '0'
-        sender = asyncio.create_task(self._send(browser, event, history))
-        try:
+
+        async def send(browser: web.WebSocketResponse, event: asyncio.Event) -> None:
             self._take_health()
-            async for message in browser:
-                if message.type is WSMsgType.ERROR:
-                    break
-        finally:
-            del self._browsers[browser]
-            self._looked_through.discard(request.protocol)
-            sender.cancel()
-            with contextlib.suppress(asyncio.CancelledError, ConnectionError):
-                await sender
-        return browser
+            await self._send(browser, event, history)
+
+        return await self.look_on(request, browser, send)
 
     async def _send(self, browser: web.WebSocketResponse, event: asyncio.Event, history: bool) -> None:
         rows = self._row_count - (len(self._rows) if history else 0)
@@ -459,8 +339,8 @@ class MonitorServer:
             return _answer(409, str(error))
         if name:
             # What came of it is told by the run itself.
-            self._say(f'monitor: {name} was asked for by {request.remote}')
-        if self._browsers:
+            self.say(f'monitor: {name} was asked for by {request.remote}')
+        if self.viewers:
             self._take_health()
         return _answer(200, text)
 

@@ -13,13 +13,13 @@ from psd_deflection.base.log import Say
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.monitor.feed import Feed
-from psd_deflection.run.monitor.foxglove import FoxgloveServer
 from psd_deflection.run.monitor.shown import ShownSession
 from psd_deflection.run.processing import RecordSink
 from psd_deflection.run.rig_publisher import RigPublisher
 from psd_deflection.run.session import Session
 
 if TYPE_CHECKING:
+    from psd_deflection.run.monitor.foxglove import FoxgloveServer
     from psd_deflection.run.monitor.server import MonitorServer
 
 
@@ -27,8 +27,8 @@ def need_server() -> None:
     """Raise ConfigError, with the fix, if aiohttp is not installed, or so old that it would not answer."""
     if importlib.util.find_spec('aiohttp') is None:
         raise ConfigError(
-            "the live page needs aiohttp: `pip install 'psd_deflection[monitor]'` or `apt install python3-aiohttp`, "
-            'or run without monitor'
+            "the live page and Foxglove need aiohttp: `pip install 'psd_deflection[monitor]'` or "
+            '`apt install python3-aiohttp`, or run without monitor and foxglove'
         )
     found = importlib.metadata.version('aiohttp')
     if tuple(int(n) for n in re.findall(r'\d+', found)[:2]) < (3, 9):
@@ -84,7 +84,11 @@ def _start_page(session: Session, say: Say) -> MonitorServer:
 
 
 def _start_foxglove(session: Session, say: Say, views: Views, reports: bool) -> None:
-    server = FoxgloveServer(session.rig)
+    need_server()
+    # Imported here, as the page.
+    from psd_deflection.run.monitor.foxglove import FoxgloveServer
+
+    server = FoxgloveServer(session.rig, say)
     views.parts.append(server)
     say(server.words())
     fanout = Fanout(session.rig.monitor.frame_prefix)

@@ -10,10 +10,11 @@ the loss, frames around it were damaged, the port was away, or none of these.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,6 +28,7 @@ from psd_deflection.devices.source import Clock, Event, Sample, Source, SourceEn
 from psd_deflection.measure.timing import ClockState
 from psd_deflection.records import FLAG_DEVICE_DROPPED, RESTART, IntArray, ParameterChange, RawChunk
 from psd_deflection.rig.config import Rig
+from psd_deflection.run.behind import SLOW
 from psd_deflection.run.reading.clock_watch import ClockWatch
 from psd_deflection.run.reading.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
@@ -59,10 +61,14 @@ The kernel holds 4096 bytes for us."""
 
 @dataclass(slots=True)
 class Arrival:
-    """A RawChunk on its way, with the monotonic time at which its last byte was read, ns."""
+    """A RawChunk on its way, with the monotonic time at which its last byte was read, ns.
+
+    ``dropped_before``: samples of the run that were dropped before it, because the queue was full.
+    """
 
     raw: RawChunk
     read_ns: int
+    dropped_before: int = 0
 
 
 @dataclass(slots=True)
@@ -103,6 +109,7 @@ class Acquisition:
     """Reads one device until stopped. ``say`` gets one line for every change of state.
 
     For every thread: ``source``, ``counters``, ``hello``, ``queue``, ``to_ros_ns``.
+    ``why_full``: asked why the queue is full, by the reader thread.
     Of the reader thread: ``beat`` (monotonic time, s, of its last round), ``failed`` (the error that ended it).
     Raises ConfigError if the rig names an unknown source.
     """
@@ -111,6 +118,7 @@ class Acquisition:
         self.source: Source = make_source(rig)
         self.counters = AcquisitionCounters()
         self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self.why_full: Callable[[], str] = lambda: SLOW
         # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
         # running must not tear the stamps apart.
         self.to_ros_ns = time.time_ns() - time.monotonic_ns()
@@ -128,7 +136,9 @@ class Acquisition:
         self._latency_ns = round(rig.acquisition.latency_offset * 1e9)
 
         # Numbers and times of samples.
-        self._sequence = SequenceExtender(self._block_size)
+        # A device with a clock of its own: it confirms how much is missing.
+        confirmed = self.source.clock is Clock.DEVICE
+        self._sequence = SequenceExtender(self._block_size, self._period_us if confirmed else 0.0)
         self._clock = ClockWatch(self._period_us, regressed=self.source.clock in (Clock.DEVICE, Clock.COUNTED))
         self._pinger = Pinger()
 
@@ -193,6 +203,17 @@ class Acquisition:
                 self.queue.put(Ended())
                 return
         self.source.close()
+
+    def abandon(self) -> int:
+        """Take what waits off the queue, after :meth:`stop`: nobody will process it. Returns its number of samples."""
+        samples = 0
+        with contextlib.suppress(queue.Empty):
+            while True:
+                item = self.queue.get_nowait()
+                samples += len(item.raw.seq) if isinstance(item, Arrival) else 0
+        self.queue.put(Ended())
+        self.counters.abandoned += samples
+        return samples
 
     @property
     def hello(self) -> HelloFrame | None:
@@ -379,7 +400,7 @@ class Acquisition:
                     self._hand_over(now)
             elif type(frame) is BadFrame:
                 reason = str(frame.reason)
-                counters.bad_frames[reason] = counters.bad_frames.get(reason, 0) + 1
+                counters.bad_frames.add(reason)
                 self._bad_since_sample += frame.reason != BadReason.UNKNOWN_TYPE
             else:
                 self._other(frame, now)
@@ -453,6 +474,14 @@ class Acquisition:
         self._last_t_ns = int(t_ns[-1])
         if self.queue.qsize() >= self._rig.acquisition.queue_blocks:
             self.counters.queue_dropped += len(gathered.seq)
+            self.counters.dropped_why = self.why_full()
+            self._repeats.tell(
+                'full',
+                f'{self.counters.dropped_why}: {self.counters.queue_dropped} samples dropped here so far '
+                f'({self._rig.acquisition.queue_blocks} blocks wait, queue_blocks)',
+                WARNING,
+                now / 1e9,
+            )
             return
         raw = RawChunk(
             np.array(gathered.seq, np.int64),
@@ -463,7 +492,7 @@ class Acquisition:
             np.array(gathered.flags, np.uint8),
             self._gate.volts_per_count,
         )
-        self.queue.put(Arrival(raw, now))
+        self.queue.put(Arrival(raw, now, self.counters.queue_dropped))
 
     def _ros_time_ns(self, t: IntArray) -> IntArray:
         """``t``: as the source gives it."""

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from psd_deflection.base.bounds import Tally
+
 BY_DEVICE = 'dropped by the device'
 DAMAGED = 'damaged on the wire'
 AWAY = 'while the port was away'
@@ -16,14 +18,20 @@ UNSEEN = 'on the wire, without a trace'
 
 @dataclass(slots=True)
 class AcquisitionCounters:
-    """Samples and frames received and lost. Only the reader writes; any thread may read."""
+    """Samples and frames received and lost. Only the reader writes; any thread may read.
+
+    ``queue_dropped``: samples that were read, and for which there was no room to wait; ``abandoned``: those that still
+    waited at the end of the run; ``dropped_why``: the last reason of either.
+    """
 
     bytes: int = 0
     samples: int = 0
     lost: int = 0
-    lost_by: dict[str, int] = field(default_factory=dict)
+    lost_by: Tally = field(default_factory=Tally)
     repeated: int = 0
     queue_dropped: int = 0
+    abandoned: int = 0
+    dropped_why: str = ''
     device_dropped: int = 0
     device_overruns: int = 0
     restarts: int = 0
@@ -33,15 +41,20 @@ class AcquisitionCounters:
     clock_jumps: int = 0
     pings: int = 0
     pongs: int = 0
-    bad_frames: dict[str, int] = field(default_factory=dict)
+    bad_frames: Tally = field(default_factory=Tally)
     temperature: float | None = None
 
     @property
     def bad(self) -> int:
         """Malformed frames, all reasons together."""
-        return sum(self.bad_frames.values())
+        return self.bad_frames.total()
+
+    @property
+    def dropped_here(self) -> int:
+        """Samples that were read and are not processed."""
+        return self.queue_dropped + self.abandoned
 
     def count_lost(self, missing: int, cause: str) -> None:
         """Count ``missing`` samples as lost."""
         self.lost += missing
-        self.lost_by[cause] = self.lost_by.get(cause, 0) + missing
+        self.lost_by.add(cause, missing)

@@ -118,7 +118,7 @@ def test_a_format_made_as_the_page_says_is_read_like_ours(
 
 @pytest.mark.parametrize(
     ('code', 'said'),
-    [('raise ValueError(3)', r'cannot be loaded \(ValueError\(3\)\)'), ('FORMAT = 3', '3 is no psd_defl')],
+    [('raise ValueError(3)', r'cannot be loaded \(ValueError: 3\)'), ('FORMAT = 3', '3 is no psd_defl')],
 )
 def test_a_format_that_is_none_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str, said: str) -> None:
     install_plug_in(tmp_path, monkeypatch, 'logger', code, f'[{GROUP}]\nmine = my_package.logger:FORMAT\n')

@@ -12,7 +12,7 @@ import pytest
 
 from bench.campaign.mortal import dies, length
 from psd_deflection import __version__
-from psd_deflection.base.errors import DaemonError, UsageError
+from psd_deflection.base.errors import ConfigError, DaemonError, UsageError
 from psd_deflection.run.fleet.engines import check_engine, open_engine
 from psd_deflection.run.fleet.tasks import AHEAD, Outcome, attempt, outcomes
 
@@ -152,6 +152,15 @@ def test_a_run_that_is_given_up_leaves_no_process() -> None:
 def test_another_word_is_refused(word: str) -> None:
     with pytest.raises(UsageError, match='must be serial, processes'):
         check_engine(word)
+
+
+def test_encryption_without_certificates_is_refused_before_it_is_tried() -> None:
+    pytest.importorskip('distributed')
+    with (
+        pytest.raises(ConfigError, match=r"^--executor dask\+tls://127\.0\.0\.1:1: Dask's configuration has no cert"),
+        open_engine('dask+tls://127.0.0.1:1'),
+    ):
+        pass
 
 
 def test_a_scheduler_that_is_not_there_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

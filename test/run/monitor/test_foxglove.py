@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import builtins
+import contextlib
+import importlib.util
 import json
 import signal
 import socket
 import struct
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,15 +20,19 @@ from mcap.reader import make_reader
 from mcap.records import Schema
 from mcap_ros2.decoder import DecoderFactory
 
+from msg_adapters import DEFLECTION, TOPIC_TYPES
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import texts
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
-from psd_deflection.run.monitor.foxglove import FoxgloveServer
+from psd_deflection.run.monitor.foxglove import BACKLOG_BYTES, PROTOCOLS, FoxgloveServer, _Viewer
+from psd_deflection.run.monitor.gated import VIEWERS
 from tools.program import PSD_DEFLECTION, WAIT_S, Program
 
-pytest.importorskip('foxglove')
-
 BAGS = Path(__file__).parents[3] / 'bags'
+
+BUSY_S = 1.0
+"""A busy machine may take longer."""
 
 Messages = dict[str, list[tuple[int, bytes]]]
 
@@ -126,21 +132,196 @@ def test_a_port_in_use_gives_way_to_a_free_one() -> None:
 
 
 def test_an_address_that_is_not_ours_is_named() -> None:
-    with pytest.raises(ConfigError, match=r'foxglove_address 192\.0\.2\.1: .*assign'):
+    with pytest.raises(ConfigError, match=r"foxglove_address = '192\.0\.2\.1'.*assign"):
         FoxgloveServer(load_rig(overrides={'foxglove_address': '192.0.2.1'}))
 
 
-def test_without_the_sdk_the_error_says_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+def test_without_aiohttp_the_error_says_how_to_install_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    found = builtins.__import__
-
-    def missing(name: str, *rest: Any, **more: Any) -> Any:
-        if name == 'foxglove':
-            raise ImportError(name)
-        return found(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, '__import__', missing)
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(importlib.util, 'find_spec', lambda name: None)
     assert main(['monitor', str(BAGS / 'clean'), '--foxglove']) == 3
-    assert "pip install 'psd_deflection[foxglove]'" in capsys.readouterr().err
+    assert "pip install 'psd_deflection[monitor]'" in capsys.readouterr().err
+
+
+@pytest.fixture
+def served() -> Iterator[Served]:
+    server = Served()
+    yield server
+    server.server.close()
+
+
+class Served:
+    """A server that the test feeds; ``said``: its lines."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+        self.server = FoxgloveServer(load_rig(overrides={'foxglove_port': 0}), texts(self.said.append))
+        self.port = int(self.server.address.rpartition(':')[2])
+
+    def give(self, count: int, size: int = 100) -> None:
+        for n in range(count):
+            self.server.put(DEFLECTION, TOPIC_TYPES[DEFLECTION], bytes(size), n)
+
+
+async def connected(client: aiohttp.ClientSession, url: str, **headers: str) -> aiohttp.ClientWebSocketResponse:
+    return await client.ws_connect(url, protocols=PROTOCOLS, headers=headers)
+
+
+@pytest.mark.parametrize(
+    'headers',
+    [
+        {'Origin': 'http://evil.com', 'Host': 'evil.com:{port}'},
+        {'Origin': 'http://evil.com'},
+        {'Host': 'evil.com:{port}'},
+        {'Origin': 'null'},
+        {'Origin': 'https://app.foxglove.dev.evil.com'},
+        {'Sec-Fetch-Site': 'cross-site'},
+    ],
+)
+def test_another_site_cannot_look(served: Served, headers: dict[str, str]) -> None:
+    async def go() -> int:
+        given = {name: value.format(port=served.port) for name, value in headers.items()}
+        async with aiohttp.ClientSession() as client:
+            try:
+                await connected(client, served.server.address, **given)
+            except aiohttp.WSServerHandshakeError as refused:
+                return refused.status
+        return 101
+
+    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == 403
+    assert not served.said
+
+
+@pytest.mark.parametrize('origin', ['https://app.foxglove.dev', 'file://'])
+def test_foxglove_itself_can_look(served: Served, origin: str) -> None:
+    async def go() -> Any:
+        async with aiohttp.ClientSession() as client:
+            socket = await connected(client, served.server.address, Origin=origin, **{'Sec-Fetch-Site': 'cross-site'})
+            return await socket.receive_json()
+
+    assert asyncio.run(asyncio.wait_for(go(), WAIT_S))['op'] == 'serverInfo'
+
+
+def test_which_pages_may_look_is_a_parameter() -> None:
+    rig = load_rig(overrides={'foxglove_port': 0, 'foxglove_origins': ['https://viewer.example']})
+    server = FoxgloveServer(rig)
+
+    async def go(origin: str) -> int:
+        async with aiohttp.ClientSession() as client:
+            try:
+                await connected(client, server.address, Origin=origin)
+            except aiohttp.WSServerHandshakeError as refused:
+                return refused.status
+        return 101
+
+    try:
+        assert asyncio.run(go('https://viewer.example')) == 101
+        assert asyncio.run(go('https://app.foxglove.dev')) == 403
+    finally:
+        server.close()
+
+
+def test_one_viewer_too_many_is_sent_away(served: Served) -> None:
+    async def go() -> tuple[object, object]:
+        async with aiohttp.ClientSession() as client:
+            lookers = [await connected(client, served.server.address) for _ in range(VIEWERS)]
+            for one in lookers:
+                await one.receive()
+            late = await (await connected(client, served.server.address)).receive()
+            return late.data, late.extra
+
+    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, f'{VIEWERS} viewers look on already')
+
+
+def deaf(served: Served) -> socket.socket:
+    """A viewer that asks for everything and then reads nothing, not even the answer to its pings."""
+    one = socket.create_connection(('127.0.0.1', served.port))
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    one.sendall(
+        (
+            f'GET / HTTP/1.1\r\nHost: 127.0.0.1:{served.port}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n'
+            'Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n'
+            'Sec-WebSocket-Protocol: foxglove.websocket.v1\r\n\r\n'
+        ).encode()
+    )
+    assert b'101' in one.recv(100)
+    asked = [{'id': n, 'channelId': n} for n in range(1, 12)]
+    text = json.dumps({'op': 'subscribe', 'subscriptions': asked}).encode()
+    # Masked with zeros, as a client must mask.
+    one.sendall(bytes((0x81, 0x80 | 126)) + struct.pack('>H', len(text)) + bytes(4) + text)
+    return one
+
+
+def test_deaf_viewers_hold_a_bounded_backlog_and_do_not_delay_the_end(served: Served) -> None:
+    ones = [deaf(served) for _ in range(VIEWERS)]
+    deadline = time.monotonic() + WAIT_S
+    backlogs = [_Viewer()]
+    while not all(v.subscriptions for v in backlogs) or len(backlogs) < VIEWERS:
+        assert time.monotonic() < deadline
+        backlogs = list(served.server._looking.values())
+    # More than all backlogs and all buffers of the system together.
+    served.give(100, 1_000_000)
+    assert all(v._budget.held <= BACKLOG_BYTES for v in backlogs)
+    began = time.monotonic()
+    served.server.close()
+    assert time.monotonic() - began < 1.0 + BUSY_S
+    assert not served.server._thread.is_alive()
+    for one in ones:
+        one.close()
+    assert not served.said
+
+
+def test_viewers_that_vanish_cost_no_line(served: Served, caplog: pytest.LogCaptureFixture) -> None:
+    for _ in range(100):
+        ones = [deaf(served) for _ in range(8)]
+        served.give(10, 10_000)
+        for one in ones:
+            # Without leave: a reset.
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack('ii', 1, 0))
+            one.close()
+    deadline = time.monotonic() + WAIT_S
+    while served.server.viewers:
+        assert time.monotonic() < deadline
+        served.give(1)
+        time.sleep(0.01)
+    assert not served.server._looking
+    assert not served.said
+    assert not caplog.records
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        'not JSON',
+        '[' * 10_000,
+        '3',
+        '{"op": "subscribe"}',
+        '{"op": "subscribe", "subscriptions": [{"id": -1, "channelId": 1}]}',
+        '{"op": "subscribe", "subscriptions": [{"id": 4294967296, "channelId": 1}]}',
+        '{"op": "subscribe", "subscriptions": [{"id": 1, "channelId": 100000}]}',
+        '{"op": "subscribe", "subscriptions": [{"id": 1e300, "channelId": true}]}',
+        '{"op": "unsubscribe", "subscriptionIds": [[]]}',
+        '{"op": "advertise", "channels": []}',
+    ],
+)
+def test_what_is_not_understood_is_not_answered_and_harms_nobody(served: Served, text: str) -> None:
+    async def go() -> int:
+        async with aiohttp.ClientSession() as client:
+            one = await connected(client, served.server.address)
+            await one.send_str(text)
+            await one.send_json({'op': 'subscribe', 'subscriptions': [{'id': 7, 'channelId': 1}]})
+            while True:
+                served.server.put(*first_topic(served), b'x', 5)
+                with contextlib.suppress(TimeoutError):
+                    got = await asyncio.wait_for(one.receive(), 0.1)
+                    if got.type is aiohttp.WSMsgType.BINARY:
+                        return int.from_bytes(got.data[1:5], 'little')
+
+    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == 7
+    assert not served.said
+
+
+def first_topic(served: Served) -> tuple[str, str]:
+    first = served.server._channels[0]
+    return str(first['topic']), str(first['schemaName'])

@@ -17,7 +17,8 @@ from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, Re
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.monitor import server
 from psd_deflection.run.monitor.feed import Feed
-from psd_deflection.run.monitor.server import BROWSERS, CONNECTIONS, MonitorServer
+from psd_deflection.run.monitor.gated import CONNECTIONS, VIEWERS
+from psd_deflection.run.monitor.server import MonitorServer
 from test.heard import WAIT_S
 
 from .serving import BLOCK_NS, START_NS, Serving, StillShown
@@ -334,7 +335,7 @@ def test_one_browser_too_many_gets_the_reason(serve: Serve) -> None:
 
     async def go() -> tuple[int | None, str]:
         async with aiohttp.ClientSession() as session:
-            lookers = [await session.ws_connect(serving.url + 'ws') for _ in range(BROWSERS)]
+            lookers = [await session.ws_connect(serving.url + 'ws') for _ in range(VIEWERS)]
             for one in lookers:
                 await one.receive()
             late = await session.ws_connect(serving.url + 'ws')
@@ -343,7 +344,7 @@ def test_one_browser_too_many_gets_the_reason(serve: Serve) -> None:
                 await one.close()
             return told.data, told.extra or ''
 
-    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, '16 browsers look on already')
+    assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, '16 viewers look on already')
 
 
 def test_a_browser_that_comes_between_two_reports_is_shown_the_last(

@@ -1,0 +1,53 @@
+"""Bounds of what others can make grow."""
+
+from __future__ import annotations
+
+import pytest
+
+from psd_deflection.base.bounds import OTHERS, BoundedMap, ByteBudget, Tally
+
+
+def test_a_budget_holds_no_more_than_its_bytes() -> None:
+    budget = ByteBudget(100)
+    assert budget.take(60)
+    assert not budget.take(41)
+    assert budget.held == 60
+    assert budget.take(40)
+    assert budget.holders == 2
+    budget.give_back(100, 2)
+    assert (budget.held, budget.holders) == (0, 0)
+    assert budget.take(100)
+    assert not budget.take(1)
+
+
+@pytest.mark.parametrize('way', ['item', 'setdefault', 'update'])
+def test_a_map_keeps_what_is_set_again_and_forgets_a_flood_of_names(way: str) -> None:
+    known: BoundedMap[str, int] = BoundedMap(10)
+    for n in range(10_000):
+        known['ours'] = n
+        if way == 'item':
+            known[f'name {n}'] = n
+        elif way == 'setdefault':
+            known.setdefault(f'name {n}', n)
+        else:
+            known.update({f'name {n}': n})
+        assert len(known) <= 10
+    assert known['ours'] == 9999
+    assert list(known)[-1] == 'name 9999'
+    assert 'name 1' not in known
+    del known['ours']
+    assert 'ours' not in known
+
+
+def test_a_tally_counts_every_word_and_remembers_few() -> None:
+    tally = Tally(5)
+    for n in range(1000):
+        tally.add('known')
+        tally.add(f'word {n}', 2)
+    assert len(tally) == 5
+    assert tally.total() == 3000
+    assert tally['known'] == 1000
+    assert tally[OTHERS] == 2 * (1000 - 3)
+    assert tally['never'] == 0
+    assert 'never' not in tally
+    assert dict(tally) == {'known': 1000, 'word 0': 2, 'word 1': 2, 'word 2': 2, OTHERS: 1994}
