@@ -385,7 +385,7 @@ def _order(arm: Arm, joints: Sequence[str]) -> list[int]:
     return [arm.names.index(name) for name in joints]
 
 
-class Described(NamedTuple):
+class DescribedArm(NamedTuple):
     """An arm that ``robot_description`` describes, to the link ``tip`` from the link ``base``, '' for the root."""
 
     tip: str
@@ -394,7 +394,7 @@ class Described(NamedTuple):
 
 def run_compensator(
     ros_args: Sequence[str],
-    robot: Arm | Described,
+    robot: Arm | DescribedArm,
     settings: CompensatorSettings,
     say: Say,
     drive: bool,
@@ -402,7 +402,7 @@ def run_compensator(
     """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
     with ros(NODE_NAME, ros_args) as signals, contextlib.suppress(StopRequestedError):
         arm = robot
-        if isinstance(arm, Described):
+        if isinstance(arm, DescribedArm):
             arm = arm_of(robot_description(signals, say), ROBOT_DESCRIPTION, arm.tip, arm.base)
         if settings.joints == (ALL_JOINTS,):
             settings = dataclasses.replace(settings, joints=arm.names)

@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     arm = None if args.urdf is None else read_arm(args.urdf, args.tip, args.base)
     if importlib.util.find_spec('rclpy') is None:
         raise ConfigError("rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`")
-    from psd_deflection.ros.compensator import Described, run_compensator
+    from psd_deflection.ros.compensator import DescribedArm, run_compensator
 
-    robot = arm or Described(args.tip, args.base)
+    robot = arm or DescribedArm(args.tip, args.base)
     return run_compensator(args.ros_arguments, robot, settings, Display().say, args.drive)
