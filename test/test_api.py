@@ -322,12 +322,7 @@ def test_errors_are_an_attribute_of_the_package() -> None:
     assert int(said) == ConfigError.exit_status
 
 
-@pytest.mark.parametrize(
-    'name',
-    sorted(
-        path.name for path in (ROOT / 'config').glob('*.yaml') if path.name in ('thesis_rig.yaml', 'three_psds.yaml')
-    ),
-)
+@pytest.mark.parametrize('name', ['thesis_rig.yaml', 'three_psds.yaml'])
 def test_a_rig_can_be_sent_to_another_process_and_copied(name: str) -> None:
     rig = psd_deflection.load_rig(ROOT / 'config' / name)
     for other in (pickle.loads(pickle.dumps(rig)), copy.deepcopy(rig), copy.copy(rig)):  # noqa: S301
