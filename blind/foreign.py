@@ -15,8 +15,8 @@ from blind.arm import Arm
 from blind.boom import Boom
 from blind.emps import Emps
 from blind.measured import DATA
+from psd_deflection.studies.discover.conclusion import size_of
 from psd_deflection.studies.discover.plants import Plant, PlantDiscovery, discover_in
-from psd_deflection.studies.discover.result import size_of
 
 MACHINES: Mapping[str, tuple[Callable[[Path], Plant], Callable[[Path], Plant] | None]] = {
     'boom': (lambda folder: Boom(folder), lambda folder: Boom(folder, weighed=True)),

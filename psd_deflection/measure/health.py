@@ -7,7 +7,7 @@ from block to block: for how many in a row a detector's values did not change.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,33 +130,22 @@ class OpticsHealth:
         """
         faults: dict[int, tuple[BlockStatus, str]] = {}
 
-        def fault(psd: int, status: BlockStatus, reason: str) -> None:
-            faults.setdefault(psd, (status, reason))
+        def add(found: Iterable[tuple[int, BlockStatus, str]]) -> None:
+            for psd, status, reason in found:
+                faults.setdefault(psd, (status, reason))
 
         present = len(block.seq)
         low = sums.min(axis=0).tolist()
-        for psd, least in enumerate(low, start=1):
-            if least < self._sum_min:
-                fault(psd, BlockStatus.LASER_LOST, f'laser {psd} lost: sum {least:.3f} V, below {self._sum_min:g} V')
-        extremes = np.abs(volts).max(axis=0)
-        if float(extremes.max()) >= self._rail:
-            for column, name in enumerate(channel_names(self._psds)):
-                if extremes[column] >= self._rail:
-                    at = float(extremes[column])
-                    reason = f'{name} saturated: {at:.3f} V, converter.full_scale is {self._full_scale:g} V'
-                    fault(1 + column // 3, BlockStatus.SATURATED, reason)
-        elif bool((block.flags & FLAG_OVER_RANGE).any()) and not faults:
+        add(self._dark(low))
+        add(saturated := self._saturated(volts))
+        if not saturated and not faults and bool((block.flags & FLAG_OVER_RANGE).any()):
             return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)
         if self.refuses_frozen:
-            for psd, reason in _long(frozen):
-                fault(psd, BlockStatus.FROZEN, reason)
+            add((psd, BlockStatus.FROZEN, reason) for psd, reason in _long(frozen))
         if present < self._min_samples and not faults:
             reason = f'{present} of {self._size} samples, at least {self._min_samples} are needed'
             return Verdict(BlockStatus.TOO_FEW_SAMPLES, reason, 0)
-        for column, (name, dot, half) in enumerate(zip(dot_names(self._psds), dots, self._half, strict=True)):
-            if abs(dot) > half:
-                reason = f'{name} at {dot * 1e3:.3f} mm, outside the active area'
-                fault(1 + column // 2, BlockStatus.OUTSIDE_ACTIVE_AREA, reason)
+        add(self._outside(dots))
         half_light = self._half_light(low) if self._splitter else False
         findings = self._findings(dots, sums, set(faults), half_light)
         if not faults:
@@ -168,6 +157,32 @@ class OpticsHealth:
         lone = len(faults) == 1 and enough
         sound = tuple(i for i in range(self._psds) if i + 1 not in faults) if enough else ()
         return Verdict(status, reason, psd if lone else 0, findings, half_light, frozenset(faults), sound)
+
+    def _dark(self, low: list[float]) -> Iterator[tuple[int, BlockStatus, str]]:
+        for psd, least in enumerate(low, start=1):
+            if least < self._sum_min:
+                reason = f'laser {psd} lost: sum {least:.3f} V, below {self._sum_min:g} V'
+                yield psd, BlockStatus.LASER_LOST, reason
+
+    def _saturated(self, volts: npt.NDArray[np.float32]) -> list[tuple[int, BlockStatus, str]]:
+        extremes = np.abs(volts).max(axis=0)
+        if float(extremes.max()) < self._rail:
+            return []
+        return [
+            (
+                1 + column // 3,
+                BlockStatus.SATURATED,
+                f'{name} saturated: {float(extremes[column]):.3f} V, converter.full_scale is {self._full_scale:g} V',
+            )
+            for column, name in enumerate(channel_names(self._psds))
+            if extremes[column] >= self._rail
+        ]
+
+    def _outside(self, dots: tuple[float, ...]) -> Iterator[tuple[int, BlockStatus, str]]:
+        for column, (name, dot, half) in enumerate(zip(dot_names(self._psds), dots, self._half, strict=True)):
+            if abs(dot) > half:
+                reason = f'{name} at {dot * 1e3:.3f} mm, outside the active area'
+                yield 1 + column // 2, BlockStatus.OUTSIDE_ACTIVE_AREA, reason
 
     def _half_light(self, low: list[float]) -> bool:
         return all(HALF_LIGHT[0] * self._nominal < s < HALF_LIGHT[1] * self._nominal for s in low)

@@ -20,7 +20,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from types import MappingProxyType
-from typing import Any, Generic, Literal, TypeVar, cast
+from typing import Any, Generic, Literal, TypedDict, TypeVar, Unpack, cast
 
 import numpy as np
 
@@ -82,28 +82,34 @@ class Parameter:
         return f'{self.name} = {shown(value)}' + (f' {self.unit}' if self.unit else '')
 
 
+class Allowed(TypedDict, total=False):
+    """The values that a parameter may have; :class:`Parameter` explains them."""
+
+    minimum: float | None
+    maximum: float | None
+    above: float | None
+    choices: tuple[str, ...] | None
+    synonyms: tuple[tuple[str | bool, str], ...]
+
+
 def parameter(
     default: T,
     unit: str,
     description: str,
     *,
     name: str = '',
-    minimum: float | None = None,
-    maximum: float | None = None,
-    above: float | None = None,
-    choices: tuple[str, ...] | None = None,
-    synonyms: tuple[tuple[str | bool, str], ...] = (),
     live: bool = False,
     before: T | None = None,
+    **allowed: Unpack[Allowed],
 ) -> T:
     """Declare a parameter as a field of a dataclass; the field's type is its type.
 
     ``name``: its name in a parameter file, below the section's prefix, if it differs from the
     field's name. :class:`Parameter` explains the rest.
     """
-    declared = {'unit': unit, 'description': description, 'minimum': minimum, 'maximum': maximum, 'above': above}
-    metadata = {**declared, 'name': name, 'choices': choices, 'synonyms': synonyms, 'live': live, 'before': before}
-    declaration: T = field(default=default, metadata=metadata)
+    declared = {'unit': unit, 'description': description, 'name': name, 'live': live, 'before': before}
+    anything = Allowed(minimum=None, maximum=None, above=None, choices=None, synonyms=())
+    declaration: T = field(default=default, metadata={**declared, **anything, **allowed})
     return declaration
 
 

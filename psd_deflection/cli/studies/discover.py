@@ -57,11 +57,12 @@ from psd_deflection.model.simulation.catalogue import effect_folders, effect_nam
 from psd_deflection.recordings.recording import WHOLE
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.fleet.parquet import Field
+from psd_deflection.studies.discover.conclusion import adopting_folder
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 from psd_deflection.studies.discover.loop import Settled, planned, settle
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.result import Discovery, adopting_folder
+from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.study import StudyResult
 
 STEPS = 8

@@ -90,42 +90,57 @@ def replayed(
 
     ``blocks``: the recording's blocks, for a caller that counts them.
     """
-    changes = list(recording.changes)
-    # Our recorder notes when a temperature took effect; for other recordings the stamps decide.
-    noted = any(name in ENVIRONMENT for change in changes for name, _ in change.values)
-    temperatures = [] if noted or not pipeline.needs_temperature else recording.temperatures()
-    noted = any(name == KNOWN_LOAD for change in changes for name, _ in change.values)
-    loads = [] if noted or pipeline.motion_filter is None else recording.loads()
-    loads.reverse()
-    accelerations = recording.accelerations() if pipeline.motion_filter is not None else iter(())
-    acceleration = next(accelerations, None)
-    begun = False
+    beside = _BesideSamples(recording, pipeline)
     for block in recording.blocks() if blocks is None else blocks:
-        if not begun:
-            changes = _with_memory(recording, block.index, changes)
-            begun = True
-        while temperatures and temperatures[0].t_ns <= block.t_ns[0]:
-            warmer = pipeline.temperature(temperatures.pop(0).celsius)
-            if warmer is not None:
-                yield [warmer]
-        while changes and changes[0].block <= block.index:
-            # The unfinished block belongs to the time before the change.
-            yield list(pipeline.flush())
-            change = changes.pop(0)
-            pipeline.apply(change)
-            for misfit in pipeline.misfits:
-                recording.warn(f'block {change.block}: {misfit}')
-            yield [change]
-        while acceleration is not None and acceleration[0] <= block.t_ns[-1]:
-            # The unfinished block belongs to the time before it.
-            yield list(pipeline.flush())
-            with contextlib.suppress(ValueError):
-                pipeline.accelerate(acceleration[1], acceleration[0])
-            acceleration = next(accelerations, None)
-        while loads and loads[-1].t_ns <= block.t_ns[-1]:
-            pipeline.load(loads.pop())
+        yield from beside.until(block)
         yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
     yield list(pipeline.flush())
+
+
+class _BesideSamples:
+    """What a recording holds beside its samples, for the pipeline, each at its time."""
+
+    def __init__(self, recording: Recording, pipeline: Pipeline) -> None:
+        self._recording, self._pipeline = recording, pipeline
+        self._changes = list(recording.changes)
+        # Our recorder notes when a temperature or a load took effect; for other recordings the stamps decide.
+        noted = {name for change in self._changes for name, _ in change.values}
+        warms = pipeline.needs_temperature and noted.isdisjoint(ENVIRONMENT)
+        self._temperatures = recording.temperatures() if warms else []
+        filtered = pipeline.motion_filter is not None
+        self._loads = recording.loads() if filtered and KNOWN_LOAD not in noted else []
+        self._loads.reverse()
+        self._accelerations = recording.accelerations() if filtered else iter(())
+        self._acceleration = next(self._accelerations, None)
+        self._begun = False
+
+    def until(self, block: SampleBlock) -> Iterator[list[Record]]:
+        """The records of what takes effect before the end of ``block``."""
+        if not self._begun:
+            self._changes = _with_memory(self._recording, block.index, self._changes)
+            self._begun = True
+        while self._temperatures and self._temperatures[0].t_ns <= block.t_ns[0]:
+            warmer = self._pipeline.temperature(self._temperatures.pop(0).celsius)
+            if warmer is not None:
+                yield [warmer]
+        while self._changes and self._changes[0].block <= block.index:
+            yield from self._apply(self._changes.pop(0))
+        while self._acceleration is not None and self._acceleration[0] <= block.t_ns[-1]:
+            # The unfinished block belongs to the time before it.
+            yield list(self._pipeline.flush())
+            with contextlib.suppress(ValueError):
+                self._pipeline.accelerate(self._acceleration[1], self._acceleration[0])
+            self._acceleration = next(self._accelerations, None)
+        while self._loads and self._loads[-1].t_ns <= block.t_ns[-1]:
+            self._pipeline.load(self._loads.pop())
+
+    def _apply(self, change: ParameterChange) -> Iterator[list[Record]]:
+        # The unfinished block belongs to the time before the change.
+        yield list(self._pipeline.flush())
+        self._pipeline.apply(change)
+        for misfit in self._pipeline.misfits:
+            self._recording.warn(f'block {change.block}: {misfit}')
+        yield [change]
 
 
 def _with_memory(recording: Recording, first: int, changes: list[ParameterChange]) -> list[ParameterChange]:

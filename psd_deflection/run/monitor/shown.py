@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 from psd_deflection.base.errors import PsdDeflectionError
@@ -126,6 +127,15 @@ class ShownSession:
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Refuse: what is measured cannot be paused."""
         raise RefusedError('only a recording can be paused')
+
+
+@dataclass(slots=True)
+class _Playhead:
+    """``due``: monotonic time of the next record, s; ``t_ns`` and ``block``: of the last one."""
+
+    due: float
+    t_ns: int | None = None
+    block: int = -1
 
 
 class ShownRecording:
@@ -345,45 +355,50 @@ class ShownRecording:
             self._carry_out()
 
     def _lap(self) -> None:
-        due = time.monotonic()
-        last_t_ns: int | None = None
-        last_block = -1
+        at = _Playhead(time.monotonic())
         for records in self._steps:
             for record in records:
-                if isinstance(record, ParameterChange):
-                    # The numbers that a restart left out belong to no sample.
-                    before_after = dict(record.values).get(RESTART)
-                    if isinstance(before_after, tuple):
-                        self._lost -= int(before_after[1] - before_after[0]) - 1
-                if isinstance(record, SpotMeans):
-                    if self._start_ns is None:
-                        self._start_ns = record.t_ns
-                    self._give_inputs(record.t_ns)
-                    if last_t_ns is not None:
-                        due += min((record.t_ns - last_t_ns) / 1e9 / self._speed, LONGEST_WAIT_S)
-                        gone = record.index - last_block - 1
-                        self._lost += gone * self.rig.estimator.block_size
-                    last_t_ns, last_block = record.t_ns, record.index
-                    self._lost += record.lost
-                    self._last = record
-                if last_t_ns is None or self._goal is None or last_t_ns > self._goal - BEFORE_GOAL_NS:
-                    self._feed.put(record)
+                self._show(record, at)
             self._carry_out()
-            if self._goal is not None and last_t_ns is not None:
-                if last_t_ns < self._goal:
-                    # No faster than the page takes it.
-                    while self._feed.waiting > QUEUE_ITEMS // 2 and not self._stop.wait(FULL_S):
-                        pass
-                    due = time.monotonic()
-                else:
-                    self._goal, due = None, time.monotonic()
-            while not self._stop.is_set() and not self._again and self._waits(due):
+            self._seek(at)
+            while not self._stop.is_set() and not self._again and self._waits(at.due):
                 self._woken.clear()
                 self._carry_out()
                 if self._paused:
-                    due = time.monotonic()
+                    at.due = time.monotonic()
             if self._stop.is_set() or self._again:
                 return
+
+    def _show(self, record: Record, at: _Playhead) -> None:
+        """Give the page a record, unless a goal lies far ahead; count losses and when the next one is due."""
+        if isinstance(record, ParameterChange):
+            # The numbers that a restart left out belong to no sample.
+            before_after = dict(record.values).get(RESTART)
+            if isinstance(before_after, tuple):
+                self._lost -= int(before_after[1] - before_after[0]) - 1
+        elif isinstance(record, SpotMeans):
+            if self._start_ns is None:
+                self._start_ns = record.t_ns
+            self._give_inputs(record.t_ns)
+            if at.t_ns is not None:
+                at.due += min((record.t_ns - at.t_ns) / 1e9 / self._speed, LONGEST_WAIT_S)
+                self._lost += (record.index - at.block - 1) * self.rig.estimator.block_size
+            at.t_ns, at.block = record.t_ns, record.index
+            self._lost += record.lost
+            self._last = record
+        if at.t_ns is None or self._goal is None or at.t_ns > self._goal - BEFORE_GOAL_NS:
+            self._feed.put(record)
+
+    def _seek(self, at: _Playhead) -> None:
+        """On the way to a goal: no faster than the page takes it, and no waiting for what was due."""
+        if self._goal is None or at.t_ns is None:
+            return
+        if at.t_ns < self._goal:
+            while self._feed.waiting > QUEUE_ITEMS // 2 and not self._stop.wait(FULL_S):
+                pass
+        else:
+            self._goal = None
+        at.due = time.monotonic()
 
     def _waits(self, due: float) -> bool:
         """Wait until ``due``, or longer if paused; whether a request ended the wait, or it is paused."""

@@ -8,7 +8,7 @@ counts correlation times. Everything else is the search of :mod:`.search` and th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -20,9 +20,10 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.studies.discover.conclusion import Conclusion
 from psd_deflection.studies.discover.problem import Machine, Progress
-from psd_deflection.studies.discover.result import Conclusion
-from psd_deflection.studies.discover.search.comparison import Comparison, Tally
+from psd_deflection.studies.discover.report import sections
+from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_tables
 from psd_deflection.studies.discover.search.localise import Cell, Localisation, dependences
@@ -30,6 +31,7 @@ from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.signatures import candidates, signatures_beside
 from psd_deflection.studies.discover.search.weighing import sd_of
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where
+from psd_deflection.studies.study import PageSection
 
 BUDGET = 4000
 FOLDS = 4
@@ -156,7 +158,7 @@ class PlantComparison(Comparison):
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
         self.physics = plant.physics
-        self.tally = Tally()
+        self.tally = SimulationCount()
         self.base = ()
         self.nuisance = tuple(ActiveEffect(e, e.off_values(plant.physics, next(e.variants()))) for e in plant.nuisance)
         self.measured = _measured(plant)
@@ -385,6 +387,10 @@ class PlantDiscovery(Conclusion):
     """
 
     workspace: PlantComparison
+
+    def sections(self) -> Iterable[PageSection]:
+        """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
+        return sections(self)
 
     def files(self) -> dict[str, str]:
         """The page, the JSON, and what the plant itself writes of the effects."""

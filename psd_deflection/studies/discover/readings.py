@@ -23,8 +23,8 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
+from psd_deflection.studies.discover.conclusion import model_yaml
 from psd_deflection.studies.discover.plants import Model, Plant
-from psd_deflection.studies.discover.result import model_yaml
 from psd_deflection.studies.study import Tell, warn_caller
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {

@@ -11,9 +11,9 @@ from matplotlib.figure import Figure
 from psd_deflection.base.pages import picture, table
 from psd_deflection.model.simulation.laws import VARIABLES
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion, parameters_of, size_of
 from psd_deflection.studies.discover.laws.law_features import known_values
 from psd_deflection.studies.discover.laws.laws import FoundLaw
-from psd_deflection.studies.discover.result import Conclusion, Discovery, parameters_of, size_of
 from psd_deflection.studies.discover.search.screen import Score
 from psd_deflection.studies.discover.search.trust import BANDS
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
@@ -92,7 +92,7 @@ def _spectrum(rows: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
     )
 
 
-def _spectrum_figure(discovery: Discovery) -> Figure:
+def _spectrum_figure(discovery: RigConclusion) -> Figure:
     ws = discovery.workspace
     figure = Figure(figsize=(10, 3.2), layout='constrained')
     axis = figure.subplots()
@@ -138,7 +138,7 @@ def _waterfall_figure(discovery: Conclusion) -> Figure:
 
 def _where_figure(discovery: Conclusion) -> Figure:
     shown = np.clip(discovery.where.map, 0.0, 60.0)
-    of_rig = isinstance(discovery, Discovery)
+    of_rig = isinstance(discovery, RigConclusion)
     bands = [f'{a:g}-{b:g}' for a, b in itertools.pairwise(BANDS)] if of_rig else ['']
     names = CHANNELS if of_rig else discovery.workspace.channels
     figure = Figure(figsize=(10, 3.4), layout='constrained')
@@ -201,7 +201,7 @@ def _effect_section(effect: NamedEffect) -> str:
     return ''.join(out)
 
 
-def _law_figure(discovery: Discovery, found: FoundLaw) -> Figure:
+def _law_figure(discovery: RigConclusion, found: FoundLaw) -> Figure:
     """What is missing and what the law leaves against its first variable, in the channel where it shows most."""
     ws, name = discovery.workspace, found.law.variables[0]
     _, alone = ws.residual([*ws.base, *found.fit.nuisance, *found.beside])
@@ -226,7 +226,7 @@ def _law_figure(discovery: Discovery, found: FoundLaw) -> Figure:
     return figure
 
 
-def _law_section(discovery: Discovery, found: FoundLaw) -> str:
+def _law_section(discovery: RigConclusion, found: FoundLaw) -> str:
     law = found.law
     out = [f'<h3>A law for it</h3><p>{"<br>".join(html.escape(e.expression) for e in found.laws)}</p>']
     beside = ', '.join(a.label for a in found.beside)
@@ -268,7 +268,7 @@ def _where_table(discovery: Conclusion) -> str:
 
 def sections(discovery: Conclusion) -> list[PageSection]:
     """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
-    of_rig = discovery if isinstance(discovery, Discovery) else None
+    of_rig = discovery if isinstance(discovery, RigConclusion) else None
     out = [PageSection('', (picture(_waterfall_figure(discovery), 'the gap, step by step'),))]
     if of_rig is not None and of_rig.setup:
         wrong = [(f.name, f.where, '' if f.value is None else f'{f.value:.5g}', f.fix) for f in of_rig.setup]
@@ -307,7 +307,7 @@ def _before_and_after(discovery: Conclusion) -> list[str]:
     if against is not None:
         out.append(picture(against, 'residual before and after against loads and position'))
     factor = 1.0
-    if isinstance(discovery, Discovery):
+    if isinstance(discovery, RigConclusion):
         out.append(picture(_spectrum_figure(discovery), 'spectrum before and after'))
         factor = discovery.workspace.scale_shown[0]
     channels = [

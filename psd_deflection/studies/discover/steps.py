@@ -193,7 +193,7 @@ def where(problem: Problem) -> Problem:
 
 
 def fields_of(problem: Problem) -> dict[str, Any]:
-    """The fields of :class:`~psd_deflection.studies.discover.result.Conclusion` after the last step, by name."""
+    """The fields of :class:`~psd_deflection.studies.discover.conclusion.Conclusion` after the last step, by name."""
     ws, null, fit = problem.bare, problem.null, problem.fit
     after, held = ws.gap(fit.difference), heldout_tables(ws, fit)
     return {

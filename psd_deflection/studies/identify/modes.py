@@ -255,7 +255,7 @@ class _Stretch:
         return max(math.hypot(*terms[2 + 2 * i : 4 + 2 * i]) for i in range(len(modes)))
 
 
-class _Fit(NamedTuple):
+class _Rung(NamedTuple):
     """``modes``, what they leave, and the covariance of (frequency, damping, ...) for a unit of variance left."""
 
     modes: Modes
@@ -276,7 +276,7 @@ def _rms(values: FloatArray) -> float:
     return math.sqrt(float(np.mean(values * values))) if len(values) else 0.0
 
 
-def _fit(stretches: Sequence[_Stretch], start: Modes, steps: int = 100) -> _Fit:
+def _fit(stretches: Sequence[_Stretch], start: Modes, steps: int = 100) -> _Rung:
     def left(x: FloatArray) -> FloatArray:
         modes = [(float(f), float(z)) for f, z in x.reshape(-1, 2)]
         return np.concatenate([s.solved(modes)[0] for s in stretches])
@@ -294,10 +294,10 @@ def _fit(stretches: Sequence[_Stretch], start: Modes, steps: int = 100) -> _Fit:
     found = least_squares(scaled, x0, x_scale=scale, bounds=(low, high), xtol=1e-13, max_nfev=steps)
     jacobian = np.asarray(found.jac, dtype=np.float64) * size
     covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
-    return _Fit([(float(f), float(z)) for f, z in found.x.reshape(-1, 2)], left(found.x), covariance)
+    return _Rung([(float(f), float(z)) for f, z in found.x.reshape(-1, 2)], left(found.x), covariance)
 
 
-def _split(stretches: Sequence[_Stretch], modes: Modes) -> _Fit:
+def _split(stretches: Sequence[_Stretch], modes: Modes) -> _Rung:
     """The best fit with one more mode close to one of ``modes``."""
     starts = [
         [*modes[:i], (f * (1.0 - apart), z), (f * (1.0 + apart), z), *modes[i + 1 :]]
@@ -308,7 +308,7 @@ def _split(stretches: Sequence[_Stretch], modes: Modes) -> _Fit:
     return _fit(stretches, best.modes)
 
 
-def _hints(stretches: Sequence[_Stretch], fit: _Fit, enough: float) -> bool:
+def _hints(stretches: Sequence[_Stretch], fit: _Rung, enough: float) -> bool:
     """Whether modes to both sides of one of ``fit`` would take ``enough`` off the squares that are left."""
     for f, z in fit.modes:
         for apart in APART:
@@ -363,7 +363,7 @@ def _ends_well(stretch: _Stretch, left: FloatArray, window: int, level: float, e
     return _rms(left[end]) < 1.5 * MISFIT * level + SHARE * float(np.ptp(stretch.y[end]))
 
 
-def _grown(samples: FloatArray, seed: _Stretch, start: _Fit, window: int, level: float) -> tuple[_Stretch, _Fit]:
+def _grown(samples: FloatArray, seed: _Stretch, start: _Rung, window: int, level: float) -> tuple[_Stretch, _Rung]:
     """``seed`` made longer, forward and then back to louder times, as long as the modes fit.
 
     If two that looked like one come apart, with both.
@@ -388,7 +388,7 @@ def _grown(samples: FloatArray, seed: _Stretch, start: _Fit, window: int, level:
     return stretch, fit
 
 
-def _good(stretch: _Stretch, fit: _Fit, level: float) -> bool:
+def _good(stretch: _Stretch, fit: _Rung, level: float) -> bool:
     loud = stretch.loud(fit.modes)
     swing = float(np.ptp(stretch.y))
     return not fit.bounded and fit.deviation < MISFIT * level + 0.3 * SHARE * swing and loud > LOUD * level
@@ -474,7 +474,7 @@ def _rung(samples: FloatArray, rate: float, start: Modes, stretches: list[_Stret
     return AxisModes(tuple(out), 'ring-down', places, fitted, fit.deviation)
 
 
-def _settled(samples: FloatArray, rate: float, stretches: list[_Stretch], start: Modes) -> tuple[list[_Stretch], _Fit]:
+def _settled(samples: FloatArray, rate: float, stretches: list[_Stretch], start: Modes) -> tuple[list[_Stretch], _Rung]:
     """The stretches without their bad ends, and the fit to them with as many modes as it needs."""
     fit = _fit(stretches, start)
     for _ in range(TRIMS):
@@ -492,12 +492,12 @@ def _sizes(stretches: Sequence[_Stretch], modes: Modes) -> FloatArray:
     return np.asarray(np.hypot(terms[..., 0], terms[..., 1]).max(axis=0))
 
 
-def _of_right_order(stretches: Sequence[_Stretch], fit: _Fit, rate: float) -> _Fit:
+def _of_right_order(stretches: Sequence[_Stretch], fit: _Rung, rate: float) -> _Rung:
     """With another mode as long as what is left asks for it; without those that make no difference."""
 
     odds = 30.0 + 4.0 * len(stretches)
 
-    def needs(more: _Fit, fewer: _Fit, frequency: float) -> bool:
+    def needs(more: _Rung, fewer: _Rung, frequency: float) -> bool:
         saved = float(fewer.left @ fewer.left - more.left @ more.left)
         return saved > odds * _variance_at(more, stretches, rate, frequency)
 
@@ -549,13 +549,13 @@ def _trimmed(
     return _Stretch(samples, first, last, rate)
 
 
-def _variance_of(fit: _Fit, stretches: Sequence[_Stretch]) -> float:
+def _variance_of(fit: _Rung, stretches: Sequence[_Stretch]) -> float:
     """Of what is left, for the freedom that it has."""
     taken = sum(2 + 2 * len(fit.modes) for _ in stretches) + 2 * len(fit.modes)
     return float(fit.left @ fit.left) / max(len(fit.left) - taken, 1)
 
 
-def _variance_at(fit: _Fit, stretches: Sequence[_Stretch], rate: float, frequency: float) -> float:
+def _variance_at(fit: _Rung, stretches: Sequence[_Stretch], rate: float, frequency: float) -> float:
     """Variance of white noise with the density that what is left has about ``frequency``.
 
     At least the variance of what is left. The modes have taken away their part of it, there and in all.

@@ -20,8 +20,8 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import nested
 from psd_deflection.studies.check.result import Finding
+from psd_deflection.studies.discover import conclusion as told
 from psd_deflection.studies.discover import planning
-from psd_deflection.studies.discover import result as told
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Setting
 from psd_deflection.studies.discover.laws.laws import FoundLaw

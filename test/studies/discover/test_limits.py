@@ -17,7 +17,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences
-from psd_deflection.studies.discover import experiment, planning, readings, result
+from psd_deflection.studies.discover import conclusion, experiment, planning, readings
 from psd_deflection.studies.discover.experiment import ModelSums
 from psd_deflection.studies.discover.laws import law_features, laws
 from psd_deflection.studies.discover.laws.law_features import SOUGHT, Response
@@ -319,12 +319,12 @@ def test_what_a_law_leaves_is_told_in_micrometres() -> None:
     law = SimpleNamespace(expression='y2 += 1', stage='psd', kind='straight')
     found = SimpleNamespace(law=law, laws=[law], beside=[], heldout_gap=1.0)
     answer = SimpleNamespace(law=found, effects=())
-    assert result._law(cast(Any, answer)).endswith('on unseen load cases it leaves 1000000.000 µm.')
+    assert conclusion._law(cast(Any, answer)).endswith('on unseen load cases it leaves 1000000.000 µm.')
     creep = SimpleNamespace(effect=SimpleNamespace(name='creep'))
     found.beside = [creep]
     for named, words in (([], ', beside creep; on'), ([SimpleNamespace(active=creep)], 'y2 += 1; on')):
         answer.effects = named
-        assert words in result._law(cast(Any, answer))
+        assert words in conclusion._law(cast(Any, answer))
 
 
 def test_the_error_of_an_unseen_gain_is_that_of_four_hundred_draws(monkeypatch: pytest.MonkeyPatch) -> None:

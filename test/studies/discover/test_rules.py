@@ -27,7 +27,7 @@ from psd_deflection.studies.discover import experiment, planning
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Machine, Problem
 from psd_deflection.studies.discover.search.coincidence import coincidences
-from psd_deflection.studies.discover.search.comparison import Comparison, Tally
+from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap, heldout_residual
 from psd_deflection.studies.discover.search.localise import (
@@ -89,7 +89,7 @@ class Plant(Workspace):
         self.pictures = pictures
         self.observations = (Observation('plant', RIG, nothing, nothing[:, :3]),)
         self.physics = Physics.of(RIG)
-        self.tally = Tally()
+        self.tally = SimulationCount()
         self.base = ()
         self.fine = [size]
         self.measured = [measured]

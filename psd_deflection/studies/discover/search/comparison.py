@@ -19,7 +19,7 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
 
 
-class Tally:
+class SimulationCount:
     """Counts the forward simulations of all comparisons that come from one."""
 
     def __init__(self) -> None:
@@ -40,7 +40,7 @@ class Comparison(ABC):
     """
 
     physics: Physics | None
-    tally: Tally
+    tally: SimulationCount
     base: tuple[ActiveEffect, ...]
     nuisance: tuple[ActiveEffect, ...] = ()
     measured: list[FloatArray]

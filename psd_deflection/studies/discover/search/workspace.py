@@ -19,7 +19,7 @@ from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.studies.discover.observation import Observation, load_cases
-from psd_deflection.studies.discover.search.comparison import Comparison, Tally
+from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
 from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
 
@@ -66,7 +66,7 @@ class Workspace(Comparison):
     def __init__(self, observations: Sequence[Observation], base: Sequence[ActiveEffect] = ()) -> None:
         self.observations = tuple(observations)
         self.physics = Physics.of(observations[0].rig)
-        self.tally = Tally()
+        self.tally = SimulationCount()
         self.base = tuple(base)
         self.fine: list[int] = []
         self.measured: list[FloatArray] = []

@@ -1,0 +1,475 @@
+"""What a search concludes: sentences, result.json, model.yaml, the files of a law (docs/discover.md).
+
+``report`` makes its page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self
+
+from psd_deflection import __version__
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.base.files import replace_file
+from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
+from psd_deflection.rig.config import Rig
+from psd_deflection.rig.parameter_files import with_effects_section, with_values
+from psd_deflection.studies.check.result import Finding, finding_tree
+from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.localise import Localisation
+from psd_deflection.studies.discover.search.search import SearchResult
+from psd_deflection.studies.discover.search.ties import ties
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.study import StudyResult, Tell, described, edited_rig_file, named, warn_caller
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Conclusion(StudyResult):
+    """The answer of a search. Gaps are rms values of measured minus simulated in the unit of ``workspace``.
+
+    ``per_channel``: before and after; ``heldout_per_channel``: after, on load cases that the fit has not seen.
+    ``nuisance``: what every model has, each with the standard deviations of its parameters.
+    """
+
+    study, json_name = 'discover', 'result.json'
+    title = 'What the model lacks'
+
+    verdict: str
+    effects: tuple[NamedEffect, ...]
+    unknown: tuple[Unknown, ...]
+    where: Localisation
+    left: Localisation
+    gap_before: float
+    gap_after: float
+    gap_floor: float
+    gap_heldout_before: float
+    gap_heldout_after: float
+    per_channel: Mapping[str, tuple[float, float]]
+    heldout_per_channel: Mapping[str, float]
+    waterfall: tuple[tuple[str, float], ...]
+    simulations: int
+    search: SearchResult
+    fit: Fit
+    workspace: Comparison
+    seed: int
+    nuisance: tuple[tuple[ActiveEffect, Mapping[str, float]], ...]
+
+    @property
+    def floors(self) -> float:
+        """The gap that remains, in units of the gap that noise alone leaves; 0 if nobody knows the noise."""
+        return self.gap_after / self.gap_floor if self.gap_floor > 0.0 else 0.0
+
+    def __repr__(self) -> str:
+        effects = ', '.join(e.active.label for e in self.effects) or 'no effect'
+        before, after, floor = (self.workspace.worded(v) for v in (self.gap_before, self.gap_after, self.gap_floor))
+        return f'<{type(self).__name__} {self.verdict}: {effects}; gap {before} → {after} (noise alone: {floor})>'
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """Version and recordings, with their digests."""
+        seen = self.workspace.provenance()
+        of = {f'recording {n}': named(str(r['name']), str(r.get('sha256', '')), 64) for n, r in enumerate(seen, 1)}
+        return {'version': __version__, 'seed': str(self.seed), **of}
+
+    @property
+    def sentence(self) -> str:
+        """The whole answer as one text."""
+        return ' '.join(self.sentences())
+
+    def sentences(self) -> list[str]:
+        """What is missing, or that nothing is, and which effects may have one cause."""
+        return [_missing(self), *(t.sentence for t in ties(self.effects))]
+
+    def lines(self) -> list[str]:
+        """The sentences in one line, then what is unknown."""
+        unknown = [f'unknown: {u.signature}' for u in self.unknown]
+        return [self.sentence, *unknown, f'{self.simulations} forward simulations']
+
+    def tree(self) -> dict[str, Any]:
+        """Verdict, places, effects, unknown, gaps, provenance."""
+        return {
+            'verdict': self.verdict,
+            'where': self._where(),
+            'effects': [_effect_tree(e) for e in self.effects],
+            'unknown': [
+                {
+                    'signature': u.signature,
+                    'depends_on': list(u.depends_on),
+                    'explains': u.explains,
+                    'rms': u.rms,
+                    'law': None,
+                }
+                for u in self.unknown
+            ],
+            'ties': self._ties(),
+            'setup': [],
+            'moves': None,
+            'remaining': {'rms': self.gap_after, 'floors': self.floors},
+            'gap': self._gap(),
+            'nuisance': [{'name': a.effect.name, 'parameters': _fitted(a, sd)} for a, sd in self.nuisance],
+            'provenance': {
+                'version': __version__,
+                'seed': self.seed,
+                'forward_simulations': self.simulations,
+                'recordings': self.workspace.provenance(),
+            },
+        }
+
+    def _where(self) -> list[dict[str, Any]]:
+        return [
+            {
+                'channel': c.channel,
+                'recording': self.workspace.names[c.recording],
+                'when': [c.when[0], c.when[1]],
+                'band_hz': [c.band[0], c.band[1]],
+                'depends_on': list(c.depends_on),
+                'statistic': _number(c.statistic),
+                'p': min(max(c.p, 0.0), 1.0),
+            }
+            for c in self.where.cells
+            if c.p < 0.05
+        ]
+
+    def _ties(self) -> list[dict[str, Any]]:
+        return [
+            {
+                'share': {'value': t.share, 'sd': t.sd},
+                'frequencies_moved': t.moves,
+                'causes': [{'name': c.name, 'factor': {'value': c.factor, 'sd': c.sd}} for c in t.causes],
+                'sentence': t.sentence,
+            }
+            for t in ties(self.effects)
+        ]
+
+    def _gap(self) -> dict[str, Any]:
+        return {
+            'unit': self.workspace.unit,
+            'before': self.gap_before,
+            'after': self.gap_after,
+            'floor': self.gap_floor if math.isfinite(self.gap_floor) else None,
+            'heldout_before': self.gap_heldout_before,
+            'heldout_after': self.gap_heldout_after,
+            'per_channel': {
+                k: {'before': a, 'after': b, 'heldout': self.heldout_per_channel[k]}
+                for k, (a, b) in self.per_channel.items()
+            },
+        }
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RigConclusion(Conclusion):
+    """The answer for the rig. Gaps in m (rms of block means over x1 y1 x2 y2).
+
+    ``setup``: mistakes of the set-up and the recording, with ``values`` that put the rig file right; ``known``: the
+    effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
+    ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
+    set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
+    ``moves``: by how much at most the effects change an estimate that does not know of them: dX m, dY m, theta rad.
+    ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
+    became, '' if it is none. ``tell``: takes warnings.
+    """
+
+    workspace: Workspace
+    setup: tuple[Finding, ...]
+    values: Mapping[str, object]
+    known: tuple[ActiveEffect, ...]
+    law: FoundLaw | None
+    rivals: tuple[Fit, ...]
+    unsettled: tuple[str, ...]
+    moves: tuple[float, float, float]
+    rig: Rig
+    params_file: str | Path | None = None
+    adopted: str = ''
+    tell: Tell = warn_caller
+
+    @property
+    def active_effects(self) -> list[ActiveEffect]:
+        """The effects to add to the rig file."""
+        return [*self.known, *(e.active for e in self.effects)]
+
+    @property
+    def laws(self) -> list[Law]:
+        """The law's parts, by the name that they get."""
+        return [] if self.law is None else self.law.adopted(self.adopted or 'law')
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """Version, recordings, rig."""
+        rig = 'the parameters in the recording' if self.params_file is None else str(self.params_file)
+        return {**super().sources, 'rig': rig}
+
+    def sentences(self) -> list[str]:
+        """What is wrong with the set-up, what is missing besides, what that does to an estimate, the law."""
+        missing = _missing(self, ' besides' if self.setup else '')
+        tied = [t.sentence for t in ties(self.effects)]
+        return [s for s in (_setup(self), missing, *tied, _moved(self), _law(self)) if s]
+
+    def lines(self) -> list[str]:
+        """The sentences in one line, what puts the set-up right, what would decide, what is unknown."""
+        first, *others = super().lines()
+        out = [first, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
+        for e in self.effects:
+            if e.suggestion is not None:
+                out.append(f'to tell {e.active.effect.name} from {", ".join(e.equivalent)}: {e.suggestion.text}')
+        return out + others
+
+    def tree(self) -> dict[str, Any]:
+        """As for any machine, with set-up, moves and law."""
+        out = super().tree()
+        for unknown, law in zip(out['unknown'], [self.law] if self.law is not None else [], strict=False):
+            unknown['law'] = _law_tree(law)
+        out['setup'] = [{**finding_tree(f), 'evidence': _number(f.evidence)} for f in self.setup]
+        out['moves'] = dict(zip(('dx_m', 'dy_m', 'theta_rad'), self.moves, strict=True))
+        return out
+
+    def adopt(self, name: str) -> Self:
+        """The answer with its law as the effect ``name``, written to the folder of the user's effects.
+
+        Without a law nothing happens. Raises ConfigError for a name that cannot be, RecordingError if the disk refuses.
+        """
+        folder = adopting_folder(name)
+        if self.law is None:
+            return self
+        out = replace(self, adopted=name)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            for law in out.laws:
+                replace_file(folder / f'{law.name}.yaml', _law_file(law).encode())
+        except OSError as error:
+            raise RecordingError(f'{folder}: cannot be written ({error.strerror or error})') from None
+        return out
+
+    def model_yaml(self) -> str:
+        """The user's parameter file with the effects, comments kept; without one what describes the rig."""
+        effects = self.active_effects
+        if self.adopted and self.law is not None:
+            beside = [a for a in self.law.beside if a.effect.name in effect_names()]
+            laws = [ActiveEffect(effect_of(law), values_of(law)) for law in self.laws]
+            effects = [*self.known, *beside, *laws]
+        return model_yaml(self.params_file, self.rig, effects, self.values, self.tell)
+
+    def files(self) -> dict[str, str]:
+        """The rig file with the effects, the page, the JSON, and the law as an effect that can be adopted."""
+        named = {law.name.replace(self.adopted, 'law', 1) if self.adopted else law.name: law for law in self.laws}
+        laws = {f'{name}.yaml': _law_file(law) for name, law in named.items()}
+        return {'model.yaml': self.model_yaml(), **super().files(), **laws}
+
+
+def adopting_folder(name: str) -> Path:
+    """The folder of the user's effects, for an effect ``name``. Raises ConfigError if there cannot be one."""
+    if not name.isidentifier() or name.startswith('_'):
+        raise ConfigError(f'{name}: must be a name of letters, digits and underscores, such as base_yields')
+    if name in effect_names():
+        raise ConfigError(f'{name}: there is an effect of that name; give another')
+    folders = effect_folders()
+    if not folders:
+        raise ConfigError(f'{name}: there is no folder for your effects; set {FOLDERS}')
+    return folders[0]
+
+
+def _law_file(law: Law) -> str:
+    return law_text(
+        law,
+        (
+            f'Found by psd-deflection discover {__version__}: no effect of the catalogue explains this.',
+            f'Edit it, and put it as NAME.yaml, with name: NAME, into a folder of effects ({FOLDERS}).',
+        ),
+    )
+
+
+def model_yaml(
+    params_file: str | Path | None,
+    rig: Rig,
+    effects: Iterable[ActiveEffect],
+    values: Mapping[str, object],
+    tell: Tell = warn_caller,
+) -> str:
+    """The user's parameter file with ``effects``, comments kept; without one what describes ``rig``.
+
+    ``values``: what was wrong in the rig file, put right. ``tell`` gets a warning if the file cannot be edited.
+    """
+    given = list(effects)
+
+    def edit(text: str, path: Path) -> str:
+        text = with_effects_section(text, effects_to_values(given), path)
+        if not values:
+            return text
+        return with_values(text, values, f'Put right by psd-deflection {__version__}', path)
+
+    return edited_rig_file(params_file, 'model.yaml', lambda: described(rig, given), edit, tell)
+
+
+def _number(value: float) -> float:
+    # JSON has no infinity; for a chi-square or standard deviation this is as good.
+    if math.isnan(value):
+        return 0.0
+    return float(min(max(value, -1e300), 1e300))
+
+
+def parameters_of(effect: NamedEffect | Rival) -> dict[str, Any]:
+    """Choices as numbers, the rest with standard deviation and unit."""
+    return _fitted(effect.active, effect.sd)
+
+
+def _fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
+    out: dict[str, Any] = {}
+    for p in active.effect.parameters:
+        value = active.values[p.name]
+        if p.kind == 'choice':
+            out[p.name] = int(value)
+        elif math.isfinite(value):
+            out[p.name] = {'value': _number(value), 'sd': _number(sds.get(p.name, 0.0)), 'unit': p.unit}
+    return out
+
+
+def _effect_tree(e: NamedEffect) -> dict[str, Any]:
+    return {
+        'name': e.active.effect.name,
+        'stage': e.active.effect.stage,
+        'parameters': parameters_of(e),
+        'equivalent': list(e.equivalent),
+        'evidence': {
+            'delta_bic': _number(e.delta_bic),
+            'p': _number(e.p),
+            'heldout_gain': _number(e.heldout.gain),
+            'heldout_gain_error': _number(e.heldout.error),
+        },
+        'suggested_experiment': None if e.suggestion is None else e.suggestion.text,
+        'rivals': [
+            {
+                'name': r.active.effect.name,
+                'parameters': parameters_of(r),
+                'delta_bic': _number(r.delta_bic),
+            }
+            for r in e.rivals
+        ],
+    }
+
+
+def _law_tree(found: FoundLaw) -> dict[str, Any]:
+    """The tree of ``law``."""
+    law = found.law
+    return {
+        'stage': law.stage,
+        'acts_on': law.acts_on,
+        'channels': list(found.channels),
+        'variables': list(law.variables),
+        'kind': law.kind,
+        'expression': law.expression,
+        'further': [e.expression for e in found.further],
+        'heldout_after': found.heldout_gap,
+        'beside': [a.label for a in found.beside],
+        'equivalent': [
+            {'stage': e.stage, 'acts_on': e.acts_on, 'variables': list(e.variables), 'expression': e.expression}
+            for e in found.equivalent
+        ],
+        'evidence': {
+            'delta_bic': _number(found.delta_bic),
+            'p': _number(found.p),
+            'heldout_gain': _number(found.heldout.gain),
+            'heldout_gain_error': _number(found.heldout.error),
+        },
+    }
+
+
+def size_of(effect: NamedEffect | Rival) -> str:
+    """The fitted amplitudes with their standard deviations, for a person: ``angle 0.00399 ± 2e-05 rad``."""
+    out = []
+    for p in effect.active.effect.parameters:
+        value, sd = effect.active.values[p.name], effect.sd.get(p.name, 0.0)
+        if p.kind == 'amplitude' and p.name in effect.sd and abs(value) > 2.0 * sd:
+            digits = 1 if sd <= 0.0 else 2 + math.floor(math.log10(abs(value) / sd))
+            out.append(f'{p.name} {value:.{min(digits, 6)}g} ± {sd:.1g} {p.unit}'.rstrip())
+    return ', '.join(out)
+
+
+def _left(discovery: Conclusion) -> str:
+    """What remains, and how many floors it is."""
+    after, floor = (
+        discovery.workspace.worded(v, discovery.workspace.digits) for v in (discovery.gap_after, discovery.gap_floor)
+    )
+    if not math.isfinite(discovery.gap_floor):
+        return after
+    return f'{after}, {discovery.floors:.2f} times what noise alone leaves ({floor})'
+
+
+def _setup(discovery: RigConclusion) -> str:
+    """What is wrong with the set-up, in a sentence, or nothing."""
+    where: dict[str, dict[str, None]] = {}
+    for f in discovery.setup:
+        where.setdefault(f.name, {})[f'{f.where}{_seconds(f)}'] = None
+    names = [f'{name} ({"; ".join(places)})' for name, places in where.items()]
+    return f'The set-up is not as the rig file or the recording says: {", ".join(names)}.' if names else ''
+
+
+def _seconds(finding: Finding) -> str:
+    """How late a load was noted, or how long it took."""
+    if finding.value is None or finding.name not in ('load_time', 'load_ramp'):
+        return ''
+    late = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
+    return f', {abs(finding.value):.2g} s{late}'
+
+
+def _moved(discovery: RigConclusion) -> str:
+    """What the effects do to an estimate, in a sentence, or nothing."""
+    if not discovery.effects:
+        return ''
+    dx, dy, theta = (1e6 * v for v in discovery.moves)
+    them = 'it' if len(discovery.effects) == 1 else 'them'
+    return f'Without {them} an estimate is wrong by up to ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad.'
+
+
+def _law(discovery: RigConclusion) -> str:
+    """The law for what is unknown, in a sentence, or nothing."""
+    if discovery.law is None:
+        return ''
+    found = discovery.law
+    expressions = '; '.join(e.expression for e in found.laws)
+    words = f'What remains follows a law ({found.law.stage}, {found.law.kind}): {expressions}'
+    beside = [a.effect.name for a in found.beside]
+    named = {e.active.effect.name for e in discovery.effects}
+    with_law = f'; on unseen load cases it leaves {1e6 * found.heldout_gap:.3f} µm'
+    also = f', beside {", ".join(beside)}' if beside and set(beside) != named else ''
+    return f'{words}{also}{with_law}.'
+
+
+def _missing(discovery: Conclusion, besides: str = '') -> str:
+    ws, left = discovery.workspace, _left(discovery)
+    before = f'{ws.scale_shown[0] * discovery.gap_before:{ws.digits}}'
+    if discovery.verdict == 'nothing_missing':
+        if not math.isfinite(discovery.gap_floor):
+            # Without a stated noise nobody knows whether what remains is noise.
+            return f'Nothing in the library helps{besides}; {left} remains, and no noise is stated to hold it against.'
+        return f'Nothing is missing{besides}: the gap is {left}.'
+    parts = []
+    for e in discovery.effects:
+        text = e.active.label
+        if e.equivalent:
+            text += f' (or {", ".join(e.equivalent)}: this data cannot tell)'
+        parts.append(text)
+    sizes = '; '.join(f'{e.active.effect.name} {size}' for e in discovery.effects if (size := size_of(e)))
+    fitted = f' Fitted: {sizes}.' if sizes else ''
+    named = ' and '.join(parts)
+    if discovery.verdict == 'effects_found':
+        is_are, them = ('is', 'it') if len(parts) == 1 else ('are', 'them')
+        return f'{named} {is_are} missing from the model; adding {them} closes the gap from {before} to {left}.{fitted}'
+    if not any(u.remains for u in discovery.unknown):
+        return (
+            f'{named} close the gap from {before} to {left}, but their sizes '
+            f'are tied: one effect that is not in the catalogue is likelier.'
+        )
+    if named:
+        explains = 'explains' if len(parts) == 1 else 'explain'
+        return (
+            f'{named} {explains} part, but an unknown effect remains: the gap goes from {before} '
+            f'{ws.scale_shown[1]} to {left}.{fitted}'
+        )
+    return f'An effect that is not in the catalogue: the gap is {left}.'
