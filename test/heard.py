@@ -2,4 +2,16 @@
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Callable
+
 from tools.program import WAIT_S as WAIT_S
+
+
+def until(true: Callable[[], bool]) -> None:
+    """Wait for what another thread brings about, and nobody tells of."""
+    deadline = time.monotonic() + WAIT_S
+    while not true():
+        assert time.monotonic() < deadline, true
+        threading.Event().wait(0.001)

@@ -7,6 +7,7 @@ diagnostics once a second named ``NODE: PART``. It says so when another node pub
 
 from __future__ import annotations
 
+import abc
 import time
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
@@ -81,7 +82,7 @@ class _ManagedNode(LifecycleNode):  # type: ignore[misc]
         return TransitionCallbackReturn.SUCCESS
 
 
-class BaseNode:
+class BaseNode(abc.ABC):
     """The base of every node. A node overrides :meth:`set_up`, what its lifecycle does, and :meth:`health`.
 
     ``say``: gets each line for the terminal. ``overrides``: parameters that take precedence over those of ROS's
@@ -117,12 +118,13 @@ class BaseNode:
 
     # What a node overrides.
 
+    @abc.abstractmethod
     def set_up(self) -> None:
         """Declare parameters; make publishers, subscriptions and services."""
-        raise NotImplementedError
 
     def configure(self) -> None:
-        """Take what the node needs (a port, a file)."""
+        """Take what the node needs (a port, a file); it is not active yet."""
+        self.active = False
 
     def activate(self) -> None:
         """Begin to publish."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import threading
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -22,7 +21,7 @@ from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.run import behind
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.session import Session
-from test.heard import WAIT_S
+from test.heard import WAIT_S, until
 
 ALLOWED_S = 2.0
 
@@ -94,13 +93,6 @@ def run_of(rig: Rig, folder: Path, said: list[str], **values: object) -> tuple[S
     session.processing.sinks.append(held)
     session.start()
     return session, held
-
-
-def until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.001)
 
 
 def ended_with(session: Session) -> list[BaseException]:
