@@ -211,7 +211,7 @@ def replay(
     import warnings
 
     from psd_deflection.recordings.recording import Recording
-    from psd_deflection.recordings.replay.engine import nominal_rig, replayed_estimates, rig_at_start
+    from psd_deflection.recordings.replay.engine import replayed_estimates, rig_at_start, warnings_about_rig
     from psd_deflection.rig.config import replace_values
 
     opened = recording if isinstance(recording, Recording) else open(recording)
@@ -219,7 +219,7 @@ def replay(
     if solver is not None:
         known = replace_values(known, {'solver': solver, 'solvers': [solver]}, 'replay')
     if rig is None:
-        for warning in nominal_rig(opened):
+        for warning in warnings_about_rig(opened):
             warnings.warn(warning, stacklevel=2)
     return replayed_estimates(opened, known)
 

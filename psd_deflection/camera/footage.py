@@ -25,7 +25,6 @@ from psd_deflection.camera.settings import CameraSettings, settings_from
 from psd_deflection.rig.parameter_files import flattened, parameter_text
 
 FRAMES = 'frames.csv'
-SUFFIXES = ('.png', '.jpg', '.jpeg', '.bmp', '.tif', '.tiff', '.pgm', '.webp')
 _MOST_SECONDS = 9.2e9
 _SILENT_READS = 50
 

@@ -193,7 +193,7 @@ class Pipeline:
         return record
 
     def apply(self, change: ParameterChange) -> None:
-        """Use the changed values from now on, and go on from what is told of a state.
+        """Use the changed values from now on, and go on from the state that it names.
 
         Raises ConfigError if a parameter is out of bounds; then nothing has changed. ``misfits`` has a line for each
         value that fits no part of this rig; it is left out.

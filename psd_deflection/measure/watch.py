@@ -43,7 +43,7 @@ LEARN = 4
 REMEMBER = 60
 """Windows whose scatter tells what is usual."""
 MOVING = 3.0
-"""A window that scatters so many times the usual is spoilt by motion."""
+"""A window that scatters by more than this factor of the usual is spoilt by motion."""
 LEAST = 0.7e-6
 """Shift of a reading that is never counted, m."""
 SIGMAS = 2.0

@@ -28,7 +28,7 @@ SIMULATED_PUSH = 0.5e-3
 def run_guided(rig: Rig, world: Rig, say: Say, show: Callable[[Guide], None]) -> Checkup:
     """Lead through the pushes on the device of ``rig``; without a port, on a simulated rig that is really ``world``.
 
-    ``say`` gets the prompts and what is told between them, ``show`` the guide after each chunk of samples. Raises
+    ``say`` gets the prompts and the lines between them, ``show`` the guide after each chunk of samples. Raises
     DeviceError, ConfigError.
     """
     # A few lost samples do no harm here, and a priority is one more thing to read about.

@@ -17,9 +17,9 @@ from psd_deflection.run.fanout import Wire
 from psd_deflection.run.session import Session
 
 MEMORY_S = 10.0
-"""What the pipeline remembers is told so often, s, or when a segment of the noise ends after that."""
+"""Time between messages with the pipeline's memory, s; each waits for the end of a segment of the noise."""
 LATE = 100
-"""So many blocks later it is told though a segment is under way, if that is not long."""
+"""Blocks after which the memory is sent though a segment is under way, if that segment is short."""
 MOST_GATHERED = 20_000
 """Numbers of a segment under way that are told; a longer one is waited for."""
 

@@ -26,7 +26,7 @@ from psd_deflection.rig.config import Rig
 PERIODS = 4
 """Bending periods that each mean on either side of a moment takes."""
 STANDS_OUT = 10.0
-"""A step is at least so many times the median of what is there without one."""
+"""Factor by which a step must exceed the median of what is there without one."""
 LEAST_SHARE = 0.03
 """A step is at least this share of the largest."""
 APART_S = 0.25
@@ -40,11 +40,11 @@ ONE_DELAY_S = 0.9
 GRADUAL_S = 0.1
 """A load that took longer than this was applied slowly."""
 BETTER = 4.0
-"""Mended times must leave so many times less of the movement than the noted ones."""
+"""Factor by which mended times must leave less of the movement than the noted ones."""
 SETTLED_S = 5.0
 """Time constants of the slower mode after which a link is at rest."""
 ROUGH = 3.0
-"""The motion under a load applied slowly is left out if what remains of its ringing is so many times the noise."""
+"""Leave out the motion under a load applied slowly if its remaining ringing exceeds the noise by this factor."""
 
 _PER_SECOND = 1.0 / 5.0
 _SKIP_STEP, _SKIP_NOTE = 4.0, 9.0

@@ -24,7 +24,7 @@ from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import WHOLE, Recording, Span
-from psd_deflection.recordings.replay.engine import nominal_rig, rig_at_end
+from psd_deflection.recordings.replay.engine import rig_at_end, warnings_about_rig
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import nested, parameter_text
@@ -144,7 +144,7 @@ def opened(
         recording = open_recording(recording, namespace=namespace, span=span)
     params_file = None if rig is None or isinstance(rig, Rig) else Path(rig)
     if rig is None:
-        for warning in nominal_rig(recording):
+        for warning in warnings_about_rig(recording):
             tell(warning)
         known = rig_at_end(recording)
     else:

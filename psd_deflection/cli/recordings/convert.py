@@ -23,7 +23,7 @@ from psd_deflection.recordings.conversion import Beside, convert, convert_comput
 from psd_deflection.recordings.formats.registry import format_of_name
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay
+from psd_deflection.recordings.replay.engine import open_for_replay, warnings_about_rig
 from psd_deflection.rig.config import load_rig
 
 
@@ -80,5 +80,5 @@ def _to_viewer(args: argparse.Namespace) -> int:
 
 
 def _warn(recording: Recording, params_file: str | None) -> None:
-    for warning in [*recording.warnings, *nominal_rig(recording, params_file)]:
+    for warning in [*recording.warnings, *warnings_about_rig(recording, params_file)]:
         warn(warning)

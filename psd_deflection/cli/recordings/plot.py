@@ -30,7 +30,7 @@ from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.formats.registry import endings_of_recordings
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay, replayed
+from psd_deflection.recordings.replay.engine import open_for_replay, replayed, warnings_about_rig
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -200,7 +200,7 @@ def run(args: argparse.Namespace) -> int:
     if window[0] >= window[1]:
         raise UsageError(f'--from {window[0]:g} --to {window[1]:g}: must rise')
     recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
-    for warning in nominal_rig(recording, args.params_file):
+    for warning in warnings_about_rig(recording, args.params_file):
         warn(warning)
     drawn, spectrum = Drawn(recording, window), Spectrum(rig, SPECTRUM_OF_S)
     for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):

@@ -40,7 +40,7 @@ from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.formats.format import Sink
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.comparison import ReplayComparison
-from psd_deflection.recordings.replay.engine import GatheredEstimates, nominal_rig, open_for_replay, replayed
+from psd_deflection.recordings.replay.engine import GatheredEstimates, open_for_replay, replayed, warnings_about_rig
 from psd_deflection.recordings.replay.watched import WatchedReplay
 from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
@@ -202,7 +202,7 @@ def _replayed(
         if comparison is not None:
             comparison.add(records)
     seconds = time.perf_counter() - began
-    warnings = [*recording.warnings, *nominal_rig(recording, params_file), *_rate_warning(recording, rig)]
+    warnings = [*recording.warnings, *warnings_about_rig(recording, params_file), *_rate_warning(recording, rig)]
     if comparison is not None:
         comparison.finish()
     return ReplayTask(recording, rig, pipeline, totals, comparison, warnings, seconds)

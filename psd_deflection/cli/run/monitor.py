@@ -29,7 +29,7 @@ from psd_deflection.cli._options import given_parameters, namespace_option, over
 from psd_deflection.cli._report import warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.replay.engine import nominal_rig, open_for_replay, replayed
+from psd_deflection.recordings.replay.engine import open_for_replay, replayed, warnings_about_rig
 from psd_deflection.records import Record
 from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.declarations import MONITOR
@@ -108,7 +108,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         # Where the page was served when it was recorded says nothing of today.
         rig = replace_values(rig, {p.name: p.default for p in MONITOR.parameters.values()})
     rig = replace_values(rig, overrides, 'command line')
-    for warning in nominal_rig(opened, args.params_file):
+    for warning in warnings_about_rig(opened, args.params_file):
         warn(warning)
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:

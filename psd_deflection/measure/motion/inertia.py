@@ -24,13 +24,13 @@ from psd_deflection.records import BaseAcceleration, FloatArray
 HOLD_NS = 100_000_000
 """An acceleration holds until the next one, but no longer than this. Then it is 0."""
 AHEAD_NS = 10_000_000_000
-"""One may be told at most so long before it acts."""
+"""Longest time that an acceleration may arrive before it acts, ns."""
 MOST_TOLD = 100_000
-"""So many may wait for their samples."""
+"""Accelerations that may wait for their samples."""
 SHARE = 0.05
 """Share by which a change of what accelerations do may differ from this model, one standard deviation."""
-TENTH = 0.1
-"""See :meth:`Inertia.unsure`."""
+CHANGE_SHARE = 0.1
+"""Share of a change of acceleration by which the velocity is unsure (:meth:`Inertia.unsure`)."""
 LARGEST = 1e4
 """m/s^2 or rad/s^2: a larger one is a mistake."""
 
@@ -129,7 +129,7 @@ class Inertia:
         (before_ns, before), (now_ns, now) = self.told[there - 2 : there]
         seconds = min(now_ns - before_ns, HOLD_NS) / 1e9
         w = np.array([mode.w for mode in self._modes])
-        return np.asarray(TENTH * np.abs(np.subtract(now, before)) * w * seconds)
+        return np.asarray(CHANGE_SHARE * np.abs(np.subtract(now, before)) * w * seconds)
 
     def forced(self, begin_ns: int, seconds: FloatArray) -> Forced:
         """At ``seconds`` (n,) after ``begin_ns``, the last one latest, from rest then."""

@@ -78,8 +78,8 @@ class Predicted(NamedTuple):
 
 
 class _Taken(NamedTuple):
-    """Of the last block: what the accelerations did as far as they were known, and how its samples moved the state at
-    its end: ``gain`` (3, 4, N), 0 for a sample that is not there."""
+    """Kept from the last block, to correct it if an acceleration arrives late: ``forced``, what the known accelerations
+    did; ``gain`` (3, 4, N), how each sample moved the state at its end, 0 for a lost sample."""
 
     forced: Forced
     gain: FloatArray

@@ -22,7 +22,7 @@ from psd_deflection.measure.motion.modal import Oscillator
 from psd_deflection.records import FloatArray
 
 GROWTH = 1.5
-"""Each span is so many times the one before, at least one block longer."""
+"""Factor from each span to the next, which is at least one block longer."""
 
 LATELY = 30.0
 """Seconds in which the variance of what was seen fades to 1/e."""

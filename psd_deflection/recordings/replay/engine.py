@@ -51,7 +51,7 @@ def rig_at_end(recording: Recording) -> Rig:
     return rig
 
 
-def nominal_rig(recording: Recording, params_file: str | None = None) -> list[str]:
+def warnings_about_rig(recording: Recording, params_file: str | None = None) -> list[str]:
     """The warning that the nominal rig is taken, if neither ``params_file`` nor the recording gives another."""
     if recording.parameters or params_file is not None:
         return []

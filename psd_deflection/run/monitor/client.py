@@ -89,7 +89,7 @@ async def _ask(daemon: Daemon, path: str, body: Mapping[str, object]) -> str:
 
 
 async def messages(daemon: Daemon) -> AsyncGenerator[dict[str, Any], None]:
-    """What the page is told: ``hello`` first, then new rows as they come. Raises DaemonError, also at the end."""
+    """The messages of the page: ``hello`` first, then new rows as they come. Raises DaemonError, also at the end."""
     limit = aiohttp.ClientTimeout(total=None, sock_connect=ANSWER_S)
     try:
         async with (

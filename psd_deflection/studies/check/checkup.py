@@ -31,7 +31,7 @@ DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
 
 SIZE_FACTOR = 1.1
-"""A movement that is so many times the expected one, or so many times less, is told."""
+"""Report a movement that differs from the expected one by more than this factor."""
 
 _LOADS = ('fx', 'fy', 'tz')
 

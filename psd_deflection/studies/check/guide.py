@@ -24,7 +24,7 @@ LEAST_PUSH = 10e-6
 """m. A smaller movement is not taken for a push, however quiet the rig is."""
 
 STAND_OUT = 10.0
-"""A push moves the dots so many times farther than they wander at rest."""
+"""Factor by which a push must move the dots farther than they wander at rest."""
 
 STEADY = 0.3
 """A push whose movement wanders less than this share of it is held."""
@@ -33,10 +33,10 @@ LET_GO = 0.15
 """A dot that is nearer to its rest than this share of the push has been let go."""
 
 STILL = 5.0
-"""Wandering of so many times the expected noise counts as rest."""
+"""Wandering up to this factor of the expected noise counts as rest."""
 
 SHIFT = 2e-6
-"""m. What a rest may shift by handling alone; drift is told beyond it."""
+"""m. Shift between rests that handling alone may cause; drift is reported beyond it."""
 
 
 class Phase(Enum):

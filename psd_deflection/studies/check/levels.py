@@ -14,16 +14,16 @@ MAINS = (50.0, 60.0)
 """Hz."""
 
 SUM_FACTOR = 1.15
-"""A sum that is so many times the nominal one, or so many times less, is told."""
+"""Report a sum that differs from the nominal one by more than this factor."""
 
 LONGEST = 1_000_000
-"""Samples that are looked at."""
+"""Only the first samples of a long recording are used, this many."""
 
 HUM_S = 60.0
 """Longest stretch in which hum is looked for, s."""
 
 HUM_SHARE = 0.25
-"""Hum below this share of the noise is not told."""
+"""Hum below this share of the noise is not reported."""
 
 _THIRD = np.sqrt(20.0)
 """Root of the variance of the third difference of white noise of variance 1."""

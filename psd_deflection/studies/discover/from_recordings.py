@@ -16,7 +16,7 @@ from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
 from psd_deflection.recordings.recording import TEMPERATURE_COLUMN, WHOLE, Recording, Span
-from psd_deflection.recordings.replay.engine import check_psds, nominal_rig, rig_at_end
+from psd_deflection.recordings.replay.engine import check_psds, rig_at_end, warnings_about_rig
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -56,7 +56,7 @@ def read_observation(
     if rig is None:
         rig = rig_at_end(recording)
         if warn is not None:
-            for warning in nominal_rig(recording):
+            for warning in warnings_about_rig(recording):
                 warn(warning)
     if overrides:
         rig = replace_values(rig, overrides, where)

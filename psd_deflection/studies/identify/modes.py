@@ -34,18 +34,18 @@ from psd_deflection.records import FloatArray
 LOWEST, HIGHEST = 0.5, 200.0
 """Hz. Of the modes that are looked for; at most a quarter of the sample rate."""
 PEAK = 25.0
-"""A peak of the spectrum counts if it stands so many times above the noise..."""
+"""Factor by which a peak of the spectrum must exceed the noise..."""
 STANDS_OUT = 30.0
-"""...and a further one so many times above the spectrum about it: of steps alone the spectrum ripples too."""
+"""...and a further peak the spectrum around it, because steps alone make the spectrum ripple."""
 MOST_MODES = 3
 WINDOW = 6.0
 """Periods of the first window of a stretch."""
 SHORTEST = 4.0
 """Periods of a stretch, at least."""
 LOUD = 8.0
-"""The ringing is so many times louder than the noise at the start of a stretch."""
+"""Factor by which the ringing must exceed the noise at the start of a stretch."""
 MISFIT = 1.25
-"""What a stretch leaves may be so many times the noise..."""
+"""Factor of the noise that a stretch may leave..."""
 SHARE = 0.01
 """...plus this share of the ringing, because no link is linear to the last digit. A smaller mode is none either."""
 SEEDS, GROWN = 30, 3

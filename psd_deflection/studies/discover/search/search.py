@@ -31,10 +31,11 @@ FAR = 10.0
 LIKELY = 0.3
 """A mistake of the set-up is tried if it explains, to first order, this share of what the best candidate explains."""
 NEARLY_ALL = 0.01
-"""It is taken before any effect if it alone leaves less than this share of the chi-square beyond noise."""
+"""A mistake of the set-up is taken before any effect if it alone leaves less than this share of the chi-square beyond
+noise."""
 OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
-TOO_FAR, HALF = -0.7, -0.5
-"""A linear step beyond the first of a sensitivity's error begins at the second instead: readings of twice the size."""
+FARTHEST_ERROR, HALVED = -0.7, -0.5
+"""A linear step to an error of a sensitivity below the first starts at the second instead (readings twice as large)."""
 STANDS_IN = 0.2
 """An effect beside others explains this share of what they leave at least, in chi-square beyond noise."""
 NEAR = 0.1
@@ -304,8 +305,8 @@ class Search:
             if s.candidate.effect.name not in self.workspace.first:
                 continue
             start, name = s.candidate.from_coefficients(s.coefficients), s.candidate.effect.name
-            if name == 'sensitivity' and start.values['error'] < TOO_FAR:
-                start = ActiveEffect(start.effect, {'error': HALF})
+            if name == 'sensitivity' and start.values['error'] < FARTHEST_ERROR:
+                start = ActiveEffect(start.effect, {'error': HALVED})
             if s.gain > LIKELY * best:
                 starts.append([start])
             if name == 'sample_rate' and far(null):

@@ -31,7 +31,7 @@ _TO_SD = 1.4826
 STUCK_S = 0.03
 """A channel that keeps the same converter count for so long is stuck."""
 UNKNOWN_SHARE = 0.05
-"""A recording whose loads are unknown for more than this share of its time is told."""
+"""Report a recording whose loads are unknown for more than this share of its time."""
 
 BoolArray = npt.NDArray[np.bool_]
 

@@ -27,12 +27,12 @@ from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
 BETTER = 10.0
-"""Another wiring or sign must leave so many times less of the movement than the rig file's."""
+"""Factor by which another wiring or sign must leave less of the movement than the rig file's."""
 AS_GOOD = 2.0
 """Wirings that leave up to this much more than the best one count as equally good; the one with the fewest changes is
 taken."""
 SEEN = 100.0
-"""A load whose movement has less than so many times the energy of one block's noise says nothing."""
+"""A load is ignored if its movement has less than this factor of the energy of one block's noise."""
 SMALL = 1e-4
 """m and rad; movements up to this size are in proportion to the load."""
 FARTHEST_S = 1.0
