@@ -20,7 +20,7 @@ EXIT_STATUSES: Mapping[int, str] = {
     6: 'the geometry of the rig cannot be solved',
     7: 'a running daemon or a Dask scheduler: none answers, or it refuses',
     8: 'of many recordings some failed; the others are done',
-    9: 'the run ended as it was asked to, and samples were dropped here: the machine was too slow, or something hung',
+    9: 'samples were dropped here: this machine was too slow for them',
     71: 'the machine: too little memory, or no further thread',
     INTERRUPTED: 'Ctrl-C before it was done (what runs until Ctrl-C ends with 0)',
 }

@@ -164,10 +164,11 @@ class Running:
         return sum(int(count) for count in counts)
 
 
-def wrench(sec: int | None = None, frame: str = '', **force: float) -> WrenchStamped:
+def wrench(sec: int = 0, frame: str = '', **force: float) -> WrenchStamped:
+    """A load; ``sec``: of its stamp, 0 for now."""
     message = WrenchStamped()
     message.header.frame_id = frame
-    message.header.stamp.sec = int(time.time()) if sec is None else sec
+    message.header.stamp.sec = sec
     for axis, value in force.items():
         setattr(message.wrench.force, axis, value)
     return message
