@@ -10,6 +10,7 @@ import doctest
 import importlib.util
 import json
 import os
+import pydoc
 import re
 import runpy
 import shlex
@@ -20,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from psd_deflection.base import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
@@ -128,6 +130,25 @@ def test_every_page_is_two_steps_from_the_readme() -> None:
     first = linked(ROOT / 'README.md')
     second = set().union(*(linked(page) for page in first if page.suffix == '.md'))
     assert {str(page.relative_to(ROOT)) for page in PAGES if page not in first | second | {ROOT / 'README.md'}} == set()
+
+
+def named(tree: Any) -> list[str]:
+    """The files that a part of the menu names."""
+    if isinstance(tree, str):
+        return [tree]
+    return [name for part in (tree.values() if isinstance(tree, dict) else tree) for name in named(part)]
+
+
+def test_every_page_is_once_in_the_menu() -> None:
+    menu = named(yaml.safe_load((ROOT / 'mkdocs.yml').read_text())['nav'])
+    assert sorted(menu) == sorted(
+        str(page.relative_to(ROOT / 'docs')) for page in PAGES if page.name != 'README.md' or page.parent != ROOT
+    )
+
+
+@pytest.mark.parametrize('name', re.findall(r'^::: (\S+)$', (ROOT / 'docs' / 'api.md').read_text(), re.M))
+def test_what_the_page_of_python_shows_is_there(name: str) -> None:
+    assert pydoc.locate(name) is not None
 
 
 def test_the_readme_is_short() -> None:
