@@ -137,7 +137,9 @@ TOOLS = {
 }
 """Programs without which a command is skipped with a message."""
 
-ADMINISTRATION = re.compile(r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|ssh|sudo|systemctl|udevadm|useradd) ')
+ADMINISTRATION = re.compile(
+    r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|ssh|sudo|systemctl|udevadm|useradd) '
+)
 """Lines for root or for another machine: never typed here. test/docs/test_deploy.py checks the files they install."""
 
 HOURS = re.compile(r'^make mutants\b')
