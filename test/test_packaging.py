@@ -153,3 +153,19 @@ def test_importing_the_package_is_light() -> None:
     code = 'import sys, psd_deflection; print([m for m in ("numpy", "mcap", "yaml") if m in sys.modules])'
     done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == '[]'
+
+
+def test_every_extra_that_is_asked_for_is_there() -> None:
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / 'setup.cfg')
+    places = ('README.md', 'Makefile', 'docs', 'packaging', '.github', 'psd_deflection')
+    roots = [ROOT / name for name in places]
+    files = [f for root in roots for f in ([root] if root.is_file() else root.rglob('*')) if f.is_file()]
+    asked: dict[str, str] = {}
+    for file in files:
+        if file.suffix in ('.md', '.yml', '.yaml', '.py', ''):
+            text = file.read_text(encoding='utf-8', errors='replace')
+            found = re.findall(r'(?:psd[-_]deflection|\.whl"?\)?|[\'" ]\.)\[([a-z,]+)\]', text)
+            asked |= {extra: file.name for group in found for extra in group.split(',')}
+    assert {'ros', 'monitor', 'camera'} <= set(asked)
+    assert {extra: name for extra, name in asked.items() if extra not in setup['options.extras_require']} == {}
