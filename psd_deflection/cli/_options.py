@@ -91,6 +91,7 @@ def section_options(parser: argparse._ActionsContainer, section: Section[Any]) -
         unit = f', {declared.unit}' if declared.unit else ''
         default = declared.default
         text = ','.join(map(str, default)) if isinstance(default, list) else f'{default}'
+        text = text.lower() if isinstance(default, bool) else text
         bounds = f', {declared.bound_text()}' if declared.choices is not None else ''
         parser.add_argument(
             f'--{declared.name.replace("_", "-")}',
@@ -112,6 +113,8 @@ def _of_section(declared: Parameter, text: str) -> Value:
     elif declared.kind == 'double':
         with contextlib.suppress(ValueError):
             value = float(text)
+    elif declared.kind == 'bool':
+        value = {'true': True, 'false': False}.get(text.lower(), text)
     try:
         return check_value(declared, value, 'options')
     except ConfigError as error:
