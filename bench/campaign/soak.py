@@ -22,7 +22,6 @@ import math
 import os
 import random
 import re
-import resource
 import subprocess
 import sys
 import tempfile
@@ -332,7 +331,7 @@ def simulated_time(hours: float) -> bool:
                     if second >= SETTLED_S * 1000:
                         errors.add(int(item.raw.t_ns[-1]) - acquisition.to_ros_ns - true_last)
         if second % 600_000 == 0:
-            memory.append(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024)
+            memory.append(resident(os.getpid()))
         if second % 7_200_000 == 0:
             print(f'  {second // 3_600_000} h', file=sys.stderr, flush=True)
     seconds = time.perf_counter() - began
