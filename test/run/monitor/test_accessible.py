@@ -63,6 +63,11 @@ def test_the_live_page(page: Page, shown: Serving) -> None:
     audit(page, 'document.body.dataset.rows >= 105 && document.querySelectorAll("#entries details").length > 0')
 
 
+def test_the_live_page_when_no_samples_come(page: Page, shown: Serving) -> None:
+    page.open(shown.url)
+    audit(page, 'document.body.dataset.state === "stale" && document.querySelectorAll("#entries details").length > 0')
+
+
 def test_the_live_page_with_all_that_opens(page: Page, shown: Serving) -> None:
     shown.give(105, 1, status=BlockStatus.LASER_LOST)
     page.open(shown.url)

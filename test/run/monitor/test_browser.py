@@ -236,7 +236,7 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
     program = start('monitor', '--port', link, '--http-port', '0', '--control')
     page.open(address_of(program))
     page.live()
-    faded = 'Number(getComputedStyle(document.querySelector(".numbers")).opacity) < 0.6'
+    faded = 'getComputedStyle(document.querySelector(".numbers")).outlineStyle === "dashed"'
     page.until(f'document.body.dataset.state === "live" && !({faded})')
     device.end()
     # What was measured last does not look like what is measured now, nor can it become a zero.

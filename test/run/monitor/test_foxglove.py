@@ -285,10 +285,10 @@ def test_viewers_that_vanish_cost_no_line(served: Served, caplog: pytest.LogCapt
     def all_gone() -> bool:
         # Who is gone is noticed when something is sent.
         served.give(1)
-        return not served.server.viewers
+        # A viewer that is no longer counted may have a message under way for one more turn of the loop.
+        return not served.server.viewers and not served.server._looking
 
     until(all_gone)
-    assert not served.server._looking
     assert not served.said
     assert not caplog.records
 
