@@ -56,6 +56,10 @@ RELEASE_S = 0.2
 WITHIN = 1.0 + 1e-6
 """The largest step over what the rate allows."""
 
+LATE_S = 0.05
+"""With a longer time between two steps of the arm, the compensator finds rightly that nobody tells it anything, s."""
+TRIES = 5
+
 WATCHED_S = 0.4
 """How long offsets are watched after a fault, s. After half a second they follow a deflection that jumped and stays."""
 LONGEST_S = 60.0
@@ -198,6 +202,8 @@ SENT: dict[str, tuple[int, tuple[str, ...]]] = {
 
 ROBOT = ('protective stop', 'speed scaling 0', 'controller ended', 'joints do not follow', 'another publisher')
 """Faults of the robot and its controller."""
+COMPENSATOR, SHAPER = 'compensator', 'shaper'
+"""All of their faults."""
 OWN = ('killed and started again', 'an error of its own')
 """Faults of the compensator."""
 
@@ -208,7 +214,7 @@ class Plant:
 
     ``tell`` and ``tell_joints`` may change what it says, and withhold it by False. ``stands``: a protective stop.
     ``applies``: the controller runs, and tells what it applies: ``held``. ``offsets``: all that were heard, and
-    ``stamps`` when they were sent, s.
+    ``stamps`` when they were sent, s. ``late``: whether a step was later than ``LATE_S``.
     """
 
     def __init__(self, node: Any, topic: str = '/end_effector/deflection', joints: str = '/joint_states') -> None:
@@ -220,6 +226,7 @@ class Plant:
         self.tell: Tell = faithful
         self.tell_joints: Tell = faithful
         self.stands, self.applies, self.held = False, True, np.zeros(2)
+        self.late = False
         self._noise = np.random.default_rng(0)
         self._deflections = node.create_publisher(PoseWithCovarianceStamped, topic, 5)
         self._joints = node.create_publisher(JointState, joints, 5)
@@ -237,6 +244,7 @@ class Plant:
     def _step(self) -> None:
         now = time.monotonic()
         self.arm.step(self.arm.angles.copy() if self.stands else NOMINAL + self.held, now - self._then)
+        self.late |= now - self._then > LATE_S
         self._then = now
         if self.applies:
             self._applied.publish(Float64MultiArray(data=self.held.tolist()))
@@ -268,24 +276,24 @@ class Relay:
     """The process that stands for one of ``RELAYED``."""
 
     def __init__(self, name: str) -> None:
-        self._name = name
+        self._name, self._killed = name, False
         self._process = self._start()
 
     def _start(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen([sys.executable, '-m', 'bench.campaign.hold', '--relay', self._name], cwd=ROOT)
 
     def signal(self, number: int) -> None:
-        """SIGKILL or SIGSTOP."""
+        """SIGKILL or SIGSTOP. The campaign's own arm moves on: nobody waits for the end of the process."""
         self._process.send_signal(number)
-        if number == signal.SIGKILL:
-            self._process.wait()
+        self._killed = number == signal.SIGKILL
 
     def again(self) -> None:
         """Let it go on if it was stopped; another one if it was killed."""
-        if self._process.poll() is None:
-            self._process.send_signal(signal.SIGCONT)
+        if self._killed:
+            self._process.wait()
+            self._process, self._killed = self._start(), False
         else:
-            self._process = self._start()
+            self._process.send_signal(signal.SIGCONT)
 
     def close(self) -> None:
         """Kill it."""
@@ -330,6 +338,7 @@ class Campaign:
         self.relays = {name: Relay(name) for name in RELAYED}
         self._flag = Path(tempfile.mkdtemp()) / 'flag'
         self.compensator = self._started()
+        self.repeated = 0
 
     def _started(self) -> Program:
         arguments = ['compensator', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive']
@@ -360,10 +369,19 @@ class Campaign:
         return fresh and float(np.ptp(plant.offsets[-10:], axis=0).max()) > 0.0 and bool(np.any(plant.offsets[-1]))
 
     def inject(self, name: str) -> Injected:
-        """One fault, from offsets that follow to offsets that follow."""
+        """One fault, from offsets that follow to offsets that follow; again if the campaign itself was late."""
+        for _ in range(TRIES):
+            out = self._once(name)
+            if not self.plant.late:
+                break
+            self.repeated += 1
+        return out
+
+    def _once(self, name: str) -> Injected:
         self.spin(self.follows, LONGEST_S, f'offsets that follow before: {name}')
         # They are to be far from zero.
         self.spin(lambda: self.plant.error() < 1e-4, LONGEST_S, 'the rigid pose')
+        self.plant.late = False
         if name in OWN:
             return self._own(name)
         began = time.time()
@@ -475,40 +493,50 @@ def main(argv: list[str] | None = None) -> int:
     names = (*DEFLECTIONS, *JOINTS, *ROBOT, *SENT, *OWN)
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('--times', type=int, default=20, help='of each fault')
-    parser.add_argument('--only', choices=(*names, 'shaper'), help='this fault alone; shaper: all of its')
+    only = (*names, COMPENSATOR, SHAPER)
+    parser.add_argument('--only', nargs='+', choices=only, default=[COMPENSATOR, SHAPER], help='these faults alone')
     parser.add_argument('--relay', choices=tuple(RELAYED), help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     if args.relay:
         relay(args.relay)
         return 0
-    late = slow = 0
-    worst = 0.0
-    if args.only != 'shaper':
-        campaign = Campaign()
-        try:
-            campaign.enable()
-            for name in (args.only,) if args.only else names:
-                heard = len(campaign.plant.offsets)
-                found = [campaign.inject(name) for _ in range(args.times)]
-                held = [one.held for one in found if not math.isnan(one.held)]
-                released = [one for one in found if not math.isnan(one.released)]
-                late += sum(t > HOLD_S for t in held)
-                slow += sum(one.released > one.allowed for one in released)
-                step = campaign.plant.step(heard - 1)
-                worst = max(worst, step)
-                print(
-                    f'{name:24}{len(found):4} times: held after {_most(held)}; '
-                    f'released in {_most([one.released for one in released])} '
-                    f'of {_most([one.allowed for one in released])}; largest step {step:.3f} of max_rate * dt',
-                    flush=True,
-                )
-        finally:
-            campaign.close()
-        print(f'held later than {HOLD_S * 1e3:g} ms: {late}; released later than offset/max_rate + 0.2 s: {slow}')
-    if args.only in (None, 'shaper'):
+    wanted = names if COMPENSATOR in args.only else [name for name in args.only if name in names]
+    missed, worst = compensator_faults(wanted, args.times) if wanted else (0, 0.0)
+    if SHAPER in args.only:
         worst = max(worst, shaper_faults(args.times))
     print(f'largest step of all: {worst:.3f} of what the rate allows')
-    return 1 if late or slow or worst > WITHIN else 0
+    return 1 if missed or worst > WITHIN else 0
+
+
+def compensator_faults(names: Sequence[str], times: int) -> tuple[int, float]:
+    """Inject each of them so often, and print a line for each.
+
+    How often it held or released later than it must, and the largest step over what the rate allows.
+    """
+    late = slow = 0
+    worst = 0.0
+    campaign = Campaign()
+    try:
+        campaign.enable()
+        for name in names:
+            heard, campaign.repeated = len(campaign.plant.offsets), 0
+            found = [campaign.inject(name) for _ in range(times)]
+            held = [one.held for one in found if not math.isnan(one.held)]
+            released = [one for one in found if not math.isnan(one.released)]
+            late += sum(t > HOLD_S for t in held)
+            slow += sum(one.released > one.allowed for one in released)
+            step = campaign.plant.step(heard - 1)
+            worst = max(worst, step)
+            print(
+                f'{name:24}{len(found):4} times (and {campaign.repeated} repeated): held after {_most(held)}; '
+                f'released in {_most([one.released for one in released])} '
+                f'of {_most([one.allowed for one in released])}; largest step {step:.3f} of max_rate * dt',
+                flush=True,
+            )
+    finally:
+        campaign.close()
+    print(f'held later than {HOLD_S * 1e3:g} ms: {late}; released later than offset/max_rate + 0.2 s: {slow}')
+    return late + slow, worst
 
 
 def _most(times: list[float]) -> str:

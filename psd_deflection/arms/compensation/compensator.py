@@ -9,8 +9,9 @@ where the controller has them. They hold (they keep their last value) while the 
 uncertain, too large or jumping, the joints are not known, leap or do not follow, the robot does not run, or somebody
 else commands it. They move again after some good estimates in a row, and go back to zero if that takes long or when
 the compensation is switched off. A controller that does not tell what it applies, or is elsewhere than it was sent,
-hears nothing until that is mended. Whatever happens, what is sent moves by no more than ``max_rate`` times the time
-since something was sent.
+hears nothing until that is mended; if the compensation was switched off meanwhile, the offsets that it still has go
+back to zero then. Whatever happens, what is sent moves by no more than ``max_rate`` times the time since something was
+sent.
 """
 
 from __future__ import annotations
@@ -219,6 +220,8 @@ class Compensator:
         self._moved_t: float | None = None
         # Whether the controller gets what we say, and what it got last, when.
         self._speaks = dry
+        # Whether the controller may still have offsets, though we have fallen silent.
+        self._owed = False
         self._sent: tuple[FloatArray, float] | None = None
         self._joints: FloatArray | None = None
         self._joints_t = -math.inf
@@ -318,8 +321,10 @@ class Compensator:
     def watch(self, now: float) -> Command:
         """What to send at the time ``now``. To be called often: here the offsets move, and deflections are missed."""
         self._look(now)
-        if self.enabled and not self._speaks:
+        if not self._speaks and self.enabled:
             self._unready = '' if self._fault else self._begin(now)
+        elif not self._speaks and self._owed and not self._stop:
+            self._begin(now)
         self._give_up(now)
         elapsed = 0.0 if self._moved_t is None else min(max(now - self._moved_t, 0.0), LONGEST_S)
         self._moved_t = now
@@ -375,7 +380,7 @@ class Compensator:
             if np.abs((offsets if pose is None else pose) - sent).max() > settings.max_rate * (now - then):
                 return 'the controller is elsewhere than it was sent last: the rate allows for it soon'
         self._offsets = self._wanted = offsets
-        self._pose, self._speaks = pose, True
+        self._pose, self._speaks, self._owed = pose, True, False
         self._anchor = self._away_t = self._held_t = None
         return ''
 
@@ -401,7 +406,7 @@ class Compensator:
             return self._away(now, self._pose + self._offsets, self._joints)
         if self.settings.takeover and now - self._applied_t > self.settings.stale:
             # It may come back with none, so it hears nothing from us until it tells what it has.
-            self._speaks = False
+            self._fall_silent()
             return UNTOLD
         away = '' if self._applied is None else self._away(now, self._offsets, self._applied)
         return away or self._stands_still()
@@ -416,8 +421,12 @@ class Compensator:
         self._away_t = now if self._away_t is None else self._away_t
         why = f'{self.arm.names[worst]} is {away[worst]:.3g} from what it was sent'
         if now - self._away_t > FOLLOW_S:
-            self._broken, self._speaks = why, False
+            self._broken = why
+            self._fall_silent()
         return why
+
+    def _fall_silent(self) -> None:
+        self._speaks, self._owed = False, self.settings.takeover and not self._sums
 
     def _stands_still(self) -> str:
         """Joints that stand still while the offsets move: nobody adds them, or a protective stop."""

@@ -434,6 +434,31 @@ def test_a_controller_that_starts_again_without_offsets_is_sent_no_step(arm: Arm
     assert loop.step() <= 1.0 + 1e-9
 
 
+def test_switched_off_while_nothing_is_told_the_offsets_go_back_once_it_is(arm: Arm) -> None:
+    loop = telling(arm)
+    loop.tells = False
+    loop.run(0.1)
+    loop.compensator.enable(False)
+    left, count = loop.offsets.copy(), len(loop.sent)
+    assert left.any()
+    assert loop.run(0.5).state is State.OFF
+    assert len(loop.sent) == count
+    assert np.array_equal(loop.offsets, left)
+    # Not while somebody else commands the robot.
+    loop.tells = True
+    loop.compensator.stop('another node publishes')
+    loop.run(0.2)
+    assert len(loop.sent) == count
+    loop.compensator.stop('')
+    assert loop.run(float(np.abs(left).max()) / 0.1 + 0.1).state is State.OFF
+    assert not loop.offsets.any()
+    assert loop.step() <= 1.0 + 1e-9
+    # Then it is silent.
+    count = len(loop.sent)
+    loop.run(0.5)
+    assert len(loop.sent) == count
+
+
 def test_offsets_of_the_controller_that_cannot_be_ours_are_not_taken_over(arm: Arm) -> None:
     loop = Loop(arm, takeover=True)
     loop.offsets = np.array([0.0, 3.0])
