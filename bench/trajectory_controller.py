@@ -2,7 +2,7 @@
 
 Its rules, as of ros2_controllers for Jazzy: a stamp of 0 begins when the trajectory arrives, another at that time.
 Until its first point it goes there from where the command is on arrival. After that it follows it, also from its
-middle. After the last point it stays. The joints are where they are commanded.
+middle. After the last point it stays. The joints are where they are commanded. Times that do not rise are refused.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ class TrajectoryController:
         self._begins = 0.0
 
     def arrive(self, now: float, stamp: float, path: Trajectory) -> None:
-        """A trajectory arrives at the time ``now``, s, with a ``stamp``, s."""
+        """A trajectory arrives at the time ``now``, s, with a ``stamp``, s. Raises ValueError if it is refused."""
+        if not (np.diff(path.times, prepend=-1e-9) > 0.0).all() or not np.isfinite(path.states).all():
+            raise ValueError(f'{path.times}: do not rise, or {path.states} are not finite')
         orders = path.states.shape[1]
         begins = stamp or now
         first = begins + path.times[0]

@@ -24,7 +24,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.steps import largest_step
 from bench.trajectory_controller import TrajectoryController
-from psd_deflection.arms.compensation.trajectory import Trajectory, checked
+from psd_deflection.arms.compensation.trajectory import Trajectory
 from psd_deflection.records import FloatArray
 from tools.program import PSD_DEFLECTION, Program
 
@@ -122,12 +122,13 @@ class Moved:
         if not message.points:
             return
         times = [p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points]
-        points = [[p.positions, p.velocities, p.accelerations] for p in message.points]
+        orders = [
+            order for order in ('positions', 'velocities', 'accelerations') if len(getattr(message.points[0], order))
+        ]
+        states = np.array([[getattr(p, order) for order in orders] for p in message.points])
         stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
-        order = [list(message.joint_names).index(name) for name in NAMES]
-        path = checked(message.joint_names, times, points)
-        path = Trajectory(NAMES, path.times, path.states[:, :, order])
-        self.controller.arrive(time.time(), stamp, path)
+        names = [list(message.joint_names).index(name) for name in NAMES]
+        self.controller.arrive(time.time(), stamp, Trajectory(NAMES, np.array(times), states[:, :, names]))
 
     def _step(self) -> None:
         now = time.time()
