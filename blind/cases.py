@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from blind import generator
+from blind import byhand, generator
 from blind.generator import Array, Generator
 
 BLOCK = 20
@@ -62,7 +62,10 @@ def histories() -> tuple[Array, Array]:
 
 @functools.cache
 def designs(name: str) -> tuple[Generator, ...]:
-    """``one``: a link of 0.585 m; ``two``: that and one of 0.400 m."""
+    """``one``: a link of 0.585 m; ``two``: that and one of 0.400 m; ``hand-...``: loads hung by hand."""
+    if name.startswith('hand-'):
+        hand = byhand.drawn(name)
+        return (Generator(hand.acted, hand.temperature, 0.585),)
     loads, temperature = histories()
     lengths = (0.585,) if name == 'one' else (0.585, 0.400)
     return tuple(Generator(loads, temperature, length) for length in lengths)
@@ -269,6 +272,7 @@ def all_cases(
     spreads: int = 60,
     mistakes: int = 5,
     fours: int = 40,
+    hand: int = 44,
 ) -> Iterator[Case]:
     """The whole suite. ``first``: number of the first seed, for a run on cases never seen before."""
     for seed in range(first, first + seeds):
@@ -296,6 +300,7 @@ def all_cases(
         yield Case(f'null-{i}', 'null', 'one', ())
     yield from hard_cases(first, spreads, mistakes)
     yield from cases_of_four(first, fours)
+    yield from cases_by_hand(first, hand)
 
 
 def cases_of_four(first: int, fours: int) -> Iterator[Case]:
@@ -306,6 +311,22 @@ def cases_of_four(first: int, fours: int) -> Iterator[Case]:
         gaps = np.exp(rng.uniform(math.log(3.0), math.log(30.0), 4)).tolist()
         two = bool(set(names) & SHOWS_ACROSS_LENGTHS)
         yield Case(f'four-{i}-{"-".join(names)}', 'four', 'two' if two else 'one', tuple(zip(names, gaps, strict=True)))
+
+
+def cases_by_hand(first: int, hand: int) -> Iterator[Case]:
+    """Loads hung and noted by hand, in turns of all kinds; half with a hidden effect of 3 to 30 floors."""
+    rng = np.random.default_rng(20261125 + first)
+    shown = [n for n in EFFECTS if n not in UNSPREAD]
+    for i in range(first, first + hand):
+        kind = byhand.KINDS[i % len(byhand.KINDS)]
+        name, gap = str(rng.choice(shown)), float(np.exp(rng.uniform(math.log(3.0), math.log(30.0))))
+        if kind == 'rounded':
+            # What moves the plate at rest is a load that nobody knows.
+            name = str(rng.choice(byhand.BESIDE_UNKNOWN_LOADS))
+        # The kinds are an odd number: each is with and without one in turn.
+        wanted = ((name, gap),) if i % 2 else ()
+        what = f'-{name}' if wanted else ''
+        yield Case(f'hand-{kind}-{i}{what}', 'hand', f'hand-{kind}-{i}', wanted, mistake=('hand', 0.0))
 
 
 MISTAKES: Mapping[str, tuple[float, ...]] = {

@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from blind import score
+from blind import byhand, score
 from blind.campaign import conclude, options, over
 from blind.cases import Case, all_cases, designs, scaled, short_cases
 from blind.mistakes import observed
@@ -36,6 +36,10 @@ def truth_of(case: Case) -> list[dict[str, Any]]:
 def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
     """The input of discover."""
     rig = load_rig()
+    if case.kind == 'hand':
+        hand = byhand.drawn(case.design)
+        volts = designs(case.design)[0].record(truth, case.noise, case.seed)
+        return [Observation('recording 1', rig, volts, hand.noted, hand.temperature)]
     if case.mistake[0]:
         return observed(case.mistake, designs(case.design)[0], rig, case.noise, case.seed)
     out = []
@@ -80,7 +84,10 @@ def _sealed(given: tuple[Case, Path]) -> None:
     if path.exists():
         return
     partial = path.with_suffix('.partial')
-    partial.write_text(json.dumps({'case': dataclasses.asdict(case), 'truth': truth_of(case)}, sort_keys=True))
+    sealed = {'case': dataclasses.asdict(case), 'truth': truth_of(case)}
+    if case.kind == 'hand':
+        sealed['wrong'] = byhand.drawn(case.design).wrong
+    partial.write_text(json.dumps(sealed, sort_keys=True))
     partial.replace(path)
 
 
@@ -111,13 +118,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--spreads', type=int, default=60, help='pairs and triples of very different size')
     parser.add_argument('--mistakes', type=int, default=5, help='sizes of each mistake of the set-up')
     parser.add_argument('--fours', type=int, default=40, help='four effects at once')
+    parser.add_argument('--hand', type=int, default=44, help='loads hung and noted by hand')
     parser.add_argument('--first', type=int, default=0, help='number of the first seed: fresh cases')
     parser.add_argument('--only', default='', help='only cases whose name contains this')
     parser.add_argument('--score', action='store_true', help='only score what is there')
     args = parser.parse_args(argv)
     folder = Path(args.out)
     whole = all_cases(
-        args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes, args.fours
+        args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes, args.fours, args.hand
     )
     listed = short_cases() if args.short else list(whole)
     cases = [c for c in listed if args.only in c.key]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,6 +28,8 @@ THRESHOLDS: dict[str, float] = {
     'all_of_four': 0.85,
     'unsaid_floors': 1.5,
     'mistake_named': 0.95,
+    'hand_effect': 0.95,
+    'hand_line': 0.98,
     'heldout_over_floor_median': 1.05,
     'heldout_over_floor_p95': 1.2,
     'coverage_low': 0.92,
@@ -47,6 +50,7 @@ class Row:
     truth: list[dict[str, Any]]
     answer: dict[str, Any]
     mistake: str = ''
+    wrong: tuple[dict[str, Any], ...] = ()
 
     @property
     def named(self) -> list[str]:
@@ -71,7 +75,18 @@ def load(folder: Path, keys: Sequence[str]) -> list[Row]:
         gap = max((g for _, g in case['wanted']), default=0.0)
         apart = case['design'] == 'two' or not any(n in SHOWS_ACROSS_LENGTHS for n, _ in case['wanted'])
         mistake = case.get('mistake', ['', 0.0])[0]
-        out.append(Row(key, case['kind'], gap, apart, sealed['truth'], json.loads(answer.read_text()), mistake))
+        out.append(
+            Row(
+                key,
+                case['kind'],
+                gap,
+                apart,
+                sealed['truth'],
+                json.loads(answer.read_text()),
+                mistake,
+                tuple(sealed.get('wrong', ())),
+            )
+        )
     return out
 
 
@@ -146,6 +161,7 @@ def summary(rows: Sequence[Row]) -> tuple[str, bool]:
     sheet.rate('both of a pair in the answer', pair, [_both(r) for r in pair], THRESHOLDS['both_of_a_pair'], 1.0, True)
     _spread(sheet, rows)
     _mistakes(sheet, rows)
+    _by_hand(sheet, [r for r in rows if r.kind == 'hand'])
     _unknowns(sheet, rows)
     _held_out(sheet, rows)
     cover = [c for r in rows if r.kind == 'single' for c in covered(r)]
@@ -224,6 +240,63 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
     alarm = [r.answer['verdict'] != 'nothing_missing' for r in odd]
     sheet.failures += [f'{r.key}: {_said(r)}' for r, wrong in zip(odd, alarm, strict=True) if wrong]
     sheet.rate('false alarm, gaps, outliers, start under load, own zeros', odd, alarm, 0.0, 0.01, False)
+
+
+NEAR = {'load_time': 0.05, 'load_ramp': 0.15, 'load_delay': 5e-4}
+"""s by which a told time may be off."""
+HUNG = (0.25, 0.25, 0.12)
+"""N, N, N m, and 2 %, by which a told load may be off."""
+
+
+def _told(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[bool, bool]:
+    """Whether a wrong note is named, and with the right numbers."""
+    of = [s for s in setup if s['name'] == wrong['name']]
+    if 'from' in wrong:
+        of = [s for s in of if abs(float(s['fix'].split('from ')[1].split(' s')[0]) - wrong['from']) < 0.1]
+    elif wrong.get('where', '').startswith('load'):
+        of = [s for s in of if s['where'] == wrong['where']]
+    if not of:
+        return False, False
+    if 'load' in wrong:
+        hung = [float(v) for v in re.findall(r'-?[0-9.]+(?= N)', of[0]['fix'])[:3]]
+        pairs = zip(hung, wrong['load'], HUNG, strict=False)
+        return True, len(hung) == 3 and all(abs(a - b) < most + 0.02 * abs(b) for a, b, most in pairs)
+    if 'value' not in wrong:
+        return True, True
+    off = abs(of[0]['value'] - wrong['value'])
+    return True, off < NEAR.get(wrong['name'], 0.03 * abs(wrong['value']))
+
+
+def _by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
+    """Notes by hand: what is wrong is named load by load, the lines are right, nothing is unknown, no effect is lost."""
+    if not of:
+        return
+    told = [[_told(w, r.answer['setup']) for w in r.wrong] for r in of]
+    found = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
+    false = [len(r.sets) > sum(any(t['name'] in s for t in r.truth) for s in r.sets) for r in of]
+    unknown = [r.answer['verdict'] == 'unknown_effect' for r in of]
+    some = [i for i, r in enumerate(of) if r.wrong]
+    named = [any(a for a, _ in told[i]) for i in some]
+    sheet.rate('hand: mistake named', [of[i] for i in some], named, THRESHOLDS['mistake_named'], 1.0, True)
+    each = [b for i in some for _, b in told[i]]
+    sheet.rate('hand: note with the right line', [], each, THRESHOLDS['hand_line'], 1.0, False)
+    hidden = [i for i, r in enumerate(of) if r.truth]
+    right = [found[i] for i in hidden]
+    sheet.rate('hand: effect named', [of[i] for i in hidden], right, THRESHOLDS['hand_effect'], 1.0, True)
+    sheet.rate('hand: an effect named that is none', of, false, 0.0, 0.0, False)
+    sheet.rate('hand: something unknown, nothing is', of, unknown, 0.0, 0.0, False)
+    sheet.rate('hand: a law told', of, [any(u['law'] for u in r.answer['unknown']) for r in of], 0.0, 0.0, False)
+    sheet.lines.append('        kind       cases  named  lines right  effects  false  unknown')
+    for kind in dict.fromkeys(r.key.split('-')[1] for r in of):
+        at = [i for i, r in enumerate(of) if r.key.split('-')[1] == kind]
+        wrong = [i for i in at if of[i].wrong]
+        lines = [b for i in wrong for _, b in told[i]]
+        hid = [i for i in at if of[i].truth]
+        sheet.lines.append(
+            f'        {kind:10s} {len(at):5d}  {sum(any(a for a, _ in told[i]) for i in wrong)}/{len(wrong)}'
+            f'    {sum(lines)}/{len(lines)}   {sum(found[i] for i in hid)}/{len(hid)}'
+            f'   {sum(false[i] for i in at)}  {sum(unknown[i] for i in at)}'
+        )
 
 
 def _held_out(sheet: _Sheet, rows: Sequence[Row]) -> None:
