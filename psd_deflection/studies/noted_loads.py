@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +45,15 @@ SETTLED_S = 5.0
 """Time constants of the slower mode after which a link is at rest."""
 ROUGH = 3.0
 """Leave out the motion under a load applied slowly if its remaining ringing exceeds the noise by this factor."""
+
+CELL_SHARE = 0.02
+"""Loads that change at more than this share of the samples were measured, not noted by a person."""
+CELL_STEP = 8.0
+"""Standard deviations of a load cell's noise beyond which the load itself has changed."""
+CELL_VALUES = 20
+"""Between two steps there are at least so many values, or nothing tells noise from motion."""
+CELL_WHITE = 0.15
+"""Largest correlation of neighbouring values that is still noise."""
 
 _PER_SECOND = 1.0 / 5.0
 _SKIP_STEP, _SKIP_NOTE = 4.0, 9.0
@@ -111,14 +120,24 @@ class MendedNote:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class MeasuredLoad:
+    """The mean of what a load cell measured at samples ``first`` to ``last``; ``sd`` (3,) of the mean, N, N, N m."""
+
+    first: int
+    last: int
+    sd: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class MendedLoads:
     """``loads`` (n, 3) N, N, N m as they acted; ``notes``: those that were wrong; ``unused`` (n,): samples in motion
-    that the mended loads do not describe.
+    that the mended loads do not describe; ``measured``: those that were measured.
     """
 
     loads: FloatArray
     notes: tuple[MendedNote, ...]
     unused: BoolArray
+    measured: tuple[MeasuredLoad, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,10 +157,74 @@ def ordinal(number: int) -> str:
 
 
 def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
-    """The loads with the times at which they acted; None if the noted times are right or the motion does not tell.
+    """The loads with the times at which they acted and without the noise of a load cell; None if they are right as
+    noted or the motion does not tell.
 
     ``dots`` (n, 4) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as noted, held.
     """
+    calm, measured = without_cell_noise(loads)
+    mended = _mended_times(rig, dots, calm)
+    if mended is None:
+        return MendedLoads(calm, (), np.zeros(len(loads), dtype=bool), measured) if measured else None
+    return replace(mended, measured=measured)
+
+
+def without_cell_noise(loads: FloatArray) -> tuple[FloatArray, tuple[MeasuredLoad, ...]]:
+    """``loads`` (n, 3) as measured by a load cell, with the mean from one step to the next, and how exact each is.
+
+    A load of 0.05 N more or less at every sample moves the simulated link as no hung weight does. What is not white
+    between two steps is motion, and stays.
+    """
+    changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
+    if len(changed) < max(CELL_SHARE * len(loads), 50):
+        return loads, ()
+    at = np.concatenate(([0], changed))
+    values = loads[at]
+    apart = np.diff(values, axis=0)
+    noise = 1.4826 * np.median(np.abs(apart), axis=0) / math.sqrt(2.0)
+    # A channel that measures nothing has no steps either.
+    steps = np.flatnonzero(np.any(np.abs(apart) > CELL_STEP * np.maximum(noise, 1e-9), axis=1)) + 1
+    edges = np.concatenate(([0], steps, [len(values)]))
+    out = loads.copy()
+    measured = []
+    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        part = values[a:b]
+        last = at[b] if b < len(at) else len(loads)
+        if b - a < CELL_VALUES:
+            continue
+        centred = part - part.mean(axis=0)
+        memory = np.abs((centred[1:] * centred[:-1]).sum(axis=0)) / np.maximum((centred**2).sum(axis=0), 1e-300)
+        if np.any(memory[noise > 0.0] > max(CELL_WHITE, 4.0 / math.sqrt(b - a))):
+            continue
+        lengths = np.diff(np.append(at[a:b], last))
+        out[at[a] : last] = (part * lengths[:, None]).sum(axis=0) / lengths.sum()
+        sd = np.sqrt((centred**2).mean(axis=0) / (b - a))
+        measured.append(MeasuredLoad(int(at[a]), int(last), sd))
+    return out, tuple(measured)
+
+
+def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
+    """When a load began to act that nobody noted, s from the first sample: steps of ``dots`` (n, 4), m, without a change
+    of ``loads`` (n, 3) near them.
+    """
+    period = 1.0 / rig.converter.sample_rate_hz
+    changes = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
+    # A load that was applied slowly changes from sample to sample.
+    ends = changes[np.append(np.diff(changes) > 1, True)] if len(changes) else changes
+    if np.any(np.diff(ends) * period < APART_S):
+        return []
+    width = max(2, round(PERIODS / rig.dynamics.bending_frequency / period))
+    steps = _steps(dots, width)
+    edges = [0.0, *(s.at for s in steps), float(len(dots))]
+    out = []
+    for j, step in enumerate(steps):
+        near = (changes >= step.first - 2 * width) & (changes <= step.last + 2 * width)
+        if not near.any():
+            out.append(_fitted(rig, dots, step, (edges[j], edges[j + 2]), period)[0])
+    return out
+
+
+def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
     period = 1.0 / rig.converter.sample_rate_hz
     changes = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
     if len(changes) == 0 or np.any(np.diff(changes) * period < APART_S):
@@ -199,6 +282,20 @@ def _without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNo
             unused |= moving
             told[-1] = MendedNote(note.number, note.load, note.noted, note.hung, note.took, settled_only=True)
     return MendedLoads(mended, tuple(told), unused)
+
+
+def shifts(note: MendedNote, loads: FloatArray, period: float) -> list[FloatArray]:
+    """What a moment more does to ``loads`` (n, 3): of the time at which the load of ``note`` began to act and, if it was
+    applied slowly, of how long that took; (n, 3) each.
+    """
+    t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
+    before, after = np.searchsorted(t, (note.hung - period, note.hung + note.took + 2.0 * period))
+    step = loads[min(int(after), len(loads) - 1)] - loads[max(int(before) - 1, 0)]
+    now, moment = _profile(t, note.hung, note.took, period), 0.25 * period
+    out = [_profile(t, note.hung + moment, note.took, period) - now]
+    if note.took > 0.0:
+        out.append(_profile(t, note.hung, note.took + moment, period) - now)
+    return [change[:, None] * step for change in out]
 
 
 def _alike(late: FloatArray, within: float) -> bool:

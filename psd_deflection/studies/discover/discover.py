@@ -27,7 +27,7 @@ from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals as propose
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
-from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Localisation, localise
 from psd_deflection.studies.discover.search.screen import Screen
@@ -36,6 +36,7 @@ from psd_deflection.studies.discover.search.signatures import SignatureBank, can
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, mistakes
+from psd_deflection.studies.discover.setup.hung import told
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
 
@@ -58,7 +59,7 @@ def discover(
     """
     known = recordings[0].rig if rig is None else rig
     machine = RecordedRig.of(recordings, known, without, bank, progress)
-    problem = solve(machine, (search, weigh, law, alternatives, set_up, where), seed, progress)
+    problem = solve(machine, (search, hung, weigh, law, alternatives, set_up, where), seed, progress)
     return Discovery(
         **fields_of(problem),
         setup=problem.setup,
@@ -167,6 +168,24 @@ def rig_of(problem: Problem) -> RecordedRig:
     return problem.machine
 
 
+def hung(problem: Problem) -> Problem:
+    """With the free loads as the chosen model says."""
+    ws = workspace_of(problem.comparison)
+    if ws.free is None:
+        return problem
+    ws = ws.settled(problem.fit.difference)
+    null = refit(ws, ())
+    fit = refit(ws, problem.fit.effects, 6) if problem.fit.effects else null
+    found = problem.search.at(ws)
+    found.dropped = {}
+    p, delta_bic, delta_chi2 = found.weigh(null, fit)
+    others = [found.alternatives(null, fit, i, delta_chi2[i]) for i in range(len(fit.effects))]
+    result = replace(
+        problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others
+    )
+    return replace(problem, search=found, result=result, fit=fit, null=null)
+
+
 def law(problem: Problem) -> Problem:
     """A law for what remains, and the fit without the effects that only stood in for it."""
     ws, fit = workspace_of(problem.comparison), problem.fit
@@ -201,6 +220,7 @@ def set_up(problem: Problem) -> Problem:
             more, lines = said(ws, problem.fit, i, effect.delta_bic)
             setup += [dataclasses.replace(f, equivalent=effect.equivalent) for f in more]
             values |= lines
+    setup += told(ws, machine.recorded.wrong)
     named = [n for n in problem.named if n.active.effect.name not in SETUP]
     if machine.recorded.lattice is None:
         setup += noise_findings(ws.observations[0].rig, noise_of(ws))[0]

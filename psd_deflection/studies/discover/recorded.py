@@ -21,10 +21,28 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.proposals import coarse_step
-from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.search.workspace import Direction, Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
+from psd_deflection.studies.discover.setup.hung import (
+    Plateau,
+    Swaying,
+    directions,
+    levels,
+    of_plateau,
+    plateaus,
+    stand_out,
+    swaying as swaying_of,
+)
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
+from psd_deflection.studies.noted_loads import SETTLED_S, MendedLoads, shifts
+
+MUCH = 10.0
+"""A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
+FREE_MOMENTS = 40.0
+"""How far fitted times may be off: 10 samples, in the quarters of one by which they are shifted."""
+MOST_MEASURED = 40
+"""Measured loads of a recording whose errors are considered; each takes three simulations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +50,8 @@ class Recorded:
     """``observations`` of the ``rig``, whose file has the effects ``known``. ``without``: effects that are not looked
     for. ``findings``: what was wrong, with ``values`` that put the rig file right. ``stated_gap``: m, before loads and
     wiring were put right, 0 if they were right. ``lattice``: the effect of coarse steps that the readings show.
-    ``delays``: by how much the loads may be noted late, s.
+    ``delays``: by how much the loads may be noted late, s. ``mended``: of each recording, its loads as they were put
+    right, if they were. ``wrong``: where another load hung than noted; it is free.
     """
 
     observations: tuple[Observation, ...]
@@ -44,6 +63,8 @@ class Recorded:
     stated_gap: float = 0.0
     lattice: ActiveEffect | None = None
     delays: tuple[float, ...] = ()
+    mended: tuple[MendedLoads | None, ...] = ()
+    wrong: tuple[Plateau, ...] = ()
 
     @property
     def physics(self) -> Physics:
@@ -66,7 +87,12 @@ def cleaned(recorded: Recorded) -> Recorded:
 def put_right(recorded: Recorded) -> Recorded:
     """With loads at the times at which they acted, and with wiring, signs and units as they are."""
     timed = [time_loads(o) for o in recorded.observations]
-    late = [f for _, found in timed for f in found]
+    late = [
+        Finding(n.name, n.where, n.value, n.words(o.name), abs(n.late))
+        for o, mended in timed
+        if mended is not None
+        for n in mended.notes
+    ]
     observations, wrong, lines = wire([o for o, _ in timed], recorded.known)
     gap = 0.0
     if wrong or late:
@@ -80,6 +106,7 @@ def put_right(recorded: Recorded) -> Recorded:
         findings=(*late, *recorded.findings, *wrong),
         values=values,
         stated_gap=gap,
+        mended=tuple(mended for _, mended in timed),
     )
 
 
@@ -116,7 +143,81 @@ def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
         recorded = replace(recorded, observations=cut)
         workspace = Workspace(cut, recorded.known)
     recorded = replace(recorded, delays=tuple(delays))
+    recorded, workspace = _as_hung(recorded, workspace)
     return recorded, workspace.replaced(nuisance=_beginnings(workspace))
+
+
+def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Workspace]:
+    """Without the time in which a weight swayed; with the few loads free that were noted wrong, and with fitted times."""
+    _, difference = workspace.residual(workspace.base)
+    gap = workspace.gap(difference)
+    if gap > MUCH * min(workspace.floor(), _stated_floor(workspace)):
+        swaying, wrong = _not_as_noted(workspace, difference)
+        findings = [s.finding(workspace.observations[s.plateau.recording]) for s in swaying]
+        if swaying:
+            cut = [_without_swaying(o, i, swaying) for i, o in enumerate(workspace.observations)]
+            workspace = Workspace(cut, recorded.known)
+        observations = list(workspace.observations)
+        for plateau, more in wrong:
+            o = observations[plateau.recording]
+            loads = o.loads.copy()
+            loads[plateau.first : plateau.last] += more
+            observations[plateau.recording] = dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed())
+        if swaying or wrong:
+            workspace = Workspace(observations, recorded.known)
+            recorded = replace(
+                recorded,
+                observations=workspace.observations,
+                findings=(*findings, *recorded.findings),
+                wrong=tuple(p for p, _ in wrong),
+                stated_gap=recorded.stated_gap or gap,
+            )
+    return recorded, freed(recorded, workspace)
+
+
+def _stated_floor(workspace: Workspace) -> float:
+    """The gap that the noise of the rig file alone leaves, m: motion spoils any other estimate of it."""
+    dots = [o.rig.noises[:, :2] * o.rig.sensitivities / math.sqrt(o.rig.estimator.block_size) for o in workspace.observations]
+    return float(np.sqrt(np.mean(np.square(dots))))
+
+
+def _not_as_noted(
+    workspace: Workspace, difference: Sequence[FloatArray]
+) -> tuple[list[Swaying], list[tuple[Plateau, FloatArray]]]:
+    sways, wrong = list[Swaying](), list[tuple[Plateau, FloatArray]]()
+    for i, (o, part) in enumerate(zip(workspace.observations, difference, strict=True)):
+        found = levels(workspace, i, part, plateaus(o, i))
+        sways += swaying_of(workspace, i, found)
+        wrong += [(found.plateaus[k], more) for k, more in stand_out(found)]
+    return sways, wrong
+
+
+def _without_swaying(o: Observation, recording: int, swaying: Sequence[Swaying]) -> Observation:
+    """Without the time in which a weight swayed, and until the link has come to rest after it."""
+    volts = o.volts.copy()
+    d = o.rig.dynamics
+    slowest = 1.0 / (2.0 * math.pi * d.bending_frequency * max(d.bending_damping_ratio, 1e-3))
+    for s in swaying:
+        if s.plateau.recording == recording:
+            volts[s.plateau.first : s.plateau.last + round(SETTLED_S * slowest / o.period)] = np.nan
+    return _with_volts(o, volts)
+
+
+def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
+    """``workspace`` with the loads free that were noted wrong, and the times that were fitted."""
+    free = directions(workspace, recorded.wrong)
+    for i, mended in enumerate(recorded.mended):
+        if mended is None:
+            continue
+        o = workspace.observations[i]
+        for note in mended.notes:
+            shifted = shifts(note, o.loads, o.period)
+            free += [Direction(i, change, FREE_MOMENTS, note, axis) for axis, change in enumerate(shifted)]
+        # In whatever unit they were measured.
+        unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(mended.loads).max(axis=0), 1e-30)
+        if len(mended.measured) <= MOST_MEASURED:
+            free += [d for m in mended.measured for d in of_plateau(o, i, m, m.sd * unit)]
+    return workspace.freed(free)
 
 
 def _beginnings(workspace: Workspace) -> tuple[ActiveEffect, ...]:

@@ -8,7 +8,9 @@ and counted here.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -55,6 +57,35 @@ def _sums(cut: FloatArray) -> FloatArray:
     return total
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Direction:
+    """A change of the loads that nobody knows: ``change`` (n, 3) N, N, N m of ``recording``, times a number of standard
+    deviation ``sd``.
+
+    ``of``: what it belongs to; ``axis``: which of its numbers it is.
+    """
+
+    recording: int
+    change: FloatArray
+    sd: float
+    of: object
+    axis: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeLoads:
+    """``tables``: what each of the ``directions`` changes, V, at its standard deviation. ``rows`` (k, D): the whitened
+    span of these, orthonormal, of variance ``energy`` (k,) against that of the noise; ``back`` (p, k): from there to the
+    numbers.
+    """
+
+    directions: tuple[Direction, ...]
+    tables: tuple[list[FloatArray], ...]
+    rows: FloatArray
+    energy: FloatArray
+    back: FloatArray
+
+
 class Workspace(Comparison):
     """All recordings of the rig of one call of discover, as means of fine blocks (6, nf), V."""
 
@@ -62,6 +93,7 @@ class Workspace(Comparison):
     first = FIRST
     setup = SETUP
     digits = '.3f'
+    free: FreeLoads | None = None
 
     def __init__(self, observations: Sequence[Observation], base: Sequence[ActiveEffect] = ()) -> None:
         self.observations = tuple(observations)
@@ -127,7 +159,8 @@ class Workspace(Comparison):
             for a, b in zip(self.noise, noise, strict=True)
         ):
             return self
-        return self.replaced(noise=noise)
+        out = self.replaced(noise=noise)
+        return out if self.free is None else out._freed(self.free.directions, self.free.tables)
 
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
@@ -153,9 +186,65 @@ class Workspace(Comparison):
         return out
 
     def whiten(self, fine: Sequence[FloatArray]) -> FloatArray:
-        """One vector of all recordings, white and of unit variance if the noise model holds."""
+        """One vector of all recordings, white and of unit variance if the noise model holds.
+
+        What is not known of the loads adds to the noise (errors in variables); a free load adds without bound.
+        """
+        white = self._white(fine)
+        if self.free is None:
+            return white
+        less = 1.0 - 1.0 / np.sqrt(1.0 + self.free.energy)
+        return np.asarray(white - (less * (self.free.rows @ white)) @ self.free.rows)
+
+    def _white(self, fine: Sequence[FloatArray]) -> FloatArray:
         parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
         return np.concatenate(parts)
+
+    def freed(self, directions: Sequence[Direction]) -> Self:
+        """With the loads free along ``directions``."""
+        if not directions:
+            return self
+        nominal = self.simulate(self.base)
+        tables = []
+        for d in directions:
+            # A free load is large: the change by one of its unit, in proportion.
+            moved = self._loaded([(d, 1.0)]).simulate(self.base)
+            tables.append([d.sd * (a - b) for a, b in zip(moved, nominal, strict=True)])
+        return self._freed(directions, tables)
+
+    def _freed(self, directions: Sequence[Direction], tables: Sequence[list[FloatArray]]) -> Self:
+        white = np.array([self._white(t) for t in tables])
+        energy, vectors = np.linalg.eigh(white @ white.T)
+        seen = energy > max(1e-6, 1e-14 * float(energy.max()))
+        energy, vectors = energy[seen], vectors[:, seen]
+        rows = (vectors / np.sqrt(energy)).T @ white
+        back = np.array([d.sd for d in directions])[:, None] * vectors
+        return self.replaced(free=FreeLoads(tuple(directions), tuple(tables), rows, energy, back))
+
+    def _loaded(self, more: Sequence[tuple[Direction, float]]) -> Self:
+        """With the loads changed."""
+        observations = list(self.observations)
+        for d, size in more:
+            o = observations[d.recording]
+            observations[d.recording] = dataclasses.replace(
+                o, loads=o.loads + size * d.change, digest=o.digest or o.hashed()
+            )
+        return self.replaced(observations=tuple(observations))
+
+    def settled(self, difference: Sequence[FloatArray]) -> Self:
+        """With the free loads as the ``difference`` of a fit, measured minus simulated, asks for."""
+        if self.free is None:
+            return self
+        free = self.free
+        sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * (free.rows @ self._white(difference)))
+        return self._loaded(list(zip(self.free.directions, sizes.tolist(), strict=True)))
+
+    def direction_sd(self) -> dict[tuple[int, int], float]:
+        """Standard deviations of the free numbers by the noise, by the id of what each belongs to, and its axis."""
+        if self.free is None:
+            return {}
+        sd = np.sqrt((self.free.back**2 / (1.0 + self.free.energy)).sum(axis=1))
+        return {(id(d.of), d.axis): float(v) for d, v in zip(self.free.directions, sd, strict=True)}
 
     @property
     def size(self) -> int:

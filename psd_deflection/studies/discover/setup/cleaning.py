@@ -21,7 +21,7 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.proposals import coarse_step
-from psd_deflection.studies.noted_loads import mend_loads
+from psd_deflection.studies.noted_loads import MendedLoads, mend_loads
 
 FAR = 8.0
 """A sample this many standard deviations from what its neighbours predict is an outlier."""
@@ -157,13 +157,12 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     return dataclasses.replace(o, volts=volts, digest=o.digest or o.hashed()), findings
 
 
-def time_loads(observation: Observation) -> tuple[Observation, list[Finding]]:
-    """The recording with its loads at the times at which they acted, by the motion, and which were noted otherwise."""
+def time_loads(observation: Observation) -> tuple[Observation, MendedLoads | None]:
+    """The recording with its loads at the times at which they acted, by the motion, and what was noted otherwise."""
     o = observation
     mended = mend_loads(o.rig, o.volts[:, list(DOT_CHANNELS)] * o.rig.sensitivities.ravel(), o.loads)
     if mended is None:
-        return o, []
+        return o, None
     volts = o.volts.copy()
     volts[mended.unused] = np.nan
-    findings = [Finding(n.name, n.where, n.value, n.words(o.name), abs(n.late)) for n in mended.notes]
-    return dataclasses.replace(o, volts=volts, loads=mended.loads, digest=o.digest or o.hashed()), findings
+    return dataclasses.replace(o, volts=volts, loads=mended.loads, digest=o.digest or o.hashed()), mended

@@ -26,6 +26,8 @@ BoolArray = npt.NDArray[np.bool_]
 ORDER = 2
 SIGNIFICANT = 5.0
 """Lag-1 correlation, in its standard errors, from which the noise is taken as coloured."""
+MOVING = 10.0
+"""Coloured noise is at most so many times what neighbouring samples show; beyond, what is taken for rest moves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,6 +153,13 @@ def _kept(there: BoolArray, upper: BoolArray) -> float:
     return max(_level(power[upper]), 1e-3)
 
 
+def _between_neighbours(values: FloatArray) -> float:
+    """Standard deviation of white noise that second differences of ``values`` (n,) show; motion hardly adds to them."""
+    bent = values[2:] - 2.0 * values[1:-1] + values[:-2]
+    bent = bent[np.isfinite(bent)]
+    return float(1.4826 * np.median(np.abs(bent)) / np.sqrt(6.0)) if len(bent) else 0.0
+
+
 def estimate_noise(observation: Observation, residual: FloatArray, fine: int, floors: FloatArray) -> NoiseModel:
     """Noise of ``residual`` (n, 6) V, measured minus simulated; NaN where samples are lost.
 
@@ -182,12 +191,14 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
         if count > 400:
             pooled = np.array([_product(rest, k) / max(_product(seen, k), 1.0) for k in range(ORDER + 1)])
             memory = pooled[0] > floor**2 and abs(pooled[1]) > SIGNIFICANT / np.sqrt(count) * pooled[0]
-        coloured.append(bool(memory))
         if memory:
             phi = solve_toeplitz(pooled[:-1], pooled[1:])
             scale = _level(power[upper] / _ar_density(phi, frequency[upper]))
             density = scale * _ar_density(phi, np.linspace(0.0, 1.0, 4096, endpoint=False))
-            acov = np.real(np.fft.ifft(density))[: len(acov)]
+            with_memory = np.real(np.fft.ifft(density))[: len(acov)]
+            memory = not with_memory[0] > (MOVING * max(_between_neighbours(residual[:, c]), floor)) ** 2
+            acov = with_memory if memory else acov
+        coloured.append(bool(memory))
         sigma[c] = np.sqrt(acov[0])
         of_fine = _block_autocovariance(acov, fine, ORDER + 1)
         if memory:

@@ -1,0 +1,289 @@
+"""What hung on the link, if it is not what was noted: three free numbers for each time between two changes.
+
+The readings that differ from the simulation are taken apart into a movement of the plate and the part that no movement
+of a plate makes (:mod:`.redundant`). A movement that a constant other load makes, from one change to the next, is a wrong
+note; one that swings is a weight that sways. An effect of the catalogue moves the plate in proportion to the loads, more
+or less: so a few wrong notes stand out beside it, and are free before any search. If all notes are wrong (rounded), they
+are free only if the search has failed, and if free loads then leave next to nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.check.result import Finding
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.search.workspace import Direction, Workspace, fine_means
+from psd_deflection.studies.discover.setup.redundant import moved_plate
+from psd_deflection.studies.noted_loads import MeasuredLoad, ordinal, unnoted_steps
+
+LONG_S = 1.0
+"""Between two changes of the load there is at least this time, or it is a sweep."""
+FEWEST = 4
+"""Times between changes that a judgement needs."""
+TOLERANCE, SHARE = 0.3, 0.01
+"""N and N m, and share of the load, by which effects other than in proportion to the load may seem to change it."""
+STANDS_OUT = 3.0
+"""A few wrong notes must exceed that so many times."""
+SOFTER, OFFSET = 0.1, 0.5
+"""Standard deviations of what effects do to a load: share, and N or N m."""
+SWAYS, SLOWEST_HZ, FASTEST_HZ = 8.0, 0.3, 6.0
+"""A weight that sways makes so much more slow movement than any other, in this band."""
+SWAYS_M = 2e-6
+"""And at least this, rms."""
+FREE = 100.0
+"""N or N m: standard deviation of a load that nobody knows."""
+CLOSES = 0.2
+"""Free loads must leave less than this share of the movement."""
+TELLING = 4.0
+"""Standard deviations by which a load that is told differs from the noted one."""
+LEAST_TOLD = (0.02, 0.02, 0.01)
+"""N, N, N m: a smaller difference is not told."""
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plateau:
+    """One time between two changes of the load: samples ``first`` to ``last`` of recording ``recording``.
+
+    ``number``: of the noted change that began it, from 1; 0 before the first. ``unnoted``: nothing was noted when it
+    began. ``noted`` (3,): N, N, N m.
+    """
+
+    recording: int
+    first: int
+    last: int
+    number: int
+    unnoted: bool
+    noted: FloatArray
+
+    def of(self, loads: FloatArray) -> FloatArray:
+        """(3,): the load in its middle, of ``loads`` (n, 3)."""
+        return np.asarray(loads[(self.first + self.last) // 2])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Swaying:
+    """A weight that swayed: its plateau, the amplitude of the force, N, and the frequency, Hz."""
+
+    plateau: Plateau
+    force: float
+    frequency: float
+
+    def finding(self, o: Observation) -> Finding:
+        """In words."""
+        p = self.plateau
+        words = (
+            f'the weight that hung on the link of {o.name} from {p.first * o.period:.3f} s to {p.last * o.period:.3f} s '
+            f'swayed at {self.frequency:.2f} Hz by {self.force:.2g} N: steady it; this time is left out'
+        )
+        return Finding('load_sway', f'load {p.number}', self.force, words, self.force)
+
+
+def plateaus(o: Observation, recording: int) -> list[Plateau]:
+    """The times between changes of the load, also between those that only the motion shows."""
+    changed = np.flatnonzero(np.any(np.diff(o.loads, axis=0) != 0.0, axis=1)) + 1
+    # A load that was applied slowly changes from sample to sample: what counts is its end.
+    ends = changed[np.append(np.diff(changed) > 1, True)].tolist() if len(changed) else []
+    dots = o.volts[:, list(DOT_CHANNELS)] * o.rig.sensitivities.ravel()
+    unnoted = [round(t / o.period) for t in unnoted_steps(o.rig, dots, o.loads)]
+    starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unnoted)])
+    out, number = [], 0
+    for i, (first, alone) in enumerate(starts):
+        number += not alone and first > 0
+        last = starts[i + 1][0] if i + 1 < len(starts) else len(o.loads)
+        if (last - first) * o.period >= LONG_S:
+            out.append(Plateau(recording, first, last, number, alone, o.loads[(first + last) // 2].copy()))
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Levels:
+    """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the noted one, N, N, N m.
+
+    ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
+    """
+
+    plateaus: tuple[Plateau, ...]
+    more: FloatArray
+    rest: FloatArray
+    moved: FloatArray
+
+    @property
+    def noted(self) -> FloatArray:
+        """(k, 3) N, N, N m."""
+        return np.array([p.noted for p in self.plateaus])
+
+
+def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Plateau]) -> Levels:
+    """The loads that the movement of ``difference`` (6, m), V, measured minus simulated, asks for."""
+    o, size = ws.observations[recording], ws.fine[recording]
+    moved = moved_plate(o.rig, difference, ws.count[recording])
+    compliance = np.diag(LinkStatics.from_rig(o.rig).compliance)
+    there = np.isfinite(moved).all(axis=0) & _held(listed, len(o.loads), size, moved.shape[1])
+    more, rest = np.zeros((len(listed), 3)), np.full_like(moved, np.nan)
+    for axis in range(3):
+        columns = np.array([np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in _pulses(o, listed, axis))])
+        found = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
+        more[:, axis] = found[1:] / compliance[axis]
+        rest[axis, there] = moved[axis, there] - found @ columns[:, there]
+    # What the first time has is an offset, which all have.
+    return Levels(tuple(listed), more, rest, np.where(there, moved, np.nan))
+
+
+def _held(listed: Sequence[Plateau], samples: int, size: int, blocks: int) -> FloatArray:
+    inside = np.zeros(samples, dtype=bool)
+    for p in listed:
+        inside[p.first : p.last] = True
+    return np.asarray(inside[: blocks * size].reshape(blocks, size).all(axis=1))
+
+
+def _pulses(o: Observation, listed: Sequence[Plateau], axis: int) -> list[FloatArray]:
+    """How the link moves, as a share, if a load acts in one of the plateaus after the first."""
+    d = o.rig.dynamics
+    mode = (d.torsion_frequency, d.torsion_damping_ratio) if axis == 2 else (d.bending_frequency, d.bending_damping_ratio)
+    out = []
+    for p in listed:
+        acts = np.zeros(len(o.loads))
+        if p.first > 0:
+            acts[p.first : p.last] = 1.0
+        out.append(Filter(mode_coefficients(*mode, o.period))(acts))
+    return out
+
+
+def stand_out(found: Levels) -> list[tuple[int, FloatArray]]:
+    """The few plateaus with another load than noted, and by what (3,) it differs; none if it is none or are many."""
+    count = len(found.plateaus)
+    if count < FEWEST + 1 or np.abs(found.more).max() < STANDS_OUT * TOLERANCE:
+        return []
+    others = range(1, count)
+    for size in (1, 2) if count > FEWEST + 2 else (1,):
+        tried = []
+        for gone in itertools.combinations(others, size):
+            apart = _apart(found, gone)
+            rest = np.delete(apart, gone)
+            if rest.max() <= 1.0 and apart[list(gone)].min() > max(STANDS_OUT, 5.0 * rest.max()):
+                tried.append((float(rest.max()), gone))
+        if tried:
+            gone = min(tried)[1]
+            slopes, offset = _proportion(found, gone)
+            out = []
+            for k in gone:
+                own = found.more[k] - found.noted[k] @ slopes - offset
+                out.append((k, np.linalg.solve((np.eye(3) + slopes).T, own)))
+            return out
+    return []
+
+
+def _proportion(found: Levels, gone: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """What effects do to all loads but ``gone``: (3, 3) and (3,), the likeliest."""
+    keep = np.setdiff1d(np.arange(len(found.plateaus)), gone)
+    x = np.column_stack((found.noted[keep], np.ones(len(keep))))
+    prior = np.diag([(0.1 * TOLERANCE / SOFTER) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
+    both = np.linalg.solve(x.T @ x + prior, x.T @ found.more[keep])
+    return both[:3], both[3]
+
+
+def _apart(found: Levels, gone: Sequence[int]) -> FloatArray:
+    """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
+    slopes, offset = _proportion(found, gone)
+    off = np.abs(found.more - found.noted @ slopes - offset)
+    allowed = TOLERANCE + SHARE * np.abs(found.noted).max(axis=1, keepdims=True)
+    return np.asarray((off / allowed).max(axis=1))
+
+
+def _off(found: Levels, gone: Sequence[int]) -> FloatArray:
+    return _apart(found, gone) > 1.0
+
+
+def all_free(found: Levels) -> bool:
+    """Whether other loads than noted, at most of the times, leave next to nothing of the movement."""
+    if len(found.plateaus) < FEWEST or np.count_nonzero(_off(found, ())) < 2:
+        return False
+    before, after = (_rms(part, found) for part in (found.moved, found.rest))
+    return after < CLOSES * before
+
+
+def _rms(part: FloatArray, found: Levels) -> float:
+    there = np.isfinite(part).all(axis=0)
+    centred = part[:, there] - part[:, there].mean(axis=1, keepdims=True)
+    # An angle counts by what it moves at a tenth of a metre.
+    return float(np.sqrt(np.mean((centred * np.array([[1.0], [1.0], [0.1]])) ** 2)))
+
+
+def swaying(ws: Workspace, recording: int, found: Levels) -> list[Swaying]:
+    """Plateaus in which the link swings slowly, and only there."""
+    o = ws.observations[recording]
+    period = o.period * ws.fine[recording]
+    per = np.diag(LinkStatics.from_rig(o.rig).compliance)
+    rows = []
+    for p in found.plateaus:
+        # The link has come to rest by then, or nearly.
+        a, b = p.first // ws.fine[recording] + round(0.4 / period), p.last // ws.fine[recording]
+        part = found.rest[:2, a:b]
+        there = np.isfinite(part).all(axis=0)
+        if there.sum() < round(0.5 / period):
+            rows.append((0.0, 0.0, 0.0))
+            continue
+        part = np.where(there, part - part[:, there].mean(axis=1, keepdims=True), 0.0)
+        power = np.abs(np.fft.rfft(part * np.hanning(b - a), axis=1)) ** 2 / (0.375 * (b - a) ** 2) * 2.0
+        f = np.fft.rfftfreq(b - a, period)
+        band = (f >= SLOWEST_HZ) & (f <= FASTEST_HZ)
+        each = power[:, band].sum(axis=1)
+        axis = int(np.argmax(each))
+        peak = float(f[band][np.argmax(power[axis, band])]) if band.any() else 0.0
+        rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / per[axis]), peak))
+    sizes = np.array([r[0] for r in rows])
+    limit = max(SWAYS * float(np.median(sizes)), SWAYS_M) if len(sizes) >= FEWEST else np.inf
+    return [Swaying(p, r[1], r[2]) for p, r in zip(found.plateaus, rows, strict=True) if r[0] > limit]
+
+
+def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[Direction]:
+    """Any load in each of ``wrong``."""
+    free = np.full(3, FREE)
+    return [d for p in wrong for d in of_plateau(ws.observations[p.recording], p.recording, p, free)]
+
+
+def of_plateau(o: Observation, recording: int, plateau: Plateau | MeasuredLoad, sd: FloatArray) -> list[Direction]:
+    """1 N or 1 N m more in ``plateau``, known to ``sd`` (3,) N, N, N m; axes that are known exactly are left out."""
+    out = []
+    for axis in np.flatnonzero(sd > 0.0).tolist():
+        more = np.zeros_like(o.loads)
+        more[plateau.first : plateau.last, axis] = 1.0
+        out.append(Direction(recording, more, float(sd[axis]), plateau, axis))
+    return out
+
+
+def told(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding]:
+    """What hung in each of ``wrong``, after the search."""
+    sd = ws.direction_sd()
+    out = []
+    for p in wrong:
+        o = ws.observations[p.recording]
+        hung = p.of(o.loads)
+        own = np.array([sd.get((id(p), axis), 0.0) for axis in range(3)])
+        off = np.abs(hung - p.noted)
+        if not np.any(off > np.maximum(TELLING * own, LEAST_TOLD)):
+            continue
+        digits = [max(0, min(4, 1 - int(np.floor(np.log10(max(s, 1e-4)))))) for s in own]
+        is_, was = (', '.join(f'{v:.{d}f} {u}' for v, d, u in zip(row, digits, UNITS, strict=True)) for row in (hung, p.noted))
+        begun = (
+            f'something was hung or taken off, and not noted, after the {ordinal(p.number)} load of {o.name}'
+            if p.unnoted and p.number
+            else f'something was hung on the link of {o.name}, and not noted'
+            if p.unnoted
+            else f'the {ordinal(p.number)} load of {o.name} was noted wrong'
+        )
+        words = f'{begun}: from {p.first * o.period:.3f} s to {p.last * o.period:.3f} s ({is_}) hung, not ({was}): note that'
+        where = f'after load {p.number}' if p.unnoted else f'load {p.number}'
+        out.append(Finding('load_size', where, float(f'{off[:2].max():.4g}') if off[:2].max() else float(f'{off[2]:.4g}'), words, float(off.max())))
+    return out
+
+
+UNITS = ('N', 'N', 'N m')
