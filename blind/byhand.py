@@ -6,6 +6,7 @@ Each design has its own weights and its own times; the name says the kind and th
 from __future__ import annotations
 
 import functools
+import itertools
 import zlib
 from dataclasses import dataclass
 from typing import Any
@@ -50,7 +51,7 @@ def _levels(rng: np.random.Generator, odd: bool) -> Array:
         row[1] = -size if kind != 2 else 0.0
         row[0] = (0.0, 0.0, float(rng.choice((-1.0, 1.0))) * size, round(0.6 * size, 2))[kind]
         row[2] = round(0.585 * row[1], 3) if kind == 1 else float(rng.choice((0.0, 12.0))) if kind == 3 else 0.0
-    for before, row in zip(out[:-1], out[1:], strict=True):
+    for before, row in itertools.pairwise(out):
         if np.abs(row - before).max() < 8.0:
             # Each weight moves the link.
             row[1] -= 15.0

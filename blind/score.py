@@ -268,7 +268,7 @@ def _told(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[bool,
 
 
 def _by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
-    """Notes by hand: what is wrong is named load by load, the lines are right, nothing is unknown, no effect is lost."""
+    """Notes by hand: each wrong one is named, with the right line; nothing is unknown; no effect is lost."""
     if not of:
         return
     told = [[_told(w, r.answer['setup']) for w in r.wrong] for r in of]

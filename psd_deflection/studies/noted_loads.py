@@ -204,8 +204,8 @@ def without_cell_noise(loads: FloatArray) -> tuple[FloatArray, tuple[MeasuredLoa
 
 
 def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
-    """When a load began to act that nobody noted, s from the first sample: steps of ``dots`` (n, 4), m, without a change
-    of ``loads`` (n, 3) near them.
+    """When a load began to act that nobody noted, s from the first sample: steps of ``dots`` (n, 4), m, without a
+    change of ``loads`` (n, 3) near them.
     """
     period = 1.0 / rig.converter.sample_rate_hz
     changes = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
@@ -285,8 +285,8 @@ def _without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNo
 
 
 def shifts(note: MendedNote, loads: FloatArray, period: float) -> list[FloatArray]:
-    """What a moment more does to ``loads`` (n, 3): of the time at which the load of ``note`` began to act and, if it was
-    applied slowly, of how long that took; (n, 3) each.
+    """What a moment more does to ``loads`` (n, 3): of the time at which the load of ``note`` began to act and, if it
+    was applied slowly, of how long that took; (n, 3) each.
     """
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
     before, after = np.searchsorted(t, (note.hung - period, note.hung + note.took + 2.0 * period))

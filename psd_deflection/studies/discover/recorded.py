@@ -21,7 +21,7 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.proposals import coarse_step
-from psd_deflection.studies.discover.search.workspace import Direction, Workspace
+from psd_deflection.studies.discover.search.workspace import LoadDirection, Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
 from psd_deflection.studies.discover.setup.hung import (
@@ -32,6 +32,8 @@ from psd_deflection.studies.discover.setup.hung import (
     of_plateau,
     plateaus,
     stand_out,
+)
+from psd_deflection.studies.discover.setup.hung import (
     swaying as swaying_of,
 )
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
@@ -148,7 +150,7 @@ def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
 
 
 def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Workspace]:
-    """Without the time in which a weight swayed; with the few loads free that were noted wrong, and with fitted times."""
+    """Without the time in which a weight swayed; the few loads that were noted wrong, and fitted times, are free."""
     _, difference = workspace.residual(workspace.base)
     gap = workspace.gap(difference)
     if gap > MUCH * min(workspace.floor(), _stated_floor(workspace)):
@@ -177,7 +179,10 @@ def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Worksp
 
 def _stated_floor(workspace: Workspace) -> float:
     """The gap that the noise of the rig file alone leaves, m: motion spoils any other estimate of it."""
-    dots = [o.rig.noises[:, :2] * o.rig.sensitivities / math.sqrt(o.rig.estimator.block_size) for o in workspace.observations]
+    dots = [
+        o.rig.noises[:, :2] * o.rig.sensitivities / math.sqrt(o.rig.estimator.block_size)
+        for o in workspace.observations
+    ]
     return float(np.sqrt(np.mean(np.square(dots))))
 
 
@@ -212,7 +217,7 @@ def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
         o = workspace.observations[i]
         for note in mended.notes:
             shifted = shifts(note, o.loads, o.period)
-            free += [Direction(i, change, FREE_MOMENTS, note, axis) for axis, change in enumerate(shifted)]
+            free += [LoadDirection(i, change, FREE_MOMENTS, note, axis) for axis, change in enumerate(shifted)]
         # In whatever unit they were measured.
         unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(mended.loads).max(axis=0), 1e-30)
         if len(mended.measured) <= MOST_MEASURED:

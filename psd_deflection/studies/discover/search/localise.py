@@ -241,7 +241,9 @@ def localise(
     q = None
     if known is not None:
         q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
-    present = (workspace.replaced(free=None).whiten([np.ones_like(m) for m in workspace.measured]) != 0.0).astype(np.float64)
+    present = (workspace.replaced(free=None).whiten([np.ones_like(m) for m in workspace.measured]) != 0.0).astype(
+        np.float64
+    )
     for draw in range(DRAWS):
         e = rng.standard_normal(len(residual), dtype=np.float32) * present
         if q is not None:

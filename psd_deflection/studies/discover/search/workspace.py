@@ -58,7 +58,7 @@ def _sums(cut: FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Direction:
+class LoadDirection:
     """A change of the loads that nobody knows: ``change`` (n, 3) N, N, N m of ``recording``, times a number of standard
     deviation ``sd``.
 
@@ -75,11 +75,11 @@ class Direction:
 @dataclass(frozen=True, slots=True, eq=False)
 class FreeLoads:
     """``tables``: what each of the ``directions`` changes, V, at its standard deviation. ``rows`` (k, D): the whitened
-    span of these, orthonormal, of variance ``energy`` (k,) against that of the noise; ``back`` (p, k): from there to the
-    numbers.
+    span of these, orthonormal, of variance ``energy`` (k,) against that of the noise; ``back`` (p, k): from there to
+    the numbers.
     """
 
-    directions: tuple[Direction, ...]
+    directions: tuple[LoadDirection, ...]
     tables: tuple[list[FloatArray], ...]
     rows: FloatArray
     energy: FloatArray
@@ -160,7 +160,7 @@ class Workspace(Comparison):
         ):
             return self
         out = self.replaced(noise=noise)
-        return out if self.free is None else out._freed(self.free.directions, self.free.tables)
+        return out.replaced(free=out.whitened(self.free))
 
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
@@ -200,7 +200,7 @@ class Workspace(Comparison):
         parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
         return np.concatenate(parts)
 
-    def freed(self, directions: Sequence[Direction]) -> Self:
+    def freed(self, directions: Sequence[LoadDirection]) -> Self:
         """With the loads free along ``directions``."""
         if not directions:
             return self
@@ -210,18 +210,22 @@ class Workspace(Comparison):
             # A free load is large: the change by one of its unit, in proportion.
             moved = self._loaded([(d, 1.0)]).simulate(self.base)
             tables.append([d.sd * (a - b) for a, b in zip(moved, nominal, strict=True)])
-        return self._freed(directions, tables)
+        nothing = np.zeros((0, 0))
+        return self.replaced(free=self.whitened(FreeLoads(tuple(directions), tuple(tables), nothing, nothing, nothing)))
 
-    def _freed(self, directions: Sequence[Direction], tables: Sequence[list[FloatArray]]) -> Self:
-        white = np.array([self._white(t) for t in tables])
+    def whitened(self, free: FreeLoads | None) -> FreeLoads | None:
+        """``free`` by the noise of this comparison."""
+        if free is None:
+            return None
+        white = np.array([self._white(t) for t in free.tables])
         energy, vectors = np.linalg.eigh(white @ white.T)
         seen = energy > max(1e-6, 1e-14 * float(energy.max()))
         energy, vectors = energy[seen], vectors[:, seen]
         rows = (vectors / np.sqrt(energy)).T @ white
-        back = np.array([d.sd for d in directions])[:, None] * vectors
-        return self.replaced(free=FreeLoads(tuple(directions), tuple(tables), rows, energy, back))
+        back = np.array([d.sd for d in free.directions])[:, None] * vectors
+        return FreeLoads(free.directions, free.tables, rows, energy, back)
 
-    def _loaded(self, more: Sequence[tuple[Direction, float]]) -> Self:
+    def _loaded(self, more: Sequence[tuple[LoadDirection, float]]) -> Self:
         """With the loads changed."""
         observations = list(self.observations)
         for d, size in more:

@@ -1,10 +1,9 @@
 """What hung on the link, if it is not what was noted: three free numbers for each time between two changes.
 
-The readings that differ from the simulation are taken apart into a movement of the plate and the part that no movement
-of a plate makes (:mod:`.redundant`). A movement that a constant other load makes, from one change to the next, is a wrong
-note; one that swings is a weight that sways. An effect of the catalogue moves the plate in proportion to the loads, more
-or less: so a few wrong notes stand out beside it, and are free before any search. If all notes are wrong (rounded), they
-are free only if the search has failed, and if free loads then leave next to nothing.
+A movement of the plate that another constant load makes, from one change to the next, is a wrong note; one that swings
+is a weight that sways. An effect of the catalogue moves the plate in proportion to the loads, more or less: so a few
+wrong notes stand out beside it, and are free before any search. If all notes are wrong (rounded), they are free only if
+the search has failed, and if free loads then leave next to nothing.
 """
 
 from __future__ import annotations
@@ -14,21 +13,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import DOT_CHANNELS, FloatArray
-from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.search.workspace import Direction, Workspace, fine_means
+from psd_deflection.studies.discover.search.workspace import LoadDirection, Workspace, fine_means
 from psd_deflection.studies.discover.setup.redundant import moved_plate
 from psd_deflection.studies.noted_loads import MeasuredLoad, ordinal, unnoted_steps
+
+BoolArray = npt.NDArray[np.bool_]
 
 LONG_S = 1.0
 """Between two changes of the load there is at least this time, or it is a sweep."""
 FEWEST = 4
 """Times between changes that a judgement needs."""
+FEWEST_RIGHT = 6
+"""Of which so many must agree for another one to be wrong: what effects do to the loads takes four numbers an axis."""
 TOLERANCE, SHARE = 0.3, 0.01
 """N and N m, and share of the load, by which effects other than in proportion to the load may seem to change it."""
 STANDS_OUT = 3.0
@@ -47,6 +50,7 @@ TELLING = 4.0
 """Standard deviations by which a load that is told differs from the noted one."""
 LEAST_TOLD = (0.02, 0.02, 0.01)
 """N, N, N m: a smaller difference is not told."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plateau:
@@ -80,8 +84,9 @@ class Swaying:
         """In words."""
         p = self.plateau
         words = (
-            f'the weight that hung on the link of {o.name} from {p.first * o.period:.3f} s to {p.last * o.period:.3f} s '
-            f'swayed at {self.frequency:.2f} Hz by {self.force:.2g} N: steady it; this time is left out'
+            f'the weight that hung on the link of {o.name} from {p.first * o.period:.3f} s to '
+            f'{p.last * o.period:.3f} s swayed at {self.frequency:.2f} Hz by {self.force:.2g} N: '
+            'steady it; this time is left out'
         )
         return Finding('load_sway', f'load {p.number}', self.force, words, self.force)
 
@@ -104,7 +109,7 @@ def plateaus(o: Observation, recording: int) -> list[Plateau]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Levels:
+class PlateauLoads:
     """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the noted one, N, N, N m.
 
     ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
@@ -121,23 +126,25 @@ class Levels:
         return np.array([p.noted for p in self.plateaus])
 
 
-def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Plateau]) -> Levels:
+def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Plateau]) -> PlateauLoads:
     """The loads that the movement of ``difference`` (6, m), V, measured minus simulated, asks for."""
     o, size = ws.observations[recording], ws.fine[recording]
     moved = moved_plate(o.rig, difference, ws.count[recording])
     compliance = np.diag(LinkStatics.from_rig(o.rig).compliance)
-    there = np.isfinite(moved).all(axis=0) & _held(listed, len(o.loads), size, moved.shape[1])
+    there: BoolArray = np.isfinite(moved).all(axis=0) & _held(listed, len(o.loads), size, moved.shape[1])
     more, rest = np.zeros((len(listed), 3)), np.full_like(moved, np.nan)
     for axis in range(3):
-        columns = np.array([np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in _pulses(o, listed, axis))])
+        columns = np.array(
+            [np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in _pulses(o, listed, axis))]
+        )
         found = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
         more[:, axis] = found[1:] / compliance[axis]
         rest[axis, there] = moved[axis, there] - found @ columns[:, there]
     # What the first time has is an offset, which all have.
-    return Levels(tuple(listed), more, rest, np.where(there, moved, np.nan))
+    return PlateauLoads(tuple(listed), more, rest, np.where(there, moved, np.nan))
 
 
-def _held(listed: Sequence[Plateau], samples: int, size: int, blocks: int) -> FloatArray:
+def _held(listed: Sequence[Plateau], samples: int, size: int, blocks: int) -> BoolArray:
     inside = np.zeros(samples, dtype=bool)
     for p in listed:
         inside[p.first : p.last] = True
@@ -147,7 +154,9 @@ def _held(listed: Sequence[Plateau], samples: int, size: int, blocks: int) -> Fl
 def _pulses(o: Observation, listed: Sequence[Plateau], axis: int) -> list[FloatArray]:
     """How the link moves, as a share, if a load acts in one of the plateaus after the first."""
     d = o.rig.dynamics
-    mode = (d.torsion_frequency, d.torsion_damping_ratio) if axis == 2 else (d.bending_frequency, d.bending_damping_ratio)
+    mode = (
+        (d.torsion_frequency, d.torsion_damping_ratio) if axis == 2 else (d.bending_frequency, d.bending_damping_ratio)
+    )
     out = []
     for p in listed:
         acts = np.zeros(len(o.loads))
@@ -157,15 +166,16 @@ def _pulses(o: Observation, listed: Sequence[Plateau], axis: int) -> list[FloatA
     return out
 
 
-def stand_out(found: Levels) -> list[tuple[int, FloatArray]]:
+def stand_out(found: PlateauLoads) -> list[tuple[int, FloatArray]]:
     """The few plateaus with another load than noted, and by what (3,) it differs; none if it is none or are many."""
     count = len(found.plateaus)
-    if count < FEWEST + 1 or np.abs(found.more).max() < STANDS_OUT * TOLERANCE:
+    if np.abs(found.more).max(initial=0.0) < STANDS_OUT * TOLERANCE or not _closes(found):
         return []
-    others = range(1, count)
-    for size in (1, 2) if count > FEWEST + 2 else (1,):
+    for size in (1, 2):
+        if count - size < FEWEST_RIGHT:
+            break
         tried = []
-        for gone in itertools.combinations(others, size):
+        for gone in itertools.combinations(range(1, count), size):
             apart = _apart(found, gone)
             rest = np.delete(apart, gone)
             if rest.max() <= 1.0 and apart[list(gone)].min() > max(STANDS_OUT, 5.0 * rest.max()):
@@ -181,16 +191,16 @@ def stand_out(found: Levels) -> list[tuple[int, FloatArray]]:
     return []
 
 
-def _proportion(found: Levels, gone: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+def _proportion(found: PlateauLoads, gone: Sequence[int]) -> tuple[FloatArray, FloatArray]:
     """What effects do to all loads but ``gone``: (3, 3) and (3,), the likeliest."""
     keep = np.setdiff1d(np.arange(len(found.plateaus)), gone)
     x = np.column_stack((found.noted[keep], np.ones(len(keep))))
     prior = np.diag([(0.1 * TOLERANCE / SOFTER) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
-    both = np.linalg.solve(x.T @ x + prior, x.T @ found.more[keep])
+    both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ found.more[keep]), dtype=np.float64)
     return both[:3], both[3]
 
 
-def _apart(found: Levels, gone: Sequence[int]) -> FloatArray:
+def _apart(found: PlateauLoads, gone: Sequence[int]) -> FloatArray:
     """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
     slopes, offset = _proportion(found, gone)
     off = np.abs(found.more - found.noted @ slopes - offset)
@@ -198,26 +208,30 @@ def _apart(found: Levels, gone: Sequence[int]) -> FloatArray:
     return np.asarray((off / allowed).max(axis=1))
 
 
-def _off(found: Levels, gone: Sequence[int]) -> FloatArray:
+def _off(found: PlateauLoads, gone: Sequence[int]) -> BoolArray:
     return _apart(found, gone) > 1.0
 
 
-def all_free(found: Levels) -> bool:
+def all_free(found: PlateauLoads) -> bool:
     """Whether other loads than noted, at most of the times, leave next to nothing of the movement."""
     if len(found.plateaus) < FEWEST or np.count_nonzero(_off(found, ())) < 2:
         return False
-    before, after = (_rms(part, found) for part in (found.moved, found.rest))
-    return after < CLOSES * before
+    return _closes(found)
 
 
-def _rms(part: FloatArray, found: Levels) -> float:
+def _closes(found: PlateauLoads) -> bool:
+    """Whether other loads, constant between changes, leave next to nothing of the movement."""
+    return _rms(found.rest) < CLOSES * _rms(found.moved)
+
+
+def _rms(part: FloatArray) -> float:
     there = np.isfinite(part).all(axis=0)
     centred = part[:, there] - part[:, there].mean(axis=1, keepdims=True)
     # An angle counts by what it moves at a tenth of a metre.
     return float(np.sqrt(np.mean((centred * np.array([[1.0], [1.0], [0.1]])) ** 2)))
 
 
-def swaying(ws: Workspace, recording: int, found: Levels) -> list[Swaying]:
+def swaying(ws: Workspace, recording: int, found: PlateauLoads) -> list[Swaying]:
     """Plateaus in which the link swings slowly, and only there."""
     o = ws.observations[recording]
     period = o.period * ws.fine[recording]
@@ -244,46 +258,50 @@ def swaying(ws: Workspace, recording: int, found: Levels) -> list[Swaying]:
     return [Swaying(p, r[1], r[2]) for p, r in zip(found.plateaus, rows, strict=True) if r[0] > limit]
 
 
-def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[Direction]:
+def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
     """Any load in each of ``wrong``."""
     free = np.full(3, FREE)
     return [d for p in wrong for d in of_plateau(ws.observations[p.recording], p.recording, p, free)]
 
 
-def of_plateau(o: Observation, recording: int, plateau: Plateau | MeasuredLoad, sd: FloatArray) -> list[Direction]:
+def of_plateau(o: Observation, recording: int, plateau: Plateau | MeasuredLoad, sd: FloatArray) -> list[LoadDirection]:
     """1 N or 1 N m more in ``plateau``, known to ``sd`` (3,) N, N, N m; axes that are known exactly are left out."""
     out = []
     for axis in np.flatnonzero(sd > 0.0).tolist():
         more = np.zeros_like(o.loads)
         more[plateau.first : plateau.last, axis] = 1.0
-        out.append(Direction(recording, more, float(sd[axis]), plateau, axis))
+        out.append(LoadDirection(recording, more, float(sd[axis]), plateau, axis))
     return out
 
 
 def told(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding]:
     """What hung in each of ``wrong``, after the search."""
-    sd = ws.direction_sd()
+    sds = ws.direction_sd()
     out = []
     for p in wrong:
         o = ws.observations[p.recording]
         hung = p.of(o.loads)
-        own = np.array([sd.get((id(p), axis), 0.0) for axis in range(3)])
+        sd = np.array([sds.get((id(p), axis), 0.0) for axis in range(3)])
         off = np.abs(hung - p.noted)
-        if not np.any(off > np.maximum(TELLING * own, LEAST_TOLD)):
-            continue
-        digits = [max(0, min(4, 1 - int(np.floor(np.log10(max(s, 1e-4)))))) for s in own]
-        is_, was = (', '.join(f'{v:.{d}f} {u}' for v, d, u in zip(row, digits, UNITS, strict=True)) for row in (hung, p.noted))
-        begun = (
-            f'something was hung or taken off, and not noted, after the {ordinal(p.number)} load of {o.name}'
-            if p.unnoted and p.number
-            else f'something was hung on the link of {o.name}, and not noted'
-            if p.unnoted
-            else f'the {ordinal(p.number)} load of {o.name} was noted wrong'
-        )
-        words = f'{begun}: from {p.first * o.period:.3f} s to {p.last * o.period:.3f} s ({is_}) hung, not ({was}): note that'
-        where = f'after load {p.number}' if p.unnoted else f'load {p.number}'
-        out.append(Finding('load_size', where, float(f'{off[:2].max():.4g}') if off[:2].max() else float(f'{off[2]:.4g}'), words, float(off.max())))
+        if np.any(off > np.maximum(TELLING * sd, LEAST_TOLD)):
+            words = f'{_begun(p, o.name)}: from {p.first * o.period:.3f} s to {p.last * o.period:.3f} s '
+            words += f'({_worded(hung)}) hung, not ({_worded(p.noted)}): note that'
+            value = float(off[:2].max()) if off[:2].max() > LEAST_TOLD[0] else float(off[2])
+            where = f'after load {p.number}' if p.unnoted else f'load {p.number}'
+            out.append(Finding('load_size', where, value, words, float(off.max())))
     return out
+
+
+def _begun(p: Plateau, name: str) -> str:
+    if not p.unnoted:
+        return f'the {ordinal(p.number)} load of {name} was noted wrong'
+    after = f' after the {ordinal(p.number)} noted load' if p.number else ''
+    return f'something was hung or taken off{after} of {name} and not noted'
+
+
+def _worded(load: FloatArray) -> str:
+    # Without a minus before nothing.
+    return ', '.join(f'{round(v, 2) + 0.0:g} {unit}' for v, unit in zip(load.tolist(), UNITS, strict=True))
 
 
 UNITS = ('N', 'N', 'N m')

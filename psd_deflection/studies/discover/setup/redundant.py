@@ -7,9 +7,6 @@ one of them is, and the link may be as well.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
 from psd_deflection.model.plate.linear import design_matrix
