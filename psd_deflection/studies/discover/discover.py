@@ -15,6 +15,7 @@ from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
+from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.judges import noise_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
@@ -31,14 +32,26 @@ from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Localisation, localise
 from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.search import far
-from psd_deflection.studies.discover.search.signatures import SignatureBank, candidates, signatures_beside
+from psd_deflection.studies.discover.search.search import FAR, far
+from psd_deflection.studies.discover.search.signatures import (
+    Candidate,
+    Columns,
+    SignatureBank,
+    candidates,
+    signatures_beside,
+)
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, mistakes
-from psd_deflection.studies.discover.setup.hung import told
+from psd_deflection.studies.discover.setup.hung import all_free, levels, plateaus, told
+from psd_deflection.studies.discover.setup.redundant import PART, STAGES, fourth_reading, visible
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
+
+FREED_FROM = 10.0
+"""A gap of so many floors, beside what the search has found, is held against loads that were noted wrong."""
+CLOSED = 0.2
+"""Free loads are the answer if they and the effects beside them leave less than this share of it."""
 
 
 def discover(
@@ -59,7 +72,7 @@ def discover(
     """
     known = recordings[0].rig if rig is None else rig
     machine = RecordedRig.of(recordings, known, without, bank, progress)
-    problem = solve(machine, (search, hung, weigh, law, alternatives, set_up, where), seed, progress)
+    problem = solve(machine, (search, hung, weigh, free_loads, law, alternatives, set_up, where), seed, progress)
     return Discovery(
         **fields_of(problem),
         setup=problem.setup,
@@ -138,9 +151,27 @@ class RecordedRig(Machine):
             values = {name: [*seen, *(v for v in beside[name] if v not in seen)] for name, seen in values.items()}
         listed = candidates([*library, *more], self.recorded.physics, values)
         if fit is None or not far(fit):
-            return Screen(ws, [(c, self.bank.get(c, ws)) for c in listed])
-        # A large effect changes the signatures of the others.
-        return Screen(ws, signatures_beside(ws, listed, fit))
+            found = [(c, self.bank.get(c, ws)) for c in listed]
+        else:
+            # A large effect changes the signatures of the others.
+            found = signatures_beside(ws, listed, fit)
+        return Screen(ws, self._not_acquitted(ws, found, residual, fit))
+
+    def _not_acquitted(
+        self, ws: Workspace, found: list[tuple[Candidate, Columns]], residual: FloatArray, fit: Fit | None
+    ) -> list[tuple[Candidate, Columns]]:
+        """Without detectors and beams that would show in the fourth reading if they made much of ``residual`` (D,)."""
+        excess = ws.loss(residual) - ws.size
+        reading = self.recorded.fourth if fit is None else fourth_reading(ws, residual)
+        if reading is None or not reading.acquits or excess < (FAR - 1.0) * ws.size:
+            return found
+        least = 2.0 * reading.allowed / (PART * excess)
+        # Mistakes of the set-up touch every channel; those of a detector are steps that the readings themselves show.
+        return [
+            (c, columns)
+            for c, columns in found
+            if c.effect.stage not in STAGES or c.effect.name in SETUP or visible(ws, columns) < least
+        ]
 
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
         """By load case, channel and frequency band, and what it follows."""
@@ -184,6 +215,34 @@ def hung(problem: Problem) -> Problem:
         problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others
     )
     return replace(problem, search=found, result=result, fit=fit, null=null)
+
+
+def free_loads(problem: Problem) -> Problem:
+    """If much remains: what hung, with every load that was noted free, and the search once more beside that."""
+    machine, ws = rig_of(problem), workspace_of(problem.comparison)
+    before = ws.gap(problem.fit.difference)
+    if machine.recorded.wrong or before < FREED_FROM * ws.floor():
+        return problem
+    wrong, observations = [], []
+    for i, (o, difference) in enumerate(zip(ws.observations, problem.fit.difference, strict=True)):
+        asked = levels(ws, i, difference, plateaus(o, i))
+        if not all_free(asked):
+            return problem
+        # A person knows when nothing hangs.
+        own = [(p, more) for p, more in zip(asked.plateaus, asked.more, strict=True) if np.any(p.noted != 0.0)]
+        loads = o.loads.copy()
+        for p, more in own:
+            loads[p.first : p.last] += more
+        wrong += [p for p, _ in own]
+        observations.append(dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed()))
+    problem.progress('what hung instead of what was noted')
+    recorded = replace(machine.recorded, observations=tuple(observations), wrong=tuple(wrong))
+    recorded = replace(recorded, stated_gap=recorded.stated_gap or problem.gap_before)
+    freed = recordings_ready.freed(recorded, recordings_ready.beside(ws, observations, recorded.known))
+    recorded = replace(recorded, fourth=fourth_reading(freed, freed.residual(freed.base)[0]))
+    other = replace(machine, recorded=recorded, workspace=freed, bank=SignatureBank(), proposals=_proposals(freed))
+    found = solve(other, (search, hung, weigh), problem.seed, problem.progress, problem.rng)
+    return found if found.comparison.gap(found.fit.difference) < CLOSED * before else problem
 
 
 def law(problem: Problem) -> Problem:

@@ -36,6 +36,7 @@ from psd_deflection.studies.discover.setup.hung import (
 from psd_deflection.studies.discover.setup.hung import (
     swaying as swaying_of,
 )
+from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
 from psd_deflection.studies.noted_loads import SETTLED_S, MendedLoads, shifts
 
@@ -54,6 +55,7 @@ class Recorded:
     wiring were put right, 0 if they were right. ``lattice``: the effect of coarse steps that the readings show.
     ``delays``: by how much the loads may be noted late, s. ``mended``: of each recording, its loads as they were put
     right, if they were. ``wrong``: where another load hung than noted; it is free.
+    ``fourth``: what the readings say of themselves.
     """
 
     observations: tuple[Observation, ...]
@@ -67,6 +69,7 @@ class Recorded:
     delays: tuple[float, ...] = ()
     mended: tuple[MendedLoads | None, ...] = ()
     wrong: tuple[Plateau, ...] = ()
+    fourth: FourthReading | None = None
 
     @property
     def physics(self) -> Physics:
@@ -146,6 +149,11 @@ def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
         workspace = Workspace(cut, recorded.known)
     recorded = replace(recorded, delays=tuple(delays))
     recorded, workspace = _as_hung(recorded, workspace)
+    residual, difference = workspace.residual(workspace.base)
+    if workspace.gap(difference) > MUCH * workspace.floor():
+        # Poses that are far off bend what no movement makes.
+        residual = solved(workspace, difference)
+    recorded = replace(recorded, fourth=fourth_reading(workspace, residual))
     return recorded, workspace.replaced(nuisance=_beginnings(workspace))
 
 
@@ -158,7 +166,7 @@ def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Worksp
         findings = [s.finding(workspace.observations[s.plateau.recording]) for s in swaying]
         if swaying:
             cut = [_without_swaying(o, i, swaying) for i, o in enumerate(workspace.observations)]
-            workspace = Workspace(cut, recorded.known)
+            workspace = beside(workspace, cut, recorded.known)
         observations = list(workspace.observations)
         for plateau, more in wrong:
             o = observations[plateau.recording]
@@ -166,7 +174,7 @@ def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Worksp
             loads[plateau.first : plateau.last] += more
             observations[plateau.recording] = dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed())
         if swaying or wrong:
-            workspace = Workspace(observations, recorded.known)
+            workspace = beside(workspace, observations, recorded.known)
             recorded = replace(
                 recorded,
                 observations=workspace.observations,
@@ -206,6 +214,13 @@ def _without_swaying(o: Observation, recording: int, swaying: Sequence[Swaying])
         if s.plateau.recording == recording:
             volts[s.plateau.first : s.plateau.last + round(SETTLED_S * slowest / o.period)] = np.nan
     return _with_volts(o, volts)
+
+
+def beside(workspace: Workspace, observations: Sequence[Observation], known: Sequence[ActiveEffect]) -> Workspace:
+    """The ``observations`` in place of those of ``workspace``, with its simulations counted on."""
+    out = Workspace(observations, known)
+    workspace.tally.count += out.tally.count
+    return out.replaced(tally=workspace.tally)
 
 
 def freed(recorded: Recorded, workspace: Workspace) -> Workspace:

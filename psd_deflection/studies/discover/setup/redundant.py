@@ -7,23 +7,109 @@ one of them is, and the link may be as well.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.linalg import eigh, null_space
 
 from psd_deflection.model.plate.linear import design_matrix
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, State, Values
+from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
+from psd_deflection.studies.discover.search.workspace import Workspace
 
 DOTS = list(DOT_CHANNELS)
+CLIP = 6.0
+"""Outliers of heavy-tailed noise count no more than so many standard deviations."""
+LIMIT = 5.0
+"""Standard deviations of chi-square within which the fourth reading is noise."""
+UNSURE = 0.03
+"""Share by which the estimated noise may be wrong, as a variance."""
+PART = 0.2
+"""A detector or beam that explains less than this share of the gap is not asked about."""
+STAGES = frozenset(('optics', 'psd', 'electronics'))
+"""Of the effects that the fourth reading can acquit."""
 
 
-def plate_of(rig: Rig) -> FloatArray:
-    """(4, 3): movements of the dots, m, by dX, dY, m, and theta, rad."""
-    return design_matrix(rig.centers + rig.zeros)
+@dataclass(frozen=True, slots=True)
+class FourthReading:
+    """``chi_square`` of what no movement of the plate makes, over ``values`` numbers: as large if it is noise."""
+
+    chi_square: float
+    values: int
+
+    @property
+    def allowed(self) -> float:
+        """How much more than ``values`` chi-square may be of noise alone."""
+        return LIMIT * float(np.sqrt(2.0 * self.values)) + UNSURE * self.values
+
+    @property
+    def acquits(self) -> bool:
+        """Whether no detector, beam or amplifier is at fault."""
+        return self.chi_square - self.values < self.allowed
 
 
 def moved_plate(rig: Rig, volts: FloatArray, there: FloatArray) -> FloatArray:
     """The plate's movement (3, m), m, m, rad, of readings (6, m), V; NaN where one is missing (``there`` 0)."""
     dots = volts[DOTS] * rig.sensitivities.reshape(4, 1)
-    out = np.linalg.pinv(plate_of(rig)) @ dots
+    out = np.linalg.pinv(design_matrix(rig.centers + rig.zeros)) @ dots
     out[:, (there[DOTS] <= 0.0).any(axis=0)] = np.nan
     return np.asarray(out)
+
+
+def fourth(ws: Workspace, vectors: FloatArray) -> FloatArray:
+    """What no movement of the plate makes of whitened ``vectors`` (k, D): (k, m), of unit variance if it is noise."""
+    out = []
+    for i, (o, noise) in enumerate(zip(ws.observations, ws.noise, strict=True)):
+        across = null_space(design_matrix(o.rig.centers + o.rig.zeros).T)[:, 0]
+        across = across * o.rig.sensitivities.ravel() * noise.innovation[DOTS]
+        across = across / np.linalg.norm(across)
+        rows = np.array([ws.split(v)[i][DOTS] for v in vectors])
+        there = (ws.count[i][DOTS] > 0.0).all(axis=0)
+        out.append(np.einsum('c,kct->kt', across, rows[:, :, there]))
+    return np.concatenate(out, axis=1)
+
+
+def fourth_reading(ws: Workspace, residual: FloatArray) -> FourthReading:
+    """Of a whitened ``residual`` (D,), measured minus simulated, of poses that are nearly right."""
+    rest = np.clip(fourth(ws, residual[None, :])[0], -CLIP, CLIP)
+    return FourthReading(float(rest @ rest), len(rest))
+
+
+def solved(ws: Workspace, difference: Sequence[FloatArray]) -> FloatArray:
+    """The whitened residual (D,) of the poses that the readings say; ``difference``: of the simulated ones."""
+    moves = [np.zeros((3, d.shape[1])) for d in difference]
+    for _ in range(2):
+        for i, (o, part) in enumerate(zip(ws.observations, difference, strict=True)):
+            more = moved_plate(o.rig, part, ws.count[i])
+            moves[i] += np.where(np.isfinite(more), more, 0.0)
+        asked = [_moved(i, len(moves), np.repeat(m, ws.fine[i], axis=1)) for i, m in enumerate(moves)]
+        residual, difference = ws.residual([*ws.base, *asked])
+    return residual
+
+
+def _moved(recording: int, count: int, by: FloatArray) -> ActiveEffect:
+    """The pose of one recording moved ``by`` (3, n)."""
+
+    def move(chunk: SimulatedSamples, values: Values, state: State) -> None:
+        n = min(chunk.pose.shape[1], by.shape[1])
+        chunk.pose[:, :n] += by[:, :n]
+
+    choices = tuple(range(1, count + 1))
+    which = EffectParameter('recording', '', 1, count, 1, '', nominal=1, kind='choice', choices=choices, each=True)
+    share = EffectParameter('share', '', 0.0, 1.0, 1.0, '')
+    effect = Effect('moved', 'link', '', '', '', '', (which, share), 'pose', apply=move, order=99, whole=True)
+    return ActiveEffect(effect, {'recording': recording + 1, 'share': 1.0})
+
+
+def visible(ws: Workspace, columns: Sequence[Sequence[FloatArray]]) -> float:
+    """The least share of its energy that an effect with signatures ``columns`` shows in the fourth reading."""
+    white = np.array([ws.whiten(c) for c in columns])
+    own = fourth(ws, white)
+    whole = white @ white.T
+    lengths = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+    whole = whole / np.outer(lengths, lengths) + 1e-9 * np.eye(len(white))
+    seen = (own @ own.T) / np.outer(lengths, lengths)
+    return float(eigh(seen, whole, eigvals_only=True)[0])
