@@ -221,11 +221,13 @@ def free_loads(problem: Problem) -> Problem:
     """If much remains: what hung, with every load that was noted free, and the search once more beside that."""
     machine, ws = rig_of(problem), workspace_of(problem.comparison)
     before = ws.gap(problem.fit.difference)
-    if machine.recorded.wrong or before < FREED_FROM * ws.floor():
+    if before < FREED_FROM * ws.floor():
         return problem
     wrong, observations = [], []
     for i, (o, difference) in enumerate(zip(ws.observations, problem.fit.difference, strict=True)):
-        asked = levels(ws, i, difference, plateaus(o, i))
+        noted = {p.first: p.noted for p in machine.recorded.wrong if p.recording == i}
+        listed = [replace(p, noted=noted.get(p.first, p.noted)) for p in plateaus(o, i)]
+        asked = levels(ws, i, difference, listed)
         if not all_free(asked):
             return problem
         # A person knows when nothing hangs.

@@ -237,7 +237,11 @@ def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
         unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(mended.loads).max(axis=0), 1e-30)
         if len(mended.measured) <= MOST_MEASURED:
             free += [d for m in mended.measured for d in of_plateau(o, i, m, m.sd * unit)]
-    return workspace.freed(free)
+    workspace = workspace.freed(free)
+    # What a large load bends is no change in proportion.
+    for _ in range(2 if recorded.wrong else 0):
+        workspace = workspace.settled(workspace.residual(workspace.base)[1])
+    return workspace
 
 
 def _beginnings(workspace: Workspace) -> tuple[ActiveEffect, ...]:
