@@ -20,7 +20,7 @@ from psd_deflection.model.simulation.laws import Law, effect_of, law_text, value
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
-from psd_deflection.studies.discover.laws.laws import FoundLaw
+from psd_deflection.studies.discover.laws.laws import WRITTEN, FoundLaw
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.localise import Localisation
@@ -29,6 +29,9 @@ from psd_deflection.studies.discover.search.ties import ties
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.study import StudyResult, Tell, described, edited_rig_file, named, warn_caller
+
+SHOWN = 1e-3
+"""µm and µrad: a smaller change of an estimate is none."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -172,7 +175,7 @@ class RigConclusion(Conclusion):
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
     ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
     set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
-    ``moves``: by how much at most the effects change an estimate that does not know of them: dX m, dY m, theta rad.
+    ``moves``: by how much at most an estimate that does not know of the effects is wrong: dX m, dY m, theta rad.
     ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
     became, '' if it is none. ``tell``: takes warnings.
     """
@@ -198,7 +201,9 @@ class RigConclusion(Conclusion):
     @property
     def laws(self) -> list[Law]:
         """The law's parts, by the name that they get."""
-        return [] if self.law is None else self.law.adopted(self.adopted or 'law')
+        if self.law is None or self.law.heldout_gap > WRITTEN * self.gap_floor:
+            return []
+        return self.law.adopted(self.adopted or 'law')
 
     @property
     def sources(self) -> Mapping[str, str]:
@@ -423,8 +428,12 @@ def _moved(discovery: RigConclusion) -> str:
     if not discovery.effects:
         return ''
     dx, dy, theta = (1e6 * v for v in discovery.moves)
+    if max(dx, dy, theta) < SHOWN:
+        return 'The estimates of the pose are right without; the simulated motion, and with it the wrench, is not.'
     them = 'it' if len(discovery.effects) == 1 else 'them'
-    return f'Without {them} an estimate is wrong by up to ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad.'
+    sizes = (('ΔX', dx, 'µm'), ('ΔY', dy, 'µm'), ('θ', theta, 'µrad'))
+    words = ', '.join(f'{name} {size:.3g} {unit}' for name, size, unit in sizes if size >= SHOWN)
+    return f'Without {them} an estimate is wrong by up to {words}.'
 
 
 def _law(discovery: RigConclusion) -> str:

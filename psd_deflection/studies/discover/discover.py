@@ -311,8 +311,14 @@ def _proposals(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> di
 
 
 def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
-    """By how much at most the effects of ``fit`` change the estimates of the recordings: dX m, dY m, theta rad."""
-    tables = ws.block_dots(ws.simulate([*ws.base, *fit.effects])), ws.block_dots(ws.simulate(ws.base))
+    """By how much at most the effects of ``fit`` make the estimates of the recordings wrong: dX m, dY m, theta rad.
+
+    An effect on the load or the link moves the tip, and an estimate says rightly where it is.
+    """
+    moving = [a for a in fit.effects if a.effect.stage not in STAGES or a.effect.name in SETUP]
+    if len(moving) == len(fit.effects):
+        return (0.0, 0.0, 0.0)
+    tables = ws.block_dots(ws.simulate([*ws.base, *fit.effects])), ws.block_dots(ws.simulate([*ws.base, *moving]))
     most = np.zeros(3)
     for o, dots, nominal in zip(ws.observations, *tables, strict=True):
         solver = solver_from_rig(o.rig.estimator.solver, o.rig)

@@ -53,7 +53,13 @@ TIED = 21.6
 UNDETERMINED = 100.0
 """Standard deviation, over its value, from which on a number counts as not determined."""
 EXPLAINS = 0.5
-"""Share of what is left, in chi-square, that a law must explain."""
+"""Share of what is left that a law must explain: in chi-square, and on unseen load cases."""
+MANY_TIMES, NEAR_S = 3, 0.3
+"""So many times of switching, most of them so near to changes of the load, s, are the loads'."""
+MOVES = 3.0
+"""Means of blocks that differ by more floors than this are no noise."""
+WRITTEN = 2.0
+"""A law that leaves more floors than this on unseen load cases is told, but is no model: it is not written."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -329,7 +335,9 @@ def _law_of_the_mean(
     p = math.exp(chances + float(chi2_law.logsf(gain, max(parameters, 1))))
     bic = gain - (best.cost - found.chi2 - penalty * without.parameters)
     held = heldout_gain(ws, without, found, rng)
-    enough = fit.chi2 - found.chi2 > EXPLAINS * excess
+    left = heldout_gap(ws, found)
+    enough = fit.chi2 - found.chi2 > EXPLAINS * excess and _predicts(ws, fit, left)
+    enough &= not _at_changes(ws, best.laws)
     enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_ACCEPT
     if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.holds or not enough:
         return None
@@ -343,8 +351,27 @@ def _law_of_the_mean(
         p,
         bic,
         held,
-        heldout_gap(ws, found),
+        left,
     )
+
+
+def _predicts(ws: Workspace, fit: Fit, left: float) -> bool:
+    """Whether a law that leaves a gap ``left``, m, on unseen load cases closes half of what ``fit`` leaves, as energies
+    beyond noise.
+    """
+    floor = ws.floor()
+    return left**2 - floor**2 <= (1.0 - EXPLAINS) * max(ws.gap(fit.difference) ** 2 - floor**2, 0.0)
+
+
+def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
+    """Whether most of the times at which ``laws`` switch are those at which the loads change: the loads do it."""
+    times = np.array([t for law in laws for term in law.terms for t in term.times])
+    (o, *more) = ws.observations
+    changes = np.flatnonzero(np.any(np.diff(o.loads, axis=0) != 0.0, axis=1)) * o.period
+    if len(times) < MANY_TIMES or more or len(changes) == 0 or len(changes) > o.duration:
+        return False
+    near = np.abs(times[:, None] - changes).min(axis=1) < NEAR_S
+    return bool(np.mean(near) > 0.5)
 
 
 def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
@@ -368,6 +395,9 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
     p = tried * float(chi2_law.sf(gain, 1))
     if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.holds or slope <= 0.0:
+        return None
+    # Noise that grows with the motion explains no gap: what remains in means is a movement.
+    if ws.gap(fit.difference) > MOVES * ws.floor():
         return None
     scale = float(np.mean([n.innovation[c] * math.sqrt(s) for n, s in zip(ws.noise, ws.fine, strict=True)]))
     if not channel.startswith('sum'):

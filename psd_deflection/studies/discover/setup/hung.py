@@ -21,7 +21,7 @@ from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.workspace import LoadDirection, Workspace, fine_means
-from psd_deflection.studies.discover.setup.redundant import moved_plate
+from psd_deflection.studies.discover.setup.redundant import across_plate, moved_plate
 from psd_deflection.studies.noted_loads import MeasuredLoad, ordinal, unnoted_steps
 
 BoolArray = npt.NDArray[np.bool_]
@@ -40,6 +40,8 @@ SOFTER, OFFSET = 0.1, 0.5
 """Standard deviations of what effects do to a load: share, and N or N m."""
 SWAYS, SLOWEST_HZ, FASTEST_HZ = 8.0, 0.3, 6.0
 """A weight that sways makes so much more slow movement than any other, in this band."""
+PLATE = 10.0
+"""And moves the plate: what no movement of the plate makes has so many times less energy."""
 SWAYS_M = 2e-6
 """And at least this, rms."""
 FREE = 100.0
@@ -112,13 +114,15 @@ def plateaus(o: Observation, recording: int) -> list[Plateau]:
 class PlateauLoads:
     """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the noted one, N, N, N m.
 
-    ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
+    ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it;
+    ``across`` (m,): of the dots, what no movement of the plate makes, m.
     """
 
     plateaus: tuple[Plateau, ...]
     more: FloatArray
     rest: FloatArray
     moved: FloatArray
+    across: FloatArray
 
     @property
     def noted(self) -> FloatArray:
@@ -141,7 +145,7 @@ def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequen
         more[:, axis] = found[1:] / compliance[axis]
         rest[axis, there] = moved[axis, there] - found @ columns[:, there]
     # What the first time has is an offset, which all have.
-    return PlateauLoads(tuple(listed), more, rest, np.where(there, moved, np.nan))
+    return PlateauLoads(tuple(listed), more, rest, np.where(there, moved, np.nan), across_plate(o.rig, difference))
 
 
 def _held(listed: Sequence[Plateau], samples: int, size: int, blocks: int) -> BoolArray:
@@ -244,11 +248,13 @@ def swaying(ws: Workspace, recording: int, found: PlateauLoads) -> list[Swaying]
         if there.sum() < round(0.5 / period):
             rows.append((0.0, 0.0, 0.0))
             continue
+        part = np.vstack((part, found.across[a:b]))
         part = np.where(there, part - part[:, there].mean(axis=1, keepdims=True), 0.0)
         power = np.abs(np.fft.rfft(part * np.hanning(b - a), axis=1)) ** 2 / (0.375 * (b - a) ** 2) * 2.0
         f = np.fft.rfftfreq(b - a, period)
         band = (f >= SLOWEST_HZ) & (f <= FASTEST_HZ)
-        each = power[:, band].sum(axis=1)
+        *moves, across = power[:, band].sum(axis=1).tolist()
+        each = np.array(moves) if sum(moves) > PLATE * across else np.zeros(2)
         axis = int(np.argmax(each))
         peak = float(f[band][np.argmax(power[axis, band])]) if band.any() else 0.0
         rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / per[axis]), peak))

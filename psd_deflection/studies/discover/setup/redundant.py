@@ -59,12 +59,20 @@ def moved_plate(rig: Rig, volts: FloatArray, there: FloatArray) -> FloatArray:
     return np.asarray(out)
 
 
+def across_plate(rig: Rig, volts: FloatArray) -> FloatArray:
+    """What no movement of the plate makes (m,), m, of readings (6, m), V."""
+    return np.asarray(_across(rig) @ (volts[DOTS] * rig.sensitivities.reshape(4, 1)))
+
+
+def _across(rig: Rig) -> FloatArray:
+    return np.asarray(null_space(design_matrix(rig.centers + rig.zeros).T)[:, 0])
+
+
 def fourth(ws: Workspace, vectors: FloatArray) -> FloatArray:
     """What no movement of the plate makes of whitened ``vectors`` (k, D): (k, m), of unit variance if it is noise."""
     out = []
     for i, (o, noise) in enumerate(zip(ws.observations, ws.noise, strict=True)):
-        across = null_space(design_matrix(o.rig.centers + o.rig.zeros).T)[:, 0]
-        across = across * o.rig.sensitivities.ravel() * noise.innovation[DOTS]
+        across = _across(o.rig) * o.rig.sensitivities.ravel() * noise.innovation[DOTS]
         across = across / np.linalg.norm(across)
         rows = np.array([ws.split(v)[i][DOTS] for v in vectors])
         there = (ws.count[i][DOTS] > 0.0).all(axis=0)
