@@ -101,10 +101,11 @@ def plateaus(o: Observation, recording: int) -> list[Plateau]:
     dots = o.volts[:, list(DOT_CHANNELS)] * o.rig.sensitivities.ravel()
     unnoted = [round(t / o.period) for t in unnoted_steps(o.rig, dots, o.loads)]
     starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unnoted)])
+    stops = np.append(np.union1d(changed, unnoted), len(o.loads))
     out, number = [], 0
-    for i, (first, alone) in enumerate(starts):
+    for first, alone in starts:
         number += not alone and first > 0
-        last = starts[i + 1][0] if i + 1 < len(starts) else len(o.loads)
+        last = int(stops[np.searchsorted(stops, first, side='right')])
         if (last - first) * o.period >= LONG_S:
             out.append(Plateau(recording, first, last, number, alone, o.loads[(first + last) // 2].copy()))
     return out
