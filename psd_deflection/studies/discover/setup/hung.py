@@ -246,7 +246,8 @@ def swaying(ws: Workspace, recording: int, found: PlateauLoads) -> list[Swaying]
         a, b = p.first // ws.fine[recording] + round(0.4 / period), p.last // ws.fine[recording]
         part = found.rest[:2, a:b]
         there = np.isfinite(part).all(axis=0)
-        if there.sum() < round(0.5 / period):
+        # How the link moved before the first sample is nobody's mistake.
+        if p.first == 0 or there.sum() < round(0.5 / period):
             rows.append((0.0, 0.0, 0.0))
             continue
         part = np.vstack((part, found.across[a:b]))

@@ -1,0 +1,147 @@
+"""What hung instead of what was noted, what the fourth reading says, and a load cell's noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
+from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.noted_loads import mend_loads, unnoted_steps, without_cell_noise
+
+RIG = load_rig()
+LEVELS = np.array(
+    [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (0, 0, 0)], float
+)
+DWELL = 4000
+HUNG = np.repeat(LEVELS, DWELL, axis=0)
+NUMBER = np.arange(len(HUNG))
+
+
+def read(acting: FloatArray, **true: object) -> FloatArray:
+    """What the device reads (n, 6), V, under ``acting`` loads, of a rig that differs by ``true``."""
+    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
+    return np.asarray(RigSimulator(rig, 3).step(acting).counts * RIG.converter.volts_per_count, dtype=np.float64)
+
+
+TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.004}
+
+
+def searched(volts: FloatArray, noted: FloatArray) -> Discovery:
+    return discover([Observation('x', RIG, volts, noted)])
+
+
+def noted_as(number: int, load: tuple[float, float, float]) -> FloatArray:
+    """The loads with another one in plateau ``number``."""
+    out = HUNG.copy()
+    out[number * DWELL : (number + 1) * DWELL] = load
+    return out
+
+
+@pytest.mark.statistics
+def test_a_weight_that_was_hung_and_never_noted_is_told_with_what_hung() -> None:
+    found = searched(read(HUNG, **TURNED), noted_as(2, (0, -20, 0)))
+    assert [(f.name, f.where) for f in found.setup] == [('load_size', 'after load 1')]
+    assert 'not noted: from 8.000 s to 12.000 s (0 N, -50 N, 0 N m) hung, not (0 N, -20 N, 0 N m)' in found.setup[0].fix
+    assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
+    assert found.effects[0].active.values['angle'] == pytest.approx(0.004, abs=4.0 * found.effects[0].sd['angle'])
+    assert found.verdict == 'effects_found'
+    assert found.floors < 1.05
+
+
+@pytest.mark.statistics
+def test_a_load_that_was_noted_twice_is_told() -> None:
+    found = searched(read(HUNG), noted_as(5, (80, -80, 40)))
+    assert [(f.name, f.where) for f in found.setup] == [('load_size', 'load 5')]
+    assert 'the 5th load of x was noted wrong' in found.setup[0].fix
+    assert '(40 N, -40 N, 20 N m) hung, not (80 N, -80 N, 40 N m)' in found.setup[0].fix
+    assert found.verdict == 'nothing_missing'
+
+
+@pytest.mark.statistics
+def test_rounded_loads_are_told_one_by_one_and_the_effect_beside_them() -> None:
+    odd = LEVELS + np.array(
+        [(0, 0, 0), (0, 1.3, 0), (0, -2.1, 0), (0, 1.7, 0.9), (2.2, 0, 0), (-1.1, 2.4, 0), (0, 1.9, 0), (0, 0, 0)]
+    )
+    found = searched(read(np.repeat(odd, DWELL, axis=0), **TURNED), HUNG)
+    assert [f.where for f in found.setup] == [f'load {i}' for i in range(1, 7)]
+    assert {f.name for f in found.setup} == {'load_size'}
+    assert '(38.9 N, -37.6 N, 20 N m) hung' in found.setup[4].fix
+    assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
+    assert found.verdict == 'effects_found'
+    assert found.law is None
+
+
+@pytest.mark.statistics
+def test_a_weight_that_sways_is_told_and_its_time_left_out() -> None:
+    acting = HUNG.copy()
+    at = (NUMBER - 3 * DWELL) / 1000.0
+    acting[:, 0] += np.where((at > 0.0) & (at < 4.0), np.sin(2.0 * np.pi * 1.3 * at), 0.0)
+    found = searched(read(acting), HUNG)
+    assert [(f.name, f.where) for f in found.setup] == [('load_sway', 'load 3')]
+    assert 'swayed at 1.3' in found.setup[0].fix
+    assert found.setup[0].value == pytest.approx(1.0, rel=0.1)
+    assert found.verdict == 'nothing_missing'
+
+
+@pytest.mark.statistics
+def test_the_noise_of_a_load_cell_is_no_effect() -> None:
+    noise = np.random.default_rng(1).normal(size=HUNG.shape) * (0.05, 0.05, 0.01)
+    found = searched(read(HUNG), HUNG + noise)
+    assert found.verdict == 'nothing_missing'
+    assert not found.setup
+    assert found.floors < 1.05
+
+
+def test_a_load_cell_is_averaged_between_steps_and_motion_is_not() -> None:
+    noise = np.random.default_rng(1).normal(size=HUNG.shape) * (0.05, 0.05, 0.0)
+    calm, measured = without_cell_noise(HUNG + noise)
+    assert np.abs(calm - HUNG).max() < 5.0 * 0.05 / np.sqrt(DWELL)
+    # The first two have no step between them that stands out of nothing.
+    assert [m.first for m in measured] == [i * DWELL for i in range(len(LEVELS))]
+    assert measured[0].sd == pytest.approx([0.05 / np.sqrt(DWELL)] * 2 + [0.0], rel=0.1)
+    swept = HUNG + np.sin(NUMBER / 30.0)[:, None]
+    assert without_cell_noise(swept) == (pytest.approx(swept), ())
+    assert without_cell_noise(HUNG)[1] == ()
+
+
+def test_a_step_without_a_note_has_its_time() -> None:
+    dots = read(HUNG)[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
+    assert unnoted_steps(RIG, dots, noted_as(2, (0, -20, 0))) == pytest.approx([8.0], abs=2e-3)
+    assert unnoted_steps(RIG, dots, HUNG) == []
+    assert mend_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
+
+
+def prepared(volts: FloatArray, noted: FloatArray) -> Recorded:
+    recorded = Recorded((Observation('x', RIG, volts, noted),), RIG, ())
+    for step in STEPS:
+        recorded = step(recorded)
+    return compared(recorded)[0]
+
+
+def test_the_fourth_reading_acquits_detectors_whatever_hangs_and_convicts_one_that_is_turned() -> None:
+    soft = read(HUNG, link__youngs_modulus=0.9 * RIG.link.youngs_modulus)
+    for volts, noted in ((read(HUNG), HUNG), (read(HUNG), 1.3 * HUNG), (soft, HUNG)):
+        fourth = prepared(volts, noted).fourth
+        assert fourth is not None
+        assert fourth.acquits
+        assert 0.8 * fourth.values < fourth.chi_square < 1.05 * fourth.values
+    turned = prepared(read(HUNG, **TURNED), HUNG).fourth
+    assert turned is not None
+    assert not turned.acquits
+
+
+@pytest.mark.statistics
+def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wrong() -> None:
+    found = searched(read(HUNG, effects__e__name='bending_stiffness', effects__e__scale=-0.06), HUNG)
+    (effect,) = found.effects
+    assert effect.active.effect.stage == 'link'
+    assert not any('sensor' in name or 'gain' in name for name in effect.equivalent)
+    assert found.moves == (0.0, 0.0, 0.0)
+    assert 'The estimates of the pose are right without' in found.sentence
+    assert 'is wrong by up to' not in found.sentence
