@@ -14,7 +14,7 @@ ARGUMENTS: dict[str, str] = {
     'frequency': 'of the mode, Hz, instead of a rig file',
     'damping_ratio': 'of that mode',
     'shaper': 'zv, mzv, zvd, ei, or none to pass trajectories through (empty: the recommended one)',
-    'urdf': 'refuse trajectories beyond the limits of the joints of this file',
+    'urdf': 'refuse trajectories beyond the limits of the joints of this file, or of the topic robot_description',
     'max_step': 'refuse a trajectory that begins further from where the joints are, rad or m (empty: 0.05)',
     'lead': 'a trajectory begins so much later, s, so that it has arrived when it does (empty: 0.1)',
 }

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -40,6 +41,7 @@ from bench.steps import largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.compensation.compensator import CompensatorSettings
 from psd_deflection.records import FloatArray
+from psd_deflection.ros.running import TRANSPORTS
 from tools.program import ROOT, Program
 
 URDF = ROOT / 'config' / 'two_links.urdf'
@@ -63,6 +65,7 @@ TRIES = 5
 WATCHED_S = 0.4
 """How long offsets are watched after a fault, s. After half a second they follow a deflection that jumped and stays."""
 LONGEST_S = 60.0
+ASK_AGAIN_S = 5.0
 RELAYED = {
     'estimator': ('/arm/deflection', '/end_effector/deflection', PoseWithCovarianceStamped),
     'driver': ('/arm/joints', '/joint_states', JointState),
@@ -358,8 +361,16 @@ class Campaign:
         """Let the offsets follow, or let them go."""
         client = self.node.create_client(SetBool, '/compensator/enable')
         self.spin(client.service_is_ready, LONGEST_S, 'the service')
-        answer = client.call_async(SetBool.Request(data=wanted))
-        self.spin(answer.done, LONGEST_S, 'its answer')
+        asked: list[Any] = []
+
+        def answered() -> bool:
+            # DDS loses a request to a service that it has just found.
+            if not asked or time.monotonic() - began > ASK_AGAIN_S * len(asked):
+                asked.append(client.call_async(SetBool.Request(data=wanted)))
+            return any(answer.done() for answer in asked)
+
+        began = time.monotonic()
+        self.spin(answered, LONGEST_S, 'its answer')
         self.node.destroy_client(client)
 
     def follows(self) -> bool:
@@ -371,19 +382,20 @@ class Campaign:
     def inject(self, name: str) -> Injected:
         """One fault, from offsets that follow to offsets that follow; again if the campaign itself was late."""
         for _ in range(TRIES):
-            out = self._once(name)
-            if not self.plant.late:
+            out, late = self._once(name)
+            if not late:
                 break
             self.repeated += 1
         return out
 
-    def _once(self, name: str) -> Injected:
+    def _once(self, name: str) -> tuple[Injected, bool]:
+        """What was found, and whether the campaign was late."""
         self.spin(self.follows, LONGEST_S, f'offsets that follow before: {name}')
         # They are to be far from zero.
         self.spin(lambda: self.plant.error() < 1e-4, LONGEST_S, 'the rigid pose')
         self.plant.late = False
         if name in OWN:
-            return self._own(name)
+            return self._own(name), False
         began = time.time()
         end = self._begin(name)
         self.spin(lambda: False, WATCHED_S)
@@ -392,10 +404,11 @@ class Campaign:
             held = max(self._changed_last() - self._beyond(began), 0.0)
         # To a controller that does not tell what it applies, nothing is said.
         out = self._release(held) if name != 'controller ended' else Injected(held)
+        late = self.plant.late
         end()
         self.enable()
         self.spin(self.follows, LONGEST_S, f'offsets that follow after: {name}')
-        return out
+        return out, late
 
     def _begin(self, name: str) -> Callable[[], None]:
         """Do it; what undoes it."""
@@ -497,6 +510,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument('--only', nargs='+', choices=only, default=[COMPENSATOR, SHAPER], help='these faults alone')
     parser.add_argument('--relay', choices=tuple(RELAYED), help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
+    # As our nodes do: relays are killed, and would leave the campaign deaf.
+    os.environ.setdefault(TRANSPORTS, 'UDPv4')
     if args.relay:
         relay(args.relay)
         return 0

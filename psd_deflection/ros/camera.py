@@ -195,6 +195,9 @@ def _info_fault(message: Any) -> str:
 
 def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Say) -> int:
     """Measure until SIGINT or SIGTERM. Raises ConfigError."""
-    with ros(NODE_NAME, ros_arguments) as signals, contextlib.closing(CameraNode(given, say)) as owner:
+    with (
+        ros(NODE_NAME, ros_arguments, shared_memory=True) as signals,
+        contextlib.closing(CameraNode(given, say)) as owner,
+    ):
         serve(owner, signals)
     return 0

@@ -23,6 +23,16 @@ MOST_BYTES = 20_000_000
 """Maximum size of the message; the largest robots have some hundred thousand bytes."""
 
 
+def listen_to_description(gate: InputGate, take: Callable[[str], None]) -> None:
+    """Let ``take`` have each text on ``robot_description``, the one that was published before, too.
+
+    A ConfigError of ``take`` refuses it.
+    """
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    kind = message_class('std_msgs/msg/String')
+    gate.listen(kind, TOPIC, _fault, lambda message: take(message.data), latched, MOST_BYTES)
+
+
 def robot_description(
     signals: Signals, say: Say, wait_s: float = WAIT_S, clock: Callable[[], float] = time.monotonic
 ) -> str:
@@ -33,16 +43,8 @@ def robot_description(
     heard: list[str] = []
     node = Node(f'{TOPIC}_reader', start_parameter_services=False)
     try:
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         gate = InputGate(node, say)
-        gate.listen(
-            message_class('std_msgs/msg/String'),
-            TOPIC,
-            _fault,
-            lambda message: heard.append(message.data),
-            latched,
-            MOST_BYTES,
-        )
+        listen_to_description(gate, heard.append)
         topic = node.resolve_topic_name(TOPIC)
         say(f'waiting for the robot on {topic}')
         until = clock() + wait_s

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator, Sequence
 
 import rclpy
@@ -15,14 +16,21 @@ from psd_deflection.run.signals import Signals
 
 SPIN_S = 0.1
 """Longest time until a signal takes effect, s."""
+TRANSPORTS = 'FASTDDS_BUILTIN_TRANSPORTS'
+OTHER_CHOICES = (TRANSPORTS, 'FASTDDS_DEFAULT_PROFILES_FILE', 'FASTRTPS_DEFAULT_PROFILES_FILE')
+"""With one of these the user has chosen the transports of Fast DDS."""
 
 
 @contextlib.contextmanager
-def ros(name: str, arguments: Sequence[str]) -> Iterator[Signals]:
+def ros(name: str, arguments: Sequence[str], shared_memory: bool = False) -> Iterator[Signals]:
     """Start rclpy with the ROS ``arguments`` of the program ``name``, and end it; SIGINT and SIGTERM set what is given.
 
-    Raises ConfigError if rclpy does not take the arguments.
+    ``shared_memory``: its messages are large, so that Fast DDS is to use it. A process that was killed in it may leave
+    the others deaf (https://github.com/eProsima/Fast-DDS/issues/5053), so what need not use it does not. Raises
+    ConfigError if rclpy does not take the arguments.
     """
+    if not shared_memory and not any(choice in os.environ for choice in OTHER_CHOICES):
+        os.environ[TRANSPORTS] = 'UDPv4'
     signals = Signals()
     try:
         try:

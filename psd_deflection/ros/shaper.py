@@ -1,8 +1,8 @@
 """The node ``shaper``: joint trajectories in, the same out, shaped so that they do not ring the link.
 
 It subscribes to ``~/trajectory`` and publishes ``~/shaped``, one for each. What cannot be followed is refused, with the
-reason in the log and in ``/diagnostics``. ``joint_states`` tells where the joints are. Everything is done in the main
-thread.
+reason in the log and in ``/diagnostics``. ``joint_states`` tells where the joints are; the parameter ``urdf`` says
+where their limits are: in a file, or on ``robot_description``. Everything is done in the main thread.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ from rclpy.duration import Duration
 from rclpy.time import Time
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from psd_deflection.arms.compensation.shaping import SHAPING, ShaperSettings, trajectory_shaper
+from psd_deflection.arms.compensation.arm import limits_of
+from psd_deflection.arms.compensation.shaping import DESCRIPTION, SHAPING, ShaperSettings, trajectory_shaper
 from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory, checked, start_of
 from psd_deflection.arms.inputs import KnownJoints, joints_fault, stamp_fault
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING, Say
 from psd_deflection.base.printable import printable
+from psd_deflection.ros.description import listen_to_description
 from psd_deflection.ros.names import JOINT_STATES
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
@@ -56,7 +58,15 @@ class ShaperNode(BaseNode):
         self._out = self.publisher(JointTrajectory, SHAPED)
         self.gate.listen(JointTrajectory, GIVEN, _trajectory_fault, self._given, 10)
         self.gate.listen(states, JOINT_STATES, lambda m: joints_fault(m.name, m.position, ()), self._joints)
+        self._undescribed = self._settings.urdf == DESCRIPTION
+        if self._undescribed:
+            listen_to_description(self.gate, self._described_as)
         self.log(f'publishing {self._out.topic_name}: {self._described}')
+
+    def _described_as(self, urdf: str) -> None:
+        self._shaper.limits = limits = limits_of(urdf, DESCRIPTION)
+        self._undescribed = False
+        self.log(f'limits of {", ".join(limits)} from {DESCRIPTION}')
 
     def _changed(self, settings: ShaperSettings) -> None:
         self._settings = settings
@@ -75,6 +85,8 @@ class ShaperNode(BaseNode):
             return
         now, stamp = time.monotonic(), message.header.stamp
         try:
+            if self._undescribed:
+                raise ConfigError(f'nobody has told the limits of the joints on {DESCRIPTION} yet')
             trajectory = _trajectory(message)
             start_ns = start_of(self.now_ns(), int(Time.from_msg(stamp).nanoseconds), self._settings.lead)
             shaped = self._shaper.shape(start_ns, trajectory, self._known.positions(now))

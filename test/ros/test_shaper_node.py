@@ -16,7 +16,9 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import GetParameters, SetParameters  # noqa: E402
 from rclpy.duration import Duration  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
+from std_msgs.msg import String  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from bench.damping import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played  # noqa: E402
@@ -109,6 +111,35 @@ def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> Non
     heard.clear()
     given.publish(message())
     peer.until(lambda: any(not h.points for h in heard), 'the stop')
+
+
+def test_the_limits_come_from_the_robots_description(domain: int, peer: Any) -> None:
+    words = [*ZVD, '--urdf', 'robot_description']
+    node = Program([*PSD_DEFLECTION, 'shaper', *words], env={'PYTHONWARNINGS': WARNINGS})
+    try:
+        given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
+        heard = peer.collect(JointTrajectory, '/shaper/shaped')
+        peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
+        told(peer, shoulder=START[0], elbow=START[1])
+        move_of = {'slow': (2.0 * MOVE_S, END.tolist()), 'far': (MOVE_S, [1e3, 0.0])}
+
+        def refused(why: str, kind: str) -> None:
+            good = message(point(0.0, START.tolist()), point(*move_of[kind]))
+            peer.until(lambda: given.publish(good) or why in node.text, why)
+
+        refused('trajectory refused: nobody has told the limits of the joints on robot_description yet', 'slow')
+        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        described = peer.node.create_publisher(String, '/robot_description', latched)
+        described.publish(String(data='<robot'))
+        peer.until(lambda: 'robot_description: refused' in node.text, 'a refusal of what is no URDF')
+        described.publish(String(data=URDF.read_text()))
+        peer.until(lambda: 'limits of shoulder, elbow' in node.text, 'the limits')
+        refused('trajectory refused: shoulder', 'far')
+        good = message(point(0.0, START.tolist()), point(*move_of['slow']))
+        peer.until(lambda: given.publish(good) or bool(heard), 'the shaped trajectory')
+    finally:
+        assert node.end() == 0
+    print(node.text)
 
 
 def test_settings_are_parameters(node: Program, peer: Any) -> None:

@@ -42,6 +42,7 @@ MOVED_SHARE = 0.1
 LEAST_SD = 1e-10
 """Nobody measures a deflection to better than this, m or rad: one that says so does not know its uncertainty."""
 UNTOLD = 'the controller does not tell the offsets that it applies'
+AWAITED = 'good deflections are awaited'
 
 
 class State(StrEnum):
@@ -262,6 +263,9 @@ class Compensator:
 
     def stop(self, why: str) -> None:
         """Hold for as long as ``why`` is not '': the robot does not run, or somebody else commands it."""
+        if self._stop and not why and self._fault == self._stop:
+            # That is over. What it waits for now is what comes next, or does not come.
+            self._fault = AWAITED
         self._stop = why
 
     def applied(self, now: float, offsets: FloatArray) -> None:
@@ -392,7 +396,7 @@ class Compensator:
         why = why or self._stop or self._broken
         if why:
             self._hold(why)
-        elif not self._fault:
+        elif self._fault in ('', AWAITED):
             if now - self._last_now > stale:
                 self._hold(f'no deflection for {stale:g} s')
             elif now - self._joints_t > stale:

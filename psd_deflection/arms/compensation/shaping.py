@@ -14,6 +14,7 @@ from psd_deflection.rig.parameters import Section, check_value, parameter
 
 MODES = ('bending', 'torsion')
 RECOMMENDED, NONE = 'recommended', 'none'
+DESCRIPTION = 'robot_description'
 LEAST_FREQUENCY = 0.1
 """Of a mode, Hz."""
 
@@ -36,7 +37,12 @@ class ShaperSettings:
         'is 5 % off',
         choices=(*KINDS, RECOMMENDED, NONE),
     )
-    urdf: str = parameter('', '', 'refuse trajectories beyond the limits of the joints of this URDF file')
+    urdf: str = parameter(
+        '',
+        '',
+        'refuse trajectories beyond the limits of the joints of this URDF file; '
+        f'{DESCRIPTION}: of the robot that this topic describes',
+    )
     max_step: float = parameter(
         0.05,
         'rad or m',
@@ -89,9 +95,12 @@ def shaper_of(settings: ShaperSettings) -> tuple[Shaper, str]:
 
 
 def trajectory_shaper(settings: ShaperSettings) -> tuple[TrajectoryShaper, str]:
-    """What shapes trajectories as the settings say, and a line about it. Raises ConfigError."""
+    """What shapes trajectories as the settings say, and a line about it; without limits yet if a topic has them.
+
+    Raises ConfigError.
+    """
     found, described = shaper_of(settings)
-    limits = read_limits(settings.urdf) if settings.urdf else {}
+    limits = read_limits(settings.urdf) if settings.urdf not in ('', DESCRIPTION) else {}
     return TrajectoryShaper(found, limits, settings.max_step), described
 
 

@@ -171,7 +171,7 @@ class TrajectoryShaper:
     def __init__(self, shaper: Shaper, limits: Mapping[str, JointLimits] | None = None, max_step: float = 0.05) -> None:
         self.shaper = shaper
         self.max_step = max_step
-        self._limits = dict(limits or {})
+        self.limits: Mapping[str, JointLimits] = dict(limits or {})
         self._pieces: list[_Piece] = []
 
     def forget(self) -> None:
@@ -236,9 +236,9 @@ class TrajectoryShaper:
     def _check_limits(self, given: Trajectory) -> None:
         low, high, speed = given.fastest()
         for j, name in enumerate(given.names):
-            if not self._limits:
+            if not self.limits:
                 return
-            limits = self._limits.get(name)
+            limits = self.limits.get(name)
             if limits is None:
                 raise ConfigError(f'{name}: the URDF file has no joint of that name that moves')
             for value, bound, word in ((low[j], limits.lower, 'least'), (high[j], limits.upper, 'most')):

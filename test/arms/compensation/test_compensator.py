@@ -434,6 +434,14 @@ def test_a_controller_that_starts_again_without_offsets_is_sent_no_step(arm: Arm
     assert loop.step() <= 1.0 + 1e-9
 
 
+def test_a_stop_that_is_over_is_no_reason_any_more(arm: Arm) -> None:
+    loop = following(arm)
+    loop.compensator.stop('the robot does not run')
+    assert loop.run(0.1).why == 'the robot does not run'
+    loop.compensator.stop('')
+    assert loop.send(loop.t + 1.0).why == 'no deflection for 0.08 s'
+
+
 def test_switched_off_while_nothing_is_told_the_offsets_go_back_once_it_is(arm: Arm) -> None:
     loop = telling(arm)
     loop.tells = False
