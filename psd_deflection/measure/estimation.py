@@ -27,7 +27,7 @@ from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatus
 from psd_deflection.model.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.model.solvers.one_psd import OnePsd
-from psd_deflection.model.solvers.registry import psds_at_base, solver_class
+from psd_deflection.model.solvers.registry import solver_class
 from psd_deflection.model.solvers.some_psds import solver_of_some
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
@@ -126,7 +126,7 @@ class Estimation:
         self.systematic: FloatArray | None = None
         self.build(rig, effects)
         # After the solvers, which refuse a geometry that cannot be solved.
-        self.stamped = StampedDots(rig, flat=not psds_at_base(rig), tilts=solver_class(config.solver).tilts)
+        self.stamped = StampedDots(rig, flat=not rig.psds_at_base, tilts=solver_class(config.solver).tilts)
 
     def build(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         """Use ``rig`` from the next block on."""
@@ -142,7 +142,7 @@ class Estimation:
     def _spread_from(self, zero_variances: tuple[float, ...]) -> None:
         """Take the uncertainty of the calibration, and of a zero with these variances (2P,) m^2, () if it has none."""
         self.zero_variances = zero_variances
-        at_base = psds_at_base(self._rig)
+        at_base = self._rig.psds_at_base
         self.spread = None if at_base else ParameterSpread.from_rig(self._rig, zero_variances, self._effects)
 
     def memory(self) -> Memory:

@@ -58,6 +58,8 @@ _ORDERED = (
     ('min_samples', 'at most', 'block_size'),
     ('sum_min', 'less than', 'sum_max'),
 )
+BASE_SOLVER = 'base_pair'
+"""The solver that alone says ``arrangement: base``."""
 _COMPARE = {'less than': operator.lt, 'at most': operator.le}
 
 
@@ -122,6 +124,15 @@ class Rig:
     def zeros_by_name(self) -> dict[str, Value]:
         """The unloaded dots, m, by parameter name."""
         return {name: self.values[name] for name in ZEROS[: len(self.psds)]}
+
+    @property
+    def psds_at_base(self) -> bool:
+        """Whether the PSDs are at the base and the lasers on the tip plate.
+
+        Files and recordings from before ``arrangement`` existed say it by the name of their solver.
+        """
+        at = self.estimator.arrangement
+        return at == 'base' or (at == 'auto' and self.estimator.solver == BASE_SOLVER)
 
     @property
     def centers(self) -> FloatArray:

@@ -258,6 +258,13 @@ class EstimatorConfig:
         maximum=1e6,
         live=True,
     )
+    arrangement: str = parameter(
+        'auto',
+        '',
+        'where the PSDs are: on the tip plate, lasers at the base (tip), or the other way round (base); auto: base with '
+        'solver: base_pair, else tip',
+        choices=('auto', 'tip', 'base'),
+    )
     solver: str = parameter('exact', '', 'the solver whose answer is /link_tip/deflection')
     solvers: tuple[str, ...] = parameter(
         ('exact', 'wls', 'iterative'), '', 'solvers that run; each has a topic /link_tip/SOLVER/deflection'

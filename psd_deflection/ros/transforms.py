@@ -16,7 +16,6 @@ from rclpy.node import Node
 
 from msg_adapters.orientation import quaternion
 from psd_deflection.model.plate.scene import Vector
-from psd_deflection.model.solvers.registry import psds_at_base
 from psd_deflection.records import DeflectionEstimate, Record
 from psd_deflection.rig.config import Rig
 from psd_deflection.ros.names import BASE, PSDS, REST, TF, TF_STATIC, TIP
@@ -41,9 +40,9 @@ def transform_message(parent: str, child: str, t_ns: int, at: Vector, rotation: 
 
 
 def static_transforms(rig: Rig, t_ns: int) -> list[Any]:
-    """The TransformStamped of the unloaded tip and of the PSDs, which are on the plate or, ``base_pair``, fixed."""
+    """The TransformStamped of the unloaded tip and of the PSDs, which are on the plate or, at the base, fixed."""
     prefix = rig.monitor.frame_prefix
-    holder = REST if psds_at_base(rig) else TIP
+    holder = REST if rig.psds_at_base else TIP
     return [
         transform_message(prefix + BASE, prefix + REST, t_ns, (0.0, 0.0, rig.link.length), _UPRIGHT),
         *(

@@ -8,7 +8,6 @@ import numpy as np
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.model.link import LinkStatics
-from psd_deflection.model.solvers.registry import psds_at_base
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 
@@ -60,7 +59,7 @@ class Physics:
     @classmethod
     def of(cls, rig: Rig) -> Physics:
         """The nominal constants of a rig file, without effects."""
-        at_base = psds_at_base(rig)
+        at_base = rig.psds_at_base
         return cls(
             period=1.0 / rig.converter.sample_rate_hz,
             length=rig.link.length,

@@ -11,11 +11,12 @@ import importlib
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.plate.layout import Geometry
 from psd_deflection.model.solvers.interface import Solver
-from psd_deflection.rig.config import Rig
+from psd_deflection.rig.config import BASE_SOLVER, Rig
+from psd_deflection.rig.declarations import BY_NAME
 
 
 class Entry(NamedTuple):
@@ -70,22 +71,23 @@ def solver_from_rig(name: str, rig: Rig) -> Solver:
 
     Raises ConfigError for an unknown name, SolverError if the method cannot solve the rig.
     """
+    at, takes = rig.estimator.arrangement, solver_class(name).psds_at
+    if at not in ('auto', takes):
+        raise SolverError(f'{name} takes PSDs at the {takes}; the rig file has arrangement: {at}')
     return make_solver(name, Geometry.from_rig(rig), **solver_class(name).options_from_rig(rig))
 
 
-def psds_at_base(rig: Rig) -> bool:
-    """Whether the PSDs are at the base and the lasers on the tip plate, as the rig's solver has them.
-
-    Raises ConfigError for an unknown solver.
-    """
-    return solver_class(rig.estimator.solver).psds_at == 'base'
-
-
 def check_arrangement(rig: Rig) -> None:
-    """Raise ConfigError if parts of the rig contradict each other about where the PSDs are."""
+    """Raise ConfigError if solvers or heights of the rig contradict where its PSDs are."""
     config = rig.estimator
-    at = solver_class(config.solver).psds_at
-    others = [name for name in config.solvers if solver_class(name).psds_at != at]
+    at = 'base' if rig.psds_at_base else 'tip'
+    others = [name for name in (config.solver, *config.solvers) if solver_class(name).psds_at != at]
+    if config.solver in others:
+        name = BASE_SOLVER if rig.psds_at_base else BY_NAME['solver'].default
+        raise ConfigError(
+            f'arrangement = {config.arrangement!r}: solver = {config.solver!r} takes PSDs at the '
+            f'{solver_class(config.solver).psds_at}: set solver: {name} and solvers: [{name}]'
+        )
     if others:
         raise ConfigError(
             f'solver = {config.solver!r} has the PSDs at the {at}; {", ".join(others)} of solvers have not: '
@@ -96,8 +98,8 @@ def check_arrangement(rig: Rig) -> None:
     for i, psd in enumerate(rig.psds, start=1):
         if at == 'tip' and psd.height < -0.5 * rig.link.length:
             raise ConfigError(
-                f'psd_{i}.height = {psd.height:g} m: that is nearer to the base than to the tip; PSDs at the base, '
-                'with the lasers on the tip plate, need solver: base_pair and solvers: [base_pair]'
+                f'psd_{i}.height = {psd.height:g} m: that is nearer to the base than to the tip; PSDs at the base, with '
+                'the lasers on the tip plate, need arrangement: base, solver: base_pair and solvers: [base_pair]'
             )
 
 

@@ -17,7 +17,6 @@ import numpy as np
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.model.misalignment.model import COUNT, INDEX, ZERO
 from psd_deflection.model.misalignment.rig import RigVector, vector_of_rig
-from psd_deflection.model.solvers.registry import psds_at_base
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.calibrate.dark import DarkLevel, check_effects
@@ -139,8 +138,8 @@ def calibrate(
     Raises RecordingError if a run has neither reference nor loads or too few of them, ConfigError for a rig that
     cannot be calibrated.
     """
-    if psds_at_base(rig):
-        raise ConfigError('solver = base_pair: PSDs at the base are not calibrated')
+    if rig.psds_at_base:
+        raise ConfigError('PSDs at the base (arrangement) are not calibrated')
     check_effects(rig)
     progress('noise')
     noise = np.median([noise_of(run, rig) for run in runs], axis=0)

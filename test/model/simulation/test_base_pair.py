@@ -32,12 +32,15 @@ def test_the_simulated_dots_are_those_of_the_rays(rays: RayPlane) -> None:
     np.testing.assert_allclose(found, rays.base_dots(Geometry.from_rig(rig), (*pose, *tilts)), rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize(('assume', 'load'), [('beam', (3.0, -20.0, 4.0)), ('no_twist', (3.0, -20.0, 0.0))])
+@pytest.mark.parametrize(
+    ('assume', 'load', 'said'),
+    [('beam', (3.0, -20.0, 4.0), {}), ('no_twist', (3.0, -20.0, 0.0), {'arrangement': 'base'})],
+)
 def test_it_is_simulated_recorded_replayed_and_solved(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], assume: str, load: tuple[float, float, float]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], assume: str, load: tuple[float, float, float], said: dict[str, str]
 ) -> None:
     file, bag = tmp_path / 'rig.yaml', tmp_path / 'run'
-    body = {**BASE, 'base_pair.assume': assume}
+    body = {**BASE, **said, 'base_pair.assume': assume}
     file.write_text(yaml.safe_dump({'/**': {'ros__parameters': body}}))
     words = ','.join(map(str, load))
     assert main(['simulate', '--params-file', str(file), '--loads', f'constant:{words}:12', '--out', str(bag)]) == 0
@@ -52,7 +55,7 @@ def test_it_is_simulated_recorded_replayed_and_solved(
 CONTRADICTIONS = [
     ({'solvers': ['base_pair', 'exact']}, r'exact of solvers.*set solvers: \[base_pair\]'),
     ({'degraded': 'hold'}, 'set degraded: none'),
-    ({'solver': 'exact', 'solvers': ['exact']}, 'psd_1.height = -0.585 m.*need solver: base_pair'),
+    ({'solver': 'exact', 'solvers': ['exact']}, 'psd_1.height = -0.585 m.*need arrangement: base, solver: base_pair'),
 ]
 
 

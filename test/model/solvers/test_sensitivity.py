@@ -354,6 +354,25 @@ def test_where_the_psds_are_is_said_once() -> None:
             check_arrangement(rig_from_values({**values, 'degraded': 'none'}))
 
 
+def test_the_arrangement_is_said_by_the_rig_or_by_the_name_of_the_solver_alone() -> None:
+    """Said by the rig, it is not changed by the name of a solver: that is refused with the lines to write."""
+    base = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
+    for more, at_base in (({}, True), ({'arrangement': 'base'}, True), ({'arrangement': 'tip'}, False)):
+        assert rig_from_values({**base, **more}).psds_at_base is at_base
+    assert rig_from_values({'arrangement': 'base'}).psds_at_base
+    assert not rig_from_values({'solvers': ['base_pair']}).psds_at_base
+    check_arrangement(rig_from_values({**base, 'arrangement': 'base'}))
+    for values, lines in (
+        ({**base, 'arrangement': 'tip'}, r"'base_pair' takes PSDs at the base: set solver: exact and solvers: \[exact\]"),
+        ({'arrangement': 'base'}, r"'exact' takes PSDs at the tip: set solver: base_pair and solvers: \[base_pair\]"),
+    ):
+        rig = rig_from_values(values)
+        with pytest.raises(ConfigError, match=lines):
+            check_arrangement(rig)
+        with pytest.raises(SolverError, match=f'the rig file has arrangement: {values["arrangement"]}'):
+            solver_from_rig(rig.estimator.solver, rig)
+
+
 @pytest.mark.parametrize(('apart', 'taken'), [(0.9e-6, False), (1.1e-6, True)])
 def test_planes_closer_than_a_micrometre_are_one(apart: float, taken: bool) -> None:
     """Of three PSDs at the tip and of two at the base. Just above, what noise makes of it is another matter."""
