@@ -261,8 +261,8 @@ class EstimatorConfig:
     arrangement: str = parameter(
         'auto',
         '',
-        'where the PSDs are: on the tip plate, lasers at the base (tip), or the other way round (base); auto: base with '
-        'solver: base_pair, else tip',
+        'where the PSDs are: on the tip plate, lasers at the base (tip), or the other way round (base); auto: base '
+        'with solver: base_pair, else tip',
         choices=('auto', 'tip', 'base'),
     )
     solver: str = parameter('exact', '', 'the solver whose answer is /link_tip/deflection')

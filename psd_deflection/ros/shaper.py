@@ -93,7 +93,8 @@ class ShaperNode(BaseNode):
         except ConfigError as error:
             self._refused += 1
             self._why = printable(str(error), LONGEST)
-            self._repeats.tell('refused', f'trajectory refused: {self._why}', WARNING, now, NEWS)
+            kind = 'undescribed' if self._undescribed else 'refused'
+            self._repeats.tell(kind, f'trajectory refused: {self._why}', WARNING, now, NEWS)
             return
         self._shaped += 1
         self._why = ''

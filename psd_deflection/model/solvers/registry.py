@@ -98,8 +98,8 @@ def check_arrangement(rig: Rig) -> None:
     for i, psd in enumerate(rig.psds, start=1):
         if at == 'tip' and psd.height < -0.5 * rig.link.length:
             raise ConfigError(
-                f'psd_{i}.height = {psd.height:g} m: that is nearer to the base than to the tip; PSDs at the base, with '
-                'the lasers on the tip plate, need arrangement: base, solver: base_pair and solvers: [base_pair]'
+                f'psd_{i}.height = {psd.height:g} m: that is nearer to the base than to the tip; PSDs at the base, '
+                'with the lasers on the tip plate, need arrangement: base, solver: base_pair and solvers: [base_pair]'
             )
 
 

@@ -46,7 +46,9 @@ _BY_PUSH = {'fx': '+X', 'fy': '+Y', 'tz': '+θ'}
 def pattern(rig: Rig) -> FloatArray:
     """Movement of x1 y1 x2 y2 (4, 3) per ΔX, ΔY (1) and θ (m/rad). Raises ConfigError for PSDs at the base."""
     if rig.psds_at_base:
-        raise ConfigError('PSDs at the base (arrangement): check knows PSDs on the tip plate only, whose dots move otherwise')
+        raise ConfigError(
+            'PSDs at the base (arrangement): check knows PSDs on the tip plate only, whose dots move otherwise'
+        )
     return design_matrix(rig.centers + rig.zeros)
 
 

@@ -37,7 +37,11 @@ def test_the_simulated_dots_are_those_of_the_rays(rays: RayPlane) -> None:
     [('beam', (3.0, -20.0, 4.0), {}), ('no_twist', (3.0, -20.0, 0.0), {'arrangement': 'base'})],
 )
 def test_it_is_simulated_recorded_replayed_and_solved(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], assume: str, load: tuple[float, float, float], said: dict[str, str]
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    assume: str,
+    load: tuple[float, float, float],
+    said: dict[str, str],
 ) -> None:
     file, bag = tmp_path / 'rig.yaml', tmp_path / 'run'
     body = {**BASE, **said, 'base_pair.assume': assume}

@@ -363,7 +363,10 @@ def test_the_arrangement_is_said_by_the_rig_or_by_the_name_of_the_solver_alone()
     assert not rig_from_values({'solvers': ['base_pair']}).psds_at_base
     check_arrangement(rig_from_values({**base, 'arrangement': 'base'}))
     for values, lines in (
-        ({**base, 'arrangement': 'tip'}, r"'base_pair' takes PSDs at the base: set solver: exact and solvers: \[exact\]"),
+        (
+            {**base, 'arrangement': 'tip'},
+            r"'base_pair' takes PSDs at the base: set solver: exact and solvers: \[exact\]",
+        ),
         ({'arrangement': 'base'}, r"'exact' takes PSDs at the tip: set solver: base_pair and solvers: \[base_pair\]"),
     ):
         rig = rig_from_values(values)
