@@ -112,7 +112,7 @@ def drawn(name: str) -> Hand:
         said_levels = np.round(levels / np.array([5.0, 5.0, 2.0])) * np.array([5.0, 5.0, 2.0])
         noted = _held(said_levels, times, n)
         wrong = [
-            {'name': 'load_size', 'where': f'load {i + 1}', 'load': levels[i + 1].tolist()}
+            {'name': 'load_value', 'where': f'load {i + 1}', 'load': levels[i + 1].tolist()}
             for i in range(len(times) - 1)
             if np.any(np.abs(levels[i + 1] - said_levels[i + 1]) > (0.2, 0.2, 0.1))
         ]
@@ -122,7 +122,10 @@ def drawn(name: str) -> Hand:
         # Never noted: the load before is held on. Noted twice: what was added is added once more.
         said_levels[i + 1] = levels[i] if kind == 'forgotten' else 2.0 * levels[i + 1] - levels[i]
         noted = _held(said_levels, times, n)
-        wrong = [{'name': 'load_size', 'from': float(times[i]), 'load': levels[i + 1].tolist()}]
+        where = {'name': 'missing_load', 'from': float(times[i])}
+        if kind == 'twice':
+            where = {'name': 'load_value', 'where': f'load {i + 1}'}
+        wrong = [{**where, 'load': levels[i + 1].tolist()}]
     elif kind == 'unit':
         factor = float(rng.choice(TORQUES))
         noted[:, 2] /= factor
@@ -138,7 +141,7 @@ def drawn(name: str) -> Hand:
         at = np.arange(n) / RATE - times[i]
         swing = np.where((at > 0.0) & (at < spans[i + 1]), np.exp(-np.maximum(at, 0.0) / 8.0), 0.0)
         acted[:, 0] += swing * np.sin(2.0 * np.pi * float(rng.uniform(0.8, 1.6)) * at)
-        wrong = [{'name': 'load_sway', 'where': f'load {i + 1}'}]
+        wrong = [{'name': 'load_value', 'where': f'load {i + 1}'}]
     at = np.arange(n) / RATE
     temperature = 21.0 + 2.0 * np.sin(0.07 * at) + 0.5 * np.sin(0.31 * at)
     return Hand(acted, noted, temperature, tuple(wrong))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import re
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -252,15 +252,14 @@ def _told(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[bool,
     """Whether a wrong note is named, and with the right numbers."""
     of = [s for s in setup if s['name'] == wrong['name']]
     if 'from' in wrong:
-        of = [s for s in of if abs(float(s['fix'].split('from ')[1].split(' s')[0]) - wrong['from']) < 0.1]
+        of = [s for s in of if abs(float(s['where'].removesuffix(' s')) - wrong['from']) < 0.1]
     elif wrong.get('where', '').startswith('load'):
         of = [s for s in of if s['where'] == wrong['where']]
     if not of:
         return False, False
     if 'load' in wrong:
-        hung = [float(v) for v in re.findall(r'-?[0-9.]+(?= N)', of[0]['fix'])[:3]]
-        pairs = zip(hung, wrong['load'], HUNG, strict=False)
-        return True, len(hung) == 3 and all(abs(a - b) < most + 0.02 * abs(b) for a, b, most in pairs)
+        pairs = zip(of[0]['value'] or (math.nan,) * 3, wrong['load'], HUNG, strict=True)
+        return True, all(abs(a - b) < most + 0.02 * abs(b) for a, b, most in pairs)
     if 'value' not in wrong:
         return True, True
     off = abs(of[0]['value'] - wrong['value'])

@@ -387,9 +387,6 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
                 flag = (option_strings or ['pos_0'])[-1]
                 values[re.sub(r'\W', '_', f'{name}_{flag}')] = self.metavar or dest.upper()
 
-        def __call__(self, *given: object, **named: object) -> None:
-            raise NotImplementedError('it only notes which arguments there are')
-
     for name in COMMANDS:
         make_parser([name], Noted)
     assert main(['completion', 'bash']) == 0

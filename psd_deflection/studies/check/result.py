@@ -29,12 +29,21 @@ NAMES = {
     'psd_swap': 'exchanged',
     'load_sign': 'sign turned',
     'load_unit': 'other unit',
+    'load_delay': 'all noted late or early',
     'load_ramp': 'applied slowly',
     'load_time': 'noted late or early',
+    'load_value': 'another load than noted',
+    'missing_load': 'never noted',
+    'sensitivity': 'other sensitivity',
+    'link_length': 'other length',
+    'sample_rate': 'other rate',
+    'zero': 'elsewhere when unloaded',
+    'jump': 'jumps',
     'stuck_channel': 'dead',
     'noise_level': 'noise',
     'load_coverage': 'not seen',
 }
+"""All names that a finding may have, as other programs know them, in words."""
 WIRED = ('channel_sign', 'axis_swap', 'psd_swap')
 
 
@@ -42,18 +51,22 @@ WIRED = ('channel_sign', 'axis_swap', 'psd_swap')
 class Finding:
     """One thing that is not as the rig file or the recording says.
 
-    ``name``: channel_sign, axis_swap, psd_swap, load_sign, load_unit, load_time, load_coverage, stuck_channel,
-    noise_level. ``where``: channel, PSD or load. ``value``: -1 for a turned sign, a factor, or s late. ``fix``: the
-    line for the rig file, or what to do. ``evidence``: how much more of the movement (summed over the pushes) the rig
-    file leaves unexplained. ``equivalent``: other causes that look the same to first order.
+    ``name``: one of ``NAMES``. ``where``: channel, PSD or load, or when. ``value``: -1 for a turned sign, a factor, s
+    late, or what hung: N, N, N m. ``fix``: the line for the rig file, or what to do. ``evidence``: how much more of the
+    movement (summed over the pushes) the rig file leaves unexplained. ``equivalent``: other causes that look the same
+    to first order. Raises ValueError for another name.
     """
 
     name: str
     where: str
-    value: float | None
+    value: float | tuple[float, ...] | None
     fix: str
     evidence: float = 0.0
     equivalent: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.name not in NAMES:
+            raise ValueError(f'{self.name}: must be one of {", ".join(NAMES)}')
 
 
 def finding_tree(finding: Finding) -> dict[str, Any]:

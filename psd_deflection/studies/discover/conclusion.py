@@ -417,7 +417,7 @@ def _setup(discovery: RigConclusion) -> str:
 
 def _seconds(finding: Finding) -> str:
     """How late a load was noted, or how long it took."""
-    if finding.value is None or finding.name not in ('load_time', 'load_ramp'):
+    if not isinstance(finding.value, float) or finding.name not in ('load_time', 'load_ramp'):
         return ''
     late = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
     return f', {abs(finding.value):.2g} s{late}'

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from psd_deflection.base.pages import picture, table
 from psd_deflection.model.simulation.laws import VARIABLES
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion, parameters_of, size_of
 from psd_deflection.studies.discover.laws.law_features import known_values
 from psd_deflection.studies.discover.laws.laws import FoundLaw
@@ -266,12 +267,16 @@ def _where_table(discovery: Conclusion) -> str:
     return table(('channel', 'recording', 'when', 'band', 'depends on', 'σ', 'p'), rows)
 
 
+def _value(finding: Finding) -> str:
+    return '' if finding.value is None else ', '.join(f'{v:.5g}' for v in np.ravel(finding.value).tolist())
+
+
 def sections(discovery: Conclusion) -> list[PageSection]:
     """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
     of_rig = discovery if isinstance(discovery, RigConclusion) else None
     out = [PageSection('', (picture(_waterfall_figure(discovery), 'the gap, step by step'),))]
     if of_rig is not None and of_rig.setup:
-        wrong = [(f.name, f.where, '' if f.value is None else f'{f.value:.5g}', f.fix) for f in of_rig.setup]
+        wrong = [(f.name, f.where, _value(f), f.fix) for f in of_rig.setup]
         out.append(PageSection('Set-up', (table(('mistake', 'where', 'value', 'what puts it right'), wrong),)))
     effects = [_effect_section(e) for e in discovery.effects] or ['<p>No effect is named.</p>']
     out.append(PageSection('What', (*effects, *_nuisance(discovery))))

@@ -22,6 +22,7 @@ from psd_deflection.records import FloatArray, ParameterChange
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import read_parameter_file
+from psd_deflection.studies.check.result import NAMES, Finding
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.result import Discovery
@@ -35,6 +36,7 @@ from psd_deflection.studies.discover.setup.noise import estimate_noise, rest_win
 from psd_deflection.studies.study import described
 
 SCHEMA = json.loads((Path(__file__).parents[2] / 'data' / 'result.schema.json').read_text())
+SHARED_SCHEMA = Path(__file__).parents[4] / 'shared' / 'checks' / 'result.schema.json'
 RIG = load_rig()
 HISTORY = loads.identification()
 WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
@@ -438,3 +440,15 @@ def test_a_recording_without_loads_is_refused_with_the_way_out(
     path.write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]) + '\n')
     assert main(['discover', str(path), '--out', str(tmp_path / 'out'), '--quiet']) == 4
     assert 'holds no loads' in capsys.readouterr().err
+
+
+def test_a_finding_has_a_name_that_other_programs_know() -> None:
+    known = SCHEMA['properties']['setup']['items']['properties']['name']['enum']
+    assert set(NAMES) <= set(known)
+    with pytest.raises(ValueError, match='load_size: must be one of channel_sign'):
+        Finding('load_size', 'load 3', None, '')
+
+
+@pytest.mark.skipif(not SHARED_SCHEMA.is_file(), reason='the schema is not beside the checkout')
+def test_the_schema_is_that_of_other_programs() -> None:
+    assert json.loads(SHARED_SCHEMA.read_text()) == SCHEMA

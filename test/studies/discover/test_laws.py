@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import jsonschema
 import numpy as np
@@ -16,6 +18,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_text, read_law, values_of
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.discover.conclusion import RigConclusion
 from psd_deflection.studies.discover.laws.law_features import responses, score, switchings, terms
 from psd_deflection.studies.discover.laws.laws import find_jitter, find_law
 from psd_deflection.studies.discover.observation import Observation
@@ -26,17 +29,20 @@ from .test_formulas import observed
 
 RIG = load_rig()
 HISTORY = loads.identification().loads
+STEPS = 20_000
+"""Samples of it in which the load is stepped."""
 WARM = 21.0 + 2.0 * np.sin(np.linspace(0.0, 5.0, len(HISTORY)))
 SCHEMA = json.loads((Path(__file__).parents[2] / 'data' / 'result.schema.json').read_text())
 
 
-def workspace(law: Law | None, seed: int = 0) -> Workspace:
+def workspace(law: Law | None, seed: int = 0, count: int = len(HISTORY)) -> Workspace:
     active = [] if law is None else [ActiveEffect(effect_of(law), values_of(law))]
     model = ForwardModel(RIG, active)
-    samples = model.run(HISTORY, WARM)
+    history, warm = HISTORY[:count], WARM[:count]
+    samples = model.run(history, warm)
     samples.volts += RIG.noises.ravel()[:, None] * np.random.default_rng(seed).standard_normal(samples.volts.shape)
     model.finish(samples)
-    return Workspace([Observation('test', RIG, samples.volts.T.copy(), HISTORY, WARM)])
+    return Workspace([Observation('test', RIG, samples.volts.T.copy(), history, warm)])
 
 
 def test_a_term_scores_to_first_order_what_it_explains() -> None:
@@ -114,3 +120,38 @@ def test_a_law_is_told_adopted_and_then_explains_the_recording(tmp_path: Path, m
     # A name that is taken, and one that is none, are refused before the search.
     assert main(['discover', run, '--out', str(out), '--adopt', 'yielding', '--quiet']) == 2
     assert main(['discover', run, '--out', str(out), '--adopt', 'a b', '--quiet']) == 2
+
+
+def test_noise_beside_a_movement_is_no_law() -> None:
+    shaky = Law('shaky', 'electronics', 'y2', (LawTerm('jitter', ('load_fy',), 5e-8),))
+    ws = workspace(shaky)
+    null = refit(ws, ())
+    penalty = float(np.log(ws.effective_size()))
+    assert find_jitter(ws, null, penalty) is not None
+    moved = workspace(Law('odd', 'psd', 'x1', (LawTerm('product', ('load_fy', 'load_fy'), 1e-8),)))
+    # The same noise, with means of blocks that no noise explains.
+    difference = [a + b for a, b in zip(null.difference, refit(moved, ()).difference, strict=True)]
+    assert find_jitter(ws, dataclasses.replace(null, difference=difference), penalty) is None
+
+
+def test_what_switches_with_the_loads_is_no_law_of_times() -> None:
+    # Without the sweep, in which the load changes all the time.
+    changes = np.flatnonzero(np.any(np.diff(HISTORY[:STEPS], axis=0) != 0.0, axis=1)) * 1e-3
+    for times, told in ((changes[1:4] + 0.1, False), (changes[1:4] + 0.7, True)):
+        term = LawTerm('switched', (), 3e-6, times=tuple(times.tolist()))
+        ws = workspace(Law('bump', 'psd', 'x1', (term,)), count=STEPS)
+        null = refit(ws, ())
+        found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
+        switched = found is not None and any(t.times for law in found.laws for t in law.terms)
+        assert switched is told
+
+
+def test_a_law_that_leaves_much_on_unseen_cases_is_told_and_not_written() -> None:
+    ws = workspace(Law('odd', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),)))
+    null = refit(ws, ())
+    found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
+    assert found is not None
+    for floors, written in ((1.9, 1), (2.1, 0)):
+        law = dataclasses.replace(found, heldout_gap=floors * ws.floor())
+        concluded = SimpleNamespace(law=law, gap_floor=ws.floor(), adopted='')
+        assert len(RigConclusion.laws.fget(concluded)) == written  # type: ignore[attr-defined]

@@ -90,7 +90,7 @@ class Swaying:
             f'{p.last * o.period:.3f} s swayed at {self.frequency:.2f} Hz by {self.force:.2g} N: '
             'steady it; this time is left out'
         )
-        return Finding('load_sway', f'load {p.number}', self.force, words, self.force)
+        return Finding('load_value', f'load {p.number}', None, words, self.force)
 
 
 def plateaus(o: Observation, recording: int) -> list[Plateau]:
@@ -293,9 +293,10 @@ def told(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding]:
         if np.any(off > np.maximum(TELLING * sd, LEAST_TOLD)):
             words = f'{_begun(p, o.name)}: from {p.first * o.period:.3f} s to {p.last * o.period:.3f} s '
             words += f'({_worded(hung)}) hung, not ({_worded(p.noted)}): note that'
-            value = float(off[:2].max()) if off[:2].max() > LEAST_TOLD[0] else float(off[2])
-            where = f'after load {p.number}' if p.unnoted else f'load {p.number}'
-            out.append(Finding('load_size', where, value, words, float(off.max())))
+            name, where = (
+                ('missing_load', f'{p.first * o.period:.3f} s') if p.unnoted else ('load_value', f'load {p.number}')
+            )
+            out.append(Finding(name, where, tuple(hung.tolist()), words, float(off.max())))
     return out
 
 
