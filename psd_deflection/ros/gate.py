@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
@@ -127,6 +128,29 @@ class InputGate:
         except FAILURES as error:
             return f'{type(error).__name__}: {error}'
         return why
+
+
+class GatedNode(LifecycleNode):  # type: ignore[misc]
+    """A node, of which a subscription that rclpy itself makes, as that of ``/clock``, cannot end it either.
+
+    ``gate``: where what fails is refused, once there is one.
+    """
+
+    gate: InputGate | None = None
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[..., Any], *more: Any, **options: Any
+    ) -> Subscription:
+        """As of rclpy's node."""
+
+        def guarded(message: Any) -> None:
+            try:
+                callback(message)
+            except FAILURES as error:
+                if self.gate is not None:
+                    self.gate.refuse(topic, str(error))
+
+        return super().create_subscription(msg_type, topic, guarded, *more, **options)
 
 
 class _Rate:

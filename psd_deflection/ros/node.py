@@ -17,7 +17,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import await_or_execute
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
@@ -31,7 +31,7 @@ from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import Section, Value
 from psd_deflection.ros.declared import SOURCE, USE_SIM_TIME, DeclaredParameters
-from psd_deflection.ros.gate import InputGate
+from psd_deflection.ros.gate import GatedNode, InputGate
 from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.running import SPIN_S, executor_of
 from psd_deflection.ros.wires import message_class, qos
@@ -56,7 +56,7 @@ class Health(NamedTuple):
     values: tuple[tuple[str, str], ...] = ()
 
 
-class _ManagedNode(LifecycleNode):  # type: ignore[misc]
+class _ManagedNode(GatedNode):
     """Hands its transitions to the :class:`BaseNode` that owns it."""
 
     owner: BaseNode
@@ -105,7 +105,7 @@ class BaseNode(abc.ABC):
         self.node = _made(name, overrides)
         self.node.owner = self
         self.log = NodeLog(self.node, say)
-        self.gate = InputGate(self.node, self.log)
+        self.gate = self.node.gate = InputGate(self.node, self.log)
         try:
             self.set_up()
             self._refuse_sim_time()

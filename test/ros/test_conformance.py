@@ -526,16 +526,24 @@ def test_simulated_time_acts_or_is_refused(running: Running) -> None:
         return
     assert answer.successful, answer.reason
     clock = running.peer.node.create_publisher(Clock, '/clock', 5)
-    seen = len(running.reports)
+    seen, refused = len(running.reports), running.refusals()
+
+    def told(sec: int) -> None:
+        message = Clock()
+        message.clock.sec = sec
+        clock.publish(message)
 
     def of_that_time() -> bool:
-        message = Clock()
-        message.clock.sec = 1234
-        clock.publish(message)
+        told(1234)
         return any(report.header.stamp.sec == 1234 for report in running.reports[seen:])
+
+    def of_no_time() -> bool:
+        told(-5)
+        return running.refusals() > refused
 
     try:
         running.peer.until(of_that_time, 'diagnostics in simulated time')
+        running.peer.until(of_no_time, 'the refusal of a time before 1970')
     finally:
         running.peer.node.destroy_publisher(clock)
         assert running.set('use_sim_time', False).successful
