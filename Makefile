@@ -140,12 +140,12 @@ crash: $(READY)
 FUZZ_SECONDS ?= 600
 FUZZ_FRAMES ?= 10000000
 FUZZ_HELLOS ?= 1000000
-FUZZ_MESSAGES ?= 1000000
+FUZZ_MINUTES ?= 10
 fuzz: $(READY)
 	$(call INSTALL,$(VENV)) atheris
 	$(BIN)/python -m bench.campaign.fuzz corrupted $(FUZZ_FRAMES)
 	$(BIN)/python -m bench.campaign.hellos $(FUZZ_HELLOS)
-	$(BIN)/python -m bench.campaign.messages $(FUZZ_MESSAGES)
+	$(BIN)/python -m bench.campaign.messages --minutes $(FUZZ_MINUTES)
 	for target in frames hello bag records csv parameters yaml; do $(BIN)/python -m bench.campaign.fuzz $$target -max_total_time=$(FUZZ_SECONDS) || exit 1; done
 
 SOAK_MINUTES ?= 30

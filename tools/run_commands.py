@@ -78,6 +78,7 @@ CI_RUNS = (
     (r'^python -m blind\.laws\b', 'Makefile', 'python -m blind.laws --jobs'),
     (r'^python -m bench\.campaign\.camera\b', 'Makefile', 'python -m bench.campaign.camera --frames'),
     (r'^python -m bench\.campaign\.hellos$', 'Makefile', 'python -m bench.campaign.hellos '),
+    (r'^python -m bench\.campaign\.messages\b', 'Makefile', 'python -m bench.campaign.messages '),
     (r'^python -m bench\.campaign\.fuzz\b', 'Makefile', 'python -m bench.campaign.fuzz $$target'),
 )
 """What CI runs without us: pattern, file, and the text in it that does."""
@@ -87,7 +88,7 @@ SHORTEST = {
     'BENCH_ACCURACY="--blocks 100" BENCH_LIMITS="--times 1 --only frames" BENCH_RIGS="--most 1 --seconds 1"',
     'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
     'crash': 'CRASH_TIMES=1',
-    'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000',
+    'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000 FUZZ_MINUTES=0.3',
     'fleet': 'FLEET_RECORDINGS=8 FLEET="--seconds 0.2 --kills 1 --only-killed"',
     'compensate-faults': 'HOLD_TIMES=1 HOLD="--only silent"',
     'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',

@@ -1,372 +1,340 @@
-"""A million messages of any content against the nodes that move an arm: no step, no death, no leak.
+"""Messages of any content against every input of the five nodes: no end, no leak, and no step of what moves an arm.
 
-  python -m bench.campaign.messages 1000000
+  python -m bench.campaign.messages 1000000 --node compensator
+  python -m bench.campaign.messages --minutes 60
 
-The compensator follows while they come, by what is right between them; the shaper has trajectories under way. Each
-message goes through the real callback of the node in this process, as DDS would hand it over, at the speed of the
-processor. Before that some hundred go over real DDS to the processes of ``compensator``, ``shaper`` and ``chain``.
+Each node is attacked in a process of its own, all at once. First its process, as a user starts it, gets some over real
+DDS. Then a node in the attacking process gets them through its own callbacks, as DDS would hand them over, at the speed
+of the processor, and what is right between them. The inputs are those to which the node subscribes on the graph: one
+that is not in the table of good messages (``bench.campaign.attacked``) ends the campaign. What is strange follows from
+the types of the fields (``bench.campaign.strange``). Its services are asked the same way: parameters, lifecycle,
+``enable``, ``zero``, ``record``.
 
-The content is that of a grammar: numbers that are not finite, huge, denormal; stamps before 1970 and ahead of us;
-frames, names and lists of wrong sizes; rotations that are none; and encoded messages that are cut or damaged.
+Judged: nothing ends the node; what cannot be decoded is counted as refused; the memory after the first tenth stays; it
+still does what it is there for; no step between two commands is larger than max_rate times the time between them, and
+no trajectory begins elsewhere than the one under way is.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import os
 import random
 import resource
-import struct
+import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import rclpy
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.publisher import Publisher
-from rclpy.serialization import serialize_message
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Bool, Float64, Float64MultiArray
+from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from bench.steps import largest_step
-from psd_deflection.arms.compensation.arm import read_arm
-from psd_deflection.arms.compensation.compensator import CompensatorSettings, State
-from psd_deflection.arms.compensation.shaping import ShaperSettings
-from psd_deflection.base.log import unsaid
-from psd_deflection.records import FloatArray
-from psd_deflection.ros.compensator import CompensatorNode
-from psd_deflection.ros.shaper import ShaperNode
-from tools.program import PSD_DEFLECTION, ROOT, Program
+from bench.campaign.attacked import NODES, Attacked, good_of
+from bench.campaign.strange import Stranger
+from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program
 
-URDF = ROOT / 'config' / 'two_links.urdf'
-NAMES = ['shoulder', 'elbow']
-JOINTS = [1.2, 0.6]
-MOST_STEP = 1.0 + 1e-6
 MOST_GROWTH = 30e6
 """Bytes that the process may grow by after the first tenth."""
 SPIN_EVERY = 50
 """Messages after which the node's timers have their turn."""
-BIG = (float('nan'), float('inf'), -float('inf'), 1e300, -1e308, 5e-324, 1e-200, -0.0, 1e4, 10.0, 1.0, -1.0)
+ASK_EVERY = 500
+"""Messages after which a service is asked."""
+AS_GIVEN_AFTER = 200
+"""Messages after which the parameters that a request has set are set back."""
+ANSWER_S = 30.0
+"""Longest time for the answer of a service, s."""
+PAUSE_S = 0.002
+"""Between two messages over DDS, s."""
+ON_GRAPH = ('/parameter_events', '/rosout')
+"""What ROS itself may subscribe to."""
+SET_TYPES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 77)
+"""Types of a parameter, and one that is none."""
 
 
-class Stranger:
-    """Messages of any content, by chance."""
-
-    def __init__(self, seed: int) -> None:
-        self._chance = random.Random(seed)
-        self.makes: Mapping[str, Callable[[], Any]] = {
-            '/end_effector/deflection': self.deflection,
-            '/joint_states': self.joints,
-            '/compensator/applied': self.applied,
-            '/compensator/robot_running': lambda: Bool(data=self._chance.random() < 0.9),
-            '/compensator/speed_scaling': lambda: Float64(data=self.number(1.0)),
-            '/shaper/trajectory': self.trajectory,
-        }
-
-    def number(self, usual: float) -> float:
-        """One that is as usual, or not."""
-        kind = self._chance.random()
-        if kind < 0.6:
-            return usual + self._chance.gauss(0.0, 0.02)
-        if kind < 0.9:
-            return self._chance.choice(BIG)
-        (out,) = struct.unpack('<d', self._chance.randbytes(8))
-        return float(out)
-
-    def stamp(self) -> Time:
-        """Of now, mostly."""
-        now = time.time_ns()
-        seconds, rest = divmod(now + self._chance.choice((0, 0, 0, 0, -(10**9), 10**8, 3600 * 10**9)), 10**9)
-        if self._chance.random() < 0.1:
-            return Time(sec=self._chance.choice((0, -1, -(2**31), 2**31 - 1)), nanosec=self._chance.getrandbits(32))
-        return Time(sec=seconds, nanosec=rest)
-
-    def deflection(self) -> Any:
-        """A pose."""
-        chance, out = self._chance, good_deflection()
-        out.header.stamp = self.stamp()
-        out.header.frame_id = chance.choice(('', '', 'end_effector_rest', 'world', 'ä' * 50))
-        place, turned = out.pose.pose.position, out.pose.pose.orientation
-        place.x, place.y, place.z = (self.number(1e-3) for _ in range(3))
-        if chance.random() < 0.5:
-            turned.x, turned.y, turned.z, turned.w = (self.number(0.0) for _ in range(4))
-        if chance.random() < 0.5:
-            out.pose.covariance = [self.number(0.0) * chance.choice((1.0, 1e-9)) for _ in range(36)]
-        return out
-
-    def joints(self) -> Any:
-        """Joints."""
-        chance = self._chance
-        names = chance.choice((NAMES, NAMES, NAMES[::-1], NAMES[:1], ['elbow'] * 2, ['', 'x'], [], self._names()))
-        count = len(names) if chance.random() < 0.8 else chance.randrange(5)
-        out = JointState(name=names, position=[self.number(chance.choice(JOINTS)) for _ in range(count)])
-        out.header.stamp = self.stamp()
-        return out
-
-    def _names(self) -> list[str]:
-        return [f'joint {self._chance.getrandbits(40)}' for _ in range(self._chance.choice((3, 50)))]
-
-    def applied(self) -> Any:
-        """Offsets."""
-        count = self._chance.choice((2, 2, 2, 0, 1, 3))
-        return Float64MultiArray(data=[self.number(0.0) for _ in range(count)])
-
-    def trajectory(self) -> Any:
-        """A trajectory."""
-        chance = self._chance
-        out = JointTrajectory(joint_names=chance.choice((NAMES, NAMES, NAMES, ['z'], [], ['a', 'a'])))
-        out.header.stamp = chance.choice((Time(), Time(), self.stamp()))
-        orders = chance.choice((1, 2, 2, 3))
-        at = 0.0
-        for _ in range(chance.choice((0, 1, 1, 2, 3))):
-            at += chance.choice((0.0, 0.1, 0.2, 0.5))
-            sec, nanosec = divmod(round(at * 1e9), 10**9)
-            point = JointTrajectoryPoint(positions=[self.number(q) for q in JOINTS])
-            point.time_from_start.sec, point.time_from_start.nanosec = sec - (chance.random() < 0.02), nanosec
-            point.velocities = [self.number(0.0) if chance.random() < 0.05 else 0.0 for _ in range(2)][
-                : orders > 1 and 2
-            ]
-            point.accelerations = [0.0, 0.0][: orders > 2 and 2]
-            point.effort = chance.choice(([], [], [0.0, 0.0], [1.0, 0.0]))
-            out.points.append(point)
-        return out
-
-    def encoded(self, topics: list[str]) -> tuple[str, bytes]:
-        """A topic with a message for it, which may be damaged on the way."""
-        chance = self._chance
-        topic = chance.choice(topics)
-        content = bytearray(serialize_message(self.makes[topic]()))
-        if chance.random() < 0.05:
-            kind = chance.randrange(3)
-            if kind == 0:
-                del content[chance.randrange(len(content)) :]
-            elif kind == 1:
-                content[chance.randrange(len(content))] ^= 1 << chance.randrange(8)
-            else:
-                content = bytearray(chance.randbytes(chance.randrange(200)))
-        return topic, bytes(content)
+class EndedError(Exception):
+    """Something that came in has ended a node."""
 
 
-def good_deflection() -> Any:
-    """A deflection of now."""
-    out = PoseWithCovarianceStamped()
-    out.header.stamp.sec, out.header.stamp.nanosec = divmod(time.time_ns(), 10**9)
-    out.pose.pose.position.x, out.pose.pose.position.z = 1e-3, 2e-3
-    out.pose.pose.orientation.w = 1.0
-    out.pose.covariance = (np.eye(6) * 1e-12).ravel()
-    return out
-
-
-class Listener:
-    """What a node publishes in this process: every command with the time at which it left."""
-
-    def __init__(self, topic: str) -> None:
-        self.stamps: list[float] = []
-        self.commands: list[FloatArray] = []
-        self.step = 0.0
-        first = Publisher.publish
-
-        def publish(publisher: Any, message: Any) -> None:
-            if publisher.topic_name == topic:
-                self.heard(message)
-            first(publisher, message)
-
-        Publisher.publish = publish
-
-    def heard(self, message: Any) -> None:
-        """Keep the last two, and the largest step."""
-        self.stamps = [*self.stamps[-1:], time.monotonic()]
-        self.commands = [*self.commands[-1:], np.array(message.data)]
-        self.step = max(self.step, largest_step(self.stamps, self.commands, CompensatorSettings().max_rate))
-
-
-def memory() -> int:
-    """Bytes that the process has now."""
-    pages = int(Path('/proc/self/statm').read_text().split()[1])
+def memory(process: int | str = 'self') -> int:
+    """Bytes that a process has now."""
+    pages = int(Path(f'/proc/{process}/statm').read_text().split()[1])
     return pages * resource.getpagesize()
 
 
-class Heard:
-    """The trajectories that the shaper lets through: finite, in order, begun where the one before is."""
+class Budget:
+    """Goes on for ``count`` messages, or for ``minutes`` if there are any."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        first = Publisher.publish
+    def __init__(self, count: int, minutes: float) -> None:
+        self._count, self._seconds, self._begun = count, 60.0 * minutes, time.monotonic()
 
-        def publish(publisher: Any, message: Any) -> None:
-            if publisher.topic_name == '/shaper/shaped' and message.points:
-                self.heard(message)
-            first(publisher, message)
-
-        Publisher.publish = publish
-
-    def heard(self, message: Any) -> None:
-        """AssertionError if a controller could not follow it."""
-        self.count += 1
-        states = np.array([[*p.positions, *p.velocities, *p.accelerations] for p in message.points])
-        times = np.array([p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points])
-        if not np.all(np.isfinite(states)) or np.any(np.diff(times) <= 0.0) or list(message.joint_names) != NAMES:
-            raise AssertionError(f'passed on: {message}')
-        if message.header.stamp.sec <= 0:
-            raise AssertionError(f'begins at no time: {message.header}')
+    def share(self, number: int) -> float:
+        """What of it is over, 0 to 1, after so many messages."""
+        if self._seconds:
+            return (time.monotonic() - self._begun) / self._seconds
+        return number / max(self._count, 1)
 
 
 class Inside:
-    """The compensator in follow and the shaper in this process."""
+    """A node in this process, and who attacks it. Raises EndedError when it has ended."""
 
-    def __init__(self, seed: int) -> None:
-        rclpy.init(args=['messages'])
-        # A busy machine is late, and what is right would be stale.
-        settings = CompensatorSettings(axes=('x', 'z'), joints=tuple(NAMES), good=1, stale=1.0)
-        self.listener, self.shaped = Listener('/compensator/offsets'), Heard()
-        self.compensator = CompensatorNode(read_arm(URDF, 'tool'), settings, unsaid, True)
-        self.shaper = ShaperNode(ShaperSettings(frequency=12.0), unsaid)
+    def __init__(self, name: str, seed: int, folder: Path) -> None:
+        # Each has its own namespace: some have inputs of the same name, and all may run at once.
+        rclpy.init(args=['messages', '--ros-args', '-r', f'__ns:=/{name}'])
+        self.attacked: Attacked = NODES[name](folder)
+        self._node = self.attacked.owner.node
         self._executor = SingleThreadedExecutor()
-        self._inputs: dict[str, list[Any]] = {}
-        for owner in (self.compensator, self.shaper):
-            self._executor.add_node(owner.node)
-            owner.start()
-            for one in owner.node.subscriptions:
-                self._inputs.setdefault(one.topic_name, []).append(one.callback)
-        self._stranger = Stranger(seed)
-        self.states: Counter[State] = Counter()
-        self._enable(True)
+        self._executor.add_node(self._node)
+        self.attacked.hand = lambda topic, content: self.hand(f'/{name}{topic}', content)
+        self.attacked.owner.start()
+        self._stranger, self._chance = Stranger(seed), random.Random(seed)
+        self._as_given = self._node.get_parameters_by_prefix('')
+        self.number, self.asked, self.undecodable = 0, 0, 0
+        self.sent: Counter[str] = Counter()
 
-    def _enable(self, wanted: bool) -> None:
-        (service,) = [s for s in self.compensator.node.services if s.service_name == '/compensator/enable']
-        self.ask = service.callback
-        result = self.ask(SetBool.Request(data=wanted), SetBool.Response())
-        if hasattr(result, 'send'):
-            with contextlib.suppress(StopIteration):
-                result.send(None)
+    def inputs(self) -> dict[str, list[Any]]:
+        """What the node subscribes to now."""
+        out: dict[str, list[Any]] = {}
+        for one in self._node.subscriptions:
+            out.setdefault(one.topic_name, []).append(one)
+        return out
 
     def hand(self, topic: str, content: bytes) -> None:
         """A message, as DDS hands it over."""
-        for callback in self._inputs[topic]:
-            callback(content)
+        for one in self.inputs().get(topic, ()):
+            if one.raw:
+                message = content
+            else:
+                try:
+                    message = deserialize_message(content, one.msg_type)
+                except (RuntimeError, UnicodeDecodeError):
+                    # DDS does not hand over what it cannot decode.
+                    continue
+            try:
+                one.callback(message)
+            except BaseException as error:
+                raise EndedError(f'{topic}: {type(error).__name__}: {error}: {content[:3000].hex()}') from error
 
-    def good(self) -> None:
-        """What is right: the robot runs, and the deflection is followed."""
-        held = self.listener.commands[-1].tolist() if self.listener.commands else [0.0, 0.0]
-        joints = JointState(name=NAMES, position=JOINTS)
-        joints.header.stamp = good_deflection().header.stamp
-        for topic, message in (
-            ('/compensator/robot_running', Bool(data=True)),
-            ('/compensator/speed_scaling', Float64(data=1.0)),
-            ('/compensator/applied', Float64MultiArray(data=held)),
-            ('/joint_states', joints),
-            ('/end_effector/deflection', good_deflection()),
-        ):
-            self.hand(topic, serialize_message(message))
+    def _attack(self, inputs: dict[str, list[Any]]) -> None:
+        topic = self._chance.choice(list(inputs))
+        kind = inputs[topic][0].msg_type
+        content, damaged = self._stranger.encode(self._stranger.change(good_of(topic, kind)()))
+        if damaged and inputs[topic][0].raw:
+            try:
+                deserialize_message(content, kind)
+            except (RuntimeError, UnicodeDecodeError, MemoryError):
+                self.undecodable += 1
+        self.sent[topic] += 1
+        self.hand(topic, content)
+
+    def _ask(self) -> None:
+        """One of its services, with any request."""
+        service = self._chance.choice(list(self._node.services))
+        self.asked += 1
+        request = service.srv_type.Request()
+        if isinstance(request, ChangeState.Request):
+            # Down and up again: what is asked in between has no node to ask.
+            for transition in (4, 3):
+                request.transition.id = transition
+                self._answer(service, request)
+            return
+        if isinstance(request, SetBool.Request):
+            request.data = self._chance.random() < 0.5
+        elif isinstance(request, SetParameters.Request | SetParametersAtomically.Request):
+            request.parameters = [self._parameter() for _ in range(self._chance.choice((0, 1, 1, 1, 2, 20)))]
+        elif hasattr(request, 'names'):
+            request.names = [self._name() for _ in range(self._chance.choice((0, 1, 3, 100)))]
+        else:
+            self._stranger.change(request, 1.0)
+        self._answer(service, request)
+
+    def _set_back(self) -> None:
+        """Its parameters are again what they were."""
+        changed = [p for name, p in self._as_given.items() if self._node.get_parameter(name).value != p.value]
+        if changed:
+            self._node.set_parameters(changed)
+
+    def _name(self) -> str:
+        known = self._chance.random() < 0.8
+        return self._chance.choice(list(self._as_given)) if known else self._stranger.text('x')
+
+    def _parameter(self) -> Any:
+        out = ParameterMessage(name=self._name())
+        given = self._as_given.get(out.name)
+        if given is not None:
+            out.value = given.to_parameter_msg().value
+        kind = out.value.type
+        self._stranger.change(out.value, self._chance.choice((0.2, 1.0)))
+        out.value.type = kind if self._chance.random() < 0.8 else self._chance.choice(SET_TYPES)
+        return out
+
+    def _answer(self, service: Any, request: Any) -> None:
+        task = self._executor.create_task(service.callback, request, service.srv_type.Response())
+        until = time.monotonic() + ANSWER_S
+        while not task.done():
+            self._executor.spin_once(timeout_sec=0.05)
+            if time.monotonic() > until:
+                raise EndedError(f'{service.service_name}: no answer in {ANSWER_S:g} s to {request}'[:3000])
+        if task.exception() is not None:
+            raise EndedError(f'{service.service_name}: {task.exception()!r}: {request}'[:3000])
 
     def spin(self) -> None:
         """Let timers have their turn."""
-        for _ in range(4):
-            self._executor.spin_once(timeout_sec=0.0)
-        self.compensator.runs()
+        try:
+            for _ in range(4):
+                self._executor.spin_once(timeout_sec=0.0)
+            self.attacked.runs()
+        except BaseException as error:
+            raise EndedError(f'beside the messages: {type(error).__name__}: {error}') from error
 
-    def run(self, count: int) -> int:
-        """So many strange messages; the bytes by which the process grew after the first tenth."""
-        topics, chance, begun = list(self._inputs), random.Random(1), 0
-        topics = [t for t in topics if t in self._stranger.makes]
-        for number in range(count):
-            if number % SPIN_EVERY == 0:
+    def run(self, budget: Budget) -> int:
+        """Strange messages as long as the budget lasts; the bytes by which the process grew after the first tenth."""
+        begun, told, inputs = 0, 0.0, self.inputs()
+        while (share := budget.share(self.number)) < 1.0:
+            if self.number % SPIN_EVERY == 0:
                 self.spin()
-                self.states[self.compensator.command.state] += 1
-                if chance.random() < 0.02:
-                    self._enable(chance.random() < 0.1)
-                else:
-                    self._enable(True)
-            if number % 6 == 0:
-                self.good()
-                self.good()
-            self.hand(*self._stranger.encoded(topics))
-            if number == count // 10:
+                inputs = self.inputs()
+            if self.number % ASK_EVERY == ASK_EVERY - 1:
+                self._ask()
+            if self.number % ASK_EVERY == AS_GIVEN_AFTER:
+                self._set_back()
+            if self.number % self.attacked.every == 0:
+                self.attacked.right()
+            self._attack(inputs)
+            self.number += 1
+            if not begun and share >= 0.1:
                 begun = memory()
-            if number % (count // 100 or 1) == 0:
-                print(
-                    f'{number} messages, {self.states[State.FOLLOWING]} of {self.states.total()} times following, '
-                    f'{memory() / 1e6:.0f} MB, largest step {self.listener.step:.4f}',
-                    file=sys.stderr,
-                    flush=True,
-                )
+            if share >= told:
+                told += 0.05
+                print(f'{self._node.get_name()}: {self.told()}', file=sys.stderr, flush=True)
         return memory() - begun
+
+    def told(self) -> str:
+        """How far it is."""
+        return (
+            f'{self.number} messages on {len(self.sent)} inputs and {self.asked} requests, '
+            f'{self.attacked.refused()} refused of which {self.undecodable} could not be decoded, '
+            f'{memory() / 1e6:.0f} MB; {self.attacked.summary()}'
+        )
 
     def close(self) -> None:
         """Leave."""
-        for owner in (self.compensator, self.shaper):
-            owner.close()
+        self.attacked.close()
         self._executor.shutdown()
         rclpy.try_shutdown()
 
 
-def over_dds(count: int, seed: int) -> int:
-    """Send ``count`` of them to the processes of the nodes; how many of these are not there any more."""
-    chain = ROOT / 'config' / 'two_links.yaml'
-    nodes = {
-        'compensator': [str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive'],
-        'shaper': ['--frequency', '12'],
-        'chain': [str(chain)],
-    }
-    programs = {name: Program([*PSD_DEFLECTION, name, *words]) for name, words in nodes.items()}
+def over_dds(name: str, count: int, seed: int, folder: Path) -> list[str]:
+    """Send ``count`` messages to the process of a node, on every input that it has on the graph; what was wrong."""
+    command = [*PSD_DEFLECTION, name, *NODES[name].words, '--ros-args', '-r', f'__ns:=/{name}']
+    program = Program(command, cwd=folder)
     rclpy.init(args=['stranger'])
     node = rclpy.create_node('stranger')
-    stranger = Stranger(seed)
-    senders = {topic: node.create_publisher(type(make()), topic, 50) for topic, make in stranger.makes.items()}
-    for sender in senders.values():
-        until = time.monotonic() + 60.0
-        while sender.get_subscription_count() == 0 and time.monotonic() < until:
-            time.sleep(0.05)
-    for _ in range(count):
-        topic, content = stranger.encoded(list(senders))
-        # DDS itself does not send what is too short.
-        with contextlib.suppress(RuntimeError):
-            senders[topic].publish(content)
-        time.sleep(0.002)
+    stranger, chance = Stranger(seed), random.Random(seed)
+    try:
+        kinds = _on_graph(node, name, program)
+        senders = {
+            topic: (node.create_publisher(kind, topic, 50), good_of(topic, kind)) for topic, kind in kinds.items()
+        }
+        for topic in senders:
+            _until(lambda topic=topic: senders[topic][0].get_subscription_count() > 0, topic, program)
+        before = 0
+        for number in range(count):
+            sender, good = senders[chance.choice(list(senders))]
+            # DDS itself does not send what is too short.
+            with contextlib.suppress(RuntimeError):
+                sender.publish(stranger.encode(stranger.change(good()))[0])
+            time.sleep(PAUSE_S)
+            if number == count // 10:
+                before = memory(program.process.pid)
+            if program.process.poll() is not None:
+                break
+        grown = memory(program.process.pid) - before if program.process.poll() is None else 0
+    finally:
+        status = program.end()
+        node.destroy_node()
+        rclpy.try_shutdown()
+    print(f'{name}: after {count} messages over DDS on {len(senders)} inputs {grown / 1e6:+.1f} MB, status {status}')
+    out = [f'over DDS it grew by {grown / 1e6:.1f} MB'] if grown > MOST_GROWTH else []
+    return out + ([f'over DDS it ended with status {status}: {program.text[-2000:]}'] if status else [])
+
+
+def _until(condition: Any, what: str, program: Program) -> None:
+    until = time.monotonic() + WAIT_S
+    while not condition():
+        if time.monotonic() > until or program.process.poll() is not None:
+            raise EndedError(f'{what}: is not on the graph\n{program.text[-2000:]}')
+        time.sleep(0.05)
+
+
+def _on_graph(node: Any, name: str, program: Program) -> dict[str, Any]:
+    """The inputs of the node ``name`` and their classes."""
+    from psd_deflection.ros.wires import message_class
+
+    found: dict[str, Any] = {}
+
+    def look() -> bool:
+        with contextlib.suppress(Exception):
+            heard = node.get_subscriber_names_and_types_by_node(name, f'/{name}')
+            found.update({topic: message_class(kinds[0]) for topic, kinds in heard if topic not in ON_GRAPH})
+        return bool(found)
+
+    _until(look, name, program)
+    # The rest of them comes within the time in which DDS finds all of a participant.
     time.sleep(2.0)
-    gone = [name for name, one in programs.items() if one.process.poll() is not None]
-    for name, one in programs.items():
-        status = one.end()
-        print(f'{name}: after {count} messages over DDS status {status}')
-        if status:
-            gone.append(name)
-            print(one.text[-2000:])
-    node.destroy_node()
-    rclpy.try_shutdown()
-    return len(gone)
+    look()
+    return found
+
+
+def attack(name: str, args: argparse.Namespace) -> int:
+    """Attack one node; 0 if it held."""
+    with tempfile.TemporaryDirectory() as place:
+        folder = Path(place)
+        os.environ.update({'ROS_LOG_DIR': place, 'XDG_STATE_HOME': place})
+        faults = over_dds(name, args.dds, args.seed, folder) if args.dds else []
+        inside = Inside(name, args.seed, folder)
+        began = time.monotonic()
+        try:
+            grown = inside.run(Budget(args.count, args.minutes))
+            faults += inside.attacked.faults()
+            if grown > MOST_GROWTH:
+                faults.append(f'it grew by {grown / 1e6:.1f} MB')
+            if inside.attacked.refused() < inside.undecodable:
+                faults.append(f'of {inside.undecodable} that cannot be decoded it counts {inside.attacked.refused()}')
+            took = time.monotonic() - began
+            print(f'{name}: in {took:.0f} s {inside.told()}; {grown / 1e6:+.1f} MB after the first tenth')
+            for topic, count in sorted(inside.sent.items()):
+                print(f'{name}:   {topic} {count}')
+        finally:
+            inside.close()
+    for fault in faults:
+        print(f'{name}: WRONG: {fault}')
+    return 1 if faults else 0
 
 
 def main() -> int:
-    """Exit status 0 if nothing leapt, ended or grew."""
+    """Exit status 0 if every node held."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('count', type=int, nargs='?', default=1_000_000)
-    parser.add_argument('--dds', type=int, default=2000, help='how many of them go over DDS before')
+    parser.add_argument('--minutes', type=float, default=0.0, help='so long instead of COUNT messages')
+    parser.add_argument('--node', choices=[*NODES, 'all'], default='all')
+    parser.add_argument('--dds', type=int, default=2000, help='how many go over DDS before')
     parser.add_argument('--seed', type=int, default=1)
     args = parser.parse_args()
-    gone = over_dds(args.dds, args.seed) if args.dds else 0
-    inside = Inside(args.seed)
-    began = time.monotonic()
-    try:
-        grown = inside.run(args.count)
-    finally:
-        inside.close()
-    took = time.monotonic() - began
-    followed = inside.states[State.FOLLOWING] / max(inside.states.total(), 1)
-    refused = inside.compensator.gate.refused.total() + inside.shaper.gate.refused.total()
-    print(
-        f'{args.count} messages in {took:.0f} s, {refused} refused at the gate; {inside.shaped.count} trajectories '
-        f'shaped; the offsets followed {followed:.0%} of the time; largest step {inside.listener.step:.4f} of '
-        f'max_rate * dt; {grown / 1e6:+.1f} MB after the first tenth; nodes that ended: {gone}'
-    )
-    return 1 if gone or inside.listener.step > MOST_STEP or grown > MOST_GROWTH or not followed else 0
+    if args.node != 'all':
+        return attack(args.node, args)
+    same = [str(args.count), f'--minutes={args.minutes}', f'--dds={args.dds}', f'--seed={args.seed}']
+    command = [sys.executable, '-m', 'bench.campaign.messages', *same]
+    each = [subprocess.Popen([*command, '--node', name], cwd=ROOT) for name in NODES]
+    return max(abs(one.wait()) for one in each)
 
 
 if __name__ == '__main__':
