@@ -55,6 +55,7 @@ class HealthReporter:
     def report(self, t_ns: int) -> DiagnosticReport:
         """The report for the time since the last one. ``t_ns``: now, ROS time."""
         s = self._session
+        s.settle()
         wire, pipeline = s.acquisition.counters, s.pipeline.counters
         dropped = wire.queue_dropped + s.recorder.dropped
         now = _Seen(

@@ -308,6 +308,10 @@ class Session:
         self.why_refused[topic] = why
         self._repeats.tell(f'refused {topic}', f'{topic}: refused: {why}', WARNING, time.monotonic())
 
+    def settle(self) -> None:
+        """Let what was counted of refused messages be said when it is due; to be called now and then."""
+        self.processing.later(lambda: self._repeats.settle(time.monotonic()))
+
     def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False) -> AppliedLoad:
         """Take down that this load (N, N, N m) acts at the tip from now on, as if it had come on ``/link_tip/load``.
 

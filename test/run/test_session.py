@@ -19,6 +19,7 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.run import processing
 from psd_deflection.run import session as module
 from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
+from psd_deflection.run.repeats import Repeats
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice
@@ -165,3 +166,13 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
     assert dict(entry.values)[f'messages refused: {REFERENCE}'] == '2'
     assert entry.level == WARN
     assert entry.message.startswith(f'{REFERENCE}: refused: ')
+
+
+def test_what_was_counted_of_refused_messages_is_said_though_no_more_come(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The health is asked once a second, whatever the run publishes."""
+    settled: queue.SimpleQueue[float] = queue.SimpleQueue()
+    monkeypatch.setattr(Repeats, 'settle', lambda _, now_s: settled.put(now_s))
+    HealthReporter(running.session).report(1)
+    assert settled.get(timeout=WAIT_S) <= time.monotonic()
