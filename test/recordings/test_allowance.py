@@ -137,6 +137,18 @@ def test_a_small_file_causes_little_work(crafted: Path, monkeypatch: pytest.Monk
     assert not recording.complete
 
 
+def test_a_file_that_unpacks_to_gigabytes_is_refused_once_with_its_bound(tmp_path: Path) -> None:
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(MAGIC + chunk(record(0x90, bytes(60_000_000))) * 100)
+    recording = BagRecording(path)
+    assert recording.topics() == {}
+    size = path.stat().st_size
+    (line,) = (w for w in recording.warnings if 'unpacks to' in w)
+    bound = 64 * 2**20 + 100 * size
+    assert f'{path}: unpacks to more than {bound} bytes, as many as a file of {size} bytes may' in line
+    assert not any('damaged' in w for w in recording.warnings)
+
+
 def test_channels_are_left_out_beyond_what_a_file_can_need(tmp_path: Path) -> None:
     path = tmp_path / 'a.mcap'
     path.write_bytes(MAGIC + chunk(many(65_536)))

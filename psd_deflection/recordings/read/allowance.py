@@ -34,6 +34,10 @@ class DamagedError(Exception):
     """The bytes contradict themselves, or ask for more than is allowed."""
 
 
+class SpentError(Exception):
+    """The file unpacks to more than a file of its size may."""
+
+
 class Allowance:
     """Of one pass over a file of ``size`` bytes. ``records``: how many may still come; the reader of a chunk counts
     them down."""
@@ -41,18 +45,19 @@ class Allowance:
     def __init__(self, size: int) -> None:
         self.size = size
         self.records = _RECORDS + size // _BYTES_A_RECORD
-        self._unpacked = _UNPACKED_BYTES + _UNPACKED_EACH * size
+        self._most = self._left = _UNPACKED_BYTES + _UNPACKED_EACH * size
 
     def may_unpack(self, size: int) -> None:
-        """Raise DamagedError if a chunk that declares ``size`` bytes must not be unpacked."""
+        """Raise DamagedError if no chunk may declare ``size`` bytes, SpentError if the file may not unpack to more."""
         if size > MAX_CHUNK_BYTES:
             raise DamagedError(f'it declares {size} bytes, more than {MAX_CHUNK_BYTES}')
-        if size > self._unpacked:
-            raise DamagedError(f'it declares {size} bytes, too many for a file of {self.size} bytes')
+        if size > self._left:
+            most = f'{self._most} bytes, as many as a file of {self.size} bytes may'
+            raise SpentError(f'unpacks to more than {most}: a chunk that declares {size} bytes is left out')
 
     def unpacked(self, size: int) -> None:
         """A chunk of ``size`` bytes was unpacked."""
-        self._unpacked -= size
+        self._left -= size
 
     def outside(self) -> bool:
         """Allow for a record outside of any chunk; False if that is one too many."""

@@ -30,7 +30,7 @@ from psd_deflection.recordings.mcap_format import (
     parsed,
     parsed_chunk,
 )
-from psd_deflection.recordings.read.allowance import MAX_CHUNK_BYTES, Allowance, DamagedError, Warnings
+from psd_deflection.recordings.read.allowance import MAX_CHUNK_BYTES, Allowance, DamagedError, SpentError, Warnings
 
 
 class RecordedChannel(NamedTuple):
@@ -178,6 +178,9 @@ class McapReader:
             yield
         except DamagedError as error:
             self.warn(f'the chunk at byte {at} is damaged ({error}); what it held is missing')
+        except SpentError as error:
+            # Chunks that are alike have one line. This one may be damaged alone: the next one may fit.
+            self.warn(str(error))
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Messages in the order of the file, of ``topics`` or of all.
@@ -254,7 +257,8 @@ def _records_in(records: bytes, allowance: Allowance) -> Iterator[tuple[int, int
 
 
 def _unpacked(content: bytes, allowance: Allowance) -> bytes:
-    """The records of a chunk record's content. Raises DamagedError if it contradicts itself, or declares too much."""
+    """The records of a chunk record's content. Raises DamagedError if it contradicts itself, or declares too much;
+    SpentError if the file unpacks to too much."""
     chunk = parsed_chunk(content)
     size = chunk.size
     allowance.may_unpack(size)
