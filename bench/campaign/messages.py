@@ -35,6 +35,7 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import SetBool
 
@@ -56,6 +57,8 @@ PAUSE_S = 0.002
 """Between two messages over DDS, s."""
 ON_GRAPH = ('/parameter_events', '/rosout')
 """What ROS itself may subscribe to."""
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""Whoever asks for less is served, too."""
 SET_TYPES = (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 77)
 """Types of a parameter, and one that is none."""
 
@@ -242,7 +245,7 @@ def over_dds(name: str, count: int, seed: int, folder: Path) -> list[str]:
     try:
         kinds = _on_graph(node, name, program)
         senders = {
-            topic: (node.create_publisher(kind, topic, 50), good_of(topic, kind)) for topic, kind in kinds.items()
+            topic: (node.create_publisher(kind, topic, LATCHED), good_of(topic, kind)) for topic, kind in kinds.items()
         }
         for topic in senders:
             _until(lambda topic=topic: senders[topic][0].get_subscription_count() > 0, topic, program)
