@@ -155,7 +155,7 @@ def bare_publishers(recording: str, seconds: float) -> None:
     """Child process: publishes the messages of each block, which are encoded already."""
     import rclpy
 
-    from psd_deflection.ros.wires import message_class
+    from psd_deflection.ros.endpoints import message_class
 
     rclpy.init()
     node = rclpy.create_node('bench_publishers')

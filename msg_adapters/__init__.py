@@ -51,6 +51,7 @@ DEFLECTION = '/link_tip/deflection'
 DEFLECTION_WITH_COVARIANCE = '/link_tip/deflection_with_covariance'
 SOLVER = '/link_tip/{solver}/deflection'
 """Each solver's own answer."""
+WRENCH = '/link_tip/wrench'
 VELOCITY = '/link_tip/velocity'
 FILTERED = '/link_tip/filtered/deflection'
 DIAGNOSTICS = '/diagnostics'
@@ -72,6 +73,22 @@ def spot_topics(psds: int) -> tuple[str, ...]:
 SPOTS = spot_topics(2)
 """Of the PSDs that every rig has."""
 
+
+class Delivery(NamedTuple):
+    """QoS of a topic: messages kept for a slow subscriber, and whether a late one gets the last message."""
+
+    depth: int = 10
+    reliable: bool = True
+    latched: bool = False
+
+
+RELIABLE = Delivery()
+LATCHED = Delivery(depth=1, latched=True)
+"""A late subscriber gets the last message (durability transient local)."""
+SECOND_OF_BLOCKS = 50
+"""A second of raw blocks: a subscriber that pauses for less misses none."""
+BEST_EFFORT = Delivery(SECOND_OF_BLOCKS, reliable=False)
+"""Of an input: a publisher may be of either kind."""
 
 Item = tuple[str, int, Any]
 """A message to be made: its topic, its stamp (ns), and what its fields are made of."""
@@ -118,54 +135,161 @@ def _of_psd(psd: int) -> Callable[[str, SpotMeans], Iterator[Item]]:
 class Topic(NamedTuple):
     """One topic, or one for each solver (``{solver}``): the message on it and the record that it is made of.
 
-    ``fields``: of a record, or of what ``items`` makes of it. ``to_record``: back again, for a topic that the node
-    subscribes to. ``latched``: a late subscriber gets the last message (durability transient local). ``items``: the
-    messages of a record.
+    ``says``: what is on it, for the documentation. ``fields``: of a record, or of what ``items`` makes
+    of it. ``to_record``: back again, for a topic that the node subscribes to. ``delivery``: how it is
+    published, or subscribed to if it is an input. ``items``: the messages of a record. ``common``: has
+    one name for all nodes of a graph, whatever their namespaces.
     """
 
     name: str
+    says: str
     message: MessageType
     record: type[Any]
     fields: Callable[[Any], Fields]
     to_record: Callable[[Mapping[str, Any]], Input] | None = None
-    latched: bool = False
+    delivery: Delivery = RELIABLE
     items: Callable[[str, Any], Iterator[Item]] = _one
+    common: bool = False
 
 
 TOPICS = (
-    Topic(SAMPLES, point_cloud2.MESSAGE, SampleBlock, point_cloud2.from_block, items=_parts),
+    Topic(
+        SAMPLES,
+        'every raw sample, one message per block, stamped with its first sample: '
+        'a table (volts, no x, y, z), not a cloud to draw',
+        point_cloud2.MESSAGE,
+        SampleBlock,
+        point_cloud2.from_block,
+        delivery=Delivery(SECOND_OF_BLOCKS),
+        items=_parts,
+    ),
     *(
-        Topic(name, point_stamped.MESSAGE, SpotMeans, partial(point_stamped.from_spot, psd=n), items=_of_psd(n))
+        Topic(
+            name,
+            'the dot of each PSD (m)',
+            point_stamped.MESSAGE,
+            SpotMeans,
+            partial(point_stamped.from_spot, psd=n),
+            items=_of_psd(n),
+        )
         for n, name in enumerate(spot_topics(MOST_PSDS), start=1)
     ),
     # A controller waits for this message: it comes first.
-    Topic(DEFLECTION, pose_stamped.MESSAGE, DeflectionEstimate, pose_stamped.from_estimate, items=_of_primary),
-    Topic(SOLVER, pose_stamped.MESSAGE, DeflectionEstimate, pose_stamped.from_estimate, items=_of_solver),
+    Topic(
+        DEFLECTION,
+        'ΔX, ΔY (m) and rotation, in `link_tip_rest`; stamp = middle of the block',
+        pose_stamped.MESSAGE,
+        DeflectionEstimate,
+        pose_stamped.from_estimate,
+        items=_of_primary,
+    ),
+    Topic(
+        SOLVER,
+        "each solver's own answer",
+        pose_stamped.MESSAGE,
+        DeflectionEstimate,
+        pose_stamped.from_estimate,
+        items=_of_solver,
+    ),
     Topic(
         DEFLECTION_WITH_COVARIANCE,
+        'the deflection with its covariance',
         pose_with_covariance_stamped.MESSAGE,
         DeflectionEstimate,
         pose_with_covariance_stamped.from_estimate,
         items=_of_primary,
     ),
-    Topic('/link_tip/wrench', wrench_stamped.MESSAGE, TipLoad, wrench_stamped.from_load),
-    Topic(VELOCITY, twist_stamped.MESSAGE, TipMotion, twist_stamped.from_motion),
-    Topic(FILTERED, pose_with_covariance_stamped.MESSAGE, TipMotion, pose_with_covariance_stamped.from_estimate),
-    Topic(DIAGNOSTICS, diagnostic_array.MESSAGE, DiagnosticReport, diagnostic_array.from_report),
-    Topic(RIG, string.MESSAGE, RigState, string.from_rig, latched=True),
-    Topic(LOAD, wrench_stamped.MESSAGE, AppliedLoad, wrench_stamped.from_load, wrench_stamped.to_applied_load),
-    Topic(ACCELERATION, accel_stamped.MESSAGE, BaseAcceleration, accel_stamped.from_base, accel_stamped.to_base),
-    Topic(REFERENCE, pose_stamped.MESSAGE, ReferencePose, pose_stamped.from_reference, pose_stamped.to_reference),
+    Topic(
+        WRENCH,
+        'the tip load that would cause this deflection, by the link model and the effects in the rig file',
+        wrench_stamped.MESSAGE,
+        TipLoad,
+        wrench_stamped.from_load,
+    ),
+    Topic(
+        VELOCITY,
+        "with `filter: modal`: the tip's velocity ([Motion](motion.md))",
+        twist_stamped.MESSAGE,
+        TipMotion,
+        twist_stamped.from_motion,
+    ),
+    Topic(
+        FILTERED,
+        "with `filter: modal`: the pose at the block's last sample, coasting through what is lost",
+        pose_with_covariance_stamped.MESSAGE,
+        TipMotion,
+        pose_with_covariance_stamped.from_estimate,
+    ),
+    Topic(
+        DIAGNOSTICS,
+        'once a second: the health of each part, as rates, losses and their causes, clock, latency, lasers',
+        diagnostic_array.MESSAGE,
+        DiagnosticReport,
+        diagnostic_array.from_report,
+        common=True,
+    ),
+    Topic(
+        RIG,
+        'all parameters, the zero and what the device says of itself, as JSON; sent again when one changes, '
+        'and every 10 s with `memory`: what the pipeline remembers before `block`, '
+        'so that a recorder that joined late replays bit for bit from there',
+        string.MESSAGE,
+        RigState,
+        string.from_rig,
+        delivery=LATCHED,
+    ),
+    Topic(
+        LOAD,
+        'a known load at the tip, in `link_tip_rest`; holds until the next',
+        wrench_stamped.MESSAGE,
+        AppliedLoad,
+        wrench_stamped.from_load,
+        wrench_stamped.to_applied_load,
+        # It holds until the next: a lost message would be a wrong label of all that follows.
+        Delivery(SECOND_OF_BLOCKS),
+    ),
+    Topic(
+        ACCELERATION,
+        "with `filter: modal`: acceleration of the link's base, in `link_base` "
+        '([Motion](motion.md#a-link-on-a-base-that-moves))',
+        accel_stamped.MESSAGE,
+        BaseAcceleration,
+        accel_stamped.from_base,
+        accel_stamped.to_base,
+        BEST_EFFORT,
+    ),
+    Topic(
+        REFERENCE,
+        'an independent measurement of the tip, in `link_tip_rest`',
+        pose_stamped.MESSAGE,
+        ReferencePose,
+        pose_stamped.from_reference,
+        pose_stamped.to_reference,
+        BEST_EFFORT,
+    ),
     Topic(
         REFERENCE_WITH_COVARIANCE,
+        'the reference with its covariance',
         pose_with_covariance_stamped.MESSAGE,
         ReferenceWithCovariance,
         pose_with_covariance_stamped.from_estimate,
         pose_with_covariance_stamped.to_reference,
+        BEST_EFFORT,
     ),
-    Topic(TEMPERATURE, temperature.MESSAGE, TemperatureReading, temperature.from_reading, temperature.to_reading),
+    Topic(
+        TEMPERATURE,
+        'the temperature of the rig, °C',
+        temperature.MESSAGE,
+        TemperatureReading,
+        temperature.from_reading,
+        temperature.to_reading,
+        BEST_EFFORT,
+    ),
 )
-"""Every topic of a rig's records, in the order in which the messages of one are sent: a new one is one line here."""
+"""Every topic of a rig's records, in the order in which the messages of one are sent: a new one is one entry here.
+
+The topics that carry no record (frames, markers, a robot's joints) are in :mod:`psd_deflection.ros.topics`, with these.
+"""
 
 TOPIC_TYPES: Mapping[str, str] = {t.name: t.message.name for t in TOPICS if t.name != SOLVER}
 MESSAGE_TYPES: Mapping[str, MessageType] = {t.message.name: t.message for t in TOPICS}
@@ -178,9 +302,7 @@ FILTER_TOPICS = (VELOCITY, FILTERED)
 FILTER_INPUTS = (ACCELERATION,)
 """Subscribed to if the rig asks for the filter."""
 
-LATCHED = tuple(t.name for t in TOPICS if t.latched)
-
-_BY_NAME = {t.name: t for t in TOPICS}
+BY_NAME: Mapping[str, Topic] = {t.name: t for t in TOPICS}
 ROWS: dict[type[Any], tuple[Topic, ...]] = {ParameterChange: ()}
 ROWS |= {kind: tuple(t for t in TOPICS if t.record is kind) for kind in {t.record for t in TOPICS}}
 """The topics of each kind of record; a change of parameters has none."""
@@ -231,7 +353,7 @@ def messages(record: Record, frame_prefix: str = '') -> Iterator[Message]:
 
 def from_fields(topic: str, fields: Mapping[str, Any]) -> Input:
     """The record of a message on one of ``INPUTS``. Raises ValueError for another topic, and if it cannot be used."""
-    found = _BY_NAME.get(topic)
+    found = BY_NAME.get(topic)
     if found is None or found.to_record is None:
         raise ValueError(f'{topic} is not an input')
     return found.to_record(fields)

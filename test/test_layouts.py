@@ -15,6 +15,7 @@ from msg_adapters import DIAGNOSTICS, INPUTS, TOPIC_TYPES
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.ros import names
+from psd_deflection.ros import topics as table
 
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / 'config'
@@ -75,11 +76,11 @@ def test_plotjuggler(recorded: dict[str, Any]) -> None:
 def test_rviz() -> None:
     tree = yaml.safe_load((CONFIG / 'link_tip.rviz').read_text())
     displays = [d for d in tree['Visualization Manager']['Displays'] if d['Class'].endswith('MarkerArray')]
-    assert {d['Topic']['Value'] for d in displays} == {names.MARKERS, names.MARKERS_AT_REST}
+    assert {d['Topic']['Value'] for d in displays} == {table.MARKERS, table.MARKERS_AT_REST}
     assert tree['Visualization Manager']['Global Options']['Fixed Frame'] == names.BASE
     # A subscriber that asks for more than the publisher gives is not connected at all.
     for topic in (d['Topic'] for d in displays):
-        given = names.delivery(topic['Value'])
+        given = table.PUBLISHED[topic['Value']].delivery
         assert topic['Durability Policy'] == ('Transient Local' if given.latched else 'Volatile')
         assert topic['Reliability Policy'] == 'Reliable'
         assert given.reliable
@@ -91,7 +92,7 @@ def test_the_sros2_policy() -> None:
     assert sorted(enclaves) == ['/psd/estimator', '/psd/operator', '/psd/viewer']
     of_every_node = {'/rosout', '/parameter_events'}
     topics = {t.text for t in root.iter('topic')} - of_every_node - {'*', '/link_tip/*'}
-    assert topics <= {*TOPIC_TYPES, names.TF, names.TF_STATIC}
+    assert topics <= {*TOPIC_TYPES, table.TF, table.TF_STATIC}
     assert topics >= set(INPUTS)
     served = {name.replace('~', '/estimator') for name in names.SERVICES}
     requested = {

@@ -15,9 +15,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from rclpy.qos import QoSProfile, ReliabilityPolicy
-
-from msg_adapters import REFERENCE, REFERENCE_WITH_COVARIANCE, TOPIC_TYPES, to_messages
+from msg_adapters import REFERENCE, REFERENCE_WITH_COVARIANCE, to_messages
 from psd_deflection.arms.inputs import stamp_fault
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING, Say
@@ -29,20 +27,19 @@ from psd_deflection.camera.settings import SETTINGS, CameraSettings
 from psd_deflection.camera.targets import target_of
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, ReferencePose
+from psd_deflection.ros.declared import DeclaredParameters
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
-from psd_deflection.ros.wires import message_class, relative
+from psd_deflection.ros.topics import CAMERA_INFO, COMPRESSED, IMAGE
 from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN
 
 NODE_NAME = 'camera'
-MOST_IMAGE_BYTES = 400_000_000
-"""Maximum size of an image's message: that of the largest image that is read, with 16 bits a pixel."""
 MOST_DISTORTIONS = 14
 LARGEST_NUMBER = 1e7
 """Bound of the numbers of a camera's matrix, px, and of its distortion."""
 
 
-class CameraNode(BaseNode):
+class CameraNode(BaseNode[CameraSettings]):
     """The node. ``given``: parameters of a file or an option. Raises ConfigError if OpenCV is missing, too."""
 
     def __init__(self, given: CameraSettings, say: Say) -> None:
@@ -54,40 +51,21 @@ class CameraNode(BaseNode):
         self._last: FrameAnswer | None = None
         super().__init__(NODE_NAME, say)
 
-    @property
-    def settings(self) -> CameraSettings:
-        """As they are now."""
-        return self._parameters.settings
-
-    @property
-    def frame_prefix(self) -> str:
-        """Of the frame of the references."""
-        return self.settings.frame_prefix
+    def declare(self) -> DeclaredParameters[CameraSettings]:
+        """Those of a camera."""
+        return self.declared(SETTINGS, self._given, self._changed)
 
     def set_up(self) -> None:
-        """Declare parameters; listen to images."""
-        self._parameters = self.declare(SETTINGS, SETTINGS.values(self._given), self._changed)
+        """Listen to images."""
         target_of(self.settings)
-        self._out = {
-            # Reliable: a subscriber may ask for less, as the estimator does.
-            topic: self.publisher(message_class(TOPIC_TYPES[topic]), relative(topic))
-            for topic in (REFERENCE, REFERENCE_WITH_COVARIANCE)
-        }
-        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        image = self.node.resolve_topic_name('image')
-        for topic, name, take in (
-            (image, 'sensor_msgs/msg/Image', self._image),
-            (
-                self._beside('image/compressed', f'{image}/compressed'),
-                'sensor_msgs/msg/CompressedImage',
-                self._compressed,
-            ),
-        ):
-            self.gate.listen(message_class(name), topic, _image_fault, take, newest, MOST_IMAGE_BYTES)
+        self._out = {topic: self.publisher(topic) for topic in (REFERENCE, REFERENCE_WITH_COVARIANCE)}
+        image = self.node.resolve_topic_name(IMAGE)
+        compressed = self._beside(COMPRESSED, f'{image}/compressed')
         # As image_transport has it: the camera's information is beside its images.
-        info = self._beside('camera_info', image.rpartition('/')[0] + '/camera_info')
-        kind = message_class('sensor_msgs/msg/CameraInfo')
-        self.gate.listen(kind, info, _info_fault, self._take_info, newest)
+        info = self._beside(CAMERA_INFO, image.rpartition('/')[0] + '/camera_info')
+        self.gate.listen(IMAGE, _image_fault, self._image, image)
+        self.gate.listen(COMPRESSED, _image_fault, self._compressed, compressed)
+        self.gate.listen(CAMERA_INFO, _info_fault, self._take_info, info)
         topics = ', '.join(publisher.topic_name for publisher in self._out.values())
         self.log(f'waiting for images on {image}; publishing {topics}')
 

@@ -8,30 +8,25 @@ the pipeline threads.
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future as DiskFuture
 from typing import Any
 
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.publisher import Publisher
-from rclpy.task import Future
-from std_srvs.srv import SetBool, Trigger
-
-from msg_adapters import DEFLECTION_WITH_COVARIANCE, END_EFFECTOR, TOPIC_TYPES
+from msg_adapters import DEFLECTION_WITH_COVARIANCE, END_EFFECTOR
 from msg_adapters.pose_with_covariance_stamped import from_end_effector
-from psd_deflection.arms.chains.chain_file import SETTINGS, ChainFile
+from psd_deflection.arms.chains.chain_file import SETTINGS, ChainFile, ChainSettings
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.inputs import joints_fault
-from psd_deflection.base.errors import PsdDeflectionError
 from psd_deflection.base.log import WARNING, Say
 from psd_deflection.recordings import cdr
-from psd_deflection.ros.names import BASE, END, END_REST, JOINT_STATES, RECORD, REST, TF, TF_STATIC, TIP, ZERO
+from psd_deflection.ros.declared import DeclaredParameters
+from psd_deflection.ros.names import BASE, END, END_REST, RECORD, REST, TIP, ZERO
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
-from psd_deflection.ros.transforms import installed, static_transforms, transform_message
-from psd_deflection.ros.wires import InputRecorder, PublisherWire, message_class, qos, relative, topics_of
+from psd_deflection.ros.services import Zeroed, add_rig_services
+from psd_deflection.ros.topics import JOINT_STATES, PUBLISHED
+from psd_deflection.ros.transforms import FramePublisher, installed, static_transforms, transform_message
+from psd_deflection.ros.wires import InputRecorder, PublisherWire, topics_of
 from psd_deflection.run.chain import ChainSession, Composed
 from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN, HealthReporter
 from psd_deflection.run.fanout import subscribed
@@ -41,10 +36,9 @@ from psd_deflection.run.session import Session, why_no_zero, zero_text
 from psd_deflection.run.signals import Signals, StopRequestedError
 
 NODE_NAME = 'chain'
-_KIND = TOPIC_TYPES[DEFLECTION_WITH_COVARIANCE]
 
 
-class ChainNode(BaseNode):
+class ChainNode(BaseNode[ChainSettings]):
     """The node and, while it is configured, its rigs."""
 
     SYSTEM_TIME = True
@@ -58,36 +52,28 @@ class ChainNode(BaseNode):
         self._told: list[RigPublisher] = []
         self._health: list[HealthReporter] = []
         self._seen = (0, 0)
-        self._tf: Publisher | None = None
-        self._tf_static: Publisher | None = None
+        self._frames: FramePublisher | None = None
         super().__init__(NODE_NAME, say)
 
-    @property
-    def frame_prefix(self) -> str:
-        """Of all frames."""
-        return self._file.settings.frame_prefix
+    def declare(self) -> DeclaredParameters[ChainSettings]:
+        """Those of a chain."""
+        return self.declared(SETTINGS, self._file.settings)
 
     def set_up(self) -> None:
-        """Declare parameters; make what is on the graph while the node lives."""
-        settings = self.declare(SETTINGS, SETTINGS.values(self._file.settings)).settings
-        self._file = file = self._file.with_settings(settings)
+        """Make what is on the graph while the node lives."""
+        self._file = file = self._file.with_settings(self.settings)
         node = self.node
-        self._end = self.publisher(message_class(_KIND), relative(END_EFFECTOR), qos(END_EFFECTOR))
+        self._end = self.publisher(END_EFFECTOR)
         if installed():
-            self._message = importlib.import_module('tf2_msgs.msg').TFMessage
-            self._tf = node.create_publisher(self._message, TF, qos(TF))
-            self._tf_static = node.create_publisher(self._message, TF_STATIC, qos(TF_STATIC))
+            self._frames = FramePublisher(node)
         else:
             self.log('tf2_msgs is not installed: no frames on /tf', WARNING)
         for name, rig in zip(file.names, file.rigs, strict=True):
             self._wires.append(PublisherWire(node, topics_of(rig), name))
             self._inputs.append(InputRecorder(node, subscribed(rig), name))
         if any(joint.name for joint in file.joints):
-            kind = message_class('sensor_msgs/msg/JointState')
-            self.gate.listen(kind, JOINT_STATES, self._joints_fault, self._joints, 10)
-        node.create_service(Trigger, ZERO, self._zero)
-        # In a separate group: while one request waits for the disk, the node serves everything else.
-        node.create_service(SetBool, RECORD, self._record, callback_group=ReentrantCallbackGroup())
+            self.gate.listen(JOINT_STATES, self._joints_fault, self._joints)
+        add_rig_services(node, lambda: self.chain, self._zero, ChainSession.record)
 
     def configure(self) -> None:
         """Open the rigs and let samples flow; nothing is published yet. Raises the errors of a session."""
@@ -117,10 +103,9 @@ class ChainNode(BaseNode):
         super().activate()
         for wire in self._wires:
             wire.active = True
-        if self._tf_static is not None:
+        if self._frames is not None:
             now = time.time_ns()
-            fixed = [t for rig in self._file.rigs for t in static_transforms(rig, now)]
-            self._tf_static.publish(self._message(transforms=fixed))
+            self._frames.fix([t for rig in self._file.rigs for t in static_transforms(rig, now)])
         for told in self._told:
             told.tell()
         topics = [self._end.topic_name, *(w.names((DEFLECTION_WITH_COVARIANCE,))[0] for w in self._wires)]
@@ -146,9 +131,11 @@ class ChainNode(BaseNode):
         record = composed.as_record()
         if record is None or not self.active:
             return
-        self._end.publish(cdr.encode(_KIND, from_end_effector(record, self.frame_prefix + END_REST)))
-        if self._tf is not None:
-            self._tf.publish(self._message(transforms=chain_transforms(self._file, composed)))
+        self._end.publish(
+            cdr.encode(PUBLISHED[END_EFFECTOR].type, from_end_effector(record, self.frame_prefix + END_REST))
+        )
+        if self._frames is not None:
+            self._frames.move(chain_transforms(self._file, composed))
 
     def _joints_fault(self, message: Any) -> str:
         return joints_fault(message.name, message.position, {joint.name for joint in self._file.joints})
@@ -157,41 +144,16 @@ class ChainNode(BaseNode):
         if self.chain is not None:
             self.chain.turn(dict(zip(message.name, message.position, strict=False)))
 
-    def _zero(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = False
-        if self.chain is None:
-            response.message = 'not zeroed: the node is not configured'
-            return response
-        try:
-            taken = self.chain.zero()
-        except (PsdDeflectionError, TimeoutError) as error:
-            response.message = f'not zeroed: {error}'
-            return response
-        links = zip(self._file.names, self.chain.sessions, taken, strict=True)
-        response.message = '; '.join(
+    def _zero(self, chain: ChainSession) -> Zeroed:
+        taken = chain.zero()
+        links = zip(self._file.names, chain.sessions, taken, strict=True)
+        texts = (
             f'{name}: not zeroed: {why_no_zero(session.pipeline)}'
             if change is None
             else f'{name}: {zero_text(session.rig)}'
             for name, session, change in links
         )
-        response.success = None not in taken
-        return response
-
-    async def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        response.success = False
-        if self.chain is None:
-            response.message = 'the node is not configured'
-            return response
-        try:
-            folders = [await _answer(asked) for asked in self.chain.record(request.data)]
-        except (PsdDeflectionError, TimeoutError) as error:
-            response.message = str(error)
-            return response
-        response.success = True
-        said = [str(folder) for folder in folders if folder is not None]
-        verb = 'recording to' if request.data else 'recording ended:'
-        response.message = f'{verb} {", ".join(said)}' if said else 'no recording runs'
-        return response
+        return Zeroed(None not in taken, '; '.join(texts))
 
     def report(self) -> None:
         """Publish the states of the links, which are recorded, and of the end effector."""
@@ -226,14 +188,6 @@ class ChainNode(BaseNode):
             (f'angle {j.name}', f'{a:.6f}') for j, a in zip(self._file.joints, chain.angles, strict=True) if j.name
         ]
         return (Health('end effector', level, text, tuple(values)),)
-
-
-async def _answer(asked: DiskFuture[Any]) -> Any:
-    """The result of ``asked``, without a thread that waits."""
-    answered: Any = Future()
-    asked.add_done_callback(lambda _: answered.set_result(None))
-    await answered
-    return asked.result()
 
 
 def chain_transforms(file: ChainFile, composed: Composed) -> list[Any]:

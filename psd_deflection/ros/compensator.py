@@ -23,17 +23,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial.transform import Rotation
 from std_srvs.srv import SetBool
 
-from msg_adapters import DEFLECTION_WITH_COVARIANCE, END_EFFECTOR, TOPIC_TYPES
+from msg_adapters import END_EFFECTOR
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.arm import Arm, arm_of
 from psd_deflection.arms.compensation.compensator import (
     ALL_JOINTS,
-    COMMANDS,
     SETTINGS,
     Command,
     Compensator,
@@ -41,26 +38,36 @@ from psd_deflection.arms.compensation.compensator import (
     Observed,
     State,
 )
+from psd_deflection.arms.compensation.compensator import COMMANDS as WITH_COMMANDS
 from psd_deflection.arms.compensation.robot import RobotWatch
 from psd_deflection.arms.inputs import LARGEST_POSITION, frame_fault, joints_fault, quaternion_fault, stamp_fault
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.records import FloatArray
-from psd_deflection.ros.description import TOPIC as ROBOT_DESCRIPTION
+from psd_deflection.ros.declared import DeclaredParameters
 from psd_deflection.ros.description import robot_description
-from psd_deflection.ros.names import END_REST, JOINT_STATES
+from psd_deflection.ros.endpoints import message_class
+from psd_deflection.ros.names import END_REST
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
-from psd_deflection.ros.wires import message_class, relative
+from psd_deflection.ros.topics import (
+    APPLIED,
+    COMMANDS,
+    CONTROLLER,
+    JOINT_STATES,
+    OFFSETS,
+    PROPOSED,
+    PUBLISHED,
+    ROBOT_DESCRIPTION,
+    RUNNING,
+    SCALING,
+)
 from psd_deflection.run.diagnostics import ERROR, OK, WARN
 from psd_deflection.run.repeats import Repeats
 from psd_deflection.run.signals import StopRequestedError
 
 NODE_NAME = 'compensator'
 ENABLE = '~/enable'
-OFFSETS, SUMS, PROPOSED = '~/offsets', '~/commands', '~/proposed'
-APPLIED, RUNNING, SCALING, CONTROLLER = '~/applied', '~/robot_running', '~/speed_scaling', '~/controller_state'
-ARRAY = 'std_msgs/msg/Float64MultiArray'
 PERIOD_S = 0.01
 TOLD_S = 0.02
 """Changes of state that are shorter are not told, s."""
@@ -77,7 +84,7 @@ MOST_SCALING = 1000.0
 _LEVELS = {State.OFF: OK, State.FOLLOWING: OK, State.RELEASING: WARN, State.HOLDING: ERROR}
 
 
-class CompensatorNode(BaseNode):
+class CompensatorNode(BaseNode[CompensatorSettings]):
     """The node; ``drive``: publish offsets for a controller, else proposals. Raises ConfigError for a bad parameter.
 
     ``hurried``: whether its end is not to wait for the offsets to go back to zero.
@@ -103,28 +110,21 @@ class CompensatorNode(BaseNode):
         self._rest_t: float | None = None
         super().__init__(NODE_NAME, say)
 
-    @property
-    def settings(self) -> CompensatorSettings:
-        """As they are now."""
-        return self._parameters.settings
-
-    @property
-    def frame_prefix(self) -> str:
-        """Of the frame of the deflections."""
-        return self.settings.frame_prefix
+    def declare(self) -> DeclaredParameters[CompensatorSettings]:
+        """Those of a compensator."""
+        return self.declared(SETTINGS, self._given, self._changed)
 
     def set_up(self) -> None:
-        """Declare parameters; listen to deflections, joints and the robot; make the outputs."""
-        self._parameters = self.declare(SETTINGS, SETTINGS.values(self._given), self._changed)
+        """Listen to deflections, joints and the robot; make the outputs."""
         self._order = _order(self._arm, self.settings.joints)
-        self._sums = self.settings.output == COMMANDS
+        self._sums = self.settings.output == WITH_COMMANDS
         self.compensator = Compensator(self._arm, self.settings, dry=not self._drive)
         self.command = self._told = self.compensator.command()
         self._repeats = Repeats(self.log)
         self._listen()
-        self._array = message_class(ARRAY)
-        outputs = [PROPOSED] if not self._drive else [OFFSETS, SUMS] if self._sums else [OFFSETS]
-        self._publishers: dict[str, Publisher] = {name: self.publisher(self._array, name, 5) for name in outputs}
+        self._array = message_class(PUBLISHED[OFFSETS].type)
+        outputs = [PROPOSED] if not self._drive else [OFFSETS, COMMANDS] if self._sums else [OFFSETS]
+        self._publishers = {topic: self.publisher(topic) for topic in outputs}
         if self._drive:
             self.node.create_service(SetBool, ENABLE, self._enable)
         self.node.create_timer(TOLD_S, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -135,20 +135,17 @@ class CompensatorNode(BaseNode):
 
     def _listen(self) -> None:
         listen = self.gate.listen
-        kind = message_class(TOPIC_TYPES[DEFLECTION_WITH_COVARIANCE])
-        listen(kind, relative(END_EFFECTOR), self._deflection_fault, self._seen)
-        listen(message_class('sensor_msgs/msg/JointState'), JOINT_STATES, self._joints_fault, self._joints)
+        listen(END_EFFECTOR, self._deflection_fault, self._seen)
+        listen(JOINT_STATES, self._joints_fault, self._joints)
         if not self._drive:
             return
-        latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        # One of them hears a driver that said it once, before we came; the other a driver that does not keep it.
-        for delivery in (latched, 1):
-            listen(message_class('std_msgs/msg/Bool'), RUNNING, _nothing_wrong, self._runs, delivery)
-        listen(message_class('std_msgs/msg/Float64'), SCALING, _scaling_fault, self._scaled)
-        if self.settings.controller_state:
-            listen(_installed(self.settings.controller_state), CONTROLLER, _nothing_wrong, self._controlled)
+        listen(RUNNING, _nothing_wrong, self._runs)
+        listen(SCALING, _scaling_fault, self._scaled)
+        if state := self.settings.controller_state:
+            _check_installed(state)
+            listen(CONTROLLER, _nothing_wrong, self._controlled, type_name=state)
         if not self._sums:
-            listen(message_class(ARRAY), APPLIED, self._applied_fault, self._applied)
+            listen(APPLIED, self._applied_fault, self._applied)
 
     def _changed(self, settings: CompensatorSettings) -> None:
         with self._lock:
@@ -309,7 +306,7 @@ class CompensatorNode(BaseNode):
 
     def _publish(self, command: Command) -> None:
         for name, publisher in self._publishers.items():
-            values = command.positions if name == SUMS else command.offsets
+            values = command.positions if name == COMMANDS else command.offsets
             if values is not None:
                 publisher.publish(self._array(data=values[self._order].tolist()))
 
@@ -368,10 +365,10 @@ def _scaling_fault(message: Any) -> str:
     return '' if 0.0 <= message.data <= MOST_SCALING else f'{message.data:g}: must be at least 0 and at most 1000'
 
 
-def _installed(kind: str) -> Any:
-    """The class of a message. Raises ConfigError if it is not installed."""
+def _check_installed(kind: str) -> None:
+    """Raises ConfigError if the message ``kind`` is not installed."""
     try:
-        return message_class(kind)
+        message_class(kind)
     except (ImportError, AttributeError, ValueError, LookupError):
         raise ConfigError(f'controller_state = {kind!r}: no message of that name is installed') from None
 

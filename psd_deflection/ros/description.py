@@ -7,20 +7,16 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import Say
 from psd_deflection.ros.gate import InputGate
 from psd_deflection.ros.running import SPIN_S, executor_of
-from psd_deflection.ros.wires import message_class
+from psd_deflection.ros.topics import ROBOT_DESCRIPTION
 from psd_deflection.run.signals import Signals, StopRequestedError
 
-TOPIC = 'robot_description'
 WAIT_S = 30.0
 """Time limit for it, s."""
-MOST_BYTES = 20_000_000
-"""Maximum size of the message; the largest robots have some hundred thousand bytes."""
 
 
 def listen_to_description(gate: InputGate, take: Callable[[str], None]) -> None:
@@ -28,9 +24,7 @@ def listen_to_description(gate: InputGate, take: Callable[[str], None]) -> None:
 
     A ConfigError of ``take`` refuses it.
     """
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    kind = message_class('std_msgs/msg/String')
-    gate.listen(kind, TOPIC, _fault, lambda message: take(message.data), latched, MOST_BYTES)
+    gate.listen(ROBOT_DESCRIPTION, _fault, lambda message: take(message.data))
 
 
 def robot_description(
@@ -41,11 +35,11 @@ def robot_description(
     Raises ConfigError if none comes in ``wait_s``, s, and StopRequestedError if a signal comes before it.
     """
     heard: list[str] = []
-    node = Node(f'{TOPIC}_reader', start_parameter_services=False)
+    node = Node(f'{ROBOT_DESCRIPTION}_reader', start_parameter_services=False)
     try:
         gate = InputGate(node, say)
         listen_to_description(gate, heard.append)
-        topic = node.resolve_topic_name(TOPIC)
+        topic = node.resolve_topic_name(ROBOT_DESCRIPTION)
         say(f'waiting for the robot on {topic}')
         until = clock() + wait_s
         with executor_of(node) as executor:
@@ -54,7 +48,7 @@ def robot_description(
                     raise StopRequestedError
                 if clock() >= until:
                     why = gate.why.get(
-                        TOPIC, 'nobody publishes it' if not node.count_publishers(topic) else 'none came'
+                        ROBOT_DESCRIPTION, 'nobody publishes it' if not node.count_publishers(topic) else 'none came'
                     )
                     raise ConfigError(f'{topic}: no description of the robot in {wait_s:g} s ({why}); give a URDF file')
                 executor.spin_once(timeout_sec=SPIN_S)

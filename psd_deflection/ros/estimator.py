@@ -14,23 +14,17 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.qos_overriding_options import InvalidQosOverridesError
-from rclpy.task import Future
-from std_srvs.srv import SetBool, Trigger
-
-from msg_adapters import DEFLECTION, DIAGNOSTICS, to_messages
-from psd_deflection.base.errors import ConfigError, PsdDeflectionError
+from msg_adapters import DEFLECTION, DIAGNOSTICS, SAMPLES, WRENCH, to_messages
 from psd_deflection.base.log import WARNING, Say
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.rig.config import Rig
-from psd_deflection.ros.names import RECORD, ZERO
 from psd_deflection.ros.node import BaseNode, serve
 from psd_deflection.ros.parameters import LiveParameters
 from psd_deflection.ros.running import ros
+from psd_deflection.ros.services import Zeroed, add_rig_services
 from psd_deflection.ros.transforms import TransformPublisher, installed
 from psd_deflection.ros.wires import InputRecorder, PublisherWire, VoltsPublisher, topics_of
 from psd_deflection.run.diagnostics import STALE, HealthReporter
@@ -47,7 +41,7 @@ if TYPE_CHECKING:
 NODE_NAME = 'estimator'
 
 
-class EstimatorNode(BaseNode):
+class EstimatorNode(BaseNode[Rig]):
     """The node and, while it is configured, its session. Raises ConfigError if the parameters are refused."""
 
     SYSTEM_TIME = True
@@ -62,28 +56,20 @@ class EstimatorNode(BaseNode):
         self._transforms: TransformPublisher | None = None
         super().__init__(NODE_NAME, say, overrides)
 
-    def set_up(self) -> None:
-        """Declare parameters; make what is on the graph while the node lives."""
+    def declare(self) -> LiveParameters:
+        """Those of the rig."""
         self._live = LiveParameters(self.node)
-        self.node.create_service(Trigger, ZERO, self._zero)
-        # In a separate group: while one request waits for the disk, the node serves everything else.
-        self.node.create_service(SetBool, RECORD, self._record, callback_group=ReentrantCallbackGroup())
-        self._wire, self._inputs = self._wires(self._live.rig)
+        return self._live
 
-    @property
-    def frame_prefix(self) -> str:
-        """Of all frames."""
-        return self._live.rig.monitor.frame_prefix
+    def set_up(self) -> None:
+        """Make what is on the graph while the node lives."""
+        add_rig_services(self.node, lambda: self.session, self._zero, lambda session, on: [session.record(on)])
+        self._wire = PublisherWire(self.node, topics_of(self.settings))
+        self._inputs = InputRecorder(self.node, subscribed(self.settings))
 
     def watched(self) -> Iterable[str]:
         """The estimate: whoever publishes that publishes all the rest."""
         return self._wire.names((DEFLECTION,))
-
-    def _wires(self, rig: Rig) -> tuple[PublisherWire, InputRecorder]:
-        try:
-            return PublisherWire(self.node, topics_of(rig)), InputRecorder(self.node, subscribed(rig))
-        except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
-            raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
 
     def _make_views(self, session: Session) -> None:
         """What the parameters ask for beside the messages of the records."""
@@ -103,7 +89,7 @@ class EstimatorNode(BaseNode):
 
     def configure(self) -> None:
         """Open the port and let samples flow; nothing is published yet."""
-        node, rig, unzeroed = self.node.get_fully_qualified_name(), self._live.rig, self._live.unzeroed
+        node, rig, unzeroed = self.full_name(), self.settings, self._live.unzeroed
         self._wire.offer(topics_of(rig))
         self._inputs.offer(subscribed(rig))
         session = self._signals.interruptible(lambda: Session(rig, self.log, node, unzeroed))
@@ -136,8 +122,8 @@ class EstimatorNode(BaseNode):
         if self._markers is not None:
             self._markers.session = self.session
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
-        node = self.node.get_fully_qualified_name()
-        topics = ', '.join(self._wire.names((DEFLECTION, '/link_tip/wrench', '/psd/samples', DIAGNOSTICS)))
+        node = self.full_name()
+        topics = ', '.join(self._wire.names((DEFLECTION, WRENCH, SAMPLES, DIAGNOSTICS)))
         self.log(f'publishing on ROS domain {domain}: {topics} …; services {node}/zero, {node}/record')
 
     def deactivate(self) -> None:
@@ -178,41 +164,11 @@ class EstimatorNode(BaseNode):
         if self._markers is not None:
             self._markers.session = None
 
-    def _zero(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = False
-        if self.session is None:
-            response.message = 'not zeroed: the node is not configured'
-            return response
-        try:
-            change = self.session.zero()
-        except (PsdDeflectionError, TimeoutError) as error:
-            response.message = f'not zeroed: {error}'
-            return response
-        if change is None:
-            response.message = f'not zeroed: {why_no_zero(self.session.pipeline)}'
-            return response
+    def _zero(self, session: Session) -> Zeroed:
+        if session.zero() is None:
+            return Zeroed(False, f'not zeroed: {why_no_zero(session.pipeline)}')
         self._live.show()
-        response.success, response.message = True, zero_text(self.session.rig)
-        return response
-
-    async def _record(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        response.success = False
-        if self.session is None:
-            response.message = 'the node is not configured'
-            return response
-        try:
-            asked = self.session.record(request.data)
-            answered: Any = Future()
-            asked.add_done_callback(lambda _: answered.set_result(None))
-            await answered
-            folder = asked.result()
-        except (PsdDeflectionError, TimeoutError) as error:
-            response.message = str(error)
-            return response
-        response.success = True
-        verb = 'recording to' if request.data else 'recording ended:'
-        response.message = f'{verb} {folder}' if folder is not None else 'no recording runs'
-        return response
+        return Zeroed(True, zero_text(session.rig))
 
     def report(self) -> None:
         """Publish the states of the session, which are recorded."""

@@ -13,23 +13,23 @@ from typing import Any
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
+from rclpy.qos import QoSPolicyKind
+from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from psd_deflection.base.bounds import BoundedMap, Tally
-from psd_deflection.base.errors import ConfigError, PsdDeflectionError
+from psd_deflection.base.errors import PsdDeflectionError
 from psd_deflection.base.log import WARNING, Say
 from psd_deflection.base.printable import printable
+from psd_deflection.ros.endpoints import graph_name, message_class, overriding, qos, refused_qos
+from psd_deflection.ros.topics import HEARD, GraphTopic
 from psd_deflection.run.repeats import Repeats
 
 LONGEST = 200
 """Characters of a reason, in which a stranger's words may be."""
 NEWS = 3
 """Refusals of a topic that are said one by one, before they are counted and said together."""
-MOST_BYTES = 1_000_000
-"""Maximum size of a message, unless the topic has its own; those of a robot's joints have some hundred bytes."""
 MOST_A_SECOND = 2000
 """Messages of one topic that are looked at within a second."""
 FAILURES = (PsdDeflectionError, ArithmeticError, ValueError, LookupError, TypeError, AttributeError)
@@ -50,41 +50,49 @@ class InputGate:
 
     def listen(
         self,
-        kind: Any,
         topic: str,
         check: Callable[[Any], str],
         take: Callable[[Any], None],
-        delivery: QoSProfile | int = 5,
-        most_bytes: int = MOST_BYTES,
-    ) -> Subscription:
-        """Subscribe to ``topic``: ``take`` gets each message that ``check`` finds nothing wrong with.
+        name: str = '',
+        type_name: str = '',
+    ) -> list[Subscription]:
+        """Subscribe to ``topic``, by its rows: ``take`` gets each message that ``check`` finds nothing wrong with.
 
-        ``kind``: its class. A publisher whose messages cannot come, because they have to be reliable, counts as a
-        refusal. Raises ConfigError for a QoS override that ROS does not take.
+        ``name``: on the graph, if it is not the topic's own. ``type_name``: of the message, if a parameter names it.
+        A publisher whose messages cannot come, because they have to be reliable, counts as a refusal. Raises KeyError
+        for a topic without a row, ImportError if its message is not installed, and ConfigError for a QoS override that
+        ROS does not take.
         """
-        rate = _Rate()
+        return [
+            self._subscribe(row, check, take, name or graph_name(row), type_name or row.type) for row in HEARD[topic]
+        ]
+
+    def _subscribe(
+        self, row: GraphTopic, check: Callable[[Any], str], take: Callable[[Any], None], name: str, type_name: str
+    ) -> Subscription:
+        kind, rate = message_class(type_name), _Rate()
 
         def heard(encoded: bytes) -> None:
-            why = self._let_in(encoded, most_bytes, rate) or self._carry_out(kind, encoded, check, take)
+            why = self._let_in(encoded, row.most_bytes, rate) or self._carry_out(kind, encoded, check, take)
             if why:
-                self.refuse(topic, why)
+                self.refuse(name, why)
 
         def hidden(event: Any) -> None:
             if event.last_policy_kind == QoSPolicyKind.RELIABILITY:
-                self.refuse(topic, 'a publisher is best effort, and this has to be reliable: none of its messages come')
+                self.refuse(name, 'a publisher is best effort, and this has to be reliable: none of its messages come')
 
         try:
             return self._node.create_subscription(
                 kind,
-                topic,
+                name,
                 heard,
-                delivery,
+                qos(row.delivery),
                 raw=True,
                 event_callbacks=SubscriptionEventCallbacks(incompatible_qos=hidden),
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                qos_overriding_options=overriding(row),
             )
         except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
-            raise ConfigError(f'ROS parameters: qos_overrides: {error}') from None
+            raise refused_qos(error) from None
 
     def unpack(self, kind: Any, encoded: bytes) -> Any:
         """The message that check and take get."""

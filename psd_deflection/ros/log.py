@@ -17,9 +17,10 @@ from pathlib import Path
 from rcl_interfaces.msg import Log
 from rclpy.logging import LoggingSeverity, get_logging_directory
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from psd_deflection.base.log import INFO, Say
+from psd_deflection.ros.endpoints import publisher_of
+from psd_deflection.ros.topics import ROSOUT
 
 MOST_LINES = 1000
 """Lines that wait for a slow disk; further ones are not in the file."""
@@ -42,8 +43,7 @@ class NodeLog:
     def __init__(self, node: Node, say: Say) -> None:
         self._say = say
         self._logger = node.get_logger()
-        as_every_node = QoSProfile(depth=MOST_LINES, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self._publisher = node.create_publisher(Log, '/rosout', as_every_node)
+        self._publisher = publisher_of(node, ROSOUT)
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         file = rcl_log_file()

@@ -22,8 +22,9 @@ from msg_adapters.orientation import quaternion
 from psd_deflection.model.plate.scene import Vector, bend, tip_boxes
 from psd_deflection.records import DeflectionEstimate, SpotMeans
 from psd_deflection.rig.config import Rig
-from psd_deflection.ros.names import BASE, MARKERS, MARKERS_AT_REST
-from psd_deflection.ros.wires import qos, relative
+from psd_deflection.ros.endpoints import publisher_of
+from psd_deflection.ros.names import BASE
+from psd_deflection.ros.topics import MARKERS, MARKERS_AT_REST
 from psd_deflection.run.session import Session
 
 PERIOD_S = 0.1
@@ -124,8 +125,7 @@ class RigMarkers:
         self._node = node
         self._magnify = rig.monitor.markers_magnify
         self._seen = 0
-        self._at_rest = node.create_publisher(MarkerArray, relative(MARKERS_AT_REST), qos(MARKERS_AT_REST))
-        self._moving = node.create_publisher(MarkerArray, relative(MARKERS), qos(MARKERS))
+        self._at_rest, self._moving = publisher_of(node, MARKERS_AT_REST), publisher_of(node, MARKERS)
         self._at_rest.publish(at_rest(rig))
         self._rest_of = rig
         self._timer = node.create_timer(PERIOD_S, self._publish, clock=Clock(clock_type=ClockType.STEADY_TIME))

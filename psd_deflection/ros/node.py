@@ -11,7 +11,7 @@ import abc
 import time
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
@@ -20,21 +20,20 @@ from rclpy.executors import await_or_execute
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter as RosParameter
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
-from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from msg_adapters import DIAGNOSTICS, TOPIC_TYPES, to_messages
+from msg_adapters import DIAGNOSTICS, to_messages
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError
 from psd_deflection.base.log import ERROR, WARNING, Say
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
-from psd_deflection.rig.declarations import BY_NAME
+from psd_deflection.rig.declarations import BY_NAME, FRAME_PREFIX
 from psd_deflection.rig.parameters import Section, Value
 from psd_deflection.ros.declared import SOURCE, USE_SIM_TIME, DeclaredParameters
+from psd_deflection.ros.endpoints import publisher_of
 from psd_deflection.ros.gate import GatedNode, InputGate
 from psd_deflection.ros.log import NodeLog
 from psd_deflection.ros.running import SPIN_S, executor_of
-from psd_deflection.ros.wires import message_class, qos
+from psd_deflection.ros.topics import PUBLISHED
 from psd_deflection.run.diagnostics import OK, STALE
 from psd_deflection.run.realtime import settle
 from psd_deflection.run.signals import Signals
@@ -45,6 +44,7 @@ END_S = 10.0
 """Longest time that a node may take to come to rest after a signal, s."""
 AUTOSTART = BY_NAME['autostart']
 T = TypeVar('T')
+T_co = TypeVar('T_co', covariant=True)
 
 
 class Health(NamedTuple):
@@ -56,10 +56,22 @@ class Health(NamedTuple):
     values: tuple[tuple[str, str], ...] = ()
 
 
+class NodeParameters(Protocol[T_co]):
+    """The declared parameters of a node, as they are now: by name, and as its settings."""
+
+    @property
+    def values(self) -> Mapping[str, Value]:
+        """By name."""
+
+    @property
+    def settings(self) -> T_co:
+        """All of them."""
+
+
 class _ManagedNode(GatedNode):
     """Hands its transitions to the :class:`BaseNode` that owns it."""
 
-    owner: BaseNode
+    owner: BaseNode[Any]
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         return self.owner.transition(self.owner.configure)
@@ -82,14 +94,17 @@ class _ManagedNode(GatedNode):
         return TransitionCallbackReturn.SUCCESS
 
 
-class BaseNode(abc.ABC):
-    """The base of every node. A node overrides :meth:`set_up`, what its lifecycle does, and :meth:`health`.
+class BaseNode(abc.ABC, Generic[T]):
+    """The base of every node, whose settings are a ``T``.
+
+    A node overrides :meth:`declare`, :meth:`set_up`, what its lifecycle does, and :meth:`health`.
 
     ``say``: gets each line for the terminal. ``overrides``: parameters that take precedence over those of ROS's
     arguments. Before ``super().__init__`` a node keeps what :meth:`set_up` needs. Raises ConfigError if a parameter is
     refused; then nothing of the node is left.
 
-    ``active``: between activation and deactivation. ``finished``: ended for good by ``change_state``.
+    ``parameters``: the declared ones. ``active``: between activation and deactivation. ``finished``: ended for good by
+    ``change_state``.
     """
 
     SYSTEM_TIME: ClassVar[bool] = False
@@ -107,6 +122,7 @@ class BaseNode(abc.ABC):
         self.log = NodeLog(self.node, say)
         self.gate = self.node.gate = InputGate(self.node, self.log)
         try:
+            self.parameters = self.declare()
             self.set_up()
             self._refuse_sim_time()
             self._survive_requests()
@@ -119,8 +135,12 @@ class BaseNode(abc.ABC):
     # What a node overrides.
 
     @abc.abstractmethod
+    def declare(self) -> NodeParameters[T]:
+        """Declare the node's parameters."""
+
+    @abc.abstractmethod
     def set_up(self) -> None:
-        """Declare parameters; make publishers, subscriptions and services."""
+        """Make publishers, subscriptions and services; the parameters are declared."""
 
     def configure(self) -> None:
         """Take what the node needs (a port, a file); it is not active yet."""
@@ -150,27 +170,29 @@ class BaseNode(abc.ABC):
         """Names of the topics that no other node should publish."""
         return (publisher.topic_name for publisher in self._published)
 
-    @property
-    def frame_prefix(self) -> str | None:
-        """Put before each name of a frame; None: the node names no frames."""
-        return None
-
     # What a node uses.
 
-    def declare(
-        self, section: Section[T], values: Mapping[str, Value], changed: Callable[[T], None] = lambda _: None
-    ) -> DeclaredParameters[T]:
-        """The node's parameters: those of ``section``, at ``values``, and ``autostart``."""
-        return DeclaredParameters(self.node, section, values, changed, (AUTOSTART,))
+    @property
+    def settings(self) -> T:
+        """The parameters as they are now."""
+        return self.parameters.settings
 
-    def publisher(self, kind: Any, topic: str, delivery: QoSProfile | int = 10) -> Publisher:
-        """A publisher whose topic no other node should publish."""
-        options = QoSOverridingOptions.with_default_policies()
-        try:
-            made = self.node.create_publisher(kind, topic, delivery, qos_overriding_options=options)
-        except (ValueError, RuntimeError) as error:
-            raise ConfigError(f'{SOURCE}: qos_overrides: {error}') from None
-        self._published.append(made)
+    @property
+    def frame_prefix(self) -> str:
+        """Put before each name of a frame; '' for a node that names no frames."""
+        return str(self.parameters.values.get(FRAME_PREFIX, ''))
+
+    def declared(
+        self, section: Section[T], given: T, changed: Callable[[T], None] = lambda _: None
+    ) -> DeclaredParameters[T]:
+        """The parameters of ``section``, at the values of ``given``, and ``autostart``."""
+        return DeclaredParameters(self.node, section, section.values(given), changed, (AUTOSTART,))
+
+    def publisher(self, topic: str) -> Publisher:
+        """The publisher of ``topic``, by its row; no other node should publish it unless it is common to all."""
+        made = publisher_of(self.node, topic)
+        if not PUBLISHED[topic].common:
+            self._published.append(made)
         return made
 
     def now_ns(self) -> int:
@@ -236,8 +258,7 @@ class BaseNode(abc.ABC):
         if entries:
             entries[0] = entries[0]._replace(values=(*entries[0].values, *self.gate.values()))
         if self._diagnostics is None:
-            kind = message_class(TOPIC_TYPES[DIAGNOSTICS])
-            self._diagnostics = self.node.create_publisher(kind, DIAGNOSTICS, qos(DIAGNOSTICS))
+            self._diagnostics = self.publisher(DIAGNOSTICS)
         for message in to_messages(DiagnosticReport(self.now_ns(), tuple(entries))):
             self._diagnostics.publish(cdr.encode(message.type, message.fields))
 
@@ -259,7 +280,8 @@ class BaseNode(abc.ABC):
             self.log(text, ERROR)
 
     def _tell_frames(self, action: Callable[[], None]) -> None:
-        if action == self.activate and self.frame_prefix == '' and self.node.get_namespace() != '/':
+        names_frames = FRAME_PREFIX in self.parameters.values
+        if action == self.activate and names_frames and not self.frame_prefix and self.node.get_namespace() != '/':
             self.log('frames have no prefix: where several run, give each its own (frame_prefix)', WARNING)
 
     def _refuse_sim_time(self) -> None:
@@ -337,7 +359,7 @@ def _refusal(request: Any, response: Any, reason: str) -> Any:
 
 
 def serve(
-    owner: BaseNode,
+    owner: BaseNode[Any],
     signals: Signals,
     runs: Callable[[], bool] = lambda: True,
     started: Callable[[], None] = lambda: None,

@@ -12,6 +12,7 @@ stays when the node is cleaned up.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
@@ -23,7 +24,7 @@ from psd_deflection.devices.registry import source_names
 from psd_deflection.model.solvers.registry import SOLVERS, check_live, solver_class
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME, QOS_OVERRIDES_PREFIX, ROS_OWN, SIMULATED
-from psd_deflection.rig.parameters import Parameter
+from psd_deflection.rig.parameters import Parameter, Value
 from psd_deflection.ros.declared import AT_START, SOURCE, descriptor, meant, plain
 from psd_deflection.run.session import Session
 
@@ -89,34 +90,39 @@ def _check_solvers(rig: Rig) -> None:
 class LiveParameters:
     """Carries out changes of the node's parameters, or refuses them.
 
-    ``rig``: as the parameters describe it. ``given``: names of those that the user has set. ``session``: the one that
-    runs while the node is configured, or None.
+    ``settings``: the rig, as the parameters describe it. ``given``: names of those that the user has
+    set. ``session``: the one that runs while the node is configured, or None.
     """
 
     def __init__(self, node: Node) -> None:
         self._node = node
         self._showing = False
-        self.rig, self.given = rig_of_node(node)
-        self._zeros = self.rig.zeros_by_name
+        self.settings, self.given = rig_of_node(node)
+        self._zeros = self.settings.zeros_by_name
         self.session: Session | None = None
         node.add_pre_set_parameters_callback(lambda changed: meant(node, changed, BY_NAME))
         node.add_on_set_parameters_callback(self._change)
 
     @property
+    def values(self) -> Mapping[str, Value]:
+        """By name."""
+        return self.settings.values
+
+    @property
     def unzeroed(self) -> Rig:
-        """``rig`` with the zero that it was given, without one that was taken while the node ran."""
-        return replace_values(self.rig, self._zeros, SOURCE)
+        """The rig with the zero that it was given, without one that was taken while the node ran."""
+        return replace_values(self.settings, self._zeros, SOURCE)
 
     def show(self) -> None:
         """Set the node's parameters to the present values of the rig, so that a new zero can be read there."""
         session = self.session
         if session is not None:
             live = {p.name: session.rig.values[p.name] for p in session.rig.parameters if p.live}
-            self.rig = replace_values(self.rig, live, SOURCE)
+            self.settings = replace_values(self.settings, live, SOURCE)
         simulated = session is not None and session.simulated
         changed = [
             RosParameter(name, value=value)
-            for name, value in {**_ros_values(self.rig), SIMULATED: simulated}.items()
+            for name, value in {**_ros_values(self.settings), SIMULATED: simulated}.items()
             if plain(self._node.get_parameter(name)) != value
         ]
         self._showing = True
@@ -150,9 +156,9 @@ class LiveParameters:
         if not new:
             return
         if self.session is None:
-            rig = replace_values(self.rig, new, SOURCE)
+            rig = replace_values(self.settings, new, SOURCE)
             _check_solvers(rig)
-            self.rig = rig
+            self.settings = rig
             self.given |= set(new)
             self._zeros |= {name: rig.values[name] for name in rig.zeros_by_name if name in new}
             return

@@ -22,43 +22,43 @@ from psd_deflection.arms.inputs import KnownJoints, joints_fault, stamp_fault
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING, Say
 from psd_deflection.base.printable import printable
+from psd_deflection.ros.declared import DeclaredParameters
 from psd_deflection.ros.description import listen_to_description
-from psd_deflection.ros.names import JOINT_STATES
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
-from psd_deflection.ros.wires import message_class
+from psd_deflection.ros.topics import JOINT_STATES, SHAPED, TRAJECTORY
 from psd_deflection.run.diagnostics import OK, STALE, WARN
 from psd_deflection.run.repeats import Repeats
 
 NODE_NAME = 'shaper'
-GIVEN, SHAPED = '~/trajectory', '~/shaped'
 NEWS = 6
 """Refusals that are told one by one, before they are counted and told together."""
 LONGEST = 200
 """Characters of a refusal, in which a stranger's words may be."""
 
 
-class ShaperNode(BaseNode):
+class ShaperNode(BaseNode[ShaperSettings]):
     """The node. Raises ConfigError for a bad parameter or file."""
 
     def __init__(self, settings: ShaperSettings, say: Say) -> None:
-        self._settings = settings
+        self._asked = settings
         self._known = KnownJoints()
         self._shaped = self._refused = 0
         self._why = ''
         super().__init__(NODE_NAME, say)
 
+    def declare(self) -> DeclaredParameters[ShaperSettings]:
+        """Those of a shaper."""
+        return self.declared(SHAPING, self._asked, self._changed)
+
     def set_up(self) -> None:
-        """Declare parameters; listen to trajectories and joints."""
-        parameters = self.declare(SHAPING, SHAPING.values(self._settings), self._changed)
-        self._settings = parameters.settings
-        self._shaper, self._described = trajectory_shaper(self._settings)
+        """Listen to trajectories and joints."""
+        self._shaper, self._described = trajectory_shaper(self.settings)
         self._repeats = Repeats(self.log)
-        states = message_class('sensor_msgs/msg/JointState')
-        self._out = self.publisher(JointTrajectory, SHAPED)
-        self.gate.listen(JointTrajectory, GIVEN, _trajectory_fault, self._given, 10)
-        self.gate.listen(states, JOINT_STATES, lambda m: joints_fault(m.name, m.position, ()), self._joints)
-        self._undescribed = self._settings.urdf == DESCRIPTION
+        self._out = self.publisher(SHAPED)
+        self.gate.listen(TRAJECTORY, _trajectory_fault, self._given)
+        self.gate.listen(JOINT_STATES, lambda m: joints_fault(m.name, m.position, ()), self._joints)
+        self._undescribed = self.settings.urdf == DESCRIPTION
         if self._undescribed:
             listen_to_description(self.gate, self._described_as)
         self.log(f'publishing {self._out.topic_name}: {self._described}')
@@ -69,7 +69,6 @@ class ShaperNode(BaseNode):
         self.log(f'limits of {", ".join(limits)} from {DESCRIPTION}')
 
     def _changed(self, settings: ShaperSettings) -> None:
-        self._settings = settings
         self._shaper.max_step = settings.max_step
 
     def _joints(self, message: Any) -> None:
@@ -88,7 +87,7 @@ class ShaperNode(BaseNode):
             if self._undescribed:
                 raise ConfigError(f'nobody has told the limits of the joints on {DESCRIPTION} yet')
             trajectory = _trajectory(message)
-            start_ns = start_of(self.now_ns(), int(Time.from_msg(stamp).nanoseconds), self._settings.lead)
+            start_ns = start_of(self.now_ns(), int(Time.from_msg(stamp).nanoseconds), self.settings.lead)
             shaped = self._shaper.shape(start_ns, trajectory, self._known.positions(now))
         except ConfigError as error:
             self._refused += 1

@@ -6,9 +6,9 @@ by the pipeline thread, with the estimate's own stamp.
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from geometry_msgs.msg import Quaternion, TransformStamped
@@ -18,8 +18,9 @@ from msg_adapters.orientation import quaternion
 from psd_deflection.model.plate.scene import Vector
 from psd_deflection.records import DeflectionEstimate, Record
 from psd_deflection.rig.config import Rig
-from psd_deflection.ros.names import BASE, PSDS, REST, TF, TF_STATIC, TIP
-from psd_deflection.ros.wires import qos
+from psd_deflection.ros.endpoints import message_class, publisher_of
+from psd_deflection.ros.names import BASE, PSDS, REST, TIP
+from psd_deflection.ros.topics import PUBLISHED, TF, TF_STATIC
 
 _UPRIGHT = {'x': 0.0, 'y': 0.0, 'z': 0.0, 'w': 1.0}
 
@@ -59,23 +60,42 @@ def tip_transform(rig: Rig, e: DeflectionEstimate) -> Any:
     return transform_message(prefix + REST, prefix + TIP, e.t_ns, (e.dx, e.dy, 0.0), rotation)
 
 
-class TransformPublisher:
-    """A sink of records: ``/tf`` for each primary estimate while it is ``active``. Needs tf2_msgs."""
+class FramePublisher:
+    """Publishes TransformStamped on ``/tf`` and ``/tf_static``. Needs tf2_msgs."""
 
-    def __init__(self, node: Node, rig: Rig) -> None:
-        self.active = False
-        self._node, self._rig = node, rig
-        self._message = importlib.import_module('tf2_msgs.msg').TFMessage
-        self._moving = node.create_publisher(self._message, TF, qos(TF))
-        self._static = node.create_publisher(self._message, TF_STATIC, qos(TF_STATIC))
-        self._static.publish(self._message(transforms=static_transforms(rig, time.time_ns())))
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._message = message_class(PUBLISHED[TF].type)
+        self._moving, self._static = publisher_of(node, TF), publisher_of(node, TF_STATIC)
 
-    def put(self, record: Record) -> None:
-        """Publish where the tip is."""
-        if self.active and isinstance(record, DeflectionEstimate) and record.primary:
-            self._moving.publish(self._message(transforms=[tip_transform(self._rig, record)]))
+    def fix(self, transforms: Sequence[Any]) -> None:
+        """Publish those that do not move, in place of the ones before."""
+        self._static.publish(self._message(transforms=transforms))
+
+    def move(self, transforms: Sequence[Any]) -> None:
+        """Publish those that move."""
+        self._moving.publish(self._message(transforms=transforms))
 
     def close(self) -> None:
         """Take the publishers off the graph."""
         for publisher in (self._moving, self._static):
             self._node.destroy_publisher(publisher)
+
+
+class TransformPublisher:
+    """A sink of records: ``/tf`` for each primary estimate while it is ``active``. Needs tf2_msgs."""
+
+    def __init__(self, node: Node, rig: Rig) -> None:
+        self.active = False
+        self._rig = rig
+        self._frames = FramePublisher(node)
+        self._frames.fix(static_transforms(rig, time.time_ns()))
+
+    def put(self, record: Record) -> None:
+        """Publish where the tip is."""
+        if self.active and isinstance(record, DeflectionEstimate) and record.primary:
+            self._frames.move([tip_transform(self._rig, record)])
+
+    def close(self) -> None:
+        """Take the publishers off the graph."""
+        self._frames.close()

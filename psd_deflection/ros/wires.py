@@ -2,65 +2,34 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 
-from msg_adapters import (
-    DIAGNOSTICS,
-    TOPIC_TYPES,
-    vector3_stamped,
-)
+from msg_adapters import DIAGNOSTICS, TOPIC_TYPES, vector3_stamped
 from psd_deflection.base.log import unsaid
+from psd_deflection.model.solvers.registry import solver_class
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, SampleBlock, TemperatureReading
 from psd_deflection.rig.config import Rig
+from psd_deflection.ros.endpoints import publisher_of
 from psd_deflection.ros.gate import InputGate
 from psd_deflection.ros.inputs import input_fault
-from psd_deflection.ros.names import VOLTS, delivery
+from psd_deflection.ros.topics import VOLTS
 from psd_deflection.run.fanout import published
 from psd_deflection.run.session import Session
 
-MAX_INPUT_BYTES = 4096
-"""Maximum size of a message of another node that we record, bytes; valid ones have some hundred bytes."""
 
-
-def message_class(type_name: str) -> Any:
-    """The class of ``pkg/msg/Name``."""
-    package, _, name = type_name.split('/')
-    return getattr(importlib.import_module(f'{package}.msg'), name)
-
-
-def relative(topic: str, below: str = '') -> str:
-    """``topic`` as a relative name in the node's namespace, so that two rigs can share a graph.
-
-    Without a namespace this is the topic's own name. ``below``: a further namespace, for a node of several rigs.
-    ``/diagnostics`` stays absolute, as is usual.
-    """
-    return topic if topic == DIAGNOSTICS else (below + topic).removeprefix('/')
-
-
-def qos(topic: str) -> QoSProfile:
-    """QoS profile of ``topic``."""
-    depth, reliable, latched = delivery(topic)
-    return QoSProfile(
-        depth=depth,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def topics_of(rig: Rig) -> dict[str, str]:
-    """The topics that a node of ``rig`` publishes encoded messages on, with their types."""
+def topics_of(rig: Rig) -> tuple[str, ...]:
+    """The topics that a node of ``rig`` publishes encoded messages on. Raises ConfigError for an unknown solver."""
+    for name in rig.estimator.solvers:
+        solver_class(name)
     volts = VOLTS[: len(rig.psds)] if rig.monitor.publish_volts else ()
-    return published(rig) | dict.fromkeys(volts, vector3_stamped.MESSAGE.name)
+    return (*published(rig), *volts)
 
 
 class PublisherWire:
@@ -69,22 +38,20 @@ class PublisherWire:
     ``below``: namespace of the topics in that of the node.
     """
 
-    def __init__(self, node: Node, topics: Mapping[str, str], below: str = '') -> None:
+    def __init__(self, node: Node, topics: Iterable[str], below: str = '') -> None:
         self.active = False
         self._node = node
         self._below = below
         self._publishers: dict[str, Publisher] = {}
         self.offer(topics)
 
-    def offer(self, topics: Mapping[str, str]) -> None:
-        """Publish exactly these topics (name to type) from now on. Only while no session runs."""
+    def offer(self, topics: Iterable[str]) -> None:
+        """Publish exactly these topics from now on. Only while no session runs."""
+        topics = tuple(topics)
         for topic in [t for t in self._publishers if t not in topics]:
             self._node.destroy_publisher(self._publishers.pop(topic))
-        options = QoSOverridingOptions.with_default_policies()
         for topic in [t for t in topics if t not in self._publishers]:
-            self._publishers[topic] = self._node.create_publisher(
-                message_class(topics[topic]), relative(topic, self._below), qos(topic), qos_overriding_options=options
-            )
+            self._publishers[topic] = publisher_of(self._node, topic, self._below)
 
     def names(self, topics: Iterable[str]) -> list[str]:
         """Names of the topics on the graph, including remapping."""
@@ -123,18 +90,18 @@ class InputRecorder(InputGate):
         super().__init__(node, unsaid)
         self.session: Session | None = None
         self._below = below
-        self._subscriptions: dict[str, Subscription] = {}
+        self._subscriptions: dict[str, list[Subscription]] = {}
         self.offer(topics)
 
     def offer(self, topics: Iterable[str]) -> None:
         """Subscribe to exactly these topics from now on. Only while no session runs."""
         topics = tuple(topics)
         for topic in [t for t in self._subscriptions if t not in topics]:
-            self._node.destroy_subscription(self._subscriptions.pop(topic))
+            for subscription in self._subscriptions.pop(topic):
+                self._node.destroy_subscription(subscription)
         for topic in [t for t in topics if t not in self._subscriptions]:
-            kind, name = message_class(TOPIC_TYPES[topic]), relative(topic, self._below)
             check, take = partial(self._fault, topic), partial(self._take, topic)
-            self._subscriptions[topic] = self.listen(kind, name, check, take, qos(topic), MAX_INPUT_BYTES)
+            self._subscriptions[topic] = self.listen(topic, check, take, (self._below + topic).removeprefix('/'))
 
     def unpack(self, kind: Any, encoded: bytes) -> bytes:
         """The message as it came: the session records these bytes."""

@@ -18,7 +18,6 @@ from msg_adapters import (
     DEFLECTION,
     DEFLECTION_WITH_COVARIANCE,
     INPUTS,
-    LATCHED,
     MESSAGE_TYPES,
     RIG,
     ROWS,
@@ -148,7 +147,7 @@ def test_the_parts_of_a_definition_stand_below_80_signs_each() -> None:
 
 
 def test_what_is_latched_and_what_is_listened_to() -> None:
-    assert LATCHED == ('/link_tip/rig',)
+    assert [t.name for t in TOPICS if t.delivery.latched] == ['/link_tip/rig']
     assert INPUTS == (
         '/link_tip/load',
         '/link_base/acceleration',

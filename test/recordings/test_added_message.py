@@ -74,7 +74,7 @@ def test_a_made_up_message_is_recorded_read_and_listed(tmp_path: Path) -> None:
     (package / 'humidity.py').write_text(ADAPTER)
     front = (package / '__init__.py').read_text()
     adapter = 'humidity.MESSAGE, humidity.Humidity, humidity.from_humidity, humidity.to_humidity'
-    line = f"    Topic('/environment/humidity', {adapter}),"
+    line = f"    Topic('/environment/humidity', 'humidity of the air, %', {adapter}, BEST_EFFORT),"
     for place, added in (('from msg_adapters import (', '    humidity,'), ('TOPICS = (', line)):
         assert front.count(place + '\n') == 1
         front = front.replace(place + '\n', f'{place}\n{added}\n')

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import importlib
 import math
+import re
 import signal
 import subprocess
 import time
@@ -43,13 +44,12 @@ from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from blind.render import Pose, Scene, photograph  # noqa: E402
+from psd_deflection.ros.topics import HEARD, PUBLISHED  # noqa: E402
 from test.ros.conftest import WARNINGS, Peer, stamp  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
 ROS = ROOT / 'psd_deflection' / 'ros'
 NAMESPACE = '/left'
-OWN_INPUT = 'gate.py'
-"""The one file that may subscribe."""
 GRAPH = ('/rosout', '/parameter_events', '/diagnostics', '/tf', '/tf_static', '/clock')
 """Topics that have one name for all nodes."""
 ROS_OWN = ('use_sim_time', 'qos_overrides.', 'start_type_description_service')
@@ -592,6 +592,25 @@ def test_second_publisher_is_told(running: Running) -> None:
         running.peer.node.destroy_publisher(rival)
 
 
+def test_its_topics_are_rows_of_the_table(running: Running) -> None:
+    """On the graph there is nothing else, with these types; what rclpy makes itself is in no table."""
+    node = running.peer.node
+    of_rclpy = ('/parameter_events', '/clock', f'/{running.name}/transition_event')
+    own = (node.get_publisher_names_and_types_by_node, lambda row: (row,), PUBLISHED)
+    others = (node.get_subscriber_names_and_types_by_node, lambda rows: rows, HEARD)
+    for graph, rows_of, table in (own, others):
+        rows = {row.name.replace('~', f'/{running.name}'): row for entry in table.values() for row in rows_of(entry)}
+        found = dict(graph(running.name, NAMESPACE))
+        assert found or graph is others[0]
+        for topic, kinds in found.items():
+            # Those of a chain's links lie below the link's name.
+            name = re.sub('^/(upper|fore)(?=/)', '', topic.removeprefix(NAMESPACE))
+            if name in of_rclpy or topic in of_rclpy:
+                continue
+            row = rows.get(name) or rows[name.removeprefix('/')]
+            assert [row.type] == kinds, topic
+
+
 def test_lifecycle_goes_down_and_up_again(running: Running) -> None:
     assert running.state() == State.PRIMARY_STATE_ACTIVE
     assert running.change(Transition.TRANSITION_DEACTIVATE)
@@ -621,13 +640,3 @@ def test_every_node_of_the_room_is_an_executable() -> None:
         if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == 'NODE_NAME'
     }
     assert names == set(nodes_of_setup()) == set(PROFILES)
-
-
-def test_messages_come_in_through_the_gate() -> None:
-    own = {
-        path.name
-        for path in ROS.glob('*.py')
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.Attribute) and node.attr == 'create_subscription'
-    }
-    assert own == {OWN_INPUT}

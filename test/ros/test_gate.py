@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -13,12 +13,13 @@ rclpy = pytest.importorskip('rclpy')
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from msg_adapters import INPUTS, LOAD  # noqa: E402
+from msg_adapters import INPUTS, LOAD, Delivery  # noqa: E402
 from psd_deflection.base.log import INFO, WARNING  # noqa: E402
 from psd_deflection.ros.gate import MOST_A_SECOND, InputGate  # noqa: E402
-from psd_deflection.ros.wires import qos  # noqa: E402
+from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic  # noqa: E402
 
 TOPIC = '/said'
+KEPT = Delivery(50)
 
 
 class Gated:
@@ -37,19 +38,24 @@ class Gated:
         self.said.append(text)
         self.levels.append(level)
 
-    def listen(self, delivery: Any = 50, **more: Any) -> None:
+    def listen(self) -> None:
         self.gate.listen(
-            String,
             TOPIC,
             lambda message: 'empty' if not message.data else '',
             lambda message: self.heard.append(message.data),
-            delivery,
-            **more,
+            TOPIC,
         )
 
 
+def heard_as(monkeypatch: pytest.MonkeyPatch, delivery: Delivery = KEPT, most_bytes: int = MOST_BYTES) -> None:
+    """Give the topic a row."""
+    row = GraphTopic(TOPIC, 'std_msgs/msg/String', 'gated', 'words', delivery, most_bytes=most_bytes)
+    monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, (row,))
+
+
 @pytest.fixture
-def gated(peer: Any) -> Iterator[Gated]:
+def gated(peer: Any, monkeypatch: pytest.MonkeyPatch) -> Iterator[Gated]:
+    heard_as(monkeypatch)
     one = Gated(peer)
     yield one
     peer.executor.remove_node(one.node)
@@ -62,8 +68,11 @@ def sender(peer: Any, delivery: Any = 50) -> Any:
     return publisher
 
 
-def test_good_ones_are_taken_and_others_counted_and_said(peer: Any, gated: Gated) -> None:
-    gated.listen(most_bytes=1000)
+def test_good_ones_are_taken_and_others_counted_and_said(
+    peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    heard_as(monkeypatch, most_bytes=1000)
+    gated.listen()
     publisher = sender(peer)
 
     def sent() -> bool:
@@ -115,10 +124,13 @@ def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> No
     peer.until(lambda: not flooded() or len(gated.heard) > MOST_A_SECOND, 'the next second')
 
 
-def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(peer: Any, gated: Gated) -> None:
+def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
+    peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It holds until the next: a lost one would be a wrong label of all that follows."""
-    assert [topic for topic in INPUTS if qos(topic).reliability is ReliabilityPolicy.RELIABLE] == [LOAD]
-    gated.listen(qos(LOAD))
+    assert [topic for topic in INPUTS if HEARD[topic][0].delivery.reliable] == [LOAD]
+    heard_as(monkeypatch, HEARD[LOAD][0].delivery)
+    gated.listen()
     peer.node.create_publisher(String, TOPIC, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
     peer.until(lambda: gated.gate.refused[TOPIC] > 0, 'the publisher that is best effort')
     assert 'a publisher is best effort, and this has to be reliable' in gated.said[0]

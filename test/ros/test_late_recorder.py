@@ -15,7 +15,8 @@ from std_msgs.msg import String
 from msg_adapters import RIG
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
-from psd_deflection.ros.wires import message_class, qos
+from psd_deflection.ros.endpoints import message_class, qos
+from psd_deflection.ros.topics import PUBLISHED
 from psd_deflection.run.fanout import published
 from test.late import Heard, written
 
@@ -38,7 +39,7 @@ def test_a_recorder_that_joins_a_running_node_replays_bit_for_bit(
         def take(message: bytes, name: str = name, kind: str = kind) -> None:
             heard.append(Heard(name, kind, message, time.time_ns()))
 
-        peer.node.create_subscription(message_class(kind), name, take, qos(topic), raw=True)
+        peer.node.create_subscription(message_class(kind), name, take, qos(PUBLISHED[topic].delivery), raw=True)
 
     def memories() -> int:
         texts = (deserialize_message(m.cdr, String).data for m in heard if m.topic == f'/arm{RIG}')

@@ -60,8 +60,7 @@ def test_a_third_psd_has_its_frame_and_its_topics() -> None:
     rig = load_rig(overrides={**third, 'publish_volts': True})
     assert tree(rig)['psd_3'] == ('link_tip', (0.08, -0.06, 0.01))
     two, three = topics_of(load_rig(overrides={'publish_volts': True})), topics_of(rig)
-    assert three.keys() - two.keys() == {'/psd_3/spot', '/psd_3/volts'}
-    assert three['/psd_3/spot'] == two['/psd_1/spot']
+    assert set(three) - set(two) == {'/psd_3/spot', '/psd_3/volts'}
     assert not [topic for topic in two if 'psd_3' in topic]
 
 
@@ -80,7 +79,7 @@ class Node:
         self.latched: dict[str, bool] = {}
         self.destroyed: list[Any] = []
 
-    def create_publisher(self, kind: Any, topic: str, qos: QoSProfile) -> Any:
+    def create_publisher(self, kind: Any, topic: str, qos: QoSProfile, **more: Any) -> Any:
         self.latched[topic] = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
         return SimpleNamespace(publish=self.sent.setdefault(topic, []).append)
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Self
 
-from msg_adapters import LATCHED, MESSAGE_TYPES, to_messages
+from msg_adapters import BY_NAME, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder, creating
@@ -247,7 +247,8 @@ class McapFile(_RecordSink):
         if schema is None:
             schema = self._writer.register_schema(type_name, 'ros2msg', message.definition.encode())
             self._schemas[type_name] = schema
-        qos = LATCHED_QOS if topic in LATCHED else DEFAULT_QOS
+        row = BY_NAME.get(topic)
+        qos = LATCHED_QOS if row is not None and row.delivery.latched else DEFAULT_QOS
         channel = self._writer.register_channel(
             topic, 'cdr', schema, {'offered_qos_profiles': qos_text(qos), 'topic_type_hash': message.type_hash}
         )

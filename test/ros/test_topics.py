@@ -1,0 +1,60 @@
+"""The table of topics is whole: nothing is published or heard beside it, and the page shows it."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from msg_adapters import BY_NAME, TOPICS, to_messages
+from psd_deflection.rig.config import load_rig
+from psd_deflection.ros.topics import HEARD, PUBLISHED
+from psd_deflection.run.fanout import published, subscribed
+from test.recordings.making import estimate
+from tools import topics
+from tools.program import ROOT
+
+MAKERS = {'create_publisher': 'endpoints.py', 'create_subscription': 'gate.py'}
+"""What makes publishers and subscriptions, and the one file that may call it: there they are made from rows."""
+
+
+@pytest.mark.parametrize('maker', MAKERS)
+def test_publishers_and_subscriptions_are_made_from_rows_alone(maker: str) -> None:
+    found = {
+        path.name
+        for path in sorted((ROOT / 'psd_deflection').rglob('*.py'))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Attribute) and node.attr == maker
+    }
+    assert found == {MAKERS[maker]}
+
+
+def test_every_topic_of_a_record_has_a_row() -> None:
+    inputs = {t.name for t in TOPICS if t.to_record is not None}
+    assert inputs <= HEARD.keys()
+    rig = load_rig(overrides={'filter': 'modal'})
+    assert published(rig).keys() <= PUBLISHED.keys()
+    assert set(subscribed(rig)) == inputs
+    for row in PUBLISHED.values():
+        if row.name in BY_NAME:
+            assert row.type == BY_NAME[row.name].message.name
+    assert {m.topic for m in to_messages(estimate(3))} <= PUBLISHED.keys()
+
+
+def test_a_topic_without_a_row_is_refused() -> None:
+    endpoints = pytest.importorskip('psd_deflection.ros.endpoints')
+    with pytest.raises(KeyError, match='/made/up'):
+        endpoints.publisher_of(None, '/made/up')
+
+
+def test_every_row_says_what_is_on_it() -> None:
+    rows = [*PUBLISHED.values(), *(row for rows in HEARD.values() for row in rows)]
+    assert [row.name for row in rows if not (row.says and row.node)] == []
+    # Any type there may be is named by a parameter, and that is one.
+    assert [row.name for row in rows if not row.type] == ['~/controller_state']
+
+
+def test_the_page_has_the_table() -> None:
+    page = Path(topics.PAGE).read_text(encoding='utf-8')
+    assert topics.written(page) == page, 'python -m tools.topics'
