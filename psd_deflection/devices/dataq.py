@@ -68,7 +68,7 @@ class Dataq(PortSource):
         self._wanted = rig.converter.sample_rate_hz
         if abs(rig.converter.volts_per_count - VOLTS_PER_COUNT) > 1e-3 * VOLTS_PER_COUNT:
             raise ConfigError(
-                'source = dataq: reads 16 bits over +-10 V; set converter.bits = 16 and converter.full_scale = 10.0'
+                'source = dataq: reads 16 bits over ±10 V; set converter.bits = 16 and converter.full_scale = 10.0'
             )
         self._decoder = ScanDecoder()
         self._count = 0

@@ -82,7 +82,7 @@ def test_a_rig_without_room_says_which_dot(tmp_path: Path, capsys: pytest.Captur
     path = tmp_path / 'rig.yaml'
     path.write_text('/**:\n  ros__parameters:\n    psd_1: {active_area: [0.004, 0.004], zero: [0.0, 0.003]}\n')
     assert main(['budget', '--params-file', str(path)]) == 3
-    assert 'psd_1 would lie at y = 3.00 mm, outside its +-2 mm' in capsys.readouterr().err
+    assert 'psd_1 would lie at y = 3.00 mm, outside its ±2 mm' in capsys.readouterr().err
 
 
 def test_json_has_the_figures_in_si(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

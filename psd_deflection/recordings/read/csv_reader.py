@@ -111,7 +111,7 @@ class CsvRecording(Recording):
         if not math.isfinite(value):
             raise self._refuse(f'column {name} holds {cell!r}, which is not finite', line)
         if abs(value) > largest:
-            raise self._refuse(f'column {name} holds {cell!r}, which is beyond +-{largest:g}', line)
+            raise self._refuse(f'column {name} holds {cell!r}, which is beyond ±{largest:g}', line)
         return value
 
     def _find_step(self) -> float:

@@ -29,7 +29,7 @@ def _iteration(at: Situation) -> Contribution:
     window, step = stop_window(at.rig.centers + at.rig.zeros, at['iteration_tolerance']), at['iteration_step']
     if window < step / 2.0:
         raise ConfigError(
-            f'iteration_tolerance = {at["iteration_tolerance"]:g} m: its window of +-{window:g} rad is narrower than '
+            f'iteration_tolerance = {at["iteration_tolerance"]:g} m: its window of ±{window:g} rad is narrower than '
             f'iteration_step = {step:g} rad: the iteration may step over it; take a finer step'
         )
     # The first trial inside the window is uniform within one step of its edge.

@@ -74,7 +74,7 @@ class Situation:
             raise ConfigError(
                 f'load = {load[0]:g} {load[1]:g} {load[2]:g}: the dot of psd_{psd + 1} would lie at '
                 f'{"xy"[axis]} = {places[0, psd, axis] * 1e3:.2f} mm, outside its '
-                f'+-{chain.half_area[psd, axis] * 1e3:g} mm: take a smaller load'
+                f'±{chain.half_area[psd, axis] * 1e3:g} mm: take a smaller load'
             )
         return cls(rig, inputs, pose, method, chain, estimator)
 

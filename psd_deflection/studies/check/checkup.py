@@ -33,7 +33,8 @@ DEAD = 0.1
 SIZE_FACTOR = 1.1
 """Report a movement that differs from the expected one by more than this factor."""
 
-_LOADS = ('fx', 'fy', 'tz')
+ALONE = {'fx': 'a load along X alone', 'fy': 'a load along Y alone', 'tz': 'a torque about Z alone'}
+_LOADS = tuple(ALONE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,8 +118,8 @@ def _wiring_findings(
         return []
     gained = misfit(file, seen, best.reversed_loads)[0] - best.misfit
     also = _same_to_first_order(file, seen, best)
-    if len(found) > 1:
-        also += (f'{len(found) - 1} other wirings that these pushes cannot tell from it',)
+    if (others := len(found) - 1) > 0:
+        also += (f'{others} other wiring{"s" if others > 1 else ""}, which these pushes cannot tell apart',)
     findings, right = wiring_findings(best.wiring, file, gained, also)
     if len(found) == 1:
         lines.update(right)
@@ -134,7 +135,10 @@ def _same_to_first_order(file: Wiring, seen: Sequence[PushResponse], best: Wirin
 
 
 def _load_findings(seen: Sequence[PushResponse], found: WiringFit) -> list[Finding]:
-    out = [Finding('load_sign', load, -1.0, f'the sign of load_{load} is turned') for load in found.reversed_loads]
+    out = [
+        Finding('load_sign', load, -1.0, f'load_{load} in the recording has the wrong sign')
+        for load in found.reversed_loads
+    ]
     sizes = np.full(3, math.nan)
     for p in seen:
         if p.sized:
@@ -154,14 +158,17 @@ def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str,
 def _coverage(
     pushes: Sequence[PushResponse], seen: Sequence[PushResponse], found: Sequence[WiringFit]
 ) -> list[Finding]:
-    missing = [load for load in ('fx', 'fy', 'tz') if (load,) not in {p.loads for p in seen}]
+    missing = [load for load in ALONE if (load,) not in {p.loads for p in seen}]
     weak = [p.name for p in pushes if not p.seen]
     if seen and not found:
         text = 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +θ'
     elif weak:
-        text = f'pushes that do not stand out of the noise: {", ".join(weak)}; push harder'
+        verb = 'does' if len(weak) == 1 else 'do'
+        text = f'{" and ".join(weak)} {verb} not stand out of the noise: push harder'
+    elif len(missing) == 1:
+        text = f'record again with {ALONE[missing[0]]} too'
     else:
-        text = f'needed alone, one after the other: {" ".join(missing)}'
+        text = f'record again, one after the other: {", ".join(ALONE[load] for load in missing or ALONE)}'
     return [Finding('load_coverage', ' '.join(missing) or 'fx fy tz', None, text)]
 
 

@@ -21,7 +21,7 @@ from psd_deflection.studies.study import PageSection, StudyResult
 RIGHT, WRONG, CANNOT_TELL = 'right', 'wrong', 'cannot_tell'
 
 TELLING_DRIFT = 5e-6 / 60.0
-"""m/s: a drift whose standard deviation is larger is not told; the recording is too short."""
+"""m/s: a drift whose standard deviation is larger is not shown; the recording is too short."""
 
 NAMES = {
     'channel_sign': 'sign turned',
@@ -112,7 +112,7 @@ class Checkup(StudyResult):
     def sentences(self) -> list[str]:
         """The verdict, then what is wrong, one line each, then what to look at."""
         wrong = [f'{what}: {fix}' for what, fix in _findings(self)]
-        return [_verdict(self), *wrong, *_other_causes(self), *(f'look at  {note}' for note in self.notes)]
+        return [_verdict(self), *wrong, *_other_causes(self), *(f'note: {note}' for note in self.notes)]
 
     def lines(self) -> list[str]:
         """Pushes, verdict, lines for the rig file, levels."""
@@ -124,8 +124,8 @@ class Checkup(StudyResult):
         if self.values:
             out += ['', 'Lines for the rig file, below ros__parameters:', '']
             out += [f'    {line(name, value)}' for name, value in self.values.items()]
-        levels = [f'{name:<9}{text}' for name, text in _levels(self)]
-        return [*out, '', *levels, *(f'look at  {note}' for note in self.notes)]
+        notes = [('note', note) for note in self.notes]
+        return [*out, '', *(f'{name:<9}{text}' for name, text in (*_levels(self), *notes))]
 
     def sections(self) -> Iterable[PageSection]:
         """Pushes, lines for the rig file, levels."""
@@ -170,7 +170,9 @@ def _pushes(found: Checkup) -> list[list[str]]:
         expected = on_channels(Wiring.from_rig(found.rig), push.expected)
         told_size = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
         words = [_arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
-        rows.append([push.name, *(f'{v * 1e6:+.1f}' for v in push.channels.tolist()), '  rig file:', *words, told_size])
+        rows.append(
+            [push.name, *(f'{v * 1e6:+z.1f}' for v in push.channels.tolist()), '  rig file:', *words, told_size]
+        )
     if not any(row[-1] for row in rows[1:]):
         rows = [row[:-1] for row in rows]
     return rows
@@ -188,9 +190,10 @@ def _verdict(found: Checkup) -> str:
     if found.verdict == CANNOT_TELL:
         if not fit:
             return 'CANNOT TELL: these pushes fit no wiring.'
-        return f'CANNOT TELL: the rig file fits, and so do {fit - 1} other wirings of {len(WIRINGS)}.'
+        verb = 'does' if fit == 2 else 'do'
+        return f"CANNOT TELL: the rig file's wiring fits, and so {verb} {fit - 1} of the other {len(WIRINGS) - 1}."
     if not any(f.name in WIRED for f in found.findings):
-        return 'WRONG, but not in the wiring: that of the rig file fits.' if fit == 1 else 'WRONG:'
+        return 'WRONG, but not in the wiring: that of the rig file fits.' if fit == 1 else 'WRONG, as follows:'
     fits = f'one wiring of {len(WIRINGS)} fits' if fit == 1 else f'{fit} wirings of {len(WIRINGS)} fit'
     return f'WRONG: {fits}, and that of the rig file does not.'
 
@@ -199,8 +202,12 @@ def _findings(found: Checkup) -> list[tuple[str, str]]:
     """What is wrong, and what to do about it."""
     rows = []
     for f in found.findings:
-        where = f.where.replace(' ', ' and ') if f.name == 'psd_swap' else f.where
-        rows.append((f'{where}: {NAMES[f.name]}', f.fix))
+        where, name = f.where, NAMES[f.name]
+        if f.name == 'psd_swap':
+            where = where.replace(' ', ' and ')
+        elif f.name == 'load_coverage':
+            where, name = 'pushes', 'not enough to tell'
+        rows.append((f'{where}: {name}', f.fix))
     return rows
 
 
@@ -222,12 +229,12 @@ def _levels(found: Checkup) -> list[tuple[str, str]]:
     measured = found.levels
     noise = '  '.join(f'{c} {v * 1e3:.2f}' for c, v in zip(CHANNELS, measured.noise.tolist(), strict=True))
     drift = '  '.join(
-        f'{c} {v * 60e6:+.1f} +- {sd * 60e6:.1f}'
+        f'{c} {v * 60e6:+z.1f} ± {sd * 60e6:.1f}'
         for c, v, sd in zip(DOTS, found.drift.tolist(), found.drift_sd.tolist(), strict=True)
     )
     drift += '  µm a minute'
     if found.drift_sd.max() > TELLING_DRIFT:
-        drift = 'too short a time to tell'
+        drift = 'cannot be told: the recording is too short'
     hum = 'none at 50 or 60 Hz'
     if measured.hum.max() > 0.0:
         sizes = '  '.join(f'{c} {v * 1e3:.1f}' for c, v in zip(CHANNELS, measured.hum.tolist(), strict=True))

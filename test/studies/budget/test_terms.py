@@ -264,7 +264,7 @@ def test_a_window_that_may_be_stepped_over_is_refused() -> None:
 
 
 def test_a_load_that_throws_a_dot_off_its_sensor_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r'psd_1 would lie at y = 8\.9.* mm, outside its \+-5 mm'):
+    with pytest.raises(ConfigError, match=r'psd_1 would lie at y = 8\.9.* mm, outside its ±5 mm'):
         _at((0.0, -200.0, 0.0))
 
 

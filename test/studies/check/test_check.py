@@ -235,7 +235,9 @@ def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() 
     found = checked(recorded(loads, 3), loads)
     assert found.verdict == CANNOT_TELL
     assert [f.name for f in found.findings] == ['load_coverage']
-    assert 'fx' in found.findings[0].fix
+    assert found.findings[0].fix == 'record again with a load along X alone too'
+    assert '  pushes: not enough to tell   record again with a load along X alone too' in found.lines()
+    assert found.sentences()[0] == "CANNOT TELL: the rig file's wiring fits, and so does 1 of the other 127."
     assert Wiring() in [c.wiring for c in found.found]
     assert not found.values
     # Weights on a sidebar: a force along Y and its torque, always together.
@@ -244,6 +246,7 @@ def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() 
     found = checked(recorded(together, 4), together)
     assert [p.name for p in found.pushes] == ['+Y with +θ']
     assert found.verdict == CANNOT_TELL
+    assert re.search(r', and so do \d+ of the other 127\.$', found.sentences()[0])
 
 
 def test_pushes_below_the_noise_accuse_nobody() -> None:
