@@ -39,7 +39,6 @@ class Port:
 
     port: str
     description: str = ''
-    usb_serial: str = ''
     source: str = ''
     answer: str = 'nothing that we know answers'
     suggested: dict[str, Any] = field(default_factory=dict)
@@ -93,7 +92,7 @@ def serial_ports() -> list[Port]:
         if p.hwid == 'n/a':
             # The built-in ports of a PC, mostly without a connector.
             continue
-        found.append(Port(p.device, p.description or '', p.serial_number or ''))
+        found.append(Port(p.device, p.description or ''))
     return found
 
 

@@ -116,7 +116,7 @@ def test_the_system_s_list_is_taken_without_the_fixed_ports(monkeypatch: pytest.
     ]
     monkeypatch.setattr('serial.tools.list_ports.comports', lambda: listed)
     (port,) = serial_ports()
-    assert (port.port, port.description, port.usb_serial) == ('/dev/ttyACM0', 'PSD', 'A7')
+    assert (port.port, port.description) == ('/dev/ttyACM0', 'PSD')
 
 
 def test_no_ports_at_all(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
