@@ -20,7 +20,8 @@ from bench.simulated_arm import SimulatedArm
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.arm import read_arm
-from psd_deflection.arms.compensation.compensator import Compensator, CompensatorSettings, Observed, State
+from psd_deflection.arms.compensation.compensator import Compensator, Observed, State
+from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.base.pages import page, picture, table
 from psd_deflection.records import FloatArray
 

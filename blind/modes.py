@@ -22,7 +22,8 @@ from scipy.signal import lfilter
 
 from blind.campaign import options, watched
 from blind.generator import Array
-from psd_deflection.studies.identify.modes import Mode, modes_of
+from psd_deflection.studies.identify.axis_modes import Mode
+from psd_deflection.studies.identify.modes import modes_of
 
 RATE = 1000.0
 

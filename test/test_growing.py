@@ -45,7 +45,7 @@ BOUNDED_BY = {
     'measure/correction.py:known': 'our own names',
     'measure/estimation.py:_some_solvers': 'sets of at most six PSDs',
     'measure/motion/inertia.py:told': 'MOST_TOLD',
-    'measure/motion/motion.py:_loads': 'MOST_LOADS',
+    'measure/motion/known.py:_waiting': 'MOST_LOADS',
     'measure/pipeline.py:misfits': 'one a part of the rig',
     'measure/pipeline.py:findings': 'our own sentences',
     'measure/pipeline.py:refused': 'our own causes',

@@ -25,7 +25,8 @@ from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERAT
 from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, SeenBlock
 from psd_deflection.measure.health import OpticsHealth, Stillness, Verdict
 from psd_deflection.measure.memory import STATE, WHOLE, Memory, Part, Value, numbers, restore
-from psd_deflection.measure.motion.motion import ModalFilter, joined_ns, split_ns
+from psd_deflection.measure.motion.known import joined_ns, split_ns
+from psd_deflection.measure.motion.motion import ModalFilter
 from psd_deflection.measure.uncertainty.rest import why_moving
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts
 from psd_deflection.model.simulation.catalogue import effects_of_rig

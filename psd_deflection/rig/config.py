@@ -39,7 +39,6 @@ from psd_deflection.rig.declarations import (
     ROS_OWN,
     SIMULATED,
     ZEROS,
-    AcquisitionConfig,
     AmplifierConfig,
     BeamConfig,
     CalibrationConfig,
@@ -47,11 +46,11 @@ from psd_deflection.rig.declarations import (
     DynamicsConfig,
     EstimatorConfig,
     LinkConfig,
-    MonitorConfig,
     PsdConfig,
 )
 from psd_deflection.rig.parameter_files import EFFECTS_PREFIX, flattened, read_parameter_file
 from psd_deflection.rig.parameters import Parameter, Section, Value, check_value, shown
+from psd_deflection.rig.running import AcquisitionConfig, MonitorConfig
 
 _ORDERED = (
     ('link.inner_radius', 'less than', 'link.outer_radius'),

@@ -29,17 +29,10 @@ from std_srvs.srv import SetBool
 from msg_adapters import END_EFFECTOR
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.arm import Arm, arm_of
-from psd_deflection.arms.compensation.compensator import (
-    ALL_JOINTS,
-    SETTINGS,
-    Command,
-    Compensator,
-    CompensatorSettings,
-    Observed,
-    State,
-)
-from psd_deflection.arms.compensation.compensator import COMMANDS as WITH_COMMANDS
+from psd_deflection.arms.compensation.compensator import Command, Compensator, Observed, State
 from psd_deflection.arms.compensation.robot import RobotWatch
+from psd_deflection.arms.compensation.settings import ALL_JOINTS, SETTINGS, CompensatorSettings
+from psd_deflection.arms.compensation.settings import COMMANDS as WITH_COMMANDS
 from psd_deflection.arms.inputs import LARGEST_POSITION, frame_fault, joints_fault, quaternion_fault, stamp_fault
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import INFO, WARNING, Say

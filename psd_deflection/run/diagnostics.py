@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 from msg_adapters import ACCELERATION
 from psd_deflection.measure.motion.inertia import HOLD_NS
-from psd_deflection.measure.motion.motion import AXES, Innovations
+from psd_deflection.measure.motion.innovations import Innovations
+from psd_deflection.measure.motion.motion import AXES
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.run.session import Session
 

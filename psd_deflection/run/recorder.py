@@ -28,7 +28,7 @@ from psd_deflection.base.log import ERROR, WARNING, Say
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 from psd_deflection.rig.config import Rig
-from psd_deflection.rig.declarations import AcquisitionConfig
+from psd_deflection.rig.running import AcquisitionConfig
 from psd_deflection.run.behind import SLOW, why_behind
 
 MESSAGES_PER_BLOCK = 100

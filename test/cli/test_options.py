@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.arms.compensation.compensator import SETTINGS
+from psd_deflection.arms.compensation.settings import SETTINGS
 from psd_deflection.arms.compensation.shaping import SHAPING
 from psd_deflection.base.errors import UsageError
 from psd_deflection.cli import _options

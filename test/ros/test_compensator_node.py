@@ -28,8 +28,9 @@ from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Bool, Float64, String  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
-from bench.campaign.hold import BREAKS, DEFLECTIONS, JOINTS, URDF, WITHIN, Plant, faithful  # noqa: E402
-from psd_deflection.arms.compensation.compensator import SETTINGS  # noqa: E402
+from bench.campaign.hold import BREAKS, URDF, WITHIN  # noqa: E402
+from bench.campaign.plant import DEFLECTIONS, JOINTS, Plant, faithful  # noqa: E402
+from psd_deflection.arms.compensation.settings import SETTINGS  # noqa: E402
 from test.ros.conftest import WARNINGS  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 

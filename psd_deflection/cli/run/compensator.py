@@ -19,7 +19,7 @@ import argparse
 import importlib.util
 
 from psd_deflection.arms.compensation.arm import read_arm
-from psd_deflection.arms.compensation.compensator import SETTINGS
+from psd_deflection.arms.compensation.settings import SETTINGS
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import of_options, section_options

@@ -12,7 +12,6 @@ is followed through the gains, so that the covariance of the pose is that of the
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -22,6 +21,8 @@ from psd_deflection.base.arithmetic import ARITHMETICS
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.measure.motion.inertia import Forced, Inertia
+from psd_deflection.measure.motion.innovations import Innovations
+from psd_deflection.measure.motion.known import KnownLoads, Pushed, joined_ns, split_ns
 from psd_deflection.measure.motion.modal import BlockTables, Oscillator
 from psd_deflection.measure.motion.unseen import UnseenLoads
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, inverse
@@ -39,12 +40,8 @@ UNKNOWN = 1.0
 """Standard deviation of each state at the start, m or rad: nothing is known."""
 STEADY = 1e-9
 """The same of r/w, if the rig file states how the load wanders: it has no rate of change."""
-KNOWN_LOAD = 0.05
-"""Share by which the deflection of a known load may differ from the rig file's link, one standard deviation."""
 LATE_S = 1.0
 """What late accelerations change fades to 1/e in this time."""
-MOST_LOADS = 1000
-"""So many known loads may wait for samples."""
 
 AXES = ('dX', 'dY', 'theta')
 _PAIRS = ((0, 1), (0, 2), (1, 2))
@@ -69,12 +66,11 @@ class TipState(NamedTuple):
 
 
 class Predicted(NamedTuple):
-    """Motion at n times: ``pose`` m, m, rad, ``velocity`` m/s, m/s, rad/s, and their variances, (n, 3) each."""
+    """Motion at n times: ``pose`` m, m, rad, ``velocity`` m/s, m/s, rad/s, ``variance`` of the pose, (n, 3) each."""
 
     pose: FloatArray
     velocity: FloatArray
     variance: FloatArray
-    velocity_variance: FloatArray
 
 
 class _Taken(NamedTuple):
@@ -83,30 +79,6 @@ class _Taken(NamedTuple):
 
     forced: Forced
     gain: FloatArray
-
-
-class Innovations(NamedTuple):
-    """How well the filter foretold the samples so far.
-
-    ``squares``: sums of the normalised innovations squared (NIS) of dX, dY, theta; each has the mean 1 a sample.
-    """
-
-    squares: tuple[float, ...] = (0.0, 0.0, 0.0)
-    samples: int = 0
-
-    def since(self, before: Innovations) -> Innovations:
-        """Those that came after ``before``."""
-        squares = tuple(now - then for now, then in zip(self.squares, before.squares, strict=True))
-        return Innovations(squares, self.samples - before.samples)
-
-    def means(self) -> tuple[float, ...]:
-        """NIS a sample, of dX, dY, theta; 0 without samples."""
-        return tuple(square / max(self.samples, 1) for square in self.squares)
-
-    def band(self, deviations: float) -> tuple[float, float]:
-        """Where the mean NIS is, up to so many standard deviations: of a chi-square with a degree for each sample."""
-        half = deviations * math.sqrt(2.0 / max(self.samples, 1))
-        return max(1.0 - half, 0.0), 1.0 + half
 
 
 class ModalFilter:
@@ -153,8 +125,7 @@ class ModalFilter:
         self._changes = _transitions((1,) if self._stated is not None else (STEPPED, SMOOTH))
         self.innovations = Innovations()
         self.coasts = 0
-        self._loads: list[AppliedLoad] = []
-        self._held: FloatArray | None = None
+        self._known = KnownLoads(self._modes, self._compliance, size, self._period)
         self.inertia = Inertia(self._modes, rig.link.length)
         self._late_ones = 0
         self._times = self._period * np.arange(1.0, size + 1.0)
@@ -198,17 +169,11 @@ class ModalFilter:
 
     def is_new(self, load: AppliedLoad) -> bool:
         """Whether ``load`` differs from the last one that was told."""
-        if self._loads:
-            return load[1:] != self._loads[-1][1:]
-        return self._held is None or load[1:] != tuple(self._held.tolist())
+        return self._known.is_new(load)
 
     def load(self, load: AppliedLoad) -> None:
-        """A known load that acts from its stamp on. One from before the samples that were used is seen in them.
-
-        If more than ``MOST_LOADS`` wait for samples, the oldest is forgotten.
-        """
-        self._loads.append(load)
-        del self._loads[:-MOST_LOADS]
+        """A known load that acts from its stamp on. One from before the samples that were used is seen in them."""
+        self._known.add(load)
 
     def block(self, index: int, t_ns: int, slots: IntArray | None, poses: FloatArray | None) -> TipState | None:
         """The motion at the end of block ``index``, or None if nothing is known.
@@ -230,13 +195,13 @@ class ModalFilter:
         self.inertia.forget_before(self._before_ns(t_ns))
         if self._index is None and slots is None:
             return None
-        pushed = self._known_loads(t_ns)
+        pushed = self._known.pushed(t_ns, self._index is None)
         forced = self._forced(t_ns)
         self._index, self._t_ns = index, t_ns
         if slots is None or poses is None:
             self._coast(seconds, forced)
             if pushed is not None:
-                self._x = self._x + pushed[1]
+                self._x = self._x + pushed.end
             if self.coasted > self._longest:
                 self.forget()
                 return None
@@ -298,33 +263,11 @@ class ModalFilter:
         self._swung = self._swung + more[:, -1]
         self._p[:, 2, 2] += np.square(np.maximum(now.doubt - taken.forced.doubt, 0.0))
 
-    def _known_loads(self, t_ns: int) -> tuple[FloatArray, FloatArray, FloatArray] | None:
-        """What the known loads of this block do: to each sample (3, N), to the end (3, 4), and to u, (3,)."""
-        if not self._loads:
-            return None
-        period_ns = 1e9 * self._period
-        end_ns = t_ns + round(0.5 * (self._size - 1) * period_ns)
-        samples, end, size = np.zeros((3, self._size)), np.zeros((3, 4)), np.zeros(3)
-        while self._loads and self._loads[0].t_ns <= end_ns:
-            load = self._loads.pop(0)
-            before, self._held = self._held, np.array(load[1:])
-            since = self._period * self._size - (end_ns - load.t_ns) / 1e9
-            # The first one may have acted before the run.
-            if self._index is None or before is None or since < 0.0:
-                continue
-            step = self._compliance * (self._held - before)
-            size = size + np.square(KNOWN_LOAD * step)
-            for a, mode in enumerate(self._modes):
-                pushed = step[a] * mode.pushed(self._period * np.arange(1.0, self._size + 1.0) - since)[:, 0]
-                samples[a] += pushed[:, 0]
-                end[a] += pushed[-1]
-        return samples, end, size
-
     def _update(
         self,
         slots: IntArray,
         poses: FloatArray,
-        pushed: tuple[FloatArray, FloatArray, FloatArray] | None,
+        pushed: Pushed | None,
         forced: Forced | None,
     ) -> None:
         says = self._tables.says(slots)
@@ -332,10 +275,10 @@ class ModalFilter:
         after = self._by.einsum('aij,aj->ai', self._tables.phi, self._x)
         p = self._p + self._unforeseen(self.coasted) if self.coasted > 0.0 else self._p
         if pushed is not None:
-            foretold = foretold + pushed[0][:, slots]
-            after = after + pushed[1]
+            foretold = foretold + pushed.samples[:, slots]
+            after = after + pushed.end
             p = p.copy()
-            p[:, 2, 2] += pushed[2]
+            p[:, 2, 2] += pushed.variance
         if forced is not None:
             foretold = foretold + forced.at[:, slots, 0]
             after = after + forced.at[:, -1]
@@ -437,7 +380,7 @@ class ModalFilter:
         p = self._by.einsum('anij,ajl,anml->naim', steps, self._unsure(), steps)
         p += self._by.einsum('ac,ancij->naij', self._rate(), added)
         p += np.stack([self._unforeseen(self.coasted + s) for s in seconds.tolist()])
-        return Predicted(x[..., 0], self._w * x[..., 1], p[..., 0, 0], self._w**2 * p[..., 1, 1])
+        return Predicted(x[..., 0], self._w * x[..., 1], p[..., 0, 0])
 
     def load_walk(self) -> tuple[float, ...]:
         """How far the load wanders in a second by what was seen last, by its steps alone: N, N, N m."""
@@ -446,8 +389,7 @@ class ModalFilter:
     def memory(self) -> Memory:
         """What the next block depends on, besides the noise; {} if nothing is known."""
         out: Memory = {}
-        held = (1.0, *self._held.tolist()) if self._held is not None else (0.0,) * 4
-        waiting = [v for load in self._loads for v in (*split_ns(load.t_ns), *load[1:])]
+        held, waiting = self._known.memory()
         if self._index is not None:
             times = (float(self._index), *split_ns(self._t_ns), self.coasted)
             arrays = [self._x, self._p, self._shared, self._weights]
@@ -455,7 +397,7 @@ class ModalFilter:
                 arrays.append(self._unseen.variances)
                 out[UNSEEN] = (*self._swung.ravel().tolist(), *self._unseen.gathered())
             out[STATE] = (*times, *held, *_flat(arrays), *waiting)
-        elif self._held is not None or waiting:
+        elif self._known:
             out[LOADS] = (*held, *waiting)
         if self.inertia.known:
             told = [v for t_ns, deflection in self.inertia.told for v in (*split_ns(t_ns), *deflection)]
@@ -474,7 +416,7 @@ class ModalFilter:
                 raise misfit(UNSEEN, unseen, 'states of as many blocks as the filter coasts')
             self._swung = np.reshape(unseen[:12], (3, 4))
         if loads := numbers(values, LOADS, 'known loads'):
-            self._restore_loads(LOADS, loads)
+            self._known.restore(LOADS, loads)
         if inertia := numbers(values, INERTIA, 'accelerations of the base'):
             self._restore_inertia(inertia)
 
@@ -494,15 +436,7 @@ class ModalFilter:
         self._begin_unseen()
         if self._unseen is not None:
             self._unseen.variances[:] = np.reshape(values[known:end], self._unseen.variances.shape)
-        self._restore_loads(STATE, (*values[4:8], *values[end:]))
-
-    def _restore_loads(self, name: str, values: tuple[float, ...]) -> None:
-        """The held load with whether there is one, and those that wait, five numbers each."""
-        if len(values) < 4 or (len(values) - 4) % 5:
-            raise misfit(name, values, 'four numbers and five for each load that waits')
-        self._held = np.array(values[1:4]) if values[0] else None
-        waiting = np.reshape(values[4:], (-1, 5)).tolist()
-        self._loads = [AppliedLoad(joined_ns(s, ns), fx, fy, tz) for s, ns, fx, fy, tz in waiting]
+        self._known.restore(STATE, (*values[4:8], *values[end:]))
 
     def _restore_inertia(self, values: tuple[float, ...]) -> None:
         n = self._size
@@ -523,16 +457,6 @@ class ModalFilter:
 
 def _flat(arrays: Sequence[FloatArray]) -> list[float]:
     return [v for array in arrays for v in array.ravel().tolist()]
-
-
-def split_ns(t_ns: int) -> tuple[float, float]:
-    """Seconds and nanoseconds: one float does not hold a time to the nanosecond."""
-    return float(t_ns // 1_000_000_000), float(t_ns % 1_000_000_000)
-
-
-def joined_ns(seconds: float, ns: float) -> int:
-    """The time that :func:`split_ns` split."""
-    return 1_000_000_000 * int(seconds) + int(ns)
 
 
 def _transitions(families: tuple[int, ...]) -> FloatArray:

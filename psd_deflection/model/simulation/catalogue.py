@@ -94,7 +94,8 @@ def effect_names() -> list[str]:
 def _of_file(path: Path) -> object:
     if path.suffix == '.yaml':
         # Imported here: it needs the filters, which a rig without laws does not.
-        from psd_deflection.model.simulation.laws import effect_of, read_law
+        from psd_deflection.model.simulation.law_files import read_law
+        from psd_deflection.model.simulation.laws import effect_of
 
         return effect_of(read_law(path))
     spec = importlib.util.spec_from_file_location(f'{__name__}.{path.stem}', path)

@@ -17,23 +17,17 @@ and shapes ``threshold1`` ... in the order of the terms.
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
 import yaml
-from scipy.signal import lfilter
 
-from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.foreign_yaml import tree_of_file
-from psd_deflection.base.spelling import did_you_mean
+from psd_deflection.model.simulation import law_forms
 from psd_deflection.model.simulation.declaration import (
-    STAGES,
     Effect,
     EffectParameter,
     Point,
@@ -43,11 +37,8 @@ from psd_deflection.model.simulation.declaration import (
     Use,
     Values,
 )
-from psd_deflection.model.simulation.hysteresis import play
-from psd_deflection.model.simulation.modes import mode_coefficients
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.parameters import Parameter, check_value
 
 Kind = Literal['static', 'switched', 'rate', 'history', 'resonance', 'variance']
 
@@ -67,7 +58,7 @@ VARIABLES: Mapping[str, str] = {
 }
 """What a law may depend on, with its unit. ``temperature``: above the first one; ``time``: since the first sample."""
 
-_LOADS, _POSE, _DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
+_LOADS, _POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,88 +77,12 @@ TARGETS: Mapping[str, LawTarget] = {
     **{n: LawTarget('load', 'load', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_LOADS)},
     **{f'static_{n}': LawTarget('link', 'static', i, VARIABLES[n], (*_LOADS, *_ALWAYS)) for i, n in enumerate(_POSE)},
     **{n: LawTarget('link', 'pose', i, VARIABLES[n], (*_LOADS, *_POSE, *_ALWAYS)) for i, n in enumerate(_POSE)},
-    **{f'beam_{n}': LawTarget('optics', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(_DOTS)},
-    **{n: LawTarget('psd', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(_DOTS)},
+    **{f'beam_{n}': LawTarget('optics', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(DOTS)},
+    **{n: LawTarget('psd', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(DOTS)},
     **{f'sum{i + 1}': LawTarget('psd', 'dots', 4 + i, 'V', tuple(VARIABLES)) for i in range(2)},
 }
 """What a law may act on. ``static_dx`` is what the link swings towards, ``dx`` where it is; ``beam_x1`` moves a laser's
 beam sideways."""
-
-
-def _above(v: FloatArray, shapes: Values) -> FloatArray:
-    return np.maximum(v - shapes['threshold'], 0.0)
-
-
-def _below(v: FloatArray, shapes: Values) -> FloatArray:
-    return np.maximum(shapes['threshold'] - v, 0.0)
-
-
-def _beyond(v: FloatArray, shapes: Values) -> FloatArray:
-    return np.sign(v) * np.maximum(np.abs(v) - shapes['threshold'], 0.0)
-
-
-def _within(v: FloatArray, shapes: Values) -> FloatArray:
-    return np.clip(v, -shapes['threshold'], shapes['threshold'])
-
-
-def _over(v: FloatArray, shapes: Values) -> FloatArray:
-    return (v > shapes['threshold']).astype(np.float64)
-
-
-def _under(v: FloatArray, shapes: Values) -> FloatArray:
-    return (v < shapes['threshold']).astype(np.float64)
-
-
-def _wave(v: FloatArray, shapes: Values) -> FloatArray:
-    return np.sin(2.0 * math.pi * v / shapes['period'] + shapes['phase'])
-
-
-def _rate(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    # Backward, second order: what comes later is not known.
-    before = state.get('v', np.full(2, v[0]))
-    whole = np.concatenate((before, v))
-    state['v'] = whole[-2:]
-    return (1.5 * whole[2:] - 2.0 * whole[1:-1] + 0.5 * whole[:-2]) / period
-
-
-def _rate_absolute(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    return np.abs(_rate(v, shapes, period, state))
-
-
-def _drag(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    rate = _rate(v, shapes, period, state)
-    return rate * np.abs(rate)
-
-
-def _direction(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    change = np.sign(np.diff(v, prepend=state.get('v', v[0])))
-    at = np.maximum.accumulate(np.where(change != 0.0, np.arange(1, len(v) + 1), 0))
-    out = np.concatenate(([state.get('way', 0.0)], change))[at]
-    state['v'], state['way'] = v[-1], out[-1]
-    return np.asarray(out)
-
-
-def _relaxed(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    # The input counts from one sample to the next as a straight line.
-    a = period / shapes['tau']
-    kept = math.exp(-a)
-    ahead = 1.0 - (1.0 - kept) / a
-    b = np.array([ahead, 1.0 - kept - ahead])
-    # Relaxed at zero before the first sample.
-    y, state['y'] = lfilter(b, [1.0, -kept], v, zi=state.get('y', np.array([b[1] * v[0]])))
-    return np.asarray(y)
-
-
-def _resonance(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    b, a = mode_coefficients(shapes['natural_frequency'], shapes['zeta'], period)
-    y, state['y'] = lfilter(b, a, v, zi=state.get('y', np.zeros(2)))
-    return np.asarray(y)
-
-
-def _play(v: FloatArray, shapes: Values, period: float, state: State) -> FloatArray:
-    held = play(v, shapes['half_width'], state.get('held', v[0]))
-    state['held'] = float(held[-1])
-    return held - v
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,43 +103,49 @@ class Form:
     per_second: int = 0
 
 
-_FREE = (-math.inf, math.inf)
-_ANY, _POSITIVE = (-1e12, 1e12), (1e-12, 1e12)
+ANY, _POSITIVE = (-1e12, 1e12), (1e-12, 1e12)
 FORMS: Mapping[str, Form] = {
     'product': Form('static', '{v}', apart=lambda v, _: v),
     'absolute': Form('static', '|{v}|', apart=lambda v, _: np.abs(v)),
     'signed_square': Form('static', '{v} |{v}|', apart=lambda v, _: v * np.abs(v), unit_of_v=2),
-    'above': Form('static', 'max({v} - {threshold}, 0)', apart=_above, fitted={'threshold': ('v', *_ANY)}),
-    'below': Form('static', 'max({threshold} - {v}, 0)', apart=_below, fitted={'threshold': ('v', *_ANY)}),
+    'above': Form('static', 'max({v} - {threshold}, 0)', apart=law_forms.above, fitted={'threshold': ('v', *ANY)}),
+    'below': Form('static', 'max({threshold} - {v}, 0)', apart=law_forms.below, fitted={'threshold': ('v', *ANY)}),
     'beyond': Form(
-        'static', 'sign({v}) max(|{v}| - {threshold}, 0)', apart=_beyond, fitted={'threshold': ('v', *_POSITIVE)}
+        'static',
+        'sign({v}) max(|{v}| - {threshold}, 0)',
+        apart=law_forms.beyond,
+        fitted={'threshold': ('v', *_POSITIVE)},
     ),
-    'within': Form('static', '{v} within ±{threshold}', apart=_within, fitted={'threshold': ('v', *_POSITIVE)}),
+    'within': Form(
+        'static', '{v} within ±{threshold}', apart=law_forms.within, fitted={'threshold': ('v', *_POSITIVE)}
+    ),
     'wave': Form(
         'static',
         'sin(2 pi {v} / {period} + {phase})',
-        apart=_wave,
+        apart=law_forms.wave,
         fitted={'period': ('v', *_POSITIVE), 'phase': ('rad', -1e3, 1e3)},
         unit_of_v=0,
     ),
-    'over': Form('switched', '[1 if {v} > {threshold}]', apart=_over, fixed=('threshold',), unit_of_v=0),
-    'under': Form('switched', '[1 if {v} < {threshold}]', apart=_under, fixed=('threshold',), unit_of_v=0),
+    'over': Form('switched', '[1 if {v} > {threshold}]', apart=law_forms.over, fixed=('threshold',), unit_of_v=0),
+    'under': Form('switched', '[1 if {v} < {threshold}]', apart=law_forms.under, fixed=('threshold',), unit_of_v=0),
     'switched': Form('switched', '{v} [between {times}]'),
-    'rate': Form('rate', 'd({v})/dt', following=_rate, per_second=1),
-    'rate_absolute': Form('rate', '|d({v})/dt|', following=_rate_absolute, per_second=1),
-    'drag': Form('rate', 'd({v})/dt |d({v})/dt|', following=_drag, unit_of_v=2, per_second=2),
-    'direction': Form('history', 'sign of the last change of {v}', following=_direction, unit_of_v=0),
+    'rate': Form('rate', 'd({v})/dt', following=law_forms.rate, per_second=1),
+    'rate_absolute': Form('rate', '|d({v})/dt|', following=law_forms.rate_absolute, per_second=1),
+    'drag': Form('rate', 'd({v})/dt |d({v})/dt|', following=law_forms.drag, unit_of_v=2, per_second=2),
+    'direction': Form('history', 'sign of the last change of {v}', following=law_forms.direction, unit_of_v=0),
     'relaxed': Form(
         'history',
         '{v} through a lag of {tau}',
-        following=_relaxed,
+        following=law_forms.relaxed,
         fitted={'tau': ('s', 1e-4, 1e5)},
     ),
-    'play': Form('history', 'play({v}, {half_width}) - {v}', following=_play, fitted={'half_width': ('v', *_POSITIVE)}),
+    'play': Form(
+        'history', 'play({v}, {half_width}) - {v}', following=law_forms.played, fitted={'half_width': ('v', *_POSITIVE)}
+    ),
     'resonance': Form(
         'resonance',
         '{v} through a mode of {natural_frequency} and damping ratio {zeta}',
-        following=_resonance,
+        following=law_forms.resonance,
         fitted={'natural_frequency': ('Hz', 0.01, 1e4), 'zeta': ('', 1e-4, 0.99)},
     ),
     'jitter': Form('variance', 'noise of rms {v}'),
@@ -356,7 +277,7 @@ def known(samples: SimulatedSamples, name: str) -> FloatArray:
         return samples.warmer
     if name in _LOADS:
         return np.asarray(samples.loads[_LOADS.index(name)])
-    rows = samples.pose[_POSE.index(name)] if name in _POSE else samples.dots[_DOTS.index(name)]
+    rows = samples.pose[_POSE.index(name)] if name in _POSE else samples.dots[DOTS.index(name)]
     return np.asarray(rows)
 
 
@@ -418,14 +339,14 @@ def _correct(law: Law, reading: Reading, values: Values) -> None:
     def read_as(name: str) -> FloatArray:
         if name == 'time':
             return reading.t
-        return reading.warmer if name == 'temperature' else reading.dots[_DOTS.index(name)]
+        return reading.warmer if name == 'temperature' else reading.dots[DOTS.index(name)]
 
     for _ in range(_PASSES):
         place[:] = read - sum(t.coefficient * t.evaluate(read_as, n, 0.0, {}) for t in terms)
 
 
 def _correctable(law: Law) -> bool:
-    seen = {*_DOTS, 'temperature', 'time'}
+    seen = {*DOTS, 'temperature', 'time'}
     apart = all(t.form == 'switched' or FORMS[t.form].apart is not None for t in law.terms)
     return TARGETS[law.acts_on].point == 'dots' and apart and set(law.variables) <= seen
 
@@ -438,7 +359,7 @@ def _parameters(law: Law) -> list[EffectParameter]:
         unit = '' if unit == '1' else unit
         out.append(EffectParameter(f'c{i}', unit, -1e30, 1e30, 0.1 * size, f'coefficient of {t.words()}'))
         for name, value in t.shapes.items():
-            _, low, high = FORMS[t.form].fitted.get(name, ('v', *_ANY))
+            _, low, high = FORMS[t.form].fitted.get(name, ('v', *ANY))
             if name not in FORMS[t.form].fitted:
                 low = high = value
             scale = 0.05 * (abs(value) or 1.0) if name != 'phase' else 0.1
@@ -489,7 +410,7 @@ def values_of(law: Law) -> dict[str, float]:
 
 
 def law_text(law: Law, comment: Sequence[str] = ()) -> str:
-    """The law as a YAML file; :func:`read_law` reads it again."""
+    """The law as a YAML file; :func:`~psd_deflection.model.simulation.law_files.read_law` reads it again."""
     terms = []
     for t in law.terms:
         body: dict[str, Any] = {'form': t.form, 'of': list(t.of), 'coefficient': float(t.coefficient)}
@@ -511,62 +432,3 @@ def law_text(law: Law, comment: Sequence[str] = ()) -> str:
     }
     head = ''.join(f'# {line}\n' for line in comment)
     return head + yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=1000)
-
-
-def read_law(path: Path) -> Law:
-    """The law of a file. Raises ConfigError naming file, key, value and what is allowed."""
-    tree = tree_of_file(path, 'law')
-    if not isinstance(tree, dict):
-        raise ConfigError(f'{path}: must be a map with name, stage, acts_on and terms')
-    for key in ('name', 'acts_on', 'terms'):
-        if key not in tree:
-            raise ConfigError(f'{path}: {key} is missing')
-    acts_on = _one_of(path, 'acts_on', tree['acts_on'], TARGETS)
-    stage = _one_of(path, 'stage', tree.get('stage', TARGETS[acts_on].stage), STAGES)
-    listed = tree['terms']
-    if not isinstance(listed, list) or not listed:
-        raise ConfigError(f'{path}: terms = {listed!r}: must be a list of at least one term')
-    terms = tuple(_term(path, f'terms[{i}]', body, acts_on) for i, body in enumerate(listed))
-    if len({t.kind == 'variance' for t in terms}) > 1:
-        raise ConfigError(f'{path}: terms: jitter stands alone; write a law of its own for the other terms')
-    if terms[0].kind == 'variance' and acts_on not in (*_DOTS, 'sum1', 'sum2'):
-        raise ConfigError(f'{path}: acts_on = {acts_on!r}: jitter acts on x1, y1, sum1, x2, y2 or sum2')
-    return Law(str(tree['name']), cast(Stage, stage), acts_on, terms, str(tree.get('summary', '')))
-
-
-def _one_of(path: Path, key: str, value: object, allowed: Mapping[str, object] | Sequence[str]) -> str:
-    if not isinstance(value, str) or value not in allowed:
-        hint = did_you_mean(str(value), list(allowed)) or f'; it may be {", ".join(allowed)}'
-        raise ConfigError(f'{path}: {key} = {value!r}: unknown{hint}')
-    return value
-
-
-def _number(
-    path: Path, key: str, body: Mapping[str, object], default: float | None = None, within: tuple[float, float] = _FREE
-) -> float:
-    declared = Parameter(key, 'double', default, '', '', *within)
-    return cast(float, check_value(declared, body.get(key.rpartition('.')[2], default), str(path)))
-
-
-def _term(path: Path, at: str, body: object, acts_on: str) -> LawTerm:
-    if not isinstance(body, dict):
-        raise ConfigError(f'{path}: {at} = {body!r}: must be a map with form, of and coefficient')
-    name = _one_of(path, f'{at}.form', body.get('form'), FORMS)
-    form, of = FORMS[name], body.get('of', [])
-    if not isinstance(of, list) or (not of and name != 'switched'):
-        raise ConfigError(f'{path}: {at}.of = {of!r}: must be a list of variables')
-    for variable in of:
-        _one_of(path, f'{at}.of', variable, TARGETS[acts_on].variables)
-    declared = Parameter(f'{at}.times', 'double_array', [], 's', '')
-    times = cast(list[float], check_value(declared, body.get('times', []), str(path)))
-    if times != sorted(times):
-        raise ConfigError(f'{path}: {at}.times = {times!r}: must be a list of rising times, s')
-    if bool(times) != (name == 'switched'):
-        raise ConfigError(f'{path}: {at}.times = {times!r}: a switched term, and no other, has times')
-    shapes = {}
-    for key in (*form.fitted, *form.fixed):
-        _, low, high = form.fitted.get(key, ('v', *_ANY))
-        shapes[key] = _number(path, f'{at}.{key}', body, within=(low, high))
-    listed = body.get('sd', {})
-    sd = {k: _number(path, f'{at}.sd.{k}', listed) for k in listed} if isinstance(listed, dict) else {}
-    return LawTerm(name, tuple(of), _number(path, f'{at}.coefficient', body), shapes, tuple(times), sd)

@@ -24,7 +24,7 @@ from aiohttp import web
 from psd_deflection import __version__
 from psd_deflection.base.log import INFO, Say
 from psd_deflection.records import BlockStatus, DiagnosticReport, ReferencePose, SampleBlock
-from psd_deflection.rig.declarations import MonitorConfig
+from psd_deflection.rig.running import MonitorConfig
 from psd_deflection.run.monitor import access
 from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
 from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer

@@ -9,34 +9,24 @@ fitted to all of them at once. What is linear (c, e, a, b of each stretch) is so
 projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973). The search begins where most of the motion is
 ringing. How many modes there are is told by what a fit leaves: two that beat look like one for a few periods only.
 
-If the link never rings alone, it is driven by what nobody measured. Then the spectrum is fitted with that of a mode
-that noise of an unknown colour drives:
-
-    S(f) = A (f/f0)^-s / ((f0^2 - f^2)^2 + (2 zeta f0 f)^2) + B
-
-by the likelihood of its periodogram (Whittle, Arkiv for Matematik 2, 423, 1953), which gives the uncertainties too.
-A spectrum that does not look like this gives no mode.
+If the link never rings alone, its mode is that of its spectrum (:mod:`psd_deflection.studies.identify.operation`).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import least_squares
 
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.identify.axis_modes import LEAST_DAMPING, MOST_DAMPING, AxisModes, Mode
+from psd_deflection.studies.identify.operation import mode_in_operation
+from psd_deflection.studies.identify.spectra import coloured_noise, filled_up, loudest_peak, stands_above, white_noise
 
-LOWEST, HIGHEST = 0.5, 200.0
-"""Hz. Of the modes that are looked for; at most a quarter of the sample rate."""
-PEAK = 25.0
-"""Factor by which a peak of the spectrum must exceed the noise..."""
-STANDS_OUT = 30.0
-"""...and a further peak the spectrum around it, because steps alone make the spectrum ripple."""
 MOST_MODES = 3
 WINDOW = 6.0
 """Periods of the first window of a stretch."""
@@ -52,50 +42,13 @@ SEEDS, GROWN = 30, 3
 """Windows that are tried as the beginning of a stretch, and of those that fit so many are let grow."""
 APART = (0.01, 0.025, 0.06)
 """Two modes that look like one may lie so far to either side of it, as a share of its frequency."""
-LEAST_DAMPING, MOST_DAMPING = 1e-6, 0.7
-"""Bounds of the fit. A damping ratio at one of them is no answer."""
 RESCANS = 3
 """Times that the stretches are sought again if there is a mode more than the search knew."""
 TRIMS = 3
 """Times that the ends of the stretches are cut and the modes fitted again."""
-SLOPE_SD = 1.0
-"""What drives a link has a spectrum that falls as frequency^-s; s before anything is known."""
-ODDS = 1e-3
-"""A spectrum that a driven mode has less often than that is not one of a driven mode."""
 
 Modes = list[tuple[float, float]]
 """Frequency, Hz, and damping ratio of each."""
-
-
-@dataclass(frozen=True)
-class Mode:
-    """One mode on one axis.
-
-    ``frequency``, Hz, undamped; ``damping``: ratio; ``*_sd``: standard deviations. ``amplitude``: largest of the
-    stretches at their start, m or rad; of a spectrum, rms.
-    """
-
-    frequency: float
-    frequency_sd: float
-    damping: float
-    damping_sd: float
-    amplitude: float
-
-
-@dataclass(frozen=True)
-class AxisModes:
-    """The modes of one axis, the loudest first.
-
-    ``how``: fitted to the link ringing alone, or to the spectrum of its motion in operation; ``none`` if it does not
-    move. ``stretches``: first and last sample of each. ``fitted`` (n,): the fit, NaN between the
-    stretches. ``noise``: standard deviation of a sample, m or rad.
-    """
-
-    modes: tuple[Mode, ...]
-    how: Literal['ring-down', 'operation', 'none']
-    stretches: tuple[tuple[int, int], ...]
-    fitted: FloatArray = field(repr=False)
-    noise: float
 
 
 def modes_of(samples: FloatArray, rate: float) -> AxisModes:
@@ -103,120 +56,25 @@ def modes_of(samples: FloatArray, rate: float) -> AxisModes:
     nothing = np.full(len(samples), np.nan)
     if np.isfinite(samples).sum() < 100:
         return AxisModes((), 'none', (), nothing, math.nan)
-    filled, white = _filled(samples), _noise(samples)
+    filled, white = filled_up(samples), white_noise(samples)
     peaks: list[float] = []
     while len(peaks) < MOST_MODES:
-        another = _peak(filled, rate, white, peaks)
+        another = loudest_peak(filled, rate, white, peaks)
         if another is None:
             break
         peaks.append(another)
     if not peaks:
         return AxisModes((), 'none', (), nothing, white)
-    noise = _coloured(filled, rate, peaks)
-    modes = [(f, 0.01) for f in peaks if _stands_above(filled, rate, f, noise)]
+    noise = coloured_noise(filled, rate, peaks)
+    modes = [(f, 0.01) for f in peaks if stands_above(filled, rate, f, noise)]
     if not modes:
         return AxisModes((), 'none', (), nothing, white)
     level = noise.deviation(modes[0][0] / 3.0, rate)
     stretches, modes = _stretches(samples, filled, rate, modes, level)
     if stretches:
         return _rung(samples, rate, modes, stretches)
-    mode = _in_operation(filled, rate, modes[0][0])
+    mode = mode_in_operation(filled, rate, modes[0][0])
     return AxisModes(() if mode is None else (mode,), 'operation' if mode else 'none', (), nothing, white)
-
-
-def _filled(samples: FloatArray) -> FloatArray:
-    """Lost samples on straight lines between their neighbours."""
-    there = np.flatnonzero(np.isfinite(samples))
-    return np.interp(np.arange(len(samples)), there, samples[there])
-
-
-def _noise(samples: FloatArray) -> float:
-    """Standard deviation of the noise of one sample: fourth differences, which no slow motion reaches."""
-    difference = np.diff(samples, 4)
-    difference = difference[np.isfinite(difference)]
-    # The sum of squares of 1 4 6 4 1 is 70. The quietest quarter: in the rest the link may be struck.
-    pieces = np.array_split(difference, max(1, len(difference) // 500))
-    scatter = sorted(float(np.mean(p * p)) for p in pieces if len(p))
-    return math.sqrt(float(np.mean(scatter[: max(1, len(scatter) // 4)])) / 70.0)
-
-
-def _spectrum(samples: FloatArray, rate: float) -> tuple[FloatArray, FloatArray]:
-    from scipy.signal import welch
-
-    length = min(len(samples) - 1, int(8 * rate))
-    # The difference of neighbours: steps and creep are slow and would hide a mode.
-    f, p = welch(np.diff(samples) * rate, rate, nperseg=length, detrend='constant')
-    return np.asarray(f, dtype=np.float64), np.asarray(p, dtype=np.float64)
-
-
-def _peak(samples: FloatArray, rate: float, noise: float, beside: Sequence[float] = ()) -> float | None:
-    """Frequency of the loudest peak, Hz, not at those of ``beside``; None if none stands out."""
-    f, p = _spectrum(samples, rate)
-    inside = (f >= LOWEST) & (f <= min(HIGHEST, rate / 4.0))
-    # Of white noise of this size, differences taken.
-    floor = 2.0 * noise**2 * rate * 2.0 * (1.0 - np.cos(2.0 * np.pi * f / rate))
-    contrast = np.where(inside, p / np.maximum(floor, 1e-300), 0.0)
-    for taken in beside:
-        contrast[np.abs(f - taken) < max(0.15 * taken, 2.0 * (f[1] - f[0]))] = 0.0
-    at = int(np.argmax(np.where(inside & (contrast > 0.0), p, 0.0)))
-    if contrast[at] < PEAK or not 0 < at < len(f) - 1 or p[at] < max(p[at - 1], p[at + 1]):
-        return None
-    about = inside & (np.abs(f - f[at]) < 0.5 * f[at]) & (np.abs(f - f[at]) > 0.2 * f[at])
-    if about.any() and p[at] < (STANDS_OUT if beside else 4.0) * np.median(p[about]):
-        return None
-    return float(f[at])
-
-
-@dataclass(frozen=True)
-class _Coloured:
-    """Noise of the density ``white`` + ``walk`` / (2 - 2 cos w), one-sided: at least that of an autoregression."""
-
-    white: float
-    walk: float
-
-    def density(self, f: FloatArray, rate: float) -> FloatArray:
-        return self.white + self.walk / np.maximum(2.0 - 2.0 * np.cos(2.0 * np.pi * f / rate), 1e-9)
-
-    def deviation(self, lowest: float, rate: float) -> float:
-        """Standard deviation of a sample, of what lies above ``lowest`` Hz."""
-        f = np.linspace(lowest, 0.5 * rate, 2000)
-        return math.sqrt(float(self.density(f, rate).mean()) * (0.5 * rate - lowest))
-
-
-def _coloured(filled: FloatArray, rate: float, peaks: Sequence[float]) -> _Coloured:
-    """The noise, from the spectrum of the quieter times above the modes that have their ``peaks`` there, Hz.
-
-    A mode falls off faster above its frequency than noise that remembers.
-    """
-    from scipy.optimize import nnls
-    from scipy.signal import stft
-
-    # A window whose side lobes are below the noise of a ringing a thousand times as loud.
-    length = min(len(filled), max(64, round(4.0 * rate / min(peaks))))
-    f, _, z = stft(filled, rate, 'blackmanharris', length, scaling='psd', boundary=None, padded=False)
-    # Of noise a quarter of the squares lie below this share of their mean.
-    p = 2.0 * np.quantile(np.abs(z) ** 2, 0.25, axis=1) / -math.log(0.75)
-    edges = np.geomspace(2.5 * peaks[0], 0.48 * rate, 25)
-    bands = [
-        (at, p[at].mean())
-        for low, high in itertools.pairwise(edges)
-        if (at := (f >= low) & (f < high) & np.all([np.abs(f - k) > 0.4 * k for k in peaks], axis=0)).any()
-    ]
-    if len(bands) < 4 or min(power for _, power in bands) <= 0.0:
-        return _Coloured(float(np.median(p)), 0.0)
-    shapes = [_Coloured(1.0, 0.0).density(f, rate), _Coloured(0.0, 1.0).density(f, rate)]
-    shapes += [1.0 / ((k * k - f * f) ** 2 + 1e-2 * k**4) for k in peaks]
-    matrix = np.array([[shape[at].mean() / power for shape in shapes] for at, power in bands])
-    sizes = np.linalg.norm(matrix, axis=0)
-    found, _ = nnls(matrix / sizes, np.ones(len(bands)))
-    white, walk = (found / sizes)[:2]
-    return _Coloured(float(white), float(walk))
-
-
-def _stands_above(filled: FloatArray, rate: float, frequency: float, noise: _Coloured) -> bool:
-    f, p = _spectrum(filled, rate)
-    floor = noise.density(f[1:], rate) * rate**2 * (2.0 - 2.0 * np.cos(2.0 * np.pi * f[1:] / rate))
-    return bool(np.interp(frequency, f, p) > PEAK * np.interp(frequency, f[1:], floor))
 
 
 def _basis(t: FloatArray, modes: Sequence[tuple[float, float]]) -> FloatArray:
@@ -568,76 +426,3 @@ def _variance_at(fit: _Rung, stretches: Sequence[_Stretch], rate: float, frequen
     free = 2 * int(near.sum()) - 2 * close * (len(stretches) + 1)
     share = 2 * int(near.sum()) / max(free, 2)
     return max(_variance_of(fit, stretches), float(p[near].mean()) * 0.5 * rate * share)
-
-
-def _in_operation(samples: FloatArray, rate: float, frequency: float) -> Mode | None:
-    """The mode from the spectrum of a link that is driven all the time."""
-    from scipy.signal import detrend, periodogram
-
-    f, p = periodogram(detrend(samples), rate, detrend=False, window='hann')
-    # Neighbours of a Hann window know of each other: every second one.
-    band = (f > 0.6 * frequency) & (f < 1.5 * frequency)
-    f, p = np.asarray(f[band][::2], dtype=np.float64), np.asarray(p[band][::2], dtype=np.float64)
-    if len(f) < 30:
-        return None
-    top = float(np.max(p))
-
-    def density(x: FloatArray) -> FloatArray:
-        a, f0, zeta, b = np.exp(x[:4])
-        out: FloatArray = a * (f / f0) ** -x[4] / ((f0**2 - f**2) ** 2 + (2.0 * zeta * f0 * f) ** 2) + b
-        return out
-
-    def loss(x: FloatArray) -> float:
-        s = density(x)
-        return float(np.sum(np.log(s) + p / s)) + 0.5 * float(x[4] / SLOPE_SD) ** 2
-
-    best = None
-    for zeta in (0.005, 0.02, 0.08):
-        sizes = [top * 4.0 * zeta**2 * frequency**4 * 0.3, frequency, zeta, float(np.median(p)) * 0.1 + 1e-30]
-        start = np.array([*np.log(sizes), 0.0])
-        tried = minimize(
-            loss,
-            start,
-            method='Nelder-Mead',
-            options={'maxiter': 6000, 'maxfev': 6000, 'xatol': 1e-6, 'fatol': 1e-6},
-        )
-        if best is None or tried.fun < best.fun:
-            best = tried
-    if best is None or not _scatters_as_it_should(p / density(best.x)):
-        return None
-    a, f0, zeta, _ = (float(v) for v in np.exp(best.x[:4]))
-    if not 0.7 * frequency < f0 < 1.4 * frequency or not 10.0 * LEAST_DAMPING < zeta < 0.5:
-        return None
-    information = _information(density, best.x)
-    information[4, 4] += SLOPE_SD**-2
-    covariance = np.linalg.pinv(information)
-    # The area under the mode's density.
-    rms = math.sqrt(a * math.pi / (4.0 * zeta * f0**3))
-    return Mode(f0, f0 * math.sqrt(covariance[1, 1]), zeta, zeta * math.sqrt(covariance[2, 2]), rms)
-
-
-def _scatters_as_it_should(ratios: FloatArray) -> bool:
-    """Whether ``ratios`` (n,) of a periodogram to a density are as the right one leaves them: exponential, mean 1."""
-    from scipy.stats import gamma
-
-    worst = 1.0
-    for length in (4, max(len(ratios) // 8, 5)):
-        parts = np.array_split(ratios, max(len(ratios) // length, 1))
-        for part in parts:
-            below = float(gamma.cdf(part.sum(), len(part)))
-            worst = min(worst, 2.0 * len(parts) * min(below, 1.0 - below))
-    return worst > 0.5 * ODDS
-
-
-def _information(density: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
-    """Fisher's information of Whittle's likelihood: the products of the derivatives of log S, summed."""
-    step = 1e-5
-    columns = []
-    for i in range(len(x)):
-        ahead, behind = x.copy(), x.copy()
-        ahead[i] += step
-        behind[i] -= step
-        columns.append((np.log(density(ahead)) - np.log(density(behind))) / (2.0 * step))
-    jacobian = np.column_stack(columns)
-    out: FloatArray = jacobian.T @ jacobian
-    return out

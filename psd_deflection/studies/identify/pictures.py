@@ -13,7 +13,7 @@ from psd_deflection.arms.shapers import KINDS, Shaper, shaper
 from psd_deflection.base.pages import picture, table
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.axes import SHOWN, SHOWN_UNITS, SYMBOLS
-from psd_deflection.studies.identify.modes import AxisModes
+from psd_deflection.studies.identify.axis_modes import AxisModes
 from psd_deflection.studies.study import PageSection
 
 MEASURED, FITTED, MARK = '#4c72b0', '#c44e52', '#555555'

@@ -15,8 +15,8 @@ from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import with_values
 from psd_deflection.studies.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
+from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.modes import AxisModes, Mode
 from psd_deflection.studies.study import PageSection, StudyResult, described, edited_rig_file, named
 
 KINDS = {'bending': (0, 1), 'torsion': (2,)}

@@ -16,7 +16,8 @@ from bench.steps import largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, shift
 from psd_deflection.arms.compensation.arm import Arm, read_arm
-from psd_deflection.arms.compensation.compensator import Command, Compensator, CompensatorSettings, Observed, State
+from psd_deflection.arms.compensation.compensator import Command, Compensator, Observed, State
+from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 

@@ -12,6 +12,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.correction import Correction
 from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.law_files import read_law
 from psd_deflection.model.simulation.laws import (
     FORMS,
     TARGETS,
@@ -19,7 +20,6 @@ from psd_deflection.model.simulation.laws import (
     LawTerm,
     effect_of,
     law_text,
-    read_law,
     unit_of,
     values_of,
 )

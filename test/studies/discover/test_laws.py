@@ -15,7 +15,8 @@ from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import FOLDERS, effect_names, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_text, read_law, values_of
+from psd_deflection.model.simulation.law_files import read_law
+from psd_deflection.model.simulation.laws import Law, LawTerm, effect_of, law_text, values_of
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.conclusion import RigConclusion

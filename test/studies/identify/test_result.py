@@ -8,9 +8,9 @@ import pytest
 from blind.modes import RATE, Link, driven, rung
 from psd_deflection.cli.main import main
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
 from psd_deflection.studies.identify.identify import identify
-from psd_deflection.studies.identify.modes import AxisModes, Mode
 from psd_deflection.studies.identify.result import Identified
 from psd_deflection.studies.study import Opened, opened
 

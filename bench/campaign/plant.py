@@ -1,0 +1,200 @@
+"""A simulated arm on the graph, which may tell of its deflection and of its joints what is not so."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
+
+from bench.simulated_arm import SimulatedArm
+from bench.steps import largest_step
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.arms.compensation.settings import CompensatorSettings
+from psd_deflection.records import FloatArray
+from tools.program import ROOT
+
+NOMINAL = np.array([1.2, 0.6])
+LOAD = (0.0, 0.0, -40.0)
+"""N, at the end effector."""
+PERIOD_S = 0.02
+NOISE = 1e-6
+MAX_RATE, FOLLOW_ERROR = CompensatorSettings().max_rate, CompensatorSettings().follow_error
+LATE_S = 0.05
+"""With a longer time between two steps of the arm, the compensator finds rightly that nobody tells it anything, s."""
+
+Tell = Callable[[Any], bool]
+
+
+def faithful(message: Any) -> bool:
+    """What is right."""
+    return True
+
+
+def silent(message: Any) -> bool:
+    """Nothing."""
+    return False
+
+
+def no_number(message: Any) -> bool:
+    """A deflection that is not finite."""
+    message.pose.pose.position.x = math.nan
+    return True
+
+
+def jumps(message: Any) -> bool:
+    """A deflection that is somewhere else."""
+    message.pose.pose.position.x += 0.1
+    return True
+
+
+def huge(message: Any) -> bool:
+    """A deflection that no link survives."""
+    message.pose.pose.position.z = 1e300
+    return True
+
+
+def ten_metres(message: Any) -> bool:
+    """A deflection that is larger than the arm."""
+    message.pose.pose.position.z = 10.0
+    return True
+
+
+def denormal(message: Any) -> bool:
+    """A rotation whose norm is zero in floating point."""
+    q = message.pose.pose.orientation
+    q.x, q.y, q.z, q.w = 0.0, 0.0, 0.0, 1e-200
+    return True
+
+
+def elsewhere(message: Any) -> bool:
+    """A deflection in another frame."""
+    message.header.frame_id = 'world'
+    return True
+
+
+def certain(message: Any) -> bool:
+    """A covariance of zeros, which is ROS's word for an unknown one."""
+    message.pose.covariance = np.zeros(36)
+    return True
+
+
+def uncertain(message: Any) -> bool:
+    """A covariance of metres."""
+    message.pose.covariance = np.eye(6).ravel()
+    return True
+
+
+def by_seconds(seconds: float) -> Tell:
+    """A stamp that is so much later."""
+
+    def shifted(message: Any) -> bool:
+        t_ns = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec + round(1e9 * seconds)
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(max(t_ns, 0), 10**9)
+        return True
+
+    return shifted
+
+
+def leaps(message: Any) -> bool:
+    """Joints that are a radian away."""
+    message.position = [v + 1.0 for v in message.position]
+    return True
+
+
+def far(message: Any) -> bool:
+    """Joints that are nowhere."""
+    message.position = [1e300 for _ in message.position]
+    return True
+
+
+DEFLECTIONS: dict[str, tuple[Tell, str]] = {
+    'not finite': (no_number, 'not finite'),
+    'jump': (jumps, 'jumps by'),
+    'stale': (by_seconds(-1.0), 'is older than'),
+    'silent': (silent, 'no deflection for'),
+    '1e300': (huge, 'more than the links can have'),
+    'ten metres': (ten_metres, 'more than the links can have'),
+    'denormal quaternion': (denormal, 'no deflection for'),
+    'wrong frame': (elsewhere, 'no deflection for'),
+    'zero covariance': (certain, 'does not say how certain'),
+    'covariance of metres': (uncertain, 'uncertain by more than'),
+    'clock set by an hour': (by_seconds(3600.0), 'ahead of our clock'),
+}
+"""What the arm tells of its deflection, and what the compensator says then."""
+
+JOINTS: dict[str, tuple[Tell, str]] = {
+    'stale joints': (by_seconds(-1.0), 'no positions of the joints'),
+    'leaping joints': (leaps, 'leap by'),
+    'joints at 1e300': (far, 'no positions of the joints'),
+}
+"""The same of its joints."""
+
+
+class Plant:
+    """The arm on the graph: it adds the offsets that it hears to its commands, and tells them, its deflection
+    and its joints.
+
+    ``tell`` and ``tell_joints`` may change what it says, and withhold it by False. ``stands``: a protective stop.
+    ``applies``: the controller runs, and tells what it applies: ``held``. ``offsets``: all that were heard, and
+    ``stamps`` when they were sent, s. ``late``: whether a step was later than ``LATE_S``.
+    """
+
+    def __init__(self, node: Any, topic: str = '/end_effector/deflection', joints: str = '/joint_states') -> None:
+        self.arm = SimulatedArm(read_chain(ROOT / 'config' / 'two_links.yaml').chain, NOMINAL, damping=0.1)
+        self.arm.force = np.array(LOAD)
+        self.rigid = self.arm.chain.rigid(NOMINAL.tolist())
+        self.offsets: list[FloatArray] = [np.zeros(2)]
+        self.stamps = [0.0]
+        self.tell: Tell = faithful
+        self.tell_joints: Tell = faithful
+        self.stands, self.applies, self.held = False, True, np.zeros(2)
+        self.late = False
+        self._noise = np.random.default_rng(0)
+        self._deflections = node.create_publisher(PoseWithCovarianceStamped, topic, 5)
+        self._joints = node.create_publisher(JointState, joints, 5)
+        node.create_subscription(Float64MultiArray, '/compensator/offsets', self._heard, 5)
+        self._applied = node.create_publisher(Float64MultiArray, '/compensator/applied', 5)
+        self._then = time.monotonic()
+        node.create_timer(PERIOD_S, self._step)
+
+    def _heard(self, message: Any, info: Any) -> None:
+        self.offsets.append(np.array(message.data))
+        self.stamps.append(info['source_timestamp'] / 1e9)
+        if self.applies:
+            self.held = self.offsets[-1]
+
+    def _step(self) -> None:
+        now = time.monotonic()
+        self.arm.step(self.arm.angles.copy() if self.stands else NOMINAL + self.held, now - self._then)
+        self.late |= now - self._then > LATE_S
+        self._then = now
+        if self.applies:
+            self._applied.publish(Float64MultiArray(data=self.held.tolist()))
+        stamp_s, stamp_ns = divmod(time.time_ns(), 10**9)
+        joints = JointState(name=['elbow', 'shoulder'], position=self.arm.angles[::-1].tolist())
+        deflection = self.arm.end().deflection
+        message = PoseWithCovarianceStamped()
+        for header in (joints.header, message.header):
+            header.stamp.sec, header.stamp.nanosec = stamp_s, stamp_ns
+        place, turned = message.pose.pose.position, message.pose.pose.orientation
+        place.x, place.y, place.z = (deflection.position + self._noise.normal(size=3) * NOISE).tolist()
+        turned.x, turned.y, turned.z, turned.w = deflection.quaternion.tolist()
+        message.pose.covariance = (np.eye(6) * NOISE**2).ravel()
+        if self.tell_joints(joints):
+            self._joints.publish(joints)
+        if self.tell(message):
+            self._deflections.publish(message)
+
+    def error(self) -> float:
+        """Distance of the end effector from its rigid pose, m."""
+        return float(np.linalg.norm(self.arm.end().deflected.position - self.rigid.position))
+
+    def step(self, since: int = 0) -> float:
+        """The largest step between two commands, from number ``since`` on, over what the rate allows."""
+        return largest_step(self.stamps[since:], self.offsets[since:], MAX_RATE)
