@@ -16,7 +16,6 @@ must be counted, under its cause, in the log, in ``/diagnostics`` and in what ``
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import math
 import os
@@ -33,6 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.campaign.line import hello_of
+from blind.campaign import options
 from msg_adapters import DIAGNOSTICS
 from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import (
@@ -51,7 +51,8 @@ from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import IntArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.run.reading.acquisition import Acquisition, Arrival
+from psd_deflection.run.reading.acquisition import Acquisition
+from psd_deflection.run.reading.arrivals import Arrival
 from tools.program import PSD_DEFLECTION, Program
 
 SKEW = 30e-6
@@ -345,7 +346,7 @@ def simulated_time(hours: float) -> bool:
 
 def main() -> int:
     """Run both parts; exit status 0 where all is as it must be."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser = options(__doc__)
     parser.add_argument('--minutes', type=float, default=30.0)
     parser.add_argument('--hours', type=float, default=24.0)
     parser.add_argument('--busy', type=int, default=0, help='processes that compute beside the node')

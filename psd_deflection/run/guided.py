@@ -12,7 +12,8 @@ from psd_deflection.base.log import Say
 from psd_deflection.model.detector import counts_to_volts
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.rig.config import Rig, replace_values
-from psd_deflection.run.reading.acquisition import Acquisition, Arrival, Ended
+from psd_deflection.run.reading.acquisition import Acquisition
+from psd_deflection.run.reading.arrivals import Arrival, Ended
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.guide import Guide, Phase

@@ -20,7 +20,7 @@ from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
 from psd_deflection.run.behind import why_behind
-from psd_deflection.run.reading.acquisition import Arrival, Item, Restarted
+from psd_deflection.run.reading.arrivals import Arrival, Item, Restarted
 
 T = TypeVar('T')
 

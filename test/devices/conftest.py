@@ -26,7 +26,8 @@ from psd_deflection.devices.serve import serve
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.reading import acquisition
-from psd_deflection.run.reading.acquisition import Acquisition, Arrival
+from psd_deflection.run.reading.acquisition import Acquisition
+from psd_deflection.run.reading.arrivals import Arrival
 from test.heard import WAIT_S
 
 

@@ -24,7 +24,8 @@ from psd_deflection.devices.registry import make_source, source_names
 from psd_deflection.devices.source import Clock, PortClosedError, Received, Sample, Source, SourceEndedError
 from psd_deflection.records import CHANNELS
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.run.reading.acquisition import Acquisition, Arrival, Ended, Item
+from psd_deflection.run.reading.acquisition import Acquisition
+from psd_deflection.run.reading.arrivals import Arrival, Ended, Item
 from test.heard import WAIT_S
 
 VOLTS = (0.1, 0.2, 5.0, 0.3, 0.4, 5.0)

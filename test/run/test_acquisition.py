@@ -24,7 +24,8 @@ from psd_deflection.devices.source import Clock, Event, Received, Sample, Source
 from psd_deflection.records import RESTART
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.reading import acquisition as module
-from psd_deflection.run.reading.acquisition import Acquisition, Arrival, Ended, Item, Restarted
+from psd_deflection.run.reading.acquisition import Acquisition
+from psd_deflection.run.reading.arrivals import Arrival, Ended, Item, Restarted
 from psd_deflection.run.reading.pinger import UNANSWERED
 from test.heard import WAIT_S
 

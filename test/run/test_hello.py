@@ -23,7 +23,8 @@ from psd_deflection.devices.source import Received, Source
 from psd_deflection.records import CHANNELS, channel_names
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.reading import acquisition as module
-from psd_deflection.run.reading.acquisition import Acquisition, Arrival
+from psd_deflection.run.reading.acquisition import Acquisition
+from psd_deflection.run.reading.arrivals import Arrival
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
 
 VOLTS = 10.0 / 32768

@@ -15,7 +15,6 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,6 +28,7 @@ from psd_deflection.measure.timing import ClockState
 from psd_deflection.records import FLAG_DEVICE_DROPPED, RESTART, IntArray, ParameterChange, RawChunk
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.behind import SLOW
+from psd_deflection.run.reading.arrivals import Arrival, Ended, Gathered, Item, Restarted
 from psd_deflection.run.reading.clock_watch import ClockWatch
 from psd_deflection.run.reading.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
@@ -57,52 +57,6 @@ GATHER_S = 0.018
 GATHER_SAMPLES = 36
 """Longest time that the reader lets samples gather, and most samples: waking up costs more than reading a sample.
 The kernel holds 4096 bytes for us."""
-
-
-@dataclass(slots=True)
-class Arrival:
-    """A RawChunk on its way, with the monotonic time at which its last byte was read, ns.
-
-    ``dropped_before``: samples of the run that were dropped before it, because the queue was full.
-    """
-
-    raw: RawChunk
-    read_ns: int
-    dropped_before: int = 0
-
-
-@dataclass(slots=True)
-class Restarted:
-    """On the queue: the device restarted; the unfinished block gets no more samples.
-
-    ``change``: what the recording says of it; None if no sample was taken before, or after ``RECORDED_RESTARTS``.
-    """
-
-    change: ParameterChange | None
-
-
-class Ended:
-    """On the queue: nothing follows."""
-
-
-Item = Arrival | Restarted | Ended
-
-
-@dataclass(slots=True)
-class Gathered:
-    """Samples that wait to be handed over, one row each: extended number, time and readings as in the source."""
-
-    seq: list[int] = field(default_factory=list)
-    t: list[int] = field(default_factory=list)
-    readings: list[tuple[float, ...]] = field(default_factory=list)
-    flags: list[int] = field(default_factory=list)
-
-    def add(self, number: int, t: int, readings: tuple[float, ...], flags: int) -> None:
-        """One more."""
-        self.seq.append(number)
-        self.t.append(t)
-        self.readings.append(readings)
-        self.flags.append(flags)
 
 
 class Acquisition:

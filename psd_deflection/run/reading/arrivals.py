@@ -1,0 +1,53 @@
+"""What the reader puts on its queue, and the samples that wait to be put there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from psd_deflection.records import ParameterChange, RawChunk
+
+
+@dataclass(slots=True)
+class Arrival:
+    """A RawChunk on its way, with the monotonic time at which its last byte was read, ns.
+
+    ``dropped_before``: samples of the run that were dropped before it, because the queue was full.
+    """
+
+    raw: RawChunk
+    read_ns: int
+    dropped_before: int = 0
+
+
+@dataclass(slots=True)
+class Restarted:
+    """On the queue: the device restarted; the unfinished block gets no more samples.
+
+    ``change``: what the recording says of it; None if no sample was taken before, or after many restarts.
+    """
+
+    change: ParameterChange | None
+
+
+class Ended:
+    """On the queue: nothing follows."""
+
+
+Item = Arrival | Restarted | Ended
+
+
+@dataclass(slots=True)
+class Gathered:
+    """Samples that wait to be handed over, one row each: extended number, time and readings as in the source."""
+
+    seq: list[int] = field(default_factory=list)
+    t: list[int] = field(default_factory=list)
+    readings: list[tuple[float, ...]] = field(default_factory=list)
+    flags: list[int] = field(default_factory=list)
+
+    def add(self, number: int, t: int, readings: tuple[float, ...], flags: int) -> None:
+        """One more."""
+        self.seq.append(number)
+        self.t.append(t)
+        self.readings.append(readings)
+        self.flags.append(flags)
