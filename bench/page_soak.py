@@ -9,7 +9,6 @@ what it saw. Ends with status 1 if the heap from the fifth minute on spans more 
 
 from __future__ import annotations
 
-import argparse
 import csv
 import re
 import signal
@@ -22,6 +21,7 @@ from typing import TextIO
 
 from selenium import webdriver
 
+from blind.campaign import conclude, options
 from tools.browser import open_browser
 
 SETTLED_MINUTES = 5
@@ -84,7 +84,7 @@ def soak(minutes: int, rate: float, out: TextIO) -> list[dict[str, int]]:
 
 def main() -> int:
     """Run it and judge."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__)
     parser.add_argument('--hours', type=float, default=4.0, help='how long (default: 4)')
     parser.add_argument('--rate', type=float, default=1.0, help='times 1000 samples a second (default: 1)')
     parser.add_argument('--out', type=Path, default=Path('build/page_soak.csv'), help='the table')
@@ -96,14 +96,13 @@ def main() -> int:
         rows = soak(round(60.0 * args.hours), args.rate, out)
     settled = [row['heap_bytes'] for row in rows if row['minute'] >= SETTLED_MINUTES]
     if not settled:
-        print(f'{len(rows)} minutes: too short to tell, the heap settles in {SETTLED_MINUTES}')
-        return 1
+        return conclude(f'{len(rows)} minutes: too short to tell, the heap settles in {SETTLED_MINUTES}', False)
     span = max(settled) - min(settled)
-    print(
+    text = (
         f'{len(rows)} minutes, {rows[-1]["rows"]} blocks: heap {min(settled) / 1e6:.2f} to {max(settled) / 1e6:.2f} MB '
         f'from minute {SETTLED_MINUTES} on, {span / 1e3:.0f} kB apart ({ALLOWED_BYTES / 1e3:.0f} allowed)'
     )
-    return 0 if span <= ALLOWED_BYTES else 1
+    return conclude(text, span <= ALLOWED_BYTES)
 
 
 if __name__ == '__main__':

@@ -6,13 +6,13 @@ maker's model. ``--null`` gives each model what is published. result.json and re
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from blind.arm import Arm
 from blind.boom import Boom
+from blind.campaign import options
 from blind.emps import Emps
 from blind.measured import DATA
 from psd_deflection.studies.discover.conclusion import size_of
@@ -41,7 +41,7 @@ def lines(found: PlantDiscovery) -> list[str]:
 
 def main() -> int:
     """Search, print, write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser = options(__doc__)
     parser.add_argument('machines', nargs='*', help='boom, emps, arm (default: all)')
     parser.add_argument('--data', type=Path, default=DATA, help='folder with a folder of each (default: %(default)s)')
     parser.add_argument('--null', action='store_true', help='with the published terms in the model')

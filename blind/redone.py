@@ -13,7 +13,6 @@ those of the sidebar, ``validate`` judges those of the link, by the camera and b
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import csv
 import io
@@ -33,6 +32,7 @@ from scipy.interpolate import CubicSpline
 from tqdm import tqdm
 
 from blind import generator, misaligned, render
+from blind.campaign import conclude, options
 from blind.generator import Array
 from blind.redone_page import Curves, page_of
 from psd_deflection.camera.opencv import opencv
@@ -338,7 +338,7 @@ def _summary(made: Bench, link: Sequence[Hung], answers: Mapping[str, Mapping[st
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Do it, and say where the page is."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__)
     parser.add_argument('--out', type=Path, default=Path('build/thesis'), help='a new folder (default %(default)s)')
     parser.add_argument('--seed', type=int, default=1, help='of the rig')
     parser.add_argument('--short', action='store_true', help='50 N only, few frames: some seconds, less precise')
@@ -350,8 +350,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         words = ', '.join(f'{axis} {100.0 * share:.3f} %' for axis, share in axes.items())
         print(f'{stem:15s} largest error on the link: {words}')
     answer = 'within' if found['holds'] else 'BEYOND'
-    print(f'{answer} {100.0 * found["limit"]:g} % after calibration; see {args.out / "page.html"}')
-    return 0 if found['holds'] else 1
+    text = f'{answer} {100.0 * found["limit"]:g} % after calibration; see {args.out / "page.html"}'
+    return conclude(text, found['holds'])
 
 
 if __name__ == '__main__':

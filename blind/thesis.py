@@ -8,7 +8,6 @@ there is one within its bounds, and prints the other figures at that size.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Callable, Iterator
@@ -16,6 +15,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 from scipy.optimize import brentq
 
+from blind.campaign import options
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect
@@ -199,7 +199,7 @@ def table_51() -> list[str]:
 
 def main() -> int:
     """Print all of it, or the first ``--parts``."""
-    parser = argparse.ArgumentParser(description=(__doc__ or '').splitlines()[0])
+    parser = options(__doc__)
     parser.add_argument('--parts', type=int, help='only the first of the three')
     for part in (table_b1, named_b1, table_51)[: parser.parse_args().parts]:
         print('\n'.join(part()), flush=True)

@@ -11,7 +11,6 @@ covariance. It ends with status 1 if a bound is broken.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 import time
@@ -24,6 +23,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from blind import render
+from blind.campaign import conclude, options
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.opencv import opencv
@@ -419,7 +419,7 @@ def cost_table(frames: int, seed: int) -> None:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__)
     parser.add_argument('--frames', type=int, default=10_000)
     parser.add_argument('--seed', type=int, default=1)
     parser.add_argument('--no-lens', action='store_true', help='adverse frames of a camera that knows no lens')
@@ -437,8 +437,7 @@ def main() -> int:
         cost_table(min(40, args.frames // 10 + 3), args.seed)
     if args.only in (None, 'adverse'):
         fine &= adverse_table(args.frames, args.seed, args.hurts, lens=not args.no_lens)
-    print(f'{time.perf_counter() - began:.0f} s')
-    return 0 if fine else 1
+    return conclude(f'{time.perf_counter() - began:.0f} s', fine)
 
 
 if __name__ == '__main__':

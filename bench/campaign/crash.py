@@ -9,7 +9,6 @@ reads a simulated rig in real time. A round: record, kill, read what is left wit
 
 from __future__ import annotations
 
-import argparse
 import os
 import random
 import shutil
@@ -21,6 +20,7 @@ from pathlib import Path
 
 from rosbags.rosbag2 import Reader
 
+from blind.campaign import conclude, options
 from psd_deflection.base.log import unsaid
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.repair import recover
@@ -74,7 +74,7 @@ def judge(folder: Path, killed_ns: int) -> float:
 
 def main() -> int:
     """Run the rounds; exit status 0 where each one lost less than a second."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser = options(__doc__)
     parser.add_argument('--times', type=int, default=200)
     parser.add_argument('--seed', type=int, default=1)
     args = parser.parse_args()
@@ -96,11 +96,11 @@ def main() -> int:
         finally:
             rig_process.end()
     worst = max(lost)
-    print(
+    text = (
         f'{len(lost)} kills: all opened, all recovered, all read by rosbags; '
         f'lost {min(lost):.3f} to {worst:.3f} s, mean {sum(lost) / len(lost):.3f} s (allowed {ALLOWED_S:g} s)'
     )
-    return 0 if worst <= ALLOWED_S else 1
+    return conclude(text, worst <= ALLOWED_S)
 
 
 if __name__ == '__main__':

@@ -10,7 +10,6 @@ sample that the fault itself took (damaged, never sent, sent to nobody) is not c
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
@@ -27,6 +26,7 @@ from sensor_msgs.msg import PointCloud2
 
 from bench.campaign.kinds import FAULTS, Fault
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
+from blind.campaign import options
 from psd_deflection.recordings.read.readers import open_recording
 from tools.program import PSD_DEFLECTION, Program
 
@@ -167,7 +167,7 @@ def report(rows: list[Row], lost: dict[str, tuple[int, int]]) -> bool:
 
 def main() -> int:
     """Run the campaign; exit status 0 where every fault was survived."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser = options(__doc__)
     parser.add_argument('--times', type=int, default=20, help='injections of each fault')
     parser.add_argument('--only', default='', help='only faults whose name holds this')
     args = parser.parse_args()

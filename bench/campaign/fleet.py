@@ -10,7 +10,6 @@ a machine that does other work as well it says nothing.
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import os
@@ -27,6 +26,7 @@ from distributed import Client, LocalCluster
 from distributed.diagnostics.plugin import SchedulerPlugin
 from tqdm import tqdm
 
+from blind.campaign import conclude, options
 from psd_deflection.cli.main import main as psd_deflection
 
 EFFECTS = ('sensor_rotation,psd=2,angle=0.01', 'axis_crosstalk,psd=1,xy=0.02', '')
@@ -155,7 +155,7 @@ def _address(cluster: Any) -> str:
 
 def main() -> int:
     """Run it; the exit status is 1 if anything differed."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__)
     parser.add_argument('--recordings', type=int, default=1000)
     parser.add_argument('--seconds', type=float, default=1.0, help='of each recording')
     parser.add_argument('--kills', type=int, default=2, help='workers that are killed on the way')
@@ -163,8 +163,7 @@ def main() -> int:
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         said, wrong = campaign(Path(folder), args.recordings, args.seconds, args.kills, not args.only_killed)
-    print('\n'.join([said, *wrong]))
-    return 1 if wrong else 0
+    return conclude('\n'.join([said, *wrong]), not wrong)
 
 
 if __name__ == '__main__':

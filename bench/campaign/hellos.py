@@ -8,7 +8,6 @@ the daemon then takes the device for another one, leaves it and comes back, and 
 
 from __future__ import annotations
 
-import argparse
 import random
 import sys
 import tempfile
@@ -19,6 +18,7 @@ import numpy as np
 
 from bench.campaign.fuzz import Choices, hello_words
 from bench.campaign.line import Line, hello_of, identities
+from blind.campaign import conclude, options
 from psd_deflection.devices.protocol.frames import HelloFrame, encode
 from psd_deflection.recordings.read.readers import open_recording
 from tools.program import PSD_DEFLECTION, Program
@@ -66,7 +66,7 @@ def send(line: Line, daemon: Program, count: int, seed: int) -> None:
 
 def main() -> int:
     """Exit status 0 if no sample was invented, and all that followed the HELLOs were measured."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else '')
+    parser = options(__doc__)
     parser.add_argument('count', type=int, nargs='?', default=1_000_000)
     parser.add_argument('--seed', type=int, default=1)
     args = parser.parse_args()
@@ -91,11 +91,11 @@ def main() -> int:
         wanted = set(range(after, read - 20))
         missing = len(wanted - set(found.tolist()))
         share = len(found) / (int(found[-1]) - int(found[0]) + 1)
-        print(
+        text = (
             f'{args.count} HELLOs in {took:.0f} s: {len(found)} samples, {share:.4%} of those sent meanwhile, '
             f'{invented} invented; of {len(wanted)} sent after the HELLOs {missing} missing; exit status {status}'
         )
-        return 0 if status == 0 and not invented and not missing and wanted else 1
+        return conclude(text, status == 0 and not invented and not missing and bool(wanted))
 
 
 if __name__ == '__main__':

@@ -37,6 +37,7 @@ from std_srvs.srv import SetBool
 
 from bench.campaign.plant import DEFLECTIONS, FOLLOW_ERROR, JOINTS, LOAD, MAX_RATE, Plant, faithful
 from bench.campaign.shaper_faults import shaper_faults
+from blind.campaign import conclude, options
 from psd_deflection.ros.running import TRANSPORTS
 from tools.program import ROOT, Program
 
@@ -321,7 +322,7 @@ class Campaign:
 def main(argv: list[str] | None = None) -> int:
     """Inject every fault, print a line for each; status 1 if one was not met as it must be."""
     names = (*DEFLECTIONS, *JOINTS, *ROBOT, *SENT, *OWN)
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = options(__doc__)
     parser.add_argument('--times', type=int, default=20, help='of each fault')
     only = (*names, COMPENSATOR, SHAPER)
     parser.add_argument('--only', nargs='+', choices=only, default=[COMPENSATOR, SHAPER], help='these faults alone')
@@ -336,8 +337,7 @@ def main(argv: list[str] | None = None) -> int:
     missed, worst = compensator_faults(wanted, args.times) if wanted else (0, 0.0)
     if SHAPER in args.only:
         worst = max(worst, shaper_faults(args.times))
-    print(f'largest step of all: {worst:.3f} of what the rate allows')
-    return 1 if missed or worst > WITHIN else 0
+    return conclude(f'largest step of all: {worst:.3f} of what the rate allows', not missed and worst <= WITHIN)
 
 
 def compensator_faults(names: Sequence[str], times: int) -> tuple[int, float]:
