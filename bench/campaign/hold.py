@@ -1,14 +1,15 @@
 """``make compensate-faults``: what the compensator and the shaper do when something goes wrong, over real DDS.
 
-A simulated arm is on the graph. Its deflection comes through a process that stands for the estimator, the positions of
-its joints through one that stands for the robot's driver, and the real compensator drives it. Each fault is injected
-again and again while the offsets follow. Judged are the last time at which an offset changed after it (at most 0.2 s),
-the time that the offsets take to go back to zero when they are let go during the fault (at most that of ``max_rate``
-and 0.2 s), whether they follow again, and the one criterion for whatever moves an arm: no step between two commands is
-larger than ``max_rate`` times the time between them, from the first to the last.
+A simulated arm is on the graph. Its deflection comes through a process that stands for the
+estimator, the positions of its joints through one that stands for the robot's driver, and the real
+compensator drives it. Each fault is injected again and again while the offsets follow. Judged are
+the last time at which an offset changed after it (at most 0.2 s), the time that the offsets take to
+go back to zero when they are let go during the fault (at most that of ``max_rate`` and 0.2 s),
+whether they follow again, and the one criterion for whatever moves an arm: no step between two
+commands is larger than ``max_rate`` times the time between them, from the first to the last.
 
-The shaper drives a stand-in of joint_trajectory_controller by trajectories that replace each other, and gets what it
-must refuse in between.
+The shaper drives a stand-in of joint_trajectory_controller by trajectories that replace each other,
+and gets what it must refuse in between.
 
   python -m bench.campaign.hold --times 20
 """
@@ -52,7 +53,8 @@ WITHIN = 1.0 + 1e-6
 TRIES = 5
 
 WATCHED_S = 0.4
-"""How long offsets are watched after a fault, s. After half a second they follow a deflection that jumped and stays."""
+"""How long offsets are watched after a fault, s. After half a second they follow a deflection that
+jumped and stays."""
 LONGEST_S = 60.0
 ASK_AGAIN_S = 5.0
 RELAYED = {
@@ -76,7 +78,8 @@ def health(self):
 CompensatorNode.health = health
 sys.exit(main(sys.argv[2:]))
 """
-"""Our program, which has an error of its own as soon as the file exists that is its first argument."""
+"""Our program, which has an error of its own as soon as the file exists that is its first argument.
+"""
 
 SENT: dict[str, tuple[int, tuple[str, ...]]] = {
     'estimator killed': (signal.SIGKILL, ('estimator',)),
@@ -343,7 +346,8 @@ def main(argv: list[str] | None = None) -> int:
 def compensator_faults(names: Sequence[str], times: int) -> tuple[int, float]:
     """Inject each of them so often, and print a line for each.
 
-    How often it held or released later than it must, and the largest step over what the rate allows.
+    How often it held or released later than it must, and the largest step over what the rate
+    allows.
     """
     late = slow = 0
     worst = 0.0

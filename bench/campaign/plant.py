@@ -26,7 +26,8 @@ PERIOD_S = 0.02
 NOISE = 1e-6
 MAX_RATE, FOLLOW_ERROR = CompensatorSettings().max_rate, CompensatorSettings().follow_error
 LATE_S = 0.05
-"""With a longer time between two steps of the arm, the compensator finds rightly that nobody tells it anything, s."""
+"""With a longer time between two steps of the arm, the compensator finds rightly that nobody tells
+it anything, s."""
 
 Tell = Callable[[Any], bool]
 
@@ -137,12 +138,13 @@ JOINTS: dict[str, tuple[Tell, str]] = {
 
 
 class Plant:
-    """The arm on the graph: it adds the offsets that it hears to its commands, and tells them, its deflection
-    and its joints.
+    """The arm on the graph: it adds the offsets that it hears to its commands, and tells them, its
+    deflection and its joints.
 
-    ``tell`` and ``tell_joints`` may change what it says, and withhold it by False. ``stands``: a protective stop.
-    ``applies``: the controller runs, and tells what it applies: ``held``. ``offsets``: all that were heard, and
-    ``stamps`` when they were sent, s. ``late``: whether a step was later than ``LATE_S``.
+    ``tell`` and ``tell_joints`` may change what it says, and withhold it by False. ``stands``: a
+    protective stop. ``applies``: the controller runs, and tells what it applies: ``held``.
+    ``offsets``: all that were heard, and ``stamps`` when they were sent, s. ``late``: whether a
+    step was later than ``LATE_S``.
     """
 
     def __init__(self, node: Any, topic: str = '/end_effector/deflection', joints: str = '/joint_states') -> None:

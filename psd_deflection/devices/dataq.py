@@ -1,8 +1,9 @@
 """DATAQ DI-1110, DI-2108 and DI-4108 in CDC mode: converters with a command line, no framing.
 
-Limits compared with our own frames, which ``describe`` reports too: the device neither numbers its samples
-nor sends times. A torn scan is detected by the marker channel (``devices.protocol.dataq``) and counted; the loss of
-whole scans cannot be detected. Times are scan counts regressed on the host's clock.
+Limits compared with our own frames, which ``describe`` reports too: the device neither numbers its
+samples nor sends times. A torn scan is detected by the marker channel (``devices.protocol.dataq``)
+and counted; the loss of whole scans cannot be detected. Times are scan counts regressed on the
+host's clock.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ STOP_S = 2.5
 """Some models need a second for ``stop`` and ``encode``."""
 
 TRIAL_SCANS = (250, 250, 500, 1000)
-"""Numbers of scans over which the rate is measured before the first sample. If a measurement disagrees with the
-set rate, the next number is tried: a busy host may have read late."""
+"""Numbers of scans over which the rate is measured before the first sample. If a measurement
+disagrees with the set rate, the next number is tried: a busy host may have read late."""
 
 TRIAL_TOLERANCE = 0.1
 RAILS = (-32768, 32767)

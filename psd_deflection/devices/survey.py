@@ -1,7 +1,8 @@
 """Finds which device is on which port: sends the question of every device that has a probe, and listens.
 
-Nothing is started, stopped or set: the devices answer these questions in any state. (An Arduino restarts
-anyway, because opening its port resets it.) A port that another program has open is left alone.
+Nothing is started, stopped or set: the devices answer these questions in any state. (An Arduino
+restarts anyway, because opening its port resets it.) A port that another program has open is left
+alone.
 """
 
 from __future__ import annotations

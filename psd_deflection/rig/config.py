@@ -1,7 +1,7 @@
 """The rig: the frozen sections that checked values make.
 
-:func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``), which the node has from
-rclpy; :func:`load_rig` has them from a parameter file.
+:func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``), which the
+node has from rclpy; :func:`load_rig` has them from a parameter file.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ class Rig:
     def replace(self, **changes: object) -> Rig:
         """The same rig with some values changed: ``rig.replace(link={'length': 1.0}, block_size=10)``.
 
-        ``changes``: with dots or as maps, as for :func:`psd_deflection.load_rig`. Raises ConfigError, which names
-        parameter, value and bound.
+        ``changes``: with dots or as maps, as for :func:`psd_deflection.load_rig`. Raises
+        ConfigError, which names parameter, value and bound.
         """
         return replace_values(self, flattened(changes, 'replace'), 'replace')
 
@@ -167,9 +167,9 @@ class Rig:
 def rig_from_values(values: Mapping[str, object], source: str = 'parameters') -> Rig:
     """Make a :class:`Rig` from flat values; missing values take their defaults.
 
-    Parameters of the node that are not of the rig are ignored, because ``ros2 param dump`` writes them too. Raises
-    ConfigError for an unknown key (with the nearest known one), a wrong type, a value out of bounds, or values that
-    contradict each other.
+    Parameters of the node that are not of the rig are ignored, because ``ros2 param dump`` writes
+    them too. Raises ConfigError for an unknown key (with the nearest known one), a wrong type, a
+    value out of bounds, or values that contradict each other.
     """
     return _rig({p.name: p.default for p in PARAMETERS}, {}, values, source)
 
@@ -177,8 +177,8 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
 def rig_as_recorded(values: Mapping[str, object], source: str) -> Rig:
     """The rig of a recording's parameters: one that they do not name was not there yet, and what held before it holds.
 
-    A recording names every parameter of its time; one that names none (CSV) has today's defaults. Raises ConfigError
-    as :func:`rig_from_values` does.
+    A recording names every parameter of its time; one that names none (CSV) has today's defaults.
+    Raises ConfigError as :func:`rig_from_values` does.
     """
     then = {p.name: p.before for p in PARAMETERS if p.before is not None} if values else {}
     return rig_from_values({**then, **values}, source)
@@ -266,8 +266,8 @@ def check_two_psds(rig: Rig, what: str) -> None:
 def left_as_in_the_thesis(values: Mapping[str, object]) -> tuple[str, ...]:
     """Measures of the thesis rig that ``values`` (flat) still have, each as ``NAME = VALUE UNIT``.
 
-    Somebody who describes another rig forgets some of them, and each then counts as measured. Empty if ``values``
-    describe no other rig: nothing of them differs.
+    Somebody who describes another rig forgets some of them, and each then counts as measured. Empty
+    if ``values`` describe no other rig: nothing of them differs.
     """
     same = [p.with_value(p.default) for p in MEASURES if values.get(p.name, p.default) == p.default]
     return tuple(same) if len(same) < len(MEASURES) else ()

@@ -1,6 +1,7 @@
 """Parameters that say how the node runs on one machine: its source and its recordings, and what viewers get.
 
-They describe no rig; those that do, and the table of all, are in :mod:`psd_deflection.rig.declarations`.
+They describe no rig; those that do, and the table of all, are in
+:mod:`psd_deflection.rig.declarations`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The node ``chain``: several rigs in one process, and the end effector composed of them.
 
-It publishes ``end_effector/deflection`` in the frame ``end_effector_rest``, each link's topics below the link's name,
-and all frames from the base to the end effector on ``/tf``. ``joint_states`` turns the joints that the chain file
-names. ``~/zero`` and ``~/record`` act on every link. The executor runs in the main thread; estimates are published by
-the pipeline threads.
+It publishes ``end_effector/deflection`` in the frame ``end_effector_rest``, each link's topics
+below the link's name, and all frames from the base to the end effector on ``/tf``. ``joint_states``
+turns the joints that the chain file names. ``~/zero`` and ``~/record`` act on every link. The
+executor runs in the main thread; estimates are published by the pipeline threads.
 """
 
 from __future__ import annotations

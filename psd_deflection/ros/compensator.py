@@ -1,15 +1,18 @@
 """The node ``compensator``: the end effector's deflection in, offsets of the joints out.
 
-It subscribes to ``end_effector/deflection`` and ``joint_states``, every 10 ms it publishes offsets as
-std_msgs/Float64MultiArray, one for each joint in the order of the parameter ``joints``: on ``~/proposed`` if it runs
-dry, else on ``~/offsets``. With the parameter ``output`` at ``commands`` it publishes positions plus offsets on
-``~/commands``, too. It is silent until ``~/enable`` lets the offsets follow, and again when they are back at zero.
+It subscribes to ``end_effector/deflection`` and ``joint_states``, every 10 ms it publishes offsets
+as std_msgs/Float64MultiArray, one for each joint in the order of the parameter ``joints``: on
+``~/proposed`` if it runs dry, else on ``~/offsets``. With the parameter ``output`` at ``commands``
+it publishes positions plus offsets on ``~/commands``, too. It is silent until ``~/enable`` lets the
+offsets follow, and again when they are back at zero.
 
-A thread of its own publishes the offsets and finds that deflections come no more, whatever the main thread waits for: a
-message, a terminal that does not read, a disk. On a busy machine it may be late. Then the offsets move later, by no
-more than their rate allows for a tenth of a second, and not at all if the deflection has become stale meanwhile.
+A thread of its own publishes the offsets and finds that deflections come no more, whatever the main
+thread waits for: a message, a terminal that does not read, a disk. On a busy machine it may be
+late. Then the offsets move later, by no more than their rate allows for a tenth of a second, and
+not at all if the deflection has become stale meanwhile.
 
-However the node ends or is deactivated, also by an error of its own, the offsets first go back to zero.
+However the node ends or is deactivated, also by an error of its own, the offsets first go back to
+zero.
 """
 
 from __future__ import annotations
@@ -71,7 +74,8 @@ LOOK_S = 1.0
 RELEASE_S = 10.0
 """Longest time that an end waits for the offsets to go back to zero, s."""
 LEAVE_S = 0.3
-"""Time for the last offsets to leave, s. DDS does not say when. If the publisher goes first, they are lost."""
+"""Time for the last offsets to leave, s. DDS does not say when. If the publisher goes first, they
+are lost."""
 MOST_SCALING = 1000.0
 
 _LEVELS = {State.OFF: OK, State.FOLLOWING: OK, State.RELEASING: WARN, State.HOLDING: ERROR}

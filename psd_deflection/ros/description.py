@@ -1,4 +1,5 @@
-"""The robot's description (URDF) as ROS 2 has it: latched on ``robot_description``, from robot_state_publisher."""
+"""The robot's description (URDF) as ROS 2 has it: latched on ``robot_description``, from
+robot_state_publisher."""
 
 from __future__ import annotations
 
@@ -32,7 +33,8 @@ def robot_description(
 ) -> str:
     """The text on ``robot_description`` in the namespace that the ROS arguments give; rclpy is started.
 
-    Raises ConfigError if none comes in ``wait_s``, s, and StopRequestedError if a signal comes before it.
+    Raises ConfigError if none comes in ``wait_s``, s, and StopRequestedError if a signal comes
+    before it.
     """
     heard: list[str] = []
     node = Node(f'{ROBOT_DESCRIPTION}_reader', start_parameter_services=False)

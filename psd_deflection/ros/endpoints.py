@@ -1,4 +1,5 @@
-"""Makes publishers from the rows of :mod:`psd_deflection.ros.topics`, and what subscriptions need of a row."""
+"""Makes publishers from the rows of :mod:`psd_deflection.ros.topics`, and what subscriptions need
+of a row."""
 
 from __future__ import annotations
 
@@ -35,7 +36,8 @@ def qos(delivery: Delivery) -> QoSProfile:
 def graph_name(row: GraphTopic, below: str = '') -> str:
     """The name of ``row`` in the node's namespace, so that two rigs can share a graph.
 
-    Without a namespace this is the topic's own name. ``below``: a further namespace, for a node of several rigs.
+    Without a namespace this is the topic's own name. ``below``: a further namespace, for a node of
+    several rigs.
     """
     return row.name if row.common else (below + row.name).removeprefix('/')
 
@@ -53,8 +55,8 @@ def refused_qos(error: Exception) -> ConfigError:
 def publisher_of(node: Node, topic: str, below: str = '') -> Publisher:
     """The publisher of ``topic``, by its row: the one place where any is made.
 
-    ``below``: as of :func:`graph_name`. Raises KeyError for a topic without a row, ImportError if its message is not
-    installed, and ConfigError for a QoS override that ROS does not take.
+    ``below``: as of :func:`graph_name`. Raises KeyError for a topic without a row, ImportError if
+    its message is not installed, and ConfigError for a QoS override that ROS does not take.
     """
     row = PUBLISHED[topic]
     kind = message_class(row.type)

@@ -5,8 +5,8 @@ thread serves parameters, services, inputs and the 1 Hz diagnostics, nothing fas
 
 It is a lifecycle node (REP-2002 states). *Configured*, it has the port, reads, estimates and
 records; *active*, it publishes as well. Deactivation stops publishing and nothing else, cleanup
-frees the port. With ``autostart`` (the default) it does both steps itself and behaves like an ordinary
-node.
+frees the port. With ``autostart`` (the default) it does both steps itself and behaves like an
+ordinary node.
 """
 
 from __future__ import annotations
@@ -177,7 +177,8 @@ class EstimatorNode(BaseNode[Rig]):
             self._live.show()
             if self._rig_told is not None:
                 self._rig_told.tell(again=False)
-            # In the time of the samples, so that a recording has one time even if the system clock is set.
+            # In the time of the samples, so that a recording has one time even if the system clock
+            # is set.
             self.session.fanout.put(self.named(self._health.report(self.session.acquisition.now_ns())))
             return
         now = time.time_ns()

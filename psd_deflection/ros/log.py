@@ -1,8 +1,8 @@
 """The node's log: each line on the terminal, on ``/rosout`` and in the log file that rcl began for this process.
 
-The terminal's lines do not go through the ROS log, because the live line is among them. So the lines are put
-on ``/rosout`` and into the file here, as rcl does with those of other nodes. A thread writes the file: a disk that
-hangs holds up nothing.
+The terminal's lines do not go through the ROS log, because the live line is among them. So the
+lines are put on ``/rosout`` and into the file here, as rcl does with those of other nodes. A thread
+writes the file: a disk that hangs holds up nothing.
 """
 
 from __future__ import annotations

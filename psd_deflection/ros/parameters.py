@@ -1,13 +1,13 @@
 """The rig's parameters as ROS parameters, with types, ranges and units.
 
 Values from the command line, a launch file or a parameter file reach the node as overrides.
-:func:`rig_from_values` validates them as everywhere else: ``0`` for a length is refused by name, and a
-whole number is accepted for a ``double``. The descriptors come from the declarations; with them rclpy
-refuses wrong types and values out of range.
+:func:`rig_from_values` validates them as everywhere else: ``0`` for a length is refused by name,
+and a whole number is accepted for a ``double``. The descriptors come from the declarations; with
+them rclpy refuses wrong types and values out of range.
 
-While the node is unconfigured every parameter may be set; configuring reads them. While it is configured only the
-live ones may; the pipeline validates these, because it knows which values depend on each other. What was set
-stays when the node is cleaned up.
+While the node is unconfigured every parameter may be set; configuring reads them. While it is
+configured only the live ones may; the pipeline validates these, because it knows which values
+depend on each other. What was set stays when the node is cleaned up.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ def rig_of_node(node: Node) -> tuple[Rig, set[str]]:
     shown = _ros_values(rig)
     values = {p.name: (shown[p.name], _descriptor(p)) for p in rig.parameters}
     for name, (value, shown_as) in {**values, SIMULATED: (False, _SIMULATED)}.items():
-        # rclpy tells of overrides that nobody declares (a mistyped name) only by declaring them, and then without
-        # descriptor and with the type as it was typed.
+        # rclpy tells of overrides that nobody declares (a mistyped name) only by declaring them,
+        # and then without descriptor and with the type as it was typed.
         if name in given:
             node.undeclare_parameter(name)
         node.declare_parameter(name, value, shown_as, ignore_override=True)
@@ -90,8 +90,8 @@ def _check_solvers(rig: Rig) -> None:
 class LiveParameters:
     """Carries out changes of the node's parameters, or refuses them.
 
-    ``settings``: the rig, as the parameters describe it. ``given``: names of those that the user has
-    set. ``session``: the one that runs while the node is configured, or None.
+    ``settings``: the rig, as the parameters describe it. ``given``: names of those that the user
+    has set. ``session``: the one that runs while the node is configured, or None.
     """
 
     def __init__(self, node: Node) -> None:
@@ -146,7 +146,8 @@ class LiveParameters:
 
     def _take(self, values: dict[str, Any]) -> None:
         """Set all of ``values`` or none. Raises ConfigError or, if no data flows, TimeoutError."""
-        # A file that `ros2 param dump` wrote names every parameter; only those that differ are changes.
+        # A file that `ros2 param dump` wrote names every parameter; only those that differ are
+        # changes.
         new = {n: v for n, v in values.items() if v != plain(self._node.get_parameter(n))}
         for name in new:
             if name == SIMULATED:

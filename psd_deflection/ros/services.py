@@ -34,9 +34,9 @@ def add_rig_services(
 ) -> None:
     """Serve ``~/zero`` and ``~/record``.
 
-    ``present``: what runs, or None while the node is not configured; then both are refused. ``zero`` takes a
-    zero; ``record`` begins (True) or ends recordings, whose answers come from the disk. If they raise an error of
-    the package or TimeoutError, the caller gets its text.
+    ``present``: what runs, or None while the node is not configured; then both are refused.
+    ``zero`` takes a zero; ``record`` begins (True) or ends recordings, whose answers come from the
+    disk. If they raise an error of the package or TimeoutError, the caller gets its text.
     """
 
     def answer_zero(request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -1,8 +1,9 @@
 """The node ``shaper``: joint trajectories in, the same out, shaped so that they do not ring the link.
 
-It subscribes to ``~/trajectory`` and publishes ``~/shaped``, one for each. What cannot be followed is refused, with the
-reason in the log and in ``/diagnostics``. ``joint_states`` tells where the joints are; the parameter ``urdf`` says
-where their limits are: in a file, or on ``robot_description``. Everything is done in the main thread.
+It subscribes to ``~/trajectory`` and publishes ``~/shaped``, one for each. What cannot be followed
+is refused, with the reason in the log and in ``/diagnostics``. ``joint_states`` tells where the
+joints are; the parameter ``urdf`` says where their limits are: in a file, or on
+``robot_description``. Everything is done in the main thread.
 """
 
 from __future__ import annotations
@@ -97,7 +98,8 @@ class ShaperNode(BaseNode[ShaperSettings]):
             return
         self._shaped += 1
         self._why = ''
-        # Whoever gets it begins when we did, however long the message takes: one that replaces another makes no step.
+        # Whoever gets it begins when we did, however long the message takes: one that replaces
+        # another makes no step.
         message.header.stamp = Time(nanoseconds=start_ns).to_msg()
         self._out.publish(_message(shaped, message.header))
 

@@ -1,8 +1,9 @@
 """Every topic of the nodes: :data:`PUBLISHED` and :data:`HEARD` have a row for each. It needs no rclpy.
 
 Publishers and subscriptions are made from a row alone (``endpoints.publisher_of``,
-``InputGate.listen``): name, type and QoS stand nowhere else, and a topic without a row can be neither
-published nor heard. ``python -m tools.topics`` writes the table of ``docs/topics.md`` from these rows.
+``InputGate.listen``): name, type and QoS stand nowhere else, and a topic without a row can be
+neither published nor heard. ``python -m tools.topics`` writes the table of ``docs/topics.md`` from
+these rows.
 """
 
 from __future__ import annotations
@@ -31,11 +32,14 @@ from psd_deflection.model.solvers.registry import SOLVERS
 from psd_deflection.records import MOST_PSDS
 
 MOST_BYTES = 1_000_000
-"""Maximum size of a message, unless the topic has its own; those of a robot's joints have some hundred bytes."""
+"""Maximum size of a message, unless the topic has its own; those of a robot's joints have some
+hundred bytes."""
 MOST_RECORDED_BYTES = 4096
-"""Maximum size of a message of another node that is recorded, bytes; valid ones have some hundred bytes."""
+"""Maximum size of a message of another node that is recorded, bytes; valid ones have some hundred
+bytes."""
 MOST_IMAGE_BYTES = 400_000_000
-"""Maximum size of an image's message: that of the largest image that is read, with 16 bits a pixel."""
+"""Maximum size of an image's message: that of the largest image that is read, with 16 bits a pixel.
+"""
 MOST_DESCRIPTION_BYTES = 20_000_000
 """Maximum size of a robot's description; the largest robots have some hundred thousand bytes."""
 KEPT_LINES = 1000
@@ -45,10 +49,10 @@ KEPT_LINES = 1000
 class GraphTopic(NamedTuple):
     """A topic of a node, published or heard.
 
-    ``name``: as of our own rig, ``/link_tip/deflection``; it becomes relative to the node's namespace, unless it is
-    ``common`` to all nodes of a graph. ``type``: ``pkg/msg/Name``, or '' where a parameter names it. ``node``: the
-    executable. ``says``: what is on it. ``overridable``: by ``qos_overrides`` parameters. ``most_bytes``: maximum size
-    of a message that is heard.
+    ``name``: as of our own rig, ``/link_tip/deflection``; it becomes relative to the node's
+    namespace, unless it is ``common`` to all nodes of a graph. ``type``: ``pkg/msg/Name``, or ''
+    where a parameter names it. ``node``: the executable. ``says``: what is on it. ``overridable``:
+    by ``qos_overrides`` parameters. ``most_bytes``: maximum size of a message that is heard.
     """
 
     name: str
@@ -227,7 +231,8 @@ _IN = (
         _INPUT,
     ),
     GraphTopic(APPLIED, _ARRAY, _COMPENSATOR, 'the offsets that the controller applies, rad or m', _INPUT),
-    # One of them hears a driver that said it once, before we came; the other a driver that does not keep it.
+    # One of them hears a driver that said it once, before we came; the other a driver that does not
+    # keep it.
     *(
         GraphTopic(
             RUNNING,

@@ -1,7 +1,7 @@
 """The frames of the messages as a tree for tf2: ``link_base``, ``link_tip_rest``, ``link_tip``, ``psd_1`` ...
 
-What the rig file fixes is static and latched. The tip moves with each estimate of the primary solver; it is sent
-by the pipeline thread, with the estimate's own stamp.
+What the rig file fixes is static and latched. The tip moves with each estimate of the primary
+solver; it is sent by the pipeline thread, with the estimate's own stamp.
 """
 
 from __future__ import annotations

@@ -82,8 +82,8 @@ class VoltsPublisher:
 class InputRecorder(InputGate):
     """Gives the session what other nodes say, as it arrives and if it can be used.
 
-    ``session``: the one that takes it, or None. It counts and says what is refused. ``below``: as of
-    :class:`PublisherWire`.
+    ``session``: the one that takes it, or None. It counts and says what is refused. ``below``: as
+    of :class:`PublisherWire`.
     """
 
     def __init__(self, node: Node, topics: Iterable[str], below: str = '') -> None:

@@ -1,4 +1,5 @@
-"""A guided check of a live rig: reads the device while a person (or the simulated hand) pushes the tip."""
+"""A guided check of a live rig: reads the device while a person (or the simulated hand) pushes the
+tip."""
 
 from __future__ import annotations
 
@@ -29,8 +30,8 @@ SIMULATED_PUSH = 0.5e-3
 def run_guided(rig: Rig, world: Rig, say: Say, show: Callable[[Guide], None]) -> Checkup:
     """Lead through the pushes on the device of ``rig``; without a port, on a simulated rig that is really ``world``.
 
-    ``say`` gets the prompts and the lines between them, ``show`` the guide after each chunk of samples. Raises
-    DeviceError, ConfigError.
+    ``say`` gets the prompts and the lines between them, ``show`` the guide after each chunk of
+    samples. Raises DeviceError, ConfigError.
     """
     # A few lost samples do no harm here, and a priority is one more thing to read about.
     rig = replace_values(rig, {'realtime': False})

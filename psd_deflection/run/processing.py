@@ -1,8 +1,8 @@
 """The pipeline thread: takes chunks off the queue, runs the pipeline, gives its records to the sinks.
 
 It is the only thread that touches the pipeline. Requests from other threads (take the zero, attach
-or detach a recording) run between two blocks, never within one. A request must not wait for anything,
-because the estimates wait for the request.
+or detach a recording) run between two blocks, never within one. A request must not wait for
+anything, because the estimates wait for the request.
 """
 
 from __future__ import annotations
@@ -86,8 +86,8 @@ class Spokesman:
 class Processing:
     """Runs ``pipeline`` over ``items`` until one of them is Ended; ``sinks`` get the records in this order.
 
-    ``dropped_before``: samples that were dropped on the way here, before those that were processed last.
-    ``clock``: monotonic time, ns; the same clock as that of the chunks' ``read_ns``.
+    ``dropped_before``: samples that were dropped on the way here, before those that were processed
+    last. ``clock``: monotonic time, ns; the same clock as that of the chunks' ``read_ns``.
     """
 
     def __init__(
@@ -142,8 +142,8 @@ class Processing:
     def request(self, action: Callable[[], T]) -> T:
         """Run ``action`` between two blocks and return its result; its errors are raised here.
 
-        Raises TimeoutError if it cannot begin within ``REQUEST_TIMEOUT_S``; then it never runs. Raises
-        TimeoutError with another message if it has begun and does not end in that time.
+        Raises TimeoutError if it cannot begin within ``REQUEST_TIMEOUT_S``; then it never runs.
+        Raises TimeoutError with another message if it has begun and does not end in that time.
         """
         asked: Future[T] = Future()
         self._requests.put((asked, action))

@@ -1,14 +1,14 @@
 """The recorder thread writes the published messages to a bag without delaying the pipeline.
 
 Each recording has its own thread, the only one that touches the disk. It opens the bag, asks the
-pipeline thread to attach the recording between two blocks, writes the messages, and closes the bag once
-the recording is detached. Attaching and detaching swap one reference. A caller that starts or ends a
-recording gets a future, which is resolved when the disk has answered.
+pipeline thread to attach the recording between two blocks, writes the messages, and closes the bag
+once the recording is detached. Attaching and detaching swap one reference. A caller that starts or
+ends a recording gets a future, which is resolved when the disk has answered.
 
-Encoded messages come through a bounded queue. A message that does not fit is dropped and counted. A disk
-error, or a disk with less room than the reserve, ends the recording with a message; acquisition and
-publishing continue. A chunk that is on the disk survives a crash. A chunk ends after half a second of log
-time, or after half a second without messages.
+Encoded messages come through a bounded queue. A message that does not fit is dropped and counted. A
+disk error, or a disk with less room than the reserve, ends the recording with a message;
+acquisition and publishing continue. A chunk that is on the disk survives a crash. A chunk ends
+after half a second of log time, or after half a second without messages.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from psd_deflection.rig.running import AcquisitionConfig
 from psd_deflection.run.behind import SLOW, why_behind
 
 MESSAGES_PER_BLOCK = 100
-"""The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes about
-ten messages, so the disk may pause ten times as long as the pipeline: 50 s by default, in 25 MB."""
+"""The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes
+about ten messages, so the disk may pause ten times as long as the pipeline: 50 s by default, in 25
+MB."""
 MOST_THREADS = 8
 """Recordings that may hang at a time: each has its thread."""
 QUEUE_BYTES = 100_000_000
@@ -75,8 +76,9 @@ class _GoneError(Exception):
 class Take:
     """One recording.
 
-    ``opened``: resolves to its folder once it is attached, or to the error that prevented it. ``closed``:
-    resolves to its folder once the bag is closed, or to the error that prevented it. Neither can be cancelled.
+    ``opened``: resolves to its folder once it is attached, or to the error that prevented it.
+    ``closed``: resolves to its folder once the bag is closed, or to the error that prevented it.
+    Neither can be cancelled.
     """
 
     def __init__(self, config: AcquisitionConfig) -> None:
@@ -89,7 +91,8 @@ class Take:
         self.closed: Future[Path | None] = Future()
         # What waits is bounded in bytes too: others may send long messages.
         self.budget = ByteBudget(QUEUE_BYTES)
-        # Samples that the run had dropped when it began and when it ended, messages that it could not take.
+        # Samples that the run had dropped when it began and when it ended, messages that it could
+        # not take.
         self.dropped_before = self.dropped_until = self.dropped_messages = 0
         for answer in (self.opened, self.closed):
             answer.set_running_or_notify_cancel()
@@ -98,11 +101,11 @@ class Take:
 class Recorder:
     """Makes one recording at a time; a wire like any other. ``say`` gets a line if a recording ends by itself.
 
-    ``dropped_samples``: how many the run has dropped so far, before those that it processed last; a recording says how
-    many it lacks because of that. ``between_blocks`` runs an action in the thread that calls the wires
-    (``Processing.request``).
-    ``node``: full name of the recorded ROS node. ``failure``: why the last recording
-    ended by itself, empty while all is well; for diagnostics.
+    ``dropped_samples``: how many the run has dropped so far, before those that it processed last; a
+    recording says how many it lacks because of that. ``between_blocks`` runs an action in the
+    thread that calls the wires (``Processing.request``). ``node``: full name of the recorded ROS
+    node. ``failure``: why the last recording ended by itself, empty while all is well; for
+    diagnostics.
     """
 
     def __init__(
@@ -157,10 +160,10 @@ class Recorder:
     ) -> Future[Path | None]:
         """Start a recording in ``bag_dir``; the future gives its folder once it runs.
 
-        If a recording already runs or starts, its future is returned. ``memory``: called with ``rig`` when
-        the recording is attached; its records come first. The future raises
-        RecordingError if the folder cannot be made, the disk has no room, or the recording was ended
-        before the disk answered; TimeoutError if no data flows.
+        If a recording already runs or starts, its future is returned. ``memory``: called with
+        ``rig`` when the recording is attached; its records come first. The future raises
+        RecordingError if the folder cannot be made, the disk has no room, or the recording was
+        ended before the disk answered; TimeoutError if no data flows.
         """
         with self._lock:
             take = self._take or self._opening
@@ -204,8 +207,9 @@ class Recorder:
     def stop(self) -> Future[Path | None]:
         """Detach the recording; the future gives its folder once it is closed, None if there was none.
 
-        A recording that is being opened does not begin. To be called between two blocks, so that the
-        last block is whole. The future raises RecordingError if the recording could not be closed.
+        A recording that is being opened does not begin. To be called between two blocks, so that
+        the last block is whole. The future raises RecordingError if the recording could not be
+        closed.
         """
         with self._lock:
             opening, self._opening = self._opening, None
@@ -225,7 +229,8 @@ class Recorder:
     def close(self) -> Path | None:
         """End for good; wait ``JOIN_S`` for a disk that takes nothing, ``PATIENCE_S`` for one that is slow.
 
-        Return the folder of the recording that ran, None if there was none or if its end went wrong.
+        Return the folder of the recording that ran, None if there was none or if its end went
+        wrong.
         """
         folder = self.folder
         with self._lock:
@@ -332,7 +337,8 @@ class Recorder:
                 try:
                     self._write(bag, take)
                 finally:
-                    # Before waiting for the disk again: a new start must not be told that this recording runs.
+                    # Before waiting for the disk again: a new start must not be told that this
+                    # recording runs.
                     with self._lock:
                         if self._take is take:
                             self._take = None

@@ -1,17 +1,19 @@
 """Follows the measured deflection with joint offsets, within limits, and holds as soon as it cannot be trusted.
 
-With the joints at q + o, the rigid pose T(q + o) and the measured deflection D, the end effector is at T(q + o) D. It
-is to be at T(q). Each estimate moves o by a damped least squares step (Nakamura & Hanafusa 1986) that lessens the
-difference on the chosen axes; a first-order lag lets the offsets follow a load that is held, and not a vibration.
+With the joints at q + o, the rigid pose T(q + o) and the measured deflection D, the end effector is
+at T(q + o) D. It is to be at T(q). Each estimate moves o by a damped least squares step (Nakamura &
+Hanafusa 1986) that lessens the difference on the chosen axes; a first-order lag lets the offsets
+follow a load that is held, and not a vibration.
 
-Nothing is sent until the compensation is enabled, everything is known and nothing is wrong. Then the offsets begin
-where the controller has them. They hold (they keep their last value) while the deflection is stale, not finite, too
-uncertain, too large or jumping, the joints are not known, leap or do not follow, the robot does not run, or somebody
-else commands it. They move again after some good estimates in a row, and go back to zero if that takes long or when
-the compensation is switched off. A controller that does not tell what it applies, or is elsewhere than it was sent,
-hears nothing until that is mended; if the compensation was switched off meanwhile, the offsets that it still has go
-back to zero then. Whatever happens, what is sent moves by no more than ``max_rate`` times the time since something was
-sent.
+Nothing is sent until the compensation is enabled, everything is known and nothing is wrong. Then
+the offsets begin where the controller has them. They hold (they keep their last value) while the
+deflection is stale, not finite, too uncertain, too large or jumping, the joints are not known, leap
+or do not follow, the robot does not run, or somebody else commands it. They move again after some
+good estimates in a row, and go back to zero if that takes long or when the compensation is switched
+off. A controller that does not tell what it applies, or is elsewhere than it was sent, hears
+nothing until that is mended; if the compensation was switched off meanwhile, the offsets that it
+still has go back to zero then. Whatever happens, what is sent moves by no more than ``max_rate``
+times the time since something was sent.
 """
 
 from __future__ import annotations
@@ -36,7 +38,8 @@ FOLLOW_S = 0.3
 MOVED_SHARE = 0.1
 """Joints that moved by less than this share of what the offsets did do not follow them."""
 LEAST_SD = 1e-10
-"""Nobody measures a deflection to better than this, m or rad: one that says so does not know its uncertainty."""
+"""Nobody measures a deflection to better than this, m or rad: one that says so does not know its
+uncertainty."""
 UNTOLD = 'the controller does not tell the offsets that it applies'
 AWAITED = 'good deflections are awaited'
 
@@ -65,9 +68,10 @@ class Observed(NamedTuple):
 class Command(NamedTuple):
     """``offsets`` (n,) of the joints, rad or m; ``why``: of a state that is not ``following``, else ''.
 
-    ``residual``: distance of the joints, as measured, from the rigid pose on the axes that are corrected, m; NaN if it
-    is not known. ``limited``: whether a limit keeps the offsets from what the deflection asks for. ``positions`` (n,):
-    of the joints with the offsets, None if the output is offsets. ``sends``: whether the controller is to get it.
+    ``residual``: distance of the joints, as measured, from the rigid pose on the axes that are
+    corrected, m; NaN if it is not known. ``limited``: whether a limit keeps the offsets from what
+    the deflection asks for. ``positions`` (n,): of the joints with the offsets, None if the output
+    is offsets. ``sends``: whether the controller is to get it.
     """
 
     offsets: FloatArray
@@ -87,7 +91,8 @@ class Command(NamedTuple):
 class Compensator:
     """The offsets of the joints of ``arm``. The times ``now`` are seconds of a clock that is never set. For one thread.
 
-    ``enabled``: whether the offsets follow; :meth:`enable` changes it. ``dry``: the joints do not get the offsets.
+    ``enabled``: whether the offsets follow; :meth:`enable` changes it. ``dry``: the joints do not
+    get the offsets.
     """
 
     def __init__(self, arm: Arm, settings: CompensatorSettings, dry: bool = False) -> None:
@@ -167,7 +172,8 @@ class Compensator:
         leap = float(np.abs(move).max())
         if leap > settings.max_joint_speed * min(max(self._joints_t - then, 0.02), 1.0):
             self._hold(f'the positions of the joints leap by {leap:.3g}')
-        # No joint turns round so quickly, but two nodes that tell different positions look like this.
+        # No joint turns round so quickly, but two nodes that tell different positions look like
+        # this.
         turned = np.where(move * self._last_move < 0.0, np.minimum(np.abs(move), np.abs(self._last_move)), 0.0)
         if turned.max() > settings.follow_error:
             self._hold(f'the positions of the joints go to and fro by {turned.max():.3g}')

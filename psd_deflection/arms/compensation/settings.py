@@ -16,7 +16,8 @@ ALL_JOINTS = 'all'
 class CompensatorSettings:
     """What the offsets may do and what makes them hold; the node has them as ROS parameters.
 
-    Offsets and rates are those of each joint: rad or m. Raises ConfigError for a value out of bounds.
+    Offsets and rates are those of each joint: rad or m. Raises ConfigError for a value out of
+    bounds.
     """
 
     axes: tuple[str, ...] = parameter(

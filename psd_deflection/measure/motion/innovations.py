@@ -9,7 +9,8 @@ from typing import NamedTuple
 class Innovations(NamedTuple):
     """How well the filter foretold the samples so far.
 
-    ``squares``: sums of the normalised innovations squared (NIS) of dX, dY, theta; each has the mean 1 a sample.
+    ``squares``: sums of the normalised innovations squared (NIS) of dX, dY, theta; each has the
+    mean 1 a sample.
     """
 
     squares: tuple[float, ...] = (0.0, 0.0, 0.0)

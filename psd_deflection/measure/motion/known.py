@@ -12,7 +12,8 @@ from psd_deflection.measure.motion.modal import Oscillator
 from psd_deflection.records import AppliedLoad, FloatArray
 
 DOUBT = 0.05
-"""Share by which the deflection of a known load may differ from the rig file's link, one standard deviation."""
+"""Share by which the deflection of a known load may differ from the rig file's link, one standard
+deviation."""
 MOST_LOADS = 1000
 """So many known loads may wait for samples."""
 
@@ -20,8 +21,8 @@ MOST_LOADS = 1000
 class Pushed(NamedTuple):
     """What the known loads of a block do.
 
-    ``samples`` (3, N): to each sample, m, m, rad. ``end`` (3, 4): to the state at its end. ``variance`` (3,):
-    what they add to that of the static deflection.
+    ``samples`` (3, N): to each sample, m, m, rad. ``end`` (3, 4): to the state at its end.
+    ``variance`` (3,): what they add to that of the static deflection.
     """
 
     samples: FloatArray
@@ -32,8 +33,9 @@ class Pushed(NamedTuple):
 class KnownLoads:
     """The load that acts, and those whose stamps lie ahead of the samples.
 
-    ``modes``: of dX, dY and theta. ``compliance`` (3,): m/N, m/N, rad/(N m). ``size``: samples of a block; ``period``:
-    of them, s. ``held`` (3,): the load that acts, N, N, N m; None if none was told.
+    ``modes``: of dX, dY and theta. ``compliance`` (3,): m/N, m/N, rad/(N m). ``size``: samples of a
+    block; ``period``: of them, s. ``held`` (3,): the load that acts, N, N, N m; None if none was
+    told.
     """
 
     def __init__(self, modes: Sequence[Oscillator], compliance: FloatArray, size: int, period: float) -> None:
@@ -68,7 +70,8 @@ class KnownLoads:
             load = self._waiting.pop(0)
             before, self.held = self.held, np.array(load[1:])
             since = self._period * self._size - (end_ns - load.t_ns) / 1e9
-            # The first one may have acted before the run. One from before these samples was seen in earlier ones.
+            # The first one may have acted before the run. One from before these samples was seen in
+            # earlier ones.
             if first or before is None or since < 0.0:
                 continue
             step = self._compliance * (self.held - before)

@@ -1,13 +1,15 @@
 """The filter: block after block of poses in, pose and velocity of the tip out.
 
-How fast the load wanders is not known and changes: a link at rest, in operation, and one whose load has just been
-switched differ by six orders of magnitude. So each axis has K rates. In every block the filter runs with all of them,
-and Bayes' rule weighs them by how well they foretold the samples (a Markov chain says how likely a change is); the
-next block starts from mean and covariance of them all (generalised pseudo-Bayes of first order, Bar-Shalom, Li &
-Kirubarajan 2001, 11.6.4). With rates that the rig file states, K is 1.
+How fast the load wanders is not known and changes: a link at rest, in operation, and one whose load
+has just been switched differ by six orders of magnitude. So each axis has K rates. In every block
+the filter runs with all of them, and Bayes' rule weighs them by how well they foretold the samples
+(a Markov chain says how likely a change is); the next block starts from mean and covariance of them
+all (generalised pseudo-Bayes of first order, Bar-Shalom, Li & Kirubarajan 2001, 11.6.4). With rates
+that the rig file states, K is 1.
 
-The axes are filtered one by one. The noise that they share, because each pose is solved from the same four readings,
-is followed through the gains, so that the covariance of the pose is that of the errors.
+The axes are filtered one by one. The noise that they share, because each pose is solved from the
+same four readings, is followed through the gains, so that the covariance of the pose is that of the
+errors.
 """
 
 from __future__ import annotations
@@ -30,12 +32,14 @@ from psd_deflection.records import AppliedLoad, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 
 STEPPED, SMOOTH = 13, 10
-"""Rates that are tried of a load that wanders by steps, and of one whose rate of change wanders; K together."""
+"""Rates that are tried of a load that wanders by steps, and of one whose rate of change wanders; K
+together."""
 SMALLEST, STEP = 1e-2, 10.0**0.5
-"""The static deflection wanders in one block by so many times the noise of a sample at the lowest rate; from each rate
-to the next the factor."""
+"""The static deflection wanders in one block by so many times the noise of a sample at the lowest
+rate; from each rate to the next the factor."""
 DOWN, UP, JUMPS = 0.03, 0.01, 0.01
-"""Probability that the rate of the next block is the next one down, the next one up, any one at all."""
+"""Probability that the rate of the next block is the next one down, the next one up, any one at
+all."""
 UNKNOWN = 1.0
 """Standard deviation of each state at the start, m or rad: nothing is known."""
 STEADY = 1e-9
@@ -48,7 +52,8 @@ _PAIRS = ((0, 1), (0, 2), (1, 2))
 _FIRST, _SECOND = (np.array(side) for side in zip(*_PAIRS, strict=True))
 STATE, INERTIA = 'state.motion', 'state.inertia'
 UNSEEN, LOADS = 'state.unseen', 'state.known_loads'
-"""Names under which :meth:`ModalFilter.memory` is recorded; ``LOADS``: while nothing else is known."""
+"""Names under which :meth:`ModalFilter.memory` is recorded; ``LOADS``: while nothing else is known.
+"""
 
 
 class TipState(NamedTuple):
@@ -74,8 +79,9 @@ class Predicted(NamedTuple):
 
 
 class _Taken(NamedTuple):
-    """Kept from the last block, to correct it if an acceleration arrives late: ``forced``, what the known accelerations
-    did; ``gain`` (3, 4, N), how each sample moved the state at its end, 0 for a lost sample."""
+    """Kept from the last block, to correct it if an acceleration arrives late: ``forced``, what the
+    known accelerations did; ``gain`` (3, 4, N), how each sample moved the state at its end, 0 for a
+    lost sample."""
 
     forced: Forced
     gain: FloatArray
@@ -84,9 +90,10 @@ class _Taken(NamedTuple):
 class ModalFilter:
     """Holds pose, velocity and static deflection of the tip, at the last sample of the last block.
 
-    ``inertia``: takes the accelerations of the base. A late one puts right what was computed of the last block.
-    ``innovations``: of the run so far. ``coasted``: s since the last sample that was used. ``coasts``: times that the
-    filter went on without samples. Raises ConfigError if blocks are too long.
+    ``inertia``: takes the accelerations of the base. A late one puts right what was computed of the
+    last block. ``innovations``: of the run so far. ``coasted``: s since the last sample that was
+    used. ``coasts``: times that the filter went on without samples. Raises ConfigError if blocks
+    are too long.
     """
 
     part = 'the filter of the motion'
@@ -178,8 +185,9 @@ class ModalFilter:
     def block(self, index: int, t_ns: int, slots: IntArray | None, poses: FloatArray | None) -> TipState | None:
         """The motion at the end of block ``index``, or None if nothing is known.
 
-        ``t_ns``: time of the block's middle. ``slots`` (n,), ``poses`` (n, 3) m, m, rad: the samples that can be used,
-        and which of the N places each has; None if there is none: then the filter coasts.
+        ``t_ns``: time of the block's middle. ``slots`` (n,), ``poses`` (n, 3) m, m, rad: the
+        samples that can be used, and which of the N places each has; None if there is none: then
+        the filter coasts.
         """
         seconds = self._size * self._period
         if self._index is not None:
@@ -248,8 +256,9 @@ class ModalFilter:
     def _take_late(self) -> None:
         """Put right what accelerations did in the last block that were not known then.
 
-        The samples of the block have shown some of it: what the filter would have found is linear in what is foretold.
-        The mean square of what that changes is how far what is published was off, and will be.
+        The samples of the block have shown some of it: what the filter would have found is linear
+        in what is foretold. The mean square of what that changes is how far what is published was
+        off, and will be.
         """
         came, self._late_ones = self.inertia.late - self._late_ones, self.inertia.late
         taken = self._taken

@@ -2,9 +2,9 @@
 
 An effect is one file with one :class:`~psd_deflection.model.simulation.declaration.Effect` called
 ``EFFECT``; the file has the effect's name. Adding a file to ``effects/`` or to a folder of
-``$PSD_DEFLECTION_EFFECTS`` adds an effect; in such a folder it may also be a law in YAML (:mod:`.laws`).
-So does an entry point of the group ``psd_deflection.effects`` of another package. In a rig file the
-effects are listed below ``effects:``, one map each, under any key::
+``$PSD_DEFLECTION_EFFECTS`` adds an effect; in such a folder it may also be a law in YAML
+(:mod:`.laws`). So does an entry point of the group ``psd_deflection.effects`` of another package.
+In a rig file the effects are listed below ``effects:``, one map each, under any key::
 
     effects:
       sensor_rotation_2: {name: sensor_rotation, psd: 2, angle: 0.01}

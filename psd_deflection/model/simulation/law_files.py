@@ -1,4 +1,5 @@
-"""Reads the YAML file of a law: what is wrong with it is said with file, key, value and what is allowed."""
+"""Reads the YAML file of a law: what is wrong with it is said with file, key, value and what is
+allowed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """What the forms of a law do to a variable v (n,): of no memory, or following it with a state from block to block.
 
-``shapes``: the numbers that shape the form, by name; ``period``: of the samples, s. A form that follows keeps in
-``state`` what the next block needs.
+``shapes``: the numbers that shape the form, by name; ``period``: of the samples, s. A form that
+follows keeps in ``state`` what the next block needs.
 """
 
 from __future__ import annotations

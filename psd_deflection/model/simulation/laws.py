@@ -1,6 +1,7 @@
 """Empirical effects: a law written as a YAML file, which a person can read and edit.
 
-``discover`` writes one where no effect of the catalogue fits. A law adds a sum of terms to one quantity of the chain::
+``discover`` writes one where no effect of the catalogue fits. A law adds a sum of terms to one
+quantity of the chain::
 
     name: stop_y2
     stage: psd
@@ -10,9 +11,9 @@
     terms:
       - {form: above, of: [load_fy], coefficient: 2.0e-07, threshold: 10.0}
 
-A term is ``coefficient`` times a form of the product of the variables in ``of``; a variable that is listed twice is
-squared. In a folder of effects the file is an effect like those written in Python: coefficients are ``c1``, ``c2`` ...
-and shapes ``threshold1`` ... in the order of the terms.
+A term is ``coefficient`` times a form of the product of the variables in ``of``; a variable that is
+listed twice is squared. In a folder of effects the file is an effect like those written in Python:
+coefficients are ``c1``, ``c2`` ... and shapes ``threshold1`` ... in the order of the terms.
 """
 
 from __future__ import annotations
@@ -56,7 +57,8 @@ VARIABLES: Mapping[str, str] = {
     'temperature': 'K',
     'time': 's',
 }
-"""What a law may depend on, with its unit. ``temperature``: above the first one; ``time``: since the first sample."""
+"""What a law may depend on, with its unit. ``temperature``: above the first one; ``time``: since
+the first sample."""
 
 _LOADS, _POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
 
@@ -81,16 +83,17 @@ TARGETS: Mapping[str, LawTarget] = {
     **{n: LawTarget('psd', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(DOTS)},
     **{f'sum{i + 1}': LawTarget('psd', 'dots', 4 + i, 'V', tuple(VARIABLES)) for i in range(2)},
 }
-"""What a law may act on. ``static_dx`` is what the link swings towards, ``dx`` where it is; ``beam_x1`` moves a laser's
-beam sideways."""
+"""What a law may act on. ``static_dx`` is what the link swings towards, ``dx`` where it is;
+``beam_x1`` moves a laser's beam sideways."""
 
 
 @dataclass(frozen=True, slots=True)
 class Form:
     """A form of a variable v. ``apart``: of no memory, (v, shapes); ``following``: also (period s, state).
 
-    ``fitted`` and ``fixed``: its shapes, with the power of v's unit; those fixed are not improved by a refit because
-    the form jumps there. ``unit_of_v``: the power of v's unit in the form's own unit. ``words``: with ``{v}``.
+    ``fitted`` and ``fixed``: its shapes, with the power of v's unit; those fixed are not improved
+    by a refit because the form jumps there. ``unit_of_v``: the power of v's unit in the form's own
+    unit. ``words``: with ``{v}``.
     """
 
     kind: Kind

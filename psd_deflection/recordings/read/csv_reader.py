@@ -137,8 +137,8 @@ class CsvRecording(Recording):
         """The samples; the first has seq 0.
 
         A row's number is that of the row before plus the whole number of steps between them. The
-        remainder is carried to the next row and decays slowly, so that neither jitter of less than half a
-        step nor a clock that runs slightly fast looks like a loss.
+        remainder is carried to the next row and decays slowly, so that neither jitter of less than
+        half a step nor a clock that runs slightly fast looks like a loss.
         """
         seq = 0
         left_over = 0.0

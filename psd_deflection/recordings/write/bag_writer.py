@@ -1,9 +1,10 @@
 """Writes recordings: rosbag2 bags (a folder with ``metadata.yaml`` and MCAP) and single MCAP files.
 
-A crash must cost at most a second. So chunks span less than half a second of log time and are handed
-to the operating system when they end (``durable``: written to the disk). Parameters, version and hello are at
-the front of every file. After a crash, :mod:`psd_deflection.recordings.read.bag_reader` reads the file up to the
-cut, and :mod:`psd_deflection.recordings.repair` repairs it.
+A crash must cost at most a second. So chunks span less than half a second of log time and are
+handed to the operating system when they end (``durable``: written to the disk). Parameters, version
+and hello are at the front of every file. After a crash,
+:mod:`psd_deflection.recordings.read.bag_reader` reads the file up to the cut, and
+:mod:`psd_deflection.recordings.repair` repairs it.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ from psd_deflection.records import ParameterChange, Record, RigState
 from psd_deflection.rig.declarations import FRAME_PREFIX
 
 CHUNK_NS = 500_000_000
-"""Largest log time that a chunk spans: together with the queues, a crash costs less than a second."""
+"""Largest log time that a chunk spans: together with the queues, a crash costs less than a second.
+"""
 
 META_SOFTWARE = 'psd_deflection'
 META_NODE = 'node'
@@ -48,7 +50,8 @@ META_PARAMETERS = 'psd_deflection.parameters'
 META_HELLO = 'psd_deflection.device_hello'
 META_DROPPED = 'psd_deflection.dropped_here'
 META_CHANGE = 'psd_deflection.change.'
-"""Names of the MCAP metadata records, and of a value in the first; those of parameters, hello and change are JSON."""
+"""Names of the MCAP metadata records, and of a value in the first; those of parameters, hello and
+change are JSON."""
 
 CUSTOM = {'psd_deflection_version': __version__}
 
@@ -99,9 +102,10 @@ class McapFile(_RecordSink):
 
     ``write`` takes the records of one thread. Raises RecordingError if the file exists, cannot be
     created, or the disk refuses to write. After such an error the file is closed and holds all
-    complete chunks. While it is being written the file is locked (``flock``), so that no program repairs it.
-    ``durable``: each chunk is written to the disk, not only to the operating system, before the next begins.
-    ``folder``: where the file is made, if its caller holds that folder. ``node``: full name of the recorded ROS node.
+    complete chunks. While it is being written the file is locked (``flock``), so that no program
+    repairs it. ``durable``: each chunk is written to the disk, not only to the operating system,
+    before the next begins. ``folder``: where the file is made, if its caller holds that folder.
+    ``node``: full name of the recorded ROS node.
     """
 
     def __init__(
@@ -290,10 +294,10 @@ class McapFile(_RecordSink):
 class BagWriter(_RecordSink):
     """A rosbag2 bag being written: ``NAME/NAME_0.mcap`` and so on, ``NAME/metadata.yaml`` at the end.
 
-    ``rig_values``: the flat parameter set, effects included. ``node``: full name of the recorded ROS node.
-    ``max_bytes``, ``max_s``: a file of this size, or with this span of log time, is closed and the
-    next one begun (0: never); each file can be read alone. Raises RecordingError if the folder
-    exists already or cannot be created; the calls raise it as in :class:`McapFile`.
+    ``rig_values``: the flat parameter set, effects included. ``node``: full name of the recorded
+    ROS node. ``max_bytes``, ``max_s``: a file of this size, or with this span of log time, is
+    closed and the next one begun (0: never); each file can be read alone. Raises RecordingError if
+    the folder exists already or cannot be created; the calls raise it as in :class:`McapFile`.
     """
 
     def __init__(
@@ -395,9 +399,9 @@ class BagWriter(_RecordSink):
     def close(self) -> None:
         """Close the file, then write ``metadata.yaml``; a second call does nothing.
 
-        A bag whose file ended with an error, or was deleted, gets no ``metadata.yaml``: ``psd-deflection
-        recover`` makes one from the files, and our reader needs none. All is written in the folder that the
-        bag was made in, wherever that has been moved.
+        A bag whose file ended with an error, or was deleted, gets no ``metadata.yaml``:
+        ``psd-deflection recover`` makes one from the files, and our reader needs none. All is
+        written in the folder that the bag was made in, wherever that has been moved.
         """
         if self.closed:
             self._held.close()

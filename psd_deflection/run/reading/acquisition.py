@@ -1,11 +1,11 @@
 """The reader thread turns a source's samples into chunks with host times and puts them in a bounded queue.
 
 The reader owns the source, the sequence numbers and the clock. It hands over a chunk as soon as the
-last sample of a block has come, so that the estimate is not delayed. If the consumer is too slow, the
-newest chunk is dropped and counted; the reader never waits.
+last sample of a block has come, so that the estimate is not delayed. If the consumer is too slow,
+the newest chunk is dropped and counted; the reader never waits.
 
-Every missing sample is counted once, under its cause (``lost_by``) if that is known: the device reported
-the loss, frames around it were damaged, the port was away, or none of these.
+Every missing sample is counted once, under its cause (``lost_by``) if that is known: the device
+reported the loss, frames around it were damaged, the port was away, or none of these.
 """
 
 from __future__ import annotations
@@ -55,17 +55,17 @@ RECORDED_RESTARTS = 10_000
 
 GATHER_S = 0.018
 GATHER_SAMPLES = 36
-"""Longest time that the reader lets samples gather, and most samples: waking up costs more than reading a sample.
-The kernel holds 4096 bytes for us."""
+"""Longest time that the reader lets samples gather, and most samples: waking up costs more than
+reading a sample. The kernel holds 4096 bytes for us."""
 
 
 class Acquisition:
     """Reads one device until stopped. ``say`` gets one line for every change of state.
 
-    For every thread: ``source``, ``counters``, ``hello``, ``queue``, ``to_ros_ns``.
-    ``why_full``: asked why the queue is full, by the reader thread.
-    Of the reader thread: ``beat`` (monotonic time, s, of its last round), ``failed`` (the error that ended it).
-    Raises ConfigError if the rig names an unknown source.
+    For every thread: ``source``, ``counters``, ``hello``, ``queue``, ``to_ros_ns``. ``why_full``:
+    asked why the queue is full, by the reader thread. Of the reader thread: ``beat`` (monotonic
+    time, s, of its last round), ``failed`` (the error that ended it). Raises ConfigError if the rig
+    names an unknown source.
     """
 
     def __init__(self, rig: Rig, say: Say) -> None:
@@ -96,7 +96,8 @@ class Acquisition:
         self._clock = ClockWatch(self._period_us, regressed=self.source.clock in (Clock.DEVICE, Clock.COUNTED))
         self._pinger = Pinger()
 
-        # The stream: the first number that is taken, the last one that was, the last stamp that was given, ns.
+        # The stream: the first number that is taken, the last one that was, the last stamp that was
+        # given, ns.
         self._gathered = Gathered()
         self._first_number = 0
         self._last_number = -1
@@ -140,7 +141,8 @@ class Acquisition:
     def stop(self) -> None:
         """Stop the reader and close the port; an Ended item is the last on the queue.
 
-        A source that waits for its device is asked to give up; a reader thread that still hangs is abandoned.
+        A source that waits for its device is asked to give up; a reader thread that still hangs is
+        abandoned.
         """
         self._stop.set()
         if self._thread.ident is None:
@@ -190,7 +192,8 @@ class Acquisition:
     def system_clock_step_ns(self) -> int:
         """How far the system clock has moved against CLOCK_MONOTONIC since the start, ns.
 
-        Stamps do not follow it, because time would jump within a recording. The next start uses the new time.
+        Stamps do not follow it, because time would jump within a recording. The next start uses the
+        new time.
         """
         return time.time_ns() - self.now_ns()
 
@@ -244,8 +247,8 @@ class Acquisition:
     def _gather(self) -> None:
         """Let samples gather before the next read; the last ones of a block are waited for one by one.
 
-        The clock map needs samples and answers to pings that are read as they arrive, and the estimate needs the last
-        sample.
+        The clock map needs samples and answers to pings that are read as they arrive, and the
+        estimate needs the last sample.
         """
         # Without the map, the time of the read is the time of the sample.
         if not self._clock.regressed or self._pinger.awaits(time.monotonic_ns()):
@@ -292,7 +295,8 @@ class Acquisition:
                 return
             self.counters.refused_reopenings += 1
             refusal = str(error)
-            # Report once why the device is refused; a port that is still missing is not worth a line.
+            # Report once why the device is refused; a port that is still missing is not worth a
+            # line.
             if 'no such port' not in refusal and refusal != self._refusal:
                 self._refusal = refusal
                 self._repeats.tell('refused', f'{refusal}; still trying', WARNING, time.monotonic(), NEWS)
@@ -307,8 +311,9 @@ class Acquisition:
     def feed(self, events: Sequence[Event], now: int) -> bool:
         """Sort the frames of one read at ``now`` (CLOCK_MONOTONIC, ns); True if one was a sample.
 
-        The reader thread calls it. Without a reader thread, a caller with its own clock may (a test, a simulation).
-        Raises AnotherDeviceError if a HELLO has another serial number than the first one.
+        The reader thread calls it. Without a reader thread, a caller with its own clock may (a
+        test, a simulation). Raises AnotherDeviceError if a HELLO has another serial number than the
+        first one.
         """
         counters = self.counters
         good = False
@@ -330,7 +335,8 @@ class Acquisition:
                 waiting = self._gathered.seq
                 self._last_number = number
                 if self._clock.torn(number, t):
-                    # Samples from before the clock jumped are stamped by the map that was valid then.
+                    # Samples from before the clock jumped are stamped by the map that was valid
+                    # then.
                     self._hand_over(now)
                     if self._clock.observe(seq, t, now):
                         self._jumped(now)

@@ -23,7 +23,8 @@ class Arrival:
 class Restarted:
     """On the queue: the device restarted; the unfinished block gets no more samples.
 
-    ``change``: what the recording says of it; None if no sample was taken before, or after many restarts.
+    ``change``: what the recording says of it; None if no sample was taken before, or after many
+    restarts.
     """
 
     change: ParameterChange | None

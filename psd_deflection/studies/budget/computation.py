@@ -1,8 +1,8 @@
 """E_C, the method's own error on perfect readings (last row of Table 3.1; 3.9, 3.10 corrected).
 
-For an exact method it is zero. The least squares of chapter 4 are linear: the result is sin theta instead
-of theta, and d is not rotated, d^ - d = -theta z x d + theta^2 l/2. The iteration of section 2.2 stops at
-the first trial angle inside a window, which is always short of the true one.
+For an exact method it is zero. The least squares of chapter 4 are linear: the result is sin theta
+instead of theta, and d is not rotated, d^ - d = -theta z x d + theta^2 l/2. The iteration of
+section 2.2 stops at the first trial angle inside a window, which is always short of the true one.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ def _iteration(at: Situation) -> Contribution:
     short, deviation = window - step / 2.0, step / math.sqrt(12.0)
     if abs(twist) <= window:
         short, deviation = abs(twist), 0.0
-    # The thesis takes d from PSD 1: d = l_1 - R(theta) q_1, so an angle error moves it by that angle times l_1 - d.
+    # The thesis takes d from PSD 1: d = l_1 - R(theta) q_1, so an angle error moves it by that
+    # angle times l_1 - d.
     arm = at.rig.centers[0] + at.rig.zeros[0] - at.pose[:2]
     response = np.array([arm[1], -arm[0], 1.0])
     return Contribution(-math.copysign(short, twist) * response, deviation**2 * np.outer(response, response))

@@ -1,8 +1,8 @@
 """The inputs of the budget besides the rig file, each with default, unit, bounds and source.
 
-A tolerance is the half-width of a uniform distribution (its standard deviation is the half-width over
-sqrt 3). A "typical" value is a standard deviation. The source of a guess begins with "assumption":
-replace these first by values of the real rig.
+A tolerance is the half-width of a uniform distribution (its standard deviation is the half-width
+over sqrt 3). A "typical" value is a standard deviation. The source of a guess begins with
+"assumption": replace these first by values of the real rig.
 """
 
 from __future__ import annotations

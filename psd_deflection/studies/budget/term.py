@@ -1,12 +1,12 @@
 """A term of the budget, and how it becomes deviations of dX, dY and theta.
 
 A term declares a few independent error parameters, each with a standard deviation, and how their
-values change the measuring chain. Two calculations use this. First order: half the difference of the
-exact chain's readings at plus and minus one deviation, times the Jacobian of the estimator. Some
-parameters act as a square (a tilted sensor is foreshortened by a^2/2 either way) or as a product with
-another, so the second order is added: the mean of the two readings gives a bias and adds 2 bias^2 to
-the variance, and the mixed difference adds its square (GUM 5.1.2, note, for normal distributions).
-Monte Carlo: normal values, the exact chain, the exact estimator.
+values change the measuring chain. Two calculations use this. First order: half the difference of
+the exact chain's readings at plus and minus one deviation, times the Jacobian of the estimator.
+Some parameters act as a square (a tilted sensor is foreshortened by a^2/2 either way) or as a
+product with another, so the second order is added: the mean of the two readings gives a bias and
+adds 2 bias^2 to the variance, and the mixed difference adds its square (GUM 5.1.2, note, for normal
+distributions). Monte Carlo: normal values, the exact chain, the exact estimator.
 
 A *known* term is not random (the tilt that a flat model leaves out). It has one parameter, present
 or absent, and its effect is a bias with a sign.
@@ -135,7 +135,8 @@ class Term(Cause):
     """A cause that acts on the measuring chain.
 
     ``deviations``: of its k error parameters, at a situation. ``apply``: returns the chain with
-    values (n, k) of these parameters; for a known term the value is 1 if it is present and 0 if not.
+    values (n, k) of these parameters; for a known term the value is 1 if it is present and 0 if
+    not.
     """
 
     name: str

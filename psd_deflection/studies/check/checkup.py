@@ -39,9 +39,9 @@ _LOADS = tuple(ALONE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckProblem:
-    """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``, ``drift_sd`` (4,): m/s, of
-    the device's channels x1 y1 x2 y2. ``source``: the recording, '' at the bench. ``late``: loads whose noted time
-    is not that of their motion.
+    """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``,
+    ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``source``: the recording, '' at
+    the bench. ``late``: loads whose noted time is not that of their motion.
     """
 
     rig: Rig

@@ -1,4 +1,5 @@
-"""The answer of check: what the rig file has wrong, how sure that is, and the lines that put it right."""
+"""The answer of check: what the rig file has wrong, how sure that is, and the lines that put it
+right."""
 
 from __future__ import annotations
 
@@ -51,10 +52,11 @@ WIRED = ('channel_sign', 'axis_swap', 'psd_swap')
 class Finding:
     """One thing that is not as the rig file or the recording says.
 
-    ``name``: one of ``NAMES``. ``where``: channel, PSD or load, or when. ``value``: -1 for a turned sign, a factor, s
-    late, or what hung: N, N, N m. ``fix``: the line for the rig file, or what to do. ``evidence``: how much more of the
-    movement (summed over the pushes) the rig file leaves unexplained. ``equivalent``: other causes that look the same
-    to first order. Raises ValueError for another name.
+    ``name``: one of ``NAMES``. ``where``: channel, PSD or load, or when. ``value``: -1 for a turned
+    sign, a factor, s late, or what hung: N, N, N m. ``fix``: the line for the rig file, or what to
+    do. ``evidence``: how much more of the movement (summed over the pushes) the rig file leaves
+    unexplained. ``equivalent``: other causes that look the same to first order. Raises ValueError
+    for another name.
     """
 
     name: str
@@ -83,9 +85,10 @@ def finding_tree(finding: Finding) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Checkup(StudyResult):
-    """``findings``: what is wrong. ``values``: parameters for the rig file. ``sizes``: movement of each push over
-    the expected one, NaN if it was not seen. ``found``: the wirings that explain the pushes. ``drift``, ``drift_sd``
-    (4,): m/s, of the device's channels x1 y1 x2 y2. ``notes``: what else is worth a look. ``source``: the recording.
+    """``findings``: what is wrong. ``values``: parameters for the rig file. ``sizes``: movement of
+    each push over the expected one, NaN if it was not seen. ``found``: the wirings that explain the
+    pushes. ``drift``, ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``notes``: what
+    else is worth a look. ``source``: the recording.
     """
 
     study, json_name = 'check', 'check.json'

@@ -15,8 +15,8 @@ LEAST_DAMPING, MOST_DAMPING = 1e-6, 0.7
 class Mode:
     """One mode on one axis.
 
-    ``frequency``, Hz, undamped; ``damping``: ratio; ``*_sd``: standard deviations. ``amplitude``: largest of the
-    stretches at their start, m or rad; of a spectrum, rms.
+    ``frequency``, Hz, undamped; ``damping``: ratio; ``*_sd``: standard deviations. ``amplitude``:
+    largest of the stretches at their start, m or rad; of a spectrum, rms.
     """
 
     frequency: float
@@ -30,9 +30,9 @@ class Mode:
 class AxisModes:
     """The modes of one axis, the loudest first.
 
-    ``how``: fitted to the link ringing alone, or to the spectrum of its motion in operation; ``none`` if it does not
-    move. ``stretches``: first and last sample of each. ``fitted`` (n,): the fit, NaN between the
-    stretches. ``noise``: standard deviation of a sample, m or rad.
+    ``how``: fitted to the link ringing alone, or to the spectrum of its motion in operation;
+    ``none`` if it does not move. ``stretches``: first and last sample of each. ``fitted`` (n,): the
+    fit, NaN between the stretches. ``noise``: standard deviation of a sample, m or rad.
     """
 
     modes: tuple[Mode, ...]

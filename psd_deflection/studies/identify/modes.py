@@ -4,12 +4,14 @@ A link that is left alone rings down: after a step of the load, or a knock,
 
     q(t) = c + e t + sum over the modes of exp(-zeta w t) (a cos w_d t + b sin w_d t),  w_d = w sqrt(1 - zeta^2)
 
-Stretches of a recording in which this holds to the noise are found, and frequency and damping of each mode are
-fitted to all of them at once. What is linear (c, e, a, b of each stretch) is solved for on the way (variable
-projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973). The search begins where most of the motion is
-ringing. How many modes there are is told by what a fit leaves: two that beat look like one for a few periods only.
+Stretches of a recording in which this holds to the noise are found, and frequency and damping of
+each mode are fitted to all of them at once. What is linear (c, e, a, b of each stretch) is solved
+for on the way (variable projection; Golub and Pereyra, SIAM J. Numer. Anal. 10, 413, 1973). The
+search begins where most of the motion is ringing. How many modes there are is told by what a fit
+leaves: two that beat look like one for a few periods only.
 
-If the link never rings alone, its mode is that of its spectrum (:mod:`psd_deflection.studies.identify.operation`).
+If the link never rings alone, its mode is that of its spectrum
+(:mod:`psd_deflection.studies.identify.operation`).
 """
 
 from __future__ import annotations
@@ -37,9 +39,11 @@ LOUD = 8.0
 MISFIT = 1.25
 """Factor of the noise that a stretch may leave..."""
 SHARE = 0.01
-"""...plus this share of the ringing, because no link is linear to the last digit. A smaller mode is none either."""
+"""...plus this share of the ringing, because no link is linear to the last digit. A smaller mode is
+none either."""
 SEEDS, GROWN = 30, 3
-"""Windows that are tried as the beginning of a stretch, and of those that fit so many are let grow."""
+"""Windows that are tried as the beginning of a stretch, and of those that fit so many are let grow.
+"""
 APART = (0.01, 0.025, 0.06)
 """Two modes that look like one may lie so far to either side of it, as a share of its frequency."""
 RESCANS = 3
@@ -100,7 +104,8 @@ class _Stretch:
     def solved(self, modes: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
         """What is left (n,), and the linear terms."""
         basis = _basis(self.t, modes)
-        # Normal equations of columns of one size: five times as fast as a decomposition, and well conditioned here.
+        # Normal equations of columns of one size: five times as fast as a decomposition, and well
+        # conditioned here.
         sizes = np.sqrt((basis * basis).sum(axis=0)) + 1e-300
         scaled = basis / sizes
         terms = np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(sizes)), scaled.T @ self.y) / sizes
@@ -257,8 +262,8 @@ def _stretches(
 ) -> tuple[list[_Stretch], Modes]:
     """Where the link rings alone, and the modes by the longest of these.
 
-    A window moves over the recording. Where it fits, it grows until it does not fit any more, so that a stretch
-    ends before the next blow.
+    A window moves over the recording. Where it fits, it grows until it does not fit any more, so
+    that a stretch ends before the next blow.
     """
     period = rate / modes[0][0]
     window, hop = round(WINDOW * period), max(1, round(0.5 * period))
@@ -416,7 +421,8 @@ def _variance_of(fit: _Rung, stretches: Sequence[_Stretch]) -> float:
 def _variance_at(fit: _Rung, stretches: Sequence[_Stretch], rate: float, frequency: float) -> float:
     """Variance of white noise with the density that what is left has about ``frequency``.
 
-    At least the variance of what is left. The modes have taken away their part of it, there and in all.
+    At least the variance of what is left. The modes have taken away their part of it, there and in
+    all.
     """
     from scipy.signal import periodogram
 

@@ -1,12 +1,12 @@
 """The mode of a link that never rings alone: from the spectrum of its motion in operation.
 
-What drives the link was not measured, so the spectrum is fitted with that of a mode that noise of an unknown colour
-drives:
+What drives the link was not measured, so the spectrum is fitted with that of a mode that noise of
+an unknown colour drives:
 
     S(f) = A (f/f0)^-s / ((f0^2 - f^2)^2 + (2 zeta f0 f)^2) + B
 
-by the likelihood of its periodogram (Whittle, Arkiv for Matematik 2, 423, 1953), which gives the uncertainties too.
-A spectrum that does not look like this gives no mode.
+by the likelihood of its periodogram (Whittle, Arkiv for Matematik 2, 423, 1953), which gives the
+uncertainties too. A spectrum that does not look like this gives no mode.
 """
 
 from __future__ import annotations

@@ -26,7 +26,8 @@ CLOSE = 0.3
 AGREE = 0.005
 """X and Y agree within this share of the frequency."""
 KNOWN = (0.01, 0.34)
-"""Standard deviations of frequency and damping ratio, as shares, beyond which the rig file keeps what it has."""
+"""Standard deviations of frequency and damping ratio, as shares, beyond which the rig file keeps
+what it has."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ class Identified(StudyResult):
     def values(self) -> dict[str, float]:
         """Parameters of the rig file. Bending is the surer of X and Y, for which the file has one value.
 
-        None of a mode that is not known well, that has another close to it, or that X and Y do not agree on.
+        None of a mode that is not known well, that has another close to it, or that X and Y do not
+        agree on.
         """
         out: dict[str, float] = {}
         for name, axes in KINDS.items():

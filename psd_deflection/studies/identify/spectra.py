@@ -1,4 +1,5 @@
-"""Where the motion of an axis stands out of its noise: peaks of the spectrum, white noise and noise that remembers."""
+"""Where the motion of an axis stands out of its noise: peaks of the spectrum, white noise and noise
+that remembers."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ def white_noise(samples: FloatArray) -> float:
     """Standard deviation of the noise of one sample: fourth differences, which no slow motion reaches."""
     difference = np.diff(samples, 4)
     difference = difference[np.isfinite(difference)]
-    # The sum of squares of 1 4 6 4 1 is 70. The quietest quarter: in the rest the link may be struck.
+    # The sum of squares of 1 4 6 4 1 is 70. The quietest quarter: in the rest the link may be
+    # struck.
     pieces = np.array_split(difference, max(1, len(difference) // 500))
     scatter = sorted(float(np.mean(p * p)) for p in pieces if len(p))
     return math.sqrt(float(np.mean(scatter[: max(1, len(scatter) // 4)])) / 70.0)
