@@ -30,7 +30,8 @@ from blind.render import Pose, Scene, photograph
 from msg_adapters import ACCELERATION, LOAD, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.compensation.arm import read_arm
-from psd_deflection.arms.compensation.compensator import CompensatorSettings, State
+from psd_deflection.arms.compensation.compensator import State
+from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.arms.compensation.shaping import ShaperSettings
 from psd_deflection.arms.compensation.trajectory import KINK_S, Trajectory
 from psd_deflection.base.log import unsaid
@@ -185,7 +186,7 @@ class Attacked(ABC):
     every: ClassVar[int] = 6
     """So many strange messages come between what is right."""
 
-    def __init__(self, owner: BaseNode) -> None:
+    def __init__(self, owner: BaseNode[Any]) -> None:
         self.owner = owner
         self.hand: Callable[[str, bytes], None] = lambda topic, content: None
 

@@ -280,7 +280,7 @@ def _until(condition: Any, what: str, program: Program) -> None:
 
 def _on_graph(node: Any, name: str, program: Program) -> dict[str, Any]:
     """The inputs of the node ``name`` and their classes."""
-    from psd_deflection.ros.wires import message_class
+    from psd_deflection.ros.endpoints import message_class
 
     found: dict[str, Any] = {}
 

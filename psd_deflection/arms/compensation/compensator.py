@@ -26,8 +26,7 @@ import numpy as np
 
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.arm import Arm
-from psd_deflection.arms.compensation.settings import AXES, COMMANDS
-from psd_deflection.arms.compensation.settings import CompensatorSettings as CompensatorSettings
+from psd_deflection.arms.compensation.settings import AXES, COMMANDS, CompensatorSettings
 from psd_deflection.arms.inputs import LARGEST_POSITION
 from psd_deflection.records import FloatArray
 
