@@ -167,3 +167,28 @@ def test_times_that_need_no_map_go_through_as_they_are(t: int) -> None:
     watched.reply(1000, BOOT, BOOT + MS)
     assert host_of(watched, t) == t
     assert watched.state().round_trip_ns is None
+
+
+def test_after_a_burst_of_ten_times_the_rate_the_clock_is_followed_again() -> None:
+    """Against the contract: the numbers run ahead of the time, a little at each sample."""
+    watched = watch()
+    seq = t_us = 0
+
+    def read(samples: int, step_us: int, late_ns: int) -> None:
+        nonlocal seq, t_us
+        events = []
+        for _ in range(samples):
+            seq, t_us = seq + 1, t_us + step_us
+            events.append(sample(seq, t_us))
+        watched.newest(events, BOOT + t_us * 1000 + late_ns)
+        for event in events:
+            watched.torn(event.seq, event.t_device_us)
+
+    read(20, 1000, 0)
+    watched.lay_anew(seq, seq, t_us, BOOT + t_us * 1000 + 40 * MS)
+    for _ in range(3):
+        read(200, 100, 40 * MS)
+    for _ in range(1500):
+        read(20, 1000, 0)
+        watched.to_host_ns(np.array([t_us], np.int64))
+    assert abs(host_of(watched, t_us) - BOOT - t_us * 1000) < MS

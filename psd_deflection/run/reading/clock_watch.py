@@ -59,10 +59,24 @@ class ClockWatch:
                 # Repeated: it carries no information.
                 return False
             passed = (seq - last_seq) % WRAP * self._period_us
-            if abs(t_us - last_t - passed) > TORN_US:
+            if abs(t_us - last_t - passed) > TORN_US and self._torn_within(events):
                 # The clock may have jumped within this read: only a look at each sample tells.
                 return False
         return self.observe(seq, t_us, now)
+
+    def _torn_within(self, events: Sequence[Event]) -> bool:
+        """Whether a step in time between neighbours disagrees with the step in number.
+
+        If none does, the device is only faster than it says, and its clock must still be followed.
+        """
+        last = self._taken
+        for event in events:
+            if type(event) is SampleFrame or type(event) is Sample:
+                _, seq, t_us, _ = event
+                if last is None or abs(t_us - last[1] - (seq - last[0]) % WRAP * self._period_us) > TORN_US:
+                    return True
+                last = seq, t_us
+        return False
 
     def observe(self, seq: int, t_us: int, now: int) -> bool:
         """Give the map one sample that was read at ``now``; True if the clock jumped and the map restarted."""
