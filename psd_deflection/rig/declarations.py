@@ -210,6 +210,13 @@ class EstimatorConfig:
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
+    vibration: str = parameter(
+        'widen',
+        '',
+        'what vibrates faster than a block can follow: widen the covariance by it and say so, or ignore it',
+        choices=('widen', 'ignore'),
+        before='ignore',
+    )
     arithmetic: str = parameter(
         'fixed',
         '',

@@ -20,6 +20,7 @@ from psd_deflection.measure.uncertainty.combinations import Left
 from psd_deflection.measure.uncertainty.consistency import LIMIT, UNMEASURED, Consistency, ConsistencyCheck, Suspect
 from psd_deflection.measure.uncertainty.noise import StreamNoise
 from psd_deflection.measure.uncertainty.redundancy import Redundancy, survival
+from psd_deflection.measure.uncertainty.vibration import Tone, words_of
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.plate.plate import Tilts, flat_points, flat_poses, plate_points, reading_slopes, tied_pose
 from psd_deflection.records import FloatArray, IntArray, dot_names
@@ -27,6 +28,7 @@ from psd_deflection.rig.config import Rig
 
 NOISE, SEGMENT = 'state.noise', 'state.noise_segment'
 FIT, HELD_RESIDUAL = 'state.block_fit', 'state.residual'
+VIBRATION, SUMS = 'state.vibration', 'state.sums_segment'
 REDUNDANCY, SOME = 'state.redundancy', 'state.psds.'
 """Names under which :meth:`StampedDots.memory` tells what is remembered; ``SOME`` goes on with the
 PSDs (from 0) that are kept."""
@@ -96,9 +98,10 @@ class SomePsds:
         # Of a plate whose tilt is not known, dots may contradict each other.
         self._redundancy = Redundancy(len(at), 2 * len(at) if tilts == 'bounded' else rest.shape[1], by)
 
-    def set_noise(self, gamma: FloatArray) -> None:
-        """Use their part of the autocovariance of all readings."""
-        self.fit.set_noise(gamma[np.ix_(self.columns, self.columns)])
+    def set_noise(self, noise: StreamNoise) -> None:
+        """Use their part of what is known of all readings."""
+        own = np.ix_(self.columns, self.columns)
+        self.fit.set_noise(noise.gamma[own], [Tone(t.frequency, t.covariance[own]) for t in noise.tones])
 
     def check(
         self,
@@ -143,11 +146,11 @@ class StampedDots:
     ``active``: whether it says more than the mean of the samples and the rig file's noise. ``contradictions``: blocks
     whose readings contradict each other. ``misfits``: blocks with motion that the fit cannot follow. ``chi_square``:
     of the last block's readings, of ``freedom`` degrees. ``left_out``: PSDs (from 1) without which the last block was
-    solved.
+    solved. ``vibrates``: what is faster than a block can follow, such as "14 um rms near 87 Hz"; '' if nothing is.
     """
 
     part = 'the fit and the noise of the dots'
-    remembers = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY, SOME)
+    remembers = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY, SOME, VIBRATION, SUMS)
 
     def __init__(self, rig: Rig, flat: bool = True, tilts: Tilts = 'none') -> None:
         """``flat``: the PSDs are on the plate, and the base line between the dots keeps its length.
@@ -169,6 +172,10 @@ class StampedDots:
         self._all: PlateModel | None = None
         slopes = self._rest_slopes(rig)
         self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes, self._left, by)
+        self._volt: FloatArray | None = None
+        if self._measures and config.vibration == 'widen':
+            self._volt = rig.sensitivities.mean(axis=1)
+            self.noise.look_for_tones(len(rig.psds))
         self._stated_sd = np.sqrt(variances)
         self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes, by)
         self._fit.set_noise(self.noise.gamma)
@@ -181,6 +188,7 @@ class StampedDots:
         self.freedom = 1
         self._rig = rig
         self._size = config.block_size
+        self.vibrates = ''
         self.contradictions = 0
         self.chi_square = 0.0
         self.misfits = 0
@@ -194,7 +202,7 @@ class StampedDots:
         slopes = self._rest_slopes(rig)
         self.noise.set_geometry(rig.centers, self._beams, slopes, self._left)
         self._fit.set_geometry(rig.centers, self._beams, slopes)
-        self._fit.set_noise(self.noise.gamma)
+        self._use_noise()
         self._suspect = Suspect(rig.centers, self._beams)
         self._consistency = Consistency(self._by)
         if slopes is not None:
@@ -217,7 +225,7 @@ class StampedDots:
         found = self._some.get(kept)
         if found is None:
             found = self._some[kept] = SomePsds(self._rig, kept, tilts, self._poly)
-            found.set_noise(self.noise.gamma)
+            found.set_noise(self.noise)
             if kept in self._told:
                 found.set_state(self._told.pop(kept))
         return found
@@ -284,17 +292,23 @@ class StampedDots:
         """Whether the readings of some PSDs agree with each other, and are enough to tell."""
         return some.agree(dots, residual, covariance, pose, self._times)
 
-    def learn(self, index: int, slots: IntArray, samples: FloatArray) -> bool:
-        """Take a good block into what is known of the noise; True if that changed.
+    def learn(self, index: int, slots: IntArray, samples: FloatArray, sums: FloatArray) -> bool:
+        """Take a good block into what is known of the noise; True if that changed. ``sums`` (n, P), V.
 
         Nothing of this block's estimate waits for it.
         """
-        if not (self._measures and self.noise.add(index, slots, samples)):
+        if not self._measures:
             return False
-        self._fit.set_noise(self.noise.gamma)
+        if not self.noise.add(index, slots, samples, None if self._volt is None else sums * self._volt):
+            return False
+        self._use_noise()
         for some in self._some.values():
-            some.set_noise(self.noise.gamma)
+            some.set_noise(self.noise)
         return True
+
+    def _use_noise(self) -> None:
+        self._fit.set_noise(self.noise.gamma, self.noise.tones)
+        self.vibrates = words_of(self.noise.tones, self._rig.converter.sample_rate_hz)
 
     def suspect(self, index: int, dots: tuple[float, ...], checked: ConsistencyCheck) -> None:
         """Take a block into the search for a wrong reading: each that contradicts itself, of the others some."""
@@ -322,6 +336,7 @@ class StampedDots:
             ('blocks whose readings contradict each other', str(self.contradictions)),
             ('blocks with motion that the fit cannot follow', str(self.misfits)),
             ('covariance from', f'noise {self.noise_source()}' if self._measures else 'noise of the rig file'),
+            *((('vibrates', self.vibrates or 'no'),) if self._volt is not None else ()),
             *(self.noise_words() if self._measures else ()),
         )
 
@@ -354,8 +369,14 @@ class StampedDots:
         out: Memory = {}
         if self._measures:
             out[NOISE] = self.noise.state()
+            if self.noise.tones:
+                out[VIBRATION] = tuple(
+                    v for t in self.noise.tones for v in (t.frequency, *t.covariance.ravel().tolist())
+                )
             if segment := self.noise.segment():
                 out[SEGMENT] = segment
+                if sums := self.noise.sums():
+                    out[SUMS] = sums
         if self.active:
             out[FIT] = self._fit.state()
         said = self._consistency
@@ -373,8 +394,10 @@ class StampedDots:
         if noise := numbers(values, NOISE, 'the noise of this rig'):
             self.noise.set_state(noise)
             # Recordings from before segments were told began a new one.
-            self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or ())
-            self._fit.set_noise(self.noise.gamma)
+            sums = numbers(values, SUMS, 'sum signals of a segment') or ()
+            self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or (), sums)
+            self.noise.tones = _tones(numbers(values, VIBRATION, 'what vibrates') or (), 2 * len(self._beams))
+            self._use_noise()
         if fit := numbers(values, FIT, 'the fit of this rig'):
             self._fit.set_state(fit)
         if residual := numbers(values, HELD_RESIDUAL, 'what the residual was lately', 1, 3):
@@ -399,3 +422,12 @@ class StampedDots:
         if len(kept) < 2 or max(kept) >= len(self._beams):
             raise ValueError(f'{name}: expected two or more of {len(self._beams)} PSDs')
         return kept
+
+
+def _tones(values: tuple[float, ...], count: int) -> tuple[Tone, ...]:
+    """Tones of ``count`` readings of what was told of them. Raises ValueError if they were of others."""
+    each = 1 + count * count
+    if len(values) % each:
+        raise misfit(VIBRATION, values, f'{each} numbers for each tone')
+    rows = np.reshape(values, (-1, each))
+    return tuple(Tone(float(row[0]), row[1:].reshape(count, count)) for row in rows)
