@@ -411,7 +411,7 @@ class Pipeline:
         sound = status is BlockStatus.OK and not findings
         # Of this block: what it has to say counts from the next one on.
         vibrates = self.stamped.vibrates
-        changed = sound and self.stamped.learn(seen.index, seen.slots, seen.samples, seen.sums)
+        changed = sound and self.stamped.learn(seen.index, seen.slots, seen.samples, volts)
         if changed and self.motion_filter is not None:
             self.motion_filter.set_noise(self.stamped.noise.gamma)
         if answer.complete and used is not None and used.checked is not None:

@@ -217,6 +217,14 @@ class EstimatorConfig:
         choices=('widen', 'ignore'),
         before='ignore',
     )
+    converter_steps: str = parameter(
+        'seen',
+        '',
+        'steps of the converter that the covariance has: those that the samples show if they are coarser than '
+        "converter.bits says (seen), or the rig file's (file)",
+        choices=('seen', 'file'),
+        before='file',
+    )
     arithmetic: str = parameter(
         'fixed',
         '',

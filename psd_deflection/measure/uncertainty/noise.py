@@ -119,6 +119,12 @@ class StreamNoise:
         self._blocks: list[tuple[int, IntArray, FloatArray]] = []
         self.gamma = self._from_file()
 
+    def set_steps(self, steps: FloatArray) -> None:
+        """Use the converter's ``steps`` (C,), m, from now on."""
+        self._steps = steps
+        self._step = float(steps.max())
+        self.gamma = self._in_use()
+
     def look_for_tones(self, sums: int) -> None:
         """From now on; so many sum signals are told with the readings."""
         self._signals = sums

@@ -18,17 +18,18 @@ from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, Fitted
 from psd_deflection.measure.uncertainty.combinations import Left
 from psd_deflection.measure.uncertainty.consistency import LIMIT, UNMEASURED, Consistency, ConsistencyCheck, Suspect
+from psd_deflection.measure.uncertainty.converter import ConverterSteps, Volts
 from psd_deflection.measure.uncertainty.noise import StreamNoise
 from psd_deflection.measure.uncertainty.redundancy import Redundancy, survival
 from psd_deflection.measure.uncertainty.vibration import Tone, words_of
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.plate.plate import Tilts, flat_points, flat_poses, plate_points, reading_slopes, tied_pose
-from psd_deflection.records import FloatArray, IntArray, dot_names
+from psd_deflection.records import FloatArray, IntArray, channel_names, dot_names
 from psd_deflection.rig.config import Rig
 
 NOISE, SEGMENT = 'state.noise', 'state.noise_segment'
 FIT, HELD_RESIDUAL = 'state.block_fit', 'state.residual'
-VIBRATION, SUMS = 'state.vibration', 'state.sums_segment'
+VIBRATION, SUMS, STEPS = 'state.vibration', 'state.sums_segment', 'state.converter_steps'
 REDUNDANCY, SOME = 'state.redundancy', 'state.psds.'
 """Names under which :meth:`StampedDots.memory` tells what is remembered; ``SOME`` goes on with the
 PSDs (from 0) that are kept."""
@@ -150,7 +151,7 @@ class StampedDots:
     """
 
     part = 'the fit and the noise of the dots'
-    remembers = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY, SOME, VIBRATION, SUMS)
+    remembers = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY, SOME, VIBRATION, SUMS, STEPS)
 
     def __init__(self, rig: Rig, flat: bool = True, tilts: Tilts = 'none') -> None:
         """``flat``: the PSDs are on the plate, and the base line between the dots keeps its length.
@@ -176,6 +177,9 @@ class StampedDots:
         if self._measures and config.vibration == 'widen':
             self._volt = rig.sensitivities.mean(axis=1)
             self.noise.look_for_tones(len(rig.psds))
+        self._converter: ConverterSteps | None = None
+        if self._measures and config.converter_steps == 'seen':
+            self._converter = ConverterSteps.of_rig(rig)
         self._stated_sd = np.sqrt(variances)
         self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes, by)
         self._fit.set_noise(self.noise.gamma)
@@ -292,19 +296,33 @@ class StampedDots:
         """Whether the readings of some PSDs agree with each other, and are enough to tell."""
         return some.agree(dots, residual, covariance, pose, self._times)
 
-    def learn(self, index: int, slots: IntArray, samples: FloatArray, sums: FloatArray) -> bool:
-        """Take a good block into what is known of the noise; True if that changed. ``sums`` (n, P), V.
+    def learn(self, index: int, slots: IntArray, samples: FloatArray, volts: Volts) -> bool:
+        """Take a good block into what is known of the noise; True if that changed. ``volts`` (n, 3P): x y sum of each.
 
         Nothing of this block's estimate waits for it.
         """
         if not self._measures:
             return False
-        if not self.noise.add(index, slots, samples, None if self._volt is None else sums * self._volt):
+        changed = self._converter is not None and self._converter.add(volts)
+        if changed:
+            self._use_steps()
+        sums = None if self._volt is None else np.multiply(volts[:, 2::3], self._volt, dtype=np.float64)
+        changed |= self.noise.add(index, slots, samples, sums)
+        if not changed:
             return False
         self._use_noise()
         for some in self._some.values():
             some.set_noise(self.noise)
         return True
+
+    def _use_steps(self) -> None:
+        """Those of the rig file where the samples show none that are coarser."""
+        if self._converter is None:
+            return
+        rig = self._rig
+        seen = self._converter.steps.reshape(-1, 3)[:, :2]
+        steps = np.maximum(seen, rig.converter.volts_per_count) * rig.sensitivities
+        self.noise.set_steps(steps.ravel())
 
     def _use_noise(self) -> None:
         self._fit.set_noise(self.noise.gamma, self.noise.tones)
@@ -337,6 +355,7 @@ class StampedDots:
             ('blocks with motion that the fit cannot follow', str(self.misfits)),
             ('covariance from', f'noise {self.noise_source()}' if self._measures else 'noise of the rig file'),
             *((('vibrates', self.vibrates or 'no'),) if self._volt is not None else ()),
+            *self._step_words(),
             *(self.noise_words() if self._measures else ()),
         )
 
@@ -350,6 +369,14 @@ class StampedDots:
     def _of_freedom(self) -> str:
         """With two PSDs it is always one degree."""
         return '' if self._redundancy is None else f' of {self.freedom} degrees of freedom'
+
+    def _step_words(self) -> tuple[tuple[str, str], ...]:
+        if self._converter is None or not self._converter.steps.any():
+            return ()
+        said = self._rig.converter.volts_per_count * 1e3
+        seen = zip(channel_names(len(self._beams)), self._converter.steps.tolist(), strict=True)
+        words = ', '.join(f'{name} {step * 1e3:.3g} mV' for name, step in seen if step)
+        return (('steps of the converter', f'{words} (rig file {said:.3g} mV)'),)
 
     def noise_words(self) -> tuple[tuple[str, str], ...]:
         """Of each reading, the noise of a sample and of a block's mean against the rig file's, um."""
@@ -377,6 +404,8 @@ class StampedDots:
                 out[SEGMENT] = segment
                 if sums := self.noise.sums():
                     out[SUMS] = sums
+        if self._converter is not None and (steps := self._converter.state()):
+            out[STEPS] = steps
         if self.active:
             out[FIT] = self._fit.state()
         said = self._consistency
@@ -391,6 +420,10 @@ class StampedDots:
 
     def restore(self, values: Mapping[str, Value]) -> None:
         """Go on from another one's :meth:`memory`. Raises ValueError if it had another block size or other PSDs."""
+        steps = numbers(values, STEPS, 'the steps of these channels')
+        if steps and self._converter is not None:
+            self._converter.set_state(steps)
+            self._use_steps()
         if noise := numbers(values, NOISE, 'the noise of this rig'):
             self.noise.set_state(noise)
             # Recordings from before segments were told began a new one.
