@@ -20,7 +20,7 @@ from blind import generator
 from blind.campaign import options
 from blind.generator import Array
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.records import DeflectionEstimate, RawChunk
+from psd_deflection.records import DeflectionEstimate, RawChunk, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
 
 SIZE = 20
@@ -65,6 +65,10 @@ ROWS = (
     Row('unequal channels', sigmas=(1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3), stated=True),
 )
 UNEQUAL = ROWS[-1]
+TONES = (5.0, 20.0, 45.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)
+"""Hz of a steady vibration."""
+SHAKEN = (8e-6, 20e-6, 0.1e-3)
+"""Its amplitudes: dX, dY m, theta rad, each with a phase of its own."""
 
 
 class Inside(NamedTuple):
@@ -179,6 +183,42 @@ def score(row: Row, loss: str, *, rest_s: int = 100, steps: int = 16, seed: int 
     )
 
 
+class Shaken(NamedTuple):
+    """A link that vibrates steadily. ``sd`` (3,): median of the published ones. ``named``: share of the blocks that say
+    that it vibrates; ``told``: of those whose error is beyond 3 standard deviations, NaN if there are none.
+    """
+
+    inside: Inside
+    sd: tuple[float, float, float]
+    named: float
+    told: float
+    words: str
+
+
+def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **overrides: object) -> Shaken:
+    """A link without load that vibrates with that frequency and the amplitudes ``SHAKEN``, from the first sample on."""
+    n = seconds * int(generator.RATE)
+    t = np.arange(n * generator.FINER) / (generator.RATE * generator.FINER)
+    phases = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi, 3)
+    fine = np.sin(2.0 * np.pi * hz * t[:, None] + phases) * SHAKEN
+    pipeline = Pipeline(rig(row, **overrides))
+    seq = np.arange(n)
+    volts = volts_of(row, _optics(fine), seed).astype(np.float32)
+    records = list(pipeline.process(RawChunk(seq, seq * 1_000_000, volts, np.zeros(n, np.uint8))))
+    got = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary and r.block >= 2 * SETTLED]
+    spots = [r for r in records if isinstance(r, SpotMeans)]
+    words = {s.index: next((f for f in s.findings if f.startswith('vibrates')), '') for s in spots}
+    block = np.array([e.block for e in got])
+    error = np.array([(e.dx, e.dy, e.theta) for e in got]) - _middles(fine)[block]
+    covariance = np.array([e.covariance for e in got]).reshape(-1, 3, 3)
+    sd = np.sqrt(np.einsum('nii->ni', covariance))
+    named = np.array([bool(words[b]) for b in block.tolist()])
+    beyond = (np.abs(error) > 3.0 * sd).any(axis=1)
+    x, y, theta = np.median(sd, axis=0).tolist()
+    told = float(named[beyond].mean()) if beyond.any() else float('nan')
+    return Shaken(inside(error, covariance), (x, y, theta), float(named.mean()), told, words[int(block[-1])])
+
+
 def alarms(row: Row, seed: int) -> tuple[int, int]:
     """Blocks of a faultless recording whose readings are said to contradict each other, and all its blocks.
 
@@ -205,15 +245,19 @@ def false_alarms(seeds: int, rows: int | None = None) -> int:
     return 0
 
 
-def coarse(poses: int = 150, seed: int = 1) -> Inside:
-    """A 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses."""
+def coarse(poses: int = 150, seed: int = 1, *, told: bool = True, **overrides: object) -> Inside:
+    """A 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses.
+
+    ``told``: the rig file says so, not 16 bit.
+    """
     rng = np.random.default_rng(seed)
     row = Row('10 bit', bits=10)
+    more = {'converter.bits': 10 if told else 16, **overrides}
     errors, covariances = [], []
     for _ in range(poses):
         pose = rng.uniform(-1.0, 1.0, 3) * (1e-3, 1e-3, 1e-2)
         volts = volts_of(row, _optics(np.tile(pose, (120 * SIZE * generator.FINER, 1))), int(rng.integers(1 << 30)))
-        for e in estimates(Pipeline(rig(row)), volts, np.ones(len(volts), bool))[100:]:
+        for e in estimates(Pipeline(rig(row, **more)), volts, np.ones(len(volts), bool))[100:]:
             errors.append(np.array((e.dx, e.dy, e.theta)) - pose)
             covariances.append(np.array(e.covariance).reshape(3, 3))
     return inside(np.array(errors), np.array(covariances))
@@ -297,6 +341,28 @@ def over_the_bound(
     return {name: np.sqrt(np.square(found).mean(axis=0)) / bound(row) for name, found in poses.items()}
 
 
+SHAKEN_HEAD = '| Hz | ΔX | ΔY | θ | joint | within 3 sd | ΔY: rms error, µm | sd, µm | named | named beyond 3 sd |'
+
+
+def vibrations(seeds: int) -> int:
+    """Print a row for each of ``TONES``: the mean of so many runs, each with phases and noise of its own."""
+    print(SHAKEN_HEAD)
+    print('|---' * (SHAKEN_HEAD.count('|') - 1) + '|')
+    for hz in TONES:
+        runs = [shaken(hz, seconds=16, seed=seed) for seed in range(1, seeds + 1)]
+        shares = np.mean([(*r.inside.axes, r.inside.joint) for r in runs], axis=0)
+        three = float(np.mean([r.inside.three for r in runs]))
+        rms = float(np.sqrt(np.mean([r.inside.rms[1] ** 2 for r in runs])))
+        sd = float(np.mean([r.sd[1] for r in runs]))
+        named = float(np.mean([r.named for r in runs]))
+        beyond = [r.told for r in runs if not np.isnan(r.told)]
+        told = f'{np.mean(beyond):.3f}' if beyond else 'none beyond'
+        inner = ' | '.join(f'{v:.3f}' for v in shares)
+        size = f'{rms * 1e6:.2f} | {sd * 1e6:.2f}'
+        print(f'| {hz:g} | {inner} | {three:.4f} | {size} | {named:.3f} | {told} |', flush=True)
+    return 0
+
+
 HEAD = '| noise | loss | rest: ΔX | ΔY | θ | joint | ringing: ΔX | ΔY | θ | joint | within 3 sd | alarms |'
 
 
@@ -319,7 +385,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         '--alarms', type=int, metavar='SEEDS', help='instead: false alarms of faultless rigs, each by so many seeds'
     )
+    parser.add_argument(
+        '--vibration',
+        type=int,
+        metavar='SEEDS',
+        help='instead: a link that vibrates steadily, each tone by so many seeds',
+    )
     args = parser.parse_args(argv)
+    if args.vibration:
+        return vibrations(args.vibration)
     if args.alarms:
         return false_alarms(args.alarms, args.rows)
     if args.faults:
@@ -331,16 +405,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     pairs = [(row, loss) for row in ROWS[: args.rows] for loss in list(LOSSES)[: args.losses]]
     whole = args.rows is None
     with ProcessPoolExecutor(args.jobs) as pool:
-        rough = pool.submit(coarse) if whole else None
+        rough = {told: pool.submit(coarse, told=told) for told in (True, False)} if whole else {}
         for row, loss, s in pool.map(_job, pairs):
             name = row.label if loss == 'none' else ''
             tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
             print(f'| {name} | {loss} | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |', flush=True)
             if cost is None:
                 cost = np.array(s.rest.rms) / bound(row)
-        r = None if rough is None else rough.result()
-    if r is not None:
-        print(f'| 10 bit, no dither | none | {_cells(r)} | | | | | {r.three:.4f} | |')
+        for told, found in rough.items():
+            r = found.result()
+            label = '10 bit, no dither' if told else '10 bit, the rig file says 16'
+            print(f'| {label} | none | {_cells(r)} | | | | | {r.three:.4f} | |')
     if cost is not None and whole:
         print('\nrms error at rest over the Cramér–Rao bound, dX, dY, theta:')
         print(f'- white, no loss: {_three(cost)}')

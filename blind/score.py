@@ -233,9 +233,10 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
     hits = [{s['name'] for s in r.answer['setup']} == {r.mistake} and not r.named for r in of]
     sheet.rate('mistake of the set-up named, and nothing else', of, hits, THRESHOLDS['mistake_named'], 1.0, True)
     sound = [r for r in rows if r.kind in ('faultless', 'null', 'single', 'pair', 'spread', 'four')]
-    wrongly = [r for r in sound if r.answer['setup']]
-    sheet.failures += [f'{r.key}: set-up {", ".join(s["name"] for s in r.answer["setup"])}' for r in wrongly]
-    sheet.rate('mistake named where there is none', sound, [bool(r.answer['setup']) for r in sound], 0.0, 0.0, False)
+    # Coarse steps are both: an effect, and a line of the rig file that is wrong.
+    said = [[s['name'] for s in r.answer['setup'] if s['name'] != 'converter_step'] for r in sound]
+    sheet.failures += [f'{r.key}: set-up {", ".join(s)}' for r, s in zip(sound, said, strict=True) if s]
+    sheet.rate('mistake named where there is none', sound, [bool(s) for s in said], 0.0, 0.0, False)
     odd = [r for r in rows if r.kind == 'faultless']
     alarm = [r.answer['verdict'] != 'nothing_missing' for r in odd]
     sheet.failures += [f'{r.key}: {_said(r)}' for r, wrong in zip(odd, alarm, strict=True) if wrong]

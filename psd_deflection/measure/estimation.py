@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from math import nan
+from math import nan, pi
 from typing import NamedTuple
 
 import numpy as np
@@ -176,6 +176,16 @@ class Estimation:
         at_rest = tuple(self._rig.zeros.ravel().tolist())
         variances = self.variances[0]
         return self.primary.gain(at_rest, variances, self.primary.solve(at_rest, variances))
+
+    def vibration(self) -> tuple[FloatArray, FloatArray]:
+        """Covariance (3, 3) of what vibrates too fast for a block: of the pose and of its rate, in SI units."""
+        gain = self.gain_at_rest()
+        pose, rate = np.zeros((3, 3)), np.zeros((3, 3))
+        for tone in self.stamped.noise.tones:
+            own = self._by.einsum('ic,cd,jd->ij', gain, tone.covariance, gain)
+            pose += own
+            rate += self._by.square(2.0 * pi * tone.frequency * self._rig.converter.sample_rate_hz) * own
+        return pose, rate
 
     def zero_noise(self, size: int) -> tuple[float, ...]:
         """Variances (2P,), m^2, of the dots of a whole block of ``size`` samples at rest."""

@@ -409,13 +409,18 @@ class Pipeline:
         if used is not None and used.wrong:
             findings = (*findings, f'psd_{used.wrong} contradicts the others and is left out')
         sound = status is BlockStatus.OK and not findings
-        if sound and self.stamped.learn(seen.index, seen.slots, seen.samples) and self.motion_filter is not None:
+        # Of this block: what it has to say counts from the next one on.
+        vibrates = self.stamped.vibrates
+        changed = sound and self.stamped.learn(seen.index, seen.slots, seen.samples, volts)
+        if changed and self.motion_filter is not None:
             self.motion_filter.set_noise(self.stamped.noise.gamma)
         if answer.complete and used is not None and used.checked is not None:
             self.stamped.suspect(seen.index, used.dots, used.checked)
         if not self._optics.refuses_frozen:
             self._stillness.count(self._optics.still(volts))
         findings += self._optics.late_findings(volts, seen.verdict, self._stillness.blocks)
+        if vibrates:
+            findings += (f'vibrates: {vibrates}',)
         for finding in findings:
             name = finding.split(':')[0]
             self.counters.findings[name] = self.counters.findings.get(name, 0) + 1
@@ -434,6 +439,10 @@ class Pipeline:
             return None
         systematic = self.estimation.systematic
         covariance = moved.covariance if systematic is None else moved.covariance + systematic
+        velocity_covariance = moved.velocity_covariance
+        if self.stamped.noise.tones:
+            pose, rate = self.estimation.vibration()
+            covariance, velocity_covariance = covariance + pose, velocity_covariance + rate
         dx, dy, theta = moved.pose.tolist()
         vx, vy, vtheta = moved.velocity.tolist()
         return TipMotion(
@@ -448,6 +457,6 @@ class Pipeline:
             vx=vx,
             vy=vy,
             vtheta=vtheta,
-            velocity_covariance=tuple(moved.velocity_covariance.ravel().tolist()),
+            velocity_covariance=tuple(velocity_covariance.ravel().tolist()),
             coasted=moved.coasted,
         )

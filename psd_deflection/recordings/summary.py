@@ -7,6 +7,7 @@ from typing import Any
 
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
 from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.vibration import RecordedVibration, vibration_of
 from psd_deflection.records import SampleBlock
 from psd_deflection.rig.config import left_as_in_the_thesis
 from psd_deflection.rig.declarations import BY_NAME
@@ -46,9 +47,13 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
     blocks = samples = flagged = 0
     first = last = (0, 0)
     counted, lasted = 0, 0
+    vibration: RecordedVibration | None = None
     if topics.get(SAMPLES):
         expected_ns = 1e9 / recording.sample_rate_hz if recording.sample_rate_hz > 0.0 else 0.0
+        vibration = vibration_of(recording)
         for block in blocks_of_it:
+            if vibration is not None:
+                vibration.add(block)
             begin, end = ((int(block.seq[i]), int(block.t_ns[i])) for i in (0, -1))
             if blocks == 0:
                 first = last = begin
@@ -78,6 +83,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'restarts': len(recording.restarts),
         'flagged': flagged,
         'sample_rate_hz': counted * 1e9 / lasted if lasted else 0.0,
+        'vibration': vibration.found() if vibration is not None else None,
         'blocks': blocks,
         'block_size': recording.block_size,
         'topics': topics,

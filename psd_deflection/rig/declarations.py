@@ -210,6 +210,21 @@ class EstimatorConfig:
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
+    vibration: str = parameter(
+        'widen',
+        '',
+        'what vibrates faster than a block can follow: widen the covariance by it and say so, or ignore it',
+        choices=('widen', 'ignore'),
+        before='ignore',
+    )
+    converter_steps: str = parameter(
+        'seen',
+        '',
+        'steps of the converter that the covariance has: those that the samples show if they are coarser than '
+        "converter.bits says (seen), or the rig file's (file)",
+        choices=('seen', 'file'),
+        before='file',
+    )
     arithmetic: str = parameter(
         'fixed',
         '',

@@ -182,11 +182,8 @@ class HealthReporter:
                 how = f'without {" and ".join(f"psd_{psd}" for psd in spots.left_out)}'
             why = spots.reason or next((f for f in spots.findings if 'left out' in f), '')
             message = f'degraded: {new.degraded} of {new.blocks} blocks {how}; {why}'
-        elif new.contradictions:
-            level = WARN
-            wrong = self._session.pipeline.stamped.most_likely_wrong() or 'which one is wrong cannot be told'
-            readings = 'four readings' if len(self._session.rig.psds) == 2 else 'readings'
-            message = f'the {readings} contradict each other in {new.contradictions} blocks: {wrong}'
+        elif doubt := self._doubt(new.contradictions):
+            level, message = WARN, doubt
         values = [
             ('rate (estimates/s)', rate),
             ('blocks', str(pipeline.blocks)),
@@ -201,6 +198,17 @@ class HealthReporter:
             values.append(('latency, median (ms)', f'{latency.median * 1e3:.3f}'))
             values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
         return DiagnosticEntry('psd_deflection: estimates', level, message, tuple(values))
+
+    def _doubt(self, contradictions: int) -> str:
+        """What widens the covariance of blocks that all have estimates; '' if nothing does."""
+        stamped = self._session.pipeline.stamped
+        if contradictions:
+            wrong = stamped.most_likely_wrong() or 'which one is wrong cannot be told'
+            readings = 'four readings' if len(self._session.rig.psds) == 2 else 'readings'
+            return f'the {readings} contradict each other in {contradictions} blocks: {wrong}'
+        if stamped.vibrates:
+            return f'vibrates {stamped.vibrates}: too fast for a block; the covariance has it'
+        return ''
 
     def _motion(self) -> tuple[DiagnosticEntry, ...]:
         motion = self._session.pipeline.motion_filter

@@ -200,6 +200,11 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
     if found['restarts']:
         out.append(row('restarts', f'{found["restarts"]} of the device'))
     out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
+    if (moved := found['vibration']) is not None:
+        size, hz, share = moved['rms_m'] * 1e6, moved['hz'], moved['share']
+        out.append(
+            row('vibrates', f'up to {size:.1f} um rms near {hz:.3g} Hz, in {100.0 * share:.3g} % of the seconds')
+        )
     out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
     return out
 

@@ -21,12 +21,15 @@ that motion is sought where the link moves the dots.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import pi
 from typing import NamedTuple
 
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.measure.uncertainty.combinations import combinations_of
+from psd_deflection.measure.uncertainty.vibration import Tone
 from psd_deflection.records import FloatArray, IntArray
 
 ORDER = 4
@@ -74,6 +77,18 @@ def basis(size: int, by: Arithmetic = FIXED) -> FloatArray:
                 column = column - by.sum(q * column, 0) * q
         columns.append(column / by.root(float(by.sum(column * column, 0))))
     return np.stack(columns, axis=1)
+
+
+class _Vibration(NamedTuple):
+    """A tone as the fit meets it: in its combinations, ``covariance`` (C, C) m^2.
+
+    ``waves`` (2, N): cosine and sine about the middle of the block. ``whole`` (C, K): what ``u`` of a whole block
+    makes of the cosine; of the sine its symmetric weights make nothing.
+    """
+
+    covariance: FloatArray
+    waves: FloatArray
+    whole: FloatArray
 
 
 class _Terms(NamedTuple):
@@ -152,8 +167,8 @@ class BlockFit:
         """Use these places (P, 2), m, from now on; :meth:`set_noise` must follow."""
         self._combinations = combinations_of(centers, beams, slopes, by=self._by)
 
-    def set_noise(self, gamma: FloatArray) -> None:
-        """Use the autocovariance ``gamma`` (C, C, N) m^2 of the readings."""
+    def set_noise(self, gamma: FloatArray, tones: Sequence[Tone] = ()) -> None:
+        """Use the autocovariance ``gamma`` (C, C, N) m^2 of the readings, and what vibrates."""
         by, turn, count = self._by, self._combinations.turn, self._count
         turned = by.einsum('ac,cdl,bd->abl', turn, gamma, turn)
         whole = np.zeros((count, count, self._fft))
@@ -167,6 +182,24 @@ class BlockFit:
         self._bias, self._least = _BIAS * self._whole.v, 1e-9 * self._whole.v
         f = np.fft.rfft(self._whole.u, self._fft, axis=1)
         self._of_whole = by.hermitian('afk,abf,bfj->akbj', f, self._spectrum)
+        self._vibrations = [self._vibration(tone) for tone in tones]
+
+    def _vibration(self, tone: Tone) -> _Vibration:
+        by, turn = self._by, self._combinations.turn
+        angle = np.asarray(2.0 * pi * tone.frequency * (np.arange(self._size) - 0.5 * (self._size - 1)), np.float64)
+        waves = np.stack((by.cos_many(angle), by.sin_many(angle)))
+        covariance = by.einsum('ac,cd,bd->ab', turn, tone.covariance, turn)
+        return _Vibration(covariance, waves, by.einsum('ask,s->ak', self._whole.u, waves[0]))
+
+    def _left_of(self, vibration: _Vibration, x: FloatArray, weights: FloatArray | None) -> FloatArray:
+        """Covariance (C, C), m^2, of what the answer leaves of a tone; ``weights`` (C, N) of a block with gaps."""
+        by = self._by
+        if weights is None:
+            left = 1.0 - by.einsum('ak,ak->a', x, vibration.whole)
+            return vibration.covariance * (left[:, None] * left)
+        kept = by.einsum('as,ws->wa', weights, vibration.waves)
+        left = 1.0 - kept[0]
+        return np.asarray(vibration.covariance * (left[:, None] * left + kept[1][:, None] * kept[1]))
 
     def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
         """The dots at the middle of the block. ``slots`` (n,): which samples are present. ``dots`` (n, C), m."""
@@ -190,6 +223,7 @@ class BlockFit:
         else:
             x = np.array(terms.first)[:, None]
         value = by.sum(x * seen[:, :orders], 1) + offset
+        weights: FloatArray | None = None
         if whole:
             covariance = by.einsum('ak,akbj,bj->ab', x, self._of_whole, x)
         else:
@@ -204,6 +238,8 @@ class BlockFit:
                 rest = z - by.einsum('sk,ak->as', terms.q[:, :told], c)
                 more += np.where(squares > limit, _WIDEN * _WIDEN * by.sum(rest * rest, 1) / left, 0.0)
             covariance[self._diagonal, self._diagonal] += more
+        for vibration in self._vibrations:
+            covariance += self._left_of(vibration, x, weights)
         return Fitted(*self._combinations.back(value.tolist(), covariance), misfit)
 
     def state(self) -> tuple[float, ...]:

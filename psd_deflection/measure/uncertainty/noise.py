@@ -28,6 +28,7 @@ import numpy as np
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis, inverse
 from psd_deflection.measure.uncertainty.combinations import Left, combinations_of
+from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch
 from psd_deflection.records import FloatArray, IntArray
 
 SEGMENT_BLOCKS = 50
@@ -76,7 +77,7 @@ class StreamNoise:
 
     ``gamma`` (C, C, N): what to compute with, the converter's share included, m^2. ``measured``: whether
     it comes from the stream; until then it is the rig file's. ``at_rest``: whether the stream was ever
-    seen at rest.
+    seen at rest. ``tones``: of the last segment, what vibrates; () unless it is asked for.
     """
 
     def __init__(
@@ -104,6 +105,10 @@ class StreamNoise:
         self.set_geometry(centers, beams, slopes, left)
         self._mean_of = _mean_weights(size)
         self._q = basis(size, by)
+        self._sums: list[FloatArray] = []
+        self._signals = 0
+        self._search: ToneSearch | None = None
+        self.tones: tuple[Tone, ...] = ()
         self._average: FloatArray | None = None
         self._sure = np.ones(size)
         self._count = 0
@@ -113,6 +118,17 @@ class StreamNoise:
         self._segment = -1
         self._blocks: list[tuple[int, IntArray, FloatArray]] = []
         self.gamma = self._from_file()
+
+    def set_steps(self, steps: FloatArray) -> None:
+        """Use the converter's ``steps`` (C,), m, from now on."""
+        self._steps = steps
+        self._step = float(steps.max())
+        self.gamma = self._in_use()
+
+    def look_for_tones(self, sums: int) -> None:
+        """From now on; so many sum signals are told with the readings."""
+        self._signals = sums
+        self._search = ToneSearch(self._size, SEGMENT_BLOCKS, self._by)
 
     def set_geometry(
         self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None, left: Left | None = None
@@ -142,10 +158,11 @@ class StreamNoise:
         """Standard deviation (C,), m, of the mean of a whole block."""
         return np.asarray(np.sqrt(self._by.einsum('cl,l->c', self._own(self.gamma), self._mean_of)))
 
-    def add(self, index: int, slots: IntArray, dots: FloatArray) -> bool:
+    def add(self, index: int, slots: IntArray, dots: FloatArray, sums: FloatArray | None = None) -> bool:
         """A block's samples; True where they ended a segment that changed ``gamma``.
 
-        ``index``: the block's number. ``slots`` (n,): which of its N samples are present. ``dots`` (n, C), m.
+        ``index``: the block's number. ``slots`` (n,): which of its N samples are present. ``dots`` (n, C), m. ``sums``
+        (n, P): the sum signals as dots of as many volts, m; they are needed if tones are looked for.
         """
         changed = False
         segment = index // SEGMENT_BLOCKS
@@ -153,6 +170,8 @@ class StreamNoise:
             changed = self._close()
             self._segment = segment
         self._blocks.append((index, slots, dots))
+        if self._search is not None:
+            self._sums.append(np.zeros((len(slots), self._signals)) if sums is None else sums)
         if index % SEGMENT_BLOCKS == SEGMENT_BLOCKS - 1:
             changed |= self._close()
         return changed
@@ -160,7 +179,7 @@ class StreamNoise:
     @property
     def gathered(self) -> int:
         """How many numbers :meth:`segment` has."""
-        return sum(2 + len(slots) + dots.size for _, slots, dots in self._blocks)
+        return sum(2 + len(slots) + dots.size for _, slots, dots in self._blocks) + sum(s.size for s in self._sums)
 
     def segment(self) -> tuple[float, ...]:
         """The blocks of the segment under way: number, how many samples, their places, their dots, of each.
@@ -172,8 +191,16 @@ class StreamNoise:
             out += [index, len(slots), *slots.tolist(), *dots.ravel().tolist()]
         return tuple(out)
 
-    def set_segment(self, values: tuple[float, ...]) -> None:
-        """Go on with the :meth:`segment` of another one. Raises ValueError if that is of other readings."""
+    def sums(self) -> tuple[float, ...]:
+        """The sum signals of the blocks of :meth:`segment`, in their order; empty if tones are not looked for."""
+        return tuple(v for sums in self._sums for v in sums.ravel().tolist())
+
+    def set_segment(self, values: tuple[float, ...], sums: tuple[float, ...] = ()) -> None:
+        """Go on with the :meth:`segment` and the :meth:`sums` of another one.
+
+        Raises ValueError if they are of other readings. One that looked for no tones has told no sums: without them no
+        tone of this segment is hum.
+        """
         blocks = []
         at = 0
         while at < len(values):
@@ -184,6 +211,14 @@ class StreamNoise:
                 raise ValueError(f'blocks of {self._readings} readings, {self._size} samples each')
             slots = np.array(values[dots - count : dots], dtype=np.int64)
             blocks.append((index, slots, np.array(values[dots:at], dtype=np.float64).reshape(count, -1)))
+        counts = [len(slots) for _, slots, _ in blocks]
+        if self._search is not None:
+            rows = np.zeros((sum(counts), self._signals))
+            if sums:
+                if len(sums) != rows.size:
+                    raise ValueError(f'{rows.size} sum signals of the same blocks')
+                rows = np.reshape(sums, rows.shape)
+            self._sums = np.split(rows, np.cumsum(counts)[:-1]) if counts else []
         self._blocks = blocks
         self._segment = blocks[-1][0] // SEGMENT_BLOCKS if blocks else -1
 
@@ -230,6 +265,7 @@ class StreamNoise:
     def _close(self) -> bool:
         """Take the segment into the average where it may be."""
         blocks, self._blocks = self._blocks, []
+        sums, self._sums = self._sums, []
         size = self._size
         if sum(len(slots) for _, slots, _ in blocks) < _LEAST_SHARE * SEGMENT_BLOCKS * size:
             return False
@@ -242,6 +278,9 @@ class StreamNoise:
         moved = self._by.einsum('sc,ac->sa', dots, self._moving)
         rough = _roughness(places, np.column_stack((moved, series)), self._q, self._by)
         count = self._readings
+        if self._search is not None:
+            still = np.column_stack((series[:, count:], np.concatenate(sums)))
+            self.tones = self._search.tones(places, moved, still, self._moving)
         fixed = _covariance(lags[count:, count:], sure, self._by)[0, 0]
         self._judge(lags[:count, :count], sure, fixed, rough + self._least())
         self.gamma = self._in_use()

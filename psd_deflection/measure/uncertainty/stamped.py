@@ -18,15 +18,18 @@ from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, Fitted
 from psd_deflection.measure.uncertainty.combinations import Left
 from psd_deflection.measure.uncertainty.consistency import LIMIT, UNMEASURED, Consistency, ConsistencyCheck, Suspect
+from psd_deflection.measure.uncertainty.converter import ConverterSteps, Volts
 from psd_deflection.measure.uncertainty.noise import StreamNoise
 from psd_deflection.measure.uncertainty.redundancy import Redundancy, survival
+from psd_deflection.measure.uncertainty.vibration import Tone, words_of
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.plate.plate import Tilts, flat_points, flat_poses, plate_points, reading_slopes, tied_pose
-from psd_deflection.records import FloatArray, IntArray, dot_names
+from psd_deflection.records import FloatArray, IntArray, channel_names, dot_names
 from psd_deflection.rig.config import Rig
 
 NOISE, SEGMENT = 'state.noise', 'state.noise_segment'
 FIT, HELD_RESIDUAL = 'state.block_fit', 'state.residual'
+VIBRATION, SUMS, STEPS = 'state.vibration', 'state.sums_segment', 'state.converter_steps'
 REDUNDANCY, SOME = 'state.redundancy', 'state.psds.'
 """Names under which :meth:`StampedDots.memory` tells what is remembered; ``SOME`` goes on with the
 PSDs (from 0) that are kept."""
@@ -96,9 +99,10 @@ class SomePsds:
         # Of a plate whose tilt is not known, dots may contradict each other.
         self._redundancy = Redundancy(len(at), 2 * len(at) if tilts == 'bounded' else rest.shape[1], by)
 
-    def set_noise(self, gamma: FloatArray) -> None:
-        """Use their part of the autocovariance of all readings."""
-        self.fit.set_noise(gamma[np.ix_(self.columns, self.columns)])
+    def set_noise(self, noise: StreamNoise) -> None:
+        """Use their part of what is known of all readings."""
+        own = np.ix_(self.columns, self.columns)
+        self.fit.set_noise(noise.gamma[own], [Tone(t.frequency, t.covariance[own]) for t in noise.tones])
 
     def check(
         self,
@@ -143,11 +147,11 @@ class StampedDots:
     ``active``: whether it says more than the mean of the samples and the rig file's noise. ``contradictions``: blocks
     whose readings contradict each other. ``misfits``: blocks with motion that the fit cannot follow. ``chi_square``:
     of the last block's readings, of ``freedom`` degrees. ``left_out``: PSDs (from 1) without which the last block was
-    solved.
+    solved. ``vibrates``: what is faster than a block can follow, such as "14 um rms near 87 Hz"; '' if nothing is.
     """
 
     part = 'the fit and the noise of the dots'
-    remembers = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY, SOME)
+    remembers = (NOISE, FIT, HELD_RESIDUAL, REDUNDANCY, SOME, VIBRATION, SUMS, STEPS)
 
     def __init__(self, rig: Rig, flat: bool = True, tilts: Tilts = 'none') -> None:
         """``flat``: the PSDs are on the plate, and the base line between the dots keeps its length.
@@ -169,6 +173,13 @@ class StampedDots:
         self._all: PlateModel | None = None
         slopes = self._rest_slopes(rig)
         self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes, self._left, by)
+        self._volt: FloatArray | None = None
+        if self._measures and config.vibration == 'widen':
+            self._volt = rig.sensitivities.mean(axis=1)
+            self.noise.look_for_tones(len(rig.psds))
+        self._converter: ConverterSteps | None = None
+        if self._measures and config.converter_steps == 'seen':
+            self._converter = ConverterSteps.of_rig(rig)
         self._stated_sd = np.sqrt(variances)
         self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes, by)
         self._fit.set_noise(self.noise.gamma)
@@ -181,6 +192,7 @@ class StampedDots:
         self.freedom = 1
         self._rig = rig
         self._size = config.block_size
+        self.vibrates = ''
         self.contradictions = 0
         self.chi_square = 0.0
         self.misfits = 0
@@ -194,7 +206,7 @@ class StampedDots:
         slopes = self._rest_slopes(rig)
         self.noise.set_geometry(rig.centers, self._beams, slopes, self._left)
         self._fit.set_geometry(rig.centers, self._beams, slopes)
-        self._fit.set_noise(self.noise.gamma)
+        self._use_noise()
         self._suspect = Suspect(rig.centers, self._beams)
         self._consistency = Consistency(self._by)
         if slopes is not None:
@@ -217,7 +229,7 @@ class StampedDots:
         found = self._some.get(kept)
         if found is None:
             found = self._some[kept] = SomePsds(self._rig, kept, tilts, self._poly)
-            found.set_noise(self.noise.gamma)
+            found.set_noise(self.noise)
             if kept in self._told:
                 found.set_state(self._told.pop(kept))
         return found
@@ -284,17 +296,37 @@ class StampedDots:
         """Whether the readings of some PSDs agree with each other, and are enough to tell."""
         return some.agree(dots, residual, covariance, pose, self._times)
 
-    def learn(self, index: int, slots: IntArray, samples: FloatArray) -> bool:
-        """Take a good block into what is known of the noise; True if that changed.
+    def learn(self, index: int, slots: IntArray, samples: FloatArray, volts: Volts) -> bool:
+        """Take a good block into what is known of the noise; True if that changed. ``volts`` (n, 3P): x y sum of each.
 
         Nothing of this block's estimate waits for it.
         """
-        if not (self._measures and self.noise.add(index, slots, samples)):
+        if not self._measures:
             return False
-        self._fit.set_noise(self.noise.gamma)
+        changed = self._converter is not None and self._converter.add(volts)
+        if changed:
+            self._use_steps()
+        sums = None if self._volt is None else np.multiply(volts[:, 2::3], self._volt, dtype=np.float64)
+        changed |= self.noise.add(index, slots, samples, sums)
+        if not changed:
+            return False
+        self._use_noise()
         for some in self._some.values():
-            some.set_noise(self.noise.gamma)
+            some.set_noise(self.noise)
         return True
+
+    def _use_steps(self) -> None:
+        """Those of the rig file where the samples show none that are coarser."""
+        if self._converter is None:
+            return
+        rig = self._rig
+        seen = self._converter.steps.reshape(-1, 3)[:, :2]
+        steps = np.maximum(seen, rig.converter.volts_per_count) * rig.sensitivities
+        self.noise.set_steps(steps.ravel())
+
+    def _use_noise(self) -> None:
+        self._fit.set_noise(self.noise.gamma, self.noise.tones)
+        self.vibrates = words_of(self.noise.tones, self._rig.converter.sample_rate_hz)
 
     def suspect(self, index: int, dots: tuple[float, ...], checked: ConsistencyCheck) -> None:
         """Take a block into the search for a wrong reading: each that contradicts itself, of the others some."""
@@ -322,6 +354,8 @@ class StampedDots:
             ('blocks whose readings contradict each other', str(self.contradictions)),
             ('blocks with motion that the fit cannot follow', str(self.misfits)),
             ('covariance from', f'noise {self.noise_source()}' if self._measures else 'noise of the rig file'),
+            *((('vibrates', self.vibrates or 'no'),) if self._volt is not None else ()),
+            *self._step_words(),
             *(self.noise_words() if self._measures else ()),
         )
 
@@ -335,6 +369,14 @@ class StampedDots:
     def _of_freedom(self) -> str:
         """With two PSDs it is always one degree."""
         return '' if self._redundancy is None else f' of {self.freedom} degrees of freedom'
+
+    def _step_words(self) -> tuple[tuple[str, str], ...]:
+        if self._converter is None or not self._converter.steps.any():
+            return ()
+        said = self._rig.converter.volts_per_count * 1e3
+        seen = zip(channel_names(len(self._beams)), self._converter.steps.tolist(), strict=True)
+        words = ', '.join(f'{name} {step * 1e3:.3g} mV' for name, step in seen if step)
+        return (('steps of the converter', f'{words} (rig file {said:.3g} mV)'),)
 
     def noise_words(self) -> tuple[tuple[str, str], ...]:
         """Of each reading, the noise of a sample and of a block's mean against the rig file's, um."""
@@ -354,8 +396,16 @@ class StampedDots:
         out: Memory = {}
         if self._measures:
             out[NOISE] = self.noise.state()
+            if self.noise.tones:
+                out[VIBRATION] = tuple(
+                    v for t in self.noise.tones for v in (t.frequency, *t.covariance.ravel().tolist())
+                )
             if segment := self.noise.segment():
                 out[SEGMENT] = segment
+                if sums := self.noise.sums():
+                    out[SUMS] = sums
+        if self._converter is not None and (steps := self._converter.state()):
+            out[STEPS] = steps
         if self.active:
             out[FIT] = self._fit.state()
         said = self._consistency
@@ -370,11 +420,17 @@ class StampedDots:
 
     def restore(self, values: Mapping[str, Value]) -> None:
         """Go on from another one's :meth:`memory`. Raises ValueError if it had another block size or other PSDs."""
+        steps = numbers(values, STEPS, 'the steps of these channels')
+        if steps and self._converter is not None:
+            self._converter.set_state(steps)
+            self._use_steps()
         if noise := numbers(values, NOISE, 'the noise of this rig'):
             self.noise.set_state(noise)
             # Recordings from before segments were told began a new one.
-            self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or ())
-            self._fit.set_noise(self.noise.gamma)
+            sums = numbers(values, SUMS, 'sum signals of a segment') or ()
+            self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or (), sums)
+            self.noise.tones = _tones(numbers(values, VIBRATION, 'what vibrates') or (), 2 * len(self._beams))
+            self._use_noise()
         if fit := numbers(values, FIT, 'the fit of this rig'):
             self._fit.set_state(fit)
         if residual := numbers(values, HELD_RESIDUAL, 'what the residual was lately', 1, 3):
@@ -399,3 +455,12 @@ class StampedDots:
         if len(kept) < 2 or max(kept) >= len(self._beams):
             raise ValueError(f'{name}: expected two or more of {len(self._beams)} PSDs')
         return kept
+
+
+def _tones(values: tuple[float, ...], count: int) -> tuple[Tone, ...]:
+    """Tones of ``count`` readings of what was told of them. Raises ValueError if they were of others."""
+    each = 1 + count * count
+    if len(values) % each:
+        raise misfit(VIBRATION, values, f'{each} numbers for each tone')
+    rows = np.reshape(values, (-1, each))
+    return tuple(Tone(float(row[0]), row[1:].reshape(count, count)) for row in rows)

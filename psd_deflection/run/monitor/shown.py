@@ -252,6 +252,8 @@ class ShownRecording:
         level, message = OK, 'end of the recording' if self._ended else 'estimates flow'
         if spots is not None and spots.reason:
             level, message = ERROR, spots.reason
+        elif self._pipeline.stamped.vibrates:
+            level, message = WARN, f'vibrates {self._pipeline.stamped.vibrates}: too fast for a block'
         entries.append(
             DiagnosticEntry(
                 'psd_deflection: estimates',

@@ -11,7 +11,7 @@ import numpy as np
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.judges import noise_findings, unit_findings, wiring_findings
+from psd_deflection.studies.check.judges import noise_findings, step_findings, unit_findings, wiring_findings
 from psd_deflection.studies.check.levels import SUM_FACTOR, Levels, levels
 from psd_deflection.studies.check.responses import responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
@@ -147,12 +147,13 @@ def _load_findings(seen: Sequence[PushResponse], found: WiringFit) -> list[Findi
 
 
 def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str, object]) -> list[Finding]:
-    """The noise of each PSD's x and y against the rig file."""
+    """The noise of each PSD's x and y, and the converter's steps, against the rig file."""
     columns = [wiring.columns[c] for c in DOT_CHANNELS]
     noise = [math.nan if CHANNELS[c] in measured.stuck else measured.noise[c] for c in columns]
-    found, right = noise_findings(rig, np.array(noise))
-    lines |= right
-    return found
+    found, right = noise_findings(rig, np.array(noise), measured.steps[columns].reshape(2, 2))
+    steps, bits = step_findings(rig, measured.steps)
+    lines |= right | bits
+    return [*found, *steps]
 
 
 def _coverage(

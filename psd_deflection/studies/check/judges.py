@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from psd_deflection.records import FloatArray
+from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
+from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import differences, fix_of, line, parameters
@@ -29,13 +30,17 @@ digit makes forces ten times too large, which is 2 % from kilograms.
 LOADS = ('load_fx', 'load_fy', 'load_tz')
 
 
-def noise_findings(rig: Rig, noise: FloatArray) -> tuple[list[Finding], dict[str, object]]:
+def noise_findings(
+    rig: Rig, noise: FloatArray, steps: FloatArray | None = None
+) -> tuple[list[Finding], dict[str, object]]:
     """Whether ``noise`` (2, 2), V rms a sample of x and y of each PSD, is the rig file's; lines that put it right.
 
-    NaN for a channel that is stuck. A rig file that says the noise of each channel is held against each.
+    NaN for a channel that is stuck. A rig file that says the noise of each channel is held against each. ``steps``
+    (2, 2), V: of the converter, where they are coarser than the rig file's: they make noise of their own.
     """
     dots = np.asarray(noise, dtype=np.float64).reshape(2, 2)
-    stated = np.hypot(rig.noises[:, :2], rig.converter.volts_per_count / math.sqrt(12.0))
+    step = np.maximum(0.0 if steps is None else steps, rig.converter.volts_per_count)
+    stated = np.hypot(rig.noises[:, :2], step / math.sqrt(12.0))
     if any(any(psd.noise) for psd in rig.psds):
         return _of_each_channel(dots, stated)
     there = np.isfinite(dots)
@@ -48,6 +53,25 @@ def noise_findings(rig: Rig, noise: FloatArray) -> tuple[list[Finding], dict[str
     fix = line('amplifier.noise', level)
     found = Finding('noise_level', 'x1 y1 x2 y2', round(factor, 3), fix, abs(math.log(factor)))
     return [found], {'amplifier.noise': level}
+
+
+def step_findings(rig: Rig, steps: FloatArray) -> tuple[list[Finding], dict[str, object]]:
+    """Channels whose converter steps more coarsely than the rig file says; lines that put it right.
+
+    ``steps`` (6,), V, of the device's channels, 0 where they are the rig file's.
+    """
+    if not steps.any():
+        return [], {}
+    own = rig.converter.volts_per_count
+    bits = rig.converter.bits - round(math.log2(float(steps.max()) / own))
+    right: dict[str, object] = {'converter.bits': bits} if LEAST_BITS <= bits < rig.converter.bits else {}
+    findings = []
+    for name, step in zip(CHANNELS, steps.tolist(), strict=True):
+        if step:
+            words = f'{name} steps by {step * 1e3:.3g} mV, the rig file says {own * 1e3:.3g} mV'
+            fix = f'{line("converter.bits", bits)} ({words})' if right else words
+            findings.append(Finding('converter_step', name, step, fix, math.log(step / own)))
+    return findings, right
 
 
 def _of_each_channel(noise: FloatArray, stated: FloatArray) -> tuple[list[Finding], dict[str, object]]:

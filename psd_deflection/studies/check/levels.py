@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.measure.uncertainty.converter import ConverterSteps
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 
@@ -31,6 +32,9 @@ _THIRD = np.sqrt(20.0)
 _TO_SD = 1.4826
 """Median absolute value of a normal law to its standard deviation."""
 
+_AT_ONCE = 1000
+"""Samples in which the steps are looked for at once: a fine converter tells in the first."""
+
 _FAR = 4.0
 _NEIGHBOURS_HZ = 8.0
 _STANDS_OUT = 5.0
@@ -41,7 +45,8 @@ class Levels:
     """Of the device's channels x1 y1 sum1 x2 y2 sum2. ``noise`` (6,): V rms a sample, without motion, drift and hum.
 
     ``stated``: of the rig file, with the converter's steps, V rms. ``hum`` (6,): amplitude of the mains, V, 0 if none
-    stands out. ``hum_hz``: its frequency. ``sums`` (2,): means, V. ``stuck``: channels on which no bit moves.
+    stands out. ``hum_hz``: its frequency. ``sums`` (2,): means, V. ``stuck``: channels on which no bit moves. ``steps``
+    (6,): of the converter, V, 0 where they are not coarser than the rig file's.
     """
 
     noise: FloatArray
@@ -50,6 +55,7 @@ class Levels:
     hum_hz: float
     sums: FloatArray
     stuck: tuple[str, ...]
+    steps: FloatArray
 
 
 def levels(rig: Rig, volts: FloatArray) -> Levels:
@@ -70,7 +76,14 @@ def levels(rig: Rig, volts: FloatArray) -> Levels:
     stuck = tuple(name for name, same in zip(CHANNELS, still.tolist(), strict=True) if same and moves)
     rate = rig.converter.sample_rate_hz
     hum_hz, hum = _hum(_longest_run(volts)[: round(HUM_S * rate)], rate, noise)
-    return Levels(noise, stated, hum, hum_hz, whole[:, 2::3].mean(axis=0), stuck)
+    return Levels(noise, stated, hum, hum_hz, whole[:, 2::3].mean(axis=0), stuck, _steps(rig, whole))
+
+
+def _steps(rig: Rig, volts: FloatArray) -> FloatArray:
+    converter = ConverterSteps.of_rig(rig)
+    for first in range(0, len(volts), _AT_ONCE):
+        converter.add(volts[first : first + _AT_ONCE])
+    return converter.steps
 
 
 def _longest_run(volts: FloatArray) -> FloatArray:

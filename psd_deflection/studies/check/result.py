@@ -42,6 +42,7 @@ NAMES = {
     'jump': 'jumps',
     'stuck_channel': 'dead',
     'noise_level': 'noise',
+    'converter_step': 'coarser steps',
     'load_coverage': 'not seen',
 }
 """All names that a finding may have, as other programs know them, in words."""

@@ -15,9 +15,9 @@ from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
-from psd_deflection.records import FloatArray
+from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.check.judges import noise_findings
+from psd_deflection.studies.check.judges import noise_findings, step_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
 from psd_deflection.studies.discover.observation import Observation
@@ -286,7 +286,11 @@ def set_up(problem: Problem) -> Problem:
     if machine.recorded.lattice is None:
         setup += noise_findings(ws.observations[0].rig, noise_of(ws))[0]
     else:
-        named.append(_named_lattice(ws, machine.recorded.lattice))
+        lattice = machine.recorded.lattice
+        named.append(_named_lattice(ws, lattice))
+        step = float(lattice.values[lattice.effect.lattice])
+        # The effect stands for the line: with both, the steps would be counted twice.
+        setup += step_findings(ws.observations[0].rig, np.full(len(CHANNELS), step))[0]
     return replace(
         problem,
         named=tuple(named),

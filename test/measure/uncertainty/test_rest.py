@@ -45,7 +45,7 @@ def test_diagnostics_say_whose_noise_it_is(covariance: str, words: str) -> None:
     stamped = StampedDots(load_rig(overrides={'covariance': covariance}))
     assert dict(stamped.words())['covariance from'] == words
     # The noise of each reading is told if it is measured.
-    assert len(stamped.words()) == (5 if covariance == 'file' else 5 + len(stamped.noise_words()))
+    assert len(stamped.words()) == (5 if covariance == 'file' else 6 + len(stamped.noise_words()))
     assert len(stamped.noise_words()) >= 4
 
 

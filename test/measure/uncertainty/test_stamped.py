@@ -20,6 +20,7 @@ THIRD: dict[str, Any] = {
     'psd_3.height': -0.03,
 }
 ALL = np.arange(20)
+VOLTS = np.full((20, 9), 5.0)
 
 
 def rig_of(psds: int = 2, named: Mapping[str, object] | None = None, **more: object) -> Rig:
@@ -163,7 +164,8 @@ def test_new_zeros_are_those_of_a_rig_that_always_had_them(psds: int) -> None:
     assert answers[0] == answers[1]
     for of in (moved, fresh):
         for block in range(100):
-            of.learn(block, ALL, new.zeros.ravel() + 1e-6 * np.random.default_rng(block).normal(size=(20, 2 * psds)))
+            samples = new.zeros.ravel() + 1e-6 * np.random.default_rng(block).normal(size=(20, 2 * psds))
+            of.learn(block, ALL, samples, VOLTS[:, : 3 * psds])
     np.testing.assert_array_equal(moved.noise.gamma, fresh.noise.gamma)
 
 
@@ -191,7 +193,7 @@ def test_the_first_blocks_of_a_second_change_no_noise_and_the_last_does() -> Non
     changed = []
     for block in range(150):
         samples = stamped._rig.zeros.ravel() + 3e-6 * rng.normal(size=(20, 6))
-        if stamped.learn(block, ALL, samples):
+        if stamped.learn(block, ALL, samples, VOLTS):
             changed.append(block)
     assert changed == [49, 99, 149]
     still = np.tile(stamped._rig.zeros.ravel(), (20, 1))
@@ -199,7 +201,7 @@ def test_the_first_blocks_of_a_second_change_no_noise_and_the_last_does() -> Non
     assert np.sqrt(np.diag(whole.covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
     assert np.sqrt(np.diag(part.covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
     assert len(part.dots) == 4
-    assert not StampedDots(rig_of(covariance='file')).learn(49, ALL, np.zeros((20, 4)))
+    assert not StampedDots(rig_of(covariance='file')).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])
 
 
 def test_what_says_no_more_than_the_mean_is_not_active() -> None:
@@ -292,7 +294,7 @@ def test_noise_and_fit_go_on_from_the_memory(psds: int) -> None:
     for block in range(110):
         samples = one._rig.zeros.ravel() + 3e-6 * rng.normal(size=(20, 2 * psds))
         one.fit(ALL, samples)
-        one.learn(block, ALL, samples)
+        one.learn(block, ALL, samples, VOLTS[:, : 3 * psds])
     other.restore(one.memory())
     assert other.memory() == one.memory()
     samples = one._rig.zeros.ravel() + 3e-6 * rng.normal(size=(20, 2 * psds))

@@ -132,3 +132,29 @@ def test_a_size_is_a_unit_within_three_per_cent(sizes: tuple[float, float, float
     places = {'fx': 0, 'fy': 1, 'tz': 2}
     told = {places[load]: f.fix.partition('it is noted in ')[2] for f in findings for load in f.where.split()}
     assert told == units
+
+
+def test_check_and_discover_name_a_converter_that_is_coarser_than_the_file_says(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, found = tmp_path / 'run.csv', tmp_path / 'found'
+    assert main(['simulate', '--out', str(run), '--loads', 'thesis:1', '--world', 'converter.bits=10']) == 0
+    assert main(['discover', str(run), '--out', str(found), '--quiet']) == 0
+    capsys.readouterr()
+    assert main(['check', str(run), '--json']) == 0
+    checked = json.loads(capsys.readouterr().out)
+    # What the steps add to the noise is not said once more.
+    assert checked['lines'] == {'converter.bits': 10}
+    searched = json.loads((found / 'result.json').read_text())['setup']
+    for said in (checked['setup'], searched):
+        steps = [f for f in said if f['name'] == 'converter_step']
+        assert [f['where'] for f in steps] == ['x1', 'y1', 'sum1', 'x2', 'y2', 'sum2']
+        assert [f['value'] for f in steps] == pytest.approx([20.0 / 2**10] * 6, rel=1e-4)
+        assert steps[0]['fix'] == 'converter.bits: 10 (x1 steps by 19.5 mV, the rig file says 0.305 mV)'
+
+
+def test_a_step_that_is_no_power_of_two_has_no_line() -> None:
+    findings, lines = judges.step_findings(RIG, np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert [(f.where, f.fix) for f in findings] == [('x1', 'x1 steps by 300 mV, the rig file says 0.305 mV')]
+    assert lines == {}
+    assert judges.step_findings(RIG, np.zeros(6)) == ([], {})

@@ -1,0 +1,157 @@
+"""Vibration that a block cannot follow: tones of the readings that move together.
+
+A motion whose period is shorter than a block looks like noise to one block: it varies inside, and hardly from mean to
+mean. But noise has no tones. Each second (50 blocks) the spectrum of the combinations of the readings that move with
+the link is searched for peaks above 1/N a sample, 50 Hz for blocks of 20 at 1 kHz, that stand far out of the floor
+about them (the median of the neighbours). A peak that the combination that does not move has too, or the sum signals,
+is hum of the electronics and no motion.
+
+Noise alone makes a bin exceed its floor T times with probability exp(-T); the floor of 50 neighbours is uncertain by
+1/7, so that of the 450 bins of three combinations, in each of 3600 seconds, one passes T = 40 in some thousand hours.
+Slow motion is kept out by a Hann window (periodic), whose lobes fall as the cube of the distance; gaps are bridged by
+straight lines, so that a regular gap makes no tone of a slow motion.
+
+What a tone of variance P does to an answer w^T z that is meant for the block's middle is known: it leaves |1 - H|^2 P,
+H the sum of w_s exp(i omega (s - middle)). :class:`Tone` has P of all readings, and
+:mod:`psd_deflection.measure.uncertainty.block_fit` computes H of the weights that it used.
+"""
+
+from __future__ import annotations
+
+from math import pi
+from typing import NamedTuple
+
+import numpy as np
+
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.records import FloatArray, IntArray
+
+SIGNIFICANT = 40.0
+"""Times the floor about it: a peak is a tone."""
+
+_SEEN = 12.0
+"""Times the floor: a combination, or a sum signal, takes part in a tone that is there."""
+
+_ELECTRIC = 0.01
+"""Share of a tone's variance in what cannot move, from which it is hum and no motion."""
+
+_LOWEST = 0.9
+"""Cycles a block: the polynomials of a block follow what is slower."""
+
+_GROUP = 50
+"""Bins of one floor."""
+
+_NARROW, _BROAD = 3, 0.04
+"""Bins to each side, and share of the frequency if that is more, that belong to a tone: the mode of a link that
+something random drives is as broad as its damping."""
+
+_MOST = 4
+"""Tones that are looked for in a second."""
+
+
+class Tone(NamedTuple):
+    """``frequency``: cycles a sample. ``covariance`` (C, C) m^2: of the readings."""
+
+    frequency: float
+    covariance: FloatArray
+
+
+class ToneSearch:
+    """Looks for tones in segments of ``blocks`` blocks of ``size`` samples."""
+
+    def __init__(self, size: int, blocks: int, by: Arithmetic = FIXED) -> None:
+        self._by = by
+        self._length = size * blocks
+        angle = np.asarray(2.0 * pi / self._length * np.arange(self._length), np.float64)
+        self._window = 0.5 - 0.5 * by.cos_many(angle)
+        self._scale = 2.0 / (self._length * float(by.sum(self._window * self._window, 0)))
+        self._first = int(_LOWEST * blocks)
+        # At half the sample rate a tone's other half folds onto it.
+        self._last = self._length // 2 - 2
+        self._groups = max((self._length // 2 - self._first // 2) // _GROUP, 1)
+        start = self._first // 2
+        middle = start + _GROUP * (np.arange(self._groups) + 0.5)
+        bins = np.arange(self._length // 2 + 1)
+        self._start = start
+        self._left = np.clip((bins - middle[0]) // _GROUP, 0, max(self._groups - 2, 0)).astype(np.int64)
+        self._right = np.minimum(self._left + 1, self._groups - 1)
+        self._share = np.clip((bins - middle[self._left]) / _GROUP, 0.0, 1.0)[:, None]
+
+    def tones(self, places: IntArray, moving: FloatArray, still: FloatArray, turn: FloatArray) -> tuple[Tone, ...]:
+        """The tones of samples at ``places`` (n,), in order, of a segment; the strongest against its floor first.
+
+        ``moving`` (n, a), m: combinations of the readings that move with the link, ``turn`` (a, C) their rows.
+        ``still`` (n, b), m: what cannot move.
+        """
+        if self._last - self._first < _GROUP or len(places) < 2:
+            return ()
+        count = moving.shape[1]
+        series = _filled(places, np.column_stack((moving, still)), self._length)
+        spectrum = np.fft.rfft(series * self._window[:, None], axis=0)
+        power = self._by.power_spectrum(spectrum)
+        above = power / self._floor(power)
+        free = np.zeros(len(power), dtype=bool)
+        free[self._first : self._last + 1] = True
+        peaks = above[:, :count].max(axis=1)
+        scale = self._scale * self._by.square(self._length / len(places))
+        out: list[Tone] = []
+        for _ in range(_MOST):
+            peak = int(np.argmax(np.where(free, peaks, 0.0)))
+            if not free[peak] or peaks[peak] < SIGNIFICANT:
+                break
+            wide = max(_NARROW, int(_BROAD * peak))
+            band = slice(max(peak - wide, self._first), min(peak + wide, self._last) + 1)
+            free[band] = False
+            strength = self._by.sum(power[band], 0)
+            seen = above[band].max(axis=0) > _SEEN
+            moved = strength[:count] * seen[:count]
+            if bool((seen[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
+                continue
+            own = spectrum[band, :count] * seen[:count]
+            cross = self._by.times_conjugate(own[:, :, None], own[:, None, :]).real
+            covariance = scale * self._by.sum(np.ascontiguousarray(cross), 0)
+            weight = self._by.sum(power[band, :count] * seen[:count], 1)
+            at = self._by.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
+            frequency = float(at) / float(self._by.sum(weight, 0)) / self._length
+            out.append(Tone(frequency, self._by.einsum('ac,ab,bd->cd', turn, covariance, turn)))
+        return tuple(out)
+
+    def _floor(self, power: FloatArray) -> FloatArray:
+        """Of each bin (F,) of each series the power of the noise about it, between the medians of groups of bins."""
+        stop = self._start + self._groups * _GROUP
+        grouped = power[self._start : stop].reshape(self._groups, _GROUP, -1)
+        # The median of an exponential distribution is ln 2 of its mean.
+        medians = np.median(grouped, axis=1) / _LN_2
+        left = medians[self._left]
+        return np.asarray(left + self._share * (medians[self._right] - left) + _LEAST)
+
+
+_LN_2 = 0.6931471805599453
+_LEAST = 1e-27
+"""m^2: readings that do not vary have a floor too."""
+
+
+def _filled(places: IntArray, series: FloatArray, length: int) -> FloatArray:
+    """``series`` (n, c) at ``places`` (n,) as (length, c): straight lines across gaps, constant at the ends."""
+    if len(places) == length:
+        return series
+    at = np.arange(length)
+    after = np.clip(np.searchsorted(places, at), 1, len(places) - 1)
+    before = after - 1
+    share = np.clip((at - places[before]) / (places[after] - places[before]), 0.0, 1.0)
+    return np.asarray(series[before] + share[:, None] * (series[after] - series[before]))
+
+
+def rms_of(tone: Tone) -> float:
+    """m: of the reading that it moves most."""
+    return float(np.sqrt(np.diagonal(tone.covariance).max()))
+
+
+def words_of(tones: tuple[Tone, ...], rate_hz: float) -> str:
+    """Such as "14 um rms near 87 Hz", '' without tones; ``rate_hz``: samples per second."""
+    return ', '.join(f'{_micrometres(rms_of(t))} rms near {t.frequency * rate_hz:.3g} Hz' for t in tones)
+
+
+def _micrometres(size: float) -> str:
+    value = size * 1e6
+    return f'{value:.0f} um' if value >= 9.95 else f'{value:.1f} um'

@@ -1,0 +1,142 @@
+"""The converter's steps as the samples show them: found where they are coarse, never where they are not."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from blind.coverage import ROWS, Row, coarse, motion, rig, volts_of
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.uncertainty.converter import ConverterSteps
+from psd_deflection.measure.uncertainty.stamped import STEPS
+from psd_deflection.records import DeflectionEstimate, RawChunk
+from psd_deflection.rig.config import load_rig, rig_as_recorded
+
+FILE, COARSEST = 20.0 / 2**16, 20.0 / 2**8
+TEN = 20.0 / 2**10
+
+
+def volts(step: float, noise: float, seed: int = 1, n: int = 1000) -> npt.NDArray[np.float32]:
+    rng = np.random.default_rng(seed)
+    levels = rng.uniform(-3.0, 3.0, 6) + noise * rng.normal(size=(n, 6))
+    return np.asarray(np.rint(levels / step) * step if step else levels, dtype=np.float32)
+
+
+def fed(samples: npt.NDArray[np.float32], file: float = FILE) -> ConverterSteps:
+    steps = ConverterSteps(6, file, COARSEST)
+    for first in range(0, len(samples), 20):
+        steps.add(samples[first : first + 20])
+    return steps
+
+
+@pytest.mark.parametrize('bits', [8, 10, 12, 14])
+@pytest.mark.parametrize('offset', [0.0, 0.5])
+@pytest.mark.parametrize('noise', [2e-3, 0.2])
+def test_coarse_steps_are_found_on_every_channel(bits: int, offset: float, noise: float) -> None:
+    step = 20.0 / 2**bits
+    samples = volts(step, noise) + np.float32(offset * step)
+    np.testing.assert_allclose(fed(samples).steps, step, rtol=1e-5)
+
+
+def test_channels_that_never_change_tell_by_their_levels() -> None:
+    np.testing.assert_allclose(fed(volts(TEN, 0.0)).steps, TEN, rtol=1e-5)
+    # A dead channel has no steps, and one level that is far off is none either.
+    samples = volts(TEN, 0.0)
+    samples[:, 0] = 0.0
+    np.testing.assert_allclose(fed(samples).steps, [0.0, *[TEN] * 5], rtol=1e-5)
+    assert not fed(np.full((1000, 6), 2.5, np.float32)).steps.any()
+
+
+def test_a_coarse_channel_beside_fine_ones_is_that_channel() -> None:
+    samples = volts(FILE, 2e-3)
+    samples[:, 4] = volts(TEN, 0.05)[:, 4]
+    np.testing.assert_allclose(fed(samples).steps, [0.0, 0.0, 0.0, 0.0, TEN, 0.0], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ('step', 'noise', 'file'),
+    [
+        (FILE, 2e-3, FILE),
+        (FILE, 2e-4, FILE),
+        (FILE / 4.0, 2e-3, FILE),
+        (20.0 / 2**24, 2e-3, 20.0 / 2**24),
+        (TEN, 2e-3, TEN),
+        (0.0, 2e-3, FILE),
+        (0.0, 1e-7, FILE),
+    ],
+)
+def test_steps_that_are_no_coarser_than_the_files_are_none(step: float, noise: float, file: float) -> None:
+    for seed in range(200):
+        assert not fed(volts(step, noise, seed, 100), file).steps.any()
+
+
+def test_a_step_is_not_believed_before_thirty_samples_and_one_finer_value_ends_it() -> None:
+    steps = ConverterSteps(1, FILE, COARSEST)
+    level = np.zeros((20, 1))
+    toggled = level.copy()
+    toggled[:10] = TEN
+    assert not steps.add(level)
+    assert not steps.add(toggled)
+    assert not steps.add(toggled)
+    assert steps.add(toggled)
+    assert steps.steps == pytest.approx([TEN])
+    assert not steps.add(toggled)
+    toggled[3] += FILE
+    assert steps.add(toggled)
+    assert not steps.steps.any()
+
+
+def test_it_goes_on_from_its_state() -> None:
+    samples = volts(TEN, 3e-3)
+    one, other = (ConverterSteps(6, FILE, COARSEST) for _ in range(2))
+    assert one.state() == ()
+    one.add(samples[:20])
+    other.set_state(one.state())
+    for part in (samples[20:40], samples[40:400]):
+        assert one.add(part) == other.add(part)
+        assert one.state() == other.state()
+        np.testing.assert_array_equal(one.steps, other.steps)
+    with pytest.raises(ValueError, match='3 channels have 9'):
+        ConverterSteps(3, FILE, COARSEST).set_state(one.state())
+
+
+def test_ten_bits_untold_are_in_the_intervals() -> None:
+    """The finding: 0.77 of the intervals of one axis held the truth."""
+    s = coarse(24, told=False)
+    assert min(s.axes) > 0.93
+    assert s.joint > 0.93
+    assert min(coarse(24, told=False, converter_steps='file').axes) < 0.93
+    assert rig_as_recorded({'block_size': 20}, 'an old recording').estimator.converter_steps == 'file'
+
+
+@pytest.mark.parametrize('label', ['white', '12 bit', '24 bit', 'hum 5 mV'])
+def test_a_told_converter_is_as_before(label: str) -> None:
+    row = next(r for r in ROWS if r.label == label)
+    samples = volts_of(row, motion(4, 1)[0], 1).astype(np.float32)
+    seq = np.arange(len(samples))
+    chunk = RawChunk(seq, seq * 1_000_000, samples, np.zeros(len(seq), np.uint8))
+    seen, told = (
+        [r for r in Pipeline(rig(row, converter_steps=how)).process(chunk) if isinstance(r, DeflectionEstimate)]
+        for how in ('seen', 'file')
+    )
+    assert seen == told
+
+
+def test_diagnostics_name_them_and_a_recording_begun_later_replays_to_the_bit() -> None:
+    own = load_rig()
+    samples = volts_of(Row('10 bit', bits=10), motion(5, 0)[0], 1).astype(np.float32)
+    seq = np.arange(len(samples))
+    head, tail = (RawChunk(s, s * 1_000_000, samples[s], np.zeros(len(s), np.uint8)) for s in (seq[:2500], seq[2500:]))
+    live = Pipeline(own)
+    list(live.process(head))
+    assert dict(live.stamped.words())['steps of the converter'] == (
+        'x1 19.5 mV, y1 19.5 mV, sum1 19.5 mV, x2 19.5 mV, y2 19.5 mV, sum2 19.5 mV (rig file 0.305 mV)'
+    )
+    memory = live.memory(own)
+    assert memory is not None
+    assert STEPS in dict(memory.values)
+    replay = Pipeline(own)
+    replay.apply(memory)
+    expected, again = ([r for r in p.process(tail) if isinstance(r, DeflectionEstimate)] for p in (live, replay))
+    assert again == expected

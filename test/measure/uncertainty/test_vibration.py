@@ -1,0 +1,223 @@
+"""What vibrates faster than a block: found by its tone, not taken for noise, and never seen where there is none."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from blind import generator
+from blind.coverage import LOSSES, ROWS, Row, motion, rig, shaken, volts_of
+from psd_deflection.cli.main import main
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.uncertainty.block_fit import BlockFit
+from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
+from psd_deflection.measure.uncertainty.stamped import VIBRATION
+from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch, rms_of, words_of
+from psd_deflection.records import DeflectionEstimate, FloatArray, IntArray, RawChunk, Record, SpotMeans, TipMotion
+from psd_deflection.rig.config import Rig, load_rig, rig_as_recorded
+
+SIZE, RATE = 20, 1000.0
+N = SIZE * SEGMENT_BLOCKS
+TURN = np.array([[0.6, 0.8, 0.0], [-0.8, 0.6, 0.0]])
+ALL = np.arange(N)
+
+
+def tone(hz: float, phase: float = 0.3, places: IntArray = ALL) -> FloatArray:
+    return np.asarray(np.sin(2.0 * np.pi * hz / RATE * places + phase))
+
+
+def noise(seed: int, columns: int = 2, n: int = N) -> FloatArray:
+    return 1e-6 * np.random.default_rng(seed).normal(size=(n, columns))
+
+
+def found(moving: FloatArray, still: FloatArray, places: IntArray = ALL) -> tuple[Tone, ...]:
+    return ToneSearch(SIZE, SEGMENT_BLOCKS).tones(places, moving, still, TURN)
+
+
+@pytest.mark.parametrize('hz', [47.0, 87.0, 130.4, 300.0, 480.0])
+def test_a_tone_is_found_with_its_frequency_and_its_covariance(hz: float) -> None:
+    amplitudes = np.array([5e-6, -2e-6])
+    (one,) = found(noise(1) + tone(hz)[:, None] * amplitudes, noise(2))
+    assert one.frequency * RATE == pytest.approx(hz, abs=0.1)
+    want = TURN.T @ np.outer(amplitudes, amplitudes) @ TURN / 2.0
+    np.testing.assert_allclose(one.covariance, want, rtol=0.05, atol=6e-13)
+
+
+def test_two_tones_are_two_and_what_does_not_take_part_stays_out() -> None:
+    moving = noise(1)
+    moving[:, 0] += 3e-6 * tone(87.0)
+    moving[:, 1] += 9e-6 * tone(180.0)
+    second, first = sorted(found(moving, noise(2)), key=rms_of)
+    assert [round(t.frequency * RATE) for t in (first, second)] == [180, 87]
+    np.testing.assert_allclose(first.covariance, np.outer(TURN[1], TURN[1]) * 9e-6**2 / 2.0, rtol=0.05, atol=1e-20)
+    assert words_of((first, second), RATE) == '5.1 um rms near 180 Hz, 1.7 um rms near 87 Hz'
+    assert words_of((Tone(0.087, np.eye(4) * 200e-12),), RATE) == '14 um rms near 87 Hz'
+
+
+@pytest.mark.parametrize('share', [0.15, 1.0])
+def test_hum_in_what_cannot_move_is_no_motion(share: float) -> None:
+    moving = noise(1) + 5e-6 * tone(50.0)[:, None]
+    assert found(moving, noise(2))
+    assert not found(moving, noise(2) + share * 5e-6 * tone(50.0)[:, None])
+    # A sound rig leaks some of a motion into them.
+    assert found(moving, noise(2) + 0.05 * 5e-6 * tone(50.0)[:, None])
+
+
+def test_slow_motion_steps_and_regular_gaps_make_no_tone() -> None:
+    slow = 1e-3 * np.stack((tone(14.0), np.where(ALL > 433, 1.0, -0.4)), axis=1)
+    assert not found(noise(1) + slow, noise(2))
+    # Every tenth sample lost makes a tone of 100 Hz of any slow motion that is not bridged.
+    here = np.flatnonzero(ALL % 10 != 3)
+    ramp = 1e-3 * np.stack((ALL / N, (ALL / N) ** 2), axis=1)
+    assert not found((noise(1) + ramp)[here], noise(2)[here], here)
+
+
+def test_a_tone_with_gaps_is_no_smaller() -> None:
+    here = np.sort(np.random.default_rng(3).choice(N, 800, replace=False))
+    (one,) = found((noise(1) + 5e-6 * tone(87.0)[:, None])[here], noise(2)[here], here)
+    assert 1.0 <= rms_of(one) / (5e-6 / 2.0**0.5 * np.abs(TURN.sum(axis=0)).max()) < 1.3
+
+
+@pytest.mark.parametrize('lost', [(), (2, 3, 11, 12)])
+def test_the_fit_states_what_it_leaves_of_a_tone(lost: tuple[int, ...]) -> None:
+    """Sinusoids of every phase through the fit: their mean square error is what the covariance grows by."""
+    places = np.array([[0.0, 0.070], [-0.100, 0.0]])
+    gamma = np.zeros((4, 4, SIZE))
+    gamma[range(4), range(4), 0] = 1e-12
+    slots = np.delete(np.arange(SIZE), lost)
+    direction = np.array([1.0, 0.2, 1.0, 0.2]) * 1e-9
+    hz = 87.0
+    fit = BlockFit(SIZE, places, places)
+    fit.set_noise(gamma, [Tone(hz / RATE, np.outer(direction, direction) / 2.0)])
+    plain = BlockFit(SIZE, places, places)
+    plain.set_noise(gamma)
+    angle = 2.0 * np.pi * hz / RATE * (slots - 0.5 * (SIZE - 1))
+    errors = []
+    for phase in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False):
+        dots = np.sin(angle + phase)[:, None] * direction
+        got = fit.fit(slots, dots)
+        errors.append(np.array(got.dots) - np.sin(phase) * direction)
+        stated = got.covariance - plain.fit(slots, dots).covariance
+    mean = np.einsum('ni,nj->ij', errors, errors) / len(errors)
+    np.testing.assert_allclose(stated, mean, rtol=1e-3, atol=1e-24)
+
+
+def records_of(clean: FloatArray, own: Rig, seed: int = 1, row: Row = ROWS[0]) -> list[Record]:
+    return list(Pipeline(own).process(chunk(volts_of(row, clean, seed))))
+
+
+def chunk(volts: FloatArray, first: int = 0) -> RawChunk:
+    seq = np.arange(first, first + len(volts))
+    return RawChunk(seq, seq * 1_000_000, volts.astype(np.float32), np.zeros(len(seq), np.uint8))
+
+
+@pytest.mark.parametrize('hz', [75.0, 87.0, 180.0, 480.0])
+def test_a_vibration_is_counted_and_named(hz: float) -> None:
+    s = shaken(hz, seconds=8)
+    assert s.inside.three > 0.99
+    assert min(s.inside.axes) > 0.93
+    # And by no more than it is: three times, where the polynomials begin to follow it.
+    assert s.inside.rms[1] > s.sd[1] / 1.2
+    assert s.named == 1.0
+    assert s.words == f'vibrates: 14 um rms near {hz:g} Hz'
+
+
+def test_without_it_nothing_is_as_before() -> None:
+    """The finding: 14 um off at +- 0.4 um, and nothing said."""
+    s = shaken(87.0, seconds=8, vibration='ignore')
+    assert s.inside.three < 0.2
+    assert s.named == 0.0
+    assert rig_as_recorded({'block_size': 20}, 'an old recording').estimator.vibration == 'ignore'
+
+
+@pytest.mark.parametrize('label', [row.label for row in ROWS])
+@pytest.mark.parametrize('loss', ['none', '20 %'])
+def test_it_does_not_fire(label: str, loss: str) -> None:
+    """At rest, at the steps of 50 N and while the link rings, with every kind of noise; hum is in the sums as well."""
+    row = next(r for r in ROWS if r.label == label)
+    clean, _ = motion(12, 2)
+    share, burst = LOSSES[loss]
+    here = np.flatnonzero(generator.present(len(clean), 1, share, burst))
+    volts = volts_of(row, clean, 2)
+    arrived = RawChunk(here, here * 1_000_000, volts[here].astype(np.float32), np.zeros(len(here), np.uint8))
+    spots = [r for r in Pipeline(rig(row)).process(arrived) if isinstance(r, SpotMeans)]
+    assert len(spots) > 1000
+    assert not [f for s in spots for f in s.findings if f.startswith('vibrates')]
+
+
+def shaking(seconds: int, hz: float = 87.0) -> FloatArray:
+    fine = np.arange(seconds * 5000) / 5000.0
+    pose = np.stack((0.0 * fine, 20e-6 * np.sin(2.0 * np.pi * hz * fine), 0.0 * fine), axis=1)
+    none = np.zeros(len(fine))
+    m, light = generator.sensors(generator.optics(pose, none, none, 0.585, []), none, none, [])
+    return generator.electronics(m, light, none, [])
+
+
+@pytest.mark.parametrize('start', [99, 120, 149, 171])
+def test_a_recording_begun_while_it_vibrates_replays_to_the_bit(start: int) -> None:
+    own = load_rig()
+    volts = volts_of(ROWS[0], shaking(5), 1)
+    live = Pipeline(own)
+    list(live.process(chunk(volts[: 20 * start])))
+    memory = live.memory(own)
+    assert memory is not None
+    assert VIBRATION in dict(memory.values)
+    replay = Pipeline(own)
+    replay.apply(memory)
+    assert not replay.misfits
+    rest = chunk(volts[20 * start :], 20 * start)
+    expected = list(live.process(rest))
+    again = list(replay.process(rest))
+    assert [r for r in again if isinstance(r, DeflectionEstimate)] == [
+        r for r in expected if isinstance(r, DeflectionEstimate)
+    ]
+    named = [[r.findings for r in one if isinstance(r, SpotMeans)] for one in (again, expected)]
+    assert named[0] == named[1]
+    assert all(named[0])
+
+
+def test_what_another_rig_remembers_of_tones_does_not_fit() -> None:
+    places = np.array([[0.0, 0.07], [-0.1, 0.0]])
+    noisy = StreamNoise(SIZE, places, places, 1e-12, 1e-9)
+    noisy.look_for_tones(2)
+    block = (0.0, 2.0, 0.0, 1.0, *(0.0,) * 8)
+    with pytest.raises(ValueError, match='4 sum signals'):
+        noisy.set_segment(block, (1.0,) * 3)
+    noisy.set_segment(block, (1.0, 2.0, 3.0, 4.0))
+    assert noisy.segment() == block
+    assert noisy.sums() == (1.0, 2.0, 3.0, 4.0)
+    # One that looked for no tones told none.
+    noisy.set_segment(block)
+    assert noisy.sums() == (0.0,) * 4
+    assert noisy.gathered == len(block) + 4
+    pipeline = Pipeline(load_rig())
+    with pytest.raises(ValueError, match='17 numbers for each tone'):
+        pipeline.stamped.restore({'state.noise': (0.0,) * 4, VIBRATION: (0.1, 1.0)})
+
+
+def test_the_filter_states_it_too() -> None:
+    """The filtered pose and the velocity: 14 um and what 87 Hz makes of them."""
+    own = load_rig(overrides={'filter': 'modal'})
+    moved = [r for r in records_of(shaking(4), own) if isinstance(r, TipMotion)]
+    last = moved[-1]
+    pose, velocity = (np.sqrt(np.reshape(c, (3, 3))[1, 1]) for c in (last.covariance, last.velocity_covariance))
+    size = 20e-6 / 2.0**0.5
+    assert 0.95 * size < pose < 1.5 * size
+    assert 0.95 * 2.0 * np.pi * 87.0 * size < velocity < 1.5 * 2.0 * np.pi * 87.0 * size
+
+
+def test_info_says_what_vibrates(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / 'shaken.csv'
+    assert main(['simulate', '--out', str(path), '--loads', 'chirp:0,-4,0:87,87:4']) == 0
+    capsys.readouterr()
+    assert main(['info', str(path)]) == 0
+    assert 'um rms near 87 Hz, in 100 % of the seconds' in capsys.readouterr().out
+    assert main(['info', str(path), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['vibration']['hz'] == pytest.approx(87.0, abs=0.2)
+    assert main(['simulate', '--out', str(tmp_path / 'quiet.csv'), '--loads', 'steps:0,0,0;0,-10,0:2']) == 0
+    capsys.readouterr()
+    assert main(['info', str(tmp_path / 'quiet.csv'), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['vibration'] is None
