@@ -15,9 +15,11 @@ import numpy as np
 
 from blind.generator import RATE, Array
 
-KINDS = ('late', 'rounded', 'one', 'forgotten', 'mixed', 'twice', 'slow', 'unit', 'ms', 'cell', 'sway')
+KINDS = ('late', 'rounded', 'one', 'forgotten', 'mixed', 'twice', 'slow', 'unit', 'ms', 'cell', 'sway', 'near')
 """Each note another delay, late, or late and early; one load only; applied over up to a second; loads rounded to 5 N;
-one never noted; one noted as two; torque in another unit; all a few ms late; a load cell's noise; a swaying weight."""
+one never noted; one noted as two; torque in another unit; all a few ms late; a load cell's noise; a swaying weight;
+each note some ms off, late or early.
+"""
 TORQUES = (9.80665, 0.0980665, 9.80665e-3, 1e-3, 1e-2)
 """N m of each unit that a torque is noted in."""
 LEAST_S = 0.05
@@ -134,6 +136,12 @@ def drawn(name: str) -> Hand:
         late = round(float(rng.uniform(2e-3, 8e-3)) * RATE) / RATE
         noted = _held(levels, times + late, n)
         wrong = [{'name': 'load_delay', 'value': late}]
+    elif kind == 'near':
+        off = np.round(rng.choice((-1.0, 1.0), len(times)) * rng.uniform(4e-3, 28e-3, len(times)), 3)
+        noted = _held(levels, times + off, n)
+        wrong = [
+            {'name': 'load_time', 'where': f'load {i}', 'value': late} for i, late in enumerate(off.tolist(), start=1)
+        ]
     elif kind == 'cell':
         noted = acted + rng.normal(size=acted.shape) * np.array(CELL)
     elif kind == 'sway':

@@ -323,8 +323,8 @@ def cases_by_hand(first: int, hand: int) -> Iterator[Case]:
         if kind == 'rounded':
             # What moves the plate at rest is a load that nobody knows.
             name = str(rng.choice(byhand.BESIDE_UNKNOWN_LOADS))
-        # The kinds are an odd number: each is with and without one in turn.
-        wanted = ((name, gap),) if i % 2 else ()
+        # Each kind is with and without one in turn.
+        wanted = ((name, gap),) if (i + i // len(byhand.KINDS)) % 2 else ()
         what = f'-{name}' if wanted else ''
         yield Case(f'hand-{kind}-{i}{what}', 'hand', f'hand-{kind}-{i}', wanted, mistake=('hand', 0.0))
 

@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from psd_deflection.studies.budget.result import Budgeted
     from psd_deflection.studies.calibrate.result import Calibrated
     from psd_deflection.studies.check.result import Checkup
-    from psd_deflection.studies.discover.plants import Plant, PlantDiscovery
+    from psd_deflection.studies.discover.plant_search import PlantDiscovery
+    from psd_deflection.studies.discover.plants import Plant
     from psd_deflection.studies.discover.result import Discovery
     from psd_deflection.studies.identify.result import Identified
     from psd_deflection.studies.validate.result import Validated
@@ -374,7 +375,7 @@ def discover_in(plant: Plant, *, seed: int = 0) -> PlantDiscovery:
     writes ``result.json`` and a page. The same ``seed`` gives the same answer. Raises
     :class:`psd_deflection.base.errors.ConfigError` if the plant contradicts itself.
     """
-    from psd_deflection.studies.discover.plants import discover_in as of_plant
+    from psd_deflection.studies.discover.plant_search import discover_in as of_plant
 
     return of_plant(plant, seed=seed)
 

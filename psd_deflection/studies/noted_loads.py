@@ -33,8 +33,8 @@ APART_S = 0.25
 """Noted changes that follow each other faster than this are a sweep or a ramp, not notes of a person."""
 FARTHEST_S = 30.0
 """A note belongs to no step that is farther away."""
-ALIKE_S = 0.03
-"""Notes are late alike if their delays differ by less than this."""
+ALIKE_S = 0.002
+"""Notes are late alike if their delays differ by less than this. A step of some µm is timed to a tenth of a sample."""
 ONE_DELAY_S = 0.9
 """One delay of all loads up to this is a parameter of the searches, which fit it better."""
 GRADUAL_S = 0.1
@@ -237,8 +237,7 @@ def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads 
         return None
     late = np.array([(changes[i] - steps[j].at) * period for i, j in matched])
     long = np.array([steps[j].last - steps[j].first > 2.0 * width + GRADUAL_S / period for _, j in matched])
-    # The middle of a step is known to a fraction of a period.
-    if _alike(late, ALIKE_S + 0.5 / rig.dynamics.bending_frequency) and not long.any():
+    if _alike(late, ALIKE_S) and not long.any():
         return None
     edges = [0.0, *(s.at for s in steps), float(len(dots))]
     fitted = {i: _fitted(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}

@@ -13,7 +13,8 @@ from blind.arm import Arm
 from blind.boom import Boom
 from blind.measured import DATA
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.discover.plants import Model, PlantComparison, PlantDiscovery, discover_in
+from psd_deflection.studies.discover.plant_search import PlantComparison, PlantDiscovery, discover_in
+from psd_deflection.studies.discover.plants import Model
 from psd_deflection.studies.discover.search.fit import refit
 
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason='the data that others measured are not here')

@@ -20,6 +20,7 @@ LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0
 DWELL = 5000
 COUNT = DWELL * len(LEVELS)
 LATE = (1.3, 1.7, 3.4, 2.7, 0.3, 2.3)
+JITTER = (0.012, -0.02, 0.004, 0.028, -0.009, 0.017)
 
 
 def hung(took: float = 0.0) -> FloatArray:
@@ -56,7 +57,8 @@ def mended(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> MendedLoads |
 
 
 @pytest.mark.parametrize(
-    'late', [LATE, (0, 0, 3, 0, 0, 0), (2.0,) * 6, (-1.5, 0.4, -2.0, 0.2, -0.3, 1.0), (4.5, 3.0, 4.8, 4.0, 2.0, 4.0)]
+    'late',
+    [LATE, (0, 0, 3, 0, 0, 0), (2.0,) * 6, (-1.5, 0.4, -2.0, 0.2, -0.3, 1.0), (4.5, 3.0, 4.8, 4.0, 2.0, 4.0), JITTER],
 )
 @pytest.mark.parametrize('read', [QUIET, TURNED], ids=['quiet', 'turned'])
 def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], read: FloatArray) -> None:
@@ -70,12 +72,26 @@ def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, 
 
 @pytest.mark.parametrize(
     'loads',
-    [noted((0.0,) * 6), noted((0.3,) * 6), noted((0.01, 0, 0.02, 0, 0.01, 0)), hung(1.2)],
-    ids=['right', 'alike', 'a few ms', 'a noted ramp'],
+    [noted((0.0,) * 6), noted((0.3,) * 6), noted((0.001, 0, 0.002, 0, 0.001, 0)), hung(1.2)],
+    ids=['right', 'alike', 'a sample', 'a noted ramp'],
 )
 def test_right_times_and_one_small_delay_of_all_are_left_as_they_are(loads: FloatArray) -> None:
     assert mended(QUIET, loads) is None
     assert mended(TURNED, loads) is None
+
+
+def test_other_natural_frequencies_than_the_rig_file_says_change_no_time() -> None:
+    read = volts(hung(), dynamics__bending_frequency=14.7, dynamics__torsion_frequency=20.4)
+    assert mended(read, noted((0.0,) * 6)) is None
+
+
+def test_a_faultless_rig_whose_loads_were_noted_some_ms_off_lacks_nothing() -> None:
+    observed = Observation('hung', RIG, QUIET, noted(JITTER), None)
+    found = discover([observed], RIG)
+    assert found.verdict == 'nothing_missing'
+    assert found.floors < 1.1
+    assert {(f.name, f.where) for f in found.setup} == {('load_time', f'load {i}') for i in range(1, 7)}
+    assert [f.value for f in found.setup] == pytest.approx(JITTER, abs=2e-3)
 
 
 def test_a_load_that_no_motion_tells_of_is_left_as_it_is() -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,9 +24,10 @@ from psd_deflection.studies.discover.laws.laws import WRITTEN, FoundLaw
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.localise import Localisation
+from psd_deflection.studies.discover.search.remainder import Remainder
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.ties import ties
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown, covariance_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.study import StudyResult, Tell, described, edited_rig_file, named, warn_caller
 
@@ -39,7 +40,8 @@ class Conclusion(StudyResult):
     """The answer of a search. Gaps are rms values of measured minus simulated in the unit of ``workspace``.
 
     ``per_channel``: before and after; ``heldout_per_channel``: after, on load cases that the fit has not seen.
-    ``nuisance``: what every model has, each with the standard deviations of its parameters.
+    ``nuisance``: what every model has, each with the standard deviations of its parameters. ``remainder``: what is
+    unknown as a function of named variables.
     """
 
     study, json_name = 'discover', 'result.json'
@@ -58,6 +60,7 @@ class Conclusion(StudyResult):
     per_channel: Mapping[str, tuple[float, float]]
     heldout_per_channel: Mapping[str, float]
     waterfall: tuple[tuple[str, float], ...]
+    remainder: Remainder | None
     simulations: int
     search: SearchResult
     fit: Fit
@@ -94,7 +97,8 @@ class Conclusion(StudyResult):
     def lines(self) -> list[str]:
         """The sentences in one line, then what is unknown."""
         unknown = [f'unknown: {u.signature}' for u in self.unknown]
-        return [self.sentence, *unknown, f'{self.simulations} forward simulations']
+        limits = [f'limit: {x.limit}; {x.beyond}' for x in self.search.limits]
+        return [self.sentence, *unknown, *limits, f'{self.simulations} forward simulations']
 
     def tree(self) -> dict[str, Any]:
         """Verdict, places, effects, unknown, gaps, provenance."""
@@ -113,6 +117,9 @@ class Conclusion(StudyResult):
                 for u in self.unknown
             ],
             'ties': self._ties(),
+            'covariance': _covariance(self.fit, self.effects),
+            'limits': [{'limit': x.limit, 'beyond': x.beyond} for x in self.search.limits],
+            'remainder': None if self.remainder is None else asdict(self.remainder),
             'setup': [],
             'moves': None,
             'remaining': {'rms': self.gap_after, 'floors': self.floors},
@@ -333,6 +340,11 @@ def _fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
         elif math.isfinite(value):
             out[p.name] = {'value': _number(value), 'sd': _number(sds.get(p.name, 0.0)), 'unit': p.unit}
     return out
+
+
+def _covariance(fit: Fit, effects: Iterable[NamedEffect]) -> dict[str, Any]:
+    names, matrix = covariance_of(fit, tuple(effects))
+    return {'names': list(names), 'matrix': [[_number(v) for v in row] for row in matrix.tolist()]}
 
 
 def _effect_tree(e: NamedEffect) -> dict[str, Any]:

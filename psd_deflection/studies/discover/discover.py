@@ -30,7 +30,8 @@ from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
-from psd_deflection.studies.discover.search.localise import Localisation, localise
+from psd_deflection.studies.discover.search.localise import Localisation, localise, regressors
+from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import FAR, far
 from psd_deflection.studies.discover.search.signatures import (
@@ -179,6 +180,10 @@ class RecordedRig(Machine):
         if null is None or not fit.free:
             return localise(ws, fit.residual, None, rng)
         return localise(ws, fit.residual, fit.jacobian, rng, explained=null.residual - fit.residual)
+
+    def regressors(self, comparison: Comparison, fit: Fit) -> Table:
+        """Time, loads and temperature, and the dots of the channel's own PSD."""
+        return regressors(workspace_of(comparison))
 
     def suggest(self, comparison: Comparison, fit: Fit, equal: Sequence[Fit]) -> Suggestion | None:
         """The recording that tells them apart."""

@@ -22,7 +22,7 @@ from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_val
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.plants import PlantDiscovery, discover_in
+from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
 from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.study import Tell, warn_caller

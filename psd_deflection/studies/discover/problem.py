@@ -19,6 +19,7 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import NOWHERE, Localisation
+from psd_deflection.studies.discover.search.remainder import Remainder, Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
@@ -42,6 +43,10 @@ class Machine(ABC):
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
         """Where what ``fit`` leaves has structure; ``null``: the fit without any effect, None if ``fit`` is that."""
 
+    @abstractmethod
+    def regressors(self, comparison: Comparison, fit: Fit) -> Table:
+        """What the remainder of each channel may follow."""
+
     def bare(self, comparison: Comparison) -> Comparison:
         """``comparison`` without what the readings show by themselves, before any search."""
         return comparison
@@ -60,7 +65,8 @@ class Problem:
     """``search``: what is compared, and the signatures. ``result``: the model that the search chose. ``fit``: the model
     so far; ``heldout``: the gain of each of its effects on unseen load cases. ``null``: the model as described, against
     which gaps count. ``before``, ``left``: where ``null`` and ``fit`` leave structure. ``named``: the effects of
-    ``fit`` that are told. ``setup``: what is wrong with the set-up, with ``values`` that put the rig file right.
+    ``fit`` that are told. ``remainder``: what is unknown as a function of named variables.
+    ``setup``: what is wrong with the set-up, with ``values`` that put the rig file right.
     ``rivals``: whole models in place of ``fit``; ``unsettled``: names of what explains as much. ``law``: for what is
     unknown. ``stated_gap``: before the wiring was put right, 0 if that was right. ``rng``: draws of the steps.
     """
@@ -78,6 +84,7 @@ class Problem:
     left: Localisation = NOWHERE
     named: tuple[NamedEffect, ...] = ()
     unknown: tuple[Unknown, ...] = ()
+    remainder: Remainder | None = None
     setup: tuple[Finding, ...] = ()
     values: Mapping[str, object] = field(default_factory=dict)
     rivals: tuple[Fit, ...] = ()

@@ -16,6 +16,7 @@ from psd_deflection.studies.discover.problem import Machine, Problem, Progress, 
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldout_tables
+from psd_deflection.studies.discover.search.remainder import remainder_of
 from psd_deflection.studies.discover.search.search import BIC_ACCEPT, P_ACCEPT, Search, unphysical
 from psd_deflection.studies.discover.search.weighing import (
     EQUIVALENT,
@@ -189,7 +190,8 @@ def where(problem: Problem) -> Problem:
         or unsaid(ws, problem.gap_before, gap_after)
         or tied(coincidences(fit, ws.physics), fit, problem.result, before)
     )
-    return replace(problem, before=before, unknown=unknown)
+    remainder = remainder_of(ws, fit, left, problem.machine.regressors(ws, fit)) if unknown else None
+    return replace(problem, before=before, unknown=unknown, remainder=remainder)
 
 
 def fields_of(problem: Problem) -> dict[str, Any]:
@@ -210,6 +212,7 @@ def fields_of(problem: Problem) -> dict[str, Any]:
         'per_channel': per_channel_of(ws, null.difference, fit.difference),
         'heldout_per_channel': heldout_per_channel_of(ws, held),
         'waterfall': waterfall_of(ws, fit, problem.gap_before, after),
+        'remainder': problem.remainder,
         'simulations': ws.simulations,
         'search': problem.result,
         'fit': fit,

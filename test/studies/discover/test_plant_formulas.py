@@ -19,8 +19,9 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.discover import plants
-from psd_deflection.studies.discover.plants import Model, Plant, PlantComparison, discover_in, plant_effect
+from psd_deflection.studies.discover import plant_search
+from psd_deflection.studies.discover.plant_search import PlantComparison, discover_in
+from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 from psd_deflection.studies.discover.search.fit import refit
 
 LENGTHS = (10, 7, 13)
@@ -401,7 +402,7 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
     plant.units = ('', '')
     assert list(ws.against())[2:] == ['force', 'turn']
     fit = refit(ws, [on('a', 0.5)], iterations=0)
-    named = plants._regressors(ws, fit)
+    named = plant_search.regressors(ws, fit)
     assert [channel for channel, _ in named] == ['force', 'turn']
     for c, (channel, of) in enumerate(named):
         for i, n in enumerate(LENGTHS):
@@ -416,9 +417,9 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
             for name, values in want.items():
                 np.testing.assert_allclose(of[name][i], values, atol=1e-12, err_msg=name)
     short = PlantComparison(Pictures([rows[:, :1] for rows in tables(0)], {}, period=1.0))
-    assert not any('rate' in name for name in plants._regressors(short, refit(short, ()))[0][1])
+    assert not any('rate' in name for name in plant_search.regressors(short, refit(short, ()))[0][1])
     two = PlantComparison(Pictures([rows[:, :2] for rows in tables(0)], {}, period=1.0))
-    assert 'rate of force' in plants._regressors(two, refit(two, ()))[0][1]
+    assert 'rate of force' in plant_search.regressors(two, refit(two, ()))[0][1]
 
 
 @pytest.mark.parametrize('period', [0.0, 0.25])
@@ -431,7 +432,7 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     plant.done = {'u': [np.arange(n) / n for n in LENGTHS]}
     ws = PlantComparison(plant)
     fit = refit(ws, ())
-    found = plants._where(ws, fit, None)
+    found = plant_search._where(ws, fit, None)
     cells = {(c.channel, c.recording): c for c in found.cells}
     assert set(cells) == {('force', 0), ('force', 1), ('force', 2), ('turn', 0), ('turn', 2)}
     for (channel, case), cell in cells.items():
@@ -470,12 +471,12 @@ def test_words_for_a_channel_are_those_of_its_own_strongest_dependences(monkeypa
             ('turn', 'u', 50.0, 0.011),
         )
     ]
-    monkeypatch.setattr(plants, 'dependences', lambda *_: depends)
+    monkeypatch.setattr(plant_search, 'dependences', lambda *_: depends)
     ws = PlantComparison(Pictures(tables(0), {}))
-    words = {c.channel: c.depends_on for c in plants._where(ws, refit(ws, ()), None).cells}
+    words = {c.channel: c.depends_on for c in plant_search._where(ws, refit(ws, ()), None).cells}
     assert words == {'force': ('u', 'u^2'), 'turn': ('time',)}
-    monkeypatch.setattr(plants, 'dependences', lambda *_: [])
-    found = plants._where(ws, refit(ws, ()), None)
+    monkeypatch.setattr(plant_search, 'dependences', lambda *_: [])
+    found = plant_search._where(ws, refit(ws, ()), None)
     assert (found.excess, found.p, found.dependences) == (0.0, 1.0, ())
 
 

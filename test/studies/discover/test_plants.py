@@ -13,7 +13,8 @@ import psd_deflection
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.discover.plants import Model, Plant, PlantComparison, plant_effect
+from psd_deflection.studies.discover.plant_search import PlantComparison
+from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 STIFFNESS = plant_effect('stiffness', EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'))
 CUBIC = plant_effect('cubic', EffectParameter('c', 'N/mm^3', -9.0, 9.0, 0.1, 'of u^3'), equation='F += c u^3')
@@ -107,6 +108,35 @@ def test_what_remains_is_unknown_if_it_follows_something() -> None:
     assert found.verdict == 'unknown_effect'
     (unknown,) = found.unknown
     assert 'u^3' in unknown.depends_on
+
+
+def test_what_remains_is_a_function_of_named_variables_that_holds_on_unseen_cases() -> None:
+    plant = Spring(0.3)
+    plant.library = (STIFFNESS,)
+    found = psd_deflection.discover_in(plant)
+    remainder = found.tree()['remainder']
+    assert 'u^3' in remainder['depends_on']
+    assert remainder['heldout'] == pytest.approx(NOISE, rel=0.1)
+    assert remainder['rms'] == pytest.approx(math.hypot(found.gap_after, NOISE), rel=0.02)
+    # What is named is no remainder.
+    assert psd_deflection.discover_in(Spring(0.3)).tree()['remainder'] is None
+
+
+def test_the_covariance_of_the_sizes_is_that_of_least_squares() -> None:
+    plant = Spring(0.3, k=1.05)
+    found = psd_deflection.discover_in(plant)
+    tree = found.tree()
+    names, matrix = tree['covariance']['names'], np.array(tree['covariance']['matrix'])
+    terms = {'stiffness.scale': np.concatenate(plant.u), 'cubic.c': np.concatenate(plant.u) ** 3}
+    assert sorted(names) == sorted(terms)
+    design = np.stack([terms[name] for name in names], axis=1)
+    expected = NOISE**2 * np.linalg.inv(design.T @ design)
+    # The level of what remains is fitted, from few cases: the same matrix, and no smaller.
+    scale = float(matrix[0, 0] / expected[0, 0])
+    assert 1.0 < scale < 3.0
+    np.testing.assert_allclose(matrix, scale * expected, rtol=0.02)
+    told = [e['parameters'][p]['sd'] for e in tree['effects'] for p in e['parameters']]
+    assert np.sqrt(np.diag(matrix)).tolist() == pytest.approx(told)
 
 
 def test_a_stated_noise_is_the_floor() -> None:

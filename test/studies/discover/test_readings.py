@@ -18,7 +18,7 @@ from psd_deflection.recordings.read.readings_table import is_table
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.from_recordings import read_tables
-from psd_deflection.studies.discover.plants import discover_in
+from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.readings import CHANNELS, Readings, ReadingsPlant
 
 RIG = load_rig()

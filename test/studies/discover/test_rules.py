@@ -40,6 +40,7 @@ from psd_deflection.studies.discover.search.localise import (
     localise,
     regressors,
 )
+from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate
@@ -121,6 +122,9 @@ class Lone(Machine):
 
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
         return Screen(comparison, [])
+
+    def regressors(self, comparison: Comparison, fit: Fit) -> Table:
+        return [(c, {}) for c in comparison.channels]
 
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
         return self.left

@@ -150,15 +150,41 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
     assert {-0.2, -0.1, -0.04, 0.04, 0.1, 0.25} <= set(tried)
 
 
-def test_at_most_four_effects_are_added_and_none_beyond_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_said(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     names = 'abcdef'
     shown = pictures(*((n, 'x') for n in names))
     plant = Plant(shown, without_noise(*((shown[n, 'x'], 900.0) for n in names)) + noise())
-    assert len(ran(searching(plant, shown, names)).fit.effects) == 4
+    whole = ran(searching(plant, shown, names))
+    assert (named(whole.fit), whole.limits) == (list(names), ())
     # The fit of no effect is one simulation; after the first effect there are more than two.
     for budget, effects in ((1, 0), (2, 1)):
         monkeypatch.setattr(plant, 'budget', budget)
-        assert len(ran(searching(plant, shown, names)).fit.effects) == effects
+        found = ran(searching(plant, shown, names))
+        assert len(found.fit.effects) == effects
+        (limit,) = found.limits
+        assert limit.limit == f'{budget * max(effects, 1)} simulations for {effects} effect{"s" * (effects != 1)}'
+        beyond = sorted(set(names) - set(named(found.fit)))
+        assert limit.beyond.startswith(f'{len(beyond)} more term')
+        assert all(name in limit.beyond.split('(')[1].split(')')[0] for name in beyond)
+        left, of = (float(words.split()[0]) for words in limit.beyond.split('be ')[-1].split(' instead of '))
+        # Six effects of 900 in 14400 values.
+        assert left < 0.9 * of
+
+
+def test_an_effect_that_may_stand_in_is_not_added_and_that_is_said() -> None:
+    shown = pictures(A, B, C)
+    # The library lacks c, which explains much more than b.
+    plant = Plant(shown, without_noise((shown[A], 9e5), (shown[B], 4000.0), (shown[C], 60000.0)) + noise())
+    found = ran(searching(plant, shown, 'ab'))
+    assert named(found.fit) == ['a']
+    (limit,) = found.limits
+    assert limit.limit.startswith('b beside 1 effect explains less than 20% of what remains')
+    assert limit.beyond.startswith('1 more term (b) would pass')
+    # With it nothing is left that stands in for anything.
+    whole = ran(searching(plant, shown, 'abc'))
+    assert (named(whole.fit), whole.limits) == (['a', 'b', 'c'], ())
 
 
 def test_a_model_of_two_effects_may_cost_twice_as_much(monkeypatch: pytest.MonkeyPatch) -> None:

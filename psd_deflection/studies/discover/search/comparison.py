@@ -1,7 +1,7 @@
 """Measured against simulated, as whitened vectors of one likelihood: what the search asks of a rig or of another plant.
 
 :class:`~psd_deflection.studies.discover.search.workspace.Workspace` is the rig with its recordings,
-:class:`~psd_deflection.studies.discover.plants.PlantComparison` any machine that simulates itself. Search, refit,
+:class:`~psd_deflection.studies.discover.plant_search.PlantComparison` any machine that simulates itself. Search, refit,
 hold-out and verdict know neither.
 """
 

@@ -7,7 +7,7 @@ optimum, and tested on that group. One step is enough because the effects are ne
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -69,6 +69,16 @@ def heldout_tables(workspace: Comparison, fit: Fit) -> list[FloatArray]:
 def heldout_gap(workspace: Comparison, fit: Fit) -> float:
     """Gap on load cases that the fit has not seen."""
     return workspace.gap(heldout_tables(workspace, fit))
+
+
+def unseen_gap(workspace: Comparison, fit: Fit, columns: FloatArray) -> float:
+    """The gap on unseen load cases if ``columns`` (D, p), whitened, describe what ``fit`` leaves, in proportion."""
+    lengths = np.maximum(np.linalg.norm(columns, axis=0), 1e-150)
+    moved = columns @ (np.linalg.lstsq(columns / lengths, fit.residual, rcond=1e-9)[0] / lengths)
+    free = tuple((0, str(j)) for j in range(columns.shape[1]))
+    linear = replace(fit, residual=fit.residual - moved, jacobian=columns, free=free, at_bound=())
+    change = workspace.unwhitened(heldout_residual(workspace, linear) - fit.residual)
+    return workspace.gap([d + c for d, c in zip(fit.difference, change, strict=True)])
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,6 +19,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.limits import Limit, beyond
 from psd_deflection.studies.discover.search.screen import Score, Screen
 from psd_deflection.studies.discover.search.trust import gain_beyond
 
@@ -40,7 +41,6 @@ STANDS_IN = 0.2
 """An effect beside others explains this share of what they leave at least, in chi-square beyond noise."""
 NEAR = 0.1
 """Unless it leaves less than this share of the noise itself."""
-MAX_EFFECTS = 4
 ROUNDS = 3
 """How often effects are added: again only if the noise beside those found is another than before."""
 TRIALS = 7
@@ -55,7 +55,7 @@ SWAP_REACH = 0.6
 class SearchResult:
     """``fit``: the model chosen. ``null``: the rig file's own. ``p``: library-wide, per effect.
     ``delta_bic``: loss of BIC if each effect were dropped. ``alternatives``: for each effect of
-    ``fit``, refits with another in its place.
+    ``fit``, refits with another in its place. ``limits``: what ended the search before the evidence did.
     """
 
     null: Fit
@@ -66,6 +66,7 @@ class SearchResult:
     first_scores: Sequence[Score] = ()
     alternatives: Sequence[Sequence[Fit]] = ()
     trace: Sequence[str] = ()
+    limits: Sequence[Limit] = ()
 
 
 def key_of(active: ActiveEffect) -> tuple[object, ...]:
@@ -94,6 +95,12 @@ def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
         ):
             return True
     return not on
+
+
+def counted(fit: Fit) -> str:
+    """How many effects ``fit`` has, in words."""
+    count = len(fit.effects)
+    return f'{count} effect{"" if count == 1 else "s"}'
 
 
 def far(fit: Fit) -> bool:
@@ -142,6 +149,7 @@ class Search:
         self.penalty = float(np.log(workspace.effective_size()))
         self.trace: list[str] = []
         self.dropped: dict[int, tuple[Fit, list[Fit]]] = {}
+        self._stopped = ''
 
     @property
     def spent(self) -> int:
@@ -245,12 +253,29 @@ class Search:
             current = calmer
         current, others = self.swap(null, current)
         p, delta_bic, delta_chi2 = self.weigh(null, current)
-        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace)
+        limits = self._limits(current)
+        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace, limits)
+
+    def _limits(self, current: Fit) -> tuple[Limit, ...]:
+        """The limit that kept further effects out, with what lies beyond it."""
+        little = current.chi2 <= (1.0 + NEAR) * self.workspace.size and not self.workspace.open_level
+        if not self._stopped or little:
+            return ()
+
+        def passes(score: Score) -> bool:
+            return score.p <= P_ACCEPT and score.gain - self.penalty * score.dof > BIC_ACCEPT
+
+        words = beyond(self.workspace, self.screen, current, passes, self.workspace.first)
+        return (Limit(self._stopped, words),) if words else ()
 
     def _grown(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
         """The fit of no effect, and ``current`` with all that passes added."""
         renoised = bool(current.effects)
-        while len(current.effects) < MAX_EFFECTS and self.spent < self._budget(current):
+        while True:
+            self._stopped = ''
+            if self.spent >= self._budget(current):
+                self._stopped = f'{self._budget(current)} simulations for {counted(current)}'
+                break
             better = self._added(null, current)
             if better is None:
                 break
@@ -276,9 +301,14 @@ class Search:
         ]
         better = self._further(current, scores)
         passes = better is not None and self.passes(current, better, null)
-        if better is not None and passes and not self._stands_in(current, better):
-            self._say('adding ' + better.effects[-1].label)
-            return better
+        if better is not None and passes:
+            if not self._stands_in(current, better):
+                self._say('adding ' + better.effects[-1].label)
+                return better
+            self._stopped = (
+                f'{better.effects[-1].effect.name} beside {counted(current)} explains less than '
+                f'{STANDS_IN:.0%} of what remains: it may only stand in for what the library lacks'
+            )
         # Of two causes of a rough machine neither may help alone, and a wrong first effect hides a pair.
         if len(current.effects) >= 2 or not (ws.open_level or passes):
             return None

@@ -90,6 +90,26 @@ def sd_of(workspace: Comparison, fit: Fit, index: int) -> dict[str, float]:
     return {fit.free[j][1]: float(sd[j]) for j in fit.columns_of(index)}
 
 
+def covariance_of(fit: Fit, effects: Sequence[NamedEffect]) -> tuple[tuple[str, ...], FloatArray]:
+    """Names (p) ``effect.parameter`` and covariance (p, p) of the fitted sizes, in the order of ``effects``.
+
+    Correlations are those of ``fit``; standard deviations are those that the effects tell. What the readings show
+    without a fit is independent of the rest.
+    """
+    places = [(e, name) for e in effects for name in e.sd if np.isfinite(e.active.values[name])]
+    index = {id(a): i for i, a in enumerate(fit.effects)}
+    columns = [fit.free.index((index[id(e.active)], n)) if id(e.active) in index else -1 for e, n in places]
+    sd = np.array([e.sd[name] for e, name in places])
+    fitted = fit.covariance()
+    spread = np.sqrt(np.maximum(np.diag(fitted), 0.0))
+    out = np.diag(sd**2)
+    for a, i in enumerate(columns):
+        for b, j in enumerate(columns):
+            if a != b and min(i, j) >= 0 and min(spread[i], spread[j]) > 0.0:
+                out[a, b] = fitted[i, j] / (spread[i] * spread[j]) * sd[a] * sd[b]
+    return tuple(f'{e.active.effect.name}.{name}' for e, name in places), out
+
+
 def per_channel_of(
     workspace: Comparison, before: Sequence[FloatArray], after: Sequence[FloatArray]
 ) -> dict[str, tuple[float, float]]:
