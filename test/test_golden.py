@@ -125,7 +125,9 @@ def test_csv_out_has_the_contracts_columns(tmp_path: Path) -> None:
         rows = list(csv.DictReader(stream))
     names = ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta']
     assert list(rows[0])[:7] == names
-    assert list(rows[0])[-1] == 'chi_square'
+    assert list(rows[0])[-4:] == ['chi_square', 'fx', 'fy', 'tz']
+    # The load at the tip, N.
+    assert max(abs(float(r['fy'])) for r in rows) > 10.0
     # One number left of four readings and three unknowns: half of a chi-square is below 0.455, and means of a ringing
     # plate's dots give a little more.
     assert 0.3 < np.median([float(r['chi_square']) for r in rows]) < 0.9

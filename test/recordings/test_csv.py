@@ -241,14 +241,17 @@ def test_estimates_have_one_row_a_block(tmp_path: Path) -> None:
     sink = CsvEstimateSink(tmp_path / 'e.csv', ['exact', 'wls'])
     sink.put(block(0))
     sink.put(estimate(0))
+    sink.put(TipLoad(estimate(0).t_ns, 1.5, -2.5, 0.125))
     sink.put(other(estimate(0), 'wls', 0.25))
+    # Of a block that is not there: it goes into no other row.
+    sink.put(TipLoad(estimate(2).t_ns, 9.0, 9.0, 9.0))
     sink.put(estimate(3)._replace(chi_square=1.25))
     sink.put(other(estimate(4), 'wls', 0.5))
     sink.close()
     sink.close()
     header, first, second, third = (tmp_path / 'e.csv').read_text().splitlines()
     assert header == (
-        't,dx,dy,theta,sd_dx,sd_dy,sd_theta,exact_dx,exact_dy,exact_theta,wls_dx,wls_dy,wls_theta,chi_square'
+        't,dx,dy,theta,sd_dx,sd_dy,sd_theta,exact_dx,exact_dy,exact_theta,wls_dx,wls_dy,wls_theta,chi_square,fx,fy,tz'
     )
     e = estimate(0)
     cells = first.split(',')
@@ -256,8 +259,8 @@ def test_estimates_have_one_row_a_block(tmp_path: Path) -> None:
     assert [float(c) for c in cells[1:4]] == [e.dx, e.dy, e.theta]
     assert [float(c) for c in cells[4:7]] == [math.sqrt(e.covariance[i]) for i in (0, 4, 8)]
     assert [float(c) for c in cells[7:13]] == [e.dx, e.dy, e.theta, 0.25, e.dy, e.theta]
-    assert cells[13:] == ['']
-    assert second.split(',')[10:] == ['', '', '', '1.25']
+    assert cells[13:] == ['', '1.5', '-2.5', '0.125']
+    assert second.split(',')[10:] == ['', '', '', '1.25', '', '', '']
     assert float(second.split(',')[1]) == estimate(3).dx
     assert third.split(',')[1:10] == [''] * 9
     assert float(third.split(',')[10]) == 0.5

@@ -24,8 +24,12 @@ from psd_deflection.records import (
     ReferenceWithCovariance,
     SampleBlock,
     TemperatureReading,
+    TipLoad,
     channel_names,
 )
+
+WRENCH_COLUMNS = ('fx', 'fy', 'tz')
+"""Of a row of estimates: the load at the tip that the deflection says."""
 
 
 def seconds(t_ns: int) -> str:
@@ -121,7 +125,8 @@ class CsvSampleSink(_CsvFile):
 
 
 class CsvEstimateSink(_CsvFile):
-    """Estimates: ``t,dx,dy,theta,sd_dx,sd_dy,sd_theta`` (s, m, m, rad), three columns a solver, ``chi_square``.
+    """Estimates: ``t,dx,dy,theta,sd_dx,sd_dy,sd_theta`` (s, m, m, rad), three columns a solver, ``chi_square``, and the
+    load at the tip ``fx,fy,tz`` (N, N, N m), as on ``/link_tip/wrench``.
 
     One row for each block that some solver answered; a block without an answer has no row, and a
     solver without an answer has empty cells.
@@ -130,11 +135,15 @@ class CsvEstimateSink(_CsvFile):
     def __init__(self, path: str | Path, solvers: Collection[str]) -> None:
         self._solvers = tuple(solvers)
         self._block: list[DeflectionEstimate] = []
+        self._load: TipLoad | None = None
         names = [f'{solver}_{q}' for solver in self._solvers for q in ('dx', 'dy', 'theta')]
-        super().__init__(path, ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', *names, 'chi_square'])
+        head = ('t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta')
+        super().__init__(path, [*head, *names, 'chi_square', *WRENCH_COLUMNS])
 
     def put(self, record: Record) -> None:
-        """Take one record; all except estimates are ignored."""
+        """Take one record; all except estimates and their loads are ignored."""
+        if isinstance(record, TipLoad) and self._block and self._block[0].t_ns == record.t_ns:
+            self._load = record
         if not isinstance(record, DeflectionEstimate):
             return
         if self._block and self._block[0].block != record.block:
@@ -157,7 +166,9 @@ class CsvEstimateSink(_CsvFile):
             cells += ['', '', ''] if e is None else [repr(e.dx), repr(e.dy), repr(e.theta)]
         known = primary is not None and not math.isnan(primary.chi_square)
         cells.append(repr(primary.chi_square) if primary is not None and known else '')
-        self._block = []
+        load = self._load
+        cells += ['', '', ''] if load is None else [repr(load.fx), repr(load.fy), repr(load.tz)]
+        self._block, self._load = [], None
         self._write([','.join(cells)])
 
 
