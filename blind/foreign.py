@@ -1,7 +1,8 @@
 """discover_in on machines that others measured. ``python -m blind.foreign [boom|emps|arm|auxtel]``.
 
 The boom lacks gravity and gives way at its root; the drive lacks its Coulomb friction and its offset; the arm is its
-maker's model; the telescope lacks all terms but the zeros of its encoders. ``--null`` gives each model what is published. result.json and report.html go to ``--out``.
+maker's model; the telescope lacks all terms but the zeros of its encoders. ``--null`` gives each model what is
+published. result.json and report.html go to ``--out``.
 """
 
 from __future__ import annotations
