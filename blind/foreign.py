@@ -1,7 +1,8 @@
-"""discover_in on machines that others measured. ``python -m blind.foreign [boom|emps|arm]``.
+"""discover_in on machines that others measured. ``python -m blind.foreign [boom|emps|arm|auxtel]``.
 
 The boom lacks gravity and gives way at its root; the drive lacks its Coulomb friction and its offset; the arm is its
-maker's model. ``--null`` gives each model what is published. result.json and report.html go to ``--out``.
+maker's model; the telescope lacks all terms but the zeros of its encoders. ``--null`` gives each model what is
+published. result.json and report.html go to ``--out``.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from blind.arm import Arm
+from blind.auxtel import PHYSICAL, AuxTel
 from blind.boom import Boom
 from blind.campaign import options
 from blind.emps import Emps
@@ -23,8 +25,9 @@ MACHINES: Mapping[str, tuple[Callable[[Path], Plant], Callable[[Path], Plant] | 
     'boom': (lambda folder: Boom(folder), lambda folder: Boom(folder, weighed=True)),
     'emps': (lambda folder: Emps(('coulomb_friction', 'force_offset'), folder), lambda folder: Emps((), folder)),
     'arm': (lambda folder: Arm(folder), None),
+    'auxtel': (lambda path: AuxTel(path), lambda path: AuxTel(path, known=PHYSICAL[:4])),
 }
-FOLDERS = {'boom': 'boom', 'emps': 'emps', 'arm': 'two_link_arm'}
+FOLDERS = {'boom': 'boom', 'emps': 'emps', 'arm': 'two_link_arm', 'auxtel': 'auxtel.txt'}
 
 
 def lines(found: PlantDiscovery) -> list[str]:
@@ -43,7 +46,7 @@ def lines(found: PlantDiscovery) -> list[str]:
 def main() -> int:
     """Search, print, write."""
     parser = options(__doc__)
-    parser.add_argument('machines', nargs='*', help='boom, emps, arm (default: all)')
+    parser.add_argument('machines', nargs='*', help='boom, emps, arm, auxtel (default: all)')
     parser.add_argument('--data', type=Path, default=DATA, help='folder with a folder of each (default: %(default)s)')
     parser.add_argument('--null', action='store_true', help='with the published terms in the model')
     parser.add_argument('--out', type=Path, help='folder for result.json and report.html of each')

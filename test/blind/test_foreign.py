@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from blind import emps, foreign
 from blind.arm import Arm
+from blind.auxtel import AuxTel
 from blind.boom import Boom
 from blind.measured import DATA
 from psd_deflection.records import FloatArray
@@ -46,6 +48,25 @@ def test_the_weighed_boom_lacks_no_weight() -> None:
     found = discover_in(Boom(weighed=True))
     assert names(found) <= {'tip_force', 'root_length', 'clamp_compliance'}
     assert found.gap_after == pytest.approx(1.58e-3, rel=0.02)
+
+
+def test_the_telescope_has_five_effects_and_their_sizes_are_those_of_tpoint() -> None:
+    """More than four effects by evidence. TPOINT, with 22 free terms: AN 44.26, AW 69.89, NPAE -50.97 arcsec."""
+    found = discover_in(AuxTel())
+    sizes = {e.active.effect.name: e.active.values['size'] for e in found.effects}
+    assert len(sizes) >= 5
+    assert sizes['AN'] == pytest.approx(44.26, abs=4.0)
+    assert sizes['AW'] == pytest.approx(69.89, abs=8.0)
+    (between,) = (e for e in found.effects if {'NPAE', 'CA'} & {e.active.effect.name, *e.equivalent})
+    assert {'NPAE', 'CA'} <= {between.active.effect.name, *between.equivalent}
+    # On unseen stars: 24.3 arcsec on the sky with four effects at most.
+    assert math.sqrt(2.0) * found.gap_heldout_after < 15.0
+
+
+@pytest.mark.parametrize('name', ['AN', 'AW'])
+def test_a_term_that_the_model_of_the_telescope_lacks_is_named(name: str) -> None:
+    known = [n for n in ('AN', 'AW', 'NPAE', 'CA') if n != name]
+    assert name in names(discover_in(AuxTel(known=known)))
 
 
 @pytest.mark.statistics
