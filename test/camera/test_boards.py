@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -12,6 +13,7 @@ import pytest
 
 from blind.render import Pose, Scene, board, developed
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera import boards
 from psd_deflection.camera.answer import Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.intrinsics import calibrated
@@ -129,3 +131,14 @@ def test_a_printed_board_is_read_again(settings: CameraSettings) -> None:
     (answer,) = reference.finish()
     assert answer.status is Status.OK
     assert printed(target, 'pdf').startswith(b'%PDF')
+
+
+@pytest.mark.parametrize('kind', ['charuco', 'apriltag'])
+def test_with_ubuntus_opencv_a_board_is_refused_with_a_way_that_its_pip_takes(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """4.6 has the boards of opencv_contrib alone, under other names."""
+    old = SimpleNamespace(__version__='4.6.0', aruco=SimpleNamespace(DICT_4X4_50=0))
+    monkeypatch.setattr(boards, 'opencv', lambda: old)
+    with pytest.raises(ConfigError, match=rf'OpenCV 4\.6\.0 has no boards; target.kind {kind} .* virtual environment'):
+        target_of(CameraSettings(target=kind))

@@ -110,11 +110,7 @@ def limits_of(text: str, where: str) -> dict[str, JointLimits]:
         if kind in MOVABLE:
             at = f'{where}: joint {name}'
             lower, upper = _range(limit, kind, at)
-            text = '' if limit is None else limit.get('velocity', '')
-            speed = _numbers(text, 1, f'{at}: velocity')[0] if text else math.inf
-            if speed < 0.0:
-                raise ConfigError(f'{at}: velocity = {speed:g}: must be at least 0')
-            out[name] = JointLimits(lower, upper, speed)
+            out[name] = JointLimits(lower, upper, _speed(limit, at))
     return out
 
 
@@ -184,7 +180,18 @@ def _joint(file: str, element: ElementTree.Element) -> ArmJoint:
     length = float(np.linalg.norm(direction))
     if not length:
         raise ConfigError(f'{where}: its axis is zero')
+    # Not used here, but whoever wrote a wrong one has others.
+    _speed(limit, where)
     return ArmJoint(name, kind, place, direction / length, *_range(limit, kind, where))
+
+
+def _speed(limit: ElementTree.Element | None, where: str) -> float:
+    """Largest speed of a joint."""
+    text = '' if limit is None else limit.get('velocity', '')
+    speed = _numbers(text, 1, f'{where}: velocity')[0] if text else math.inf
+    if speed < 0.0:
+        raise ConfigError(f'{where}: velocity = {speed:g}: must be at least 0')
+    return speed
 
 
 def _range(limit: ElementTree.Element | None, kind: str, where: str) -> tuple[float, float]:

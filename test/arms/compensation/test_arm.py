@@ -81,6 +81,8 @@ def test_a_negative_speed_is_no_limit(tmp_path: Path) -> None:
     path.write_text(WRIST.replace('lower="-1"', 'velocity="-1" lower="-1"'))
     with pytest.raises(ConfigError, match='joint turn: velocity = -1: must be at least 0'):
         read_limits(path)
+    with pytest.raises(ConfigError, match='joint turn: velocity = -1: must be at least 0'):
+        read_arm(path, 'd')
     path.write_text(WRIST.replace('lower="-1"', 'velocity="1.5e0" lower="-1"'))
     assert read_limits(path)['turn'].speed == 1.5
 
