@@ -14,15 +14,15 @@ from concurrent.futures import Future, wait
 from functools import partial
 from pathlib import Path
 
-from msg_adapters import ACCELERATION, LOAD, TOPIC_TYPES, accel_stamped, from_fields, to_messages
-from psd_deflection.base.bounds import BoundedMap, Tally
+from msg_adapters import ACCELERATION, LOAD, MARK, TOPIC_TYPES, accel_stamped, from_fields, string, to_messages
+from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
 from psd_deflection.base.errors import SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.base.printable import printable
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.solvers.registry import check_arrangement, check_live
 from psd_deflection.recordings import cdr
-from psd_deflection.records import AppliedLoad, BaseAcceleration, ParameterChange, Record
+from psd_deflection.records import AppliedLoad, BaseAcceleration, Mark, ParameterChange, Record
 from psd_deflection.rig.config import Rig, left_as_in_the_thesis, replace_values
 from psd_deflection.rig.declarations import ZEROS
 from psd_deflection.run.fanout import Fanout
@@ -53,6 +53,9 @@ KEEP_S = 0.2
 OPEN_S = 2.0
 """How long the start waits for the disk if a recording is wanted from the start."""
 
+MARKS_A_SECOND = 10
+"""Marks that are taken within a second: more than any hand sets, and few enough for every plot."""
+
 LONGEST_LINE = 2000
 """Characters of a line that is said."""
 
@@ -66,6 +69,11 @@ def zero_text(rig: Rig) -> str:
 def load_text(load: AppliedLoad) -> str:
     """A known load, as one line of text."""
     return f'load noted: Fx {load.fx:.6g} N, Fy {load.fy:.6g} N, Tz {load.tz:.6g} N·m'
+
+
+def mark_text(mark: Mark) -> str:
+    """A mark, as one line of text."""
+    return f'mark: {mark.text}'
 
 
 def why_no_zero(pipeline: Pipeline) -> str:
@@ -97,6 +105,7 @@ class Session:
         self.why_refused: BoundedMap[str, str] = BoundedMap()
         say = self._tell
         self._repeats = Repeats(say)
+        self._mark_rate = RateLimit(MARKS_A_SECOND)
         check_live(rig.estimator.solver)
         check_arrangement(rig)
         # The geometry first: a rig that cannot be solved must not open a port.
@@ -247,6 +256,11 @@ class Session:
         """
         if topic == ACCELERATION:
             return self._take_acceleration(message)
+        if topic == MARK:
+            try:
+                return self._take_mark(message)
+            except ValueError:
+                return None
         self.recorder.put(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
         if self.watcher is not None:
             self.watcher.put_message(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
@@ -255,7 +269,8 @@ class Session:
         except ValueError as error:
             self.refuse_input(topic, str(error))
             return None
-        if not all(math.isfinite(n) for field in record for n in (field if isinstance(field, tuple) else (field,))):
+        numbers = (n for field in record for n in (field if isinstance(field, tuple) else (field,)))
+        if not all(math.isfinite(n) for n in numbers if not isinstance(n, str)):
             self.refuse_input(topic, 'a number is not finite')
             return None
         if record.t_ns == 0:
@@ -298,6 +313,36 @@ class Session:
             self.watcher.put_message(ACCELERATION, TOPIC_TYPES[ACCELERATION], message, known_ns)
         for sink in self.input_sinks:
             sink.put(record)
+
+    def note_mark(self, text: str) -> Mark:
+        """Mark this moment, as if ``text`` had come on ``/link_tip/mark``.
+
+        Raises ValueError if it is no mark, or comes too soon after others; that is counted.
+        """
+        try:
+            fields = string.from_mark(string.to_mark({'data': text}))
+        except ValueError as error:
+            self.refuse_input(MARK, str(error))
+            raise
+        return self._take_mark(cdr.encode(TOPIC_TYPES[MARK], fields))
+
+    def _take_mark(self, message: bytes) -> Mark:
+        """Unlike another input it is recorded only if it can be used: it is all text. Its time is its arrival."""
+        try:
+            mark = string.to_mark(cdr.decode(TOPIC_TYPES[MARK], message))
+            if not self._mark_rate.allows(time.monotonic()):
+                raise ValueError(f'more than {MARKS_A_SECOND} marks a second')
+        except ValueError as error:
+            self.refuse_input(MARK, str(error))
+            raise
+        mark = mark._replace(t_ns=self.acquisition.now_ns())
+        self.recorder.put(MARK, TOPIC_TYPES[MARK], message, mark.t_ns)
+        if self.watcher is not None:
+            self.watcher.put_message(MARK, TOPIC_TYPES[MARK], message, mark.t_ns)
+        for sink in self.input_sinks:
+            sink.put(mark)
+        self._tell(mark_text(mark))
+        return mark
 
     def refuse_input(self, topic: str, why: str) -> None:
         """Count a message of another node that cannot be used, and say so."""

@@ -142,7 +142,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         say,
         speed=args.speed,
         loop=args.loop,
-        inputs=[*opened.loads(), *opened.references()],
+        inputs=[*opened.loads(), *opened.references(), *opened.marks()],
         find_span=find_span,
     )
     server = MonitorServer(shown, feed, rig.monitor, display.say)

@@ -42,7 +42,7 @@ HEALTH_S = 0.9
 HISTORY_S = 60.0
 MESSAGES = 50
 MARKS = 200
-"""Loads and zeros that are kept."""
+"""Loads, zeros and marks that are kept."""
 
 MAX_SEEK_S = 1e8
 MAX_FORCE = 1e6
@@ -117,6 +117,7 @@ class MonitorServer(GatedServer):
         application.router.add_post('/api/zero', self._zero)
         application.router.add_post('/api/record', self._record)
         application.router.add_post('/api/load', self._load)
+        application.router.add_post('/api/mark', self._mark)
         application.router.add_post('/api/play', self._play)
         application.router.add_static('/page', PAGE)
         application.on_response_prepare.append(_add_headers)
@@ -304,6 +305,14 @@ class MonitorServer(GatedServer):
             return asyncio.to_thread(self._shown.load, fx, fy, tz, add)
 
         return await self._act(request, 'load', load)
+
+    async def _mark(self, request: web.Request) -> web.StreamResponse:
+        def mark(body: dict[str, Any]) -> Awaitable[str]:
+            text = body.get('text')
+            _need(isinstance(text, str), '{"text": "what happened"}')
+            return asyncio.to_thread(self._shown.mark, str(text))
+
+        return await self._act(request, '', mark)
 
     async def _play(self, request: web.Request) -> web.StreamResponse:
         def play(body: dict[str, Any]) -> Awaitable[str]:

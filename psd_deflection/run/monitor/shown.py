@@ -20,6 +20,7 @@ from psd_deflection.records import (
     AppliedLoad,
     DiagnosticEntry,
     DiagnosticReport,
+    Mark,
     ParameterChange,
     Record,
     ReferencePose,
@@ -28,7 +29,7 @@ from psd_deflection.records import (
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.diagnostics import ERROR, OK, WARN, HealthReporter
 from psd_deflection.run.monitor.feed import QUEUE_ITEMS, Feed
-from psd_deflection.run.session import Session, load_text, why_no_zero, zero_text
+from psd_deflection.run.session import Session, load_text, mark_text, why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
 """Longest wait for a pause in a recording, s."""
@@ -67,6 +68,9 @@ class Shown(Protocol):
 
     def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
         """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RefusedError."""
+
+    def mark(self, text: str) -> str:
+        """Mark this moment; return the mark as a line. Raises RefusedError."""
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Pause or resume, go to a time from the start; None leaves it. Raises RefusedError."""
@@ -124,6 +128,15 @@ class ShownSession:
         """Take down a load that acts from now on."""
         return load_text(self._session.note_load(fx, fy, tz, add=add))
 
+    def mark(self, text: str) -> str:
+        """Set a mark; say so if no recording has it."""
+        try:
+            mark = self._session.note_mark(text)
+        except ValueError as error:
+            raise RefusedError(f'not marked: {error}') from None
+        unkept = '' if self._session.recorder.folder is not None else ' (nothing is recorded now)'
+        return mark_text(mark) + unkept
+
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Refuse: what is measured cannot be paused."""
         raise RefusedError('only a recording can be paused')
@@ -142,7 +155,7 @@ class ShownRecording:
     """A recording, played once or repeatedly; a separate thread feeds ``feed``.
 
     ``open_steps``: returns a new pipeline and the records of each of its steps. ``speed``: factor of the
-    recorded speed. ``inputs``: its loads and references. ``find_span``: finds the times of its first and last
+    recorded speed. ``inputs``: its loads, references and marks. ``find_span``: finds the times of its first and last
     block, ns, which may take a while; it runs in a thread of its own.
     """
 
@@ -155,7 +168,7 @@ class ShownRecording:
         *,
         speed: float = 1.0,
         loop: bool = False,
-        inputs: Iterable[AppliedLoad | ReferencePose] = (),
+        inputs: Iterable[AppliedLoad | ReferencePose | Mark] = (),
         find_span: Callable[[], tuple[int, int]] | None = None,
     ) -> None:
         self.failed: BaseException | None = None
@@ -282,6 +295,10 @@ class ShownRecording:
     def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
         """Refuse: what is recorded is not changed."""
         raise RefusedError('a recording is played: its loads are those that were recorded')
+
+    def mark(self, text: str) -> str:
+        """Refuse: what is recorded is not changed."""
+        raise RefusedError('a recording is played: its marks are those that were recorded')
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Pause or resume, go to a time from the first block. What lies between is computed as fast as possible."""

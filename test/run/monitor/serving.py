@@ -31,6 +31,7 @@ class StillShown:
         self.rig = rig
         self.zeros = 0
         self.loads: list[tuple[float, float, float, bool]] = []
+        self.marks: list[str] = []
         self.played: list[tuple[bool | None, float | None]] = []
         self.recordings: list[str | None] = []
         self.refusal = ''
@@ -64,6 +65,12 @@ class StillShown:
             raise RefusedError(self.refusal)
         self.loads.append((fx, fy, tz, add))
         return 'load noted'
+
+    def mark(self, text: str) -> str:
+        if self.refusal:
+            raise RefusedError(self.refusal)
+        self.marks.append(text)
+        return f'mark: {text}'
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         self.played.append((paused, seek_s))

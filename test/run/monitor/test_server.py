@@ -136,7 +136,7 @@ def test_the_buttons_are_off_on_the_network_and_if_they_are_switched_off(
 ) -> None:
     serving = serve(**overrides)
     url = f'http://127.0.0.1:{serving.port}/'
-    for path in ('api/zero', 'api/record', 'api/load', 'api/play'):
+    for path in ('api/zero', 'api/record', 'api/load', 'api/mark', 'api/play'):
         status, text, _ = ask(url + path)
         assert status == 403
         assert 'monitor_control' in text
@@ -190,11 +190,20 @@ def test_requests_from_another_site_are_refused(
     serve: Serve, headers: dict[str, str], body: object, status: int
 ) -> None:
     serving = serve(monitor_control=True)
-    for path in ('api/zero', 'api/record', 'api/load', 'api/play'):
+    for path in ('api/zero', 'api/record', 'api/load', 'api/mark', 'api/play'):
         assert ask(serving.url + path, body=body, headers=headers)[0] == status
     assert serving.shown.zeros == 0
     assert not serving.shown.recordings
     assert not serving.shown.loads
+    assert not serving.shown.marks
+
+
+def test_a_moment_is_marked(serve: Serve) -> None:
+    serving = serve()
+    assert ask(serving.url + 'api/mark', body={'text': 'bumped it'})[0] == 200
+    assert ask(serving.url + 'api/mark', body={'text': 3})[0] == 400
+    assert ask(serving.url + 'api/mark', body={'text': 'x' * 5000})[0] == 413
+    assert serving.shown.marks == ['bumped it']
 
 
 def test_a_load_is_noted(serve: Serve) -> None:

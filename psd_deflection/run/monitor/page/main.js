@@ -349,11 +349,12 @@ function refused(id) {
   if (!hello || body.dataset.state === 'offline') return 'there is no connection to the daemon';
   if (!hello.control) return hello.why_no_control;
   if (hello.kind === 'replay' && id === 'record') return 'a recording is played; it is not recorded again';
+  if (hello.kind === 'replay' && id === 'mark') return 'a recording is played; its marks are those that were recorded';
   if (hello.kind === 'replay' && id === 'load') return 'a recording is played; its loads are those that were recorded';
   return '';
 }
 
-const TITLES = new Map(['load', 'zero', 'record'].map((id) => [id, $(id).title]));
+const TITLES = new Map(['mark', 'load', 'zero', 'record'].map((id) => [id, $(id).title]));
 
 function buttons() {
   const recording = Boolean(health && health.recording);
@@ -446,6 +447,15 @@ function askToken() {
   });
 }
 
+// A moment is marked at once; without a text it gets the next number.
+press('mark', () => {
+  const texts = new Set(plots.state.marks.filter(([, kind]) => kind === 'mark').map(([, , text]) => text));
+  let number = 1;
+  while (texts.has(`mark ${number}`)) number += 1;
+  act('/api/mark', { text: $('mark_text').value.trim() || `mark ${number}` });
+  $('mark_text').value = '';
+});
+$('mark_text').onkeydown = (event) => { if (event.key === 'Enter') $('mark').click(); };
 press('zero', () => act('/api/zero', {}));
 press('record', () => act('/api/record', { record: !(health && health.recording) }));
 press('load', () => {
