@@ -66,9 +66,10 @@ def zero_text(rig: Rig) -> str:
     return 'unloaded dots (mm): ' + ', '.join(f'psd_{n} ({x * 1e3:z.4f}, {y * 1e3:z.4f})' for n, (x, y) in zeros)
 
 
-def load_text(load: AppliedLoad) -> str:
+def load_text(load: AppliedLoad, ago_s: float = 0.0) -> str:
     """A known load, as one line of text."""
-    return f'load noted: Fx {load.fx:.6g} N, Fy {load.fy:.6g} N, Tz {load.tz:.6g} N·m'
+    since = f', since {ago_s:.2f} s ago' if ago_s > 0.0 else ''
+    return f'load noted: Fx {load.fx:.6g} N, Fy {load.fy:.6g} N, Tz {load.tz:.6g} N·m{since}'
 
 
 def mark_text(mark: Mark) -> str:
@@ -357,16 +358,25 @@ class Session:
         """Let what was counted of refused messages be said when it is due; to be called now and then."""
         self.processing.later(lambda: self._repeats.settle(time.monotonic()))
 
-    def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False) -> AppliedLoad:
-        """Take down that this load (N, N, N m) acts at the tip from now on, as if it had come on ``/link_tip/load``.
+    def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False, ago_s: float = 0.0) -> AppliedLoad:
+        """Take down that this load (N, N, N m) acts at the tip, as if it had come on ``/link_tip/load``.
 
-        ``add``: it acts beside the one that is held.
+        ``add``: it acts beside the one that is held. ``ago_s``: for how long it has acted already; the recording has
+        that time as the stamp, and the time at which it was told as that of the message. Raises ValueError if another
+        load was noted since.
         """
+        now_ns = self.acquisition.now_ns()
+        since_ns = now_ns - round(1e9 * ago_s)
+        if self.load is not None and since_ns < self.load.t_ns and ago_s > 0.0:
+            held_s = (now_ns - self.load.t_ns) / 1e9
+            raise ValueError(
+                f'another load is noted since {held_s:.2f} s ago, this one would be since {ago_s:.2f} s ago'
+            )
         if add and (held := self.load) is not None:
             fx, fy, tz = held.fx + fx, held.fy + fy, held.tz + tz
-        load = AppliedLoad(self.acquisition.now_ns(), fx, fy, tz)
+        load = AppliedLoad(since_ns, fx, fy, tz)
         self._put_load(load)
-        self._tell(load_text(load))
+        self._tell(load_text(load, ago_s))
         return load
 
     def _put_load(self, load: AppliedLoad) -> None:

@@ -396,7 +396,7 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     # What is left is numbers and words: a new kind of value is to be put here or among the paths. Options that may be
     # repeated have an action of their own and are not completed.
     assert {str(values[name]) for name in set(values) - as_path} == {
-        '/NAME', 'ADDRESS', 'LINK', 'M', 'N', 'NAME', 'PPM', 'S', 'SEED', 'SOURCE', 'TEXT',
+        '/NAME', 'ADDRESS', 'LINK', 'M', 'N', 'NAME', 'PPM', 'S', 'SECONDS', 'SEED', 'SOURCE', 'TEXT',
         'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'WHERE', 'X', 'X,Y', 'XY,THETA',
         "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from msg_adapters import MARK, REFERENCE, to_messages
+from msg_adapters import LOAD, MARK, REFERENCE, to_messages
 from psd_deflection.base.bounds import RateLimit
 from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import SampleFrame
@@ -20,6 +20,7 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.run import processing
 from psd_deflection.run import session as module
 from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
+from psd_deflection.run.monitor.shown import RefusedError, ShownSession
 from psd_deflection.run.repeats import Repeats
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
@@ -141,6 +142,34 @@ def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
     assert first.t_ns < before <= loads[0].t_ns <= loads[1].t_ns
     assert loads[1] == more == session.load
     assert [r for r in seen.records if isinstance(r, AppliedLoad)] == [first, *loads]
+
+
+def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_told_now(
+    running: Running, device: ScriptedDevice, sample: Sample
+) -> None:
+    session = running.session
+    folder = session.record(True).result(WAIT_S)
+    assert folder is not None
+    asked_ns = session.acquisition.now_ns()
+    first = session.note_load(0.0, -10.0, 0.0, ago_s=5.0)
+    running.heard('Fy -10 N, Tz 0 N·m, since 5.00 s ago')
+    assert 0 <= first.t_ns - (asked_ns - 5_000_000_000) < session.acquisition.now_ns() - asked_ns + 1
+    with pytest.raises(ValueError, match=r'another load is noted since 5\.\d\d s ago, this one would be since 9\.00 s'):
+        session.note_load(0.0, -20.0, 0.0, ago_s=9.0)
+    assert session.load == first
+    # From the page, as far as the daemon knows when the dots moved.
+    shown = ShownSession(session)
+    assert shown.step() == ''
+    with pytest.raises(RefusedError, match='not noted: the dots have not stepped in the last 60 s'):
+        shown.load(0.0, -20.0, 0.0, False, None)
+    with pytest.raises(RefusedError, match='not noted: another load is noted'):
+        shown.load(0.0, -20.0, 0.0, False, 9.0)
+    device.send_frames(*(sample(seq) for seq in range(200, 300)))
+    assert session.record(False).result(WAIT_S) == folder
+    recording = open_recording(folder)
+    assert recording.loads() == [first]
+    (message,) = recording.messages([LOAD])
+    assert message.log_time >= asked_ns
 
 
 def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDevice, sample: Sample) -> None:

@@ -28,6 +28,7 @@ from psd_deflection.records import (
 )
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.diagnostics import ERROR, OK, WARN, HealthReporter
+from psd_deflection.run.last_step import REACH_S, RecentDots
 from psd_deflection.run.monitor.feed import QUEUE_ITEMS, Feed
 from psd_deflection.run.session import Session, load_text, mark_text, why_no_zero, zero_text
 
@@ -66,8 +67,14 @@ class Shown(Protocol):
     async def record(self, wanted: bool) -> str:
         """Start or stop a recording; return the result as a line once the disk has answered. Raises RefusedError."""
 
-    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
-        """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RefusedError."""
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
+        """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RefusedError.
+
+        ``ago_s``: s for which it has acted already; None: since the last step of the dots.
+        """
+
+    def step(self) -> str:
+        """How long ago the dots stepped last, s; empty if they did not in the last minute. Raises RefusedError."""
 
     def mark(self, text: str) -> str:
         """Mark this moment; return the mark as a line. Raises RefusedError."""
@@ -82,6 +89,8 @@ class ShownSession:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._health = HealthReporter(session)
+        self._recent = RecentDots(session.rig)
+        session.processing.sinks.append(self._recent)
 
     @property
     def rig(self) -> Rig:
@@ -124,9 +133,25 @@ class ShownSession:
             return 'no recording runs'
         return f'recording to {folder}' if wanted else f'recording ended: {folder}'
 
-    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
-        """Take down a load that acts from now on."""
-        return load_text(self._session.note_load(fx, fy, tz, add=add))
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
+        """Take down a load that acts from now on, or has acted for some time."""
+        if ago_s is None:
+            ago_s = self._step_s()
+        if ago_s is None:
+            raise RefusedError(f'not noted: the dots have not stepped in the last {REACH_S:g} s')
+        try:
+            return load_text(self._session.note_load(fx, fy, tz, add=add, ago_s=ago_s), ago_s)
+        except ValueError as error:
+            raise RefusedError(f'not noted: {error}') from None
+
+    def step(self) -> str:
+        """How long ago the dots stepped last."""
+        ago_s = self._step_s()
+        return '' if ago_s is None else f'{ago_s:.2f}'
+
+    def _step_s(self) -> float | None:
+        step_ns = self._recent.step_ns()
+        return None if step_ns is None else max((self._session.acquisition.now_ns() - step_ns) / 1e9, 0.0)
 
     def mark(self, text: str) -> str:
         """Set a mark; say so if no recording has it."""
@@ -292,8 +317,12 @@ class ShownRecording:
         """Refuse: a recording is not recorded again."""
         raise RefusedError('a recording is not recorded again; the command replay writes its answers')
 
-    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
         """Refuse: what is recorded is not changed."""
+        raise RefusedError('a recording is played: its loads are those that were recorded')
+
+    def step(self) -> str:
+        """Refuse: nothing is noted here."""
         raise RefusedError('a recording is played: its loads are those that were recorded')
 
     def mark(self, text: str) -> str:

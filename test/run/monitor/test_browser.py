@@ -330,6 +330,30 @@ def test_a_moment_is_marked_from_the_page(page: Page, serve: Callable[..., Servi
     assert page.complaints() == []
 
 
+def test_a_load_is_noted_since_the_last_step(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    serving.give(0, 20)
+    page.open(serving.url)
+    page.until('document.body.dataset.rows >= 20')
+    page.driver.find_element(By.ID, 'load').click()
+    page.until('document.getElementById("since_step").textContent.startsWith("since the last step (")')
+    page.driver.find_element(By.ID, 'since_step').click()
+    page.until('document.getElementById("ago").valueAsNumber >= 3.4')
+    page.driver.find_element(By.CSS_SELECTOR, '#weigh button[value=set]').click()
+    page.until('document.getElementById("notice").textContent === "load noted"')
+    # What passed while the dialog was open counts too.
+    (ago,) = serving.shown.agos
+    assert ago is not None
+    assert ago > 3.4
+    # Without a step that is known there is no such button.
+    serving.shown.stepped = ''
+    page.driver.find_element(By.ID, 'load').click()
+    page.until('document.getElementById("weigh").open && document.getElementById("since_step").hidden')
+    assert page.js('document.getElementById("ago").value') == '0'
+    page.driver.find_element(By.ID, 'weigh_cancel').click()
+    assert page.complaints() == []
+
+
 def test_a_load_is_noted_from_the_page(page: Page, start: Start) -> None:
     page.open(address_of(start('monitor', '--http-port', '0')))
     page.live()

@@ -415,7 +415,7 @@ function notice(text, bad = false) {
 }
 
 async function act(path, content, quiet = false) {
-  if (hello.needs_token && !token && !(token = await askToken())) return;
+  if (hello.needs_token && !token && !(token = await askToken())) return null;
   try {
     const answer = await fetch(path, {
       method: 'POST',
@@ -428,8 +428,10 @@ async function act(path, content, quiet = false) {
       sessionStorage.removeItem('token');
     }
     if (!quiet || !result.ok) notice(result.message, !result.ok);
+    return result;
   } catch {
     notice('no answer: the connection is lost', true);
+    return null;
   }
 }
 
@@ -458,15 +460,39 @@ press('mark', () => {
 $('mark_text').onkeydown = (event) => { if (event.key === 'Enter') $('mark').click(); };
 press('zero', () => act('/api/zero', {}));
 press('record', () => act('/api/record', { record: !(health && health.recording) }));
-press('load', () => {
+// When the link moved last, on the clock of this page; null if that is not known, or not chosen.
+let stepAt = null;
+let since = null;
+const secondsSince = (at) => (performance.now() - at) / 1000;
+
+function showStep() {
+  $('since_step').hidden = stepAt === null;
+  if (stepAt !== null) $('since_step').textContent = `since the last step (${secondsSince(stepAt).toFixed(1)} s ago)`;
+  if (since !== null) $('ago').value = secondsSince(since).toFixed(2);
+}
+
+press('load', async () => {
   $('weigh').returnValue = '';
+  [stepAt, since] = [null, null];
+  $('ago').value = '0';
+  showStep();
   $('weigh').showModal();
+  const found = await act('/api/step', {}, true);
+  if (found && found.ok && found.message) stepAt = performance.now() - 1000 * Number(found.message);
+  showStep();
 });
+setInterval(() => { if ($('weigh').open) showStep(); }, 250);
+$('since_step').onclick = () => {
+  since = stepAt;
+  showStep();
+};
+$('ago').oninput = () => { since = null; };
 $('weigh').onclose = () => {
   const how = $('weigh').returnValue;
   if (!how) return;
   const [fx, fy, tz] = ['fx', 'fy', 'tz'].map((id) => $(id).valueAsNumber);
-  act('/api/load', { fx, fy, tz, add: how === 'add' });
+  const ago = since === null ? $('ago').valueAsNumber : secondsSince(since);
+  act('/api/load', { fx, fy, tz, add: how === 'add', ago });
 };
 $('weigh_cancel').onclick = () => $('weigh').close('');
 $('cancel').onclick = () => $('ask').close('');
