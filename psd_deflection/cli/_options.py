@@ -143,6 +143,15 @@ def given_parameters(args: argparse.Namespace) -> dict[str, object]:
     return values
 
 
+DEMO = 'without a port: weights hang on the simulated rig in turn, so that there is motion to look at'
+
+
+def refuse_demo(args: argparse.Namespace) -> None:
+    """Raise UsageError if --demo is given for a real device, on which it would do nothing."""
+    if args.demo and args.port is not None:
+        raise UsageError('--demo is for the simulated rig: leave out --port')
+
+
 def over_file(params_file: str | None, given: Mapping[str, object]) -> dict[str, object]:
     """The flat values of ``params_file``, if there is one, with the ``given`` ones on top. Raises ConfigError."""
     if params_file is None:

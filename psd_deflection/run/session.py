@@ -56,6 +56,8 @@ OPEN_S = 2.0
 MARKS_A_SECOND = 10
 """Marks that are taken within a second: more than any hand sets, and few enough for every plot."""
 
+_SIMULATED = {True: 'on which weights hang in turn', False: 'at rest: it hangs the loads that are noted'}
+
 LONGEST_LINE = 2000
 """Characters of a line that is said."""
 
@@ -116,7 +118,8 @@ class Session:
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
             say(
-                f'no port given: started the simulated rig on {self._simulated.port} (parameter port names a real one)',
+                f'no port given: started the simulated rig on {self._simulated.port}, '
+                f'{_SIMULATED[rig.acquisition.demo]} (parameter port names a real one)',
                 WARNING,
             )
         same = left_as_in_the_thesis(rig.values)
@@ -174,6 +177,11 @@ class Session:
     def simulated(self) -> bool:
         """Whether the device is the simulated rig that this session started."""
         return self._simulated is not None
+
+    @property
+    def hangs(self) -> bool:
+        """Whether the device is a simulated rig that hangs what is noted."""
+        return self._simulated is not None and not self.rig.acquisition.demo
 
     @property
     def alive(self) -> bool:
@@ -278,6 +286,8 @@ class Session:
             record = record._replace(t_ns=self.acquisition.now_ns())
         if isinstance(record, AppliedLoad):
             self.load = record
+            if self._simulated is not None and self.hangs:
+                self._simulated.push(record[1:])
             if self.pipeline.motion_filter is not None:
                 self.processing.later(partial(self._tell_filter, record))
             if self.watcher is not None:
@@ -363,8 +373,10 @@ class Session:
 
         ``add``: it acts beside the one that is held. ``ago_s``: for how long it has acted already; the recording has
         that time as the stamp, and the time at which it was told as that of the message. Raises ValueError if another
-        load was noted since.
+        load was noted since, and on a simulated rig that hangs a load when it is noted.
         """
+        if ago_s > 0.0 and self.hangs:
+            raise ValueError('the simulated rig hangs a load when it is noted, so no load has hung before')
         now_ns = self.acquisition.now_ns()
         since_ns = now_ns - round(1e9 * ago_s)
         if self.load is not None and since_ns < self.load.t_ns and ago_s > 0.0:

@@ -124,7 +124,7 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
         pytest.skip('the node needs rclpy: pip install .[ros]')
     arguments = ['--params-file', parameter_file(tmp_path, monitor=True, monitor_port=0, monitor_control='off')]
     # As `make run` starts it, but for the port, which others may have.
-    program = start('estimator', *arguments, *([] if how == 'node' else ['--no-ros']))
+    program = start('estimator', '--demo', *arguments, *([] if how == 'node' else ['--no-ros']))
     page.open(address_of(program))
     page.live()
     first = [picture(page, f'#detector_{n} canvas') for n in (1, 2)]
