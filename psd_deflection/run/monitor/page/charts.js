@@ -115,7 +115,8 @@ export function eventMarks(color, state) {
     const g = u.ctx;
     const ratio = window.devicePixelRatio || 1;
     const right = u.bbox.left + u.bbox.width;
-    let free = u.bbox.left;
+    // Marks have their words at the top, the others at the bottom.
+    const free = { true: u.bbox.left, false: u.bbox.left };
     g.save();
     g.beginPath();
     g.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
@@ -137,9 +138,9 @@ export function eventMarks(color, state) {
       const wide = g.measureText(words).width + 8 * ratio;
       // To the left of the line where the edge would cut it.
       const from = x + wide > right ? x - wide : x;
-      if (from < free) continue;
-      g.fillText(words, from + 4 * ratio, u.bbox.top + u.bbox.height - 5 * ratio);
-      free = from + wide;
+      if (from < free[marked]) continue;
+      g.fillText(words, from + 4 * ratio, u.bbox.top + (marked ? 20 * ratio : u.bbox.height - 5 * ratio));
+      free[marked] = from + wide;
     }
     g.restore();
   };
