@@ -105,7 +105,7 @@ unit: $(READY)
 	$(BIN)/python -m pytest -n $(WORKERS) $(PYTEST)
 
 run: $(VENV)/.installed
-	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT)) $(ARGS)
+	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT),--demo) $(ARGS)
 
 # Arguments, e.g. BENCH_LIVE='--seconds 5 --starts 1' for a first look.
 BENCH_LIVE ?=

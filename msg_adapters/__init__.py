@@ -32,6 +32,7 @@ from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
     DiagnosticReport,
+    Mark,
     ParameterChange,
     Record,
     ReferencePose,
@@ -44,7 +45,7 @@ from psd_deflection.records import (
     TipMotion,
 )
 
-Input = AppliedLoad | BaseAcceleration | ReferencePose | ReferenceWithCovariance | TemperatureReading
+Input = AppliedLoad | BaseAcceleration | Mark | ReferencePose | ReferenceWithCovariance | TemperatureReading
 
 SAMPLES = '/psd/samples'
 DEFLECTION = '/link_tip/deflection'
@@ -57,6 +58,7 @@ FILTERED = '/link_tip/filtered/deflection'
 DIAGNOSTICS = '/diagnostics'
 RIG = '/link_tip/rig'
 LOAD = '/link_tip/load'
+MARK = '/link_tip/mark'
 ACCELERATION = '/link_base/acceleration'
 REFERENCE = '/reference/deflection'
 REFERENCE_WITH_COVARIANCE = '/reference/deflection_with_covariance'
@@ -246,6 +248,16 @@ TOPICS = (
         wrench_stamped.from_load,
         wrench_stamped.to_applied_load,
         # It holds until the next: a lost message would be a wrong label of all that follows.
+        Delivery(SECOND_OF_BLOCKS),
+    ),
+    Topic(
+        MARK,
+        'a mark ("bumped it here"), at the time of its arrival; at most 200 printable characters',
+        string.MESSAGE,
+        Mark,
+        string.from_mark,
+        string.to_mark,
+        # It is set once.
         Delivery(SECOND_OF_BLOCKS),
     ),
     Topic(

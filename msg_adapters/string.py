@@ -1,4 +1,4 @@
-"""std_msgs/String: the rig as JSON, so that a recording of any recorder can be evaluated with it."""
+"""std_msgs/String: the rig as JSON, so that a recording of any recorder can be evaluated with it; and marks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from msg_adapters.header import Fields
 from msg_adapters.message_type import MessageType
-from psd_deflection.records import RigState
+from psd_deflection.records import Mark, RigState
 
 MESSAGE = MessageType(
     'std_msgs/msg/String',
@@ -19,6 +19,25 @@ MESSAGE = MessageType(
 MAX_CHARACTERS = 16_000_000
 """Longest text that is parsed. Ours have some thousand characters, with what a pipeline remembers some ten thousand,
 and some million if its blocks are long or its filter goes on for a minute without samples."""
+
+
+LONGEST_MARK = 200
+"""Characters of a mark."""
+
+
+def from_mark(mark: Mark) -> Fields:
+    """Fields of a mark; the message has no stamp, its arrival is the time."""
+    return {'data': mark.text}
+
+
+def to_mark(fields: Mapping[str, Any]) -> Mark:
+    """The record of a mark, at time 0: the message has none. Raises ValueError for a text that is no mark."""
+    text: str = fields['data']
+    if not 0 < len(text.strip()) <= len(text) <= LONGEST_MARK:
+        raise ValueError(f'a mark of {len(text)} characters: must be 1 to {LONGEST_MARK}, not only spaces')
+    if not text.isprintable():
+        raise ValueError('a mark with a control character: must be one line of printable characters')
+    return Mark(0, text.strip())
 
 
 def _plain(value: object) -> object:

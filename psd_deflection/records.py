@@ -215,6 +215,13 @@ class AppliedLoad(NamedTuple):
     tz: float
 
 
+class Mark(NamedTuple):
+    """A moment that somebody marked ("bumped it here"); ``t_ns`` is when the mark arrived."""
+
+    t_ns: int
+    text: str
+
+
 class BaseAcceleration(NamedTuple):
     """A known acceleration of the link's base in ``link_base``, without gravity, held until the next one.
 
@@ -330,6 +337,7 @@ Record = (
     | TipLoad
     | TipMotion
     | AppliedLoad
+    | Mark
     | BaseAcceleration
     | ReferencePose
     | ReferenceWithCovariance

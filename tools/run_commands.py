@@ -165,7 +165,7 @@ LIVE = re.compile(
 BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compensator|shaper)\b')
 """Nodes that run beside the lines below them."""
 
-ASKS = re.compile(r'^psd-deflection (echo|zero|record|load)\b')
+ASKS = re.compile(r'^psd-deflection (echo|zero|record|load|mark)\b')
 """Commands that speak to a running daemon."""
 
 

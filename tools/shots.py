@@ -92,7 +92,7 @@ def main() -> int:
     seconds = parser.parse_args().seconds
     monitor = [*PSD_DEFLECTION, 'monitor', '--http-port', '0']
     with tempfile.TemporaryDirectory() as folder:
-        program = Program(monitor)
+        program = Program([*monitor, '--demo'])
         try:
             url = program.until(r'monitor: (http\S+)')[1]
             take(url, *MONITOR, seconds, loaded if seconds > 10.0 else lambda driver: True)

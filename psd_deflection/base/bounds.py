@@ -46,6 +46,21 @@ class ByteBudget:
             self.holders -= holders
 
 
+class RateLimit:
+    """At most ``most`` events within a second. It owns no clock; one thread at a time."""
+
+    def __init__(self, most: int) -> None:
+        self.most = most
+        self._since, self._count = 0.0, 0
+
+    def allows(self, now_s: float) -> bool:
+        """Whether one more may be, ``now_s``: monotonic, s."""
+        if now_s - self._since >= 1.0:
+            self._since, self._count = now_s, 0
+        self._count += 1
+        return self._count <= self.most
+
+
 class BoundedMap(MutableMapping[K, V]):
     """A map of at most ``most`` keys. A further key takes the place of the one that was set longest ago.
 

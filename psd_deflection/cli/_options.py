@@ -17,7 +17,7 @@ from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.recordings.formats.registry import formats
-from psd_deflection.recordings.recording import WHOLE, Bound
+from psd_deflection.recordings.recording import MARK_WORD, WHOLE, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameter_files import read_parameter_file
@@ -143,6 +143,15 @@ def given_parameters(args: argparse.Namespace) -> dict[str, object]:
     return values
 
 
+DEMO = 'without a port: weights hang on the simulated rig in turn, so that there is motion to look at'
+
+
+def refuse_demo(args: argparse.Namespace) -> None:
+    """Raise UsageError if --demo is given for a real device, on which it would do nothing."""
+    if args.demo and args.port is not None:
+        raise UsageError('--demo is for the simulated rig: leave out --port')
+
+
 def over_file(params_file: str | None, given: Mapping[str, object]) -> dict[str, object]:
     """The flat values of ``params_file``, if there is one, with the ``given`` ones on top. Raises ConfigError."""
     if params_file is None:
@@ -172,7 +181,8 @@ def span_options(parser: argparse._ActionsContainer) -> None:
             at=at,
             dest='span',
             metavar='TIME',
-            help=f'only what was recorded {words} this time: s from the first sample, or a time as 2026-11-24T14:03:10',
+            help=f'only what was recorded {words} this time: s from the first sample, a time as 2026-11-24T14:03:10, '
+            'or mark:TEXT',
         )
 
 
@@ -192,6 +202,8 @@ class _SpanEnd(argparse.Action):
 
 
 def _bound(option: str, text: str) -> Bound:
+    if text.startswith(MARK_WORD):
+        return text
     try:
         seconds = plain_number(text)
     except ValueError:
@@ -199,7 +211,7 @@ def _bound(option: str, text: str) -> Bound:
             return datetime.fromisoformat(text).astimezone()
         except (ValueError, OverflowError, OSError):
             raise UsageError(
-                f'{option} {text}: must be s from the first sample, or a time such as 2026-11-24T14:03:10'
+                f'{option} {text}: must be s from the first sample, a time such as 2026-11-24T14:03:10, or mark:TEXT'
             ) from None
     if not abs(seconds) <= LONGEST_SPAN_S:
         raise UsageError(f'{option} {text}: must be at most {LONGEST_SPAN_S:g} s')

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 import psd_deflection.run.monitor
 from psd_deflection import __version__
-from psd_deflection.records import AppliedLoad, FloatArray, ReferencePose, dot_names
+from psd_deflection.records import AppliedLoad, FloatArray, Mark, ReferencePose, dot_names
 from psd_deflection.rig.config import Rig
 
 PAGE = Path(psd_deflection.run.monitor.__file__).parent / 'page'
@@ -46,7 +46,7 @@ CAPTIONS = {
 
 
 class DrawnInputs(NamedTuple):
-    """Inputs of the recording: known loads, references, and when the zero was taken, ns.
+    """Inputs of the recording: known loads, references, when the zero was taken (ns), and marks.
 
     ``start_ns``: the time from which the page counts.
     """
@@ -55,6 +55,7 @@ class DrawnInputs(NamedTuple):
     references: list[ReferencePose]
     zeros: list[int]
     start_ns: int
+    marks: Sequence[Mark] = ()
 
     def seconds(self, t_ns: int) -> float:
         """A time on the page, s."""
@@ -67,6 +68,7 @@ class DrawnInputs(NamedTuple):
             (self.seconds(load.t_ns), ['load', load.fx, load.fy, load.tz]) for load in loads
         ]
         marks += [(self.seconds(z), ['zero']) for z in self.zeros]
+        marks += [(self.seconds(mark.t_ns), ['mark', mark.text]) for mark in self.marks]
         held: dict[str, str] = {}
         if loads:
             times = [self.seconds(load.t_ns) for load in loads]

@@ -47,6 +47,7 @@ COMMANDS: dict[str, str] = {
     'echo': 'print what a running daemon measures, without ROS',
     'zero': 'make a running daemon take the zero, without ROS',
     'record': 'start or stop a recording of a running daemon, without ROS',
+    'mark': 'mark this moment in the recording of a running daemon, without ROS',
     'load': 'note a known load that acts on the tip from now on, for the recording',
     'replay': 'compute the estimates of a recording again, as the daemon did',
     'simulate': 'simulate the rig: write a recording, or act as a device on a pseudo-terminal',

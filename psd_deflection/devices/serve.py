@@ -147,6 +147,8 @@ def main() -> int:
     try:
         rig = _rig_of(line)
         hand = Hand(served_loads(rig.converter.sample_rate_hz))
+        if not rig.acquisition.demo:
+            hand.hold(b'[0, 0, 0]')
 
         def until_the_end() -> None:
             with contextlib.suppress(OSError, ValueError):

@@ -14,10 +14,18 @@ from psd_deflection.recordings.formats.registry import format_of_name
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import replayed
 from psd_deflection.recordings.write.sinks import open_sink
-from psd_deflection.records import AppliedLoad, ParameterChange, Record, ReferencePose, SampleBlock, TemperatureReading
+from psd_deflection.records import (
+    AppliedLoad,
+    Mark,
+    ParameterChange,
+    Record,
+    ReferencePose,
+    SampleBlock,
+    TemperatureReading,
+)
 from psd_deflection.rig.config import Rig
 
-Convertible = SampleBlock | ParameterChange | AppliedLoad | ReferencePose | TemperatureReading
+Convertible = SampleBlock | ParameterChange | AppliedLoad | Mark | ReferencePose | TemperatureReading
 
 
 def _time(record: Convertible) -> int:
@@ -30,20 +38,28 @@ class Beside(NamedTuple):
     loads: list[AppliedLoad]
     references: list[ReferencePose]
     temperatures: list[TemperatureReading]
+    marks: list[Mark]
 
     @classmethod
     def of(cls, recording: Recording) -> Beside:
         """Read them."""
-        return cls(recording.loads(), recording.references(), recording.temperatures())
+        return cls(recording.loads(), recording.references(), recording.temperatures(), recording.marks())
 
 
 def convert(
     recording: Recording, out: Path, parameters: Mapping[str, object], beside: Beside, blocks: Iterable[SampleBlock]
 ) -> int:
-    """Write ``recording`` and its ``blocks`` to ``out``; returns the number of samples. Raises RecordingError."""
-    loads, references, temperatures = beside
-    records: Iterable[Convertible] = heapq.merge(recording.changes, loads, references, temperatures, blocks, key=_time)
+    """Write ``recording`` and its ``blocks`` to ``out``; returns the number of samples. Raises RecordingError.
+
+    A table has no place for marks: they are left out, with a warning of the recording.
+    """
+    loads, references, temperatures, marks = beside
+    records: Iterable[Convertible] = heapq.merge(
+        recording.changes, loads, references, temperatures, marks, blocks, key=_time
+    )
     if format_of_name(out).is_table:
+        if marks:
+            recording.warn(f'{out}: a table has no place for marks: {len(marks)} left out')
         # A row takes what is waiting, and a block's last row what came during the block.
         records = itertools.chain(loads, references, temperatures, blocks)
     kinds: list[type[Record]] = [type(found[0]) for found in beside if found]

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.printable import printable
+from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.base.tables import Column, Table, columns_of, html_table
 from psd_deflection.measure.averaging import BlockCutter
 from psd_deflection.recordings.estimates import EstimateSeries
@@ -30,6 +31,7 @@ from psd_deflection.records import (
     BaseAcceleration,
     FloatArray,
     IntArray,
+    Mark,
     ParameterChange,
     RawChunk,
     ReferencePose,
@@ -45,9 +47,13 @@ if TYPE_CHECKING:
 
 DEFAULT_BLOCK_SIZE = 20
 LONGEST_REPR = 2000
+MOST_NAMED = 20
+"""Marks that are named if the one that is wanted is not there."""
 
-Bound = float | datetime
-"""s from the first sample, or a time with a time zone."""
+Bound = float | datetime | str
+"""s from the first sample, a time with a time zone, or ``mark:TEXT``: the time of the mark with this text."""
+MARK_WORD = 'mark:'
+"""Begins a bound that is a mark."""
 Span = tuple[Bound | None, Bound | None]
 """From and up to; None: the start or the end."""
 WHOLE: Span = (None, None)
@@ -123,10 +129,11 @@ class Recording(abc.ABC):
         return other
 
     def crop(self, first: Bound | None = None, last: Bound | None = None) -> Recording:
-        """The part from ``first`` on and before ``last``: s from the first sample, or times with a time zone.
+        """The part from ``first`` on and before ``last``: s from the first sample, times with a time zone, marks.
 
-        The load and the temperature that held at its start belong to it.
-        Raises RecordingError if no sample lies in it, ConfigError if ``first`` is not below ``last``.
+        ``mark:TEXT`` is the first mark with this text; as ``last`` the first one after the start.
+        The load and the temperature that held at its start belong to it. Raises RecordingError if no sample lies in
+        it, or it has no such mark; ConfigError if ``first`` is not below ``last``, or a text is no bound.
         """
         return RecordingWindow(self, first, last)
 
@@ -196,6 +203,10 @@ class Recording(abc.ABC):
     @abc.abstractmethod
     def loads(self) -> list[AppliedLoad]:
         """Known loads, each held until the next."""
+
+    def marks(self) -> list[Mark]:
+        """The moments that somebody marked, in order of time."""
+        return []
 
     def rows_with_load(self) -> tuple[int, int]:
         """Number of rows of a CSV that say their load, and the time of the last one, ns; (0, 0) for others."""
@@ -328,19 +339,18 @@ class Recording(abc.ABC):
 class RecordingWindow(Recording):
     """The samples of ``source`` from ``first`` on and before ``last``, with what was recorded beside them.
 
-    A bound is in s from the first sample of ``source``, or a time of the clock; None: its start or end. The load and
-    the temperature that held at the start come with the start's time. Sample and block numbers stay; so the first and
-    the last block may have less samples. Parameters that were changed before the start are among ``changes``.
+    A bound is in s from the first sample of ``source``, a time of the clock, or a mark; None: its start or end. The
+    load and the temperature that held at the start come with the start's time. Sample and block numbers stay; so the
+    first and the last block may have less samples. Parameters that were changed before the start are among ``changes``.
 
-    Raises RecordingError if no sample lies in it, ConfigError if ``first`` is not below ``last``.
+    Raises as :meth:`Recording.crop` does.
     """
 
     def __init__(self, source: Recording, first: Bound | None, last: Bound | None) -> None:
         super().__init__(source.path, source.requested_block_size)
         self._source, self._bounds = source, (first, last)
         start = next((int(block.t_ns[0]) for block in source.blocks()), 0)
-        self.first_ns = start if first is None else _ns(first, start)
-        self.end_ns = np.iinfo(np.int64).max if last is None else _ns(last, start)
+        self.first_ns, self.end_ns = span_ns(source, start, (first, last))
         if self.first_ns >= self.end_ns:
             raise ConfigError(f'{source.path}: from {first} to {last}: must rise')
         self.parameters, self.hello, self.version = source.parameters, source.hello, source.version
@@ -425,6 +435,10 @@ class RecordingWindow(Recording):
             part += int(np.count_nonzero((block.t_ns >= self.first_ns) & (block.t_ns <= until)))
         return round(count * part / whole) if whole else 0, until
 
+    def marks(self) -> list[Mark]:
+        """Those that were set in it."""
+        return [one for one in self._source.marks() if self._has(one.t_ns)]
+
     def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
         """Those that came in it."""
         return ((t_ns, one) for t_ns, one in self._source.accelerations() if self._has(t_ns))
@@ -451,8 +465,37 @@ class RecordingWindow(Recording):
         return out
 
 
-def _ns(bound: Bound, start_ns: int) -> int:
-    """A bound in ns, by the clock of the recording."""
+def span_ns(recording: Recording, start_ns: int, span: Span) -> tuple[int, int]:
+    """From when and up to when, ns by the clock of ``recording``; its first sample is at ``start_ns``.
+
+    Raises RecordingError if it lacks a mark, ConfigError if a text is no bound.
+    """
+    first, last = span
+    first_ns = start_ns if first is None else _ns(recording, first, start_ns)
+    end_ns = np.iinfo(np.int64).max if last is None else _ns(recording, last, start_ns, first_ns)
+    return first_ns, end_ns
+
+
+def _mark_ns(recording: Recording, bound: str, after_ns: int | None) -> int:
+    if not bound.startswith(MARK_WORD):
+        raise ConfigError(f'{bound!r}: must be s from the first sample, a time with a time zone, or {MARK_WORD}TEXT')
+    text = bound.removeprefix(MARK_WORD).strip()
+    there = recording.marks()
+    found = [mark.t_ns for mark in there if mark.text == text]
+    if not found:
+        names = sorted({mark.text for mark in there})
+        have = f'its marks are {", ".join(names[:MOST_NAMED])}' if names else 'it has no marks'
+        raise RecordingError(
+            f'{recording.path}: has no mark {printable(text, LONGEST_REPR)!r}; {have}{did_you_mean(text, names)}'
+        )
+    # To the mark that it begins with there is nothing: the next one is meant.
+    return next((t_ns for t_ns in found if after_ns is None or t_ns > after_ns), found[-1])
+
+
+def _ns(recording: Recording, bound: Bound, start_ns: int, after_ns: int | None = None) -> int:
+    """A bound in ns, by the clock of the recording. ``after_ns``: of marks of one name the first after it."""
+    if isinstance(bound, str):
+        return _mark_ns(recording, bound, after_ns)
     if isinstance(bound, datetime):
         return (bound - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
     return start_ns + round(bound * 1e9)

@@ -87,6 +87,7 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'blocks': blocks,
         'block_size': recording.block_size,
         'topics': topics,
+        'marks': [{'t_ns': m.t_ns, 't_s': (m.t_ns - first[1]) * 1e-9, 'text': m.text} for m in recording.marks()],
         'parameters': dict(recording.parameters),
         'changed_parameters': changed_parameters(recording.parameters),
         'as_in_the_thesis': list(left_as_in_the_thesis(recording.parameters)) if recording.parameters else [],

@@ -37,6 +37,9 @@ class AcquisitionConfig:
         'serial number that the device must say (HELLO); with it the device is found again under another port name',
     )
     autostart: bool = parameter(True, '', 'configure and activate at start; false: wait for lifecycle transitions')
+    demo: bool = parameter(
+        False, '', 'without a port: weights hang on the simulated rig in turn; false: it hangs what is noted'
+    )
     keep_zero: bool = parameter(True, '', '~/zero holds for later runs with the same device as well')
     zero_file: str = parameter(
         '',

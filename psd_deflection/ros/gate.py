@@ -18,7 +18,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-from psd_deflection.base.bounds import BoundedMap, Tally
+from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
 from psd_deflection.base.errors import PsdDeflectionError
 from psd_deflection.base.log import WARNING, Say
 from psd_deflection.base.printable import printable
@@ -70,7 +70,7 @@ class InputGate:
     def _subscribe(
         self, row: GraphTopic, check: Callable[[Any], str], take: Callable[[Any], None], name: str, type_name: str
     ) -> Subscription:
-        kind, rate = message_class(type_name), _Rate()
+        kind, rate = message_class(type_name), RateLimit(MOST_A_SECOND)
 
         def heard(encoded: bytes) -> None:
             why = self._let_in(encoded, row.most_bytes, rate) or self._carry_out(kind, encoded, check, take)
@@ -116,7 +116,7 @@ class InputGate:
             *((f'refused last: {topic}', self.why[topic]) for topic, _ in counted),
         ]
 
-    def _let_in(self, encoded: bytes, most_bytes: int, rate: _Rate) -> str:
+    def _let_in(self, encoded: bytes, most_bytes: int, rate: RateLimit) -> str:
         """Why a message is not even unpacked, or ''."""
         if len(encoded) > most_bytes:
             return f'{len(encoded)} bytes: must be at most {most_bytes}'
@@ -159,17 +159,3 @@ class GatedNode(LifecycleNode):  # type: ignore[misc]
                     self.gate.refuse(topic, str(error))
 
         return super().create_subscription(msg_type, topic, guarded, *more, **options)
-
-
-class _Rate:
-    """Counts the messages of each second."""
-
-    def __init__(self) -> None:
-        self._since, self._count = 0.0, 0
-
-    def allows(self, now_s: float) -> bool:
-        """Whether one more may be looked at."""
-        if now_s - self._since >= 1.0:
-            self._since, self._count = now_s, 0
-        self._count += 1
-        return self._count <= MOST_A_SECOND

@@ -10,8 +10,9 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from msg_adapters import ACCELERATION, LOAD, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
+from msg_adapters import ACCELERATION, LOAD, MARK, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
 from msg_adapters.header import stamp_ns
+from msg_adapters.string import to_mark
 from psd_deflection.arms.inputs import frame_fault, quaternion_fault, stamp_fault
 from psd_deflection.rig.config import Rig
 from psd_deflection.ros.names import BASE, REST
@@ -30,7 +31,7 @@ Fields = Mapping[str, Any]
 
 def input_fault(topic: str, fields: Fields, rig: Rig, now_ns: int) -> str:
     """Why the message on ``topic`` cannot be used; '' if it can. ``now_ns``: in the time of the samples."""
-    stamp = fields['header']['stamp']
+    stamp = fields.get('header', {}).get('stamp', {'sec': 0, 'nanosec': 0})
     return stamp_fault(stamp['sec'], stamp['nanosec']) or _FAULTS[topic](fields, rig, now_ns)
 
 
@@ -77,6 +78,14 @@ def _acceleration_fault(fields: Fields, rig: Rig, now_ns: int) -> str:
     return _time_fault(fields, now_ns)
 
 
+def _mark_fault(fields: Fields, rig: Rig, now_ns: int) -> str:
+    try:
+        to_mark(fields)
+    except ValueError as error:
+        return str(error)
+    return ''
+
+
 def _components(vectors: Fields) -> Iterator[tuple[str, str, float]]:
     return ((name, axis, vector[axis]) for name, vector in vectors.items() for axis in 'xyz')
 
@@ -92,6 +101,7 @@ def _time_fault(fields: Fields, now_ns: int) -> str:
 
 _FAULTS: Mapping[str, Callable[[Fields, Rig, int], str]] = {
     LOAD: _load_fault,
+    MARK: _mark_fault,
     REFERENCE: _reference_fault,
     REFERENCE_WITH_COVARIANCE: _reference_fault,
     TEMPERATURE: _temperature_fault,

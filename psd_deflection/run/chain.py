@@ -27,7 +27,7 @@ from psd_deflection.records import (
     Record,
     SpotMeans,
 )
-from psd_deflection.rig.config import Rig
+from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.run.processing import Spokesman
 from psd_deflection.run.session import Session
 from psd_deflection.run.simulated_rig import simulates, started_early
@@ -102,7 +102,9 @@ class ChainSession:
                 for rig in file.rigs:
                     early.enter_context(started_early(simulates(rig.values)))
                 for name, rig in zip(file.names, file.rigs, strict=True):
-                    self.sessions.append(open_session(name, rig, partial(self._said, name)))
+                    # Nobody notes loads to a chain.
+                    moving = replace_values(rig, {'demo': True}) if simulates(rig.values) else rig
+                    self.sessions.append(open_session(name, moving, partial(self._said, name)))
         except BaseException:
             self.close()
             raise

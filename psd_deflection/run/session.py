@@ -14,15 +14,15 @@ from concurrent.futures import Future, wait
 from functools import partial
 from pathlib import Path
 
-from msg_adapters import ACCELERATION, LOAD, TOPIC_TYPES, accel_stamped, from_fields, to_messages
-from psd_deflection.base.bounds import BoundedMap, Tally
+from msg_adapters import ACCELERATION, LOAD, MARK, TOPIC_TYPES, accel_stamped, from_fields, string, to_messages
+from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
 from psd_deflection.base.errors import SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.base.printable import printable
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.solvers.registry import check_arrangement, check_live
 from psd_deflection.recordings import cdr
-from psd_deflection.records import AppliedLoad, BaseAcceleration, ParameterChange, Record
+from psd_deflection.records import AppliedLoad, BaseAcceleration, Mark, ParameterChange, Record
 from psd_deflection.rig.config import Rig, left_as_in_the_thesis, replace_values
 from psd_deflection.rig.declarations import ZEROS
 from psd_deflection.run.fanout import Fanout
@@ -53,6 +53,11 @@ KEEP_S = 0.2
 OPEN_S = 2.0
 """How long the start waits for the disk if a recording is wanted from the start."""
 
+MARKS_A_SECOND = 10
+"""Marks that are taken within a second: more than any hand sets, and few enough for every plot."""
+
+_SIMULATED = {True: 'on which weights hang in turn', False: 'at rest: it hangs the loads that are noted'}
+
 LONGEST_LINE = 2000
 """Characters of a line that is said."""
 
@@ -63,9 +68,15 @@ def zero_text(rig: Rig) -> str:
     return 'unloaded dots (mm): ' + ', '.join(f'psd_{n} ({x * 1e3:z.4f}, {y * 1e3:z.4f})' for n, (x, y) in zeros)
 
 
-def load_text(load: AppliedLoad) -> str:
+def load_text(load: AppliedLoad, ago_s: float = 0.0) -> str:
     """A known load, as one line of text."""
-    return f'load noted: Fx {load.fx:.6g} N, Fy {load.fy:.6g} N, Tz {load.tz:.6g} N·m'
+    since = f', since {ago_s:.2f} s ago' if ago_s > 0.0 else ''
+    return f'load noted: Fx {load.fx:.6g} N, Fy {load.fy:.6g} N, Tz {load.tz:.6g} N·m{since}'
+
+
+def mark_text(mark: Mark) -> str:
+    """A mark, as one line of text."""
+    return f'mark: {mark.text}'
 
 
 def why_no_zero(pipeline: Pipeline) -> str:
@@ -97,6 +108,7 @@ class Session:
         self.why_refused: BoundedMap[str, str] = BoundedMap()
         say = self._tell
         self._repeats = Repeats(say)
+        self._mark_rate = RateLimit(MARKS_A_SECOND)
         check_live(rig.estimator.solver)
         check_arrangement(rig)
         # The geometry first: a rig that cannot be solved must not open a port.
@@ -106,7 +118,8 @@ class Session:
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
             say(
-                f'no port given: started the simulated rig on {self._simulated.port} (parameter port names a real one)',
+                f'no port given: started the simulated rig on {self._simulated.port}, '
+                f'{_SIMULATED[rig.acquisition.demo]} (parameter port names a real one)',
                 WARNING,
             )
         same = left_as_in_the_thesis(rig.values)
@@ -164,6 +177,11 @@ class Session:
     def simulated(self) -> bool:
         """Whether the device is the simulated rig that this session started."""
         return self._simulated is not None
+
+    @property
+    def hangs(self) -> bool:
+        """Whether the device is a simulated rig that hangs what is noted."""
+        return self._simulated is not None and not self.rig.acquisition.demo
 
     @property
     def alive(self) -> bool:
@@ -247,6 +265,11 @@ class Session:
         """
         if topic == ACCELERATION:
             return self._take_acceleration(message)
+        if topic == MARK:
+            try:
+                return self._take_mark(message)
+            except ValueError:
+                return None
         self.recorder.put(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
         if self.watcher is not None:
             self.watcher.put_message(topic, TOPIC_TYPES[topic], message, self.acquisition.now_ns())
@@ -255,13 +278,16 @@ class Session:
         except ValueError as error:
             self.refuse_input(topic, str(error))
             return None
-        if not all(math.isfinite(n) for field in record for n in (field if isinstance(field, tuple) else (field,))):
+        numbers = (n for field in record for n in (field if isinstance(field, tuple) else (field,)))
+        if not all(math.isfinite(n) for n in numbers if not isinstance(n, str)):
             self.refuse_input(topic, 'a number is not finite')
             return None
         if record.t_ns == 0:
             record = record._replace(t_ns=self.acquisition.now_ns())
         if isinstance(record, AppliedLoad):
             self.load = record
+            if self._simulated is not None and self.hangs:
+                self._simulated.push(record[1:])
             if self.pipeline.motion_filter is not None:
                 self.processing.later(partial(self._tell_filter, record))
             if self.watcher is not None:
@@ -299,6 +325,36 @@ class Session:
         for sink in self.input_sinks:
             sink.put(record)
 
+    def note_mark(self, text: str) -> Mark:
+        """Mark this moment, as if ``text`` had come on ``/link_tip/mark``.
+
+        Raises ValueError if it is no mark, or comes too soon after others; that is counted.
+        """
+        try:
+            fields = string.from_mark(string.to_mark({'data': text}))
+        except ValueError as error:
+            self.refuse_input(MARK, str(error))
+            raise
+        return self._take_mark(cdr.encode(TOPIC_TYPES[MARK], fields))
+
+    def _take_mark(self, message: bytes) -> Mark:
+        """Unlike another input it is recorded only if it can be used: it is all text. Its time is its arrival."""
+        try:
+            mark = string.to_mark(cdr.decode(TOPIC_TYPES[MARK], message))
+            if not self._mark_rate.allows(time.monotonic()):
+                raise ValueError(f'more than {MARKS_A_SECOND} marks a second')
+        except ValueError as error:
+            self.refuse_input(MARK, str(error))
+            raise
+        mark = mark._replace(t_ns=self.acquisition.now_ns())
+        self.recorder.put(MARK, TOPIC_TYPES[MARK], message, mark.t_ns)
+        if self.watcher is not None:
+            self.watcher.put_message(MARK, TOPIC_TYPES[MARK], message, mark.t_ns)
+        for sink in self.input_sinks:
+            sink.put(mark)
+        self._tell(mark_text(mark))
+        return mark
+
     def refuse_input(self, topic: str, why: str) -> None:
         """Count a message of another node that cannot be used, and say so."""
         self.processing.later(partial(self._refuse, topic, why))
@@ -312,16 +368,27 @@ class Session:
         """Let what was counted of refused messages be said when it is due; to be called now and then."""
         self.processing.later(lambda: self._repeats.settle(time.monotonic()))
 
-    def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False) -> AppliedLoad:
-        """Take down that this load (N, N, N m) acts at the tip from now on, as if it had come on ``/link_tip/load``.
+    def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False, ago_s: float = 0.0) -> AppliedLoad:
+        """Take down that this load (N, N, N m) acts at the tip, as if it had come on ``/link_tip/load``.
 
-        ``add``: it acts beside the one that is held.
+        ``add``: it acts beside the one that is held. ``ago_s``: for how long it has acted already; the recording has
+        that time as the stamp, and the time at which it was told as that of the message. Raises ValueError if another
+        load was noted since, and on a simulated rig that hangs a load when it is noted.
         """
+        if ago_s > 0.0 and self.hangs:
+            raise ValueError('the simulated rig hangs a load when it is noted, so no load has hung before')
+        now_ns = self.acquisition.now_ns()
+        since_ns = now_ns - round(1e9 * ago_s)
+        if self.load is not None and since_ns < self.load.t_ns and ago_s > 0.0:
+            held_s = (now_ns - self.load.t_ns) / 1e9
+            raise ValueError(
+                f'another load is noted since {held_s:.2f} s ago, this one would be since {ago_s:.2f} s ago'
+            )
         if add and (held := self.load) is not None:
             fx, fy, tz = held.fx + fx, held.fy + fy, held.tz + tz
-        load = AppliedLoad(self.acquisition.now_ns(), fx, fy, tz)
+        load = AppliedLoad(since_ns, fx, fy, tz)
         self._put_load(load)
-        self._tell(load_text(load))
+        self._tell(load_text(load, ago_s))
         return load
 
     def _put_load(self, load: AppliedLoad) -> None:

@@ -73,10 +73,12 @@ class SimulatedRigProcess:
         self.port = line[len(PORT_LINE) :].strip()
 
     def push(self, load: Sequence[float]) -> None:
-        """Hold ``load`` (Fx, Fy N, Tz N m) from now on, instead of the cycle that it starts with."""
-        if self._process.stdin is not None:
-            self._process.stdin.write(json.dumps(list(load)).encode() + b'\n')
-            self._process.stdin.flush()
+        """Hold ``load`` (Fx, Fy N, Tz N m) from now on. A process that has ended holds nothing."""
+        # It may end, or be told to, at any moment.
+        with contextlib.suppress(OSError, ValueError):
+            if self._process.stdin is not None:
+                self._process.stdin.write(json.dumps(list(load)).encode() + b'\n')
+                self._process.stdin.flush()
 
     def hang_up(self) -> None:
         """Tell the process to end; does not wait."""

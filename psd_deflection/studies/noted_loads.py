@@ -224,6 +224,16 @@ def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
     return out
 
 
+def last_step(rig: Rig, dots: FloatArray, period: float) -> float | None:
+    """When the last lasting step of ``dots`` (n, 4), m, was, s from the first of them; None if they have none.
+
+    ``period``: s from one to the next; they may be means of blocks. The time is that of the step's middle, to a
+    fraction of a period of the link's bending.
+    """
+    steps = _steps(dots, max(2, round(PERIODS / rig.dynamics.bending_frequency / period)))
+    return steps[-1].at * period if steps else None
+
+
 def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
     period = 1.0 / rig.converter.sample_rate_hz
     changes = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from psd_deflection.base.bounds import OTHERS, BoundedMap, ByteBudget, Tally
+from psd_deflection.base.bounds import OTHERS, BoundedMap, ByteBudget, RateLimit, Tally
 
 
 def test_a_budget_holds_no_more_than_its_bytes() -> None:
@@ -51,3 +51,9 @@ def test_a_tally_counts_every_word_and_remembers_few() -> None:
     assert tally['never'] == 0
     assert 'never' not in tally
     assert dict(tally) == {'known': 1000, 'word 0': 2, 'word 1': 2, 'word 2': 2, OTHERS: 1994}
+
+
+def test_a_rate_is_bounded_second_by_second() -> None:
+    rate = RateLimit(2)
+    allowed = [rate.allows(at) for at in (5.0, 5.1, 5.2, 5.9, 6.0, 6.1, 6.2)]
+    assert allowed == [True, True, False, False, True, True, False]

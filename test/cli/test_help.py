@@ -23,6 +23,7 @@ ENDLESS = (
     'zero',
     'record',
     'load',
+    'mark',
     'estimator',
     'chain',
     'compensator',

@@ -23,9 +23,12 @@ from typing import Any
 import pytest
 import yaml
 
+import psd_deflection
 from psd_deflection.base import errors
 from psd_deflection.cli.main import COMMANDS, main, make_parser
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from tools import run_commands
 from tools.program import ROOT
 from tools.run_commands import FENCE, JOURNEY, PAGES, Command
@@ -163,6 +166,19 @@ def test_links_lead_somewhere(page: Path) -> None:
         assert path.exists(), f'{page.name}: {target}'
         if anchor and path.suffix == '.md':
             assert anchor in anchors(path), f'{page.name}: {target}'
+
+
+def test_the_recordings_that_a_beginner_plays_raise_no_alarm() -> None:
+    """A faultless rig: nothing of it may be red but what the page speaks of."""
+    text = (ROOT / 'docs/quickstart.md').read_text() + (ROOT / 'docs/first-day.md').read_text()
+    played = set(re.findall(r'psd-deflection monitor (bags/\w+)', text))
+    assert played
+    for name in played:
+        recording = psd_deflection.open(ROOT / name)
+        pipeline = Pipeline(rig_at_start(recording))
+        for _ in replayed(recording, pipeline):
+            pass
+        assert dict(pipeline.stamped.words())['blocks whose readings contradict each other'] == '0'
 
 
 def test_the_tests_that_follow_the_steps_are_there() -> None:
@@ -396,7 +412,7 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     # What is left is numbers and words: a new kind of value is to be put here or among the paths. Options that may be
     # repeated have an action of their own and are not completed.
     assert {str(values[name]) for name in set(values) - as_path} == {
-        '/NAME', 'ADDRESS', 'LINK', 'M', 'N', 'NAME', 'PPM', 'S', 'SEED', 'SOURCE',
+        '/NAME', 'ADDRESS', 'LINK', 'M', 'N', 'NAME', 'PPM', 'S', 'SECONDS', 'SEED', 'SOURCE', 'TEXT',
         'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'WHERE', 'X', 'X,Y', 'XY,THETA',
         "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip

@@ -16,6 +16,7 @@ from psd_deflection.records import (
     DeflectionEstimate,
     DiagnosticEntry,
     DiagnosticReport,
+    Mark,
     Record,
     ReferencePose,
     ReferenceWithCovariance,
@@ -73,6 +74,7 @@ def run(blocks: int) -> Iterator[Record]:
         yield motion(i)
         if i % 10 == 0:
             yield AppliedLoad(T0 + 20 * STEP * i, 0.5 * i, 0.0, 0.1)
+            yield Mark(T0 + 20 * STEP * i, f'block {i}')
             yield BaseAcceleration(T0 + 20 * STEP * i, (0.5, 0.0, -9.0), (0.0, 0.1 * i, 2.0))
             yield ReferencePose(T0 + 20 * STEP * i, 1e-3, 2e-3, 3e-3)
             yield ReferenceWithCovariance(T0 + 20 * STEP * i, 1e-3, 2e-3, 3e-3, 0.0, 0.0, (1e-12,) * 9)

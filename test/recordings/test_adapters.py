@@ -52,6 +52,7 @@ from psd_deflection.records import (
     DiagnosticReport,
     EndEffectorDeflection,
     FloatArray,
+    Mark,
     Record,
     ReferencePose,
     ReferenceWithCovariance,
@@ -150,6 +151,7 @@ def test_what_is_latched_and_what_is_listened_to() -> None:
     assert [t.name for t in TOPICS if t.delivery.latched] == ['/link_tip/rig']
     assert INPUTS == (
         '/link_tip/load',
+        '/link_tip/mark',
         '/link_base/acceleration',
         '/reference/deflection',
         '/reference/deflection_with_covariance',
@@ -169,6 +171,7 @@ OF_EACH_KIND: list[Record] = [
     motion(3),
     TipLoad(T0, 1.0, 2.0, 3.0),
     AppliedLoad(T0, 1.0, 2.0, 3.0),
+    Mark(T0, 'bumped it here'),
     BaseAcceleration(T0, (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)),
     ReferencePose(T0, 1e-3, 2e-3, 3e-3),
     ReferenceWithCovariance(T0, 1e-3, 2e-3, 3e-3, 0.0, 0.0, (1e-12,) * 9),
@@ -270,8 +273,9 @@ def test_an_independent_decoder_reads_every_message_as_the_fields_say() -> None:
             assert raw[:4] == b'\0\1\0\0'
             decoded = STORE.deserialize_cdr(raw, m.type)
             assert STORE.serialize_cdr(decoded, m.type) == raw or m.type == point_cloud2.MESSAGE.name
-            stamp = decoded.header.stamp
-            assert stamp.sec * 10**9 + stamp.nanosec == m.t_ns
+            if 'header' in m.fields:
+                stamp = decoded.header.stamp
+                assert stamp.sec * 10**9 + stamp.nanosec == m.t_ns
             assert cdr.decode(m.type, raw) == m.fields
             seen.add(m.topic)
     of_two = {*TOPIC_TYPES} - {*spot_topics(MOST_PSDS)[2:]}
@@ -503,6 +507,12 @@ def test_a_load_is_a_force_in_the_plane_and_a_torque_about_z() -> None:
             'force': {'x': 1.0, 'y': 2.0, 'z': 0.0},
             'torque': {'x': 0.0, 'y': 0.0, 'z': 3.0},
         }
+
+
+def test_a_mark_is_a_text_without_a_time() -> None:
+    (m,) = to_messages(Mark(T0, 'bumped it here'))
+    assert (m.topic, m.t_ns, m.fields) == ('/link_tip/mark', T0, {'data': 'bumped it here'})
+    assert from_fields(m.topic, m.fields) == Mark(0, 'bumped it here')
 
 
 def test_numbers_of_many_messages_are_poses_and_covariances() -> None:

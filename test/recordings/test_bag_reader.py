@@ -25,6 +25,7 @@ from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,
     DeflectionEstimate,
+    Mark,
     ParameterChange,
     ReferencePose,
     SampleBlock,
@@ -53,6 +54,7 @@ def test_every_record_comes_back(bag: Path) -> None:
     assert_same(list(recording.blocks()), [r for r in records if isinstance(r, SampleBlock)])
     assert recording.loads() == [r for r in records if isinstance(r, AppliedLoad)]
     assert recording.temperatures() == [r for r in records if isinstance(r, TemperatureReading)]
+    assert recording.marks() == [r for r in records if isinstance(r, Mark)]
     references = [r for r in records if isinstance(r, ReferencePose)]
     np.testing.assert_allclose(recording.references(), references, rtol=1e-15)
     assert recording.parameters == {**load_rig().values, 'sum_min': 1.5}

@@ -137,7 +137,7 @@ def test_a_part_is_written_and_studied(tmp_path: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ('words', 'status', 'told'),
     [
-        (['--from', 'noon'], 2, '--from noon: must be s from the first sample, or a time'),
+        (['--from', 'noon'], 2, '--from noon: must be s from the first sample, a time such'),
         (['--to', '1e9'], 2, '--to 1e9: must be at most'),
         (['--from', '3', '--to', '2'], 3, 'must rise'),
         (['--from', '2026-11-24T14:03:10'], 4, 'has no sample from 2026-11-24'),

@@ -65,6 +65,7 @@ TOPICS = {
     '/psd/samples': 'sensor_msgs/msg/PointCloud2',
     '/diagnostics': 'diagnostic_msgs/msg/DiagnosticArray',
     '/link_tip/load': 'geometry_msgs/msg/WrenchStamped',
+    '/link_tip/mark': 'std_msgs/msg/String',
     '/reference/deflection': 'geometry_msgs/msg/PoseStamped',
     '/environment/temperature': 'sensor_msgs/msg/Temperature',
 }

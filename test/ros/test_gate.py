@@ -13,7 +13,7 @@ rclpy = pytest.importorskip('rclpy')
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from msg_adapters import INPUTS, LOAD, Delivery  # noqa: E402
+from msg_adapters import INPUTS, LOAD, MARK, Delivery  # noqa: E402
 from psd_deflection.base.log import INFO, WARNING  # noqa: E402
 from psd_deflection.ros.gate import MOST_A_SECOND, InputGate  # noqa: E402
 from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic  # noqa: E402
@@ -128,7 +128,7 @@ def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
     peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It holds until the next: a lost one would be a wrong label of all that follows."""
-    assert [topic for topic in INPUTS if HEARD[topic][0].delivery.reliable] == [LOAD]
+    assert [topic for topic in INPUTS if HEARD[topic][0].delivery.reliable] == [LOAD, MARK]
     heard_as(monkeypatch, HEARD[LOAD][0].delivery)
     gated.listen()
     peer.node.create_publisher(String, TOPIC, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))

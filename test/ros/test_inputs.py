@@ -8,14 +8,15 @@ from typing import Any
 
 import pytest
 
-from msg_adapters import ACCELERATION, LOAD, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE, TOPICS
-from psd_deflection.records import AppliedLoad, BaseAcceleration, ReferencePose, TemperatureReading
+from msg_adapters import ACCELERATION, LOAD, MARK, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE, TOPICS
+from psd_deflection.records import AppliedLoad, BaseAcceleration, Mark, ReferencePose, TemperatureReading
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.ros.inputs import input_fault
 
 NOW_NS = 1_700_000_000_000_000_000
 RECORDS: dict[str, Any] = {
     LOAD: AppliedLoad(t_ns=NOW_NS, fx=3.0, fy=-4.0, tz=0.5),
+    MARK: Mark(t_ns=NOW_NS, text='bumped it here'),
     REFERENCE: ReferencePose(t_ns=NOW_NS, dx=1e-3, dy=2e-3, theta=0.1),
     TEMPERATURE: TemperatureReading(t_ns=NOW_NS, celsius=21.0),
     ACCELERATION: BaseAcceleration(t_ns=NOW_NS, linear=(0.0, 1.0, 0.0), angular=(0.0, 0.0, 2.0)),
@@ -54,6 +55,21 @@ def test_the_frame_is_that_of_this_rig_at_rest_or_not_said(topic: str) -> None:
     assert fault(topic, {'header.frame_id': 'link_tip_rest'}, frame_prefix='left_') != ''
     for other in ('tool0', 'world', 'link_tip', 'xlink_tip_rest'):
         assert fault(topic, {'header.frame_id': other}) == f"frame_id '{other}': must be link_tip_rest"
+
+
+@pytest.mark.parametrize(
+    ('text', 'why'),
+    [
+        ('', '0 characters: must be 1 to 200'),
+        ('  ', 'not only spaces'),
+        ('x' * 201, '201 characters: must be 1 to 200'),
+        ('a\x1b[2Jb', 'control character'),
+        ('two\nlines', 'control character'),
+        ('\N{RIGHT-TO-LEFT OVERRIDE}x', 'control character'),
+    ],
+)
+def test_a_mark_is_one_short_line(text: str, why: str) -> None:
+    assert why in fault(MARK, {'data': text})
 
 
 def test_an_acceleration_says_its_frame() -> None:
@@ -98,7 +114,7 @@ def test_kelvin_is_no_celsius() -> None:
     assert fault(TEMPERATURE, {'temperature': 293.15}) == '293.15 °C: must be -100 to 200'
 
 
-@pytest.mark.parametrize('topic', [*RECORDS, REFERENCE_WITH_COVARIANCE])
+@pytest.mark.parametrize('topic', [*sorted({*RECORDS} - {MARK}), REFERENCE_WITH_COVARIANCE])
 def test_a_stamp_that_is_no_time_is_refused(topic: str) -> None:
     for stamp in ({'sec': -(2**31), 'nanosec': 0}, {'sec': 5, 'nanosec': 2_000_000_000}):
         assert 'is no time' in fault(topic, {'header.stamp': stamp})

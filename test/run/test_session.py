@@ -9,16 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from msg_adapters import REFERENCE, to_messages
+from msg_adapters import LOAD, MARK, REFERENCE, to_messages
+from psd_deflection.base.bounds import RateLimit
 from psd_deflection.base.log import texts
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.records import AppliedLoad, Record, ReferencePose
+from psd_deflection.records import AppliedLoad, Mark, Record, ReferencePose
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run import processing
 from psd_deflection.run import session as module
 from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
+from psd_deflection.run.monitor.shown import RefusedError, ShownSession
 from psd_deflection.run.repeats import Repeats
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
@@ -140,6 +142,68 @@ def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
     assert first.t_ns < before <= loads[0].t_ns <= loads[1].t_ns
     assert loads[1] == more == session.load
     assert [r for r in seen.records if isinstance(r, AppliedLoad)] == [first, *loads]
+
+
+def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_told_now(
+    running: Running, device: ScriptedDevice, sample: Sample
+) -> None:
+    session = running.session
+    folder = session.record(True).result(WAIT_S)
+    assert folder is not None
+    asked_ns = session.acquisition.now_ns()
+    first = session.note_load(0.0, -10.0, 0.0, ago_s=5.0)
+    running.heard('Fy -10 N, Tz 0 N·m, since 5.00 s ago')
+    assert 0 <= first.t_ns - (asked_ns - 5_000_000_000) < session.acquisition.now_ns() - asked_ns + 1
+    with pytest.raises(ValueError, match=r'another load is noted since 5\.\d\d s ago, this one would be since 9\.00 s'):
+        session.note_load(0.0, -20.0, 0.0, ago_s=9.0)
+    assert session.load == first
+    # From the page, as far as the daemon knows when the dots moved.
+    shown = ShownSession(session)
+    assert shown.step() == ''
+    with pytest.raises(RefusedError, match='not noted: the dots have not stepped in the last 60 s'):
+        shown.load(0.0, -20.0, 0.0, False, None)
+    with pytest.raises(RefusedError, match='not noted: another load is noted'):
+        shown.load(0.0, -20.0, 0.0, False, 9.0)
+    device.send_frames(*(sample(seq) for seq in range(200, 300)))
+    assert session.record(False).result(WAIT_S) == folder
+    recording = open_recording(folder)
+    assert recording.loads() == [first]
+    (message,) = recording.messages([LOAD])
+    assert message.log_time >= asked_ns
+
+
+def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDevice, sample: Sample) -> None:
+    session, seen = running.session, Seen()
+    session.input_sinks.append(seen)
+    folder = session.record(True).result(WAIT_S)
+    assert folder is not None
+    device.send_frames(*(sample(seq) for seq in range(200, 300)))
+    first = session.note_mark(' bumped it ')
+    running.heard('mark: bumped it')
+    (message,) = to_messages(Mark(0, 'at rest'))
+    last = session.take_input(MARK, cdr.encode(message.type, message.fields))
+    assert session.record(False).result(WAIT_S) == folder
+    assert [mark.text for mark in open_recording(folder).marks()] == ['bumped it', 'at rest']
+    assert open_recording(folder).marks() == [first, last] == seen.records
+
+
+def test_a_mark_that_is_none_or_comes_too_often_is_refused_and_counted(
+    running: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, seen = running.session, Seen()
+    session.input_sinks.append(seen)
+    for text in ('', 'x' * 201, 'a\x1b[31m', '\ud800'):
+        with pytest.raises(ValueError, match='a mark'):
+            session.note_mark(text)
+    assert session.take_input(MARK, b'too short') is None
+    running.heard('refused')
+    session.note_mark('good')
+    monkeypatch.setattr(session, '_mark_rate', RateLimit(0))
+    with pytest.raises(ValueError, match='more than 10 marks a second'):
+        session.note_mark('one more')
+    session.processing.request(lambda: None)
+    assert session.refused[MARK] >= 6
+    assert [mark.text for mark in seen.records if isinstance(mark, Mark)] == ['good']
 
 
 def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) -> None:

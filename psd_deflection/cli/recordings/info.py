@@ -61,10 +61,11 @@ FIELDS = (
     Field('version', str),
     Field('lacks', str),
     Field('warnings', str),
+    Field('marks', str),
     Field('topics', str),
     Field('parameters', str),
 )
-"""Columns of --out. ``topics`` and ``parameters`` are JSON."""
+"""Columns of --out. ``marks``, ``topics`` and ``parameters`` are JSON."""
 
 HEAD = ('state', 'seconds', 'samples', 'lost', 'flagged', 'rate (1/s)', 'lacks')
 
@@ -122,7 +123,7 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
 
 def _row(found: Mapping[str, Any]) -> dict[str, object]:
     texts = {name: '; '.join(found[name]) for name in ('lacks', 'warnings')}
-    return {**found, **texts, **{name: json.dumps(found[name]) for name in ('topics', 'parameters')}}
+    return {**found, **texts, **{name: json.dumps(found[name]) for name in ('marks', 'topics', 'parameters')}}
 
 
 def _line(found: Mapping[str, Any]) -> list[str]:
@@ -146,6 +147,10 @@ def _lines(found: Mapping[str, Any]) -> list[str]:
     out = [f'{found["path"]}: {found["bytes"] / 1e6:.2f} MB']
     out += _lines_of_origin(found)
     out += _lines_of_samples(found)
+    out += [
+        _row_of('marks' if i == 0 else '', f'{mark["t_s"]:9.3f} s  {mark["text"]}')
+        for i, mark in enumerate(found['marks'])
+    ]
     out += [_row_of('lacks' if i == 0 else '', text) for i, text in enumerate(found['lacks'])]
     out.append('  topics')
     width = max((len(t) for t in found['topics']), default=0)

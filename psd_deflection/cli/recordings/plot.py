@@ -1,7 +1,7 @@
 """Draw a recording: deflection and twist with their uncertainty, dots, sums, spectrum and losses.
 
 The estimates are computed as by `replay`, with the recorded parameters or those of --params-file. Known
-loads, references and zeros of the recording are drawn too. The ending of --out sets the format: .png,
+loads, references, marks and zeros of the recording are drawn too. The ending of --out sets the format: .png,
 .svg, .pdf, or .html: one self-contained page with values under the cursor and zoom.
 
   psd-deflection plot bags/lost_samples
@@ -12,7 +12,6 @@ loads, references and zeros of the recording are drawn too. The ending of --out 
 from __future__ import annotations
 
 import argparse
-import math
 import os
 from collections import Counter
 from dataclasses import dataclass, field
@@ -23,13 +22,13 @@ import numpy as np
 
 from psd_deflection.base.errors import RecordingError, UsageError
 from psd_deflection.base.printable import printable
-from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, number, picture_name
+from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name, span_options
 from psd_deflection.cli._plot_page import DrawnInputs, plot_page
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.formats.registry import endings_of_recordings
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.recording import WHOLE, Recording, span_ns
 from psd_deflection.recordings.replay.engine import open_for_replay, replayed, warnings_about_rig
 from psd_deflection.records import (
     BlockStatus,
@@ -47,14 +46,23 @@ from psd_deflection.run.monitor.spectrum import Spectrum
 SPECTRUM_OF_S = 600.0
 """The spectrum is of the last ten minutes: it does not get better after that, only slower."""
 
-MAX_SECONDS = 1e8
-
 LONGEST_NAME = 200
 """Characters of a recording's name in the figure."""
 
 MOST_REFERENCES = 500
+EVER = (-(2**63), 2**63)
 
-COLORS = {'dx': '#0b6bcb', 'dy': '#c2570c', 'theta': '#0f7b4f', 'lost': '#c62828', 'quiet': '#5a6875'}
+MOST_WORDS, LONGEST_WORDS = 50, 40
+"""Marks whose text is written, and its characters."""
+
+COLORS = {
+    'dx': '#0b6bcb',
+    'dy': '#c2570c',
+    'theta': '#0f7b4f',
+    'lost': '#c62828',
+    'quiet': '#5a6875',
+    'mark': '#7b1fa2',
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -67,14 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='OUT',
         help='.png, .svg, .pdf or .html (default: REC.png in this folder)',
     )
-    for option, name, words in (('--from', 'first_s', 'from'), ('--to', 'last_s', 'up to')):
-        parser.add_argument(
-            option,
-            dest=name,
-            type=number(option, 0.0, MAX_SECONDS),
-            metavar='S',
-            help=f'draw {words} this time, in s from the first block',
-        )
+    span_options(parser)
     namespace_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON, in SI units')
 
@@ -84,12 +85,12 @@ class Drawn:
     """What is drawn, a row a block: s, m, m, rad, V; NaN where a block has no estimate.
 
     ``numbers``: of the first and the last sample. ``first``, ``last``: the blocks at the ends, which a
-    start or a stop amid a block leaves unfinished. ``window``: what is drawn of the recording, s from its
-    first block, which was at ``start_ns``. ``zeros``: when a zero was taken, ns.
+    start or a stop amid a block leaves unfinished. ``window``: what is drawn of the recording, from and before
+    these times, ns; its first block was at ``start_ns``. ``zeros``: when a zero was taken, ns.
     """
 
     recording: Recording
-    window: tuple[float, float] = (-math.inf, math.inf)
+    window: tuple[int, int] = EVER
     start_ns: int | None = None
     numbers: tuple[int, int] | None = None
     first: SampleBlock | None = None
@@ -103,7 +104,7 @@ class Drawn:
         """Take what is drawn of a record; return whether it is within the window."""
         if isinstance(record, SpotMeans | DeflectionEstimate):
             self.start_ns = record.t_ns if self.start_ns is None else self.start_ns
-            self._inside = self.window[0] <= (record.t_ns - self.start_ns) / 1e9 <= self.window[1]
+            self._inside = self.window[0] <= record.t_ns < self.window[1]
         if is_zero(record):
             self.zeros.append(record.t_ns)
         if not self._inside:
@@ -125,7 +126,7 @@ class Drawn:
         return bool(self.spots) and not self._inside
 
     def inputs(self) -> DrawnInputs:
-        """Loads, references and zeros within the window; first the load that is held when it begins."""
+        """Loads, references, zeros and marks within the window; first the load that is held when it begins."""
         first = self.spots[0].t_ns
         last = self.spots[-1].t_ns
         loads = sorted((r for r in self.recording.loads() if r.t_ns <= last), key=lambda r: r.t_ns)
@@ -136,8 +137,17 @@ class Drawn:
             loads=[*before, *(r for r in loads if r.t_ns > first)],
             references=references,
             zeros=zeros,
+            marks=[m for m in self.recording.marks() if self._covers(m.t_ns)],
             start_ns=self.start_ns or 0,
         )
+
+    def _covers(self, t_ns: int) -> bool:
+        """Whether a moment lies within the window, and within what was recorded."""
+        if self.first is None or self.last is None or not self.window[0] <= t_ns < self.window[1]:
+            return False
+        # A block's stamp is its middle; what is beside the window has no sample here.
+        margin = int(self.first.t_ns[-1] - self.first.t_ns[0]) + 1
+        return int(self.first.t_ns[0]) - margin <= t_ns <= int(self.last.t_ns[-1]) + margin
 
     def table(self) -> dict[str, FloatArray]:
         """Arrays (n,): t from the first block, pose, standard deviations, dots, sums, samples lost, 1 if unfinished."""
@@ -196,12 +206,15 @@ def run(args: argparse.Namespace) -> int:
     )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
     need_folder(out)
-    window = (-math.inf if args.first_s is None else args.first_s, math.inf if args.last_s is None else args.last_s)
-    if window[0] >= window[1]:
-        raise UsageError(f'--from {window[0]:g} --to {window[1]:g}: must rise')
     recording, rig = open_for_replay(args.recording, args.params_file, args.namespace)
     for warning in warnings_about_rig(recording, args.params_file):
         warn(warning)
+    window = EVER
+    if args.span != WHOLE:
+        start_ns = next(int(block.t_ns[0]) for block in recording.blocks())
+        window = span_ns(recording, start_ns, args.span)
+        if window[0] >= window[1]:
+            raise UsageError(f'--from {args.span[0]} --to {args.span[1]}: must rise')
     drawn, spectrum = Drawn(recording, window), Spectrum(rig, SPECTRUM_OF_S)
     for records in replayed(recording, Pipeline(rig), progress_of(recording.blocks(), quiet=args.json)):
         for record in records:
@@ -210,7 +223,7 @@ def run(args: argparse.Namespace) -> int:
         if drawn.ended:
             break
     if not drawn.spots:
-        part = '' if window == (-math.inf, math.inf) else ' between --from and --to'
+        part = '' if args.span == WHOLE else ' between --from and --to'
         raise RecordingError(f'{args.recording}: has no samples to draw{part}')
     summary = summarise(drawn, rig)
     with told('drawing', quiet=args.json):
@@ -310,6 +323,7 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
             axes.set_title(f'{label}{typical}', loc='left', fontsize=9)
             _mark_losses(axes, table)
             _mark_inputs(axes, inputs, key, scale)
+            _marks(axes, inputs)
         if left[0].get_legend_handles_labels()[0]:
             left[0].legend(loc='upper right', fontsize=8)
         sums = [f'sum{n}' for n in range(1, len(rig.psds) + 1)]
@@ -323,6 +337,13 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
         left[3].legend(loc='center right', fontsize=8, ncols=len(sums))
         if inputs.loads:
             _loads(left[4], inputs, float(t[-1]))
+        for axes in left[len(_POSE) :]:
+            _marks(axes, inputs)
+        for mark in inputs.marks[:MOST_WORDS]:
+            words = printable(mark.text, LONGEST_WORDS)
+            at = inputs.seconds(mark.t_ns)
+            where = left[0].get_xaxis_transform()
+            left[0].text(at, 0.97, f' {words}', rotation=90, fontsize=7, va='top', transform=where, clip_on=True)
         left[-1].set_xlabel('t (s)')
         for number in range(1, len(rig.psds) + 1):
             _detector(figure.add_subplot(grid[_place(number, len(rig.psds))]), table, rig, number, raster)
@@ -380,6 +401,12 @@ def _mark_inputs(axes: Any, inputs: DrawnInputs, name: str, scale: float) -> Non
         axes.axvline(inputs.seconds(zero), color=COLORS['lost'], ls='--', lw=1, label='' if i else 'zero taken')
     for load in inputs.loads[1:]:
         axes.axvline(inputs.seconds(load.t_ns), color=COLORS['quiet'], ls='--', lw=0.6)
+
+
+def _marks(axes: Any, inputs: DrawnInputs) -> None:
+    """A line where somebody set a mark."""
+    for mark in inputs.marks:
+        axes.axvline(inputs.seconds(mark.t_ns), color=COLORS['mark'], lw=0.9)
 
 
 def _loads(axes: Any, inputs: DrawnInputs, end: float) -> None:

@@ -1,9 +1,10 @@
 """Acquire, estimate, publish on ROS 2 and record: the daemon.
 
-Without --port it starts a simulated rig, so that you can try everything without hardware. Ctrl-C
-ends it; if it recorded, it prints the command that replays the recording.
+Without --port it starts a simulated rig, so that you can try everything without hardware. It is at rest
+and hangs the loads that are noted (`psd-deflection load`, the page, /link_tip/load); with --demo weights hang on
+it in turn. Ctrl-C ends it; if it recorded, it prints the command that replays the recording.
 
-  psd-deflection estimator                                   the simulated rig
+  psd-deflection estimator --demo                            the simulated rig
   psd-deflection estimator --port /dev/ttyACM0 --record      a device, recorded
   psd-deflection estimator --params-file my_rig.yaml --monitor --no-ros
   ros2 run psd_deflection estimator --ros-args -p port:=/dev/ttyACM0
@@ -22,7 +23,14 @@ from collections.abc import Mapping, Sequence
 
 from psd_deflection.base.errors import ConfigError, UsageError
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import given_as_option, given_parameters, over_file, parameter_option
+from psd_deflection.cli._options import (
+    DEMO,
+    given_as_option,
+    given_parameters,
+    over_file,
+    parameter_option,
+    refuse_demo,
+)
 from psd_deflection.devices.registry import DEVICES, source_names
 from psd_deflection.model.solvers.registry import SOLVERS, check_live
 from psd_deflection.run.headless import run_headless
@@ -50,6 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='NAME',
         help='solver whose answer is published as /link_tip/deflection (default exact)',
     )
+    parser.add_argument('--demo', action='store_true', help=DEMO)
     parser.add_argument('--monitor', action='store_true', help='serve the live page and print its address')
     parser.add_argument('--foxglove', action='store_true', help='serve the messages to Foxglove and print the address')
     parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
@@ -72,6 +81,7 @@ def simulates_at_once(overrides: Mapping[str, object], ros_arguments: Sequence[s
 
 def run(args: argparse.Namespace) -> int:
     """Run until Ctrl-C."""
+    refuse_demo(args)
     # `ros2 launch` adds others; they can be ignored.
     if args.no_ros and any(a in ('-p', '--param', '--params-file') for a in args.ros_arguments):
         raise UsageError(

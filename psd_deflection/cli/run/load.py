@@ -8,6 +8,8 @@ centroid, in the axes of link_tip_rest. The daemon must serve its page (`monitor
   psd-deflection load 0 -10 0           10 N downwards, if Y points up
   psd-deflection load --add 0 -10 0     10 N more than before
   psd-deflection load 0 0 0             nothing hangs there any more
+  psd-deflection load 0 -10 0 --ago 3.4   it has hung for 3.4 s already
+  psd-deflection load 0 -10 0 --ago step  it hangs since the link moved last
 
 With ROS: ros2 topic pub --once /link_tip/load geometry_msgs/msg/WrenchStamped
           "{header: auto, wrench: {force: {y: -10.0}}}"
@@ -19,7 +21,8 @@ import argparse
 
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._daemon import request, url_option
-from psd_deflection.cli._options import need_finite
+from psd_deflection.cli._options import need_finite, number
+from psd_deflection.run.monitor.served import MAX_AGO_S, SINCE_STEP
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -27,10 +30,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name, unit in (('FX', 'N'), ('FY', 'N'), ('TZ', 'N m')):
         parser.add_argument(name.lower(), metavar=name, type=plain_number, help=unit)
     parser.add_argument('--add', action='store_true', help='this load acts beside the one that was noted last')
+    parser.add_argument(
+        '--ago',
+        metavar='SECONDS',
+        type=_ago,
+        default=0.0,
+        help=f'for how long it has hung already, or {SINCE_STEP}: since the last step of the dots',
+    )
     url_option(parser)
+
+
+def _ago(text: str) -> float | str:
+    return text if text == SINCE_STEP else number('--ago', 0.0, MAX_AGO_S)(text)
 
 
 def run(args: argparse.Namespace) -> int:
     """Tell the daemon."""
     need_finite('FX FY TZ:', (args.fx, args.fy, args.tz))
-    return request(args, 'api/load', {'fx': args.fx, 'fy': args.fy, 'tz': args.tz, 'add': args.add})
+    return request(args, 'api/load', {'fx': args.fx, 'fy': args.fy, 'tz': args.tz, 'add': args.add, 'ago': args.ago})

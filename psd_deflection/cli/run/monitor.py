@@ -1,13 +1,15 @@
 """Serve a web page: both detectors, deflection and twist, spectrum, rates, losses, clock and health.
 
-Without REC it acquires, without ROS, from --port or from a simulated rig of its own. With REC (a bag
-folder, an .mcap or a .csv) it plays that recording. Only this machine can open the page, unless
---address is given. Its buttons (zero, record, load) work for users of this machine. If the network can
+Without REC it acquires, without ROS, from --port or from a simulated rig of its own, which hangs the loads
+that are noted; with --demo weights hang on it in turn. With REC (a bag folder, an .mcap or a .csv) it plays that
+recording. Only this machine can open the page, unless
+--address is given. Its buttons (zero, record, load, mark) work for users of this machine. If the network can
 reach the page, they are off; with --control they work for those who have the printed address with its
 token. Ctrl-C ends it.
 
-  psd-deflection monitor                                 the simulated rig
-  psd-deflection monitor --port /dev/ttyACM0             a device
+  psd-deflection monitor                          the simulated rig, at rest
+  psd-deflection monitor --demo                   the same with weights in turn
+  psd-deflection monitor --port /dev/ttyACM0      a device
   psd-deflection monitor recordings/psd_20260101_120000 --speed 2 --loop
 
 The node serves the same page: estimator --monitor, or the parameter monitor:=true.
@@ -25,7 +27,15 @@ from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import INFO
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import given_parameters, namespace_option, over_file, parameter_option, refuse
+from psd_deflection.cli._options import (
+    DEMO,
+    given_parameters,
+    namespace_option,
+    over_file,
+    parameter_option,
+    refuse,
+    refuse_demo,
+)
 from psd_deflection.cli._report import warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
@@ -65,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     live = parser.add_argument_group('the rig (without REC)')
     parameter_option(live, '--port', 'port')
     parameter_option(live, '--baud', 'baud')
+    live.add_argument('--demo', action='store_true', help=DEMO)
     live.add_argument(
         '--record', nargs='?', const='', metavar='FOLDER', help='record from the start, below FOLDER (recordings/)'
     )
@@ -79,10 +90,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _check(args: argparse.Namespace) -> None:
     if not math.isfinite(args.speed) or args.speed <= 0.0:
         raise UsageError(f'--speed {args.speed:g}: must be above 0')
+    refuse_demo(args)
     if args.recording is None:
         refuse(args, {'speed': 1.0, 'loop': False, 'namespace': None}, 'is for a recording: give REC')
-    for name in ('port', 'baud', 'record'):
-        if args.recording is not None and getattr(args, name) is not None:
+    for name in ('port', 'baud', 'record', 'demo'):
+        if args.recording is not None and getattr(args, name) not in (None, False):
             raise UsageError(f'--{name} is for a rig; {args.recording} is played')
 
 
@@ -142,7 +154,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         say,
         speed=args.speed,
         loop=args.loop,
-        inputs=[*opened.loads(), *opened.references()],
+        inputs=[*opened.loads(), *opened.references(), *opened.marks()],
         find_span=find_span,
     )
     server = MonitorServer(shown, feed, rig.monitor, display.say)

@@ -23,6 +23,7 @@ from msg_adapters import (
     DIAGNOSTICS,
     FILTERED,
     LOAD,
+    MARK,
     REFERENCE,
     REFERENCE_WITH_COVARIANCE,
     RIG,
@@ -59,6 +60,7 @@ from psd_deflection.recordings.write.bag_writer import (
 from psd_deflection.records import (
     AppliedLoad,
     BaseAcceleration,
+    Mark,
     ParameterChange,
     RawChunk,
     ReferencePose,
@@ -353,6 +355,19 @@ class BagRecording(Recording):
     def loads(self) -> list[AppliedLoad]:
         """Known loads, each held until the next."""
         return self._decoded(LOAD, wrench_stamped.to_applied_load)
+
+    def marks(self) -> list[Mark]:
+        """The moments that somebody marked, each at its arrival. A live run refuses what is left out here, too."""
+        out = []
+        for channel, log_time, message in self.messages([MARK]):
+            self._check_type(channel.type, channel.encoding, MARK)
+            try:
+                mark = string.to_mark(cdr.decode(channel.type, message))
+            except ValueError as error:
+                self._warn(f'{MARK} at log time {log_time} ns is left out: {error}')
+            else:
+                out.append(mark._replace(t_ns=log_time))
+        return sorted(out, key=lambda mark: mark.t_ns)
 
     def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
         """Known accelerations of the base, with the time of arrival. A live run refuses what is left out here, too."""

@@ -5,6 +5,7 @@ Items that do not fit into the queue are dropped and counted. Publishing and rec
 
 from __future__ import annotations
 
+import json
 import math
 import queue
 from typing import NamedTuple, TypeGuard
@@ -12,6 +13,7 @@ from typing import NamedTuple, TypeGuard
 from psd_deflection.records import (
     AppliedLoad,
     DeflectionEstimate,
+    Mark,
     ParameterChange,
     Record,
     ReferencePose,
@@ -54,13 +56,13 @@ class BlockResult(NamedTuple):
     estimate: DeflectionEstimate | None
 
 
-Item = BlockResult | SampleBlock | AppliedLoad | ReferencePose | ParameterChange
+Item = BlockResult | SampleBlock | AppliedLoad | Mark | ReferencePose | ParameterChange
 
 
 class Feed:
     """A sink of records; :meth:`take` is for one other thread. ``dropped``: items that did not fit.
 
-    Loads and references may come from any thread, the other records from one.
+    Loads, marks and references may come from any thread, the other records from one.
     """
 
     def __init__(self, limit: int = QUEUE_ITEMS) -> None:
@@ -77,7 +79,7 @@ class Feed:
         elif isinstance(record, SpotMeans):
             best, self._estimate = self._estimate, None
             self._offer(BlockResult(record, best if best is not None and best.block == record.index else None))
-        elif isinstance(record, SampleBlock | AppliedLoad | ReferencePose) or is_zero(record):
+        elif isinstance(record, SampleBlock | AppliedLoad | Mark | ReferencePose) or is_zero(record):
             self._offer(record)
 
     @property
@@ -101,8 +103,10 @@ def is_zero(record: Record) -> TypeGuard[ParameterChange]:
     return isinstance(record, ParameterChange) and any(name in ZEROS for name, _ in record.values)
 
 
-def mark_json(record: AppliedLoad | ParameterChange) -> str:
-    """A load as ``[t, "load", fx, fy, tz]``, a zero as ``[t, "zero"]``: s, N, N, N m."""
+def mark_json(record: AppliedLoad | Mark | ParameterChange) -> str:
+    """A load as ``[t, "load", fx, fy, tz]``, a mark ``[t, "mark", text]``, a zero ``[t, "zero"]``: s, N, N, N m."""
+    if isinstance(record, Mark):
+        return f'[{_seconds(record.t_ns)},"mark",{json.dumps(record.text)}]'
     if isinstance(record, AppliedLoad):
         return f'[{_seconds(record.t_ns)},"load",{record.fx:.7g},{record.fy:.7g},{record.tz:.7g}]'
     return f'[{_seconds(record.t_ns)},"zero"]'

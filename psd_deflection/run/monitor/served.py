@@ -17,6 +17,11 @@ from psd_deflection.run.zero_store import state_folder
 
 MAX_BYTES = 10_000
 
+MAX_AGO_S = 600.0
+"""A load may have hung for so long before it is noted, s."""
+SINCE_STEP = 'step'
+"""In place of that time: since the last step of the dots."""
+
 
 class Served(NamedTuple):
     """A served page: its address without the token, the token or '', what it shows, its process."""

@@ -28,7 +28,7 @@ from psd_deflection.rig.running import MonitorConfig
 from psd_deflection.run.monitor import access
 from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
 from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer
-from psd_deflection.run.monitor.served import Served, announce, withdraw
+from psd_deflection.run.monitor.served import MAX_AGO_S, SINCE_STEP, Served, announce, withdraw
 from psd_deflection.run.monitor.shown import RefusedError, Shown
 from psd_deflection.run.monitor.spectrum import Spectrum, density_json
 
@@ -42,7 +42,7 @@ HEALTH_S = 0.9
 HISTORY_S = 60.0
 MESSAGES = 50
 MARKS = 200
-"""Loads and zeros that are kept."""
+"""Loads, zeros and marks that are kept."""
 
 MAX_SEEK_S = 1e8
 MAX_FORCE = 1e6
@@ -117,6 +117,8 @@ class MonitorServer(GatedServer):
         application.router.add_post('/api/zero', self._zero)
         application.router.add_post('/api/record', self._record)
         application.router.add_post('/api/load', self._load)
+        application.router.add_post('/api/step', self._step)
+        application.router.add_post('/api/mark', self._mark)
         application.router.add_post('/api/play', self._play)
         application.router.add_static('/page', PAGE)
         application.on_response_prepare.append(_add_headers)
@@ -298,12 +300,33 @@ class MonitorServer(GatedServer):
         def load(body: dict[str, Any]) -> Awaitable[str]:
             values: list[Any] = [body.get(name) for name in ('fx', 'fy', 'tz')]
             add = body.get('add', False)
+            ago = body.get('ago', 0.0)
             good = all(map(_is_number, values)) and all(abs(v) <= MAX_FORCE for v in values) and isinstance(add, bool)
-            _need(good, f'{{"fx": N, "fy": N, "tz": N m, "add": false}}, each of at most {MAX_FORCE:g}')
+            good = good and (ago == SINCE_STEP or (_is_number(ago) and 0.0 <= ago <= MAX_AGO_S))
+            _need(
+                good,
+                f'{{"fx": N, "fy": N, "tz": N m, "add": false, "ago": s or "{SINCE_STEP}"}}, '
+                f'each of at most {MAX_FORCE:g}, ago of at most {MAX_AGO_S:g}',
+            )
             fx, fy, tz = map(float, values)
-            return asyncio.to_thread(self._shown.load, fx, fy, tz, add)
+            return asyncio.to_thread(self._shown.load, fx, fy, tz, add, None if ago == SINCE_STEP else float(ago))
 
         return await self._act(request, 'load', load)
+
+    async def _step(self, request: web.Request) -> web.StreamResponse:
+        def step(body: dict[str, Any]) -> Awaitable[str]:
+            _need(not body, '{}')
+            return asyncio.to_thread(self._shown.step)
+
+        return await self._act(request, '', step)
+
+    async def _mark(self, request: web.Request) -> web.StreamResponse:
+        def mark(body: dict[str, Any]) -> Awaitable[str]:
+            text = body.get('text')
+            _need(isinstance(text, str), '{"text": "what happened"}')
+            return asyncio.to_thread(self._shown.mark, str(text))
+
+        return await self._act(request, '', mark)
 
     async def _play(self, request: web.Request) -> web.StreamResponse:
         def play(body: dict[str, Any]) -> Awaitable[str]:

@@ -20,6 +20,7 @@ from psd_deflection.records import (
     AppliedLoad,
     DiagnosticEntry,
     DiagnosticReport,
+    Mark,
     ParameterChange,
     Record,
     ReferencePose,
@@ -27,8 +28,9 @@ from psd_deflection.records import (
 )
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.diagnostics import ERROR, OK, WARN, HealthReporter
+from psd_deflection.run.last_step import REACH_S, RecentDots
 from psd_deflection.run.monitor.feed import QUEUE_ITEMS, Feed
-from psd_deflection.run.session import Session, load_text, why_no_zero, zero_text
+from psd_deflection.run.session import Session, load_text, mark_text, why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
 """Longest wait for a pause in a recording, s."""
@@ -65,8 +67,17 @@ class Shown(Protocol):
     async def record(self, wanted: bool) -> str:
         """Start or stop a recording; return the result as a line once the disk has answered. Raises RefusedError."""
 
-    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
-        """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RefusedError."""
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
+        """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RefusedError.
+
+        ``ago_s``: s for which it has acted already; None: since the last step of the dots.
+        """
+
+    def step(self) -> str:
+        """How long ago the dots stepped last, s; empty if they did not in the last minute. Raises RefusedError."""
+
+    def mark(self, text: str) -> str:
+        """Mark this moment; return the mark as a line. Raises RefusedError."""
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Pause or resume, go to a time from the start; None leaves it. Raises RefusedError."""
@@ -78,6 +89,8 @@ class ShownSession:
     def __init__(self, session: Session) -> None:
         self._session = session
         self._health = HealthReporter(session)
+        self._recent = RecentDots(session.rig)
+        session.processing.sinks.append(self._recent)
 
     @property
     def rig(self) -> Rig:
@@ -120,9 +133,34 @@ class ShownSession:
             return 'no recording runs'
         return f'recording to {folder}' if wanted else f'recording ended: {folder}'
 
-    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
-        """Take down a load that acts from now on."""
-        return load_text(self._session.note_load(fx, fy, tz, add=add))
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
+        """Take down a load that acts from now on, or has acted for some time."""
+        if ago_s is None:
+            ago_s = self._step_s()
+        if ago_s is None:
+            raise RefusedError(f'not noted: the dots have not stepped in the last {REACH_S:g} s')
+        try:
+            return load_text(self._session.note_load(fx, fy, tz, add=add, ago_s=ago_s), ago_s)
+        except ValueError as error:
+            raise RefusedError(f'not noted: {error}') from None
+
+    def step(self) -> str:
+        """How long ago the dots stepped last."""
+        ago_s = self._step_s()
+        return '' if ago_s is None else f'{ago_s:.2f}'
+
+    def _step_s(self) -> float | None:
+        step_ns = self._recent.step_ns()
+        return None if step_ns is None else max((self._session.acquisition.now_ns() - step_ns) / 1e9, 0.0)
+
+    def mark(self, text: str) -> str:
+        """Set a mark; say so if no recording has it."""
+        try:
+            mark = self._session.note_mark(text)
+        except ValueError as error:
+            raise RefusedError(f'not marked: {error}') from None
+        unkept = '' if self._session.recorder.folder is not None else ' (nothing is recorded now)'
+        return mark_text(mark) + unkept
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Refuse: what is measured cannot be paused."""
@@ -142,7 +180,7 @@ class ShownRecording:
     """A recording, played once or repeatedly; a separate thread feeds ``feed``.
 
     ``open_steps``: returns a new pipeline and the records of each of its steps. ``speed``: factor of the
-    recorded speed. ``inputs``: its loads and references. ``find_span``: finds the times of its first and last
+    recorded speed. ``inputs``: its loads, references and marks. ``find_span``: finds the times of its first and last
     block, ns, which may take a while; it runs in a thread of its own.
     """
 
@@ -155,7 +193,7 @@ class ShownRecording:
         *,
         speed: float = 1.0,
         loop: bool = False,
-        inputs: Iterable[AppliedLoad | ReferencePose] = (),
+        inputs: Iterable[AppliedLoad | ReferencePose | Mark] = (),
         find_span: Callable[[], tuple[int, int]] | None = None,
     ) -> None:
         self.failed: BaseException | None = None
@@ -279,9 +317,17 @@ class ShownRecording:
         """Refuse: a recording is not recorded again."""
         raise RefusedError('a recording is not recorded again; the command replay writes its answers')
 
-    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
         """Refuse: what is recorded is not changed."""
         raise RefusedError('a recording is played: its loads are those that were recorded')
+
+    def step(self) -> str:
+        """Refuse: nothing is noted here."""
+        raise RefusedError('a recording is played: its loads are those that were recorded')
+
+    def mark(self, text: str) -> str:
+        """Refuse: what is recorded is not changed."""
+        raise RefusedError('a recording is played: its marks are those that were recorded')
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Pause or resume, go to a time from the first block. What lies between is computed as fast as possible."""

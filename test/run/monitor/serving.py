@@ -31,6 +31,9 @@ class StillShown:
         self.rig = rig
         self.zeros = 0
         self.loads: list[tuple[float, float, float, bool]] = []
+        self.agos: list[float | None] = []
+        self.stepped = '3.40'
+        self.marks: list[str] = []
         self.played: list[tuple[bool | None, float | None]] = []
         self.recordings: list[str | None] = []
         self.refusal = ''
@@ -59,11 +62,23 @@ class StillShown:
         self.recordings.append('recordings/test' if wanted else None)
         return 'recording' if wanted else 'recording ended'
 
-    def load(self, fx: float, fy: float, tz: float, add: bool) -> str:
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
         if self.refusal:
             raise RefusedError(self.refusal)
         self.loads.append((fx, fy, tz, add))
+        self.agos.append(ago_s)
         return 'load noted'
+
+    def step(self) -> str:
+        if self.refusal:
+            raise RefusedError(self.refusal)
+        return self.stepped
+
+    def mark(self, text: str) -> str:
+        if self.refusal:
+            raise RefusedError(self.refusal)
+        self.marks.append(text)
+        return f'mark: {text}'
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         self.played.append((paused, seek_s))

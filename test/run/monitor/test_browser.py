@@ -19,7 +19,7 @@ from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 
-from psd_deflection.records import AppliedLoad, ParameterChange, ReferencePose
+from psd_deflection.records import AppliedLoad, Mark, ParameterChange, ReferencePose
 from tools.program import PSD_DEFLECTION, ROOT, Program
 
 from .browsing import Page
@@ -124,7 +124,7 @@ def test_the_daemon_on_the_simulated_rig_shows_moving_dots_and_traces(
         pytest.skip('the node needs rclpy: pip install .[ros]')
     arguments = ['--params-file', parameter_file(tmp_path, monitor=True, monitor_port=0, monitor_control='off')]
     # As `make run` starts it, but for the port, which others may have.
-    program = start('estimator', *arguments, *([] if how == 'node' else ['--no-ros']))
+    program = start('estimator', '--demo', *arguments, *([] if how == 'node' else ['--no-ros']))
     page.open(address_of(program))
     page.live()
     first = [picture(page, f'#detector_{n} canvas') for n in (1, 2)]
@@ -313,6 +313,47 @@ def test_no_element_is_cut_off_or_overlaps(page: Page, serve: Callable[..., Serv
         page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})
 
 
+def test_a_moment_is_marked_from_the_page(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    serving.give(0, 200)
+    page.open(serving.url)
+    page.until('document.body.dataset.rows >= 200')
+    page.driver.find_element(By.ID, 'mark_text').send_keys('bumped it\n')
+    page.until('document.getElementById("notice").textContent === "mark: bumped it"')
+    # Without words it has a number, which the marks that are there do not have.
+    serving.feed.put(Mark(START_NS + 100 * BLOCK_NS, 'mark 1'))
+    serving.give(200, 20)
+    page.until('document.body.dataset.rows >= 220')
+    page.driver.find_element(By.ID, 'mark').click()
+    page.until('document.getElementById("notice").textContent === "mark: mark 2"')
+    assert serving.shown.marks == ['bumped it', 'mark 2']
+    assert page.complaints() == []
+
+
+def test_a_load_is_noted_since_the_last_step(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    serving.give(0, 20)
+    page.open(serving.url)
+    page.until('document.body.dataset.rows >= 20')
+    page.driver.find_element(By.ID, 'load').click()
+    page.until('document.getElementById("since_step").textContent.startsWith("since the last step (")')
+    page.driver.find_element(By.ID, 'since_step').click()
+    page.until('document.getElementById("ago").valueAsNumber >= 3.4')
+    page.driver.find_element(By.CSS_SELECTOR, '#weigh button[value=set]').click()
+    page.until('document.getElementById("notice").textContent === "load noted"')
+    # What passed while the dialog was open counts too.
+    (ago,) = serving.shown.agos
+    assert ago is not None
+    assert ago > 3.4
+    # Without a step that is known there is no such button.
+    serving.shown.stepped = ''
+    page.driver.find_element(By.ID, 'load').click()
+    page.until('document.getElementById("weigh").open && document.getElementById("since_step").hidden')
+    assert page.js('document.getElementById("ago").value') == '0'
+    page.driver.find_element(By.ID, 'weigh_cancel').click()
+    assert page.complaints() == []
+
+
 def test_a_load_is_noted_from_the_page(page: Page, start: Start) -> None:
     page.open(address_of(start('monitor', '--http-port', '0')))
     page.live()
@@ -393,12 +434,13 @@ def test_traces_show_values_zoom_and_can_be_switched_off(page: Page, serve: Call
     assert [c for c in page.complaints() if 'willReadFrequently' not in c] == []
 
 
-def test_loads_zeros_and_references_are_drawn(page: Page, serve: Callable[..., Serving]) -> None:
+def test_loads_zeros_marks_and_references_are_drawn(page: Page, serve: Callable[..., Serving]) -> None:
     drawn = []
     for marked in (False, True):
         serving = serve()
         if marked:
             serving.feed.put(AppliedLoad(START_NS + 100 * BLOCK_NS, 0.0, -10.0, 0.0))
+            serving.feed.put(Mark(START_NS + 300 * BLOCK_NS, 'bumped it'))
             serving.feed.put(ParameterChange(START_NS + 200 * BLOCK_NS, 200, (('psd_1.zero', (0.0, 0.0)),)))
             for k in range(0, 500, 20):
                 serving.feed.put(ReferencePose(START_NS + k * BLOCK_NS, 0.5e-3, -0.5e-3, 0.005))
@@ -407,9 +449,9 @@ def test_loads_zeros_and_references_are_drawn(page: Page, serve: Callable[..., S
         page.until(f'document.body.dataset.rows >= 500 && {COLORED} > 200')
         shown = 'document.querySelector(".references").hidden'
         page.until(f'{shown} === {str(not marked).lower()}')
-        drawn.append([page.js(f'{INK}("{plot}")') for plot in ('#plot_shift', '#plot_theta')])
-    # Two dashed lines with words, and rings.
-    assert all(after > before + 100 for before, after in zip(*drawn, strict=True))
+        drawn.append([page.js(f'{INK}("{plot}")') for plot in ('#plot_shift', '#plot_theta', '#plot_sums')])
+    # Lines with words, and rings.
+    assert all(after > before + 50 for before, after in zip(*drawn, strict=True))
 
 
 def test_a_recording_is_paused_and_sought(page: Page, start: Start) -> None:
@@ -425,7 +467,7 @@ def test_a_recording_is_paused_and_sought(page: Page, start: Start) -> None:
     # Backwards too: the traces start again.
     page.js('(() => { const s = document.getElementById("seek"); s.value = 1; s.onchange(); })()')
     page.until('document.getElementById("position").textContent.startsWith("1.0 of 4.0 s")')
-    for button in ('record', 'load'):
+    for button in ('record', 'load', 'mark'):
         page.driver.find_element(By.ID, button).click()
         page.until('document.getElementById("notice").textContent.startsWith("a recording is played; it")')
     page.driver.find_element(By.ID, 'pause').click()

@@ -32,21 +32,27 @@ def nobody_else(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(client, 'DEFAULT_URL', 'http://127.0.0.1:9/')
 
 
-def test_zero_record_and_load_reach_the_daemon(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
+def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
     serving = serve()
     assert main(['zero']) == 0
     assert main(['record']) == 0
     assert main(['record', 'stop']) == 0
     assert main(['load', '0', '-10', '0.5']) == 0
     assert main(['load', '--add', '-1e1', '0', '0']) == 0
+    assert main(['load', '0', '0', '1', '--ago', '3.4']) == 0
+    assert main(['load', '0', '0', '1', '--ago', 'step']) == 0
+    assert serving.shown.agos == [0.0, 0.0, 3.4, None]
+    assert main(['mark', 'bumped', 'it']) == 0
+    assert serving.shown.marks == ['bumped it']
     assert serving.shown.zeros == 1
     assert serving.shown.recordings == ['recordings/test', None]
-    assert serving.shown.loads == [(0.0, -10.0, 0.5, False), (-10.0, 0.0, 0.0, True)]
+    assert serving.shown.loads[:2] == [(0.0, -10.0, 0.5, False), (-10.0, 0.0, 0.0, True)]
     assert capsys.readouterr().out.splitlines() == [
         'unloaded dots taken',
         'recording',
         'recording ended',
-        *['load noted'] * 2,
+        *['load noted'] * 4,
+        'mark: bumped it',
     ]
 
 
@@ -164,7 +170,7 @@ def test_several_daemons_are_listed(serve: Serve, capsys: pytest.CaptureFixture[
     assert (first.shown.zeros, second.shown.zeros) == (0, 1)
 
 
-@pytest.mark.parametrize('command', [['zero'], ['record'], ['load', '0', '0', '0'], ['echo']])
+@pytest.mark.parametrize('command', [['zero'], ['record'], ['load', '0', '0', '0'], ['mark', 'x'], ['echo']])
 def test_without_a_daemon_the_error_says_how_to_start_one(
     command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -136,7 +136,7 @@ def test_the_buttons_are_off_on_the_network_and_if_they_are_switched_off(
 ) -> None:
     serving = serve(**overrides)
     url = f'http://127.0.0.1:{serving.port}/'
-    for path in ('api/zero', 'api/record', 'api/load', 'api/play'):
+    for path in ('api/zero', 'api/record', 'api/load', 'api/mark', 'api/play'):
         status, text, _ = ask(url + path)
         assert status == 403
         assert 'monitor_control' in text
@@ -190,11 +190,20 @@ def test_requests_from_another_site_are_refused(
     serve: Serve, headers: dict[str, str], body: object, status: int
 ) -> None:
     serving = serve(monitor_control=True)
-    for path in ('api/zero', 'api/record', 'api/load', 'api/play'):
+    for path in ('api/zero', 'api/record', 'api/load', 'api/mark', 'api/play'):
         assert ask(serving.url + path, body=body, headers=headers)[0] == status
     assert serving.shown.zeros == 0
     assert not serving.shown.recordings
     assert not serving.shown.loads
+    assert not serving.shown.marks
+
+
+def test_a_moment_is_marked(serve: Serve) -> None:
+    serving = serve()
+    assert ask(serving.url + 'api/mark', body={'text': 'bumped it'})[0] == 200
+    assert ask(serving.url + 'api/mark', body={'text': 3})[0] == 400
+    assert ask(serving.url + 'api/mark', body={'text': 'x' * 5000})[0] == 413
+    assert serving.shown.marks == ['bumped it']
 
 
 def test_a_load_is_noted(serve: Serve) -> None:
@@ -202,10 +211,14 @@ def test_a_load_is_noted(serve: Serve) -> None:
     assert ask(serving.url + 'api/load', body={'fx': 0, 'fy': -10.5, 'tz': 0.25})[0] == 200
     assert ask(serving.url + 'api/load', body={'fx': 1, 'fy': 0, 'tz': 0, 'add': True})[0] == 200
     assert serving.shown.loads == [(0.0, -10.5, 0.25, False), (1.0, 0.0, 0.0, True)]
+    for ago in (3.4, 'step'):
+        assert ask(serving.url + 'api/load', body={'fx': 0, 'fy': 1, 'tz': 0, 'ago': ago})[0] == 200
+    assert serving.shown.agos == [0.0, 0.0, 3.4, None]
+    assert json.loads(ask(serving.url + 'api/step', body={})[1])['message'] == '3.40'
     assert ask(serving.url + 'api/play', body={'paused': True, 'seek': 2.5})[0] == 200
     assert serving.shown.played == [(True, 2.5)]
     # Who paused it is of no interest later.
-    assert [line for line in serving.said if 'asked for' in line] == ['monitor: load was asked for by 127.0.0.1'] * 2
+    assert [line for line in serving.said if 'asked for' in line] == ['monitor: load was asked for by 127.0.0.1'] * 4
 
 
 @pytest.mark.parametrize(
@@ -217,6 +230,10 @@ def test_a_load_is_noted(serve: Serve) -> None:
         ('load', {'fx': 1, 'fy': 2, 'tz': '3'}),
         ('load', {'fx': 1, 'fy': 2, 'tz': 1e7}),
         ('load', {'fx': 1, 'fy': 2, 'tz': 3, 'add': 1}),
+        ('load', {'fx': 1, 'fy': 2, 'tz': 3, 'ago': -1}),
+        ('load', {'fx': 1, 'fy': 2, 'tz': 3, 'ago': 601}),
+        ('load', {'fx': 1, 'fy': 2, 'tz': 3, 'ago': 'noon'}),
+        ('step', {'at': 1}),
         ('load', '{"fx": NaN, "fy": 0, "tz": 0}'),
         ('load', '{"fx": -Infinity, "fy": 0, "tz": 0}'),
         ('load', f'{{"fx": 1{"0" * 400}, "fy": 0, "tz": 0}}'),

@@ -146,7 +146,11 @@ def test_a_recording_can_be_paused_and_sought() -> None:
     assert feed.times[before] == start
     source.close()
     with pytest.raises(RefusedError, match='those that were recorded'):
-        source.load(0.0, 0.0, 0.0, False)
+        source.load(0.0, 0.0, 0.0, False, 0.0)
+    with pytest.raises(RefusedError, match='those that were recorded'):
+        source.mark('x')
+    with pytest.raises(RefusedError, match='those that were recorded'):
+        source.step()
 
 
 @pytest.mark.parametrize(

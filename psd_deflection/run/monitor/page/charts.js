@@ -106,36 +106,41 @@ export function loadText(fx, fy, tz) {
   return parts.length ? parts.map(([value, unit]) => `${number(value, 4)} ${unit}`).join(', ') : 'no load';
 }
 
-// A dashed line where a load began or the zero was taken, with its words where there is room for them.
+const LONGEST_WORDS = 40;
+const short = (text) => (text.length > LONGEST_WORDS ? `${text.slice(0, LONGEST_WORDS - 1)}\u2026` : text);
+
+// A dashed line where a load began or the zero was taken, a whole one at a mark, with its words where there is room.
 export function eventMarks(color, state) {
   return (u) => {
     const g = u.ctx;
     const ratio = window.devicePixelRatio || 1;
     const right = u.bbox.left + u.bbox.width;
-    let free = u.bbox.left;
+    // Marks have their words at the top, the others at the bottom.
+    const free = { true: u.bbox.left, false: u.bbox.left };
     g.save();
     g.beginPath();
     g.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
     g.clip();
-    g.strokeStyle = g.fillStyle = color('--quiet');
     g.lineWidth = ratio;
     g.textAlign = 'left';
-    g.setLineDash([5 * ratio, 4 * ratio]);
     g.font = `${10 * ratio}px system-ui, sans-serif`;
     for (const [t, kind, ...load] of state.marks) {
       const x = Math.round(u.valToPos(t, 'x', true));
       if (x < u.bbox.left || x > right) continue;
+      const marked = kind === 'mark';
+      g.strokeStyle = g.fillStyle = color(marked ? '--mark' : '--quiet');
+      g.setLineDash(marked ? [] : [5 * ratio, 4 * ratio]);
       g.beginPath();
       g.moveTo(x, u.bbox.top);
       g.lineTo(x, u.bbox.top + u.bbox.height);
       g.stroke();
-      const words = kind === 'load' ? loadText(...load) : kind;
+      const words = kind === 'load' ? loadText(...load) : marked ? short(load[0]) : kind;
       const wide = g.measureText(words).width + 8 * ratio;
       // To the left of the line where the edge would cut it.
       const from = x + wide > right ? x - wide : x;
-      if (from < free) continue;
-      g.fillText(words, from + 4 * ratio, u.bbox.top + u.bbox.height - 5 * ratio);
-      free = from + wide;
+      if (from < free[marked]) continue;
+      g.fillText(words, from + 4 * ratio, u.bbox.top + (marked ? 20 * ratio : u.bbox.height - 5 * ratio));
+      free[marked] = from + wide;
     }
     g.restore();
   };

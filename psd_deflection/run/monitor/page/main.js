@@ -349,11 +349,12 @@ function refused(id) {
   if (!hello || body.dataset.state === 'offline') return 'there is no connection to the daemon';
   if (!hello.control) return hello.why_no_control;
   if (hello.kind === 'replay' && id === 'record') return 'a recording is played; it is not recorded again';
+  if (hello.kind === 'replay' && id === 'mark') return 'a recording is played; its marks are those that were recorded';
   if (hello.kind === 'replay' && id === 'load') return 'a recording is played; its loads are those that were recorded';
   return '';
 }
 
-const TITLES = new Map(['load', 'zero', 'record'].map((id) => [id, $(id).title]));
+const TITLES = new Map(['mark', 'load', 'zero', 'record'].map((id) => [id, $(id).title]));
 
 function buttons() {
   const recording = Boolean(health && health.recording);
@@ -414,7 +415,7 @@ function notice(text, bad = false) {
 }
 
 async function act(path, content, quiet = false) {
-  if (hello.needs_token && !token && !(token = await askToken())) return;
+  if (hello.needs_token && !token && !(token = await askToken())) return null;
   try {
     const answer = await fetch(path, {
       method: 'POST',
@@ -427,8 +428,10 @@ async function act(path, content, quiet = false) {
       sessionStorage.removeItem('token');
     }
     if (!quiet || !result.ok) notice(result.message, !result.ok);
+    return result;
   } catch {
     notice('no answer: the connection is lost', true);
+    return null;
   }
 }
 
@@ -446,17 +449,50 @@ function askToken() {
   });
 }
 
+// A moment is marked at once; without a text it gets the next number.
+press('mark', () => {
+  const texts = new Set(plots.state.marks.filter(([, kind]) => kind === 'mark').map(([, , text]) => text));
+  let number = 1;
+  while (texts.has(`mark ${number}`)) number += 1;
+  act('/api/mark', { text: $('mark_text').value.trim() || `mark ${number}` });
+  $('mark_text').value = '';
+});
+$('mark_text').onkeydown = (event) => { if (event.key === 'Enter') $('mark').click(); };
 press('zero', () => act('/api/zero', {}));
 press('record', () => act('/api/record', { record: !(health && health.recording) }));
-press('load', () => {
+// When the link moved last, on the clock of this page; null if that is not known, or not chosen.
+let stepAt = null;
+let since = null;
+const secondsSince = (at) => (performance.now() - at) / 1000;
+
+function showStep() {
+  $('since_step').hidden = stepAt === null;
+  if (stepAt !== null) $('since_step').textContent = `since the last step (${secondsSince(stepAt).toFixed(1)} s ago)`;
+  if (since !== null) $('ago').value = secondsSince(since).toFixed(2);
+}
+
+press('load', async () => {
   $('weigh').returnValue = '';
+  [stepAt, since] = [null, null];
+  $('ago').value = '0';
+  showStep();
   $('weigh').showModal();
+  const found = await act('/api/step', {}, true);
+  if (found && found.ok && found.message) stepAt = performance.now() - 1000 * Number(found.message);
+  showStep();
 });
+setInterval(() => { if ($('weigh').open) showStep(); }, 250);
+$('since_step').onclick = () => {
+  since = stepAt;
+  showStep();
+};
+$('ago').oninput = () => { since = null; };
 $('weigh').onclose = () => {
   const how = $('weigh').returnValue;
   if (!how) return;
   const [fx, fy, tz] = ['fx', 'fy', 'tz'].map((id) => $(id).valueAsNumber);
-  act('/api/load', { fx, fy, tz, add: how === 'add' });
+  const ago = since === null ? $('ago').valueAsNumber : secondsSince(since);
+  act('/api/load', { fx, fy, tz, add: how === 'add', ago });
 };
 $('weigh_cancel').onclick = () => $('weigh').close('');
 $('cancel').onclick = () => $('ask').close('');

@@ -59,7 +59,7 @@ export class Plots {
       sums: new uPlot(options(color, elements.sums, this.psds.map((n) => line(color(['--dx', '--dy'][n - 1] ?? `--x${n}`))), {
         scales: { x: time, y: { range: () => [0, 1.5 * hello.sum_nominal] } },
         cursor: cursor(this.zoom, 'traces'),
-        hooks: seen('sums', []),
+        hooks: seen('sums', [eventMarks(color, this.state)]),
       }), this.empty(1 + this.psds.length), elements.sums),
       spectrum: new uPlot(options(color, elements.spectrum, dots.map((n) => line(color(n), 1)), {
         scales: { x: { time: false, distr: 3, range: () => this.band ?? [f0, f0 * bins] }, y: { distr: 3 } },

@@ -82,10 +82,10 @@ function build() {
       scales: { x: time, y: { range: calm(0.5) } }, cursor: cursor(zoom, 'traces'), hooks: seen('theta', [...marked, of(['--theta', 'theta', 1])]),
     }),
     load: () => options(color, element('load'), ['--dx', '--dy', '--theta'].map((name) => ({ ...line(color(name)), paths: steps })), {
-      scales: { x: time, y: { range: calm(1) } }, cursor: cursor(zoom, 'traces'), hooks: seen('load', []),
+      scales: { x: time, y: { range: calm(1) } }, cursor: cursor(zoom, 'traces'), hooks: seen('load', [eventMarks(color, state)]),
     }),
     sums: () => options(color, element('sums'), psds.map((n) => line(color(['--dx', '--dy'][n - 1] ?? `--x${n}`))), {
-      scales: { x: time, y: { range: () => [0, 1.5 * read.sum_nominal] } }, cursor: cursor(zoom, 'traces'), hooks: seen('sums', []),
+      scales: { x: time, y: { range: () => [0, 1.5 * read.sum_nominal] } }, cursor: cursor(zoom, 'traces'), hooks: seen('sums', [eventMarks(color, state)]),
     }),
     spectrum: () => options(color, element('spectrum'), psds.flatMap((n) => [`--x${n}`, `--y${n}`]).map((name) => line(color(name), 1)), {
       scales: { x: { time: false, distr: 3, range: () => limits.frequencies ?? [data.spectrum[0][0], data.spectrum[0].at(-1)] }, y: { distr: 3 } },

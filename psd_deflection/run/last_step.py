@@ -1,0 +1,44 @@
+"""When the link moved last, by the dots of the last minute: a weight is noted some seconds after it was hung."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from psd_deflection.records import BlockStatus, Record, SpotMeans
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.noted_loads import last_step
+
+REACH_S = 60.0
+"""A step that is older is not looked for."""
+
+
+class RecentDots:
+    """A sink of records. It keeps the dots of two PSDs for ``REACH_S``, and computes only when it is asked."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self._period = rig.estimator.block_size / rig.converter.sample_rate_hz
+        self._most = max(2, round(REACH_S / self._period))
+        self._rows: deque[tuple[int, int, tuple[float, ...]]] = deque(maxlen=self._most)
+
+    def put(self, record: Record) -> None:
+        """Keep the dots of a good block."""
+        if isinstance(record, SpotMeans) and record.status is BlockStatus.OK:
+            self._rows.append((record.index, record.t_ns, record.dots[:4]))
+
+    def step_ns(self) -> int | None:
+        """When the last lasting step of the dots was, ns; None if there was none. From any thread."""
+        rows = tuple(self._rows)
+        if not rows:
+            return None
+        last, last_ns, _ = rows[-1]
+        # Blocks that are missing are rows without dots. After a restart numbers may begin anew.
+        first = max(min(index for index, _, _ in rows), last - self._most + 1)
+        dots = np.full((last - first + 1, 4), np.nan)
+        for index, _, values in rows:
+            if first <= index <= last:
+                dots[index - first] = values
+        found = last_step(self._rig, dots, self._period)
+        return None if found is None else last_ns - round(((last - first) * self._period - found) * 1e9)
