@@ -51,6 +51,7 @@ BOUNDED_BY = {
     'measure/pipeline.py:refused': 'our own causes',
     'measure/timing.py:_minima': 'WINDOW_S',
     'measure/uncertainty/noise.py:_blocks': 'emptied when it is full',
+    'measure/uncertainty/noise.py:_sums': 'emptied with the blocks',
     'measure/uncertainty/stamped.py:_some': 'sets of at most six PSDs',
     'measure/uncertainty/stamped.py:_told': 'our own sentences',
     'measure/watch.py:_learned': 'LEARN',
