@@ -57,7 +57,9 @@ _GOLDEN = 'test/test_golden.py'
 _SOLVERS = (
     *('sensitivity', 'truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd'),
 )
-_UNCERTAINTY = (*('formulas', 'consistency', 'combinations', 'stamped', 'redundancy', 'rest', 'block_fit', 'noise'),)
+_UNCERTAINTY = (
+    *('formulas', 'consistency', 'combinations', 'stamped', 'redundancy', 'rest', 'block_fit', 'noise', 'converter'),
+)
 _RUNS = ('test/measure/test_pipeline.py', 'test/test_layouts.py')
 
 ROOMS: Mapping[str, Room] = {
@@ -116,6 +118,7 @@ ROOMS: Mapping[str, Room] = {
         ('psd_deflection/measure/uncertainty',),
         (
             *(f'test/measure/uncertainty/test_{n}.py' for n in _UNCERTAINTY),
+            'test/measure/uncertainty/test_vibration.py -k tone or hum or regular or fit_states or counted',
             'test/measure/test_pipeline.py -k zero or contradict',
             'test/test_more_psds.py -k contradicts or degree or tells_on_itself or one_after or from_the_memory',
             'test/measure/uncertainty/test_pipeline_state.py',
@@ -178,6 +181,81 @@ ROOMS: Mapping[str, Room] = {
             f'test/studies/discover/test_{n}.py'
             for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
         ),
+    ),
+    'link': Room(
+        ('psd_deflection/model/link',),
+        ('test/model/link',),
+        slow=('test/model/simulation/test_simulator.py', 'test/studies/thesis'),
+    ),
+    'misalignment': Room(
+        ('psd_deflection/model/misalignment',),
+        ('test/model/misalignment',),
+        slow=('test/studies/calibrate', 'test/measure/test_estimation.py'),
+    ),
+    'motion': Room(
+        ('psd_deflection/measure/motion',),
+        (
+            'test/measure/motion/test_modal.py',
+            'test/measure/motion/test_unseen.py',
+            'test/measure/motion/test_inertia.py',
+        ),
+        slow=('test/measure/motion/test_motion.py',),
+    ),
+    'watch': Room(
+        ('psd_deflection/measure/watch.py',),
+        ('test/measure/test_watch.py',),
+        slow=('test/run/test_watcher.py',),
+    ),
+    'chains': Room(
+        ('psd_deflection/arms/chains',),
+        ('test/arms/chains',),
+        slow=('test/run/test_chain.py', 'test/cli/test_chain.py'),
+    ),
+    'compensation': Room(
+        ('psd_deflection/arms/compensation', 'psd_deflection/arms/shapers.py', 'psd_deflection/arms/inputs.py'),
+        ('test/arms/compensation', 'test/arms/test_shapers.py', 'test/arms/test_inputs.py'),
+        slow=('test/cli/test_shaper.py',),
+    ),
+    'camera': Room(
+        ('psd_deflection/camera',),
+        ('test/camera',),
+        leave=('psd_deflection/camera/preview.py', 'psd_deflection/camera/print_target.py'),
+        slow=('test/cli/test_camera.py',),
+    ),
+    'calibrate': Room(
+        ('psd_deflection/studies/calibrate',),
+        ('test/studies/calibrate/test_dark.py', 'test/studies/calibrate/test_fit.py'),
+        leave=('psd_deflection/studies/calibrate/pictures.py',),
+        slow=('test/studies/calibrate/test_calibrate.py', 'test/cli/test_calibrate.py'),
+    ),
+    'check': Room(
+        ('psd_deflection/studies/check', 'psd_deflection/studies/noted_loads.py'),
+        ('test/studies/check', 'test/studies/test_noted_loads.py'),
+        slow=('test/run/test_guided.py',),
+    ),
+    'identify': Room(
+        ('psd_deflection/studies/identify',),
+        ('test/studies/identify',),
+        leave=('psd_deflection/studies/identify/pictures.py',),
+        slow=('test/cli/test_identify.py',),
+    ),
+    'validate': Room(
+        ('psd_deflection/studies/validate',),
+        ('test/studies/validate',),
+        leave=('psd_deflection/studies/validate/pictures.py',),
+        slow=('test/cli/test_validate.py',),
+    ),
+    'budget': Room(
+        ('psd_deflection/studies/budget',),
+        ('test/studies/budget',),
+        leave=('psd_deflection/studies/budget/pictures.py',),
+        slow=('test/cli/test_budget.py',),
+    ),
+    'thesis': Room(
+        ('psd_deflection/studies/thesis',),
+        ('test/studies/thesis',),
+        leave=('psd_deflection/studies/thesis/figures.py',),
+        slow=('test/cli/test_compare_methods.py',),
     ),
 }
 
