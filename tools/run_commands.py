@@ -108,6 +108,7 @@ SHORTER = {
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
     r'^python -m blind\.coverage --faults$': '--rows 1',
     r'^python -m blind\.coverage --alarms \d+$': '--alarms 1 --rows 1',
+    r'^python -m blind\.coverage --vibration \d+$': '--vibration 1',
     r'^python -m blind\.thesis$': '--parts 1',
     r'^python -m blind\.clock$': '--runs 5',
     r'^python -m blind\.watch\b': '--runs 1 --hours 0',
