@@ -75,10 +75,13 @@ class BoundedMap(MutableMapping[K, V]):
         return self._items[key]
 
     def __setitem__(self, key: K, value: V) -> None:
-        self._items.pop(key, None)
-        if len(self._items) >= self.most:
-            del self._items[next(iter(self._items))]
-        self._items[key] = value
+        # In a copy: whoever reads from another thread never finds the key gone.
+        items = self._items.copy()
+        items.pop(key, None)
+        if len(items) >= self.most:
+            del items[next(iter(items))]
+        items[key] = value
+        self._items = items
 
     def __delitem__(self, key: K) -> None:
         del self._items[key]

@@ -360,8 +360,9 @@ class Session:
         self.processing.later(partial(self._refuse, topic, why))
 
     def _refuse(self, topic: str, why: str) -> None:
-        self.refused.add(topic)
+        # The reason first: the main thread asks for it as soon as there is a count.
         self.why_refused[topic] = why
+        self.refused.add(topic)
         self._repeats.tell(f'refused {topic}', f'{topic}: refused: {why}', WARNING, time.monotonic())
 
     def settle(self) -> None:

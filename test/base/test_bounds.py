@@ -57,3 +57,23 @@ def test_a_rate_is_bounded_second_by_second() -> None:
     rate = RateLimit(2)
     allowed = [rate.allows(at) for at in (5.0, 5.1, 5.2, 5.9, 6.0, 6.1, 6.2)]
     assert allowed == [True, True, False, False, True, True, False]
+
+
+def test_a_key_that_is_set_again_is_never_gone_for_another_thread() -> None:
+    class Word(str):
+        """Its hash is asked for whenever a map is changed: there another thread may read."""
+
+        def __hash__(self) -> int:
+            seen.append(not held or 'a' in held[0])
+            return super().__hash__()
+
+        __eq__ = str.__eq__
+
+    seen: list[bool] = []
+    held: list[BoundedMap[str, int]] = []
+    kept: BoundedMap[str, int] = BoundedMap()
+    kept['a'] = 1
+    held.append(kept)
+    kept[Word('a')] = 2
+    assert seen
+    assert all(seen)
