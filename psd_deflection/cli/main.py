@@ -129,7 +129,8 @@ def make_parser(chosen: Collection[str], value: type[argparse.Action] | None = N
             module = module_of(name)
             sub.description = module.__doc__
             module.add_arguments(sub)
-            sub.set_defaults(run=module.run, refuse=sub.error)
+            options = tuple(sub._option_string_actions)  # noqa: SLF001
+            sub.set_defaults(run=module.run, refuse=sub.error, known_options=options)
     return parser
 
 
@@ -223,7 +224,8 @@ def _run(argv: list[str]) -> int:
         return error.exit_status
     if unknown:
         # Let the subcommand's parser report the error, so that its own usage is printed.
-        args.refuse(f'unrecognized arguments: {" ".join(unknown)}{_ros_hint(unknown)}')
+        hint = _ros_hint(unknown) or _option_hint(unknown, args.known_options)
+        args.refuse(f'unrecognized arguments: {" ".join(unknown)}{hint}')
     args.ros_arguments = ros_arguments
     out: str | None = getattr(args, 'out', None)
     # An output that existed before belongs to another run; this one has not written to it.
@@ -294,6 +296,12 @@ def _refuse_empty(argv: Sequence[str]) -> None:
 def _ros_hint(unknown: Sequence[str]) -> str:
     meant = any(a in ROS_OPTIONS or ':=' in a for a in unknown)
     return '; ROS arguments go behind --ros-args' if meant else ''
+
+
+def _option_hint(unknown: Sequence[str], known: Collection[str]) -> str:
+    """``; did you mean --from?`` for the first option that is spelt nearly right."""
+    typed = (a.partition('=')[0] for a in unknown if a.startswith('--'))
+    return next((hint for a in typed if (hint := did_you_mean(a, known))), '')
 
 
 def _split_ros_arguments(argv: Sequence[str]) -> tuple[list[str], list[str]]:

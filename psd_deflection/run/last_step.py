@@ -1,4 +1,4 @@
-"""When the link moved last, by the dots of the last minute: a weight is noted some seconds after it was hung."""
+"""When the link moved last, by the dots of the last minute: a weight is noted after it was hung."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ REACH_S = 60.0
 
 
 class RecentDots:
-    """A sink of records. It keeps the dots of two PSDs for ``REACH_S``, and computes only when it is asked."""
+    """A sink of records. It keeps the dots of two PSDs for ``REACH_S`` and computes when asked."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -29,7 +29,7 @@ class RecentDots:
             self._rows.append((record.index, record.t_ns, record.dots[:4]))
 
     def step_ns(self) -> int | None:
-        """When the last lasting step of the dots was, ns; None if there was none. From any thread."""
+        """When the last lasting step of the dots was, ns, or None. From any thread."""
         rows = tuple(self._rows)
         if not rows:
             return None
@@ -41,4 +41,5 @@ class RecentDots:
             if first <= index <= last:
                 dots[index - first] = values
         found = last_step(self._rig, dots, self._period)
-        return None if found is None else last_ns - round(((last - first) * self._period - found) * 1e9)
+        ago_s = None if found is None else (last - first) * self._period - found
+        return None if ago_s is None else last_ns - round(ago_s * 1e9)

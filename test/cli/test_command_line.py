@@ -67,6 +67,23 @@ def test_arguments_that_are_none_are_refused_by_the_command(
     assert ('; ROS arguments go behind --ros-args' in err) == hinted
 
 
+@pytest.mark.parametrize(
+    ('argv', 'hint'),
+    [
+        (['info', 'x', '--form', '1'], '; did you mean --from?'),
+        (['replay', 'x', '--comapre'], '; did you mean --compare?'),
+        (['estimator', '--prot=/dev/ttyACM0'], '; did you mean --port?'),
+        (['info', 'x', '--xyzzy'], 'unrecognized arguments: --xyzzy\n'),
+    ],
+)
+def test_an_option_that_is_mistyped_is_named_with_the_nearest(
+    argv: list[str], hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(argv)
+    assert hint in capsys.readouterr().err
+
+
 def test_ros_arguments_go_through_untouched(monkeypatch: pytest.MonkeyPatch) -> None:
     taken: list[list[str]] = []
 

@@ -1,8 +1,8 @@
-"""Mark this moment: "bumped it here". The running daemon writes it into its recording, as a message on /link_tip/mark.
+"""Mark this moment: "bumped it here". The running daemon records it as a message on /link_tip/mark.
 
-The time is that at which the daemon hears of it. `info` lists the marks of a recording, plots show them, and
-they bound a part of it (--from 'mark:bumped the table'). The daemon must serve its page (`monitor`,
-`estimator --monitor`, `make run`); one that you run on this machine is found by itself.
+The time is that at which the daemon hears of it. `info` lists the marks of a recording, plots show
+them, and they bound a part of it (--from 'mark:bumped the table'). The daemon must serve its page
+(`monitor`, `estimator --monitor`, `make run`); one that you run on this machine is found by itself.
 
   psd-deflection mark bumped the table
 
@@ -18,7 +18,8 @@ from psd_deflection.cli._daemon import request, url_option
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('text', metavar='TEXT', nargs='+', help='what happened, in at most 200 characters')
+    words = 'what happened, in at most 200 characters'
+    parser.add_argument('text', metavar='TEXT', nargs='+', help=words)
     url_option(parser)
 
 
