@@ -27,7 +27,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from bench.steps import largest_step
 from blind.render import Pose, Scene, photograph
-from msg_adapters import ACCELERATION, LOAD, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
+from msg_adapters import ACCELERATION, LOAD, MARK, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.compensation.arm import read_arm
 from psd_deflection.arms.compensation.compensator import State
@@ -147,6 +147,7 @@ GOOD: Mapping[str, Good] = {
     REFERENCE: _reference,
     REFERENCE_WITH_COVARIANCE: lambda: _covered(''),
     TEMPERATURE: lambda: _stamped(Temperature(temperature=21.0)),
+    MARK: lambda: String(data='a mark'),
     ACCELERATION: lambda: _stamped(AccelStamped(), 'link_base'),
     '/image': PICTURES.image,
     '/image/compressed': PICTURES.compressed,
