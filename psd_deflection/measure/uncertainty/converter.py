@@ -55,7 +55,7 @@ class ConverterSteps:
     def of_rig(cls, rig: Rig) -> ConverterSteps:
         """Of the channels of its PSDs."""
         converter = rig.converter
-        return cls(3 * len(rig.psds), converter.volts_per_count, converter.full_scale / 2.0 ** (LEAST_BITS - 1))
+        return cls(3 * len(rig.psds), converter.volts_per_count, converter.full_scale / (1 << (LEAST_BITS - 1)))
 
     @property
     def _fine(self) -> npt.NDArray[np.bool_]:
@@ -70,7 +70,7 @@ class ConverterSteps:
         self._first = np.where(np.isnan(self._first), levels[0], self._first)
         apart = np.abs(levels - self._first)
         rounding = self._tolerance(levels)
-        self._off += (apart > rounding).sum(axis=0)
+        self._off += np.count_nonzero(apart > rounding, axis=0)
         with np.errstate(divide='ignore', invalid='ignore'):
             times = apart / self._divisor
             fits = np.abs(times - np.rint(times)) * self._divisor <= rounding
@@ -115,7 +115,7 @@ class ConverterSteps:
     def _of_levels(self) -> float:
         own = 0.0
         levels = np.abs(self._first)
-        if int((levels > 0.0).sum()) < _LEVELS:
+        if np.count_nonzero(levels > 0.0) < _LEVELS:
             return 0.0
         for value in (*levels.tolist(), *self._divisor.tolist()):
             own = _common(own, value, float(self._tolerance(levels[None, :]).max()))

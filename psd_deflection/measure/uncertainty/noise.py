@@ -21,6 +21,7 @@ the characteristic function of the noise at multiples of 2 pi/q).
 
 from __future__ import annotations
 
+import itertools
 from math import pi
 
 import numpy as np
@@ -218,7 +219,7 @@ class StreamNoise:
                 if len(sums) != rows.size:
                     raise ValueError(f'{rows.size} sum signals of the same blocks')
                 rows = np.reshape(sums, rows.shape)
-            self._sums = np.split(rows, np.cumsum(counts)[:-1]) if counts else []
+            self._sums = np.split(rows, list(itertools.accumulate(counts))[:-1]) if counts else []
         self._blocks = blocks
         self._segment = blocks[-1][0] // SEGMENT_BLOCKS if blocks else -1
 

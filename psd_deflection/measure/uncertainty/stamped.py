@@ -175,7 +175,7 @@ class StampedDots:
         self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes, self._left, by)
         self._volt: FloatArray | None = None
         if self._measures and config.vibration == 'widen':
-            self._volt = rig.sensitivities.mean(axis=1)
+            self._volt = 0.5 * (rig.sensitivities[:, 0] + rig.sensitivities[:, 1])
             self.noise.look_for_tones(len(rig.psds))
         self._converter: ConverterSteps | None = None
         if self._measures and config.converter_steps == 'seen':

@@ -118,7 +118,7 @@ class Conclusion(StudyResult):
             ],
             'ties': self._ties(),
             'covariance': _covariance(self.fit, self.effects),
-            'limits': [{'limit': x.limit, 'beyond': x.beyond} for x in self.search.limits],
+            'limits': [asdict(x) for x in self.search.limits],
             'remainder': None if self.remainder is None else asdict(self.remainder),
             'setup': [],
             'moves': None,

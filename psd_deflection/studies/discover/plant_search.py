@@ -7,6 +7,7 @@ counts correlation times. Everything else is the search of :mod:`.search` and th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Self
@@ -43,6 +44,7 @@ class PlantComparison(Comparison):
 
     open_level = True
     budget = BUDGET
+    most_effects = math.inf
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant

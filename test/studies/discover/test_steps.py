@@ -156,6 +156,11 @@ def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_said
     names = 'abcdef'
     shown = pictures(*((n, 'x') for n in names))
     plant = Plant(shown, without_noise(*((shown[n, 'x'], 900.0) for n in names)) + noise())
+    four = ran(searching(plant, shown, names))
+    assert len(four.fit.effects) == 4
+    assert [x.limit for x in four.limits] == ['4 effects, which is the most that are looked for']
+    assert four.limits[0].beyond.startswith('2 more terms (')
+    monkeypatch.setattr(plant, 'most_effects', math.inf)
     whole = ran(searching(plant, shown, names))
     assert (named(whole.fit), whole.limits) == (list(names), ())
     # The fit of no effect is one simulation; after the first effect there are more than two.

@@ -35,8 +35,8 @@ class Comparison(ABC):
     case of each column, counted over all recordings. ``first``: names of effects that are only looked for before any
     other is found; ``setup``: of those that are mistakes of the set-up. ``open_level``: the level of what remains is
     fitted too, because nobody knows how exact the model of the machine is. ``budget``: forward simulations for each
-    effect of the model after which nothing more is added; the alternatives end at twice as many. ``digits``: format of
-    a gap in the sentence.
+    effect of the model after which nothing more is added; the alternatives end at twice as many. ``most_effects``:
+    beside so many nothing more is added. ``digits``: format of a gap in the sentence.
     """
 
     physics: Physics | None
@@ -49,6 +49,7 @@ class Comparison(ABC):
     setup: frozenset[str] = frozenset()
     open_level: bool = False
     budget: int = 700
+    most_effects: float = 4
     digits: str = '.4g'
 
     @property

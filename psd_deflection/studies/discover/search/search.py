@@ -276,6 +276,9 @@ class Search:
             if self.spent >= self._budget(current):
                 self._stopped = f'{self._budget(current)} simulations for {counted(current)}'
                 break
+            if len(current.effects) >= self.workspace.most_effects:
+                self._stopped = f'{counted(current)}, which is the most that are looked for'
+                break
             better = self._added(null, current)
             if better is None:
                 break
