@@ -169,6 +169,10 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         until = time.monotonic() + RELEASE_S
         while not (self.at_rest() or self._hurried()) and time.monotonic() < until:
             time.sleep(PERIOD_S)
+            # The executor waits for this transition. Offsets go back only while the controller
+            # and the joints are heard.
+            self.gate.take_in()
+            self._tell()
         self._ended.set()
         if self._sender is not None:
             self._sender.join()

@@ -21,6 +21,8 @@ pytest.importorskip('rclpy')
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+from lifecycle_msgs.msg import Transition  # noqa: E402
+from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
@@ -102,6 +104,24 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
     compensator.process.send_signal(2)
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
     assert compensator.wait() == 0
+    assert plant.step() <= WITHIN
+
+
+def test_a_transition_lets_the_offsets_go_back_to_zero(compensator: Program, peer: Any) -> None:
+    plant = Plant(peer.node)
+    peer.until(lambda: plant.error() > 2e-3, 'a deflection')
+    free = plant.error()
+    assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
+    peer.until(lambda: plant.error() < 0.05 * free, 'offsets that follow')
+    # So slowly that what was heard before it is stale by then.
+    seconds = 1.5
+    slow = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=np.abs(plant.offsets[-1]).max() / seconds)
+    request = SetParameters.Request(parameters=[Parameter(name='max_rate', value=slow)])
+    assert peer.call(SetParameters, '/compensator/set_parameters', request).results[0].successful
+    for wanted in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
+        change = ChangeState.Request(transition=Transition(id=wanted))
+        assert peer.call(ChangeState, '/compensator/change_state', change).success
+    peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
     assert plant.step() <= WITHIN
 
 
