@@ -45,7 +45,6 @@ class InputGate:
     def __init__(self, node: Node, say: Say, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
         self._repeats = Repeats(say)
-        self._listening: list[Subscription] = []
         self.refused = Tally()
         self.why: BoundedMap[str, str] = BoundedMap()
 
@@ -64,18 +63,19 @@ class InputGate:
         for a topic without a row, ImportError if its message is not installed, and ConfigError for a QoS override that
         ROS does not take.
         """
-        made = [
+        return [
             self._subscribe(row, check, take, name or graph_name(row), type_name or row.type) for row in HEARD[topic]
         ]
-        self._listening += made
-        return made
 
     def take_in(self) -> None:
         """Take the messages that have come, while a transition keeps the executor waiting.
 
         To be called in the executor's thread.
         """
-        for subscription in self._listening:
+        for subscription in self._node.subscriptions:
+            if not subscription.raw:
+                # Those of rclpy itself, such as that of /clock.
+                continue
             for _ in range(subscription.qos_profile.depth):
                 with subscription.handle:
                     taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
