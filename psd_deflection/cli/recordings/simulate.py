@@ -28,7 +28,7 @@ from psd_deflection.cli._report import print_json, show
 from psd_deflection.cli.run import serve
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.effect_words import with_effects
-from psd_deflection.model.simulation.load_words import HELP, load_history, temperature_history
+from psd_deflection.model.simulation.load_words import HELP, load_histories, temperature_history
 from psd_deflection.recordings.formats.registry import format_of_name
 from psd_deflection.recordings.replay.simulated_run import BAG_START_NS, SimulatedRun
 from psd_deflection.recordings.write.sinks import open_sink
@@ -40,7 +40,6 @@ LEAST_SAMPLES = 2
 
 OF_A_RECORDING: dict[str, object] = {
     'out': None,
-    'loads': None,
     'temperature': None,
     'effect': [],
     'reference': False,
@@ -56,11 +55,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--params-file', metavar='RIG.yaml', help='the rig and its known effects')
     parser.add_argument('--seed', type=seed, default=0, help='seed of the noise (default 0)')
     world_option(parser)
+    parser.add_argument(
+        '--loads',
+        metavar='WORDS',
+        action='append',
+        help='a load history, see below (default: thesis); repeatable; a device begins it again and again',
+    )
     group = parser.add_argument_group('as a recording (--out)')
     group.add_argument('--out', type=recording_name(), metavar='OUT', help='X.csv, X.mcap or a bag folder (X)')
-    group.add_argument(
-        '--loads', metavar='WORDS', action='append', help='a load history, see below (default: thesis); repeatable'
-    )
     group.add_argument(
         '--temperature', metavar='T0[,T1...]', help='°C, straight lines through these, evenly spread over the recording'
     )
@@ -94,8 +96,7 @@ def run(args: argparse.Namespace) -> int:
     with given_as_option():
         rig = with_effects(in_the_world(known, args.world), args.effect, '--effect')
         rate = rig.converter.sample_rate_hz
-        parts = [load_history(words, rate, '--loads') for words in args.loads or ['thesis']]
-        history = parts[0].then(*parts[1:])
+        history = load_histories(args.loads or ['thesis'], rate, '--loads')
         if len(history) < LEAST_SAMPLES:
             raise UsageError(
                 f'--loads: last {len(history)} samples at {rate:g} Hz; a recording has at least {LEAST_SAMPLES}'

@@ -12,7 +12,9 @@ from psd_deflection.cli._program import program
 from psd_deflection.devices.device import PowerUp
 from psd_deflection.devices.pseudo_terminal import PORT_LINE, link_names, open_terminals
 from psd_deflection.devices.registry import SIMULATED
-from psd_deflection.devices.serve import serve_all, simulated_devices, stopped_by_signals
+from psd_deflection.devices.serve import Hand, serve_all, simulated_devices, stopped_by_signals
+from psd_deflection.model.simulation.load_words import load_histories
+from psd_deflection.model.simulation.loads import CyclicLoads
 from psd_deflection.rig.config import load_rig
 
 OF_A_DEVICE = {'device': None, 'link': None, 'skew_ppm': 0.0, 'first_seq': 0}
@@ -57,7 +59,11 @@ def run_device(args: argparse.Namespace) -> int:
     rig = in_the_world(load_rig(args.params_file), args.world)
     stop = stopped_by_signals()
     name = args.device or rig.acquisition.source
-    devices = simulated_devices(name, rig, args.seed, PowerUp(args.skew_ppm, args.first_seq))
+    hand = None
+    if args.loads:
+        with given_as_option():
+            hand = Hand(CyclicLoads(load_histories(args.loads, rig.converter.sample_rate_hz, '--loads')))
+    devices = simulated_devices(name, rig, args.seed, PowerUp(args.skew_ppm, args.first_seq), hand)
     links = link_names(args.link, len(devices))
     with contextlib.ExitStack() as stack:
         with given_as_option():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +52,12 @@ def _seconds(text: str, source: str) -> float:
     if not 0.0 < value <= MAX_SECONDS:
         raise ConfigError(f'{source}: {value:g} s: must be above 0 and at most {MAX_SECONDS:g}')
     return value
+
+
+def load_histories(words: Sequence[str], rate: float, parameter: str = 'loads') -> LoadHistory:
+    """The histories of several ``words``, one after the other. Raises as :func:`load_history`."""
+    parts = [load_history(one, rate, parameter) for one in words]
+    return parts[0].then(*parts[1:])
 
 
 def load_history(words: str, rate: float, parameter: str = 'loads') -> LoadHistory:
