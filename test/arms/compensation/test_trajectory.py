@@ -107,7 +107,7 @@ def test_a_stream_of_set_points_is_shaped() -> None:
         for t, a in zip(ZV.times, ZV.sizes, strict=True)
     )
     np.testing.assert_allclose(heard, wanted, atol=1e-6)
-    assert len(by._pieces) < 6
+    assert len(by.history) < 6
 
 
 def test_it_begins_where_the_joints_are() -> None:
@@ -239,7 +239,7 @@ def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = Tr
             start_ns = start_of(round(sent[len(arriving)] * S), 0, lead)
             measured = dict(zip(NAMES, here.tolist(), strict=True))
             shaped = by.shape(start_ns, checked(NAMES, [0.4], [point]), measured)
-            fastest = max(fastest, float(by._pieces[-1].path.fastest()[2].max()))
+            fastest = max(fastest, float(by.history[-1].path.fastest()[2].max()))
             arriving.append((start_ns / S if stamped else 0.0, shaped))
         while arrived < len(arriving) and arrivals[arrived] <= now:
             controller.arrive(now, *arriving[arrived])
