@@ -20,9 +20,7 @@ def table() -> str:
     """The table: a line for each topic, or for those of several PSDs or solvers, and one for each action."""
     lines = ['| topic | type | node | QoS | |', '|---|---|---|---|---|']
     heard = (rows[0] for rows in HEARD.values())
-    actions = [
-        f'| `{a.name}` (action) | {a.type.split("/")[-1]} | {a.node} | | {a.says} |' for a in SERVED.values()
-    ]
+    actions = [f'| `{a.name}` (action) | {a.type.split("/")[-1]} | {a.node} | | {a.says} |' for a in SERVED.values()]
     return '\n'.join([*lines, *_lines(PUBLISHED.values(), ''), *_lines(heard, ' (in)'), *actions])
 
 

@@ -32,6 +32,9 @@ a goal that another one replaced. It answers within one of its cycles."""
 SILENT_S = 5.0
 """A controller that has sent feedback, and then none for so long, is gone, s. It sends 20 a second by
 default. DDS itself notices after 20 s that a process was killed."""
+FRESH_S = 0.5
+"""With feedback older than this, s, nobody knows whether the controller still moves: a new goal begins
+where the joints are."""
 LEAVE_S = 0.3
 """Time for the last result to leave, s."""
 LOOK_S = 0.1
@@ -169,6 +172,9 @@ class Follower:
                 self._send(goal)
 
     def _send(self, goal: _Goal) -> None:
+        told = self._newest.told if self._newest is not None else None
+        if told is not None and time.monotonic() - told > FRESH_S:
+            self._shaper.forget()
         request, before = goal.handle.request, self._shaper.history
         try:
             if not self.ready():

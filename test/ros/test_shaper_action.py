@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from bench.trajectory_controller import ACTION, ServedController, TrajectoryController, arriving  # noqa: E402
-from test.ros.conftest import WARNINGS, Peer, stamp  # noqa: E402
+from test.ros.conftest import WARNINGS, Peer  # noqa: E402
 from tools.control_msgs import available  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
