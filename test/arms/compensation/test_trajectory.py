@@ -233,7 +233,8 @@ def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = Tr
     # DDS keeps the order.
     arrivals = np.maximum.accumulate(sent + latencies)
     arriving: list[tuple[float, Trajectory]] = []
-    at, commands, arrived = np.arange(10.0, sent[-1] + 2.0, 0.002), [], 0
+    at, arrived = np.arange(10.0, sent[-1] + 2.0, 0.002), 0
+    commands: list[FloatArray] = []
     late: list[int] = []
     for now in at:
         if len(arriving) < len(sent) and sent[len(arriving)] <= now:
