@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -245,6 +246,18 @@ def test_a_flood_of_goals_is_cut_off(begin: Callable[..., Arm]) -> None:
         return 'more than 20 goals a second' in arm.shaper.text
 
     arm.peer.until(flooded, 'the end of the flood')
+
+
+def test_what_cannot_be_unpacked_is_counted_and_ends_nothing(begin: Callable[..., Arm]) -> None:
+    arm = begin()
+    words = [sys.executable, str(ROOT / 'test' / 'ros' / 'cyclone_stranger.py'), f'rq{FOLLOW}/_action/send_goalRequest']
+    stranger = Program(words)
+    try:
+        arm.peer.until(lambda: 'refused: no message of this type' in arm.shaper.text, 'a refusal')
+        assert arm.followed(arm.goal())[0] == SUCCEEDED
+    finally:
+        print(stranger.text)
+        stranger.end(signal.SIGKILL)
 
 
 def test_a_controller_that_is_not_there_ends_a_goal_at_once(begin: Callable[..., Arm]) -> None:
