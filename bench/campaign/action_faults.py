@@ -16,11 +16,19 @@ from typing import Any
 from rclpy.action import ActionClient
 
 from bench.campaign.shaper_faults import LONGEST_S, NAMES, REFUSED, Moved, injected
+from bench.campaign.strange import Stranger
 from bench.trajectory_controller import ACTION, ServedController
 from tools.control_msgs import available
 from tools.program import PSD_DEFLECTION, Program
 
-OTHERS = ('goal replaced', 'goal cancelled', 'controller rejects', 'controller dies', 'controller says nothing more')
+OTHERS = (
+    'strange goals',
+    'goal replaced',
+    'goal cancelled',
+    'controller rejects',
+    'controller dies',
+    'controller says nothing more',
+)
 MOST_S = 30.0
 """Longest time until a goal ends that nobody follows any more, s."""
 
@@ -33,6 +41,7 @@ class Followed(Moved):
 
         self._goal = FollowJointTrajectory.Goal
         self._sent: list[Any] = []
+        self._stranger = Stranger(3)
         self._served: ServedController | None = None
         super().__init__()
         self._client = ActionClient(self.node, FollowJointTrajectory, '/shaper/follow_joint_trajectory')
@@ -69,11 +78,21 @@ class Followed(Moved):
                 self.spin(max(deaf - time.monotonic(), 1.0), future.done, 'the end of a goal')
         self._sent.clear()
 
+    def _strange(self, message: Any) -> None:
+        """Of joints that nobody has, with any content."""
+        message.joint_names = ['y', 'z']
+        self._stranger.change(message, 0.3)
+
     def inject(self, name: str) -> None:
         """One fault while a goal is under way."""
         assert self._served is not None
         if name in REFUSED:
             super().inject(name)
+        elif name == 'strange goals':
+            self.under_way()
+            for _ in range(15):
+                self.move(self._strange)
+                self.spin(0.02)
         elif name == 'goal replaced':
             self.under_way()
             for _ in range(5):

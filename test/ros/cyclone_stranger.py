@@ -1,7 +1,7 @@
-"""Another vendor's DDS sends goals that no client of ROS would send: text that is no text, and half a message.
+"""Another vendor's DDS sends goals that no client of ROS would send: text that is no text, or half a message.
 
-Run as ``python cyclone_stranger.py TOPIC`` in ROS_DOMAIN_ID; it sends until it is killed. The type is written from the
-ROS definition alone: a string lies in a message as bytes do.
+Run as ``python cyclone_stranger.py TOPIC text|half`` in ROS_DOMAIN_ID; it sends until it is killed. The type is written
+from the ROS definition alone: a string lies in a message as bytes do.
 (No postponed annotations here: cyclonedds reads the types of the fields at run time.)
 """
 
@@ -32,18 +32,25 @@ class Goal(IdlStruct, typename=NAME):
     rest: array[uint32, 8]
 
 
+@dataclass
+class Half(IdlStruct, typename=NAME):
+    goal_id: array[uint8, 16]
+    sec: int32
+
+
 def main() -> None:
+    half = sys.argv[2] == 'half'
     participant = DomainParticipant(int(os.environ['ROS_DOMAIN_ID']))
     qos = Qos(
         Policy.Reliability.Reliable(duration(seconds=1)),
         Policy.History.KeepLast(10),
         Policy.DataRepresentation(use_cdrv0_representation=True),
     )
-    writer = DataWriter(participant, Topic(participant, sys.argv[1], Goal), qos=qos)
+    writer = DataWriter(participant, Topic(participant, sys.argv[1], Half if half else Goal), qos=qos)
     for number in range(10**6):
-        text = list(b'\xff\xfe\0') if number % 2 else [65] * 3
-        names = [0] * 4 if number % 2 else [2**32 - 1] * 4
-        writer.write(Goal([number % 256] * 16, 0, 0, text, names, [0], [0] * 8))
+        own = [*number.to_bytes(4, 'little'), *([0] * 12)]
+        writer.write(Half(own, 0) if half else Goal(own, 0, 0, list(b'\xff\xfe\0'), [0] * 4, [0], [0] * 8))
+        print('sent', number, flush=True)
         time.sleep(0.05)
 
 
