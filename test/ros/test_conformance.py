@@ -656,15 +656,14 @@ def test_goal_that_cannot_be_used_is_refused(running: Running) -> None:
         running.peer.until(client.server_is_ready, name)
         for why, sent in strange.items():
             before, reports = running.refusals(), len(running.reports)
+
+            def counted(before: int = before, reports: int = reports, why: str = why) -> bool:
+                return running.refusals() > before and why in running.texts(reports)
+
             future = client.send_goal_async(sent)
             running.peer.until(future.done, 'the answer to a goal')
             assert not future.result().accepted
-            running.peer.until(
-                lambda before=before, reports=reports, why=why: (
-                    running.refusals() > before and why in running.texts(reports)
-                ),
-                f'the refusal of a goal: {why}',
-            )
+            running.peer.until(counted, f'the refusal of a goal: {why}')
     finally:
         client.destroy()
 

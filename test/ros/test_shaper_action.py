@@ -266,7 +266,7 @@ def test_what_no_client_of_ros_sends_ends_nothing(begin: Callable[..., Arm]) -> 
     def taken() -> bool:
         # Of what the strangers have sent some may be on its way, and only so many goals a second are taken.
         handle = arm.send(arm.goal())
-        return handle.accepted and arm.result(handle).status == SUCCEEDED
+        return bool(handle.accepted) and arm.result(handle).status == SUCCEEDED
 
     arm.peer.until(taken, 'a goal that succeeds')
 
