@@ -29,7 +29,7 @@ def action_class(type_name: str) -> Any:
     package, _, name = type_name.split('/')
     try:
         return getattr(importlib.import_module(f'{package}.action'), name)
-    except ImportError:
+    except (ImportError, AttributeError):
         apt = f'ros-{os.environ.get("ROS_DISTRO", "jazzy")}-{package.replace("_", "-")}'
         raise ConfigError(f'{package} is not installed: apt install {apt}') from None
 
