@@ -3,8 +3,9 @@
   python3 -m bench.mock_hardware
 
 It wants ROS 2 from apt with ros-jazzy-ros2-control and ros-jazzy-ros2-controllers; the workflow has them. First the
-shaper moves the arm by joint_trajectory_controller, with trajectories that replace each other. Then the compensator
-drives forward_position_controller with sums, while a simulated arm bends. Judged are the steps of the joints.
+shaper moves the arm by joint_trajectory_controller, with trajectories that replace each other, and then by its action,
+with goals that replace each other, one that is cancelled and one that cannot be. Then the compensator drives
+forward_position_controller with sums, while a simulated arm bends. Judged are the steps of the joints.
 """
 
 from __future__ import annotations
@@ -17,7 +18,10 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from action_msgs.msg import GoalStatus
+from control_msgs.action import FollowJointTrajectory
 from geometry_msgs.msg import PoseWithCovarianceStamped
+from rclpy.action import ActionClient
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -57,6 +61,7 @@ class Arm:
         self._description.publish(String(data=text.replace('</robot>', hardware + '</robot>')))
         self._deflections = self.node.create_publisher(PoseWithCovarianceStamped, '/end_effector/deflection', 5)
         self.given = self.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
+        self.goals = ActionClient(self.node, FollowJointTrajectory, '/shaper/follow_joint_trajectory')
         self.node.create_subscription(JointState, '/joint_states', self._joints, 50)
         self.node.create_timer(PERIOD_S, self._bend)
 
@@ -114,23 +119,69 @@ def started(*words: str, until: str) -> Program:
 
 def shaped(arm: Arm, programs: list[Program]) -> None:
     """Trajectories that replace each other, through the shaper. SystemExit if the joints make a step."""
-    words = ['ros2', 'run', 'psd_deflection', 'shaper', '--frequency', '12', '--ros-args', '-r']
+    action = ['--action', '/joint_trajectory_controller/follow_joint_trajectory']
+    words = ['ros2', 'run', 'psd_deflection', 'shaper', '--frequency', '12', *action, '--ros-args', '-r']
     remap = '~/shaped:=/joint_trajectory_controller/joint_trajectory'
     programs.append(started(*words, remap, until='publishing /joint_trajectory_controller/joint_trajectory'))
     arm.spin(LONGEST_S, lambda: arm.given.get_subscription_count() > 0, 'the shaper')
     since, chance = len(arm.positions), np.random.default_rng(1)
     for _ in range(20):
-        end = np.array([1.2, 0.6]) + chance.uniform(-0.2, 0.2, 2)
-        at = Duration(nanoseconds=400_000_000).to_msg()
-        point = JointTrajectoryPoint(positions=end.tolist(), velocities=[0.0, 0.0], time_from_start=at)
-        arm.given.publish(JointTrajectory(joint_names=list(NAMES), points=[point]))
+        arm.given.publish(move(chance))
         arm.spin(float(chance.uniform(0.1, 0.4)))
     arm.spin(1.0)
+    judged(arm, since, 'shaper')
+    since = len(arm.positions)
+    followed(arm, chance)
+    arm.spin(1.0)
+    judged(arm, since, 'action of the shaper')
+
+
+def move(chance: np.random.Generator) -> JointTrajectory:
+    """To somewhere near."""
+    end = np.array([1.2, 0.6]) + chance.uniform(-0.2, 0.2, 2)
+    at = Duration(nanoseconds=400_000_000).to_msg()
+    point = JointTrajectoryPoint(positions=end.tolist(), velocities=[0.0, 0.0], time_from_start=at)
+    return JointTrajectory(joint_names=list(NAMES), points=[point])
+
+
+def followed(arm: Arm, chance: np.random.Generator) -> None:
+    """Goals that replace each other, a cancelled one, one of no joint. SystemExit if one ends otherwise."""
+    arm.spin(LONGEST_S, arm.goals.server_is_ready, "the shaper's action")
+
+    def ends(handle: Any) -> Any:
+        future = handle.get_result_async()
+        arm.spin(LONGEST_S, future.done, 'the result of a goal')
+        return future.result()
+
+    def sent(trajectory: JointTrajectory) -> Any:
+        future = arm.goals.send_goal_async(FollowJointTrajectory.Goal(trajectory=trajectory))
+        arm.spin(LONGEST_S, future.done, 'the answer to a goal')
+        return future.result()
+
+    handles = []
+    for _ in range(20):
+        handles.append(sent(move(chance)))
+        arm.spin(float(chance.uniform(0.1, 0.4)))
+    results = [ends(handle) for handle in handles]
+    if results[-1].status != GoalStatus.STATUS_SUCCEEDED:
+        raise SystemExit(f'action: the last goal did not succeed: {results[-1]}')
+    handle = sent(move(chance))
+    arm.spin(0.3)
+    arm.spin(LONGEST_S, handle.cancel_goal_async().done, 'the answer to the cancel request')
+    if ends(handle).status != GoalStatus.STATUS_CANCELED:
+        raise SystemExit('action: a cancelled goal did not end so')
+    bad = ends(sent(JointTrajectory(joint_names=['z'], points=move(chance).points)))
+    if (bad.status, bad.result.error_code) != (GoalStatus.STATUS_ABORTED, FollowJointTrajectory.Result.INVALID_GOAL):
+        raise SystemExit(f'action: a goal of too few joints: {bad}')
+
+
+def judged(arm: Arm, since: int, what: str) -> None:
+    """SystemExit if the joints made a step since then, or did not move."""
     moved, step = float(np.ptp(arm.positions[since:], axis=0).max()), arm.step(since)
-    print(f'shaper: the joints moved {moved:.3f} rad, the largest step is {step:.5f} rad')
+    print(f'{what}: the joints moved {moved:.3f} rad, the largest step is {step:.5f} rad')
     # A message of the joints may be missed.
     if moved < 0.05 or step > 5.0 * FASTEST * STATES_S:
-        raise SystemExit('shaper: a step, or no motion')
+        raise SystemExit(f'{what}: a step, or no motion')
 
 
 def compensated(arm: Arm, programs: list[Program]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,3 +26,12 @@ def largest_step(stamps: Sequence[float], commands: Sequence[FloatArray], max_ra
     with np.errstate(divide='ignore', invalid='ignore'):
         shares = np.where(steps <= 1e-9 * max_rate, 0.0, steps / np.maximum(allowed, 0.0))
     return float(shares.max())
+
+
+def largest_step_in_time(
+    stamps: Sequence[float], commands: Sequence[FloatArray], max_rate: float, late: Sequence[int]
+) -> float:
+    """The same without the steps to the commands of the numbers ``late``, before which something came too late."""
+    cuts = sorted({0, *(n for n in late if 0 < n < len(stamps)), len(stamps)})
+    parts = [slice(a, b) for a, b in itertools.pairwise(cuts)]
+    return max((largest_step(stamps[part], commands[part], max_rate) for part in parts), default=0.0)

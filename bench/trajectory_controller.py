@@ -3,14 +3,34 @@
 Its rules, as of ros2_controllers for Jazzy: a stamp of 0 begins when the trajectory arrives, another at that time.
 Until its first point it goes there from where the command is on arrival. After that it follows it, also from its
 middle. After the last point it stays. The joints are where they are commanded. Times that do not rise are refused.
+
+As an action: a goal that is taken ends the one before it (aborted, INVALID_GOAL). A cancelled one ends at once, and the
+joints are held where they are. A goal has succeeded when its last point is over. Feedback comes 20 times a second.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
-from psd_deflection.arms.compensation.trajectory import Trajectory
+from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory
 from psd_deflection.records import FloatArray
+
+FEEDBACK_S = 0.05
+ACTION = '/joint_trajectory_controller/follow_joint_trajectory'
+
+
+def arriving(message: Any, names: Sequence[str]) -> tuple[float, Trajectory]:
+    """The stamp, s, and the trajectory of a message, with its joints in the order of ``names``."""
+    times = [p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points]
+    orders = [order for order in QUANTITIES if len(getattr(message.points[0], order))]
+    states = np.array([[getattr(p, order) for order in orders] for p in message.points])
+    stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
+    given = list(message.joint_names)
+    return stamp, Trajectory(tuple(names), np.array(times), states[:, :, [given.index(name) for name in names]])
 
 
 class TrajectoryController:
@@ -34,7 +54,92 @@ class TrajectoryController:
             path = Trajectory(path.names, np.append(now - begins, path.times), np.concatenate([here, path.states]))
         self._path, self._begins = path, begins
 
+    @property
+    def ends(self) -> float:
+        """When it is at its last point, s."""
+        return self._begins + self._path.duration
+
+    def hold(self, now: float) -> None:
+        """Stay where the command is."""
+        self._path, self._begins = Trajectory(self._path.names, np.zeros(1), self.state(now)[None, :1]), now
+
     def state(self, now: float) -> FloatArray:
         """Position, and velocity and acceleration if the trajectory has them, (k, j)."""
         out: FloatArray = self._path.at(np.array([now - self._begins]))[0]
         return out
+
+
+class ServedController:
+    """``controller`` as the action ``name`` of a node that somebody spins, on the system's clock.
+
+    ``rejects``: it takes no goal. ``mute``: it says nothing more of a goal that it has taken. ``goals``: those that it
+    has been asked. ``late``: how many came after they should have begun.
+    """
+
+    def __init__(self, node: Any, names: Sequence[str], controller: TrajectoryController, name: str = ACTION) -> None:
+        # The stand-in itself needs no ROS.
+        from psd_deflection.ros.actions import GuardedServer
+        from psd_deflection.ros.endpoints import action_class
+        from psd_deflection.ros.topics import FOLLOW, SERVED
+
+        self.controller, self._names = controller, tuple(names)
+        self.rejects = self.mute = False
+        self.goals: list[Any] = []
+        self.late = 0
+        self._handle: Any = None
+        self._told = 0.0
+        self.refused: list[str] = []
+        kind = action_class(SERVED[FOLLOW].type)
+        self._kind = kind
+        self._server = GuardedServer(
+            node, kind, name, self.refused.append, self._asked, self._accepted, self._cancelled
+        )
+
+    def _asked(self, goal: Any) -> Any:
+        from rclpy.action import GoalResponse
+
+        self.goals.append(goal)
+        good = not self.rejects and sorted(goal.trajectory.joint_names) == sorted(self._names)
+        return GoalResponse.ACCEPT if good and goal.trajectory.points else GoalResponse.REJECT
+
+    def _accepted(self, handle: Any) -> None:
+        if self._handle is not None:
+            self._end('abort', self._kind.Result.INVALID_GOAL, 'Current goal preempted by new incoming action.')
+        stamp, path = arriving(handle.request.trajectory, self._names)
+        now = time.time()
+        self.late += bool(stamp) and now > stamp
+        self.controller.arrive(now, stamp, path)
+        self._handle = handle
+
+    def _cancelled(self, handle: Any) -> None:
+        if self._handle is not None and handle == self._handle:
+            self.controller.hold(time.time())
+            self._end('canceled')
+
+    def _end(self, how: str, code: int = 0, text: str = '') -> None:
+        handle, self._handle = self._handle, None
+        if self.mute:
+            return
+
+        def say(handle: Any) -> Any:
+            getattr(handle, how)()
+            return self._kind.Result(error_code=code, error_string=text)
+
+        self._server.finish(handle, say)
+
+    def step(self, now: float) -> None:
+        """What it does in a cycle."""
+        if self._handle is None or self.mute:
+            return
+        if now - self._told >= FEEDBACK_S:
+            self._told = now
+            feedback = self._kind.Feedback(joint_names=list(self._names))
+            feedback.actual.positions = self.controller.state(now)[0].tolist()
+            self._handle.publish_feedback(feedback)
+        if now >= self.controller.ends:
+            self._end('succeed', text='Goal successfully reached!')
+
+    def close(self) -> None:
+        """It dies: its goals have no end."""
+        self._handle = None
+        self._server.destroy()

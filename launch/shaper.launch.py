@@ -16,6 +16,7 @@ ARGUMENTS: dict[str, str] = {
     'shaper': 'zv, mzv, zvd, ei, or none to pass trajectories through (empty: the recommended one)',
     'urdf': 'refuse trajectories beyond the limits of the joints of this file, or of the topic robot_description',
     'max_step': 'refuse a trajectory that begins further from where the joints are, rad or m (empty: 0.05)',
+    'action': "the controller's action FollowJointTrajectory, for MoveIt (empty: topics alone)",
     'lead': 'a trajectory begins so much later, s, so that it has arrived when it does (empty: 0.1)',
 }
 """Options of the command with their descriptions; the default of each is empty."""

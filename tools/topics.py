@@ -9,7 +9,7 @@ import itertools
 from collections.abc import Iterable, Iterator
 
 from msg_adapters import Delivery
-from psd_deflection.ros.topics import HEARD, PUBLISHED, GraphTopic
+from psd_deflection.ros.topics import HEARD, PUBLISHED, SERVED, GraphTopic
 from tools.program import ROOT
 
 PAGE = ROOT / 'docs' / 'topics.md'
@@ -17,10 +17,11 @@ BEGIN, END = '<!-- topics: python -m tools.topics writes this table -->', '<!-- 
 
 
 def table() -> str:
-    """The table: a line for each topic, or for those of several PSDs or solvers."""
+    """The table: a line for each topic, or for those of several PSDs or solvers, and one for each action."""
     lines = ['| topic | type | node | QoS | |', '|---|---|---|---|---|']
     heard = (rows[0] for rows in HEARD.values())
-    return '\n'.join([*lines, *_lines(PUBLISHED.values(), ''), *_lines(heard, ' (in)')])
+    actions = [f'| `{a.name}` (action) | {a.type.split("/")[-1]} | {a.node} | | {a.says} |' for a in SERVED.values()]
+    return '\n'.join([*lines, *_lines(PUBLISHED.values(), ''), *_lines(heard, ' (in)'), *actions])
 
 
 def _lines(rows: Iterable[GraphTopic], direction: str) -> Iterator[str]:

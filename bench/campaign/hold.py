@@ -9,7 +9,7 @@ whether they follow again, and the one criterion for whatever moves an arm: no s
 commands is larger than ``max_rate`` times the time between them, from the first to the last.
 
 The shaper drives a stand-in of joint_trajectory_controller by trajectories that replace each other,
-and gets what it must refuse in between.
+and gets what it must refuse in between; then the same by goals of FollowJointTrajectory.
 
   python -m bench.campaign.hold --times 20
 """
@@ -36,6 +36,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
 from std_srvs.srv import SetBool
 
+from bench.campaign.action_faults import action_faults
 from bench.campaign.plant import DEFLECTIONS, FOLLOW_ERROR, JOINTS, LOAD, MAX_RATE, Plant, faithful
 from bench.campaign.shaper_faults import shaper_faults
 from blind.campaign import conclude, options
@@ -339,7 +340,7 @@ def main(argv: list[str] | None = None) -> int:
     wanted = names if COMPENSATOR in args.only else [name for name in args.only if name in names]
     missed, worst = compensator_faults(wanted, args.times) if wanted else (0, 0.0)
     if SHAPER in args.only:
-        worst = max(worst, shaper_faults(args.times))
+        worst = max(worst, shaper_faults(args.times), action_faults(args.times))
     return conclude(f'largest step of all: {worst:.3f} of what the rate allows', not missed and worst <= WITHIN)
 
 

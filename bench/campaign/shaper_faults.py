@@ -2,7 +2,8 @@
 
 The shaper moves a stand-in of joint_trajectory_controller by trajectories that replace each other. A fault comes while
 one is under way: the shaper must refuse it, or go on without a step. Judged is the largest step of the command, sampled
-500 times a second, over what the fastest trajectory that was given allows.
+500 times a second, over what the fastest trajectory that was given allows. A trajectory that DDS or a busy machine
+delivers after its begin is joined in its middle: such ones are counted, and the step to them is not the shaper's.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,8 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from bench.steps import largest_step
-from bench.trajectory_controller import TrajectoryController
-from psd_deflection.arms.compensation.trajectory import Trajectory
+from bench.steps import largest_step_in_time
+from bench.trajectory_controller import TrajectoryController, arriving
 from psd_deflection.records import FloatArray
 from tools.program import PSD_DEFLECTION, Program
 
@@ -92,7 +92,11 @@ OTHERS = ('replaced again and again', 'joints not told', 'killed and started aga
 
 
 class Moved:
-    """The graph: the shaper, and what it moves."""
+    """The graph: the shaper, and what it moves.
+
+    ``stamps`` (s) and ``commands`` of the joints; ``late``: the numbers of those before which a trajectory came after
+    its begin. ``heard``: how many came. ``tells``: whether the joints are told.
+    """
 
     def __init__(self) -> None:
         rclpy.init()
@@ -104,6 +108,7 @@ class Moved:
         self.heard = 0
         self.stamps: list[float] = []
         self.commands: list[FloatArray] = []
+        self.late: list[int] = []
         self._rng = np.random.default_rng(2)
         self._joints = self.node.create_publisher(JointState, '/joint_states', 5)
         self.given = self.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
@@ -121,14 +126,10 @@ class Moved:
         self.heard += 1
         if not message.points:
             return
-        times = [p.time_from_start.sec + p.time_from_start.nanosec / 1e9 for p in message.points]
-        orders = [
-            order for order in ('positions', 'velocities', 'accelerations') if len(getattr(message.points[0], order))
-        ]
-        states = np.array([[getattr(p, order) for order in orders] for p in message.points])
-        stamp = message.header.stamp.sec + message.header.stamp.nanosec / 1e9
-        names = [list(message.joint_names).index(name) for name in NAMES]
-        self.controller.arrive(time.time(), stamp, Trajectory(NAMES, np.array(times), states[:, :, names]))
+        now, (stamp, path) = time.time(), arriving(message, NAMES)
+        if now > stamp:
+            self.late.append(len(self.stamps))
+        self.controller.arrive(now, stamp, path)
 
     def _step(self) -> None:
         now = time.time()
@@ -154,6 +155,10 @@ class Moved:
         point = JointTrajectoryPoint(positions=end, velocities=[0.0, 0.0], time_from_start=at)
         message = JointTrajectory(joint_names=list(NAMES), points=[point])
         change(message)
+        self.give(message)
+
+    def give(self, message: Any) -> None:
+        """Send a trajectory to the shaper."""
         self.given.publish(message)
 
     def under_way(self) -> None:
@@ -207,20 +212,27 @@ class Moved:
         rclpy.try_shutdown()
 
 
-def shaper_faults(times: int) -> float:
+def injected(moved: Moved, names: Sequence[str], times: int, by: str = 'shaper') -> float:
     """Inject each of them so often, and print a line for each; the largest step over what is allowed."""
-    moved, worst = Moved(), 0.0
+    worst = 0.0
     try:
-        for name in (*REFUSED, *OTHERS):
-            since = len(moved.stamps)
+        for name in names:
+            since, late = len(moved.stamps), len(moved.late)
             for _ in range(times):
                 moved.inject(name)
-            step = largest_step(moved.stamps[since:], moved.commands[since:], FASTEST)
+            numbers = [number - since for number in moved.late[late:]]
+            step = largest_step_in_time(moved.stamps[since:], moved.commands[since:], FASTEST, numbers)
             worst = max(worst, step)
-            print(f'shaper: {name:26}{times:4} times: largest step {step:.3f} of speed * dt', flush=True)
+            came = f', {len(numbers)} came too late' if numbers else ''
+            print(f'{by}: {name:26}{times:4} times: largest step {step:.3f} of speed * dt{came}', flush=True)
     finally:
         moved.close()
     return worst
+
+
+def shaper_faults(times: int) -> float:
+    """All of the topic; as :func:`injected`."""
+    return injected(Moved(), (*REFUSED, *OTHERS), times)
 
 
 if __name__ == '__main__':

@@ -4,6 +4,7 @@ of a row."""
 from __future__ import annotations
 
 import importlib
+import os
 from typing import Any
 
 from rclpy.node import Node
@@ -21,6 +22,16 @@ def message_class(type_name: str) -> Any:
     """The class of ``pkg/msg/Name``."""
     package, _, name = type_name.split('/')
     return getattr(importlib.import_module(f'{package}.msg'), name)
+
+
+def action_class(type_name: str) -> Any:
+    """The class of ``pkg/action/Name``. Raises ConfigError if it is not installed."""
+    package, _, name = type_name.split('/')
+    try:
+        return getattr(importlib.import_module(f'{package}.action'), name)
+    except (ImportError, AttributeError):
+        apt = f'ros-{os.environ.get("ROS_DISTRO", "jazzy")}-{package.replace("_", "-")}'
+        raise ConfigError(f'{package} is not installed: apt install {apt}') from None
 
 
 def qos(delivery: Delivery) -> QoSProfile:

@@ -2,28 +2,33 @@
 
 A message is bounded in size before it is unpacked, and a topic in messages a second. A check gives the reason why a
 message is refused, or ''. A message that makes a node's own code fail is refused, too: no message ends a node.
+
+Goals of an action come through it, too. rclpy shows a goal only unpacked: one that is too large is refused before
+anything is done with it, but it was in memory.
 """
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.action import GoalResponse
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind
 from rclpy.qos_overriding_options import InvalidQosOverridesError
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 
 from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
-from psd_deflection.base.errors import PsdDeflectionError
 from psd_deflection.base.log import WARNING, Say
 from psd_deflection.base.printable import printable
-from psd_deflection.ros.endpoints import graph_name, message_class, overriding, qos, refused_qos
-from psd_deflection.ros.topics import HEARD, GraphTopic
+from psd_deflection.ros.actions import FAILURES, GuardedClient, GuardedServer
+from psd_deflection.ros.endpoints import action_class, graph_name, message_class, overriding, qos, refused_qos
+from psd_deflection.ros.topics import HEARD, MOST_GOALS, SERVED, GraphTopic
 from psd_deflection.run.repeats import Repeats
 
 LONGEST = 200
@@ -32,8 +37,6 @@ NEWS = 3
 """Refusals of a topic that are said one by one, before they are counted and said together."""
 MOST_A_SECOND = 2000
 """Messages of one topic that are looked at within a second."""
-FAILURES = (PsdDeflectionError, ArithmeticError, ValueError, LookupError, TypeError, AttributeError)
-"""What a message of a strange content can cause; scipy's and numpy's errors of linear algebra are ValueErrors."""
 
 
 class InputGate:
@@ -67,6 +70,37 @@ class InputGate:
             self._subscribe(row, check, take, name or graph_name(row), type_name or row.type) for row in HEARD[topic]
         ]
 
+    def serve(
+        self,
+        action: str,
+        check: Callable[[Any], str],
+        accepted: Callable[[Any], None],
+        cancelled: Callable[[Any], None],
+    ) -> GuardedServer:
+        """Serve ``action``, by its row: ``accepted`` gets the handle of each goal that ``check`` lets in, ``cancelled``
+        that of one that is to be cancelled.
+
+        Raises KeyError for an action without a row, and ConfigError if its type is not installed.
+        """
+        row, rate = SERVED[action], RateLimit(MOST_GOALS)
+
+        def asked(goal: Any) -> GoalResponse:
+            why = self._let_in(len(serialize_message(goal)), row.most_bytes, rate, 'goals')
+            why = why or self._taken(goal, check, lambda _: None)
+            if why:
+                self.refuse(row.name, why)
+            return GoalResponse.REJECT if why else GoalResponse.ACCEPT
+
+        refuse, kind = functools.partial(self.refuse, row.name), action_class(row.type)
+        return GuardedServer(self._node, kind, row.name, refuse, asked, accepted, cancelled)
+
+    def ask(self, action: str, name: str) -> GuardedClient:
+        """A client of the action ``name`` of another node, of the type of ``action``.
+
+        Raises as :meth:`serve`, and what rclpy raises for a name that is none.
+        """
+        return GuardedClient(self._node, action_class(SERVED[action].type), name, functools.partial(self.refuse, name))
+
     def take_in(self) -> None:
         """Take the messages that have come, while a transition keeps the executor waiting.
 
@@ -89,7 +123,7 @@ class InputGate:
         kind, rate = message_class(type_name), RateLimit(MOST_A_SECOND)
 
         def heard(encoded: bytes) -> None:
-            why = self._let_in(encoded, row.most_bytes, rate) or self._carry_out(kind, encoded, check, take)
+            why = self._let_in(len(encoded), row.most_bytes, rate) or self._carry_out(kind, encoded, check, take)
             if why:
                 self.refuse(name, why)
 
@@ -132,11 +166,11 @@ class InputGate:
             *((f'refused last: {topic}', self.why[topic]) for topic, _ in counted),
         ]
 
-    def _let_in(self, encoded: bytes, most_bytes: int, rate: RateLimit) -> str:
-        """Why a message is not even unpacked, or ''."""
-        if len(encoded) > most_bytes:
-            return f'{len(encoded)} bytes: must be at most {most_bytes}'
-        return '' if rate.allows(self._clock()) else f'more than {MOST_A_SECOND} messages a second'
+    def _let_in(self, size: int, most_bytes: int, rate: RateLimit, what: str = 'messages') -> str:
+        """Why a message is not even looked at, or ''."""
+        if size > most_bytes:
+            return f'{size} bytes: must be at most {most_bytes}'
+        return '' if rate.allows(self._clock()) else f'more than {rate.most} {what} a second'
 
     def _carry_out(self, kind: Any, encoded: bytes, check: Callable[[Any], str], take: Callable[[Any], None]) -> str:
         """Take the message, or give the reason why not."""
@@ -145,6 +179,9 @@ class InputGate:
         except (*FAILURES, RuntimeError, MemoryError):
             # Its reason is that of the library, with paths of the machine that built it.
             return f'{len(encoded)} bytes: no message of this type'
+        return self._taken(message, check, take)
+
+    def _taken(self, message: Any, check: Callable[[Any], str], take: Callable[[Any], None]) -> str:
         try:
             why = check(message)
             if not why:

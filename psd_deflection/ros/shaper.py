@@ -1,7 +1,8 @@
 """The node ``shaper``: joint trajectories in, the same out, shaped so that they do not ring the link.
 
-It subscribes to ``~/trajectory`` and publishes ``~/shaped``, one for each. What cannot be followed
-is refused, with the reason in the log and in ``/diagnostics``. ``joint_states`` tells where the
+It subscribes to ``~/trajectory`` and publishes ``~/shaped``, one for each. With the parameter
+``action`` it does the same for goals of FollowJointTrajectory. What cannot be followed is refused,
+with the reason in the log and in ``/diagnostics``. ``joint_states`` tells where the
 joints are; the parameter ``urdf`` says where their limits are: in a file, or on
 ``robot_description``. Everything is done in the main thread.
 """
@@ -25,6 +26,7 @@ from psd_deflection.base.log import WARNING, Say
 from psd_deflection.base.printable import printable
 from psd_deflection.ros.declared import DeclaredParameters
 from psd_deflection.ros.description import listen_to_description
+from psd_deflection.ros.follow import Follower
 from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import JOINT_STATES, SHAPED, TRAJECTORY
@@ -46,6 +48,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
         self._known = KnownJoints()
         self._shaped = self._refused = 0
         self._why = ''
+        self._follow: Follower | None = None
         super().__init__(NODE_NAME, say)
 
     def declare(self) -> DeclaredParameters[ShaperSettings]:
@@ -59,6 +62,8 @@ class ShaperNode(BaseNode[ShaperSettings]):
         self._out = self.publisher(SHAPED)
         self.gate.listen(TRAJECTORY, _trajectory_fault, self._given)
         self.gate.listen(JOINT_STATES, lambda m: joints_fault(m.name, m.position, ()), self._joints)
+        if self.settings.action:
+            self._follow = Follower(self, self.settings.action, self._shape, self._shaper)
         self._undescribed = self.settings.urdf == DESCRIPTION
         if self._undescribed:
             listen_to_description(self.gate, self._described_as)
@@ -81,27 +86,64 @@ class ShaperNode(BaseNode[ShaperSettings]):
         if not message.points:
             # joint_trajectory_controller stops at an empty one, and so does whoever listens to us.
             self._shaper.forget()
+            self._stop('stopped by an empty trajectory')
             self._out.publish(message)
             return
-        now, stamp = time.monotonic(), message.header.stamp
         try:
-            if self._undescribed:
-                raise ConfigError(f'nobody has told the limits of the joints on {DESCRIPTION} yet')
-            trajectory = _trajectory(message)
-            start_ns = start_of(self.now_ns(), int(Time.from_msg(stamp).nanoseconds), self.settings.lead)
-            shaped = self._shaper.shape(start_ns, trajectory, self._known.positions(now))
+            shaped = self._shape(message)
         except ConfigError as error:
             self._refused += 1
             self._why = printable(str(error), LONGEST)
             kind = 'undescribed' if self._undescribed else 'refused'
-            self._repeats.tell(kind, f'trajectory refused: {self._why}', WARNING, now, NEWS)
+            self._repeats.tell(kind, f'trajectory refused: {self._why}', WARNING, time.monotonic(), NEWS)
             return
-        self._shaped += 1
         self._why = ''
+        self._out.publish(shaped)
+
+    def _shape(self, message: Any) -> Any:
+        """The message of a trajectory, shaped. Raises ConfigError for one that cannot be followed."""
+        if self._undescribed:
+            raise ConfigError(f'nobody has told the limits of the joints on {DESCRIPTION} yet')
+        trajectory = _trajectory(message)
+        stamp_ns = int(Time.from_msg(message.header.stamp).nanoseconds)
+        start_ns = start_of(self.now_ns(), stamp_ns, self.settings.lead)
+        shaped = self._shaper.shape(start_ns, trajectory, self._known.positions(time.monotonic()))
+        self._shaped += 1
         # Whoever gets it begins when we did, however long the message takes: one that replaces
         # another makes no step.
         message.header.stamp = Time(nanoseconds=start_ns).to_msg()
-        self._out.publish(_message(shaped, message.header))
+        return _message(shaped, message.header)
+
+    def deactivate(self) -> None:
+        """Shape nothing more; what goals have begun is stopped."""
+        super().deactivate()
+        self._stop('the shaper was deactivated')
+
+    def cleanup(self) -> None:
+        """The same."""
+        super().cleanup()
+        self._stop('the shaper has ended')
+
+    def at_rest(self) -> bool:
+        """Whether no goal is under way: after a signal they are stopped."""
+        self._stop('the shaper ends')
+        return self._follow is None or self._follow.at_rest()
+
+    def leave(self) -> None:
+        """Leave the graph."""
+        if self._follow is not None:
+            self._follow.close()
+        super().leave()
+
+    def watched(self) -> Iterable[str]:
+        """What it publishes, and the feedback of its action."""
+        yield from super().watched()
+        if self._follow is not None:
+            yield self._follow.topic()
+
+    def _stop(self, why: str) -> None:
+        if self._follow is not None:
+            self._follow.stop(why)
 
     def health(self) -> Iterable[Health]:
         """What was shaped and refused."""
@@ -116,7 +158,12 @@ class ShaperNode(BaseNode[ShaperSettings]):
             ('trajectories shaped', str(self._shaped)),
             ('trajectories refused', str(self._refused)),
         )
-        return (Health('trajectories', level, text, values),)
+        yield Health('trajectories', level, text, values)
+        if self._follow is not None:
+            ready, action = self._follow.ready(), self._follow.action
+            level, text = (OK, f'goals go to {action}') if ready else (WARN, f'{action} is served by nobody')
+            counts = ('goals under way', self._follow.under_way), ('goals taken by the controller', self._follow.taken)
+            yield Health('action', level, text, tuple((name, str(count)) for name, count in counts))
 
 
 def _trajectory_fault(message: Any) -> str:

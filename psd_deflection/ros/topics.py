@@ -1,8 +1,9 @@
-"""Every topic of the nodes: :data:`PUBLISHED` and :data:`HEARD` have a row for each. It needs no rclpy.
+"""Every topic of the nodes: :data:`PUBLISHED` and :data:`HEARD` have a row for each, and
+:data:`SERVED` one for each action. It needs no rclpy.
 
-Publishers and subscriptions are made from a row alone (``endpoints.publisher_of``,
-``InputGate.listen``): name, type and QoS stand nowhere else, and a topic without a row can be
-neither published nor heard. ``python -m tools.topics`` writes the table of ``docs/topics.md`` from
+Publishers, subscriptions and actions are made from a row alone (``endpoints.publisher_of``,
+``InputGate.listen``, ``InputGate.serve``): name, type and QoS stand nowhere else, and a topic without
+a row can be neither published nor heard. ``python -m tools.topics`` writes the table of ``docs/topics.md`` from
 these rows.
 """
 
@@ -37,6 +38,9 @@ hundred bytes."""
 MOST_RECORDED_BYTES = 4096
 """Maximum size of a message of another node that is recorded, bytes; valid ones have some hundred
 bytes."""
+MOST_GOALS = 20
+"""Goals of an action within a second: each is work of some milliseconds, and its result is kept for a
+while."""
 MOST_IMAGE_BYTES = 400_000_000
 """Maximum size of an image's message: that of the largest image that is read, with 16 bits a pixel.
 """
@@ -65,6 +69,19 @@ class GraphTopic(NamedTuple):
     most_bytes: int = MOST_BYTES
 
 
+class GraphAction(NamedTuple):
+    """An action that a node serves.
+
+    ``name``, ``node``, ``says``, ``most_bytes``: as of a topic. ``type``: ``pkg/action/Name``.
+    """
+
+    name: str
+    type: str
+    node: str
+    says: str
+    most_bytes: int = MOST_BYTES
+
+
 TF, TF_STATIC, ROSOUT = '/tf', '/tf_static', '/rosout'
 VOLTS = tuple(f'/psd_{n}/volts' for n in range(1, MOST_PSDS + 1))
 MARKERS = '/link_tip/markers'
@@ -75,6 +92,7 @@ OFFSETS, COMMANDS, PROPOSED = '~/offsets', '~/commands', '~/proposed'
 APPLIED, RUNNING, SCALING = '~/applied', '~/robot_running', '~/speed_scaling'
 CONTROLLER = '~/controller_state'
 TRAJECTORY, SHAPED = '~/trajectory', '~/shaped'
+FOLLOW = '~/follow_joint_trajectory'
 IMAGE, COMPRESSED, CAMERA_INFO = 'image', 'image/compressed', 'camera_info'
 
 _ARRAY = 'std_msgs/msg/Float64MultiArray'
@@ -266,3 +284,12 @@ PUBLISHED: Mapping[str, GraphTopic] = {row.name: row for row in _OUT}
 """What the nodes publish, by name."""
 HEARD: Mapping[str, tuple[GraphTopic, ...]] = _by_name(_IN)
 """What the nodes subscribe to, by name: a row for each subscription."""
+SERVED: Mapping[str, GraphAction] = {
+    FOLLOW: GraphAction(
+        FOLLOW,
+        'control_msgs/action/FollowJointTrajectory',
+        _SHAPER,
+        'with `action`: goals for the action of that name, shaped ([Shaping](shaping.md))',
+    )
+}
+"""The actions that the nodes serve, by name."""

@@ -36,6 +36,7 @@ from rcl_interfaces.srv import (  # noqa: E402
     ListParameters,
     SetParameters,
 )
+from rclpy.action import ActionClient, get_action_server_names_and_types_by_node  # noqa: E402
 from rclpy.parameter import Parameter, parameter_value_to_python  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
@@ -44,8 +45,9 @@ from std_msgs.msg import Float64MultiArray, String  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
 from blind.render import Pose, Scene, photograph  # noqa: E402
-from psd_deflection.ros.topics import HEARD, PUBLISHED  # noqa: E402
+from psd_deflection.ros.topics import FOLLOW, HEARD, PUBLISHED, SERVED  # noqa: E402
 from test.ros.conftest import WARNINGS, Peer, stamp  # noqa: E402
+from tools.control_msgs import available  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
 ROS = ROOT / 'psd_deflection' / 'ros'
@@ -292,6 +294,11 @@ def taken_in_the_prefixed_frame_alone(running: Running) -> bool:
     return refuses(running, sent, ("'end_effector_rest': must be left_end_effector_rest",))
 
 
+def follow_of(name: str) -> tuple[str, ...]:
+    """The words with which a shaper serves its action, if control_msgs is there."""
+    return ('--action', name) if available() else ()
+
+
 PREFIX = 'left_'
 PROFILES: Mapping[str, Profile] = {
     'estimator': Profile(
@@ -350,7 +357,7 @@ PROFILES: Mapping[str, Profile] = {
         frames=taken_in_the_prefixed_frame_alone,
     ),
     'shaper': Profile(
-        words=('--shaper', 'none'),
+        words=('--shaper', 'none', *follow_of('arm/follow_joint_trajectory')),
         params={'max_step': 0.04},
         published=(JointTrajectory, 'shaper/shaped'),
         fixed=('shaper', 'zv'),
@@ -605,10 +612,60 @@ def test_its_topics_are_rows_of_the_table(running: Running) -> None:
         for topic, kinds in found.items():
             # Those of a chain's links lie below the link's name.
             name = re.sub('^/(upper|fore)(?=/)', '', topic.removeprefix(NAMESPACE))
-            if name in of_rclpy or topic in of_rclpy:
+            if name in of_rclpy or topic in of_rclpy or '/_action/' in topic:
                 continue
             row = rows.get(name) or rows[name.removeprefix('/')]
             assert [row.type] == kinds, topic
+
+
+def served(running: Running) -> dict[str, list[str]]:
+    """The rows of its actions as the graph has them; skips if there are none."""
+    graph = dict(get_action_server_names_and_types_by_node(running.peer.node, running.name, NAMESPACE))
+    rows = [row for row in SERVED.values() if row.node == running.name]
+    if not rows:
+        assert graph == {}
+        pytest.skip('it serves no action')
+    if '--action' not in running.profile.words:
+        pytest.skip('control_msgs is not installed, and no compiler to build it')
+    return {row.name.replace('~', f'{NAMESPACE}/{running.name}'): [row.type] for row in rows}
+
+
+def test_its_actions_are_rows_of_the_table(running: Running) -> None:
+    rows, node = served(running), running.peer.node
+
+    def found() -> bool:
+        return dict(get_action_server_names_and_types_by_node(node, running.name, NAMESPACE)) == rows
+
+    running.peer.until(found, f'{rows} and no other action')
+
+
+def test_goal_that_cannot_be_used_is_refused(running: Running) -> None:
+    (name,) = served(running)
+    from control_msgs.action import FollowJointTrajectory
+    from control_msgs.msg import JointTolerance
+
+    assert name.endswith(FOLLOW.removeprefix('~'))
+    client = ActionClient(running.peer.node, FollowJointTrajectory, name)
+    goal = FollowJointTrajectory.Goal
+    strange = {
+        'is no time': goal(trajectory=trajectory(0.0, sec=-5)),
+        'not finite': goal(path_tolerance=[JointTolerance(position=math.nan)]),
+        ' bytes: must be at most': goal(trajectory=trajectory(0.0, names=60_000)),
+    }
+    try:
+        running.peer.until(client.server_is_ready, name)
+        for why, sent in strange.items():
+            before, reports = running.refusals(), len(running.reports)
+
+            def counted(before: int = before, reports: int = reports, why: str = why) -> bool:
+                return running.refusals() > before and why in running.texts(reports)
+
+            future = client.send_goal_async(sent)
+            running.peer.until(future.done, 'the answer to a goal')
+            assert not future.result().accepted
+            running.peer.until(counted, f'the refusal of a goal: {why}')
+    finally:
+        client.destroy()
 
 
 def test_lifecycle_goes_down_and_up_again(running: Running) -> None:

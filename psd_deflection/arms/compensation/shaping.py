@@ -51,6 +51,12 @@ class ShaperSettings:
         maximum=10.0,
         live=True,
     )
+    action: str = parameter(
+        '',
+        '',
+        "the controller's action, as /joint_trajectory_controller/follow_joint_trajectory: goals of "
+        '~/follow_joint_trajectory go there, shaped; empty: no action is served',
+    )
     lead: float = parameter(
         0.1,
         's',

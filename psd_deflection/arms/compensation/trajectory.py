@@ -42,6 +42,14 @@ OLDEST_S = 1.0
 QUANTITIES = ('positions', 'velocities', 'accelerations')
 
 
+class JointsError(ConfigError):
+    """The trajectory is of joints that cannot be: not named, not known, or other ones are under way."""
+
+
+class OldStampError(ConfigError):
+    """The trajectory should have begun too long ago."""
+
+
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """``times`` (n,), s from the start, rising. ``states`` (n, k, j) of j joints: positions, rad or m; then velocities
@@ -111,7 +119,7 @@ def checked(names: Sequence[str], times: Sequence[float], points: Sequence[Seque
     Raises ConfigError with the reason for one that cannot be followed.
     """
     if not names or len(set(names)) < len(names) or not all(names):
-        raise ConfigError('joint_names: must be at least one, none empty and none twice')
+        raise JointsError('joint_names: must be at least one, none empty and none twice')
     if not 0 < len(points) <= MOST_POINTS:
         raise ConfigError(f'points: there are {len(points)}, must be 1 to {MOST_POINTS}')
     orders = next((k for k, values in enumerate(points[0]) if not len(values)), len(points[0]))
@@ -150,7 +158,7 @@ def start_of(now_ns: int, stamp_ns: int, lead: float) -> int:
     """
     ago = (now_ns - stamp_ns) / 1e9
     if stamp_ns and ago > OLDEST_S:
-        raise ConfigError(f'its stamp is {ago:.3g} s old, must be at most {OLDEST_S:g} s (or 0, for at once)')
+        raise OldStampError(f'its stamp is {ago:.3g} s old, must be at most {OLDEST_S:g} s (or 0, for at once)')
     return max(stamp_ns, now_ns + round(1e9 * lead))
 
 
@@ -164,25 +172,25 @@ class _Piece(NamedTuple):
 class TrajectoryShaper:
     """``max_step``: a trajectory may begin so far from where the joints are, or are commanded, rad or m.
 
-    ``limits``: of joints by name; what is given must be within them, and other joints are refused. Owns no clock; for
-    one thread.
+    ``limits``: of joints by name; what is given must be within them, and other joints are refused. ``history``: what
+    was commanded and is not over. Owns no clock; for one thread.
     """
 
     def __init__(self, shaper: Shaper, limits: Mapping[str, JointLimits] | None = None, max_step: float = 0.05) -> None:
         self.shaper = shaper
         self.max_step = max_step
         self.limits: Mapping[str, JointLimits] = dict(limits or {})
-        self._pieces: list[_Piece] = []
+        self.history: tuple[_Piece, ...] = ()
 
     def forget(self) -> None:
         """The motion was stopped: the next trajectory begins at rest."""
-        self._pieces.clear()
+        self.history = ()
 
     def moves(self, t_ns: int) -> bool:
         """Whether a shaped trajectory is under way."""
-        if not self._pieces:
+        if not self.history:
             return False
-        start_ns, path = self._pieces[-1]
+        start_ns, path = self.history[-1]
         return (t_ns - start_ns) / 1e9 < path.duration + self.shaper.duration
 
     def shape(self, start_ns: int, given: Trajectory, measured: Mapping[str, float]) -> Trajectory:
@@ -192,10 +200,10 @@ class TrajectoryShaper:
         Raises ConfigError with the reason; then nothing has changed.
         """
         moves = self.moves(start_ns)
-        pieces = [p for p in self._pieces if p.start_ns < start_ns] if moves else []
+        pieces = [p for p in self.history if p.start_ns < start_ns] if moves else []
         # One that begins earlier than what is kept takes its place.
         if pieces and set(pieces[-1].path.names) != set(given.names):
-            raise ConfigError('other joints are under way: ' + ', '.join(pieces[-1].path.names))
+            raise JointsError('other joints are under way: ' + ', '.join(pieces[-1].path.names))
         pieces = [_Piece(t, path.ordered(given.names)) for t, path in pieces]
         given = self._begun(start_ns, given, pieces, measured)
         self._check_limits(given)
@@ -203,7 +211,7 @@ class TrajectoryShaper:
         out = self._sum(start_ns, pieces)
         # What was replaced longer ago than the shaper looks back is over.
         replaced = [start_ns - p.start_ns for p in pieces[1:]] + [0]
-        self._pieces = [p for p, ago in zip(pieces, replaced, strict=True) if ago / 1e9 <= self.shaper.duration]
+        self.history = tuple(p for p, ago in zip(pieces, replaced, strict=True) if ago / 1e9 <= self.shaper.duration)
         return out
 
     def _begun(
@@ -216,7 +224,7 @@ class TrajectoryShaper:
         else:
             missing = next((name for name in given.names if name not in measured), None)
             if missing is not None:
-                raise ConfigError(f'the position of {missing} is not known')
+                raise JointsError(f'the position of {missing} is not known')
             here[0, 0] = [measured[name] for name in given.names]
         if given.times[0] > 0.0:
             return Trajectory(given.names, np.append(0.0, given.times), np.concatenate([here, given.states]))
@@ -240,7 +248,7 @@ class TrajectoryShaper:
                 return
             limits = self.limits.get(name)
             if limits is None:
-                raise ConfigError(f'{name}: the URDF file has no joint of that name that moves')
+                raise JointsError(f'{name}: the URDF file has no joint of that name that moves')
             for value, bound, word in ((low[j], limits.lower, 'least'), (high[j], limits.upper, 'most')):
                 if (value < bound - AT_REST) if word == 'least' else (value > bound + AT_REST):
                     raise ConfigError(f'{name} goes to {value:.4g}, must be at {word} {bound:g} rad or m')

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
 from bench import damping
-from bench.steps import largest_step
+from bench.steps import largest_step_in_time
 from bench.trajectory_controller import TrajectoryController
 from psd_deflection.arms.compensation.arm import JointLimits, read_limits
 from psd_deflection.arms.compensation.trajectory import Trajectory, TrajectoryShaper, checked, start_of
@@ -107,7 +107,7 @@ def test_a_stream_of_set_points_is_shaped() -> None:
         for t, a in zip(ZV.times, ZV.sizes, strict=True)
     )
     np.testing.assert_allclose(heard, wanted, atol=1e-6)
-    assert len(by._pieces) < 6
+    assert len(by.history) < 6
 
 
 def test_it_begins_where_the_joints_are() -> None:
@@ -222,9 +222,10 @@ def test_between_its_points_it_meets_the_states_of_both(orders: int) -> None:
         np.testing.assert_allclose(path.at(at)[:, order], wanted(at, nu=order), atol=1e-9)
 
 
-def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = True) -> float:
+def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = True, in_time: bool = False) -> float:
     """The largest step of a command at 500 Hz over what the fastest speed that was given allows, by trajectories
-    that replace each other and take ``latencies`` (n,), s, to the controller."""
+    that replace each other and take ``latencies`` (n,), s, to the controller. ``in_time``: without the steps to those
+    that come after their begin."""
     rng = np.random.default_rng(5)
     by, here, fastest = TrajectoryShaper(ZVD), np.array([0.3, -0.2]), 0.0
     controller = TrajectoryController(here)
@@ -232,21 +233,25 @@ def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = Tr
     # DDS keeps the order.
     arrivals = np.maximum.accumulate(sent + latencies)
     arriving: list[tuple[float, Trajectory]] = []
-    at, commands, arrived = np.arange(10.0, sent[-1] + 2.0, 0.002), [], 0
+    at, arrived = np.arange(10.0, sent[-1] + 2.0, 0.002), 0
+    commands: list[FloatArray] = []
+    late: list[int] = []
     for now in at:
         if len(arriving) < len(sent) and sent[len(arriving)] <= now:
             point = [rng.uniform(-0.4, 0.4, 2).tolist(), *([[0.0, 0.0]] * (orders - 1)), *([[]] * (3 - orders))]
             start_ns = start_of(round(sent[len(arriving)] * S), 0, lead)
             measured = dict(zip(NAMES, here.tolist(), strict=True))
             shaped = by.shape(start_ns, checked(NAMES, [0.4], [point]), measured)
-            fastest = max(fastest, float(by._pieces[-1].path.fastest()[2].max()))
+            fastest = max(fastest, float(by.history[-1].path.fastest()[2].max()))
             arriving.append((start_ns / S if stamped else 0.0, shaped))
         while arrived < len(arriving) and arrivals[arrived] <= now:
+            if now > arriving[arrived][0]:
+                late.append(len(commands))
             controller.arrive(now, *arriving[arrived])
             arrived += 1
         here = controller.state(now)[0]
         commands.append(here)
-    return largest_step(at.tolist(), commands, fastest)
+    return largest_step_in_time(at.tolist(), commands, fastest, late if in_time else ())
 
 
 @pytest.mark.parametrize('orders', [1, 2, 3])
@@ -259,6 +264,17 @@ def test_however_long_messages_take_a_replacement_makes_no_step(orders: int) -> 
     # The judge sees a step if there is one: without our stamp, and if messages take longer than the lead.
     assert replaced(orders, 0.0, latencies, stamped=False) > 3.0
     assert orders == 3 or replaced(orders, 0.0, latencies) > 2.0
+
+
+@pytest.mark.parametrize('orders', [1, 2])
+def test_a_message_that_comes_after_the_lead_is_a_step_and_the_only_one(orders: int) -> None:
+    """The shaper cannot know when a message arrives: one that has begun by then is joined in its middle."""
+    latencies = np.full(40, 0.004)
+    latencies[::5] = 0.15
+    assert replaced(orders, 0.1, latencies) > 1.5
+    assert replaced(orders, 0.1, latencies, in_time=True) <= 1.0 + 1e-6
+    # With a lead that is longer than the longest it is none.
+    assert replaced(orders, 0.2, latencies) <= 1.0 + 1e-6
 
 
 def test_a_first_point_that_is_a_little_off_is_no_step_of_one_under_way() -> None:

@@ -1,0 +1,58 @@
+"""Another vendor's DDS sends goals that no client of ROS would send: text that is no text, or half a message.
+
+Run as ``python cyclone_stranger.py TOPIC text|half`` in ROS_DOMAIN_ID; it sends until it is killed. The type is written
+from the ROS definition alone: a string lies in a message as bytes do.
+(No postponed annotations here: cyclonedds reads the types of the fields at run time.)
+"""
+
+import os
+import sys
+import time
+from dataclasses import dataclass
+
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl.types import array, int32, sequence, uint8, uint32
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+NAME = 'control_msgs::action::dds_::FollowJointTrajectory_SendGoal_Request_'
+
+
+@dataclass
+class Goal(IdlStruct, typename=NAME):
+    goal_id: array[uint8, 16]
+    sec: int32
+    nanosec: uint32
+    frame_id: sequence[uint8]
+    names_and_points: array[uint32, 4]
+    other_frame_id: sequence[uint8]
+    rest: array[uint32, 8]
+
+
+@dataclass
+class Half(IdlStruct, typename=NAME):
+    goal_id: array[uint8, 16]
+    sec: int32
+
+
+def main() -> None:
+    half = sys.argv[2] == 'half'
+    participant = DomainParticipant(int(os.environ['ROS_DOMAIN_ID']))
+    qos = Qos(
+        Policy.Reliability.Reliable(duration(seconds=1)),
+        Policy.History.KeepLast(10),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+    )
+    writer = DataWriter(participant, Topic(participant, sys.argv[1], Half if half else Goal), qos=qos)
+    for number in range(10**6):
+        own = [*number.to_bytes(4, 'little'), *([0] * 12)]
+        writer.write(Half(own, 0) if half else Goal(own, 0, 0, list(b'\xff\xfe\0'), [0] * 4, [0], [0] * 8))
+        print('sent', number, flush=True)
+        time.sleep(0.05)
+
+
+if __name__ == '__main__':
+    main()

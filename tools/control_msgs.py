@@ -1,0 +1,195 @@
+"""Builds the action FollowJointTrajectory for a Python without ROS 2 from apt: control_msgs has no wheel.
+
+  python -m tools.control_msgs
+
+It prints the folder to put on PYTHONPATH: build/control_msgs/…, made once by the generators that
+rclpy's wheels bring along, and by a C++ compiler. Names, types and order of the fields are those of
+control_msgs for Jazzy; with others DDS would not take it for the same action.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from tools.program import ROOT
+
+PACKAGE = 'control_msgs'
+FOLDER = ROOT / 'build' / PACKAGE
+TOLERANCE = 'float64 position\nfloat64 velocity\nfloat64 acceleration\n'
+DEFINITIONS = {
+    'msg/JointTolerance.msg': f'string name\n{TOLERANCE}',
+    'msg/JointComponentTolerance.msg': 'uint16 X_AXIS=1\nuint16 Y_AXIS=2\nuint16 Z_AXIS=3\n'
+    f'uint16 TRANSLATION=4\nuint16 ROTATION=5\nstring joint_name\nuint16 component\n{TOLERANCE}',
+    'action/FollowJointTrajectory.action': """\
+trajectory_msgs/JointTrajectory trajectory
+trajectory_msgs/MultiDOFJointTrajectory multi_dof_trajectory
+JointTolerance[] path_tolerance
+JointComponentTolerance[] component_path_tolerance
+JointTolerance[] goal_tolerance
+JointComponentTolerance[] component_goal_tolerance
+builtin_interfaces/Duration goal_time_tolerance
+---
+int32 error_code
+int32 SUCCESSFUL = 0
+int32 INVALID_GOAL = -1
+int32 INVALID_JOINTS = -2
+int32 OLD_HEADER_TIMESTAMP = -3
+int32 PATH_TOLERANCE_VIOLATED = -4
+int32 GOAL_TOLERANCE_VIOLATED = -5
+string error_string
+---
+std_msgs/Header header
+string[] joint_names
+trajectory_msgs/JointTrajectoryPoint desired
+trajectory_msgs/JointTrajectoryPoint actual
+trajectory_msgs/JointTrajectoryPoint error
+string[] multi_dof_joint_names
+trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_desired
+trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_actual
+trajectory_msgs/MultiDOFJointTrajectoryPoint multi_dof_error
+""",
+}
+USED = (
+    'action_msgs',
+    'builtin_interfaces',
+    'geometry_msgs',
+    'service_msgs',
+    'std_msgs',
+    'trajectory_msgs',
+    'type_description_interfaces',
+    'unique_identifier_msgs',
+)
+"""The packages whose messages are in it."""
+RUNTIME = (
+    'rosidl_runtime_c',
+    'rosidl_typesupport_c',
+    'rosidl_typesupport_fastrtps_c',
+    'rosidl_typesupport_fastrtps_cpp',
+    'rosidl_typesupport_introspection_c',
+    'fastcdr',
+    'rmw',
+)
+SUPPORTS = ('rosidl_typesupport_fastrtps_c', 'rosidl_typesupport_introspection_c')
+"""What the only rmw that has a wheel asks for."""
+KINDS = ('rosidl_generator_c', *SUPPORTS, 'rosidl_typesupport_c', 'rosidl_generator_py')
+"""Of sources, each of which becomes a library that may use those before it."""
+
+
+def installed() -> bool:
+    """Whether this Python has the package."""
+    return importlib.util.find_spec(PACKAGE) is not None
+
+
+def available() -> bool:
+    """Have it: installed, or built here and from now on the path, of our children too. False if it cannot be."""
+    if installed():
+        return True
+    if shutil.which('g++') is None or importlib.util.find_spec('rosidl_generator_py') is None:
+        return False
+    place = str(built())
+    sys.path.append(place)
+    os.environ['PYTHONPATH'] = os.pathsep.join(filter(None, [os.environ.get('PYTHONPATH', ''), place]))
+    importlib.invalidate_caches()
+    return installed()
+
+
+def built() -> Path:
+    """The folder in which the package lies, once it is whole. RuntimeError with what the compiler said."""
+    key = hashlib.sha256(Path(__file__).read_bytes() + sys.version.encode() + sys.prefix.encode()).hexdigest()[:16]
+    place = FOLDER / key
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    with (FOLDER / 'lock').open('w') as lock:
+        # The workers of pytest come at once.
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (place / PACKAGE).is_dir():
+            work = FOLDER / 'work'
+            shutil.rmtree(work, ignore_errors=True)
+            _generate(work)
+            shutil.rmtree(place, ignore_errors=True)
+            place.mkdir()
+            _compile(work).rename(place / PACKAGE)
+    return place
+
+
+def _generate(work: Path) -> None:
+    """Sources in ``work/KIND/control_msgs``, as the generators write them."""
+    from rosidl_adapter.action import convert_action_to_idl
+    from rosidl_adapter.msg import convert_msg_to_idl
+    from rosidl_generator_c.cli import GenerateC
+    from rosidl_generator_py.cli import GeneratePython
+    from rosidl_generator_type_description.cli import HashTypeDescription
+    from rosidl_typesupport_c.cli import GenerateCTypesupport
+    from rosidl_typesupport_fastrtps_c.cli import GenerateFastRTPSCTypesupport
+    from rosidl_typesupport_introspection_c.cli import GenerateIntrospectionCTypesupport
+
+    os.environ.setdefault('AMENT_PREFIX_PATH', sys.prefix)
+    given_in = work / PACKAGE
+    for name, text in DEFINITIONS.items():
+        file = given_in / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, encoding='utf-8')
+        convert = convert_msg_to_idl if file.suffix == '.msg' else convert_action_to_idl
+        convert(given_in, PACKAGE, Path(name), file.parent)
+    given = [f'{given_in}:{Path(name).with_suffix(".idl")}' for name in DEFINITIONS]
+    shares = [Path(sys.prefix) / 'share' / package for package in USED]
+    hashes = HashTypeDescription('').generate_type_hashes(PACKAGE, given, shares, given_in)
+    makers = (
+        GenerateC(''),
+        GenerateFastRTPSCTypesupport(''),
+        GenerateIntrospectionCTypesupport(''),
+        GenerateCTypesupport('', typesupport_implementations=list(SUPPORTS)),
+        GeneratePython('', typesupport_implementations=['rosidl_typesupport_c']),
+    )
+    for kind, maker in zip(KINDS, makers, strict=True):
+        more = [hashes] if kind == KINDS[0] else []
+        maker.generate(PACKAGE, given, shares, work / kind / PACKAGE, *more)
+
+
+def _compile(work: Path) -> Path:
+    """The package that rclpy imports, with a library for each kind in it."""
+    import numpy as np
+
+    prefix, out = Path(sys.prefix), work / KINDS[-1] / PACKAGE
+    (out / '__init__.py').touch()
+    include = [work / kind for kind in KINDS]
+    include += [Path(sysconfig.get_path('include')), Path(np.get_include()), prefix / 'include']
+    include += [path for path in (prefix / 'include').iterdir() if path.is_dir()]
+    flags = ['-O0', '-fPIC', *(f'-I{path}' for path in include)]
+    files = [(kind, file) for kind in KINDS for file in (work / kind).rglob('*.c*')]
+
+    def one(file: Path) -> None:
+        _run('gcc' if file.suffix == '.c' else 'g++', '-c', *flags, str(file), '-o', f'{file}.o')
+
+    with ThreadPoolExecutor(2) as two:
+        list(two.map(one, (file for _, file in files)))
+    # A library is found by its name once it is loaded: the last one loads all of them.
+    names = {kind: f'lib{PACKAGE}__{kind}.so' for kind in KINDS[:-1]}
+    names[KINDS[-1]] = f'{PACKAGE}_s__rosidl_typesupport_c{sysconfig.get_config_var("EXT_SUFFIX")}'
+    needed = [*(f'{package}__{kind}' for package in USED for kind in KINDS), *RUNTIME]
+    of_ros = [f'-l{name}' for name in needed if (prefix / 'lib' / f'lib{name}.so').exists()]
+    before: list[str] = []
+    for kind, name in names.items():
+        objects = [f'{file}.o' for of, file in files if of == kind]
+        paths = [f'-L{prefix / "lib"}', f'-Wl,-rpath,$ORIGIN:{prefix / "lib"}', '-Wl,--no-as-needed']
+        _run('g++', '-shared', f'-Wl,-soname,{name}', *objects, *paths, *before, *of_ros, '-o', str(out / name))
+        before.append(str(out / name))
+    return out
+
+
+def _run(*words: str) -> None:
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f'{" ".join(words)}\n{done.stderr[-4000:]}')
+
+
+if __name__ == '__main__':
+    print(built())
