@@ -1,4 +1,4 @@
-"""The way to a .deb: the rows that rosdep lacks, what bloom says, the line that a plain Debian runs; no network, no root."""
+"""The way to a .deb: the rows that rosdep lacks, what bloom says, the line of pip. No network, no root."""
 
 from __future__ import annotations
 
@@ -64,7 +64,8 @@ def test_the_answers_of_rosdep_are_by_key_and_system(tmp_path: Path) -> None:
 
 
 def test_what_bloom_warns_of_is_said_and_a_refusal_is_an_error(tmp_path: Path) -> None:
-    path = program(tmp_path, 'bloom-generate', 'mkdir debian; touch debian/control; echo "No CHANGELOG.rst found"; echo fine')
+    said = 'mkdir debian; touch debian/control; echo "No CHANGELOG.rst found"; echo fine'
+    path = program(tmp_path, 'bloom-generate', said)
     env = {'PATH': f'{path / "bin"}:/usr/bin:/bin'}
     assert templates(tmp_path, env, 'ubuntu', 'noble') == ['No CHANGELOG.rst found']
     program(tmp_path, 'bloom-generate', "echo Could not resolve rosdep key \\'x\\' >&2; exit 1")

@@ -149,9 +149,7 @@ def test_a_wheel_without_the_page_is_noticed(tmp_path: Path) -> None:
     assert all('lacks psd_deflection/run/monitor/page/vendor/' in line for line in said)
 
 
-def test_a_check_of_a_wheel_without_the_page_fails(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_check_of_a_wheel_without_the_page_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """With judges that find nothing."""
     made = tmp_path
     (made / 'dist').mkdir()

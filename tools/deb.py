@@ -1,6 +1,7 @@
 """From a plain Debian to the live page: by pip, and by the .deb of bloom's templates; both timed.
 
-``python -m tools.deb FOLDER`` (``make deb ROSDISTRO=FOLDER``; root only, some minutes). FOLDER: a checkout of ros/rosdistro.
+``python -m tools.deb FOLDER`` (``make deb ROSDISTRO=FOLDER``; root only, some minutes).
+FOLDER: a checkout of ros/rosdistro.
 It makes the templates for Ubuntu noble and for Debian bookworm, as ``bloom-generate rosdebian`` does for Jazzy. In
 a chroot that debootstrap makes it runs the one line of docs/quickstart.md, then builds the .deb of noble, installs it
 and starts it. A package that provides their names stands in for the packages of ROS, which Debian does not have.
@@ -47,13 +48,13 @@ names=$(dpkg-deb -f ros-jazzy-psd-deflection_*.deb Depends | tr , '\\n' | grep -
 printf 'Package: stand-in-for-ros\\nVersion: 1\\nProvides: %s\\nDescription: nothing\\n' "$names" >control
 equivs-build control >/dev/null 2>&1
 """
-INSTALL = 'apt-get install -qq --no-install-recommends /root/stand-in*.deb /root/ros-jazzy-psd-deflection_*.deb >/dev/null 2>&1'
+INSTALL = 'cd /root && apt-get install -qq --no-install-recommends ./stand-in*.deb ./ros-jazzy-*.deb >/dev/null 2>&1'
 START = (
     'cd /root && PYTHONPATH=$(echo /opt/ros/jazzy/lib/python3*/site-packages) '
     'exec /opt/ros/jazzy/lib/psd_deflection/psd-deflection monitor'
 )
 LEFT = (
-    "the tests of the package in its build (nocheck): Debian has no ROS, and the build farm's job does not fail by them",
+    'the tests of the package in its build (nocheck): Debian has no ROS',
     'the node of ROS: its packages are stood in for; the workflow runs it with those of apt',
     'Ubuntu 24.04 and 26.04: no registry here has them; the workflow runs the line of pip there',
 )
@@ -79,8 +80,11 @@ def tree(root: Path, folder: Path) -> Path:
 
 def templates(folder: Path, env: dict[str, str], system: str, version: str) -> list[str]:
     """Fills ``folder/debian`` as bloom does, and returns what it warns of. Raises RuntimeError if it refuses."""
-    command = ['bloom-generate', 'rosdebian', '--os-name', system, '--os-version', version, '--ros-distro', 'jazzy', '.']
-    done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False)
+    words = f'bloom-generate rosdebian --os-name {system} --os-version {version} --ros-distro jazzy .'
+    pipe, none = subprocess.PIPE, subprocess.DEVNULL
+    done = subprocess.run(
+        words.split(), cwd=folder, env=env, stdin=none, stdout=pipe, stderr=pipe, text=True, check=False
+    )
     said = re.sub(r'\x1b\[\d*m', '', done.stdout + done.stderr)
     if done.returncode or not (folder / 'debian/control').is_file():
         raise RuntimeError(f'bloom refuses the package for {version}:\n{said}')
@@ -145,7 +149,8 @@ def main(argv: list[str] | None = None) -> int:
         print(f'bloom, {version}: ' + ('; '.join(warned) or 'no warning'))
     chroot = work / options.suite
     if not (chroot / 'etc/debian_version').is_file():
-        subprocess.run(['debootstrap', '--variant=minbase', options.suite, chroot], check=True, stdout=subprocess.DEVNULL)
+        command = ['debootstrap', '--variant=minbase', options.suite, chroot]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     shutil.rmtree(chroot / 'root', ignore_errors=True)
     tree(ROOT, chroot / 'root/checkout')
     shutil.copytree(work / 'made/noble', chroot / 'root/deb')
@@ -155,7 +160,7 @@ def main(argv: list[str] | None = None) -> int:
     print(f'{options.suite}, pip: {page:.0f} s to the page, after {ready:.0f} s for python3-venv', flush=True)
     built, installed = seconds_of(chroot, BUILD), seconds_of(chroot, INSTALL)
     page = seconds_to_the_page(chroot, START)
-    print(f'{options.suite}, .deb: {built:.0f} s to build it, {installed:.0f} s to install it, {page:.0f} s to the page')
+    print(f'{options.suite}, .deb: {built:.0f} s to build, {installed:.0f} s to install, {page:.0f} s to the page')
     for line in LEFT:
         print(f'not tried: {line}')
     return 0

@@ -58,7 +58,7 @@ def our_rows(root: Path) -> str:
 
 
 def prepared(rosdistro: Path, tools: Path, into: Path, ours: str = '') -> dict[str, str]:
-    """The environment with which rosdep and bloom read ``rosdistro`` alone, and first the rows ``ours``. Fills ``into``."""
+    """The environment with which rosdep and bloom read the rows ``ours``, then ``rosdistro``. Fills ``into``."""
     lists = into / 'sources'
     lists.mkdir(parents=True)
     if ours:
