@@ -94,7 +94,7 @@ def resolved(env: dict[str, str], tools: Path, keys: list[str]) -> dict[str, dic
     """By the key, then by the column: apt, pip or none."""
     rows: dict[str, dict[str, str]] = {key: {} for key in keys}
     for version, (system, ros) in SYSTEMS.items():
-        command = [tools / 'bin/python', '-c', LOOK_UP, system, version, *keys]
+        command = [str(tools / 'bin/python'), '-c', LOOK_UP, system, version, *keys]
         here = {**env, 'ROS_DISTRO': ros}
         said = subprocess.run(command, env=here, check=True, capture_output=True, text=True).stdout
         for key, how in json.loads(said.splitlines()[-1]).items():
