@@ -14,7 +14,6 @@ import argparse
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -125,7 +124,8 @@ def seconds_to_the_page(chroot: Path, script: str) -> float:
                     return time.monotonic() - begun
                 time.sleep(0.1)
         finally:
-            running.send_signal(signal.SIGTERM)
+            # unshare passes no other signal on, and does not end by them.
+            running.kill()
             running.wait()
     raise RuntimeError(f'no page after {time.monotonic() - begun:.0f} s:\n{log.read_text(errors="replace")[-2000:]}')
 
