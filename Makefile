@@ -21,6 +21,8 @@
 # make notebooks  execute the notebooks of the documentation and keep what they answer
 # make wheel    sdist and wheel in dist/, tried in an environment of its own
 # make release-check  build all that a release publishes, try it, and look whether version, changelog, licences, addresses agree (RELEASE=1: as a release)
+# make rosdep   ask rosdep how apt resolves each key of package.xml (ROSDISTRO=a checkout of ros/rosdistro)
+# make deb      a chroot of plain Debian: the live page by pip, and by the .deb of bloom's templates, timed (root; ROSDISTRO as above)
 # make release-files  CHANGELOG.rst, CITATION.cff and .zenodo.json, from CHANGELOG.md, package.xml and the version
 # make doc-commands  every command of README and docs that the tests do not run, run
 # make rerun    recordings converted for the Rerun viewer (170 MB, in an environment of its own) and looked at in it
@@ -60,7 +62,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rosdep deb rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -234,6 +236,18 @@ release-check: wheel
 
 release-files: $(READY)
 	$(BIN)/python -m tools.release files
+
+# git clone --depth 1 https://github.com/ros/rosdistro
+ROSDISTRO ?= ../rosdistro
+build/bloom/bin/bloom-generate:
+	$(PYTHON) -m venv build/bloom && $(call INSTALL,build/bloom) bloom rosdep setuptools
+
+rosdep: $(READY) build/bloom/bin/bloom-generate
+	$(BIN)/python -m tools.rosdistro $(ROSDISTRO)
+
+SUITE ?= trixie
+deb: $(READY) build/bloom/bin/bloom-generate
+	$(SUDO) $(BIN)/python -m tools.deb $(ROSDISTRO) --suite $(SUITE)
 
 # An environment of its own below build/, which is kept. The picture, where Xvfb is: build/rerun/shot.png.
 RERUN ?=

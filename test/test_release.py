@@ -114,10 +114,19 @@ def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None
         'no entry', 'a key without a row',
     ],
 )  # fmt: skip
-def test_what_a_release_must_not_have_is_said(tree: Path, sabotage: Callable[[Path], object], said: str) -> None:
+def test_what_a_release_must_not_have_is_said(
+    tree: Path,
+    sabotage: Callable[[Path], object],
+    said: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv('RELEASE', '1')
     ready(tree)
+    assert main(['check'], tree) == 0
     sabotage(tree)
-    found = problems(tree, release=True)
+    assert main(['check'], tree) == 1
+    found = [line for line in capsys.readouterr().out.splitlines() if line.startswith('PROBLEM: ')]
     assert any(said in line for line in found), found
 
 
@@ -138,6 +147,25 @@ def test_a_wheel_without_the_page_is_noticed(tmp_path: Path) -> None:
     said = list(check_wheel(ROOT, packed(tmp_path / 'bare.whl', '/page/vendor/')))
     assert said
     assert all('lacks psd_deflection/run/monitor/page/vendor/' in line for line in said)
+
+
+def test_a_check_of_a_wheel_without_the_page_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With judges that find nothing."""
+    made = tmp_path
+    (made / 'dist').mkdir()
+    (made / 'dist/x.tar.gz').touch()
+    (made / 'build/release/bin').mkdir(parents=True)
+    for judge in ('twine', 'check-wheel-contents', 'zizmor', 'hadolint', 'python', 'pip-audit'):
+        (made / 'build/release/bin' / judge).symlink_to('/bin/true')
+    bom = made / 'build/release/bin/cyclonedx-py'
+    bom.write_text('#!/bin/sh\nfor last; do :; done; echo \'{"components": [1]}\' >"$last"\n')
+    bom.chmod(0o755)
+    subprocess.run([sys.executable, '-m', 'venv', '--without-pip', made / 'use'], check=True)
+    words = ['check', '--dist', made / 'dist', '--installed', made / 'use', '--tools', made / 'build/release']
+    for without, status in (('\0', 0), ('/page/', 1)):
+        packed(made / 'dist/x.whl', without)
+        assert main([str(w) for w in words], ROOT) == status
+    assert 'PROBLEM: x.whl: lacks psd_deflection/run/monitor/page/' in capsys.readouterr().out
 
 
 def test_a_copyleft_licence_among_what_is_installed_is_noticed(tmp_path: Path) -> None:

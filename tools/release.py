@@ -321,27 +321,28 @@ NEVER_HERE = (
     'publishing to PyPI, ros2-gbp, conda-forge and a registry of containers: only the maintainer does',
     'building the containers (packaging/Dockerfile): the workflow does, with a Docker engine',
     'the ROS distributions from apt (Jazzy, Lyrical, Rolling): the workflow does',
+    'rosdep with the whole of rosdistro, and the .deb in a plain Debian: `make rosdep` and `make deb` do',
     'building the conda recipe (packaging/conda), which is rendered: no channel of conda is on a registry that we use',
 )
 
 
-def main(argv: list[str] | None = None) -> int:
-    """``files`` or ``check``; exit status 1 for problems."""
+def main(argv: list[str] | None = None, root: Path = ROOT) -> int:
+    """``files`` or ``check`` of the tree ``root``; exit status 1 for problems."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument('what', choices=('files', 'check'))
-    parser.add_argument('--dist', type=Path, default=ROOT / 'dist')
+    parser.add_argument('--dist', type=Path, default=root / 'dist')
     parser.add_argument('--installed', type=Path, help='environment with the wheel and all extras')
     parser.add_argument('--tools', type=Path, help='environment with twine and the others')
     options = parser.parse_args(argv)
     if options.what == 'files':
         for name, made in MAKERS.items():
-            (ROOT / name).write_text(made(ROOT))
+            (root / name).write_text(made(root))
         return 0
     release = os.environ.get('RELEASE') == '1'
-    problems = [problem for check in TREE for problem in check(ROOT, release)]
+    problems = [problem for check in TREE for problem in check(root, release)]
     left: list[str] = []
     if options.installed and options.tools:
-        found, left = check_built(ROOT, options.dist.resolve(), options.installed.absolute(), options.tools.absolute())
+        found, left = check_built(root, options.dist.resolve(), options.installed.absolute(), options.tools.absolute())
         problems += found
     else:
         left = ['what is built: --installed and --tools name where it is']

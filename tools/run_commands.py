@@ -47,6 +47,7 @@ CI_RUNS = (
     (r'^make axe$', '.ci/run', 'make axe '),
     (r'^make colcon$', '.ci/run', 'make colcon '),
     (r'^make release-check$', '.github/workflows/ci.yml', 'make release-check '),
+    (r'^make (rosdep|deb) ROSDISTRO=', '.github/workflows/ci.yml', 'make rosdep deb ROSDISTRO=../rosdistro'),
     (r'^make demo-thesis$', 'test/blind/test_redone.py', "main(['--short', "),
     (
         r'^psd-deflection compare-methods --out ',

@@ -223,7 +223,7 @@ class FixedFunctions(Arithmetic):
         least, most = np.where(steep, along, across), np.where(steep, across, along)
         t = np.divide(least, most, out=np.zeros_like(most), where=most > 0.0)
         known = (across < np.inf) & (along < np.inf)
-        k = np.where(known, 8.0 * t + 0.5, 0.0).astype(np.int64)
+        k = np.where(known, 8.0 * t + 0.5, 0.0).astype(np.intp)
         at = 0.125 * k
         out = np.take(_ATAN_AT, k) + (_atan_near((t - at) / (1.0 + t * at)) + np.take(_ATAN_REST, k))
         out = np.where(steep, (_QUARTER - out) + _QUARTER_REST, out)
