@@ -25,7 +25,7 @@ def lines_of(row: Row) -> list[str]:
     """The rows of the table."""
     lines = []
     for i, f in enumerate(row.figures):
-        verdict = '' if f.bound is None else ('met' if row.met(f) else '**not met**')
+        verdict = row.verdict(f).replace('not met', '**not met**')
         if f.kind == 'ours':
             ratio, bound = '', '' if f.bound is None else f'≥ {f.bound:g}'
         elif f.kind == 'peer':
