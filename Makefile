@@ -113,6 +113,7 @@ run: $(VENV)/.installed
 BENCH_LIVE ?=
 BENCH_LIMITS ?=
 BENCH_RIGS ?=
+BENCH_CPU ?=
 BENCH_SOLVERS ?=
 BENCH_ACCURACY ?=
 # Rows with peers and limits go into bench/results.json, of which docs/performance.md is made.
@@ -121,6 +122,7 @@ bench: $(READY)
 	$(BIN)/python -m bench.live $(BENCH_LIVE)
 	$(BIN)/python -m bench.limits $(BENCH_LIMITS)
 	$(BIN)/python -m bench.rigs $(BENCH_RIGS)
+	$(BIN)/python -m bench.cpu $(BENCH_CPU)
 	$(BIN)/python -m bench.page
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
 	$(BIN)/python bench/accuracy.py $(BENCH_ACCURACY)

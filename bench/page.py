@@ -1,4 +1,7 @@
-"""Makes docs/performance.md from bench/results.json: ``python -m bench.page`` (the last step of ``make bench``)."""
+"""Makes docs/performance.md from bench/results.json and bench/cpu.json: ``python -m bench.page``.
+
+It is the last step of ``make bench``.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bench.cpu import RESULTS as CPU
 from bench.rows import RESULTS, ROOT, Figure, Row, read
 
 TEMPLATE = ROOT / 'bench' / 'performance_template.md'
@@ -21,7 +25,7 @@ def lines_of(row: Row) -> list[str]:
     """The rows of the table."""
     lines = []
     for i, f in enumerate(row.figures):
-        verdict = '' if f.bound is None else ('met' if row.met(f) else '**not met**')
+        verdict = row.verdict(f).replace('not met', '**not met**')
         if f.kind == 'ours':
             ratio, bound = '', '' if f.bound is None else f'≥ {f.bound:g}'
         elif f.kind == 'peer':
@@ -33,23 +37,36 @@ def lines_of(row: Row) -> list[str]:
     return lines
 
 
-def page(rows: Sequence[Row], machine: Mapping[str, Any]) -> str:
-    """The text of the page."""
+def measured(machine: Mapping[str, Any]) -> str:
+    """Where and of what the figures are."""
     versions = ', '.join(f'{name} {version}' for name, version in machine['versions'].items())
-    measured = (
+    return (
         f'{machine["date"]}, commit {machine["commit"]}, {machine["processor"]}, {machine["cores"]} cores, '
         f'load {machine["load"]} at the end, Python {machine["python"]}, {versions}.'
     )
+
+
+def shares(rows: Sequence[Row], machine: Mapping[str, Any]) -> str:
+    """What :mod:`bench.cpu` found."""
+    lines = [measured(machine)]
+    for row in rows:
+        lines += ['', f'| {row.work} | {row.unit} |', '|---|---|']
+        lines += [f'| {f.name} | {f.median:.1f} |' for f in row.figures]
+    return '\n'.join(lines)
+
+
+def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cpu_machine: Mapping[str, Any]) -> str:
+    """The text of the page: of ``rows``, and of those of :mod:`bench.cpu`."""
     table = ['| work | what | time | ours | wanted | |', '|---|---|---|---|---|---|']
     for row in rows:
         table += lines_of(row)
     text = TEMPLATE.read_text(encoding='utf-8')
-    return text.replace('<!-- machine -->', measured).replace('<!-- table -->', '\n'.join(table))
+    text = text.replace('<!-- machine -->', measured(machine)).replace('<!-- table -->', '\n'.join(table))
+    return text.replace('<!-- cpu -->', shares(cpu, cpu_machine))
 
 
 def main() -> int:
-    rows, machine = read(RESULTS)
-    PAGE.write_text(page(rows, machine), encoding='utf-8')
+    PAGE.write_text(page(*read(RESULTS), *read(CPU)), encoding='utf-8')
     return 0
 
 

@@ -22,6 +22,10 @@ RESULTS = ROOT / 'bench' / 'results.json'
 PACKAGES = ('numpy', 'scipy', 'mcap', 'cobs', 'rclpy', 'pandas', 'rosbags')
 
 
+STEADY = 0.25
+"""Quartiles that are further apart than this share of their median: load from outside shows in them."""
+
+
 @dataclass
 class Figure:
     """One thing measured several times. ``kind``: ours, peer or limit.
@@ -37,6 +41,11 @@ class Figure:
     high: float
     runs: int
     bound: float | None = None
+
+    @property
+    def spread(self) -> float:
+        """How far the quartiles are apart, as a share of the median; 0 of one run."""
+        return (self.high - self.low) / self.median if self.median else 0.0
 
 
 @dataclass
@@ -59,6 +68,15 @@ class Row:
         if figure.kind == 'ours':
             return figure.median >= figure.bound
         return self.ratio(figure) >= figure.bound if figure.kind == 'peer' else self.ratio(figure) <= figure.bound
+
+    def verdict(self, figure: Figure) -> str:
+        """met, not met, or that the quartiles of what is compared are too far apart to tell; '' without a bound."""
+        if figure.bound is None:
+            return ''
+        spread = max(figure.spread, self.figures[0].spread)
+        if spread > STEADY:
+            return f'not judged: quartiles {100 * spread:.0f} % apart, load from outside'
+        return 'met' if self.met(figure) else 'not met'
 
 
 def figure(name: str, kind: str, values: npt.ArrayLike, bound: float | None = None) -> Figure:
@@ -96,7 +114,7 @@ def tell(row: Row) -> None:
             way = 'ours is so many times as fast' if f.kind == 'peer' else 'ours takes so many times as much'
             words += f'  {row.ratio(f):.2f} {way}'
         if f.bound is not None:
-            words += f' (bound {f.bound:g}{"" if row.met(f) else ", NOT MET"})'
+            words += f' (bound {f.bound:g}, {row.verdict(f)})'
         print(words, flush=True)
 
 

@@ -86,7 +86,8 @@ CI_RUNS = (
 
 SHORTEST = {
     'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 1 --starts 0" BENCH_SOLVERS="--blocks 1000" '
-    'BENCH_ACCURACY="--blocks 100" BENCH_LIMITS="--times 1 --only frames" BENCH_RIGS="--most 1 --seconds 1"',
+    'BENCH_ACCURACY="--blocks 100" BENCH_LIMITS="--times 1 --only frames" BENCH_RIGS="--most 1 --seconds 1" '
+    'BENCH_CPU="--seconds 2"',
     'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
     'crash': 'CRASH_TIMES=1',
     'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000 FUZZ_MINUTES=0.3',

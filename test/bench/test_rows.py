@@ -6,24 +6,35 @@ from pathlib import Path
 
 import pytest
 
-from bench import limits, page
+from bench import cpu, limits, page
 from bench.rows import ROOT, Row, figure, keep, read
 
 
 def test_ratios_and_bounds_are_those_of_peers_and_limits() -> None:
-    ours, peer = figure('mine', 'ours', [2.0, 1.0, 9.0]), figure('theirs', 'peer', [6.0], 3.0)
+    ours, peer = figure('mine', 'ours', [2.0, 1.8, 2.2]), figure('theirs', 'peer', [6.0], 3.0)
     limit, slow = figure('least', 'limit', [1.0], 1.5), figure('theirs', 'peer', [6.0], 3.1)
     row = Row('work', 's', [ours, peer, limit, slow])
-    assert (ours.median, ours.low, ours.high, ours.runs) == (2.0, 1.5, 5.5, 3)
+    assert (ours.median, ours.low, ours.high, ours.runs) == (2.0, 1.9, 2.1, 3)
     assert (row.ratio(peer), row.ratio(limit)) == (3.0, 2.0)
     assert [row.met(f) for f in row.figures] == [True, True, False, False]
     assert not Row('rigs', 'rigs', [few := figure('8', 'ours', [8], 32)]).met(few)
     assert page.lines_of(row) == [
-        '| work | mine | 2 (1.5 to 5.5) s |  |  |  |',
+        '| work | mine | 2 (1.9 to 2.1) s |  |  |  |',
         '|  | peer: theirs | 6 s | 3.00 × as fast | ≥ 3 × | met |',
         '|  | limit: least | 1 s | 2.00 × the limit | ≤ 1.5 × | **not met** |',
         '|  | peer: theirs | 6 s | 3.00 × as fast | ≥ 3.1 × | **not met** |',
     ]
+
+
+def test_a_row_in_which_outside_load_shows_is_not_judged() -> None:
+    steady, torn = figure('mine', 'ours', [1.0, 1.1, 0.9]), figure('least', 'limit', [1.0, 1.0, 1.6], 0.5)
+    said = 'not judged: quartiles 30 % apart, load from outside'
+    assert Row('work', 's', [steady, torn]).verdict(torn) == said
+    assert page.lines_of(Row('work', 's', [steady, torn]))[1].endswith(f'| {said} |')
+    once = figure('least', 'limit', [1.0], 0.5)
+    assert Row('work', 's', [steady, once]).verdict(once) == 'not met'
+    assert Row('work', 's', [figure('mine', 'ours', [1.0, 1.0, 1.6]), once]).verdict(once) == said
+    assert Row('work', 's', [steady, figure('least', 'limit', [1.0])]).verdict(figure('least', 'limit', [1.0])) == ''
 
 
 def test_a_row_replaces_the_older_one_of_its_work(tmp_path: Path) -> None:
@@ -36,7 +47,7 @@ def test_a_row_replaces_the_older_one_of_its_work(tmp_path: Path) -> None:
 
 
 def test_the_page_is_made_of_the_results() -> None:
-    assert page.PAGE.read_text(encoding='utf-8') == page.page(*read())
+    assert page.PAGE.read_text(encoding='utf-8') == page.page(*read(), *read(cpu.RESULTS))
     assert '<!--' not in page.PAGE.read_text(encoding='utf-8')
     assert page.PAGE == ROOT / 'docs' / 'performance.md'
 

@@ -1,0 +1,330 @@
+"""Where the CPU time of the live node goes: by thread and part of the program, and by kind of native code.
+
+    python -m bench.cpu [--seconds 20] [--no-native]
+
+The node runs with its defaults and records. Two windows follow each other:
+
+- *Parts.* The functions of ``PARTS`` are measured by the CPU clock of their thread, each without those
+  inside it; the kernel says what each thread took in all. What belongs to no part is the rest of its
+  thread: waking up, waiting, loops. Clocks of threads stand still while others run, so that load from
+  outside changes the shares little.
+- *Native.* ``perf`` (if it is installed and permitted) samples the running threads, with the clocks in
+  them. Each sample belongs to the first kind of ``KINDS`` that one of its callers is of.
+
+The table goes into ``bench/cpu.json``, of which docs/performance.md is made.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from bench.live import BLOCKS_PER_S, Device
+from bench.rows import ROOT, Row, figure, keep
+from blind.campaign import conclude, options
+
+RESULTS = ROOT / 'bench' / 'cpu.json'
+SETTLE_BLOCKS = 250
+"""Five seconds of blocks: what is imported and made at the start is over."""
+PATIENCE_S = 300.0
+"""Longest time until the node runs, s."""
+ENOUGH = 0.98
+"""Least share of the blocks that a node gets through which is not held up by others."""
+
+PARTS = {
+    'port: select and read': ('devices.serial_port:SerialPort.read',),
+    'frames: bytes to samples': ('devices.protocol.frames:FrameDecoder.feed',),
+    'sequence numbers, gathering': ('run.reading.acquisition:Acquisition.feed',),
+    'clock map': ('run.reading.clock_watch:ClockWatch.observe',),
+    'chunk: stamps, arrays, queue': ('run.reading.acquisition:Acquisition._hand_over',),
+    'sleep until samples gather': ('run.reading.acquisition:Acquisition._gather',),
+    'pings': ('run.reading.pinger:Pinger.ask',),
+    'blocks by number': ('measure.averaging:BlockCutter.add',),
+    'volts to metres, corrections': ('measure.pipeline:counts_to_volts', 'measure.pipeline:Pipeline.dots'),
+    'lasers and detectors': (
+        'measure.health:OpticsHealth.judge',
+        'measure.health:OpticsHealth.still',
+        'measure.health:OpticsHealth.late_findings',
+    ),
+    'fit of the block': ('measure.uncertainty.block_fit:BlockFit.fit',),
+    'check of the readings': ('measure.uncertainty.stamped:StampedDots.check',),
+    'primary and other solvers': ('measure.estimation:Estimation._solve',),
+    'uncertainty of the calibration': ('model.misalignment.spread:ParameterSpread.factor',),
+    'covariance of the estimates': ('measure.estimation:Estimation._covariance',),
+    'tip load': ('model.simulation.tip_load:TipLoads.tip_load',),
+    'scatter of the dots': ('measure.pipeline:covariance',),
+    'noise learnt': ('measure.uncertainty.stamped:StampedDots.learn',),
+    'search for a wrong reading': ('measure.uncertainty.stamped:StampedDots.suspect',),
+    'watch: is the rig its model?': ('run.watcher:Watcher.put',),
+    'messages: fields of the records': ('run.fanout:Fanout.put',),
+    'messages: CDR': ('recordings.cdr:encode',),
+    'publishing: rclpy and DDS': ('ros.wires:PublisherWire.put',),
+    'frames on /tf': ('ros.transforms:TransformPublisher.put',),
+    'queue of the recorder': ('run.recorder:Recorder.put',),
+    'other work on a block: records, findings, counters': ('run.processing:Processing.give',),
+    'MCAP: messages': ('recordings.write.bag_writer:BagWriter.write_encoded',),
+    'MCAP: chunks (zstd, CRC, write, fsync)': ('recordings.write.bag_writer:McapFile._flush',),
+    'MCAP: look for room and file': ('run.recorder:Recorder._make_room',),
+    'executor: wait and callbacks': ('ros.running:SingleThreadedExecutor.spin_once',),
+    'diagnostics, rig and zero shown': ('ros.estimator:EstimatorNode.report',),
+}
+"""By its name: functions of the package, ``module:name``. The self time of each is its part's."""
+COLLECTION = 'garbage collection'
+REST = 'rest: waking up, waiting, loops'
+
+KINDS = (
+    ('rclpy, rmw, DDS', r'rclpy|librcl|librmw|fastdds|fastrtps|fastcdr|rosidl|libtracetools'),
+    ('MCAP: zstd, CRC', r'zstd|zstandard|libz\.so'),
+    ('numpy', r'_multiarray_umath|numpy|pocketfft|openblas'),
+    ('scipy', r'scipy'),
+    ('garbage collection', r'gc_collect|deduce_unreachable|visit_reachable|subtract_refs'),
+    (
+        'waking up: locks, sleep, select, queue',
+        r'take_gil|drop_gil|PyThread_acquire|futex|sem_|pthread_cond|nanosleep|select|poll|schedule',
+    ),
+    ('kernel: read, write, fsync, page faults, interrupts', r'kernel\.kallsyms'),
+    ("Python's interpreter and objects", r'python|libc\.so|ld-linux|libm\.so|_struct|\[vdso\]'),
+)
+"""Native code, from what is most telling to what is least: a frame's function and library."""
+
+
+def resolve(place: str) -> tuple[Any, str, Callable[..., Any]]:
+    """The owner, the name and the function of ``module:name`` in the package."""
+    module, _, path = place.partition(':')
+    *owners, name = path.split('.')
+    owner: Any = importlib.import_module(f'psd_deflection.{module}')
+    for part in owners:
+        owner = getattr(owner, part)
+    return owner, name, getattr(owner, name)
+
+
+class Clocks:
+    """CPU time (ns) and calls of each part in each thread, by the thread's native id. ``clock``: of this thread, ns."""
+
+    def __init__(self, clock: Callable[[], int] = time.thread_time_ns) -> None:
+        self.clock = clock
+        self.spent: dict[int, Counter[str]] = defaultdict(Counter)
+        self.calls: dict[int, Counter[str]] = defaultdict(Counter)
+        self._inside = threading.local()
+
+    def enter(self) -> None:
+        """A part begins in this thread."""
+        stack = self._inside.__dict__.setdefault('stack', [])
+        # Its clock, and the time in parts inside it.
+        stack.append([self.clock(), 0])
+
+    def leave(self, part: str) -> None:
+        """It ends."""
+        stack = self._inside.stack
+        began, within = stack.pop()
+        took = self.clock() - began
+        if stack:
+            stack[-1][1] += took
+        thread = threading.get_native_id()
+        self.spent[thread][part] += took - within
+        self.calls[thread][part] += 1
+
+    def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """``function``, counted as ``part``."""
+
+        def measured(*args: Any, **options: Any) -> Any:
+            self.enter()
+            try:
+                return function(*args, **options)
+            finally:
+                self.leave(part)
+
+        return measured
+
+    def collects(self, phase: str, _: object) -> None:
+        """For ``gc.callbacks``."""
+        if phase == 'start':
+            self.enter()
+        else:
+            self.leave(COLLECTION)
+
+    def cost_ns(self) -> float:
+        """What one call of a measured function costs more, ns."""
+        nothing = Clocks(self.clock).timed('', lambda: None)
+        before = time.thread_time_ns()
+        for _ in range(2000):
+            nothing()
+        return (time.thread_time_ns() - before) / 2000
+
+    def state(self) -> dict[str, Any]:
+        """What is known now: of each thread its name, its CPU time and that of its parts, ns."""
+        names = {thread.native_id: thread.name for thread in threading.enumerate()}
+        out = {}
+        for task in Path('/proc/self/task').iterdir():
+            used = int((task / 'schedstat').read_text().split()[0])
+            number = int(task.name)
+            name = names.get(number) or (task / 'comm').read_text().strip()
+            out[task.name] = {
+                'name': re.sub(r'[.0-9]+$|_?\d+$', '', name) or name,
+                'used': used,
+                'spent': dict(self.spent[number]),
+                'calls': sum(self.calls[number].values()),
+            }
+        return out
+
+
+def node(port: str, folder: str, seconds: float) -> int:
+    """Child process: the node with clocks in it; prints what a window of ``seconds`` took, then waits for a signal."""
+    from psd_deflection.cli.main import main as command_line
+
+    clocks = Clocks()
+    for part, places in PARTS.items():
+        for place in places:
+            owner, name, function = resolve(place)
+            setattr(owner, name, clocks.timed(part, function))
+    gc.callbacks.append(clocks.collects)
+    out = os.fdopen(os.dup(1), 'w')
+
+    def blocks() -> int:
+        return sum(calls['fit of the block'] for calls in tuple(clocks.calls.values()))
+
+    def watch() -> None:
+        while (fits := blocks()) < SETTLE_BLOCKS:
+            time.sleep(0.2)
+        before, began = clocks.state(), time.monotonic()
+        time.sleep(seconds)
+        told = {'before': before, 'after': clocks.state(), 'took': time.monotonic() - began}
+        more = {'cost': clocks.cost_ns(), 'blocks': blocks() - fits}
+        print(json.dumps({**told, **more}), file=out, flush=True)
+
+    threading.Thread(target=watch, name='measurement', daemon=True).start()
+    return command_line(['estimator', '--port', port, '--record', folder])
+
+
+def parts(told: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float, float]:
+    """Of :func:`node`: CPU time (s) by thread and part, the window, s, and the clocks' share of it."""
+    out: defaultdict[tuple[str, str], float] = defaultdict(float)
+    calls = 0
+    for number, after in told['after'].items():
+        if after['name'] == 'measurement':
+            continue
+        before = told['before'].get(number, {'used': 0, 'spent': {}, 'calls': 0})
+        name = after['name']
+        used = after['used'] - before['used']
+        spent = {part: ns - before['spent'].get(part, 0) for part, ns in after['spent'].items()}
+        calls += after['calls'] - before['calls']
+        shown = REST if spent else 'all of it'
+        for part, ns in {**spent, shown: used - sum(spent.values())}.items():
+            out[name, part] += ns / 1e9
+    found = {key: s for key, s in out.items() if s > 0.0}
+    return found, told['took'], calls * told['cost'] / 1e9 / sum(found.values())
+
+
+def kind_of(frames: list[str]) -> str:
+    """The kind of a sample by its ``frames``, the innermost first, each with its function and library."""
+    for name, pattern in KINDS[:-2]:
+        if any(re.search(pattern, frame) for frame in frames):
+            return name
+    return next((name for name, pattern in KINDS[-2:] if frames and re.search(pattern, frames[0])), 'not known')
+
+
+def native(pid: int, seconds: float) -> Counter[str]:
+    """Samples of each kind of native code in ``seconds`` of the process ``pid``; none if perf cannot."""
+    if shutil.which('perf') is None:
+        return Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        data = f'{folder}/perf.data'
+        record = ['perf', 'record', '-e', 'cpu-clock', '-F', '999', '--call-graph', 'dwarf,16384', '-o', data]
+        done = subprocess.run([*record, '-p', str(pid), '--', 'sleep', f'{seconds:g}'], capture_output=True, text=True)
+        if done.returncode:
+            print(f'perf: {done.stderr.strip().splitlines()[-1]}', file=sys.stderr)
+            return Counter()
+        script = ['perf', 'script', '-i', data, '--no-inline', '-F', 'ip,sym,dso']
+        text = subprocess.run(script, capture_output=True, text=True).stdout
+    samples = [block.split('\n') for block in map(str.strip, text.split('\n\n')) if block]
+    return Counter(kind_of(frames) for frames in samples)
+
+
+def measure(seconds: float, with_perf: bool) -> tuple[dict[tuple[str, str], float], float, float, Counter[str]]:
+    """Run the node on a device of its own; what :func:`parts` and :func:`native` say of it."""
+    device = Device()
+    device.thread.start()
+    with tempfile.TemporaryDirectory() as folder:
+        words = ['--node', device.port.name, '--folder', folder, '--seconds', f'{seconds:g}']
+        child = subprocess.Popen(
+            [sys.executable, '-m', 'bench.cpu', *words], stdout=subprocess.PIPE, text=True, cwd=ROOT
+        )
+        timer = threading.Timer(PATIENCE_S + seconds, child.kill)
+        timer.start()
+        assert child.stdout is not None
+        line = next((line for line in child.stdout if line.startswith('{')), '')
+        try:
+            if not line:
+                raise SystemExit('bench.cpu: the node ended before it was measured')
+            found = native(child.pid, seconds) if with_perf else Counter()
+        finally:
+            timer.cancel()
+            child.send_signal(signal.SIGTERM)
+            child.wait(60.0)
+            device.stop.set()
+            device.thread.join()
+    told = json.loads(line)
+    if told['blocks'] < ENOUGH * BLOCKS_PER_S * told['took']:
+        print(
+            f'bench.cpu: {told["blocks"]} blocks in {told["took"]:.0f} s: others take the processors, '
+            f'and the parts of the threads that wait for them come out too small',
+            file=sys.stderr,
+        )
+    return (*parts(told), found)
+
+
+def rows_of(spent: dict[tuple[str, str], float], took: float, clocks: float, samples: Counter[str]) -> list[Row]:
+    """The tables: shares of the node's CPU, %, the largest first."""
+    total = sum(spent.values())
+    threads: defaultdict[str, float] = defaultdict(float)
+    for (thread, _), s in spent.items():
+        threads[thread] += s
+    share = f'{100.0 * total / took:.1f} % of a core, clocks {100.0 * clocks:.0f} % of it'
+    rows = [Row(f'CPU of the node by part: {share}', '%')]
+    for thread in sorted(threads, key=threads.__getitem__, reverse=True):
+        for (one, part), s in sorted(spent.items(), key=lambda item: -item[1]):
+            if one == thread and s >= 0.001 * total:
+                rows[0].figures.append(figure(f'{thread}: {part}', 'ours', [100.0 * s / total]))
+    if samples:
+        kinds = Row(f'CPU of the node by native code: {samples.total()} samples of perf', '%')
+        kinds.figures += [figure(k, 'ours', [100.0 * n / samples.total()]) for k, n in samples.most_common()]
+        rows.append(kinds)
+    return rows
+
+
+def main() -> int:
+    """Measure, print and keep."""
+    parser = options(__doc__)
+    parser.add_argument('--seconds', type=float, default=20.0, help='of each window (default: 20)')
+    parser.add_argument('--no-native', action='store_true', help='without perf')
+    parser.add_argument('--results', type=Path, default=RESULTS)
+    parser.add_argument('--node', help='of the child process: the port')
+    parser.add_argument('--folder', help='of the child process: where it records')
+    args = parser.parse_args()
+    if args.node:
+        return node(args.node, args.folder, args.seconds)
+    rows = rows_of(*measure(args.seconds, not args.no_native))
+    args.results.unlink(missing_ok=True)
+    keep(rows, args.results)
+    lines = []
+    for row in rows:
+        lines += [row.work, *(f'  {f.median:5.1f} %  {f.name}' for f in row.figures)]
+    return conclude('\n'.join(lines))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
