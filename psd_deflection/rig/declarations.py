@@ -131,6 +131,13 @@ class CalibrationConfig:
         maximum=1.0,
     )
     source: str = parameter('', '', 'recordings (by hash), software and date of the calibration')
+    range: tuple[float, ...] = parameter(
+        (0.0,),
+        '',
+        'poses that it was made with: least dx, dy (m), theta (rad), then the largest; 0: not known, nothing is said',
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
 
 
 @dataclass(frozen=True, slots=True)
