@@ -281,7 +281,8 @@ def certified(seed: int) -> Certified:
     """One rig: calibrated by a reference whose scale is wrong, certified, and measured after it has drifted."""
     rng = np.random.default_rng([22, seed])
     truth = misaligned.draw(rng)
-    pose = misaligned.poses(misaligned.pushes(rng, HOLDS, SECONDS))
+    # Half as long as the others: U is to hold of a short calibration, too.
+    pose = misaligned.poses(misaligned.pushes(rng, HOLDS // 2, SECONDS))
     lengths, angles = (1.0 + rng.normal(0.0, REFERENCE_SCALE, 2)).tolist()
     recorded = misaligned.record(truth, pose, rng)
     scaled = replace(recorded, reference=recorded.reference * (lengths, lengths, angles))
@@ -308,7 +309,8 @@ def table_of_certificates(rigs: Sequence[Certified]) -> Iterator[str]:
     ratio = np.sqrt(np.mean(np.stack([one.ratio for one in rigs]) ** 2, axis=(0, 1)))
     yield '| | ΔX | ΔY | θ | all |\n|---|---|---|---|---|'
     x, y, t = covered.mean(axis=(0, 1)).tolist()
-    yield f'| U covers the error, {covered.shape[0]} rigs of {STATED} poses | {x:.1%} | {y:.1%} | {t:.1%} | {covered.mean():.1%} |'
+    words = f'U covers the error, {len(rigs)} rigs of {STATED} poses'
+    yield f'| {words} | {x:.1%} | {y:.1%} | {t:.1%} | {covered.mean():.1%} |'
     yield f'| rms of error over U (of a normal one 0.51) | {ratio[0]:.2f} | {ratio[1]:.2f} | {ratio[2]:.2f} | |'
 
 

@@ -20,9 +20,8 @@ class BudgetProblem:
     """``rig``; ``inputs``: sizes of the errors by name, those that differ from the defaults.
 
     ``load``: at the tip, Fx N, Fy N, Tz N m; None: a weight on a sidebar that suits the rig. ``method``: whose errors
-    are computed; None: that of the rig. ``draws``: random draws of all causes at once, 0: none; ``seed`` of them. So many are drawn normal, and so many of
-    the declared distributions.
-    ``rig_file``: the name of the rig's, '' if it has none.
+    are computed; None: that of the rig. ``draws``: random draws of all causes at once, 0: none; as many normal ones as
+    of the declared distributions. ``seed`` of them. ``rig_file``: the name of the rig's, '' if it has none.
     """
 
     rig: Rig

@@ -107,7 +107,7 @@ class Certified(StudyResult):
 
     def tree(self) -> dict[str, Any]:
         """SI; (ΔX, ΔY, θ) in this order."""
-        verdicts = self.verdicts or [None] * len(self.found.poses)
+        verdicts: Sequence[Verdict | None] = self.verdicts or [None] * len(self.found.poses)
         rows = zip(self.found.poses, self.found.found, self.found.stated, verdicts, strict=True)
         return {
             'unit': ['m', 'm', 'rad'],
@@ -124,9 +124,7 @@ class Certified(StudyResult):
             ],
             'limits': None if self.problem.limits is None else list(self.problem.limits),
             'range': self.problem.calibration['range'],
-            'inputs': [
-                {**row._asdict(), 'coefficients': row.coefficients.tolist()} for row in self.found.inputs
-            ],
+            'inputs': [{**row._asdict(), 'coefficients': row.coefficients.tolist()} for row in self.found.inputs],
             'correlations': self.found.correlations.tolist(),
             'provenance': {'version': __version__, 'calibration': self.problem.calibration['provenance']},
         }
@@ -202,13 +200,14 @@ class Certified(StudyResult):
 
     def _range(self) -> str:
         seen, rig = self.problem.calibration['range'], self.problem.rig
-        ends = (f'{name} {low} to {high}' for name, low, high in zip(UNITS, *map(_shown, (seen['low'], seen['high'])), strict=True))
+        low, high = (shown(np.array(seen[key])) for key in ('low', 'high'))
+        ends = (f'{unit} {a} to {b}' for unit, a, b in zip(UNITS, low, high, strict=True))
         rate, size = rig.converter.sample_rate_hz, rig.estimator.block_size
         words = (
             f'Valid for poses of {", ".join(ends)}, single estimates of {size} samples at {rate:g} Hz by the solver '
-            f'{rig.estimator.solver}, after a zero at rest, and for motion slower than {0.9 * rate / size:g} Hz. Outside '
-            f'that range, and while the link vibrates faster, the estimates say so in their findings. As left, the '
-            f'error is corrected by the calibrated rig file; what may be left of it is U.'
+            f'{rig.estimator.solver}, after a zero at rest, and for motion slower than {0.9 * rate / size:g} Hz. '
+            f'Outside that range, and while the link vibrates faster, the estimates say so in their findings. As left, '
+            f'the error is corrected by the calibrated rig file; what may be left of it is U.'
         )
         return f'<p>{html.escape(words)}</p>'
 
@@ -224,8 +223,8 @@ class Certified(StudyResult):
 
 _HOW = (
     '<p>u: standard uncertainty of an input, nu: its degrees of freedom, c: how ΔX, ΔY (m) and θ (rad) of each pose go '
-    'with it. With g = u c the variance of a cause is the sum of g² over its parameters; that of the calibration, whose '
-    'parameters are correlated, is the sum of g_p r_pq g_q (JCGM 100:2008, 5.2.2). u_c² is the sum over the causes; '
+    'with it. With g = u c the variance of a cause is the sum of g² over its parameters; that of the calibration, '
+    'whose parameters are correlated, is the sum of g_p r_pq g_q (JCGM 100:2008, 5.2.2). u_c² is the sum over the causes; '
     'ν_eff = u_c⁴ / Σ u_i⁴/ν_i over the causes (G.2b), down to a whole number; k is the quantile of Student’s t for '
     '95 %; U = k u_c. The same tables with all digits: inputs.csv, correlations.csv, results.csv.</p>'
 )
@@ -233,10 +232,6 @@ _HOW = (
 
 def _six(value: float) -> str:
     return '∞' if math.isinf(value) else f'{value:.6g}'
-
-
-def _shown(values: Sequence[float]) -> list[str]:
-    return shown(np.array(values))
 
 
 def _table(rows: list[list[str]]) -> str:

@@ -48,11 +48,10 @@ def _check(tree: Any, path: Path) -> None:
         raise ConfigError(f'{path}: refused: the calibration was refused, and there is nothing to certify')
     if tree.get('kind') != 'reference':
         raise ConfigError(
-            f'{path}: kind = {printable(str(tree.get("kind")), LONGEST_WORDS)}: its scale is traceable to nothing; calibrate with a '
-            f'reference'
+            f'{path}: kind = {_words(tree.get("kind"))}: its scale is traceable to nothing; calibrate with a reference'
         )
     for name, one in _map(tree, 'parameters', path).items():
-        words = f'parameters.{printable(str(name), LONGEST_WORDS)}'
+        words = f'parameters.{_words(name)}'
         if not isinstance(one, dict) or not all(_is_number(one.get(key)) for key in ('value', 'used')):
             raise ConfigError(f'{path}: {words}: needs the numbers value and used; calibrate again')
     reference = _map(tree, 'reference', path)
@@ -73,6 +72,10 @@ def _check(tree: Any, path: Path) -> None:
         if warm is not None and not (isinstance(warm, list) and all(map(_is_number, warm))):
             raise ConfigError(f'{path}: provenance.recordings.temperature: must be numbers; calibrate again')
     given.setdefault('date', '')
+
+
+def _words(value: object) -> str:
+    return printable(str(value), LONGEST_WORDS)
 
 
 def _map(tree: Mapping[str, Any], key: str, path: Path) -> dict[str, Any]:
@@ -99,8 +102,8 @@ def read_fields(path: str | None) -> dict[str, str]:
     out = {}
     for name, words in tree.items():
         if name not in FIELDS:
-            raise ConfigError(f'{path}: {printable(str(name), LONGEST_WORDS)}: no such field{did_you_mean(str(name), FIELDS)}')
+            raise ConfigError(f'{path}: {_words(name)}: no such field{did_you_mean(str(name), FIELDS)}')
         if isinstance(words, dict | list):
             raise ConfigError(f'{path}: {name}: must be words or a number')
-        out[str(name)] = '' if words is None else printable(str(words), LONGEST_WORDS)
+        out[str(name)] = '' if words is None else _words(words)
     return out

@@ -171,9 +171,10 @@ def read_inputs(
     source: str = 'settings',
     declared: Sequence[Input] = INPUTS,
 ) -> dict[str, float]:
-    """All inputs that are ``declared``: ``settings`` override the YAML file (``name: value`` lines), which overrides the defaults.
+    """All inputs that are ``declared``.
 
-    ``source``: where ``settings`` come from, for messages.
+    ``settings`` override the YAML file (``name: value`` lines), which overrides the defaults. ``source``: where
+    ``settings`` come from, for messages.
 
     Raises ConfigError naming the source, the input, the value and the bound.
     """

@@ -27,7 +27,8 @@ AXES = ('ΔX', 'ΔY', 'θ')
 class Budgeted(StudyResult):
     """``budget``: every cause at ``load`` (Fx N, Fy N, Tz N m). ``sampled``: of ``draws`` random draws with ``seed``.
 
-    ``interval``: of as many draws from the declared distributions. ``rig_file``: the name of the rig's, '' if it has none.
+    ``interval``: of as many draws from the declared distributions. ``rig_file``: the name of the rig's, '' if it has
+    none.
     """
 
     study, json_name = 'budget', 'budget.json'
@@ -160,15 +161,17 @@ class Budgeted(StudyResult):
         rows.append(['expanded uncertainty U = k u_c + |b|', *shown(said.uncertainty)])
         if self.interval is not None:
             rows.append(['Monte Carlo: half of the 95 % interval', *shown(self.interval.half)])
-            rows.append(['k u_c beside it, %', *(f'{100.0 * v:+.1f}' for v in difference(said, self.interval).tolist())])
+            off = difference(said, self.interval).tolist()
+            rows.append(['k u_c beside it, %', *(f'{100.0 * v:+.1f}' for v in off)])
         return rows
 
     def _compared(self, interval: Interval) -> str:
         """The GUM's interval beside that of the draws."""
-        off = [f'{name} {100.0 * v:+.1f} %' for name, v in zip(AXES, difference(self.budget.expanded(), interval), strict=True)]
+        off = difference(self.budget.expanded(), interval).tolist()
+        each = ', '.join(f'{name} {100.0 * v:+.1f} %' for name, v in zip(AXES, off, strict=True))
         return (
             f'{self.draws} draws of the declared distributions (GUM Supplement 1) have 95 % of the errors within '
-            f'{in_words(interval.half)}; k u_c differs by {", ".join(off)}.'
+            f'{in_words(interval.half)}; k u_c differs by {each}.'
         )
 
     def _totals(self) -> list[list[str]]:
