@@ -266,8 +266,8 @@ CERTIFIED = {
     'zero_blocks': 25.0,
 }
 """Inputs of the certificate as this generator has them."""
-STATED = 6
-"""Poses of each rig, one estimate at each."""
+STATED, HELD = 6, 4
+"""Poses of each rig, one estimate at each, and blocks for which each is held."""
 
 
 class Certified(NamedTuple):
@@ -291,14 +291,15 @@ def certified(seed: int) -> Certified:
     inputs = read_inputs(None, CERTIFIED, declared=(*INPUTS, *REFERENCE_INPUTS))
     asked = [(x, y, theta) for x, y, theta in poses.tolist()]
     stated = certify(CertificateProblem(rig, result(found, 'today'), inputs, asked)).stated
-    held = np.repeat(np.vstack((np.zeros(3), poses)), [25 * SIZE, *([10 * SIZE] * STATED)], axis=0)
+    held = np.repeat(np.vstack((np.zeros(3), poses)), [25 * SIZE, *([HELD * SIZE] * STATED)], axis=0)
     volts = misaligned.record(truth, held, rng).volts
     beams = rng.normal(0.0, POINTING * misaligned.LENGTH, 4)
     detectors = rng.uniform(-1.0, 1.0, 4) * DRIFT * WARMER * AREA
     volts[25 * SIZE :, [0, 1, 3, 4]] += (beams + detectors) / generator.MM_PER_V
-    _, estimates, _ = measured(rig, volts)
+    # Of the estimates alone: their own covariances are not asked.
+    _, estimates, _ = measured(replace_values(rig, {'covariance': 'noise', 'consistency': 'report'}), volts)
     # The last block of each pose: the step to it is over.
-    error = estimates[9::10] - poses
+    error = estimates[HELD - 1 :: HELD] - poses
     uncertainty = np.stack([one.uncertainty for one in stated])
     return Certified(np.abs(error) <= uncertainty, error / uncertainty)
 

@@ -217,6 +217,14 @@ class EstimatorConfig:
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
+    motion_memory: str = parameter(
+        'lasting',
+        '',
+        'how long the fit of a block remembers motion: a quarter of a second (recent), or besides for as long as it goes '
+        'on alike, so that a steady vibration of some micrometres is told from noise (lasting)',
+        choices=('lasting', 'recent'),
+        before='recent',
+    )
     vibration: str = parameter(
         'widen',
         '',
