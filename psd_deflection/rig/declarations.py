@@ -220,8 +220,8 @@ class EstimatorConfig:
     motion_memory: str = parameter(
         'lasting',
         '',
-        'how long the fit of a block remembers motion: a quarter of a second (recent), or besides for as long as it goes '
-        'on alike, so that a steady vibration of some micrometres is told from noise (lasting)',
+        'how long the fit of a block remembers motion: a quarter of a second (recent), or besides for as long as it '
+        'goes on alike, so that a steady vibration of some micrometres is told from noise (lasting)',
         choices=('lasting', 'recent'),
         before='recent',
     )

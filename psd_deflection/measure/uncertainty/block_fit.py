@@ -43,8 +43,8 @@ _BIAS = 0.5
 """Times v_k, taken off tau_k^2: a mean that cannot be negative is too large by about that where there is no motion."""
 
 _LASTING = 250.0
-"""Blocks, at the most, of the mean of motion that goes on alike: 5 s of 20 samples at 1 kHz. Its error is a fifth of that
-of the short one, so that motion which bends a block by a fifth of its noise is told from noise."""
+"""Blocks, at the most, of the mean of motion that goes on alike: 5 s of 20 samples at 1 kHz. Its error is a fifth of
+that of the short one, so that motion which bends a block by a fifth of its noise is told from noise."""
 
 _OVER = 0.35
 """Times the noise and the motion of late: a lasting mean that begins anew and is larger by that is of motion that is

@@ -224,7 +224,7 @@ class Certified(StudyResult):
 _HOW = (
     '<p>u: standard uncertainty of an input, nu: its degrees of freedom, c: how ΔX, ΔY (m) and θ (rad) of each pose go '
     'with it. With g = u c the variance of a cause is the sum of g² over its parameters; that of the calibration, '
-    'whose parameters are correlated, is the sum of g_p r_pq g_q (JCGM 100:2008, 5.2.2). u_c² is the sum over the causes; '
+    'whose parameters are correlated, is the sum of g_p r_pq g_q (JCGM 100:2008, 5.2.2). u_c² is the sum of all; '
     'ν_eff = u_c⁴ / Σ u_i⁴/ν_i over the causes (G.2b), down to a whole number; k is the quantile of Student’s t for '
     '95 %; U = k u_c. The same tables with all digits: inputs.csv, correlations.csv, results.csv.</p>'
 )
