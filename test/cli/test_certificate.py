@@ -53,7 +53,7 @@ def _student(probability: float, freedom: float) -> float:
     def share(k: float) -> float:
         n = 2000
         values = [(1 + (k * i / n) ** 2 / freedom) ** (-(freedom + 1) / 2) for i in range(n + 1)]
-        return scale * k / n / 3 * (values[0] + values[-1] + 4 * sum(values[1::2]) + 2 * sum(values[2:-1:2])) * 2
+        return float(scale * k / n / 3 * (values[0] + values[-1] + 4 * sum(values[1::2]) + 2 * sum(values[2:-1:2])) * 2)
 
     low, high = 0.0, 20.0
     for _ in range(60):
