@@ -3,6 +3,7 @@
     python -m blind.calibration --rigs 200 --jobs 2
     python -m blind.calibration --rigs 40 --light
     python -m blind.calibration --rigs 60 --unequal
+    python -m blind.calibration --rigs 200 --certificate
 
 Each rig is recorded with a reference (a camera of 30 frames a second), calibrated from the nominal rig file, and then
 measures another motion without a reference, with the zero taken anew. Compared with the truth: every parameter and
@@ -12,11 +13,15 @@ parameters moved by three tolerances, for ``calibrate --check``.
 
 ``--unequal``: the parameters alone, of rigs whose channels have noise of 0.5 to 4 mV each, with a reference of 0.1, 1
 and 4 times the camera's noise.
+
+``--certificate``: does the U of a certificate cover the truth? The reference's scale is wrong by chance, and since the
+zero was taken the beams and the detectors have drifted by chance, as much as the certificate's inputs say.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -31,12 +36,14 @@ from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.records import DeflectionEstimate, RawChunk
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.parameter_files import flattened
+from psd_deflection.studies.budget.certificate import CertificateProblem, certify
+from psd_deflection.studies.budget.inputs import INPUTS, REFERENCE_INPUTS, read_inputs
 from psd_deflection.studies.calibrate.calibrate import OPEN, Calibration, calibrate
 from psd_deflection.studies.calibrate.check import check
 from psd_deflection.studies.calibrate.dark import dark_levels, values_of_levels
 from psd_deflection.studies.calibrate.fit import NAMES
 from psd_deflection.studies.calibrate.observation import CalibrationRun
-from psd_deflection.studies.calibrate.result import values_of
+from psd_deflection.studies.calibrate.result import result, values_of
 
 HOLDS, SECONDS = 24, 2.5
 AFTER, AFTER_SECONDS = 8, 1.5
@@ -239,6 +246,75 @@ def errors_over_sd(seed: int, reference: float) -> dict[str, float]:
     return {n: float((found.values[i] - truth[n]) / found.sd[i]) for i, n in enumerate(NAMES) if n in truth}
 
 
+REFERENCE_SCALE = 5e-4
+"""Relative standard deviation of the lengths, and of the angles, of the reference."""
+POINTING = 2e-6
+"""rad, standard deviation by which a beam has turned since the zero was taken."""
+DRIFT, WARMER, AREA = 40e-6, 2.0, 10e-3
+"""Largest drift of a detector, 1/K of its length, over so many K; its length, m."""
+CERTIFIED = {
+    'reference_scale': REFERENCE_SCALE,
+    'reference_angle_scale': REFERENCE_SCALE,
+    'pointing_drift': POINTING,
+    'drift_coefficient': DRIFT,
+    'temperature_change': WARMER,
+    'profile_change': 0.0,
+    'air_gradient': 0.0,
+    'air_step': 0.0,
+    'interference': 0.0,
+    'bracket_temperature': 0.0,
+    'zero_blocks': 25.0,
+}
+"""Inputs of the certificate as this generator has them."""
+STATED, HELD = 6, 4
+"""Poses of each rig, one estimate at each, and blocks for which each is held."""
+
+
+class Certified(NamedTuple):
+    """One rig. ``covered`` (n, 3): whether U covers the error of each pose; ``ratio`` (n, 3): the error over U."""
+
+    covered: npt.NDArray[np.bool_]
+    ratio: Array
+
+
+def certified(seed: int) -> Certified:
+    """One rig: calibrated by a reference whose scale is wrong, certified, and measured after it has drifted."""
+    rng = np.random.default_rng([22, seed])
+    truth = misaligned.draw(rng)
+    # Half as long as the others: U is to hold of a short calibration, too.
+    pose = misaligned.poses(misaligned.pushes(rng, HOLDS // 2, SECONDS))
+    lengths, angles = (1.0 + rng.normal(0.0, REFERENCE_SCALE, 2)).tolist()
+    recorded = misaligned.record(truth, pose, rng)
+    scaled = replace(recorded, reference=recorded.reference * (lengths, lengths, angles))
+    rig, found = calibrated_rig(rig_from_values({}), run_of(scaled))
+    poses = rng.uniform(-1.0, 1.0, (STATED, 3)) * (2e-3, 2e-3, 0.015)
+    inputs = read_inputs(None, CERTIFIED, declared=(*INPUTS, *REFERENCE_INPUTS))
+    asked = [(x, y, theta) for x, y, theta in poses.tolist()]
+    stated = certify(CertificateProblem(rig, result(found, 'today'), inputs, asked)).stated
+    held = np.repeat(np.vstack((np.zeros(3), poses)), [25 * SIZE, *([HELD * SIZE] * STATED)], axis=0)
+    volts = misaligned.record(truth, held, rng).volts
+    beams = rng.normal(0.0, POINTING * misaligned.LENGTH, 4)
+    detectors = rng.uniform(-1.0, 1.0, 4) * DRIFT * WARMER * AREA
+    volts[25 * SIZE :, [0, 1, 3, 4]] += (beams + detectors) / generator.MM_PER_V
+    # Of the estimates alone: their own covariances are not asked.
+    _, estimates, _ = measured(replace_values(rig, {'covariance': 'noise', 'consistency': 'report'}), volts)
+    # The last block of each pose: the step to it is over.
+    error = estimates[HELD - 1 :: HELD] - poses
+    uncertainty = np.stack([one.uncertainty for one in stated])
+    return Certified(np.abs(error) <= uncertainty, error / uncertainty)
+
+
+def table_of_certificates(rigs: Sequence[Certified]) -> Iterator[str]:
+    """Shares that U covers, of ΔX, ΔY, θ."""
+    covered = np.stack([one.covered for one in rigs])
+    ratio = np.sqrt(np.mean(np.stack([one.ratio for one in rigs]) ** 2, axis=(0, 1)))
+    yield '| | ΔX | ΔY | θ | all |\n|---|---|---|---|---|'
+    x, y, t = covered.mean(axis=(0, 1)).tolist()
+    words = f'U covers the error, {len(rigs)} rigs of {STATED} poses'
+    yield f'| {words} | {x:.1%} | {y:.1%} | {t:.1%} | {covered.mean():.1%} |'
+    yield f'| rms of error over U (of a normal one 0.51) | {ratio[0]:.2f} | {ratio[1]:.2f} | {ratio[2]:.2f} | |'
+
+
 def table_of_errors(scale: float, errors: Sequence[Mapping[str, float]]) -> Iterator[str]:
     """One row for gains, one for all parameters."""
     for words, part in (('gains', '.gain_'), ('all parameters', '')):
@@ -316,7 +392,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--rigs', type=int, default=200)
     parser.add_argument('--light', action='store_true', help='1 to 4 %% of other light, which changes; --dark is used')
     parser.add_argument('--unequal', action='store_true', help='parameters alone, of rigs with unequal channels')
+    parser.add_argument('--certificate', action='store_true', help='whether the U of a certificate covers the truth')
     args = parser.parse_args(argv)
+    if args.certificate:
+        print('\n'.join(table_of_certificates(list(over(certified, range(args.rigs), args.jobs, 'rigs')))))
+        return 0
     if args.unequal:
         print('| noise of the reference, x | of | inside 95 % | rms of error over sd |\n|---|---|---|---|')
         for scale in (0.1, 1.0, 4.0):

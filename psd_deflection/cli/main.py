@@ -64,6 +64,7 @@ COMMANDS: dict[str, str] = {
     'convert': 'convert a recording to CSV, MCAP, a bag or Rerun',
     'recover': 'repair a recording that a crash cut off',
     'budget': 'compute the error budget: what each cause adds to the error of ΔX, ΔY and θ',
+    'certificate': 'write a calibration certificate: U at stated poses, with every input of it',
     'design': 'compute link stiffness and compare sensor placements',
     'compare-methods': 'compare the errors of all methods, and explain Table 5.1 of the thesis',
     'params': 'list every parameter with unit, bounds and default',

@@ -7,6 +7,7 @@ from block to block: for how many in a row a detector's values did not change.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.memory import Memory, Value, numbers
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock, channel_names, dot_names
 from psd_deflection.rig.config import Rig
@@ -244,3 +246,30 @@ _ORDER = (
     BlockStatus.FROZEN,
     BlockStatus.OUTSIDE_ACTIVE_AREA,
 )
+
+
+class CalibratedRange:
+    """The poses that the calibration of a rig was made with (``calibration.range``)."""
+
+    def __init__(self, rig: Rig) -> None:
+        """Raises ConfigError if the range is none."""
+        given = rig.calibration.range
+        if given != _UNKNOWN and (len(given) != 6 or any(a > b for a, b in zip(given[:3], given[3:], strict=True))):
+            raise ConfigError(
+                f'calibration.range: {len(given)} values {list(given)}: must be the least dx, dy, theta, then the '
+                f'largest; take them from a calibration unchanged'
+            )
+        self._axes = list(zip(('dX', 'dY', 'theta'), given[:3], given[3:], _SHOWN, strict=False)) if given[1:] else []
+
+    def findings(self, pose: tuple[float, float, float]) -> tuple[str, ...]:
+        """What to say of ``pose``: dX, dY m, theta rad. Outside the range no calibration vouches for the covariance."""
+        out = [
+            f'{name} {scale * value:.3g} {unit} ({scale * low:.3g} to {scale * high:.3g})'
+            for value, (name, low, high, (scale, unit)) in zip(pose, self._axes, strict=False)
+            if not low <= value <= high
+        ]
+        return (f'outside the calibrated range: {", ".join(out)}',) if out else ()
+
+
+_UNKNOWN = (0.0,)
+_SHOWN = ((1e3, 'mm'), (1e3, 'mm'), (math.degrees(1.0), 'deg'))

@@ -23,7 +23,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
 from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, SeenBlock
-from psd_deflection.measure.health import OpticsHealth, Stillness, Verdict
+from psd_deflection.measure.health import CalibratedRange, OpticsHealth, Stillness, Verdict
 from psd_deflection.measure.memory import STATE, WHOLE, Memory, Part, Value, numbers, restore
 from psd_deflection.measure.motion.known import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
@@ -121,6 +121,7 @@ class Pipeline:
         self._calibration = VoltsToDots.from_rig(rig)
         self._correction = Correction(rig, self._effects)
         self._optics = OpticsHealth(rig)
+        self._calibrated = CalibratedRange(rig)
 
     @property
     def repeated(self) -> int:
@@ -421,6 +422,8 @@ class Pipeline:
         findings += self._optics.late_findings(volts, seen.verdict, self._stillness.blocks)
         if vibrates:
             findings += (f'vibrates: {vibrates}',)
+        if answer.estimate is not None:
+            findings += self._calibrated.findings(answer.estimate.pose)
         for finding in findings:
             name = finding.split(':')[0]
             self.counters.findings[name] = self.counters.findings.get(name, 0) + 1

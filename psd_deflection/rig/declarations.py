@@ -131,6 +131,13 @@ class CalibrationConfig:
         maximum=1.0,
     )
     source: str = parameter('', '', 'recordings (by hash), software and date of the calibration')
+    range: tuple[float, ...] = parameter(
+        (0.0,),
+        '',
+        'poses that it was made with: least dx, dy (m), theta (rad), then the largest; 0: not known, nothing is said',
+        minimum=-1000.0,
+        maximum=1000.0,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,6 +216,14 @@ class EstimatorConfig:
         'when the readings contradict each other: widen the covariance, refuse the block, or only report it',
         choices=('widen', 'refuse', 'report'),
         before='report',
+    )
+    motion_memory: str = parameter(
+        'lasting',
+        '',
+        'how long the fit of a block remembers motion: a quarter of a second (recent), or besides for as long as it '
+        'goes on alike, so that a steady vibration of some micrometres is told from noise (lasting)',
+        choices=('lasting', 'recent'),
+        before='recent',
     )
     vibration: str = parameter(
         'widen',

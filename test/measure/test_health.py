@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.estimation import HELD
 from psd_deflection.measure.health import FROZEN
 from psd_deflection.measure.pipeline import Pipeline
@@ -321,3 +322,32 @@ def test_a_change_of_the_rule_while_it_runs_holds_from_the_next_block() -> None:
     assert sorted(first) == [0, 1, 2, 3, 4]
     assert sorted(second) == list(range(10, 20))
     assert change.values == (('degraded', 'zero'),)
+
+
+# ---- the calibrated range
+
+
+def test_outside_the_calibrated_range_the_block_says_so() -> None:
+    dx, dy, theta = POSE
+    seen = (-1e-3, -1e-3, -0.01, 1e-3, 1e-3, 0.01)
+    inside = spots(records_of(Pipeline(load_rig(overrides={'calibration.range': list(seen)})), moving(10)))
+    assert not [f for s in inside for f in s.findings]
+    for axis, (name, shown) in enumerate((('dX', dx * 1e3), ('dY', dy * 1e3), ('theta', np.degrees(theta)))):
+        narrow = list(seen)
+        # Its largest, or its least, just short of the pose.
+        narrow[axis + 3 if shown > 0.0 else axis] = 0.9 * POSE[axis]
+        pipeline = Pipeline(load_rig(overrides={'calibration.range': narrow}))
+        said = [f for s in spots(records_of(pipeline, moving(10))) for f in s.findings]
+        assert len(said) == 10
+        assert all(f.startswith(f'outside the calibrated range: {name} {shown:.1g}') for f in said)
+        assert pipeline.counters.findings == {'outside the calibrated range': 10}
+
+
+def test_of_a_rig_that_tells_no_range_nothing_is_said() -> None:
+    assert not [f for s in spots(records_of(Pipeline(load_rig()), moving(5))) for f in s.findings]
+
+
+@pytest.mark.parametrize('given', [[1.0], [0.0, 0.0], [0.0, 0.0, 1.0, 1.0, 1.0, 0.5]])
+def test_a_range_that_is_none_is_refused(given: list[float]) -> None:
+    with pytest.raises(ConfigError, match=r'calibration\.range: '):
+        Pipeline(load_rig(overrides={'calibration.range': given}))

@@ -92,6 +92,38 @@ def test_a_bump_is_told_with_its_time_channel_and_size() -> None:
     assert 'x1 is +5' in alarm.words.replace('+4.9', '+5')
 
 
+def test_a_bump_the_other_way_is_told_with_its_time_too() -> None:
+    fed = Fed()
+    fed.load(0.0, 0.0)
+    fed.run(10.0, REST)
+    fed.run(6.0, REST - X1)
+    alarm = fed.watch.alarm
+    assert alarm is not None
+    assert alarm.shift == pytest.approx(-5e-6, abs=0.3e-6)
+    assert alarm.since_ns / 1e9 == pytest.approx(10.0, abs=0.2)
+
+
+def test_a_load_that_is_noted_again_changes_nothing() -> None:
+    """What was learnt under it stays, so that a bump with the second note is no new level."""
+    fed = Fed()
+    fed.load(7.0, -10.0, 1.0)
+    fed.run(10.0, under(7.0, -10.0))
+    fed.load(7.0, -10.0, 1.0)
+    fed.run(6.0, under(7.0, -10.0) + X1)
+    assert fed.watch.alarm is not None
+    assert fed.watch.alarm.channel == 'x1'
+
+
+def test_the_base_line_may_be_wrong_by_two_thousandths_of_a_movement() -> None:
+    """A link that moved by 2 mm, without a known load: 3 um are a sound rig's, 9 um are not."""
+    for wrong, alarm in ((1.5e-6, False), (6e-6, True)):
+        fed = Fed()
+        fed.run(8.0, under(0.0, 0.0))
+        longer = wrong * np.array([1.0, 1.0, -1.0, -1.0])
+        fed.run(8.0, under(0.0, -45.0) + longer)
+        assert alarmed(fed) is alarm
+
+
 def test_what_comes_back_ends_the_alarm_and_a_zero_too() -> None:
     fed = Fed()
     fed.load(0.0, 0.0)
@@ -153,6 +185,8 @@ def test_a_load_must_do_what_the_link_model_says(share: float, alarm: bool) -> N
     if found is not None:
         assert found.channel == 'dy'
         assert found.shift == pytest.approx(-40.0 * (share - 1.0) * COMPLIANCE[1], rel=0.05)
+        # Six of these are what is allowed: 5 um and 2 % of the movement.
+        assert found.sd == pytest.approx((5e-6 + 0.02 * abs(40.0 * share * COMPLIANCE[1])) / 6.0, rel=0.01)
         # It is not seen to end under another load.
         fed.load(0.0, 0.0)
         fed.run(20.0, under(0.0, 0.0))

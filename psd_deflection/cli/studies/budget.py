@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
     # Of the file alone first, so that what is wrong in it is not laid to the options.
     read_inputs(args.inputs, {})
     with given_as_option():
-        inputs = read_inputs(args.inputs, _settings(args.set), '--set')
+        inputs = read_inputs(args.inputs, settings_of(args.set), '--set')
     if args.explain:
         show_text(explain(rig, inputs))
         return 0
@@ -121,7 +121,8 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _settings(pairs: list[str]) -> dict[str, object]:
+def settings_of(pairs: list[str]) -> dict[str, object]:
+    """What --set gave, by name. Raises UsageError."""
     out: dict[str, object] = {}
     for pair in pairs:
         name, equals, value = pair.partition('=')

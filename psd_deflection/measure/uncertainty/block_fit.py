@@ -42,6 +42,17 @@ _FORGET = 1.0 / 12.0
 _BIAS = 0.5
 """Times v_k, taken off tau_k^2: a mean that cannot be negative is too large by about that where there is no motion."""
 
+_LASTING = 250.0
+"""Blocks, at the most, of the mean of motion that goes on alike: 5 s of 20 samples at 1 kHz. Its error is a fifth of
+that of the short one, so that motion which bends a block by a fifth of its noise is told from noise."""
+
+_OVER = 0.35
+"""Times the noise and the motion of late: a lasting mean that begins anew and is larger by that is of motion that is
+over. It rises to 1 as the mean gets older."""
+
+_LASTING_BIAS = 0.03
+"""As ``_BIAS``, of the mean over ``_LASTING`` blocks: half of its standard deviation where there is no motion."""
+
 _SUDDEN = 16.0
 """c_k^2 over what the blocks before let expect of it, above which this block alone says how much motion there is."""
 
@@ -142,10 +153,12 @@ class BlockFit:
         poly: bool = True,
         slopes: FloatArray | None = None,
         by: Arithmetic = FIXED,
+        lasting: bool = False,
     ) -> None:
         """``size``: N samples of a whole block. ``centers``, ``beams`` (P, 2) m, C = 2P.
 
-        ``poly``: False gives the mean. ``slopes``: as :func:`combinations_of` takes them.
+        ``poly``: False gives the mean. ``slopes``: as :func:`combinations_of` takes them. ``lasting``: motion that
+        goes on alike is remembered besides, so that little of it is enough.
         """
         self._size = size
         self._by = by
@@ -159,6 +172,10 @@ class BlockFit:
         self._squares = np.zeros((self._count, self._orders))
         # Until motion is seen there was none.
         self._weight = np.ones((self._count, self._orders))
+        self._gaps = False
+        self._lasting = lasting and poly
+        self._long = np.zeros((self._count, self._orders))
+        self._blocks = np.full((self._count, self._orders), 1.0 / _FORGET)
         self._folds = np.full(self._fft // 2 + 1, 2.0 / self._fft)
         self._folds[[0, -1]] = 1.0 / self._fft
         self.set_geometry(centers, beams, slopes)
@@ -180,6 +197,8 @@ class BlockFit:
         self._precision = _precision(own, white=not self._poly or self._size > LARGEST)
         self._whole = _terms(self._q, self._precision, self._middle, True, by)
         self._bias, self._least = _BIAS * self._whole.v, 1e-9 * self._whole.v
+        self._long_bias = _LASTING_BIAS * self._whole.v
+        self._before: FloatArray | None = None
         f = np.fft.rfft(self._whole.u, self._fft, axis=1)
         self._of_whole = by.hermitian('afk,abf,bfj->akbj', f, self._spectrum)
         self._vibrations = [self._vibration(tone) for tone in tones]
@@ -244,15 +263,19 @@ class BlockFit:
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
-        return (*self._squares.ravel().tolist(), *self._weight.ravel().tolist())
+        own = (self._squares, self._weight, *((self._long, self._blocks) if self._lasting else ()))
+        return tuple(v for one in own for v in one.ravel().tolist())
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
-        size = self._squares.size
-        if len(values) != 2 * size:
-            raise ValueError(f'a fit of {self._size} samples a block has {2 * size} values, not {len(values)}')
-        self._squares = np.array(values[:size]).reshape(self._count, -1)
-        self._weight = np.array(values[size:]).reshape(self._count, -1)
+        wanted = (4 if self._lasting else 2) * self._squares.size
+        if len(values) != wanted:
+            raise ValueError(f'a fit of {self._size} samples a block has {wanted} values, not {len(values)}')
+        parts = np.array(values).reshape(-1, self._count, self._orders)
+        self._squares, self._weight = parts[0].copy(), parts[1].copy()
+        self._gaps, self._before = True, None
+        if self._lasting:
+            self._long, self._blocks = parts[2].copy(), parts[3].copy()
 
     def _without(self, slots: IntArray) -> FloatArray:
         """The precision (C, n, n) of the samples that are present: a block of a matrix's inverse, inverted."""
@@ -275,17 +298,24 @@ class BlockFit:
         told = v.shape[1]
         square = c * c
         excess = square - v
-        before = self._usual()
+        before = self._before if self._before is not None else self._usual(self._late())
         squares, weight = self._squares[:, :told], self._weight[:, :told]
+        sure: FloatArray | None = None
         if v is self._whole.v:
             squares += _FORGET * (excess - squares)
-            weight += _FORGET * (1.0 - weight)
+            if self._gaps:
+                weight += _FORGET * (1.0 - weight)
         else:
             # A block with gaps says less the more noise its coefficients have.
             sure = np.minimum(self._whole.v[:, :told] / v, 1.0) ** 2
             squares += _FORGET * (sure * excess - squares)
             weight += _FORGET * (sure - weight)
-        tau = self._usual()
+            self._gaps = True
+        late = self._late()
+        if self._lasting:
+            self._remember(excess, sure, late[:, :told])
+        self._before = self._usual(late)
+        tau = self._before.copy()
         sudden = square > _SUDDEN * (v + before[:, :told])
         if sudden.any():
             usual = tau[:, :told]
@@ -296,9 +326,34 @@ class BlockFit:
         tau[still] = before[still]
         return tau
 
-    def _usual(self) -> FloatArray:
-        """tau^2 (C, K) by the blocks so far."""
-        return np.asarray(np.maximum(self._squares / np.maximum(self._weight, 1e-3) - self._bias, self._least))
+    def _late(self) -> FloatArray:
+        """Mean of c_k^2 less its noise (C, K), of the blocks of late."""
+        if not self._gaps:
+            # All weights are 1.
+            return self._squares
+        return np.asarray(self._squares / np.maximum(self._weight, 1e-3))
+
+    def _remember(self, excess: FloatArray, sure: FloatArray | None, late: FloatArray) -> None:
+        """Take a block into the mean of what goes on alike; where that is over, begin with what is of ``late``."""
+        told = late.shape[1]
+        long, blocks, v = self._long[:, :told], self._blocks[:, :told], self._whole.v[:, :told]
+        blocks += 1.0 if sure is None else sure
+        np.minimum(blocks, _LASTING, out=blocks)
+        step = excess - long
+        step /= blocks
+        if sure is not None:
+            step *= sure
+        long += step
+        # Of the noise and the motion of late: three standard deviations of the short mean; less where both began alike.
+        over = long - late > (_OVER + blocks * ((1.0 - _OVER) / _LASTING)) * (v + np.maximum(late, 0.0))
+        if over.any():
+            long[over] = late[over]
+            blocks[over] = 1.0 / _FORGET
+
+    def _usual(self, late: FloatArray) -> FloatArray:
+        """tau^2 (C, K) by the blocks so far; ``late``: by those of late."""
+        usual = np.maximum(late - self._bias, self._least)
+        return np.asarray(np.maximum(usual, self._long - self._long_bias) if self._lasting else usual)
 
     def _spread(self, weights: FloatArray) -> FloatArray:
         """Covariance (C, C) of the weighted sums; ``weights`` (C, N)."""

@@ -95,7 +95,8 @@ class SomePsds:
         self._model = PlateModel(rig, at, tilts)
         rest = self._model.slopes_at((0.0,) * 5)
         by = ARITHMETICS[rig.estimator.arithmetic]
-        self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, poly, rest, by)
+        lasting = rig.estimator.motion_memory == 'lasting'
+        self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, poly, rest, by, lasting)
         # Of a plate whose tilt is not known, dots may contradict each other.
         self._redundancy = Redundancy(len(at), 2 * len(at) if tilts == 'bounded' else rest.shape[1], by)
 
@@ -181,7 +182,8 @@ class StampedDots:
         if self._measures and config.converter_steps == 'seen':
             self._converter = ConverterSteps.of_rig(rig)
         self._stated_sd = np.sqrt(variances)
-        self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes, by)
+        lasting = config.motion_memory == 'lasting'
+        self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes, by, lasting)
         self._fit.set_noise(self.noise.gamma)
         self._consistency = Consistency(self._by)
         self._suspect = Suspect(rig.centers, self._beams)

@@ -40,7 +40,7 @@ class ParameterSpread:
         root = scale[:, None] * vectors[:, kept] * np.sqrt(size[kept])
         levels = np.linspace(-1.0, 1.0, LEVELS)
         points = np.stack(np.meshgrid(levels, levels, levels), axis=0).reshape(3, -1)
-        slopes = by.product(_dots_by_parameters(values, points * RANGE[:, None], length, by), root)
+        slopes = by.product(dots_by_parameters(values, points * RANGE[:, None], length, by), root)
         basis = np.stack([_terms(*point) for point in points.T.tolist()])
         self._shape = (4, root.shape[1])
         # Smooth as they are, a quartic gives them to 1e-4; a block has no time for differences.
@@ -92,7 +92,7 @@ def _terms(x: float, y: float, t: float) -> list[float]:
     return [second[a] * second[b] for a, b in _PAIRS]
 
 
-def _dots_by_parameters(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = FIXED) -> FloatArray:
+def dots_by_parameters(p: FloatArray, pose: FloatArray, length: float, by: Arithmetic = FIXED) -> FloatArray:
     """S^-1 (df/dp), (n, 4, COUNT), at poses (3, n)."""
     slopes = by_parameters(p, pose, length, by).transpose(2, 0, 1).copy()
     read = readings(p, pose, length, by)

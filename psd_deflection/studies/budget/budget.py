@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.budget.estimate import method_of
-from psd_deflection.studies.budget.evaluate import evaluate, monte_carlo
+from psd_deflection.studies.budget.evaluate import draws, evaluate, monte_carlo
+from psd_deflection.studies.budget.expanded import Interval, interval_of
 from psd_deflection.studies.budget.inputs import read_inputs
 from psd_deflection.studies.budget.load import default_load
 from psd_deflection.studies.budget.result import Budgeted
-from psd_deflection.studies.budget.term import Situation
+from psd_deflection.studies.budget.term import Contribution, Situation
 
 
 @dataclass(frozen=True)
@@ -19,8 +20,8 @@ class BudgetProblem:
     """``rig``; ``inputs``: sizes of the errors by name, those that differ from the defaults.
 
     ``load``: at the tip, Fx N, Fy N, Tz N m; None: a weight on a sidebar that suits the rig. ``method``: whose errors
-    are computed; None: that of the rig. ``draws``: random draws of all causes at once, 0: none; ``seed`` of them.
-    ``rig_file``: the name of the rig's, '' if it has none.
+    are computed; None: that of the rig. ``draws``: random draws of all causes at once, 0: none; as many normal ones as
+    of the declared distributions. ``seed`` of them. ``rig_file``: the name of the rig's, '' if it has none.
     """
 
     rig: Rig
@@ -40,5 +41,9 @@ def budget(problem: BudgetProblem, drawn: Callable[[int], object] = lambda size:
     rig = problem.rig
     load = default_load(rig) if problem.load is None else problem.load
     found = evaluate(Situation.at_load(rig, problem.inputs, load, problem.method or method_of(rig)))
-    sampled = monte_carlo(found.at, problem.draws, problem.seed, drawn=drawn) if problem.draws else None
-    return Budgeted(found, load, sampled, problem.draws, problem.seed, problem.rig_file)
+    sampled: Contribution | None = None
+    interval: Interval | None = None
+    if problem.draws:
+        sampled = monte_carlo(found.at, problem.draws, problem.seed, drawn=drawn)
+        interval = interval_of(draws(found.at, problem.draws, problem.seed, drawn=drawn, shaped=True))
+    return Budgeted(found, load, sampled, interval, problem.draws, problem.seed, problem.rig_file)

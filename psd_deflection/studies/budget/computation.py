@@ -64,7 +64,9 @@ class Computation(Cause):
         """As declared: the chain is unchanged."""
         return chain
 
-    def perturb(self, chain: MeasuringChain, at: Situation, count: int, random: np.random.Generator) -> MeasuringChain:
+    def perturb(
+        self, chain: MeasuringChain, at: Situation, count: int, random: np.random.Generator, *, shaped: bool = False
+    ) -> MeasuringChain:
         """As declared."""
         return chain
 

@@ -16,7 +16,7 @@ from psd_deflection.studies.budget.optics import (
     gradient_shift,
     index_per_kelvin,
 )
-from psd_deflection.studies.budget.term import Kind, Situation, Term, adds_to
+from psd_deflection.studies.budget.term import Distribution, Kind, Situation, Term, adds_to
 
 # ---- E_RF: refraction ----
 
@@ -75,6 +75,7 @@ INTERFERENCE = Term(
     ('interference', 'interference_frequency'),
     _interference,
     adds_to('reading_shift'),
+    distribution=Distribution.ARCSINE,
 )
 
 

@@ -41,19 +41,21 @@ class ExactEstimator(Estimator):
     """Least squares on the exact model: the plate flat (``slope_ratio`` 0), or tilting as a cantilever.
 
     Flat, two or more sensors of equal weight have a closed form: theta from the base lines'
-    cross and dot products, d from the centroids (orthogonal Procrustes). Tied, Gauss-Newton from there.
+    cross and dot products, d from the centroids (orthogonal Procrustes). Tied, or with ``weights`` (2P,) of the
+    readings, Gauss-Newton from there.
     """
 
     centers: FloatArray
     heights: FloatArray
     link_length: float
     slope_ratio: float
+    weights: FloatArray | None = None
 
     def estimate(self, readings: FloatArray, zeros: FloatArray) -> FloatArray:
         """As declared."""
         points, beams = self.centers + readings, self.centers + zeros
         pose = flat_poses(points, beams)
-        if self.slope_ratio == 0.0:
+        if self.slope_ratio == 0.0 and self.weights is None:
             return pose
         tie = tie_matrix(self.slope_ratio, self.link_length)
         # Six steps converge to rounding in the sensors' range: the start lacks only the tilt.
@@ -63,6 +65,8 @@ class ExactEstimator(Estimator):
             jacobian = slopes.reshape(len(pose), -1, 5) @ tie
             residual = (points - model).reshape(len(pose), -1, 1)
             transposed = np.swapaxes(jacobian, -1, -2)
+            if self.weights is not None:
+                transposed = transposed * self.weights
             pose = pose + np.linalg.solve(transposed @ jacobian, transposed @ residual)[..., 0]
         return pose
 
@@ -71,7 +75,8 @@ class ExactEstimator(Estimator):
         full = tied_pose(pose, self.slope_ratio, self.link_length)
         _, slopes = crossings(full, self.centers + zeros, self.heights)
         jacobian = slopes.reshape(-1, 5) @ tie_matrix(self.slope_ratio, self.link_length)
-        by_readings: FloatArray = np.asarray(np.linalg.pinv(jacobian), dtype=np.float64)
+        root = np.ones(len(jacobian)) if self.weights is None else np.sqrt(self.weights)
+        by_readings: FloatArray = np.asarray(np.linalg.pinv(jacobian * root[:, None]) * root, dtype=np.float64)
         # A zero moves its beam, and beam and translation enter as their difference.
         by_zeros = by_readings @ block_diag(*slopes[..., :2])
         return by_readings, np.asarray(by_zeros, dtype=np.float64)

@@ -11,6 +11,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.budget import environment, installation, sensor
 from psd_deflection.studies.budget.chain import measure
 from psd_deflection.studies.budget.computation import COMPUTATION
+from psd_deflection.studies.budget.expanded import Expanded, expanded
 from psd_deflection.studies.budget.term import Cause, Contribution, Kind, Situation
 
 CAUSES: tuple[Cause, ...] = (*sensor.TERMS, *environment.TERMS, *installation.TERMS, COMPUTATION)
@@ -33,6 +34,11 @@ class Budget:
         bias = np.sum([c.bias for c in chosen], axis=0, dtype=np.float64) + np.zeros(3)
         covariance = np.sum([c.covariance for c in chosen], axis=0, dtype=np.float64) + np.zeros((3, 3))
         return Contribution(bias, covariance)
+
+    def expanded(self) -> Expanded:
+        """The expanded uncertainty of an estimate, every cause as it is declared."""
+        variances = np.array([np.diag(line.covariance) for _, line in self.lines])
+        return expanded(variances, [cause.freedom(self.at) for cause, _ in self.lines], self.total().bias)
 
     def shares(self, line: Contribution) -> FloatArray:
         """(3,): mean square of a line over the total's, for dX, dY, theta.
@@ -57,6 +63,23 @@ def monte_carlo(
 ) -> Contribution:
     """Mean error and covariance of ``count`` draws of all ``causes`` at once.
 
+    Errors are normal; otherwise as :func:`draws` has it.
+    """
+    everything = draws(at, count, seed, causes, drawn)
+    return Contribution(everything.mean(axis=0), np.cov(everything.T))
+
+
+def draws(
+    at: Situation,
+    count: int,
+    seed: int,
+    causes: Sequence[Cause] = CAUSES,
+    drawn: Callable[[int], object] = lambda size: None,
+    *,
+    shaped: bool = False,
+) -> FloatArray:
+    """Errors (count, 3) of draws of all ``causes`` at once; ``shaped``: each of its declared distribution.
+
     It uses the exact chain and the exact estimator; nothing is linearised. All other causes are
     absent, including the tilt of the tip. Errors are relative to the answer without ``causes``.
     ``drawn`` is called with the number of draws just done.
@@ -71,9 +94,8 @@ def monte_carlo(
         size = min(_CHUNK, count - start)
         chain, beside = at.chain, np.zeros((size, 3))
         for cause in causes:
-            chain = cause.perturb(chain, at, size, random)
+            chain = cause.perturb(chain, at, size, random, shaped=shaped)
             beside = beside + cause.beside(at, size, random)
         errors.append(at.estimator.estimate(*measure(chain, at.pose)) - nothing + beside)
         drawn(size)
-    everything = np.concatenate(errors)
-    return Contribution(everything.mean(axis=0), np.cov(everything.T))
+    return np.concatenate(errors)

@@ -7,7 +7,7 @@ over sqrt 3). A "typical" value is a standard deviation. The source of a guess b
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -114,28 +114,76 @@ INPUTS: tuple[Input, ...] = (
     _input(
         'zero_blocks', 1.0, 'blocks', 'averaged for the stored zero', "a zero is one estimate's block", 1e6, above=0.0
     ),
+    # How well the deviations themselves are known.
+    _input(
+        'noise_freedom',
+        999.0,
+        '',
+        'degrees of freedom of the measured noise',
+        'assumption: the noise of a second at 1 kHz',
+        1e9,
+        above=0.0,
+    ),
+    _input(
+        'assumption_doubt',
+        0.25,
+        '',
+        'relative standard uncertainty of a deviation that is an assumption; 0: known',
+        'JCGM 100:2008, G.4.2, example: 25 % gives 8 degrees of freedom',
+        10.0,
+    ),
     _input('iteration_tolerance', 0.1e-3, 'm', 'stop rule of thesis_iteration', 'thesis, appendix D', 0.01),
     _input('iteration_step', 1.745329e-4, 'rad', 'angle step of thesis_iteration', 'thesis: 0.01 deg', 0.1),
 )
 
-INPUT_BY_NAME: Mapping[str, Input] = MappingProxyType({i.parameter.name: i for i in INPUTS})
+REFERENCE_INPUTS: tuple[Input, ...] = (
+    _input(
+        'reference_scale',
+        1e-4,
+        '',
+        'relative standard uncertainty of the lengths of the reference',
+        'assumption: a printed target measured with a rule; its certificate has it',
+        0.1,
+    ),
+    _input(
+        'reference_angle_scale',
+        1e-4,
+        '',
+        'relative standard uncertainty of the angles of the reference',
+        'assumption: as its lengths; its certificate has it',
+        0.1,
+    ),
+)
+"""Further ones of a certificate: what no calibration can see of its own reference."""
+
+INPUT_BY_NAME: Mapping[str, Input] = MappingProxyType({i.parameter.name: i for i in (*INPUTS, *REFERENCE_INPUTS)})
+
+
+def is_assumed(name: str, value: float) -> bool:
+    """Whether ``value`` of an input is a guess: the default, whose source is an assumption."""
+    found = INPUT_BY_NAME[name]
+    return found.source.startswith('assumption') and value == found.parameter.default
 
 
 def read_inputs(
-    path: str | Path | None = None, settings: Mapping[str, object] | None = None, source: str = 'settings'
+    path: str | Path | None = None,
+    settings: Mapping[str, object] | None = None,
+    source: str = 'settings',
+    declared: Sequence[Input] = INPUTS,
 ) -> dict[str, float]:
-    """All inputs: ``settings`` override the YAML file (``name: value`` lines), which overrides the defaults.
+    """All inputs that are ``declared``.
 
-    ``source``: where ``settings`` come from, for messages.
+    ``settings`` override the YAML file (``name: value`` lines), which overrides the defaults. ``source``: where
+    ``settings`` come from, for messages.
 
     Raises ConfigError naming the source, the input, the value and the bound.
     """
-    values = {i.parameter.name: float(i.parameter.default) for i in INPUTS}
+    values = {i.parameter.name: float(i.parameter.default) for i in declared}
     for place, given in ((str(path), _read(Path(path)) if path is not None else {}), (source, settings or {})):
         for name, value in given.items():
             found = INPUT_BY_NAME.get(str(name))
-            if found is None:
-                hint = did_you_mean(str(name), INPUT_BY_NAME)
+            if found is None or found.parameter.name not in values:
+                hint = did_you_mean(str(name), values)
                 raise ConfigError(f'{place}: {name} = {value!r}: no such input{hint}')
             values[str(name)] = cast(float, check_value(found.parameter, value, place))
     return values

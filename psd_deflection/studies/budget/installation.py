@@ -9,7 +9,7 @@ import numpy as np
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.budget.chain import MeasuringChain
-from psd_deflection.studies.budget.term import ROOT_3, Kind, Situation, Term, adds_to
+from psd_deflection.studies.budget.term import ROOT_3, Distribution, Kind, Situation, Term, adds_to
 
 
 def _tolerance(name: str, count: int) -> Callable[[Situation], FloatArray]:
@@ -27,6 +27,9 @@ SENSOR_ROTATION = Term(
     ('rotation_tolerance',),
     _tolerance('rotation_tolerance', 2),
     adds_to('rotation'),
+    unit='rad',
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 BEAM_MISALIGNMENT = Term(
@@ -37,6 +40,9 @@ BEAM_MISALIGNMENT = Term(
     ('beam_tolerance',),
     _tolerance('beam_tolerance', 4),
     adds_to('beam_slope'),
+    unit='rad',
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 
@@ -56,6 +62,8 @@ PLANE_TILT = Term(
     (),
     lambda at: np.ones(1),
     _tilt,
+    unit='',
+    calibrated=True,
 )
 
 
@@ -71,6 +79,9 @@ SLOPE_RATIO = Term(
     ('slope_ratio_tolerance',),
     _tolerance('slope_ratio_tolerance', 1),
     _vary_slope_ratio,
+    unit='',
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 SENSOR_TILT = Term(
@@ -81,6 +92,9 @@ SENSOR_TILT = Term(
     ('tilt_tolerance',),
     _tolerance('tilt_tolerance', 4),
     adds_to('tilt'),
+    unit='rad',
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 
@@ -94,6 +108,8 @@ CENTER_POSITION = Term(
     ('center_tolerance',),
     _tolerance('center_tolerance', 4),
     adds_to('center_error'),
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 SENSOR_HEIGHT = Term(
@@ -104,6 +120,8 @@ SENSOR_HEIGHT = Term(
     ('height_tolerance',),
     _tolerance('height_tolerance', 2),
     adds_to('height_error'),
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 
@@ -119,6 +137,7 @@ BRACKET_EXPANSION = Term(
     ('expansion_coefficient', 'bracket_temperature'),
     lambda at: np.array([at['expansion_coefficient'] * at['bracket_temperature']]),
     _expand,
+    unit='',
 )
 
 TERMS = (

@@ -11,20 +11,24 @@ import numpy as np
 
 from psd_deflection.base.pages import picture, table
 from psd_deflection.base.tables import columns
+from psd_deflection.records import FloatArray
 from psd_deflection.studies.budget.evaluate import Budget
-from psd_deflection.studies.budget.term import Contribution, Kind
+from psd_deflection.studies.budget.expanded import PROBABILITY, Interval, difference
+from psd_deflection.studies.budget.term import Cause, Contribution, Kind
 from psd_deflection.studies.study import PageSection, StudyResult
 
 SHOWN = np.array([1e6, 1e6, math.degrees(1e3)])
 """µm, µm and mdeg of m, m and rad."""
 UNITS = ('ΔX µm', 'ΔY µm', 'θ mdeg')
+AXES = ('ΔX', 'ΔY', 'θ')
 
 
 @dataclass(frozen=True, eq=False)
 class Budgeted(StudyResult):
     """``budget``: every cause at ``load`` (Fx N, Fy N, Tz N m). ``sampled``: of ``draws`` random draws with ``seed``.
 
-    ``rig_file``: the name of the rig's, '' if it has none.
+    ``interval``: of as many draws from the declared distributions. ``rig_file``: the name of the rig's, '' if it has
+    none.
     """
 
     study, json_name = 'budget', 'budget.json'
@@ -33,6 +37,7 @@ class Budgeted(StudyResult):
     budget: Budget
     load: tuple[float, float, float]
     sampled: Contribution | None = None
+    interval: Interval | None = None
     draws: int = 0
     seed: int = 0
     rig_file: str = ''
@@ -51,18 +56,24 @@ class Budgeted(StudyResult):
             key=lambda entry: entry[1],
         )
         out.append(f'The largest cause is {name}: up to {share:.0%} of the mean square of an axis.')
+        out.append(f'Expanded uncertainty for 95 %: {in_words(self.budget.expanded().uncertainty)}.')
         if self.sampled is not None:
             out.append(f'{self.draws} random draws of all causes at once give {_words(self.sampled)}.')
+        if self.interval is not None:
+            out.append(self._compared(self.interval))
         return out
 
     def lines(self) -> list[str]:
         """The situation, the table of all causes, the totals."""
-        out = [self._situation(), '', *columns(self._causes(), left=3).splitlines()]
+        out = [self._situation(), '', *columns(self._causes(), left=4).splitlines()]
         out += ['', *columns(self._totals()).splitlines()]
+        out += ['', *columns(self._expanded()).splitlines()]
         if self.sampled is not None:
             dx, dy, theta = _figures(self.sampled)
             out += ['', f'Monte Carlo, {self.draws} draws of everything at once (seed {self.seed}):']
             out.append(f'total     ΔX {dx} µm  ΔY {dy} µm  θ {theta} mdeg')
+        if self.interval is not None:
+            out.append(self._compared(self.interval))
         return out
 
     def sections(self) -> Iterable[PageSection]:
@@ -77,6 +88,8 @@ class Budgeted(StudyResult):
             PageSection('Every cause beside the total', (drawn,)),
             PageSection('Totals', (table(totals_head, totals),)),
             PageSection('Every cause', (table(head, rows),)),
+            PageSection('Expanded uncertainty (GUM)', (table(*_split(self._expanded())), _RULES)),
+            PageSection('Every error parameter', (table(*_split(parameter_rows(self.budget))),)),
         ]
 
     def tree(self) -> dict[str, Any]:
@@ -86,6 +99,13 @@ class Budgeted(StudyResult):
         totals['total'] = _si(budget.total())
         if self.sampled is not None:
             totals['monte_carlo'] = _si(self.sampled)
+        said = self.budget.expanded()
+        stated = {
+            'probability': PROBABILITY,
+            **{name: value.tolist() for name, value in said._asdict().items()},
+        }
+        if self.interval is not None:
+            stated['monte_carlo'] = {'half': self.interval.half.tolist(), 'middle': self.interval.middle.tolist()}
         return {
             'unit': ['m', 'm', 'rad'],
             'load': list(self.load),
@@ -100,10 +120,18 @@ class Budgeted(StudyResult):
                     'inputs': {name: budget.at[name] for name in cause.inputs},
                     **_si(line),
                     'share': budget.shares(line).tolist(),
+                    'type': type_of(cause),
+                    'distribution': cause.distribution.value,
+                    'freedom': cause.freedom(budget.at),
+                    'parameters': [
+                        {'name': s.name, 'u': s.deviation, 'unit': cause.unit, 'sensitivity': s.coefficient.tolist()}
+                        for s in cause.sensitivities(budget.at)
+                    ],
                 }
                 for cause, line in budget.lines
             ],
             'totals': totals,
+            'expanded': stated,
         }
 
     def _situation(self) -> str:
@@ -115,11 +143,36 @@ class Budgeted(StudyResult):
         )
 
     def _causes(self) -> list[list[str]]:
-        rows = [['term', 'Table 3.1', 'kind', *UNITS, 'ΔX %', 'ΔY %', 'θ %']]
+        rows = [['term', 'Table 3.1', 'kind', 'type', 'ν', *UNITS, 'ΔX %', 'ΔY %', 'θ %']]
         for cause, line in self.budget.lines:
             shares = [f'{100.0 * v:.1f}' for v in self.budget.shares(line).tolist()]
-            rows.append([cause.name, cause.row or '-', cause.kind.value, *_figures(line), *shares])
+            freedom = freedom_words(cause.freedom(self.budget.at))
+            head = [cause.name, cause.row or '-', cause.kind.value, type_of(cause), freedom]
+            rows.append([*head, *_figures(line), *shares])
         return rows
+
+    def _expanded(self) -> list[list[str]]:
+        """u_c, nu_eff, k, U, and what the draws say."""
+        said = self.budget.expanded()
+        rows = [['', *UNITS], ['standard uncertainty u_c', *shown(said.standard)]]
+        rows.append(['effective degrees of freedom ν_eff', *map(freedom_words, said.freedom.tolist())])
+        rows.append(['coverage factor k, 95 %', *(f'{k:.3f}' for k in said.factor.tolist())])
+        rows.append(['known bias b, not corrected', *shown(said.bias)])
+        rows.append(['expanded uncertainty U = k u_c + |b|', *shown(said.uncertainty)])
+        if self.interval is not None:
+            rows.append(['Monte Carlo: half of the 95 % interval', *shown(self.interval.half)])
+            off = difference(said, self.interval).tolist()
+            rows.append(['k u_c beside it, %', *(f'{100.0 * v:+.1f}' for v in off)])
+        return rows
+
+    def _compared(self, interval: Interval) -> str:
+        """The GUM's interval beside that of the draws."""
+        off = difference(self.budget.expanded(), interval).tolist()
+        each = ', '.join(f'{name} {100.0 * v:+.1f} %' for name, v in zip(AXES, off, strict=True))
+        return (
+            f'{self.draws} draws of the declared distributions (GUM Supplement 1) have 95 % of the errors within '
+            f'{in_words(interval.half)}; k u_c differs by {each}.'
+        )
 
     def _totals(self) -> list[list[str]]:
         rows = [['', *UNITS]]
@@ -127,13 +180,58 @@ class Budgeted(StudyResult):
         return [*rows, ['total', *_figures(self.budget.total())]]
 
 
+_RULES = (
+    '<p class=quiet>JCGM 100:2008: u_c is the root of the sum of the squares of the causes; ν_eff by '
+    'Welch-Satterthwaite (G.2b), each cause as one, down to a whole number; k is the quantile of Student’s t for 95 %; '
+    'a bias that is not corrected is added (F.2.4.5). Type A: from a series of observations; B: from anything else. '
+    'An assumption has ν = 1/(2 r²), r its assumption_doubt (G.3).</p>'
+)
+
+
+def type_of(cause: Cause) -> str:
+    """A or B."""
+    return 'A' if cause.observed else 'B'
+
+
+def freedom_words(freedom: float) -> str:
+    """A number, or ∞."""
+    return '∞' if math.isinf(freedom) else f'{freedom:.0f}'
+
+
+def parameter_rows(budget: Budget) -> list[list[str]]:
+    """Of every error parameter what a sum by hand needs, the head first; contributions in µm, µm, mdeg."""
+    rows = [['cause', 'parameter', 'type', 'distribution', 'u', 'unit', 'ν', *(f'c {a}' for a in AXES), *UNITS]]
+    for cause, _ in budget.lines:
+        freedom = freedom_words(cause.freedom(budget.at))
+        for s in cause.sensitivities(budget.at):
+            head = [cause.name, s.name, type_of(cause), cause.distribution.value, f'{s.deviation:.6g}', cause.unit]
+            slopes = [f'{c:.6g}' for c in s.coefficient.tolist()]
+            rows.append([*head, freedom, *slopes, *shown(np.abs(s.coefficient) * s.deviation)])
+    return rows
+
+
+def _split(rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
+    head, *others = rows
+    return head, others
+
+
+def shown(values: FloatArray) -> list[str]:
+    """(3,) m, m, rad in µm, µm and mdeg."""
+    return [f'{v:.3f}' for v in (values * SHOWN).tolist()]
+
+
+def in_words(values: FloatArray) -> str:
+    """(3,) m, m, rad for a sentence."""
+    dx, dy, theta = (f'{v:.3g}' for v in (values * SHOWN).tolist())
+    return f'ΔX {dx} µm, ΔY {dy} µm, θ {theta} mdeg'
+
+
 def _figures(line: Contribution) -> list[str]:
-    return [f'{v:.3f}' for v in (line.rms * SHOWN).tolist()]
+    return shown(line.rms)
 
 
 def _words(line: Contribution) -> str:
-    dx, dy, theta = (f'{v:.3g}' for v in (line.rms * SHOWN).tolist())
-    return f'ΔX {dx} µm, ΔY {dy} µm, θ {theta} mdeg'
+    return in_words(line.rms)
 
 
 def _si(line: Contribution) -> dict[str, Any]:

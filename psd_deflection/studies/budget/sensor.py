@@ -10,7 +10,7 @@ import numpy as np
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.budget.chain import MeasuringChain
 from psd_deflection.studies.budget.optics import beam_diameter
-from psd_deflection.studies.budget.term import ROOT_3, Kind, Situation, Term, adds_to
+from psd_deflection.studies.budget.term import ROOT_3, Distribution, Kind, Situation, Term, adds_to
 
 
 def spot_diameter(at: Situation) -> float:
@@ -54,6 +54,7 @@ SPOT_CLIPPING = Term(
     ('laser_diameter', 'laser_wavelength'),
     lambda at: np.ones(1),
     _clip,
+    calibrated=True,
 )
 
 
@@ -72,6 +73,9 @@ DARK_CURRENT = Term(
     ('dark_current', 'responsivity', 'laser_power'),
     _dark_current,
     adds_to('background'),
+    unit='',
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 
@@ -92,6 +96,9 @@ RESISTIVITY = Term(
     ('nonlinearity',),
     _resistivity,
     adds_to('nonlinearity'),
+    unit='1/m^2',
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 
@@ -110,6 +117,7 @@ THERMAL_DRIFT = Term(
     ('drift_coefficient', 'temperature_change'),
     _thermal_drift,
     adds_to('reading_shift'),
+    distribution=Distribution.UNIFORM,
 )
 
 
@@ -129,6 +137,7 @@ AMPLIFIER_NOISE = Term(
     (),
     _amplifier_noise,
     adds_to('reading_shift'),
+    observed=True,
 )
 
 
@@ -166,6 +175,7 @@ ZEROING = Term(
     ('zero_blocks',),
     _zeroing,
     adds_to('zero_shift'),
+    observed=True,
 )
 
 
@@ -181,6 +191,9 @@ SENSOR_GAIN = Term(
     ('gain_tolerance',),
     _sensor_gain,
     adds_to('gain'),
+    unit='',
+    distribution=Distribution.UNIFORM,
+    calibrated=True,
 )
 
 TERMS = (

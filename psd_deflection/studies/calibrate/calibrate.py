@@ -125,6 +125,17 @@ class Calibration:
         """Standard deviations (SIZE,)."""
         return np.sqrt(np.diag(self.covariance))
 
+    @property
+    def used(self) -> FloatArray:
+        """Parameters (SIZE,) as the pipeline took them before."""
+        return before_of(self.vector, self.prior)
+
+    @property
+    def seen(self) -> FloatArray | None:
+        """Least and largest pose (2, 3), m, m, rad, of the reference where it counted; None without a reference."""
+        poses = self.rows.pose[self.fit.weights > 0.0]
+        return np.stack([poses.min(axis=0), poses.max(axis=0)]) if self.kind == 'reference' and len(poses) else None
+
 
 def calibrate(
     runs: Sequence[CalibrationRun],

@@ -75,7 +75,13 @@ def read_run(
         recording.digest,
         references.sd,
         exposure,
+        '' if recording.hello is None else str(recording.hello.get('serial', '')),
+        _ends([r.celsius for r in recording.temperatures()]),
     )
+
+
+def _ends(values: Sequence[float]) -> tuple[float, float] | None:
+    return (min(values), max(values)) if values else None
 
 
 def read_runs(

@@ -55,6 +55,8 @@ class CalibrationRun:
     digest: str = ''
     reference_sd: FloatArray | None = None
     exposure: float = 0.0
+    device: str = ''
+    temperature: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

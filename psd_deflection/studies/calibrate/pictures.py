@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from psd_deflection.base.pages import picture, table
 from psd_deflection.model.misalignment.model import ALL, COUNT, ZERO
-from psd_deflection.studies.calibrate.calibrate import Calibration, before_of
+from psd_deflection.studies.calibrate.calibrate import Calibration
 from psd_deflection.studies.calibrate.fit import CLOCK, NAMES, REPORTED, UNITS, linearised
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
 from psd_deflection.studies.study import PageSection
@@ -140,7 +140,7 @@ def _dark(found: Calibration) -> str:
 
 
 def _residuals(found: Calibration) -> Figure:
-    before: Any = linearised(found.rows, before_of(found.vector, found.prior), found.rig, found.kind).residual
+    before: Any = linearised(found.rows, found.used, found.rig, found.kind).residual
     after = found.fit.linear.residual
     figure = Figure(figsize=(10, 6.4), layout='constrained')
     axes = figure.subplots(4, 1, sharex=True)

@@ -85,9 +85,11 @@ def result(found: Calibration, date: str) -> dict[str, Any]:
 
     def one(i: int) -> dict[str, Any]:
         file = float(found.prior.mean[i])
-        return {'value': float(found.values[i]), 'sd': float(sd[i]), 'unit': UNITS[i], 'file': file}
+        value, used = float(found.values[i]), float(found.used[i])
+        return {'value': value, 'sd': float(sd[i]), 'unit': UNITS[i], 'file': file, 'used': used}
 
     at = list(REPORTED)
+    seen = found.seen
     reference = found.fit.noise.reference
     return {
         'parameters': {NAMES[i]: one(i) for i in at},
@@ -105,6 +107,7 @@ def result(found: Calibration, date: str) -> dict[str, Any]:
         }
         if found.kind == 'reference'
         else None,
+        'range': None if seen is None else {'low': seen[0].tolist(), 'high': seen[1].tolist()},
         'dark': result_of_levels(found.dark) or None,
         'refused': found.refused or None,
         'widened': found.widened,
@@ -112,7 +115,10 @@ def result(found: Calibration, date: str) -> dict[str, Any]:
         'provenance': {
             'version': __version__,
             'date': date,
-            'recordings': [{'name': run.name, 'sha256': run.digest} for run in found.runs],
+            'recordings': [
+                {'name': run.name, 'sha256': run.digest, 'device': run.device, 'temperature': run.temperature}
+                for run in found.runs
+            ],
         },
     }
 
@@ -145,6 +151,7 @@ def values_of(found: Calibration, date: str) -> tuple[dict[str, object], list[Ac
             float(f'{np.clip(correlation[i, j], -1.0, 1.0):.12f}') for i in range(1, len(at)) for j in range(i)
         ],
         'calibration.source': source_of(found, date),
+        **({} if found.seen is None else {'calibration.range': [float(f'{v:.6g}') for v in found.seen.ravel()]}),
     }, effects
 
 

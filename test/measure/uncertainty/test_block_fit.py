@@ -349,3 +349,110 @@ def test_a_block_misfits_from_five_standard_deviations_of_its_squares_on(share: 
     assert got.misfit == misfit
     own = float(combinations(PLACES)[0] @ got.covariance @ combinations(PLACES)[0])
     assert own == pytest.approx(SIGMA**2 / 20.0 + (float(left @ left) / 15.0 if misfit else 0.0), rel=1e-2)
+
+
+# ---- motion that goes on alike
+
+
+def shaken(fit: BlockFit, hz: float, amplitude: float, blocks: int, seed: int = 5) -> tuple[FloatArray, FloatArray]:
+    """Error over standard deviation (n,) of x1, and that (n,), of both plates' x that sway along with white noise."""
+    rng = np.random.default_rng(seed)
+    turn = 2.0 * np.pi * hz / 1000.0
+    errors, sds = [], []
+    for block in range(blocks):
+        sway = amplitude * np.sin(turn * (block * SIZE + ALL) + 0.7)
+        dots = np.outer(sway, [1.0, 0.0, 1.0, 0.0]) + rng.normal(0.0, SIGMA, (SIZE, 4))
+        fitted = fit.fit(ALL, dots)
+        sds.append(float(fitted.covariance[0, 0] ** 0.5))
+        errors.append(fitted.dots[0] - amplitude * np.sin(turn * (block * SIZE + 9.5) + 0.7))
+    return np.array(errors) / np.array(sds), np.array(sds)
+
+
+def remembering(lasting: bool = True) -> BlockFit:
+    out = BlockFit(SIZE, PLACES, PLACES, lasting=lasting)
+    out.set_noise(white())
+    return out
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize(('hz', 'amplitude'), [(5.0, 15e-6), (20.0, 15e-6), (30.0, 10e-6)])
+def test_a_steady_motion_that_bends_a_block_by_as_much_as_its_noise_is_in_the_variance(
+    hz: float, amplitude: float
+) -> None:
+    z, _ = shaken(remembering(), hz, amplitude, 4000)
+    lately, _ = shaken(remembering(False), hz, amplitude, 4000)
+    settled, before = np.abs(z[500:]), np.abs(lately[500:])
+    assert 0.94 < np.mean(settled < 1.959964) < 0.97
+    # What the last blocks alone say is too little, and was what was stated.
+    assert np.mean(before < 1.959964) < np.mean(settled < 1.959964) - 0.005
+
+
+@pytest.mark.statistics
+def test_at_rest_the_longer_memory_adds_less_than_a_percent_of_noise() -> None:
+    z, sds = shaken(remembering(), 5.0, 0.0, 4000)
+    recent, recent_sds = shaken(remembering(False), 5.0, 0.0, 4000)
+    assert np.std(z * sds) < 1.01 * np.std(recent * recent_sds)
+    assert np.mean(np.abs(z) < 1.959964) == pytest.approx(0.955, abs=0.012)
+
+
+def test_motion_that_is_over_is_stated_hardly_longer_than_the_short_memory_does() -> None:
+    """A motion of 0.1 mm is some 10^4 times its noise: the short memory, too, forgets it after ten times its length."""
+    stated = []
+    for lasting in (True, False):
+        fit = remembering(lasting)
+        shaken(fit, 10.0, 1e-4, 300)
+        stated.append(shaken(fit, 10.0, 0.0, 250)[1])
+    ratio = stated[0] / stated[1]
+    assert stated[0][0] > 1.15 * stated[0][-1]
+    assert ratio.max() < 1.15
+    # A second and a half after that it is over for both, but for four per cent.
+    assert np.median(ratio[200:]) < 1.07
+
+
+def test_a_mean_of_blocks_that_lasts_is_that_mean() -> None:
+    """Of the same coefficient in each block: 12 blocks of nothing, then n of c^2 - v, over 12 + n."""
+    fit = remembering()
+    bend = 1e-6 * basis(SIZE)[:, 2]
+    blocks = 40
+    for _ in range(blocks):
+        fit.fit(ALL, np.outer(bend, [1.0, 0.0, 1.0, 0.0]))
+    squares, _, long, counted = np.array(fit.state()).reshape(4, 4, 5)
+    # sqrt 2 of the readings' bend in the first combination; v is the noise of a sample.
+    excess = 2.0 * 1e-12 - SIGMA**2
+    assert long[0, 2] == pytest.approx(excess * blocks / (12.0 + blocks))
+    assert counted[0, 2] == 12.0 + blocks
+    assert squares[0, 2] == pytest.approx(excess * (1.0 - (11.0 / 12.0) ** blocks))
+    for _ in range(300):
+        fit.fit(ALL, np.outer(bend, [1.0, 0.0, 1.0, 0.0]))
+    assert np.array(fit.state()).reshape(4, 4, 5)[3].max() == 250.0
+
+
+def test_what_lasted_begins_with_what_is_of_late_where_it_is_over() -> None:
+    fit = remembering()
+    bend = 1e-5 * basis(SIZE)[:, 2]
+    for _ in range(200):
+        fit.fit(ALL, np.outer(bend, [1.0, 0.0, 1.0, 0.0]))
+    counts = []
+    for _ in range(60):
+        fit.fit(ALL, np.zeros((SIZE, 4)))
+        squares, _, long, counted = np.array(fit.state()).reshape(4, 4, 5)
+        # Never above that of late by more than the noise and the motion of late.
+        assert long[0, 2] - squares[0, 2] <= SIGMA**2 + max(float(squares[0, 2]), 0.0) + 1e-18
+        counts.append(float(counted[0, 2]))
+    assert 12.0 in counts
+
+
+def test_a_fit_with_the_longer_memory_goes_on_from_its_state_to_the_bit() -> None:
+    rng = np.random.default_rng(8)
+    first, second = remembering(), remembering()
+    for _ in range(30):
+        first.fit(ALL, rng.normal(0.0, 3e-6, (SIZE, 4)))
+    second.set_state(first.state())
+    for slots in (ALL, GAPS[1], ALL):
+        dots = rng.normal(0.0, SIGMA, (len(slots), 4))
+        one, two = first.fit(slots, dots), second.fit(slots, dots)
+        assert one.dots == two.dots
+        assert (one.covariance == two.covariance).all()
+    assert first.state() == second.state()
+    with pytest.raises(ValueError, match='80 values, not 40'):
+        second.set_state(remembering(False).state())

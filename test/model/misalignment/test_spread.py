@@ -80,14 +80,14 @@ def test_a_rig_that_was_not_calibrated_has_no_spread() -> None:
 
 
 def test_the_polynomial_is_what_it_stands_for() -> None:
-    from psd_deflection.model.misalignment.spread import _dots_by_parameters
+    from psd_deflection.model.misalignment.spread import dots_by_parameters
 
     rig = calibrated()
     spread = ParameterSpread.from_rig(rig)
     assert spread is not None
     rng = np.random.default_rng(2)
     for dx, dy, theta in rng.uniform(-1.0, 1.0, (20, 3)) * (4e-3, 4e-3, 0.04):
-        slopes = _dots_by_parameters(vector_of_rig(rig).as_used, np.array([[dx], [dy], [theta]]), 0.585)[0]
+        slopes = dots_by_parameters(vector_of_rig(rig).as_used, np.array([[dx], [dy], [theta]]), 0.585)[0]
         wanted = slopes @ known_of_rig(rig).covariance @ slopes.T
         factor = spread.factor(dx, dy, theta)
         assert factor @ factor.T == pytest.approx(wanted, rel=2e-3, abs=1e-3 * float(np.diag(wanted).max()))

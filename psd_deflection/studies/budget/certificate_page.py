@@ -1,0 +1,249 @@
+"""A certificate of calibration as a page, and its numbers as tables that a spreadsheet opens.
+
+The page's tables have every input, so that each U can be computed again from them alone: with g = u c of each input,
+
+    u_c^2 = sum over the causes; of the calibration sum_pq g_p r_pq g_q, of another cause sum_p g_p^2
+    nu_eff, k and U: see :mod:`psd_deflection.studies.budget.expanded`
+"""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from psd_deflection import __version__
+from psd_deflection.base.pages import table
+from psd_deflection.base.tables import columns
+from psd_deflection.studies.budget.certificate import Certificate, CertificateProblem, Verdict, verdict_of
+from psd_deflection.studies.budget.expanded import PROBABILITY
+from psd_deflection.studies.budget.result import AXES, UNITS, freedom_words, in_words, shown
+from psd_deflection.studies.study import PageSection, StudyResult
+
+OBJECT = {
+    'number': 'certificate number',
+    'laboratory': 'laboratory',
+    'customer': 'customer',
+    'link': 'link, serial number',
+    'psd_1': 'PSD 1, type and serial number',
+    'psd_2': 'PSD 2, type and serial number',
+    'laser_1': 'laser 1, serial number',
+    'laser_2': 'laser 2, serial number',
+    'device': 'amplifier and converter, serial number',
+    'place': 'place of the calibration',
+    'temperature': 'air temperature, °C',
+    'pressure': 'air pressure, hPa',
+    'humidity': 'relative humidity, %',
+}
+"""Fields of the object and its surroundings, in the order of the page."""
+TRACEABLE = {
+    'reference': 'reference, type and serial number',
+    'reference_certificate': 'its certificate, number',
+    'reference_laboratory': 'issued by',
+    'reference_date': 'on',
+    'reference_uncertainty': 'its expanded uncertainty as stated there',
+}
+SIGNED = {'performed_by': 'performed by', 'approved_by': 'approved by', 'signed': 'date, signature'}
+FIELDS: Mapping[str, str] = {**OBJECT, **TRACEABLE, **SIGNED}
+_OPEN = '. . . . . . . . . . . . . . . .'
+"""What nobody filled in is for a pen."""
+
+
+@dataclass(frozen=True, eq=False)
+class Certified(StudyResult):
+    """``found``: the numbers of ``problem``."""
+
+    study, json_name = 'certificate', 'certificate.json'
+    title = 'Certificate of calibration'
+
+    found: Certificate
+    problem: CertificateProblem
+
+    @property
+    def sources(self) -> dict[str, str]:
+        """Version, the calibration and its recordings."""
+        given = self.problem.calibration['provenance']
+        runs = {f'recording {n}': f'{r["name"]} (sha256 {r["sha256"]})' for n, r in enumerate(given['recordings'], 1)}
+        rig = {'calibrated rig file': self.problem.rig_file}
+        return {'version': __version__, **rig, 'calibrated on': str(given['date']), **runs}
+
+    @property
+    def fields(self) -> dict[str, str]:
+        """The fields as given; device and temperature of the recordings if nobody gave them."""
+        runs = self.problem.calibration['provenance']['recordings']
+        devices = dict.fromkeys(str(r['device']) for r in runs if r.get('device'))
+        warm = [v for r in runs for v in r.get('temperature') or ()]
+        seen = {'device': ', '.join(devices), 'temperature': f'{min(warm):.1f} to {max(warm):.1f}' if warm else ''}
+        return {name: self.problem.fields.get(name) or seen.get(name, '') for name in FIELDS}
+
+    @property
+    def verdicts(self) -> list[Verdict]:
+        """Of each pose; empty without limits."""
+        if self.problem.limits is None:
+            return []
+        limits = np.array(self.problem.limits)
+        pairs = zip(self.found.found, self.found.stated, strict=True)
+        return [verdict_of(error, said.uncertainty, limits) for error, said in pairs]
+
+    def sentences(self) -> list[str]:
+        """The largest U, the largest error as found, the verdict."""
+        largest = np.max([said.uncertainty for said in self.found.stated], axis=0)
+        out = [f'Expanded uncertainty for 95 %, the largest of {len(self.found.poses)} poses: {in_words(largest)}.']
+        out.append(f'As found the pose was wrong by up to {in_words(np.abs(self.found.found).max(axis=0))}.')
+        if verdicts := self.verdicts:
+            found, left = ({getattr(v, part) for v in verdicts} for part in ('found', 'left'))
+            out.append(f'As found: {_all_of(found)}; as left: {_all_of(left)}.')
+        return out
+
+    def lines(self) -> list[str]:
+        """The sentences and the table of poses."""
+        return [*self.sentences(), '', *columns(self._results(), left=4).splitlines()]
+
+    def tree(self) -> dict[str, Any]:
+        """SI; (ΔX, ΔY, θ) in this order."""
+        verdicts: Sequence[Verdict | None] = self.verdicts or [None] * len(self.found.poses)
+        rows = zip(self.found.poses, self.found.found, self.found.stated, verdicts, strict=True)
+        return {
+            'unit': ['m', 'm', 'rad'],
+            'probability': PROBABILITY,
+            'fields': self.fields,
+            'poses': [
+                {
+                    'pose': pose.tolist(),
+                    'as_found': error.tolist(),
+                    **{name: value.tolist() for name, value in said._asdict().items()},
+                    'conformity': None if verdict is None else verdict._asdict(),
+                }
+                for pose, error, said, verdict in rows
+            ],
+            'limits': None if self.problem.limits is None else list(self.problem.limits),
+            'range': self.problem.calibration['range'],
+            'inputs': [{**row._asdict(), 'coefficients': row.coefficients.tolist()} for row in self.found.inputs],
+            'correlations': self.found.correlations.tolist(),
+            'provenance': {'version': __version__, 'calibration': self.problem.calibration['provenance']},
+        }
+
+    def files(self) -> dict[str, str]:
+        """The page, the JSON, and the tables with all their digits."""
+        return {
+            'certificate.html': self.report(),
+            self.json_name: self.json(),
+            'inputs.csv': _csv(self._inputs(repr)),
+            'correlations.csv': _csv(self._correlations(repr)),
+            'results.csv': _csv(self._numbers()),
+        }
+
+    def sections(self) -> Iterable[PageSection]:
+        """Object, reference, results, inputs, rules, signatures."""
+        return [
+            PageSection('Object and surroundings', (self._filled(OBJECT),)),
+            PageSection('Reference', (self._filled(TRACEABLE),)),
+            PageSection('Results', (_table(self._results()), self._range())),
+            PageSection('Decision rule', (f'<p>{html.escape(self._rule())}</p>',)),
+            PageSection('How U was computed', (_HOW, _table(self._inputs(_six)))),
+            PageSection('Correlations of the calibration', (_table(self._correlations(_six)),)),
+            PageSection('Signatures', (self._filled(SIGNED),)),
+        ]
+
+    def _filled(self, names: Mapping[str, str]) -> str:
+        given = self.fields
+        return table(('', ''), [(words, given[name] or _OPEN) for name, words in names.items()])
+
+    def _results(self) -> list[list[str]]:
+        """The head first."""
+        judged = self.verdicts
+        head = ['pose', *UNITS, *(f'as found {u}' for u in UNITS), *(f'u_c {u}' for u in UNITS)]
+        head += [f'ν_eff {a}' for a in AXES] + [f'k {a}' for a in AXES] + [f'U {u}' for u in UNITS]
+        rows = [head + (['as found', 'as left'] if judged else [])]
+        for n, (pose, error, said) in enumerate(
+            zip(self.found.poses, self.found.found, self.found.stated, strict=True)
+        ):
+            row = [str(n + 1), *shown(pose), *shown(error), *shown(said.standard)]
+            row += map(freedom_words, said.freedom.tolist())
+            row += [f'{k:.3f}' for k in said.factor.tolist()] + shown(said.uncertainty)
+            rows.append(row + (list(judged[n]) if judged else []))
+        return rows
+
+    def _numbers(self) -> list[list[str]]:
+        """As ``_results``, in SI units with all digits."""
+        names = ('dx', 'dy', 'theta')
+        kinds = ('', 'as_found_', 'u_c_', 'nu_eff_', 'k_', 'U_')
+        rows = [['pose', *(f'{kind}{name}' for kind in kinds for name in names)]]
+        for n, (pose, error, said) in enumerate(
+            zip(self.found.poses, self.found.found, self.found.stated, strict=True), start=1
+        ):
+            values = (pose, error, said.standard, said.freedom, said.factor, said.uncertainty)
+            rows.append([str(n), *(repr(v) for part in values for v in part.tolist())])
+        return rows
+
+    def _inputs(self, words: Any) -> list[list[str]]:
+        head = ['cause', 'parameter', 'type', 'distribution', 'u', 'unit', 'nu']
+        head += [f'c_{a}_{n + 1}' for n in range(len(self.found.poses)) for a in ('dx', 'dy', 'theta')]
+        rows = [head]
+        for row in self.found.inputs:
+            kind = 'A' if row.observed else 'B'
+            own = [row.cause, row.parameter, kind, row.distribution, words(row.u), row.unit, words(row.freedom)]
+            rows.append(own + [words(c) for c in row.coefficients.ravel().tolist()])
+        return rows
+
+    def _correlations(self, words: Any) -> list[list[str]]:
+        names = [row.parameter for row in self.found.inputs[: len(self.found.correlations)]]
+        rows = [['', *names]]
+        rows += [[name, *map(words, own)] for name, own in zip(names, self.found.correlations.tolist(), strict=True)]
+        return rows
+
+    def _range(self) -> str:
+        seen, rig = self.problem.calibration['range'], self.problem.rig
+        low, high = (shown(np.array(seen[key])) for key in ('low', 'high'))
+        ends = (f'{unit} {a} to {b}' for unit, a, b in zip(UNITS, low, high, strict=True))
+        rate, size = rig.converter.sample_rate_hz, rig.estimator.block_size
+        words = (
+            f'Valid for poses of {", ".join(ends)}, single estimates of {size} samples at {rate:g} Hz by the solver '
+            f'{rig.estimator.solver}, after a zero at rest, and for motion slower than {0.9 * rate / size:g} Hz. '
+            f'Outside that range, and while the link vibrates faster, the estimates say so in their findings. As left, '
+            f'the error is corrected by the calibrated rig file; what may be left of it is U.'
+        )
+        return f'<p>{html.escape(words)}</p>'
+
+    def _rule(self) -> str:
+        if self.problem.limits is None:
+            return 'No limits were given: nothing is judged.'
+        return (
+            f'Largest errors allowed: {in_words(np.array(self.problem.limits))}. A pose conforms if |error| + U is '
+            f'within the limit on every axis, and does not if |error| − U is beyond it on any (JCGM 106:2012, 8.3.2, '
+            f'guard band U); otherwise it is not decided.'
+        )
+
+
+_HOW = (
+    '<p>u: standard uncertainty of an input, nu: its degrees of freedom, c: how ΔX, ΔY (m) and θ (rad) of each pose go '
+    'with it. With g = u c the variance of a cause is the sum of g² over its parameters; that of the calibration, '
+    'whose parameters are correlated, is the sum of g_p r_pq g_q (JCGM 100:2008, 5.2.2). u_c² is the sum of all; '
+    'ν_eff = u_c⁴ / Σ u_i⁴/ν_i over the causes (G.2b), down to a whole number; k is the quantile of Student’s t for '
+    '95 %; U = k u_c. The same tables with all digits: inputs.csv, correlations.csv, results.csv.</p>'
+)
+
+
+def _six(value: float) -> str:
+    return '∞' if math.isinf(value) else f'{value:.6g}'
+
+
+def _table(rows: list[list[str]]) -> str:
+    head, *others = rows
+    return table(head, others)
+
+
+def _all_of(words: set[str]) -> str:
+    return f'every pose {next(iter(words))}' if len(words) == 1 else ', '.join(sorted(words))
+
+
+def _csv(rows: list[list[str]]) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator='\n').writerows(rows)
+    return out.getvalue()
