@@ -227,7 +227,7 @@ def all_free(found: PlateauLoads, loads: FloatArray) -> bool:
     """
     if len(found.plateaus) < FEWEST or not _closes(found):
         return False
-    return np.count_nonzero(_apart(found, (), SOFTER) > 1.0) >= 2 or _rounded(found, loads)
+    return int(np.count_nonzero(_apart(found, (), SOFTER) > 1.0)) >= 2 or _rounded(found, loads)
 
 
 def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
@@ -243,7 +243,7 @@ def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
     steps = np.array([_step(noted[:, :2]), _step(noted[:, :2]), _step(noted[:, 2:])])
     if np.any(np.abs(off) > (0.5 + SHARE) * steps):
         return False
-    return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > LEAST_STEP * steps[0]
+    return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > LEAST_STEP * float(steps[0])
 
 
 def _step(noted: FloatArray) -> float:
