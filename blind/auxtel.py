@@ -64,6 +64,12 @@ class AuxTel(Plant):
         """Azimuth and elevation, rad."""
         return {'azimuth': [self.azimuth], 'elevation': [self.elevation]}
 
+    def variables(self) -> Mapping[str, Sequence[FloatArray]]:
+        """Elevation, which the tube hangs by, and the place on the sky, as a direction: azimuth has no ends."""
+        a, e = self.azimuth, self.elevation
+        place = np.column_stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+        return {'elevation': [e], 'place on the sky': [place]}
+
     def parts(self) -> Sequence[IntArray]:
         """Each star is left out by itself."""
         return [np.arange(len(self.azimuth))]

@@ -40,6 +40,7 @@ def lines(found: PlantDiscovery) -> list[str]:
     out += [f'  beside it {a.label}: {dict(a.values)} ± {dict(sd)}' for a, sd in found.nuisance]
     for name, (before, after) in found.per_channel.items():
         out.append(f'  {name}: {before:.4g} -> {after:.4g}, on unseen cases {found.heldout_per_channel[name]:.4g}')
+    out += [f'  unknown: {u.signature}' for u in found.unknown]
     return [*out, f'  {found.simulations} simulations']
 
 

@@ -61,6 +61,11 @@ def test_the_telescope_has_five_effects_and_their_sizes_are_those_of_tpoint() ->
     assert {'NPAE', 'CA'} <= {between.active.effect.name, *between.equivalent}
     # On unseen stars: 24.3 arcsec on the sky with four effects at most.
     assert math.sqrt(2.0) * found.gap_heldout_after < 15.0
+    # With one smooth function beside them, found without the star; it has no name.
+    assert found.remainder is not None
+    assert set(found.remainder.depends_on) == {'elevation', 'place on the sky'}
+    assert math.sqrt(2.0) * found.remainder.heldout < 9.0
+    assert found.verdict == 'unknown_effect'
 
 
 @pytest.mark.parametrize('name', ['AN', 'AW'])

@@ -119,7 +119,7 @@ class Conclusion(StudyResult):
             'ties': self._ties(),
             'covariance': _covariance(self.fit, self.effects),
             'limits': [asdict(x) for x in self.search.limits],
-            'remainder': None if self.remainder is None else asdict(self.remainder),
+            'remainder': None if self.remainder is None else self.remainder.tree(),
             'setup': [],
             'moves': None,
             'remaining': {'rms': self.gap_after, 'floors': self.floors},

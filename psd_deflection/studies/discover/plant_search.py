@@ -30,7 +30,8 @@ from psd_deflection.studies.discover.search.localise import Cell, Localisation, 
 from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.signatures import candidates, signatures_beside
-from psd_deflection.studies.discover.search.weighing import sd_of
+from psd_deflection.studies.discover.search.smooth import Smooth, smooth_of
+from psd_deflection.studies.discover.search.weighing import UNSAID, sd_of
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where
 from psd_deflection.studies.study import PageSection
 
@@ -45,6 +46,8 @@ class PlantComparison(Comparison):
     open_level = True
     budget = BUDGET
     most_effects = math.inf
+    # Its values are few, and one machine is asked once.
+    p_accept = 0.01
 
     def __init__(self, plant: Plant) -> None:
         self.plant = plant
@@ -374,6 +377,12 @@ class SimulatedPlant(Machine):
     def regressors(self, comparison: Comparison, fit: Fit) -> Table:
         """Time, the plant's inputs, and the channel's own reading and rate."""
         return regressors(_of_plant(comparison), fit)
+
+    def smooth(self, comparison: Comparison, fit: Fit) -> Smooth | None:
+        """Of the plant's variables, if more than its noise remains."""
+        if comparison.gap(fit.difference) <= UNSAID * comparison.floor():
+            return None
+        return smooth_of(comparison, fit, self.plant.variables())
 
 
 def _of_plant(comparison: Comparison) -> PlantComparison:

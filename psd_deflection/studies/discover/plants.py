@@ -74,6 +74,12 @@ class Plant(ABC):
         """What was done to the machine, by name: of each case (n,). What remains is held against it."""
         return {}
 
+    def variables(self) -> Mapping[str, Sequence[FloatArray]]:
+        """Of what an unnamed smooth function may be told, by name: of each case (n,), or (n, k) if a variable has
+        several coordinates, as a direction has. By default each of the inputs.
+        """
+        return self.inputs()
+
     def simulate_effects(self, effects: Sequence[ActiveEffect]) -> Sequence[FloatArray]:
         """What the search calls: :meth:`simulate`, unless a plant may have one effect several times."""
         return self.simulate({a.effect.name: dict(a.values) for a in effects})

@@ -22,6 +22,7 @@ from psd_deflection.studies.discover.search.localise import NOWHERE, Localisatio
 from psd_deflection.studies.discover.search.remainder import Remainder, Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
+from psd_deflection.studies.discover.search.smooth import Smooth
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
 
 Progress = Callable[[str], None]
@@ -46,6 +47,10 @@ class Machine(ABC):
     @abstractmethod
     def regressors(self, comparison: Comparison, fit: Fit) -> Table:
         """What the remainder of each channel may follow."""
+
+    def smooth(self, comparison: Comparison, fit: Fit) -> Smooth | None:
+        """What ``fit`` leaves as one smooth function of what the machine names."""
+        return None
 
     def bare(self, comparison: Comparison) -> Comparison:
         """``comparison`` without what the readings show by themselves, before any search."""

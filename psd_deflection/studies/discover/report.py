@@ -16,6 +16,7 @@ from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
 from psd_deflection.studies.discover.laws.law_features import known_values
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.search.screen import Score
+from psd_deflection.studies.discover.search.smooth import Smooth
 from psd_deflection.studies.discover.search.trust import BANDS
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
 from psd_deflection.studies.study import PageSection
@@ -74,6 +75,29 @@ def _against_figure(discovery: Conclusion) -> Figure | None:
     unit = ws.units_shown[row]
     axes[0].set_ylabel(f'{ws.channels[row]} / {unit}' if unit else ws.channels[row])
     figure.suptitle(f'measured minus simulated {ws.channels[row]} against loads and position')
+    return figure
+
+
+def _function_figure(discovery: Conclusion, function: Smooth) -> Figure:
+    """What remains without a name, and the smooth function, against each input, by channel."""
+    ws = discovery.workspace
+    against = list(ws.against().items())
+    # The last ones are the readings.
+    inputs = against[1 : len(against) - len(ws.channels)] or against[:1]
+    value, left = ws.shown(function.tables), ws.shown(discovery.fit.difference)
+    figure = Figure(figsize=(10, 0.6 + 2.2 * len(ws.channels)), layout='constrained')
+    axes = figure.subplots(len(ws.channels), len(inputs), sharex='col', sharey='row', squeeze=False)
+    for row, name, unit, own in zip(range(len(ws.channels)), ws.channels, ws.units_shown, axes, strict=True):
+        for axis, (along, at) in zip(own, inputs, strict=True):
+            x = np.concatenate(at)
+            axis.plot(x, np.concatenate([t[row] for t in left]), '.', ms=4, color=BEFORE, label='remains')
+            axis.plot(x, np.concatenate([t[row] for t in value]), '.', ms=4, color=AFTER, label='smooth function')
+            axis.grid(alpha=0.25)
+            if row == len(ws.channels) - 1:
+                axis.set_xlabel(along)
+        own[0].set_ylabel(f'{name} / {unit}' if unit else name)
+    axes[0, 0].legend(frameon=False)
+    figure.suptitle(f'a smooth function of {" and ".join(function.variables)}')
     return figure
 
 
@@ -282,7 +306,9 @@ def sections(discovery: Conclusion) -> list[PageSection]:
     out.append(PageSection('What', (*effects, *_nuisance(discovery))))
     law = () if of_rig is None or of_rig.law is None else (_law_section(of_rig, of_rig.law),)
     if discovery.unknown or law:
-        out.append(PageSection('Unknown', (*map(_unknown, discovery.unknown), *law)))
+        function = None if discovery.remainder is None else discovery.remainder.function
+        drawn = [] if function is None else [picture(_function_figure(discovery, function), 'the smooth function')]
+        out.append(PageSection('Unknown', (*map(_unknown, discovery.unknown), *law, *drawn)))
     out.append(PageSection('Before and after', tuple(_before_and_after(discovery))))
     out.append(PageSection('How it was found', tuple(_how(discovery))))
     return out

@@ -1,7 +1,7 @@
 """The steps of discover: search, weigh, name the alternatives, say where. Each gives the next problem.
 
-An effect is named only if all of these hold: library-wide p <= 0.01, a BIC better by more than 10, a gain of more than
-two standard errors on held-out load cases, and parameters within their bounds.
+An effect is named only if all of these hold: library-wide p <= 1e-4 (0.01 of a plant), a BIC better by more
+than 10, a gain of more than two standard errors on held-out load cases, and parameters within their bounds.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from psd_deflection.studies.discover.problem import Machine, Problem, Progress, 
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldout_tables
-from psd_deflection.studies.discover.search.remainder import remainder_of
-from psd_deflection.studies.discover.search.search import BIC_ACCEPT, P_ACCEPT, Search, unphysical
+from psd_deflection.studies.discover.search.remainder import Remainder, remainder_of
+from psd_deflection.studies.discover.search.search import BIC_ACCEPT, Search, unphysical
 from psd_deflection.studies.discover.search.weighing import (
     EQUIVALENT,
     EQUIVALENT_BIC,
@@ -94,7 +94,7 @@ def accepted(problem: Problem) -> Problem:
             if (
                 not gain.holds
                 or unphysical(ws, fit, i)
-                or found.library_p(chi2, len(columns)) > P_ACCEPT
+                or found.library_p(chi2, len(columns)) > ws.p_accept
                 or bic <= BIC_ACCEPT
             ):
                 fails.append((bic, i))
@@ -191,6 +191,11 @@ def where(problem: Problem) -> Problem:
         or tied(coincidences(fit, ws.physics), fit, problem.result, before)
     )
     remainder = remainder_of(ws, fit, left, problem.machine.regressors(ws, fit)) if unknown else None
+    smooth = problem.machine.smooth(ws, fit)
+    if smooth is not None and (remainder is None or smooth.heldout < remainder.heldout):
+        remainder = Remainder.of(smooth)
+        share = min((remainder.rms / problem.gap_before) ** 2, 1.0)
+        unknown = (*unknown, remainder.unknown(ws, share))
     return replace(problem, before=before, unknown=unknown, remainder=remainder)
 
 

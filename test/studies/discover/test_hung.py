@@ -12,6 +12,7 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
 from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.setup.hung import Plateau, PlateauLoads, all_free
 from psd_deflection.studies.noted_loads import mend_loads, unnoted_steps, without_cell_noise
 
 RIG = load_rig()
@@ -76,6 +77,40 @@ def test_rounded_loads_are_told_one_by_one_and_the_effect_beside_them() -> None:
     assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
     assert found.verdict == 'effects_found'
     assert found.law is None
+
+
+ROUNDED = np.array(
+    [(0, 0, 0), (0, -50, 0), (5, -10, 0), (0, -35, 0), (20, -30, 18), (0, -25, -14), (30, -50, 0), (0, 0, 0)], float
+)
+"""As noted; what hung is nearly in proportion."""
+OFF = np.zeros((8, 3))
+OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
+
+
+def asked(off: FloatArray, noted: FloatArray = ROUNDED) -> bool:
+    """Whether ``noted`` loads are asked for, if the movement says that they are ``off``; all (8, 3)."""
+    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, noted[i]) for i in range(len(noted)))
+    moved = np.repeat(off.T * 1e-6, 10, axis=1)
+    found = PlateauLoads(listed, off, np.zeros_like(moved), moved, np.zeros(80))
+    return all_free(found, np.repeat(noted, DWELL, axis=0))
+
+
+def test_loads_are_asked_for_if_what_hung_rounds_to_the_notes_and_not_if_it_is_far_nearer_or_farther() -> None:
+    assert asked(OFF)
+    # What hung would be noted as another number, or the step is too coarse for so small an error.
+    assert not asked(ROUNDED * 0.06)
+    assert not asked(0.1 * OFF)
+    # Numbers of no step, however small the error.
+    assert not asked(0.3 * OFF, ROUNDED + 0.37 * (ROUNDED != 0.0))
+
+
+@pytest.mark.statistics
+def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search() -> None:
+    found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0)), np.repeat(ROUNDED, DWELL, axis=0))
+    assert [(f.name, f.where) for f in found.setup] == [('load_value', f'load {i}') for i in range(1, 7)]
+    assert '(31.03 N, -51.71 N, 0 N m) hung, not (30 N, -50 N, 0 N m)' in found.setup[5].fix
+    assert found.verdict == 'nothing_missing'
+    assert found.simulations <= 600
 
 
 @pytest.mark.statistics

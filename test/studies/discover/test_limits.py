@@ -19,7 +19,7 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences
 from psd_deflection.studies.discover import conclusion, experiment, planning, readings
 from psd_deflection.studies.discover.experiment import ModelSums
-from psd_deflection.studies.discover.laws import law_features, laws
+from psd_deflection.studies.discover.laws import law_features, laws, variance
 from psd_deflection.studies.discover.laws.law_features import SOUGHT, Response
 from psd_deflection.studies.discover.search import coincidence, localise, proposals, weighing
 from psd_deflection.studies.discover.search import hold_out as validate
@@ -162,7 +162,7 @@ def test_noise_of_a_sum_is_no_gap() -> None:
     (term,) = found.law.terms
     squares = workspace.split(fit.residual)[0][5] ** 2
     known = law_features.known_fine(workspace, (), term.of[0])[0]
-    _, b = laws._variance(squares, known**2 / (known**2).max())
+    _, b = variance.variance(squares, known**2 / (known**2).max())
     # Volts: no sensitivity is in it.
     scale = workspace.noise[0].innovation[5] * 2.0
     assert term.coefficient == pytest.approx(math.sqrt(b / (known**2).max()) * scale, rel=1e-9)

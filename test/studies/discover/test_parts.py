@@ -17,7 +17,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.studies.discover import experiment, planning
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Proposal, Setting
-from psd_deflection.studies.discover.laws import laws
+from psd_deflection.studies.discover.laws import laws, variance
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search import hold_out as validate
 from psd_deflection.studies.discover.search import localise, proposals, weighing
@@ -778,8 +778,8 @@ def test_what_noise_grows_with_may_have_any_size(monkeypatch: pytest.MonkeyPatch
     assert found is not None
     assert (found.law.acts_on, found.law.terms[0].of) == ('y1', ('dx',))
     squares, v2 = residual[1] ** 2, v**2 / float((v**2).max())
-    a, b = laws._variance(squares, v2)
-    gain = laws._likelihood(squares, a + b * v2) - laws._likelihood(squares, squares.mean())
+    a, b = variance.variance(squares, v2)
+    gain = variance.likelihood(squares, a + b * v2) - variance.likelihood(squares, squares.mean())
     assert found.delta_bic == pytest.approx(gain - 3.0)
     # Two variables that change, on each of six channels.
     assert found.p == pytest.approx(12.0 * math.erfc(math.sqrt(gain / 2.0)), rel=1e-6)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,11 +34,14 @@ from psd_deflection.studies.discover.laws.law_features import (
     with_better_level,
     with_better_times,
 )
+from psd_deflection.studies.discover.laws.variance import likelihood, most_jitter, variance
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap
-from psd_deflection.studies.discover.search.search import BIC_ACCEPT, P_ACCEPT
+from psd_deflection.studies.discover.search.search import BIC_ACCEPT
 from psd_deflection.studies.discover.search.workspace import Workspace
 
+P_ACCEPT = 0.01
+"""Largest p, over all that might have been taken, of a law."""
 TRIED = 12
 """Terms that are refitted in the simulation for the first place."""
 FOLLOWED = 3
@@ -379,7 +382,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     known = {name: known_fine(ws, fit.effects, name) for name in VARIABLES}
     folds = [ws.folds()[case] for case in ws.case]
     fold = np.concatenate(folds)
-    best, tried = _most_jitter(ws, fit, known)
+    best, tried = most_jitter(ws, fit, known)
     if best is None:
         return None
     gain, channel, name, slope, full = best
@@ -389,9 +392,9 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     held = []
     for k in np.unique(fold):
         other, own = (fold != k) & (squares > 0.0), (fold == k) & (squares > 0.0)
-        a, b = _variance(squares[other], v2[other])
+        a, b = variance(squares[other], v2[other])
         flat = float(squares[other].mean())
-        held.append(_likelihood(squares[own], a + b * v2[own]) - _likelihood(squares[own], flat))
+        held.append(likelihood(squares[own], a + b * v2[own]) - likelihood(squares[own], flat))
     heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
     p = tried * float(chi2_law.sf(gain, 1))
     if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.holds or slope <= 0.0:
@@ -424,49 +427,6 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         heldout,
         math.sqrt(max(heldout_gap(ws, fit) ** 2 - added, 0.0)),
     )
-
-
-def _most_jitter(
-    ws: Workspace, fit: Fit, known: Mapping[str, Sequence[FloatArray]]
-) -> tuple[tuple[float, str, str, float, float] | None, int]:
-    """Gain, channel, variable, slope and its greatest square, where the noise follows a variable most; how many were
-    tried.
-    """
-    best: tuple[float, str, str, float, float] | None = None
-    tried = 0
-    for c, channel in enumerate(CHANNELS):
-        squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
-        there = squares > 0.0
-        for name, values in known.items():
-            v2 = np.concatenate(values) ** 2
-            full = float(v2.max())
-            if full <= 0.0:
-                continue
-            tried += 1
-            a, b = _variance(squares[there], v2[there] / full)
-            gain = _likelihood(squares[there], a + b * v2[there] / full) - _likelihood(
-                squares[there], squares[there].mean()
-            )
-            if best is None or gain > best[0]:
-                best = gain, channel, name, b / full, full
-    return best, tried
-
-
-def _likelihood(squares: FloatArray, variance: FloatArray | float) -> float:
-    """Twice the log-likelihood of whitened values, up to a constant."""
-    v = np.broadcast_to(np.asarray(variance), squares.shape)
-    return float(-np.sum(np.log(v) + squares / v))
-
-
-def _variance(squares: FloatArray, v2: FloatArray) -> tuple[float, float]:
-    """a and b of variance = a + b v2, the likeliest: weighted least squares on the squares, in turn."""
-    a, b = float(squares.mean()), 0.0
-    columns = np.stack([np.ones_like(v2), v2], axis=1)
-    for _ in range(8):
-        weight = 1.0 / (a + b * v2)
-        found = np.linalg.lstsq(columns * weight[:, None], squares * weight, rcond=None)[0]
-        a, b = max(float(found[0]), 0.05), max(float(found[1]), 0.0)
-    return a, b
 
 
 def _simplest(best: _Trial, others: Sequence[_Trial]) -> _Trial:

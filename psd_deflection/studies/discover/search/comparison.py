@@ -36,7 +36,8 @@ class Comparison(ABC):
     other is found; ``setup``: of those that are mistakes of the set-up. ``open_level``: the level of what remains is
     fitted too, because nobody knows how exact the model of the machine is. ``budget``: forward simulations for each
     effect of the model after which nothing more is added; the alternatives end at twice as many. ``most_effects``:
-    beside so many nothing more is added. ``digits``: format of a gap in the sentence.
+    beside so many nothing more is added. ``p_accept``: largest library-wide p of an accepted
+    effect. ``digits``: format of a gap in the sentence.
     """
 
     physics: Physics | None
@@ -50,6 +51,8 @@ class Comparison(ABC):
     open_level: bool = False
     budget: int = 700
     most_effects: float = 4
+    # At 1e-3, where BIC alone ends in a recording of minutes, one of 1000 without fault has an effect by chance.
+    p_accept: float = 1e-4
     digits: str = '.4g'
 
     @property

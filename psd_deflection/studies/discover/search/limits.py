@@ -36,7 +36,6 @@ def beyond(
     columns = [fit.jacobian[:, j] for j, name in enumerate(fit.free) if name not in fit.at_bound]
     names: list[str] = []
     used: set[tuple[object, ...]] = set()
-    rows = dict(zip(map(id, screen.candidates), screen.slices, strict=True))
     while len(names) < MOST_TERMS:
         known = np.column_stack(columns) if columns else None
         further = [
@@ -49,7 +48,7 @@ def beyond(
         best = max(further, key=lambda s: s.gain)
         used.add(best.candidate.variant)
         names.append(best.candidate.effect.name)
-        columns += list(screen.rows[rows[id(best.candidate)]].astype(np.float64))
+        columns += screen.columns_of(best.candidate)
     if not names:
         return ''
     gap = unseen_gap(workspace, fit, np.column_stack(columns))

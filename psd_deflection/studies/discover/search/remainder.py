@@ -1,9 +1,10 @@
-"""What remains without a name, as one smooth function of named variables."""
+"""What remains without a name, by the named variables that it follows."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.hold_out import unseen_gap
 from psd_deflection.studies.discover.search.localise import Localisation
+from psd_deflection.studies.discover.search.smooth import Smooth
+from psd_deflection.studies.discover.search.weighing import Unknown
 
 STRONG_P = 1e-3
 """Largest library-wide p of a regressor that takes part."""
@@ -25,12 +28,31 @@ Table = Sequence[tuple[str, Mapping[str, Sequence[FloatArray]]]]
 @dataclass(frozen=True, slots=True)
 class Remainder:
     """``depends_on``: names of variables. ``rms``: what a polynomial of them explains, beyond what then is left;
-    ``heldout``: the gap that it leaves on unseen load cases. In the unit of the gap.
+    ``heldout``: the gap that it leaves on unseen load cases. In the unit of the gap. ``function``: it, if that is one
+    smooth function.
     """
 
     depends_on: tuple[str, ...]
     rms: float
     heldout: float
+    function: Smooth | None = None
+
+    @classmethod
+    def of(cls, function: Smooth) -> Remainder:
+        """A smooth function."""
+        rms = float(np.sqrt(function.before**2 - function.heldout**2))
+        return cls(function.variables, rms, function.heldout, function)
+
+    def tree(self) -> dict[str, Any]:
+        """As JSON has it."""
+        return {'depends_on': list(self.depends_on), 'rms': self.rms, 'heldout': self.heldout}
+
+    def unknown(self, ws: Comparison, share: float) -> Unknown:
+        """In words; ``share``: of the gap's energy that it explains."""
+        names = ' and '.join(self.depends_on)
+        words = f'a smooth function of {names} that has no name, {ws.worded(self.rms)} rms; '
+        words += f'with it {ws.worded(self.heldout)} remain on unseen cases'
+        return Unknown(words, self.depends_on, share, rms=self.rms)
 
 
 def remainder_of(ws: Comparison, fit: Fit, left: Localisation, table: Table) -> Remainder | None:

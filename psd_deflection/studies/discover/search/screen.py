@@ -76,6 +76,11 @@ class Screen:
         self.fisher = (self.rows @ self.rows.T).astype(np.float64)
         self.lengths = np.diag(self.fisher)
 
+    def columns_of(self, candidate: Candidate) -> list[FloatArray]:
+        """The whitened signatures (D,) of one of its candidates."""
+        at = next(i for i, c in enumerate(self.candidates) if c is candidate)
+        return list(self.rows[self.slices[at]].astype(np.float64))
+
     def _projected(self, residual: FloatArray, known: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         g = (self.rows @ residual.astype(np.float32)).astype(np.float64)
         fisher = self.fisher

@@ -23,8 +23,6 @@ from psd_deflection.studies.discover.search.limits import Limit, beyond
 from psd_deflection.studies.discover.search.screen import Score, Screen
 from psd_deflection.studies.discover.search.trust import gain_beyond
 
-P_ACCEPT = 0.01
-"""Largest library-wide p of an accepted effect."""
 BIC_ACCEPT = 10.0
 """Smallest improvement of BIC by an accepted effect."""
 FAR = 10.0
@@ -263,7 +261,7 @@ class Search:
             return ()
 
         def passes(score: Score) -> bool:
-            return score.p <= P_ACCEPT and score.gain - self.penalty * score.dof > BIC_ACCEPT
+            return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_ACCEPT
 
         words = beyond(self.workspace, self.screen, current, passes, self.workspace.first)
         return (Limit(self._stopped, words),) if words else ()
@@ -321,7 +319,7 @@ class Search:
 
     def _further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
         """``current`` with the best further effect."""
-        if not scores or min(s.p for s in scores) > P_ACCEPT:
+        if not scores or min(s.p for s in scores) > self.workspace.p_accept:
             return None
         # From the second effect on, the residual is smaller and the first guess better.
         tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
@@ -330,7 +328,7 @@ class Search:
 
     def mistake(self, null: Fit, scores: Sequence[Score]) -> Fit:
         """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
-        if not scores or min(s.p for s in scores) > P_ACCEPT:
+        if not scores or min(s.p for s in scores) > self.workspace.p_accept:
             return null
         best = max((s.gain for s in scores), default=0.0)
         starts: list[list[ActiveEffect]] = []

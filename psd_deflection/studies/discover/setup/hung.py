@@ -44,6 +44,10 @@ PLATE = 10.0
 """And moves the plate: what no movement of the plate makes has so many times less energy."""
 SWAYS_M = 2e-6
 """And at least this, rms."""
+STEPS = (1.0, 2.0, 5.0, 10.0)
+"""N and N m to which people round loads."""
+LEAST_STEP = 0.1
+"""Share of the step, rms, by which rounded forces are off at least: on average 0.29."""
 FREE = 100.0
 """N or N m: standard deviation of a load that nobody knows."""
 CLOSES = 0.2
@@ -216,11 +220,37 @@ def _apart(found: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArra
     return np.asarray((off / allowed).max(axis=1))
 
 
-def all_free(found: PlateauLoads) -> bool:
-    """Whether other loads than noted, at most of the times, leave next to nothing of the movement."""
-    if len(found.plateaus) < FEWEST or np.count_nonzero(_apart(found, (), SOFTER) > 1.0) < 2:
+def all_free(found: PlateauLoads, loads: FloatArray) -> bool:
+    """Whether other loads than noted, at most of the times, leave next to nothing of the movement.
+
+    ``loads`` (n, 3): as the movement of ``found`` counts them; those that were already put right differ from the noted.
+    """
+    if len(found.plateaus) < FEWEST or not _closes(found):
         return False
-    return _closes(found)
+    return int(np.count_nonzero(_apart(found, (), SOFTER) > 1.0)) >= 2 or _rounded(found, loads)
+
+
+def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
+    """Whether the noted loads are what hung, rounded to a whole step: off by up to half of it, and by no less.
+
+    An effect of the catalogue changes loads by little against such a step, or in proportion to them.
+    """
+    hung = np.array([p.of(loads) for p in found.plateaus]) + found.more
+    held = np.any(found.noted != 0.0, axis=1)
+    if np.count_nonzero(held) < FEWEST:
+        return False
+    off, noted = (hung - found.noted)[held], found.noted[held]
+    steps = np.array([_step(noted[:, :2]), _step(noted[:, :2]), _step(noted[:, 2:])])
+    if np.any(np.abs(off) > (0.5 + SHARE) * steps):
+        return False
+    return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > LEAST_STEP * float(steps[0])
+
+
+def _step(noted: FloatArray) -> float:
+    """The largest step of which all ``noted`` numbers are multiples; infinity if all are 0, 0 if there is none."""
+    if not np.any(noted):
+        return np.inf
+    return max((s for s in STEPS if np.allclose(noted, s * np.round(noted / s), atol=1e-6)), default=0.0)
 
 
 def _closes(found: PlateauLoads) -> bool:

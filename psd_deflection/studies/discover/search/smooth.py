@@ -1,0 +1,188 @@
+"""What remains without a name as one smooth function of named variables, beside the named effects.
+
+A Gaussian process (Rasmussen and Williams 2006, chapter 2): a sum of one function for each variable, in each channel,
+with the sizes of the named effects free beside it (universal kriging). How large and how smooth it is, and the noise,
+are those of the largest restricted likelihood (Patterson and Thompson 1971). scipy's interpolators have no free sizes
+beside them and no likelihood. A case is predicted by sizes and a function that were found without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.optimize import Bounds, minimize
+
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.hold_out import heldout_gap
+
+FEWEST, MOST = 20, 150
+"""Values of a channel between which a function is looked for: fewer tell none, more take too long."""
+FEWEST_CASES = 8
+"""Parts left out in turn that a function needs to be confirmed."""
+CLOSES = 0.5
+"""Share of the energy of what remains on unseen cases that the function must close there."""
+SIZES, LENGTHS, NOISES = (0.05, 20.0), (0.08, 8.0), (0.02, 2.0)
+"""Bounds of the size and the noise, in standard deviations of a channel; of the length, in those of a variable."""
+START = (1.0, 0.5, 0.5)
+"""Size, length and noise that the fit begins with."""
+WORTH = 10.0
+"""A further variable must raise twice the log-likelihood by so much, as a named effect must BIC."""
+
+BoolArray = npt.NDArray[np.bool_]
+Variables = Mapping[str, Sequence[FloatArray]]
+"""By name, for each case (n,) or, of several coordinates, (n, k)."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smooth:
+    """``variables``: of which it is a function, by name. ``heldout``: the gap that it and the effects leave on unseen
+    cases; ``before``: that the effects alone leave there. ``tables``: its value, in the form of what was measured, also
+    where nothing was. ``sizes`` (p,): by what the fitted sizes, in the order of the fit, are others beside it.
+    """
+
+    variables: tuple[str, ...]
+    heldout: float
+    before: float
+    tables: tuple[FloatArray, ...]
+    sizes: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Remains:
+    """``values`` (d,), whitened, of ``channel`` (d,); ``sizes`` (d, p): what the effects can do there; ``fold`` (d,).
+    ``apart``: of each variable the squared distances (d, d).
+    """
+
+    values: FloatArray
+    channel: IntArray
+    sizes: FloatArray
+    fold: IntArray
+    apart: Mapping[str, FloatArray]
+
+    def part(self, keep: BoolArray) -> _Remains:
+        """Some of the values."""
+        apart = {name: d[np.ix_(keep, keep)] for name, d in self.apart.items()}
+        return _Remains(self.values[keep], self.channel[keep], self.sizes[keep], self.fold[keep], apart)
+
+
+def smooth_of(ws: Comparison, fit: Fit, variables: Variables) -> Smooth | None:
+    """What ``fit`` leaves as a function of some of the ``variables``; None if it predicts unseen cases no better."""
+    there = np.concatenate([np.isfinite(m).ravel() for m in ws.measured])
+    channel = np.concatenate([np.repeat(np.arange(len(m)), m.shape[1]) for m in ws.measured])
+    counts = np.bincount(channel[there], minlength=len(ws.channels))
+    folds = ws.folds()[ws.row_cases()]
+    parts = len(np.unique(folds[there]))
+    if parts < FEWEST_CASES or counts.min() < FEWEST or len(there) > MOST * len(counts):
+        return None
+    free = np.array([name not in fit.at_bound for name in fit.free], dtype=bool)
+    apart = {name: _distances(ws, values) for name, values in variables.items()}
+    remains = _Remains(fit.residual, channel, fit.jacobian[:, free], folds, apart)
+    chosen, shapes = _chosen(remains.part(there))
+    if not chosen:
+        return None
+    change = ws.unwhitened(_unseen(remains, chosen, shapes, there) - fit.residual)
+    heldout, before = ws.gap([d + c for d, c in zip(fit.difference, change, strict=True)]), heldout_gap(ws, fit)
+    if heldout**2 > (1.0 - CLOSES) * before**2:
+        return None
+    sizes = np.zeros(len(fit.free))
+    _, value, sizes[free] = _known(remains, chosen, shapes, there)
+    return Smooth(chosen, heldout, before, tuple(ws.unwhitened(value)), sizes)
+
+
+def _distances(ws: Comparison, values: Sequence[FloatArray]) -> FloatArray:
+    """Squared (D, D), in units of the variable's own scatter, between all elements of a vector."""
+    columns = [np.asarray(v, dtype=np.float64).reshape(len(v), -1) for v in values]
+    x = np.concatenate([np.tile(c, (len(m), 1)) for c, m in zip(columns, ws.measured, strict=True)])
+    scatter = float(np.sqrt(np.mean(np.sum((x - x.mean(axis=0)) ** 2, axis=1))))
+    x = x / max(scatter, 1e-300)
+    return np.asarray(((x[:, None, :] - x[None, :, :]) ** 2).sum(axis=2))
+
+
+def _chosen(remains: _Remains) -> tuple[tuple[str, ...], FloatArray]:
+    """The variables that the likelihood asks for, one after the other, and the logarithms of the shapes."""
+    names: tuple[str, ...] = ()
+    shapes, likelihood = _shaped(remains, names)
+    while True:
+        tried = [(*names, name) for name in remains.apart if name not in names]
+        found = [(*_shaped(remains, more), more) for more in tried]
+        best = max(found, key=lambda row: row[1], default=None)
+        if best is None or 2.0 * (best[1] - likelihood) < WORTH:
+            return names, shapes
+        shapes, likelihood, names = best
+
+
+def _shaped(remains: _Remains, names: Sequence[str], start: FloatArray | None = None) -> tuple[FloatArray, float]:
+    """Logarithms (channels, 1 + 2 len(names)) of noise, then size and length of each, and the likelihood of all."""
+    out, total = list[FloatArray](), 0.0
+    usual = np.log([START[2], *(START[0], START[1]) * len(names)])
+    low, high = np.log([NOISES, *(SIZES, LENGTHS) * len(names)]).T
+    for c in np.unique(remains.channel).tolist():
+        own = remains.part(remains.channel == c)
+        surprise: Callable[[FloatArray], float] = partial(_surprise, own=own, basis=_span(own.sizes), names=names)
+        begin: FloatArray = usual if start is None else start[len(out)]
+        found = minimize(surprise, begin, method='L-BFGS-B', bounds=Bounds(low, high), options={'maxiter': 60})
+        out.append(found.x)
+        total -= float(found.fun)
+    return np.array(out), total
+
+
+def _span(columns: FloatArray) -> FloatArray:
+    """An orthonormal basis of ``columns``, which may depend on each other."""
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
+
+
+def _surprise(shape: FloatArray, own: _Remains, basis: FloatArray, names: Sequence[str]) -> float:
+    """Minus the restricted log-likelihood of one channel, up to a constant; ``basis``: of what the effects can do."""
+    try:
+        lower = cholesky(_covariance(shape, own, names) + np.exp(2.0 * shape[0]) * np.eye(len(own.values)), lower=True)
+    except LinAlgError:
+        return 1e12
+    white = solve_triangular(lower, np.column_stack((basis, own.values)), lower=True)
+    q, r = np.linalg.qr(white[:, :-1])
+    rest = white[:, -1] - q @ (q.T @ white[:, -1])
+    return float(0.5 * rest @ rest + np.log(np.diag(lower)).sum() + np.log(np.abs(np.diag(r))).sum())
+
+
+def _covariance(shape: FloatArray, own: _Remains, names: Sequence[str]) -> FloatArray:
+    """Of the function of one channel (d, d)."""
+    out = np.zeros((len(own.values), len(own.values)))
+    for name, (size, length) in zip(names, shape[1:].reshape(-1, 2).tolist(), strict=True):
+        out += np.exp(2.0 * size - 0.5 * np.exp(-2.0 * length) * own.apart[name])
+    return out
+
+
+def _known(
+    remains: _Remains, names: Sequence[str], shapes: FloatArray, seen: BoolArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """What is left (d,) of all values, the function there (d,), and by what the sizes (p,) move, from the ``seen``."""
+    function = np.zeros((len(remains.values), len(remains.values)))
+    noise = np.zeros(len(remains.values))
+    for shape, c in zip(shapes, np.unique(remains.channel).tolist(), strict=True):
+        own = remains.channel == c
+        function[np.ix_(own, own)] = _covariance(shape, remains.part(own), names)
+        noise[own] = np.exp(2.0 * shape[0])
+    factor = cho_factor((function + np.diag(noise))[np.ix_(seen, seen)])
+    sizes, values = remains.sizes[seen], remains.values[seen]
+    lengths = np.maximum(np.linalg.norm(sizes, axis=0), 1e-150)
+    f = (sizes / lengths).T @ cho_solve(factor, sizes / lengths)
+    more = np.linalg.lstsq(f, (sizes / lengths).T @ cho_solve(factor, values), rcond=1e-9)[0] / lengths
+    value = function[:, seen] @ cho_solve(factor, values - sizes @ more)
+    return remains.values - remains.sizes @ more - value, value, more
+
+
+def _unseen(remains: _Remains, names: Sequence[str], shapes: FloatArray, there: BoolArray) -> FloatArray:
+    """What is left (d,) of each value by sizes, shapes and a function that were found without its part."""
+    out = np.zeros(len(remains.values))
+    for fold in np.unique(remains.fold[there]):
+        seen = there & (remains.fold != fold)
+        own, _ = _shaped(remains.part(seen), names, shapes)
+        out[~seen & there] = _known(remains, names, own, seen)[0][~seen & there]
+    return out

@@ -1,0 +1,107 @@
+"""What remains without a name as one smooth function, found by discover_in on a table of readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pytest
+
+import psd_deflection
+from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.studies.discover.plant_search import PlantComparison
+from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
+from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.smooth import Smooth, _Remains, _unseen, smooth_of
+
+NOISE = 0.1
+SLOPE = plant_effect('slope', EffectParameter('size', 'mm', -9.0, 9.0, 0.1, 'per turn'))
+
+
+class Table(Plant):
+    """Thirty readings at places ``along`` and ``across``: a slope, waves along, noise; each is left out by itself."""
+
+    channels, units, cases = ('height',), ('mm',), ('table',)
+    library = (SLOPE,)
+    nuisance = (plant_effect('offset', EffectParameter('size', 'mm', -9.0, 9.0, 0.1, 'of all')),)
+
+    def __init__(self, seed: int, waves: float, noise: float = NOISE) -> None:
+        rng = np.random.default_rng(seed)
+        self.along, self.across = rng.uniform(0.0, 1.0, (2, 30))
+        self.error = noise * rng.standard_normal(30)
+        self.seen = 2.0 * self.along + waves * np.sin(9.0 * self.along) + self.error
+
+    def measured(self) -> list[FloatArray]:
+        return [self.seen[None, :]]
+
+    def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
+        return {'along': [self.along], 'across': [self.across]}
+
+    def parts(self) -> list[IntArray]:
+        return [np.arange(30)]
+
+    def simulate(self, model: Model) -> list[FloatArray]:
+        slope = model.get('slope', {'size': 0.0})['size']
+        return [(model['offset']['size'] + slope * self.along)[None, :]]
+
+
+def smooth(plant: Table, variables: Mapping[str, Sequence[FloatArray]] | None = None) -> Smooth | None:
+    """What remains beside offset and slope."""
+    ws = PlantComparison(plant)
+    fit = refit(ws, [ActiveEffect(SLOPE, {'size': 0.0})])
+    return smooth_of(ws, fit, plant.variables() if variables is None else variables)
+
+
+def test_a_smooth_remainder_is_one_function_of_the_variable_that_it_follows() -> None:
+    plant = Table(1, 1.0)
+    found = psd_deflection.discover_in(plant)
+    remainder = found.tree()['remainder']
+    assert remainder['depends_on'] == ['along']
+    # Little but the noise remains of readings that the function has not seen; those at the ends are the worst.
+    assert remainder['heldout'] < 2.5 * NOISE < 0.5 * found.gap_heldout_after
+    assert found.verdict == 'unknown_effect'
+    assert 'a smooth function of along that has no name' in found.unknown[-1].signature
+    assert found.remainder is not None
+    assert found.remainder.function is not None
+    # It is the waves, but for what offset and slope take.
+    free = np.column_stack([np.ones(30), plant.along, np.sin(9.0 * plant.along)])
+    left = found.remainder.function.tables[0][0]
+    assert np.std(left - free @ np.linalg.lstsq(free, left, rcond=None)[0]) < NOISE
+    assert 'a smooth function of along' in found.report()
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_noise_alone_is_no_function(seed: int) -> None:
+    assert smooth(Table(seed, 0.0)) is None
+
+
+def test_what_the_library_explains_is_no_function_and_neither_is_what_the_stated_noise_does() -> None:
+    assert psd_deflection.discover_in(Table(1, 0.0)).tree()['remainder'] is None
+    quiet = Table(1, 1.0)
+    quiet.noise = (1.0,)
+    assert psd_deflection.discover_in(quiet).tree()['remainder'] is None
+
+
+def test_a_reading_is_predicted_without_itself() -> None:
+    rng = np.random.default_rng(2)
+    x = np.sort(rng.uniform(0.0, 1.0, 24))
+    values = np.sin(9.0 * x) + 0.1 * rng.standard_normal(24)
+    apart = {'x': (x[:, None] - x) ** 2 / np.var(x)}
+    there = np.ones(24, dtype=bool)
+
+    def left(readings: FloatArray) -> FloatArray:
+        remains = _Remains(readings, np.zeros(24, dtype=np.int64), np.ones((24, 1)), np.arange(24), apart)
+        return _unseen(remains, ('x',), np.log([[0.1, 1.0, 0.5]]), there)
+
+    moved = values.copy()
+    moved[7] += 0.5
+    assert left(moved)[7] - left(values)[7] == pytest.approx(0.5, abs=1e-6)
+    assert float(np.std(left(values))) < 0.3
+
+
+def test_few_readings_tell_no_function() -> None:
+    plant = Table(1, 1.0)
+    plant.seen[19:] = np.nan
+    assert smooth(plant) is None
+    assert smooth(Table(1, 1.0), {}) is None
