@@ -12,13 +12,15 @@ late. Then the offsets move later, by no more than their rate allows for a tenth
 not at all if the deflection has become stale meanwhile.
 
 However the node ends or is deactivated, also by an error of its own, the offsets first go back to
-zero.
+zero. If that takes longer than ``RELEASE_S``, the node is not deactivated: the transition fails and
+says which offset is left. Offsets that stay with a controller that tells nothing are said, too.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -37,7 +39,7 @@ from psd_deflection.arms.compensation.robot import RobotWatch
 from psd_deflection.arms.compensation.settings import ALL_JOINTS, SETTINGS, CompensatorSettings
 from psd_deflection.arms.compensation.settings import COMMANDS as WITH_COMMANDS
 from psd_deflection.arms.inputs import LARGEST_POSITION, frame_fault, joints_fault, quaternion_fault, stamp_fault
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.records import FloatArray
 from psd_deflection.ros.declared import DeclaredParameters
@@ -73,6 +75,8 @@ LOOK_S = 1.0
 """Time in which DDS finds another node that commands the robot, before anything is sent, s."""
 RELEASE_S = 10.0
 """Longest time that an end waits for the offsets to go back to zero, s."""
+OWED_S = 2.0
+"""Longest time that an end waits for a controller that does not tell the offsets that it has, s."""
 LEAVE_S = 0.3
 """Time for the last offsets to leave, s. DDS does not say when. If the publisher goes first, they
 are lost."""
@@ -105,6 +109,9 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._ended, self._ramped = threading.Event(), threading.Event()
         self._failed: BaseException | None = None
         self._rest_t: float | None = None
+        self._release_until = math.inf
+        # Since when only offsets that the controller does not tell are left.
+        self._owed_t: float | None = None
         super().__init__(NODE_NAME, say)
 
     def declare(self) -> DeclaredParameters[CompensatorSettings]:
@@ -152,44 +159,73 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         """Send offsets: at once if it runs dry, else when it is enabled."""
         super().activate()
         self.compensator.enable(not self._drive)
+        self._release_until = math.inf
         self._ended.clear()
         self._sender = threading.Thread(target=self._send_until_the_end, name='offsets', daemon=True)
         self._sender.start()
 
     def deactivate(self) -> None:
-        """Let the offsets go back to zero, and send no more."""
-        super().deactivate()
+        """Let the offsets go back to zero, and send no more.
+
+        Raises DeviceError, and stays active, if they are not there after ``RELEASE_S``.
+        """
         self._come_to_rest()
+        if self.command.sends and (left := self._left()):
+            self._release_until = math.inf
+            raise DeviceError(
+                f'{left} is left after {RELEASE_S:g} s ({self.command.text}, max_rate = {self.settings.max_rate:g}): '
+                'it goes on; deactivate again'
+            )
+        super().deactivate()
+        self._fall_silent()
 
     def cleanup(self) -> None:
-        """The same."""
-        self.deactivate()
+        """The same; it ends in any case, and says what is left."""
+        self._come_to_rest()
+        super().deactivate()
+        self._fall_silent()
 
     def _come_to_rest(self) -> None:
-        until = time.monotonic() + RELEASE_S
-        while not (self.at_rest() or self._hurried()) and time.monotonic() < until:
+        while not (self.at_rest() or self._hurried()) and time.monotonic() < self._release_until:
             time.sleep(PERIOD_S)
             # The executor waits for this transition. Offsets go back only while the controller
             # and the joints are heard.
             self.gate.take_in()
             self._tell()
+
+    def _fall_silent(self) -> None:
+        if self._sender is None:
+            return
         self._ended.set()
-        if self._sender is not None:
-            self._sender.join()
-            self._sender = None
+        self._sender.join()
+        self._sender = None
+        if left := self._left():
+            self.log(f'{left} is left with the controller: {self.command.text}', WARNING)
+
+    def _left(self) -> str:
+        """The largest offset that the controller may still have, in words; '' if it has none."""
+        if not self._drive:
+            return ''
+        with self._lock:
+            left = self.command.offsets if self._failed is not None else self.compensator.left
+        worst = int(np.abs(left).argmax())
+        return f'an offset of {left[worst]:.3g} at {self._names[worst]}' if left[worst] else ''
 
     def at_rest(self) -> bool:
         """Let the offsets go back to zero; whether they are there, and the last ones have left."""
         if self._sender is None or not self._drive:
             return True
+        now = time.monotonic()
+        if self._release_until == math.inf:
+            self._release_until = now + RELEASE_S
         with self._lock:
             if self.compensator.enabled:
                 self.compensator.enable(False)
-            busy = self.compensator.enabled or self.command.sends
-        now = time.monotonic()
+            sends, owes = self.compensator.enabled or self.command.sends, bool(np.any(self.compensator.left))
         if self._failed is not None:
-            busy = not self._ramped.is_set()
-        if busy:
+            sends, owes = not self._ramped.is_set(), False
+        self._owed_t = (self._owed_t or now) if owes and not sends else None
+        if sends or (self._owed_t is not None and now - self._owed_t < OWED_S):
             self._rest_t = now
         return self._rest_t is None or now - self._rest_t > LEAVE_S
 

@@ -59,10 +59,14 @@ class Repeats:
             reason.wait_s = FIRST_WAIT_S
         reason.line, reason.level = line, level
         reason.since += 1
-        if known.told >= at_once and now_s < reason.next_s:
+        news = known.told < at_once
+        if not news and now_s < reason.next_s:
             return
         known.told += 1
         more = f' (and {reason.since - 1} more like it)' if reason.since > 1 else ''
+        if news:
+            # Those that are said at once make none wait longer.
+            reason.wait_s = FIRST_WAIT_S
         self._said(reason, line + more, now_s)
 
     def settle(self, now_s: float) -> None:

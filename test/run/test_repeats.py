@@ -46,6 +46,17 @@ def test_the_first_few_are_said_one_by_one_and_so_is_what_comes_after_a_quiet_ti
     assert said[3:] == ['2 more in the last 99998 s: gone 4', 'gone again']
 
 
+def test_lines_that_are_said_at_once_make_the_next_wait_no_longer() -> None:
+    said: list[str] = []
+    repeats = Repeats(texts(said.append))
+    for k in range(6):
+        repeats.tell('following', 'following', WARNING, float(k), at_once=6)
+    repeats.tell('following', 'following', WARNING, 6.0, at_once=6)
+    assert len(said) == 6
+    repeats.settle(5.0 + FIRST_WAIT_S)
+    assert said[6:] == ['1 more in the last 10 s: following']
+
+
 def test_one_kind_does_not_hold_up_another() -> None:
     said: list[str] = []
     repeats = Repeats(texts(said.append))

@@ -133,6 +133,13 @@ class Compensator:
     def _sums(self) -> bool:
         return self.settings.output == COMMANDS
 
+    @property
+    def left(self) -> FloatArray:
+        """(n,): the offsets that the controller may still have, as far as one knows, rad or m."""
+        if self._owed and not self._speaks and self._applied is not None:
+            return self._applied.copy()
+        return self._offsets.copy()
+
     def enable(self, wanted: bool) -> None:
         """Let the offsets follow from where the controller has them, or let them go back to zero.
 
