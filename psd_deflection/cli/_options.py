@@ -83,7 +83,7 @@ def parameter_option(parser: argparse._ActionsContainer, option: str, name: str,
         *older,
         dest=name,
         type=int if p.kind == 'integer' else str,
-        metavar='N' if p.kind == 'integer' else option.strip('-').upper(),
+        metavar='N' if p.kind == 'integer' else option.rpartition('-')[2].upper(),
         help=text.replace('%', '%%'),
     )
 
