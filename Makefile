@@ -27,6 +27,7 @@
 # make doc-commands  every command of README and docs that the tests do not run, run
 # make rerun    recordings converted for the Rerun viewer (170 MB, in an environment of its own) and looked at in it
 # make page-soak  the live page left open for PAGE_HOURS=4 hours: its heap every minute (needs Chromium)
+# make gallery  docs/gallery.md and its pictures anew: what each command says of a good rig and of faults (GALLERY=--check: does the page still hold)
 # make shots    the pictures of the live page in docs/figures anew (needs Chromium)
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (six minutes on two idle cores; RIGS=20 for a look, LIGHT=--light in the light of a room)
@@ -62,7 +63,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rosdep deb rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak gallery shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rosdep deb rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -209,6 +210,11 @@ notebooks: $(READY)
 PAGE_HOURS ?= 4
 page-soak: $(READY)
 	$(BIN)/python -m bench.page_soak --hours $(PAGE_HOURS)
+
+# Further words, e.g. GALLERY='--only check'.
+GALLERY ?=
+gallery: $(READY)
+	$(BIN)/python -m tools.gallery $(GALLERY)
 
 SHOT_SECONDS ?= 40
 shots: $(READY)

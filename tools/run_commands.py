@@ -100,6 +100,7 @@ SHORTEST = {
     'blind-laws': 'LAWS="--laws 1 --nulls 0"',
     'blind-next': 'NEXT="--only quantisation --designs torque"',
     'blind-watch': 'WATCH="--runs 1 --hours 0"',
+    'gallery': 'GALLERY="--only check_good --check"',
     'shots': 'SHOT_SECONDS=2',
     'page-soak': 'PAGE_HOURS=0.02',
     'suites': 'SUITES="--rows 2 --tests test/base"',

@@ -90,7 +90,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--seconds', type=float, default=40.0, help='before the first picture')
     seconds = parser.parse_args().seconds
-    monitor = [*PSD_DEFLECTION, 'monitor', '--http-port', '0']
+    monitor = [*PSD_DEFLECTION, 'monitor', '--monitor-port', '0']
     with tempfile.TemporaryDirectory() as folder:
         program = Program([*monitor, '--demo'])
         try:

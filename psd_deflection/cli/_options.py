@@ -69,8 +69,10 @@ def _within(option: str, kind: Callable[[str], N], words: str, least: float, mos
     raise UsageError(f'{option} {text}: must be {words}')
 
 
-def parameter_option(parser: argparse._ActionsContainer, option: str, name: str) -> None:
+def parameter_option(parser: argparse._ActionsContainer, option: str, name: str, *older: str) -> None:
     """Add ``option``, which sets the parameter ``name``; help, type and default come from its declaration.
+
+    ``older``: names that it had once, which still work.
 
     :func:`given_parameters` returns the given values.
     """
@@ -78,9 +80,10 @@ def parameter_option(parser: argparse._ActionsContainer, option: str, name: str)
     text = p.description + (f' (default {p.default})' if p.default != '' else '')
     parser.add_argument(
         option,
+        *older,
         dest=name,
         type=int if p.kind == 'integer' else str,
-        metavar='N' if p.kind == 'integer' else option.strip('-').upper(),
+        metavar='N' if p.kind == 'integer' else option.rpartition('-')[2].upper(),
         help=text.replace('%', '%%'),
     )
 

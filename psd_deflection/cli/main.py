@@ -72,6 +72,16 @@ COMMANDS: dict[str, str] = {
 }
 """Command name to one-line summary; the module is ``NAME.py`` (``-`` as ``_``) in ``cli`` or one of ``FOLDERS``."""
 
+GROUPS: dict[str, tuple[str, ...]] = {
+    'run: measure, look on, note': ('estimator', 'monitor', 'chain', 'echo', 'zero', 'load', 'mark', 'record'),
+    'rig: describe it, wire it, know what to expect': ('devices', 'check', 'params', 'design', 'budget'),
+    'recording: compute again, draw, convert': ('replay', 'plot', 'info', 'convert', 'recover'),
+    'truth: an independent measurement': ('camera', 'validate', 'calibrate'),
+    'model: simulate, find what is missing': ('simulate', 'discover', 'effects', 'compare-methods'),
+    'motion: what rings, and an arm that moves': ('identify', 'compensator', 'shaper'),
+}
+"""Commands by what one wants to do, in the order of the help; those of no group come last."""
+
 FOLDERS = ('run', 'recordings', 'studies')
 """Where commands lie, beside ``cli`` itself."""
 
@@ -98,6 +108,21 @@ class _Help(argparse.RawDescriptionHelpFormatter):
     def __init__(self, prog: str) -> None:
         super().__init__(prog, width=min(shutil.get_terminal_size().columns - 2, _WIDEST))
 
+    def _format_action(self, action: argparse.Action) -> str:
+        """The commands in their groups; everything else as argparse has it."""
+        subactions = {sub.dest: sub for sub in self._iter_indented_subactions(action)}
+        if not subactions:
+            return super()._format_action(action)
+        grouped = {name for names in GROUPS.values() for name in names}
+        parts = []
+        for title, names in (*GROUPS.items(), ('shell', tuple(name for name in subactions if name not in grouped))):
+            parts.append(f'\n  {title}\n')
+            self._indent()
+            for name in names:
+                parts.append(super()._format_action(subactions[name]))
+            self._dedent()
+        return ''.join(parts)
+
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         out = []
         for indented, lines in itertools.groupby(text.splitlines(), lambda line: line.startswith(' ') or not line):
@@ -119,7 +144,7 @@ def make_parser(chosen: Collection[str], value: type[argparse.Action] | None = N
         formatter_class=_Help,
     )
     parser.add_argument('--version', action='version', version=f'psd-deflection {__version__}')
-    commands = parser.add_subparsers(dest='command', metavar='COMMAND', required=True)
+    commands = parser.add_subparsers(title='commands', dest='command', metavar='COMMAND', required=True)
     for name, summary in COMMANDS.items():
         sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help)
         # `-5,20` and `-2.9e1` are values, which argparse takes for options; it has no public way to be told.

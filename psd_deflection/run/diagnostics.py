@@ -8,7 +8,9 @@ from msg_adapters import ACCELERATION
 from psd_deflection.measure.motion.inertia import HOLD_NS
 from psd_deflection.measure.motion.innovations import Innovations
 from psd_deflection.measure.motion.motion import AXES
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
+from psd_deflection.run.processing import Latency
 from psd_deflection.run.session import Session
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
@@ -30,7 +32,9 @@ LATE_SHARE = 0.25
 LOAD_WALK = ('load wanders, fx (N in 1 s)', 'load wanders, fy (N in 1 s)', 'load wanders, tz (N m in 1 s)')
 
 
-class _Seen(NamedTuple):
+class Seen(NamedTuple):
+    """What was counted up to ``t_ns``, or between two reports."""
+
     t_ns: int
     samples: int
     lost: int
@@ -49,7 +53,7 @@ class HealthReporter:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._seen: _Seen | None = None
+        self._seen: Seen | None = None
         self._foretold = Innovations()
         self._base = (0, 0, 0, 0)
 
@@ -59,7 +63,7 @@ class HealthReporter:
         s.settle()
         wire, pipeline = s.acquisition.counters, s.pipeline.counters
         dropped = wire.queue_dropped + s.recorder.dropped
-        now = _Seen(
+        now = Seen(
             t_ns,
             wire.samples,
             wire.lost,
@@ -76,7 +80,7 @@ class HealthReporter:
         before = self._seen
         self._seen = now
         seconds = (now.t_ns - before.t_ns) / 1e9 if before is not None else 0.0
-        new = _Seen(0, *(b - a for a, b in zip(before[1:], now[1:], strict=True))) if before is not None else now
+        new = Seen(0, *(b - a for a, b in zip(before[1:], now[1:], strict=True))) if before is not None else now
 
         def rate(count: int) -> str:
             return f'{count / seconds:.2f}' if seconds > 0 else 'unknown'
@@ -87,16 +91,16 @@ class HealthReporter:
             (
                 self._acquisition(new, rate(new.samples)),
                 self._clock(new),
-                self._estimates(new, rate(new.estimates)),
+                estimates_entry(s.pipeline, new, rate(new.estimates), s.processing.latency()),
                 *self._motion(),
-                *(self._laser(psd, new) for psd in range(1, len(self._session.rig.psds) + 1)),
+                *(laser_entry(s.pipeline, psd, new.samples > 0) for psd in range(1, len(s.rig.psds) + 1)),
                 self._recording(),
                 *(() if s.watcher is None else (s.watcher.entry(),)),
             ),
             str(hello.info.get('serial', '')) if hello is not None else '',
         )
 
-    def _acquisition(self, new: _Seen, rate: str) -> DiagnosticEntry:
+    def _acquisition(self, new: Seen, rate: str) -> DiagnosticEntry:
         s = self._session
         wire = s.acquisition.counters
         level, message = OK, 'samples flow'
@@ -134,7 +138,7 @@ class HealthReporter:
             values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))
         return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))
 
-    def _clock(self, new: _Seen) -> DiagnosticEntry:
+    def _clock(self, new: Seen) -> DiagnosticEntry:
         acquisition = self._session.acquisition
         clock, wire = acquisition.clock_state(), acquisition.counters
         stepped = acquisition.system_clock_step_ns()
@@ -165,50 +169,6 @@ class HealthReporter:
             level = WARN
             message = f'the system clock was set by {stepped / 1e9:+.3f} s; stamps go on as before until the next start'
         return DiagnosticEntry('psd_deflection: clock', level, message, tuple(values))
-
-    def _estimates(self, new: _Seen, rate: str) -> DiagnosticEntry:
-        pipeline, latency = self._session.pipeline.counters, self._session.processing.latency()
-        spots = self._session.pipeline.last_spots
-        level, message = OK, 'estimates flow'
-        if new.estimates == 0:
-            level, message = ERROR, spots.reason if spots is not None and spots.reason else 'no blocks'
-        elif new.estimates < new.blocks:
-            level, message = WARN, f'{new.blocks - new.estimates} of {new.blocks} blocks have no estimate'
-        elif new.degraded and spots is not None:
-            rule = self._session.rig.estimator.degraded
-            level = WARN
-            how = f'from one detector, twist {"held" if rule == "hold" else "assumed 0"}'
-            if spots.left_out:
-                how = f'without {" and ".join(f"psd_{psd}" for psd in spots.left_out)}'
-            why = spots.reason or next((f for f in spots.findings if 'left out' in f), '')
-            message = f'degraded: {new.degraded} of {new.blocks} blocks {how}; {why}'
-        elif doubt := self._doubt(new.contradictions):
-            level, message = WARN, doubt
-        values = [
-            ('rate (estimates/s)', rate),
-            ('blocks', str(pipeline.blocks)),
-            ('estimates', str(pipeline.estimates)),
-            ('degraded', str(pipeline.degraded)),
-            ('status', spots.status.name if spots is not None else 'none yet'),
-            *((f'found: {finding}', str(count)) for finding, count in sorted(pipeline.findings.items())),
-            *((f'refused: {cause}', str(count)) for cause, count in sorted(pipeline.refused.items())),
-        ]
-        values += self._session.pipeline.stamped.words()
-        if latency is not None:
-            values.append(('latency, median (ms)', f'{latency.median * 1e3:.3f}'))
-            values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
-        return DiagnosticEntry('psd_deflection: estimates', level, message, tuple(values))
-
-    def _doubt(self, contradictions: int) -> str:
-        """What widens the covariance of blocks that all have estimates; '' if nothing does."""
-        stamped = self._session.pipeline.stamped
-        if contradictions:
-            wrong = stamped.most_likely_wrong() or 'which one is wrong cannot be told'
-            readings = 'four readings' if len(self._session.rig.psds) == 2 else 'readings'
-            return f'the {readings} contradict each other in {contradictions} blocks: {wrong}'
-        if stamped.vibrates:
-            return f'vibrates {stamped.vibrates}: too fast for a block; the covariance has it'
-        return ''
 
     def _motion(self) -> tuple[DiagnosticEntry, ...]:
         motion = self._session.pipeline.motion_filter
@@ -254,34 +214,6 @@ class HealthReporter:
             )
         return (DiagnosticEntry(name, level, message, tuple(values)),)
 
-    def _laser(self, psd: int, new: _Seen) -> DiagnosticEntry:
-        name = f'psd_deflection: psd_{psd}'
-        spots = self._session.pipeline.last_spots
-        if spots is None:
-            return DiagnosticEntry(name, STALE, 'no block yet', ())
-        if new.samples == 0:
-            # The last readings are out of date.
-            return DiagnosticEntry(name, STALE, 'no samples', ())
-        total = spots.sums[psd - 1]
-        x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
-        # Reasons and findings name the detector they are about.
-        names = (f'laser {psd} ', f'x{psd} ', f'y{psd} ', f'sum{psd} ', f'psd_{psd} ')
-        fault = spots.reason if spots.reason.startswith(names) else ''
-        found = [f for f in spots.findings if f.startswith((f'psd_{psd}', 'one of the two lasers'))]
-        level, message = OK, 'dot seen'
-        if found:
-            level, message = WARN, '; '.join(found)
-        if fault or total < self._session.rig.estimator.sum_min * 0.5:
-            level, message = ERROR, fault or 'laser lost'
-        values = (
-            ('sum (V)', f'{total:.4f}'),
-            ('x (mm)', f'{x * 1e3:.4f}'),
-            ('y (mm)', f'{y * 1e3:.4f}'),
-            ('x, std in the block (um)', f'{spots.covariance[2 * psd - 2, 2 * psd - 2] ** 0.5 * 1e6:.2f}'),
-            ('y, std in the block (um)', f'{spots.covariance[2 * psd - 1, 2 * psd - 1] ** 0.5 * 1e6:.2f}'),
-        )
-        return DiagnosticEntry(name, level, message, values)
-
     def _recording(self) -> DiagnosticEntry:
         recorder = self._session.recorder
         folder = recorder.folder
@@ -300,3 +232,79 @@ class HealthReporter:
         elif recorder.dropped:
             level, message = WARN, f'{recorder.dropped} messages dropped: the disk is too slow'
         return DiagnosticEntry('psd_deflection: recording', level, message, values)
+
+
+def estimates_entry(pipeline: Pipeline, new: Seen, rate: str, latency: Latency | None = None) -> DiagnosticEntry:
+    """Whether ``pipeline`` makes estimates, and why not. ``new``: since the last report; ``rate``: estimates/s."""
+    counters, spots = pipeline.counters, pipeline.last_spots
+    level, message = OK, 'estimates flow'
+    if new.estimates == 0:
+        level, message = ERROR, spots.reason if spots is not None and spots.reason else 'no blocks'
+    elif new.estimates < new.blocks:
+        level, message = WARN, f'{new.blocks - new.estimates} of {new.blocks} blocks have no estimate'
+    elif new.degraded and spots is not None:
+        rule = pipeline.rig.estimator.degraded
+        level = WARN
+        how = f'from one detector, twist {"held" if rule == "hold" else "assumed 0"}'
+        if spots.left_out:
+            how = f'without {" and ".join(f"psd_{psd}" for psd in spots.left_out)}'
+        why = spots.reason or next((f for f in spots.findings if 'left out' in f), '')
+        message = f'degraded: {new.degraded} of {new.blocks} blocks {how}; {why}'
+    elif doubt := _doubt(pipeline, new.contradictions):
+        level, message = WARN, doubt
+    values = [
+        ('rate (estimates/s)', rate),
+        ('blocks', str(counters.blocks)),
+        ('estimates', str(counters.estimates)),
+        ('degraded', str(counters.degraded)),
+        ('status', spots.status.name if spots is not None else 'none yet'),
+        *((f'found: {finding}', str(count)) for finding, count in sorted(counters.findings.items())),
+        *((f'refused: {cause}', str(count)) for cause, count in sorted(counters.refused.items())),
+    ]
+    values += pipeline.stamped.words()
+    if latency is not None:
+        values.append(('latency, median (ms)', f'{latency.median * 1e3:.3f}'))
+        values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
+    return DiagnosticEntry('psd_deflection: estimates', level, message, tuple(values))
+
+
+def _doubt(pipeline: Pipeline, contradictions: int) -> str:
+    """What widens the covariance of blocks that all have estimates; '' if nothing does."""
+    stamped = pipeline.stamped
+    if contradictions:
+        wrong = stamped.most_likely_wrong() or 'which one is wrong cannot be told'
+        readings = 'four readings' if len(pipeline.rig.psds) == 2 else 'readings'
+        return f'the {readings} contradict each other in {contradictions} blocks: {wrong}'
+    if stamped.vibrates:
+        return f'vibrates {stamped.vibrates}: too fast for a block; the covariance has it'
+    return ''
+
+
+def laser_entry(pipeline: Pipeline, psd: int, flows: bool = True) -> DiagnosticEntry:
+    """What ``pipeline`` sees of detector ``psd`` (from 1). ``flows``: whether samples have come lately."""
+    name = f'psd_deflection: psd_{psd}'
+    spots = pipeline.last_spots
+    if spots is None:
+        return DiagnosticEntry(name, STALE, 'no block yet', ())
+    if not flows:
+        # The last readings are out of date.
+        return DiagnosticEntry(name, STALE, 'no samples', ())
+    total = spots.sums[psd - 1]
+    x, y = spots.dots[2 * psd - 2], spots.dots[2 * psd - 1]
+    # Reasons and findings name the detector they are about.
+    names = (f'laser {psd} ', f'x{psd} ', f'y{psd} ', f'sum{psd} ', f'psd_{psd} ')
+    fault = spots.reason if spots.reason.startswith(names) else ''
+    found = [f for f in spots.findings if f.startswith((f'psd_{psd}', 'one of the two lasers'))]
+    level, message = OK, 'dot seen'
+    if found:
+        level, message = WARN, '; '.join(found)
+    if fault or total < pipeline.rig.estimator.sum_min * 0.5:
+        level, message = ERROR, fault or 'laser lost'
+    values = (
+        ('sum (V)', f'{total:.4f}'),
+        ('x (mm)', f'{x * 1e3:.4f}'),
+        ('y (mm)', f'{y * 1e3:.4f}'),
+        ('x, std in the block (um)', f'{spots.covariance[2 * psd - 2, 2 * psd - 2] ** 0.5 * 1e6:.2f}'),
+        ('y, std in the block (um)', f'{spots.covariance[2 * psd - 1, 2 * psd - 1] ** 0.5 * 1e6:.2f}'),
+    )
+    return DiagnosticEntry(name, level, message, values)

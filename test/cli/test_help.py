@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -10,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.base.errors import EXIT_STATUSES
-from psd_deflection.cli.main import COMMANDS, main, make_parser
+from psd_deflection.cli.main import COMMANDS, GROUPS, main, make_parser
+from psd_deflection.cli.params import NEEDED
 
 ROOT = Path(__file__).parent.parent.parent
 OURS = 'psd-deflection '
@@ -62,6 +64,39 @@ def test_it_tells_the_exit_statuses(capsys: pytest.CaptureFixture[str], monkeypa
     text = help_of('', capsys, monkeypatch, 80)
     told = re.findall(r'^  (\d+) +\S', text[text.index('exit status:') :], re.MULTILINE)
     assert [int(status) for status in told] == list(EXIT_STATUSES)
+
+
+def test_every_command_is_in_one_group(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    grouped = [name for names in GROUPS.values() for name in names]
+    assert sorted([*grouped, 'completion']) == sorted(COMMANDS)
+    text = help_of('', capsys, monkeypatch, 80)
+    listed = re.findall(r'^ {4}([a-z-]+)(?: |$)', text[text.index('commands:') : text.index('where to begin')], re.M)
+    assert listed == [*grouped, 'completion']
+    assert [text.index(f'\n  {title}\n') for title in GROUPS] == sorted(
+        text.index(f'\n  {title}\n') for title in GROUPS
+    )
+
+
+def test_the_short_list_of_parameters_is_short(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['params', '--short']) == 0
+    named = re.findall(r'^(\S+) = ', capsys.readouterr().out, re.M)
+    assert set(named) == set(NEEDED)
+    assert main(['params', '--short', '--json']) == 0
+    assert set(json.loads(capsys.readouterr().out)) == set(NEEDED)
+
+
+def options_of(command: str) -> set[str]:
+    return set(make_parser([command]).parse_args([command]).known_options)
+
+
+def test_one_thing_has_one_name_in_all_commands() -> None:
+    """What was called otherwise once still works."""
+    for command in ('estimator', 'monitor'):
+        assert {'--monitor-port', '--monitor-address', '--port', '--params-file'} <= options_of(command)
+    monitor = make_parser(['monitor']).parse_args(['monitor', '--http-port', '1', '--address', '::1'])
+    assert (monitor.monitor_port, monitor.monitor_address) == (1, '::1')
+    assert '--true-pose' in options_of('simulate')
+    assert make_parser(['simulate']).parse_args(['simulate', '--reference']).reference is True
 
 
 @pytest.mark.parametrize('command', COMMANDS)

@@ -135,6 +135,35 @@ def test_every_page_is_two_steps_from_the_readme() -> None:
     assert {str(page.relative_to(ROOT)) for page in PAGES if page not in first | second | {ROOT / 'README.md'}} == set()
 
 
+QUESTIONS = {
+    'May my user open the port?': ('hardware.md', 'dialout'),
+    'How is an Arduino wired?': ('devices/lines.md', '## Wiring'),
+    'A PSD is mirrored: what now?': ('calibration.md', 'mirrored'),
+    'How is a recording computed with another rig file?': ('recording.md', '--params-file'),
+    'What does ± mean?': ('accuracy.md', '# Accuracy: what ±'),
+    'How is a load noted?': ('monitor.md', 'psd-deflection load 0 -10 0'),
+    'Why is there no estimate without a laser?': ('troubleshooting.md', '| laser lost |'),
+    'How do estimates get into pandas?': ('api.md', 'to_pandas()'),
+    'How does it start at boot?': ('deploy/README.md', 'systemctl'),
+    'How is the page seen from another computer?': ('monitor.md', 'ssh -L'),
+    'Which columns has a CSV?': ('recording.md', '`load_fx,load_fy,load_tz`'),
+    'What are gap and floor?': ('glossary.md', '| floor |'),
+    "What sets the page's port in a rig file?": ('monitor.md', '`monitor_port`'),
+    'How is a recording cut?': ('recording.md', '## A part of a recording'),
+    'How many loads does discover need?': ('discover.md', 'How much is enough?'),
+}
+"""What newcomers looked for, and the words that answer it."""
+
+
+@pytest.mark.parametrize('question', QUESTIONS)
+def test_what_newcomers_ask_is_answered_on_a_page_two_steps_from_the_readme(question: str) -> None:
+    page, words = QUESTIONS[question]
+    first = linked(ROOT / 'README.md')
+    second = set().union(*(linked(near) for near in first if near.suffix == '.md'))
+    assert ROOT / 'docs' / page in first | second
+    assert words in (ROOT / 'docs' / page).read_text()
+
+
 def named(tree: Any) -> list[str]:
     """The files that a part of the menu names."""
     if isinstance(tree, str):

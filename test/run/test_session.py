@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from prometheus_client.openmetrics.parser import text_string_to_metric_families
 
 from msg_adapters import LOAD, MARK, REFERENCE, to_messages
 from psd_deflection.base.bounds import RateLimit
@@ -20,6 +21,7 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.run import processing
 from psd_deflection.run import session as module
 from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
+from psd_deflection.run.monitor.metrics import text_of
 from psd_deflection.run.monitor.shown import RefusedError, ShownSession
 from psd_deflection.run.repeats import Repeats
 from psd_deflection.run.session import Session
@@ -67,6 +69,23 @@ def test_no_zero_is_taken_of_a_device_that_is_away(running: Running, device: Scr
     running.heard('waiting for it to come back')
     with pytest.raises(TimeoutError, match='no data flows'):
         running.session.zero()
+
+
+def test_metrics_count_what_came_was_lost_and_was_refused(running: Running) -> None:
+    running.session.refuse_input(LOAD, 'a number is not finite')
+    running.session.processing.request(lambda: None)
+    families = ShownSession(running.session).metrics()
+    found = {
+        (s.name, *s.labels.values()): s.value
+        for family in text_string_to_metric_families(text_of(families))
+        for s in family.samples
+    }
+    assert found[('psd_deflection_samples_total',)] == running.session.acquisition.counters.samples > 0
+    assert found[('psd_deflection_estimates_total',)] >= 5.0
+    assert found[('psd_deflection_messages_refused_total', LOAD)] == 1.0
+    assert found[('psd_deflection_recording',)] == 0.0
+    # The device measures none, and nothing watches.
+    assert not any('celsius' in key[0] or 'watch' in key[0] for key in found)
 
 
 def test_diagnostics_report_no_dots_while_the_device_is_away(running: Running, device: ScriptedDevice) -> None:

@@ -4,7 +4,7 @@ The rig file describes the rig and its known effects. --effect adds a hidden eff
 contain it, but the estimates do not correct for it and the recorded parameters do not list it.
 --world sets a parameter of the simulated rig alone, so that the rig file has it wrong.
 A recording contains the samples, the estimates and the loads, the temperature if --temperature is
-given, and the true pose with --reference or, with noise, --reference-noise. A .csv has no estimates.
+given, and the true pose with --true-pose or, with noise, --reference-noise. A .csv has no estimates.
 
   psd-deflection simulate --out run --loads thesis --temperature 20,24
   psd-deflection simulate --out odd.csv --effect axis_crosstalk,psd=1,xy=0.02
@@ -73,7 +73,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help='add a hidden effect; repeatable',
     )
-    group.add_argument('--reference', action='store_true', help='record the true pose as a reference measurement')
+    group.add_argument(
+        '--true-pose',
+        '--reference',
+        dest='reference',
+        action='store_true',
+        help='record the true pose as a reference measurement',
+    )
     group.add_argument(
         '--reference-noise',
         metavar='XY,THETA',

@@ -60,6 +60,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument('--demo', action='store_true', help=DEMO)
     parser.add_argument('--monitor', action='store_true', help='serve the live page and print its address')
+    parameter_option(parser, '--monitor-port', 'monitor_port')
+    parameter_option(parser, '--monitor-address', 'monitor_address')
     parser.add_argument('--foxglove', action='store_true', help='serve the messages to Foxglove and print the address')
     parser.add_argument('--no-ros', action='store_true', help='acquire and record without ROS')
     parser.add_argument(

@@ -3,7 +3,7 @@
 Without REC it acquires, without ROS, from --port or from a simulated rig of its own, which hangs the loads
 that are noted; with --demo weights hang on it in turn. With REC (a bag folder, an .mcap or a .csv) it plays that
 recording. Only this machine can open the page, unless
---address is given. Its buttons (zero, record, load, mark) work for users of this machine. If the network can
+--monitor-address is given. Its buttons (zero, record, load, mark) work for users of this machine. If the network can
 reach the page, they are off; with --control they work for those who have the printed address with its
 token. Ctrl-C ends it.
 
@@ -56,8 +56,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('recording', nargs='?', metavar='REC', help='a bag folder, an .mcap or a .csv to play')
     parser.add_argument('--params-file', metavar='RIG.yaml', help='ROS 2 parameter file with the rig')
     page = parser.add_argument_group('the page')
-    parameter_option(page, '--http-port', 'monitor_port')
-    parameter_option(page, '--address', 'monitor_address')
+    parameter_option(page, '--monitor-port', 'monitor_port', '--http-port')
+    parameter_option(page, '--monitor-address', 'monitor_address', '--address')
     control = page.add_mutually_exclusive_group()
     control.add_argument(
         '--control',

@@ -25,7 +25,7 @@ from psd_deflection import __version__
 from psd_deflection.base.log import INFO, Say
 from psd_deflection.records import BlockStatus, DiagnosticReport, ReferencePose, SampleBlock
 from psd_deflection.rig.running import MonitorConfig
-from psd_deflection.run.monitor import access
+from psd_deflection.run.monitor import access, metrics
 from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
 from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer
 from psd_deflection.run.monitor.served import MAX_AGO_S, SINCE_STEP, Served, announce, withdraw
@@ -40,6 +40,8 @@ PUMP_S = 0.03
 SPECTRUM_EVERY_S = 0.5
 HEALTH_S = 0.9
 HISTORY_S = 60.0
+FRESH_S = 2.0
+"""A block that came longer ago, s, is in no metrics: the device is away, and a scrape may come once a minute."""
 MESSAGES = 50
 MARKS = 200
 """Loads, zeros and marks that are kept."""
@@ -74,6 +76,8 @@ class MonitorServer(GatedServer):
         self._rows: deque[str] = deque(maxlen=max(100, round(HISTORY_S * rate)))
         self._row_count = 0
         # References may come faster than blocks: one for each block is shown.
+        self._last_block: BlockResult | None = None
+        self._block_came = 0.0
         self._references: deque[str] = deque(maxlen=self._rows.maxlen)
         self._reference_count = 0
         self._reference_ns: int | None = None
@@ -114,6 +118,7 @@ class MonitorServer(GatedServer):
         """The page, its websocket, its buttons."""
         application.router.add_get('/', self._index)
         application.router.add_get(self.websocket_path, self._websocket)
+        application.router.add_get('/metrics', self._metrics)
         application.router.add_post('/api/zero', self._zero)
         application.router.add_post('/api/record', self._record)
         application.router.add_post('/api/load', self._load)
@@ -136,6 +141,7 @@ class MonitorServer(GatedServer):
             for item in self._feed.take():
                 if isinstance(item, BlockResult):
                     self._rows.append(row_json(item))
+                    self._last_block, self._block_came = item, time.monotonic()
                     self._row_count += 1
                     new = True
                 elif isinstance(item, SampleBlock):
@@ -203,6 +209,13 @@ class MonitorServer(GatedServer):
 
     async def _index(self, request: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / 'index.html')
+
+    async def _metrics(self, request: web.Request) -> web.StreamResponse:
+        families = self._shown.metrics()
+        families.append(metrics.counter('page_dropped', 'Items for which the page was too slow', self._feed.dropped))
+        if self._last_block is not None and time.monotonic() - self._block_came < FRESH_S:
+            families += metrics.of_block(self._last_block)
+        return web.Response(text=metrics.text_of(families), headers={'Content-Type': metrics.CONTENT_TYPE})
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
         # A browser that does not read for this long is gone.

@@ -30,6 +30,7 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.run.diagnostics import ERROR, OK, WARN, HealthReporter
 from psd_deflection.run.last_step import REACH_S, RecentDots
 from psd_deflection.run.monitor.feed import QUEUE_ITEMS, Feed
+from psd_deflection.run.monitor.metrics import Family, of_pipeline, of_session
 from psd_deflection.run.session import Session, load_text, mark_text, why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
@@ -60,6 +61,9 @@ class Shown(Protocol):
 
     def health(self, t_ns: int) -> DiagnosticReport:
         """Once a second."""
+
+    def metrics(self) -> list[Family]:
+        """What was counted since the start."""
 
     def zero(self) -> str:
         """Take the present dots as the unloaded ones; return the result as a line. Raises RefusedError."""
@@ -110,6 +114,10 @@ class ShownSession:
     def health(self, t_ns: int) -> DiagnosticReport:
         """As on ``/diagnostics``."""
         return self._health.report(t_ns)
+
+    def metrics(self) -> list[Family]:
+        """Of the session."""
+        return of_session(self._session)
 
     def zero(self) -> str:
         """Take the zero between two blocks."""
@@ -306,6 +314,10 @@ class ShownRecording:
             )
         )
         return DiagnosticReport(t_ns, tuple(entries))
+
+    def metrics(self) -> list[Family]:
+        """Of the part that was played."""
+        return of_pipeline(self._pipeline)
 
     def zero(self) -> str:
         """Take the zero between two blocks; it holds for the rest of the playback."""

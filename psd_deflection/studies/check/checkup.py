@@ -149,7 +149,9 @@ def _load_findings(seen: Sequence[PushResponse], found: WiringFit) -> list[Findi
 def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str, object]) -> list[Finding]:
     """The noise of each PSD's x and y, and the converter's steps, against the rig file."""
     columns = [wiring.columns[c] for c in DOT_CHANNELS]
-    noise = [math.nan if CHANNELS[c] in measured.stuck else measured.noise[c] for c in columns]
+    # Steps hide a noise that is smaller than they are.
+    hidden = [CHANNELS[c] in measured.stuck or measured.noise[c] < measured.steps[c] for c in columns]
+    noise = [math.nan if unseen else measured.noise[c] for c, unseen in zip(columns, hidden, strict=True)]
     found, right = noise_findings(rig, np.array(noise), measured.steps[columns].reshape(2, 2))
     steps, bits = step_findings(rig, measured.steps)
     lines |= right | bits

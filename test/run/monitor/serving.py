@@ -17,6 +17,7 @@ from psd_deflection.records import (
 )
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.monitor.feed import Feed
+from psd_deflection.run.monitor.metrics import Family, counter
 from psd_deflection.run.monitor.server import MonitorServer
 from psd_deflection.run.monitor.shown import RefusedError
 
@@ -48,6 +49,9 @@ class StillShown:
         return DiagnosticReport(
             t_ns, (DiagnosticEntry('psd_deflection: acquisition', 0, 'samples flow', (('rate (samples/s)', '1000'),)),)
         )
+
+    def metrics(self) -> list[Family]:
+        return [counter('samples', 'Samples that came', 40)]
 
     def zero(self) -> str:
         if self.refusal:

@@ -70,7 +70,8 @@ def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
 
     def more(message: dict[str, Any]) -> bool:
         seen.extend(message.get('rows', []))
-        if len(seen) == 5:
+        # A message without rows may come while there are five.
+        if len(seen) == 5 and 'rows' in message:
             serving.give(5, 3, status=BlockStatus.LASER_LOST)
         return len(seen) >= 8 and any('health' in m for m in (message, *got))
 

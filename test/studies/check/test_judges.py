@@ -13,6 +13,8 @@ from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check import judges
+from psd_deflection.studies.check.checkup import check, of_recording
+from psd_deflection.studies.check.levels import levels
 from psd_deflection.studies.check.wirings import WIRINGS
 
 RIG = load_rig()
@@ -151,6 +153,19 @@ def test_check_and_discover_name_a_converter_that_is_coarser_than_the_file_says(
         assert [f['where'] for f in steps] == ['x1', 'y1', 'sum1', 'x2', 'y2', 'sum2']
         assert [f['value'] for f in steps] == pytest.approx([20.0 / 2**10] * 6, rel=1e-4)
         assert steps[0]['fix'] == 'converter.bits: 10 (x1 steps by 19.5 mV, the rig file says 0.305 mV)'
+
+
+def test_a_channel_that_stands_within_a_coarse_step_is_neither_dead_nor_too_quiet() -> None:
+    rng = np.random.default_rng(3)
+    volts = rng.normal((0.0, 0.0, 5.0, 0.0, 0.0, 5.0), 0.002, (3000, 6))
+    volts[:, [0, 1, 3, 4]] += 0.2 * np.sin(np.arange(3000) / 300.0)[:, None]
+    coarse = levels(RIG, 0.02 * np.round(volts / 0.02))
+    assert coarse.stuck == ()
+    found = check(of_recording(RIG, 0.02 * np.round(volts / 0.02), np.zeros((3000, 3))))
+    assert {f.name for f in found.findings} == {'converter_step', 'load_coverage'}
+    # With a fine converter a channel on which no bit moves is dead.
+    volts[:, 5] = 5.0
+    assert levels(RIG, volts).stuck == ('sum2',)
 
 
 def test_a_step_that_is_no_power_of_two_has_no_line() -> None:

@@ -1,0 +1,171 @@
+"""Makes docs/gallery.md and its pictures: ``python -m tools.gallery``.
+
+Each case of :mod:`tools.gallery_cases` is a simulated rig with one fault. The command of the case is run on its
+recording; the page gets the plot of the recording and, word for word, what the command says.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import math
+import re
+import shlex
+import sys
+import tempfile
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from blind.campaign import conclude, options, over
+from psd_deflection.cli.main import main as psd_deflection
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.replay.engine import open_for_replay, replayed
+from psd_deflection.run.diagnostics import OK, Seen, estimates_entry, laser_entry
+from tools.gallery_cases import CASES, STUDIES, Case
+from tools.program import ROOT
+
+PAGE = ROOT / 'docs' / 'gallery.md'
+FIGURES = ROOT / 'docs' / 'figures' / 'gallery'
+NUMBER = re.compile(r'\d+(?:\.\d+)?(?:e[+-]\d+)?')
+WIDTH = 760
+"""Pixels of a picture, as wide as the column of the site."""
+COLOURS = 24
+
+SAID = re.compile(r'^(?:RIGHT|WRONG|CANNOT TELL)[\s\S]*?(?=\n\n)|^note .*', re.M)
+"""What a person reads first of the answer of ``check``: a pattern of lines, all of which are taken."""
+
+
+def run(words: list[str]) -> str:
+    """What one of our commands prints. Raises SystemExit if it fails."""
+    stream, errors = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(stream), contextlib.redirect_stderr(errors):
+        status = psd_deflection(words)
+    if status:
+        raise SystemExit(f'{shlex.join(words)}\n{stream.getvalue()}{errors.getvalue()}')
+    return stream.getvalue()
+
+
+def record(case: Case, folder: Path) -> Path:
+    """The recording of the case: simulated, then changed as the case says."""
+    path = folder / f'{case.name}.csv'
+    run(['simulate', '--out', str(path), *shlex.split(case.simulate)])
+    if case.change is not None:
+        names = path.read_text().partition('\n')[0].split(',')
+        table = np.loadtxt(path, delimiter=',', skiprows=1, ndmin=2)
+        columns = case.change({name: table[:, i] for i, name in enumerate(names)})
+        np.savetxt(path, np.column_stack(list(columns.values())), '%.10g', ',', header=','.join(names), comments='')
+    return path
+
+
+def said_live(path: Path) -> str:
+    """What the live page and ``/diagnostics`` say at the end of the recording, from a report that covers it all."""
+    recording, rig = open_for_replay(path)
+    pipeline = Pipeline(rig)
+    for _ in replayed(recording, pipeline):
+        pass
+    count = pipeline.counters
+    new = Seen(
+        0, count.samples, 0, 0, 0, count.blocks, count.estimates, count.degraded, pipeline.stamped.contradictions, 0, 0
+    )
+    entries = [
+        estimates_entry(pipeline, new, 'unknown'),
+        *(laser_entry(pipeline, psd) for psd in range(1, len(rig.psds) + 1)),
+    ]
+    wrong = [entry for entry in entries if entry.level > OK]
+    return '\n'.join(f'{e.name.partition(": ")[2]}: {e.message}' for e in wrong or entries)
+
+
+def answered(case: Case, folder: Path) -> str:
+    """What the product says of the case."""
+    path = record(case, folder)
+    if case.study == 'live':
+        return said_live(path)
+    answer = run([case.study, str(path)])
+    said = '\n'.join(line.strip() for found in SAID.findall(answer) for line in found.splitlines())
+    return said.replace(f'{folder}/', '')
+
+
+def picture(case: Case, folder: Path) -> bytes:
+    """The plot of its recording, small."""
+    drawn = folder / f'{case.name}.png'
+    run(['plot', str(folder / f'{case.name}.csv'), '--out', str(drawn)])
+    image = Image.open(drawn).convert('RGB')
+    image.thumbnail((WIDTH, WIDTH))
+    stream = io.BytesIO()
+    image.quantize(COLOURS).save(stream, 'png', optimize=True)
+    return stream.getvalue()
+
+
+def section(case: Case, said: str) -> str:
+    """The part of the page about one case."""
+    quoted = '\n'.join(f'    {line}' for line in said.splitlines())
+    return (
+        f'### {case.title}\n\n![{case.title}: the recording](figures/gallery/{case.name}.png)\n\n'
+        f'It says:\n\n{quoted}\n\n{case.do}\n'
+    )
+
+
+def page(said: dict[str, str]) -> str:
+    """The whole page; ``said``: by the name of the case."""
+    parts = [
+        '# Gallery\n\nHow a good rig looks, and how typical faults look. Below each picture stand the words that the '
+        'program said, and what to do.\n\n`make gallery` makes this page: it simulates each rig, runs the '
+        'command, and copies what it says. The tests run them again.\n'
+    ]
+    for name, study in STUDIES.items():
+        parts.append(f'## {study.title}\n\n{study.about}\n')
+        parts += [section(case, said[case.name]) for case in CASES if case.study == name and case.name in said]
+    return '\n'.join(parts)
+
+
+def kept() -> dict[str, str]:
+    """What the page has of each case, by its name."""
+    if not PAGE.exists():
+        return {}
+    found = re.findall(r'figures/gallery/(\w+)\.png\)\n\nIt says:\n\n((?: {4}.*\n)+)', PAGE.read_text())
+    return {name: '\n'.join(line[4:] for line in text.splitlines()) for name, text in found}
+
+
+def same(now: str, before: str) -> bool:
+    """Whether two answers have the same words, and numbers that agree within 5 %: other processors round otherwise."""
+    if NUMBER.split(now) != NUMBER.split(before):
+        return False
+    pairs = zip(NUMBER.findall(now), NUMBER.findall(before), strict=True)
+    return all(math.isclose(float(a), float(b), rel_tol=0.05, abs_tol=1e-9) for a, b in pairs)
+
+
+def shown(case: Case, renew: bool) -> str:
+    """What the product says of the case; ``renew``: its picture is drawn too."""
+    with tempfile.TemporaryDirectory() as temporary:
+        said = answered(case, Path(temporary))
+        if renew:
+            (FIGURES / f'{case.name}.png').write_bytes(picture(case, Path(temporary)))
+    return said
+
+
+def main() -> int:
+    """Run the cases; write the page, or hold it against what they say now."""
+    parser = options(__doc__, jobs=1)
+    parser.add_argument('--only', metavar='WORD', help='only the cases with this word in their name')
+    parser.add_argument('--check', action='store_true', help='write nothing: does the page have what they say?')
+    args = parser.parse_args()
+    cases = [case for case in CASES if args.only is None or args.only in case.name]
+    FIGURES.mkdir(exist_ok=True)
+    said, before = {}, kept()
+    answers = over(partial(shown, renew=not args.check), cases, args.jobs, 'cases')
+    for case, answer in zip(cases, answers, strict=True):
+        said[case.name] = answer
+    differ = [name for name, answer in said.items() if not same(answer, before.get(name, ''))]
+    if not args.check:
+        PAGE.write_text(page(kept() | said))
+        for left in set(FIGURES.glob('*.png')) - {FIGURES / f'{case.name}.png' for case in CASES}:
+            left.unlink()
+    text = '\n\n'.join(f'{name}\n{said[name]}' for name in differ)
+    return conclude(text or 'every case says what the page has', met=not (args.check and differ))
+
+
+if __name__ == '__main__':
+    sys.exit(main())
