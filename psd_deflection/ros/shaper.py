@@ -84,7 +84,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
         if not self.active:
             return
         if not message.points:
-            # joint_trajectory_controller stops at an empty one, and so does whoever listens to us.
+            # Some controllers stop at an empty one. Whoever listens to us gets it.
             self._shaper.forget()
             self._stop('stopped by an empty trajectory')
             self._out.publish(message)

@@ -58,12 +58,18 @@ def _check(tree: Any, path: Path) -> None:
     for key in ('rows', 'outliers'):
         if not _is_number(reference.get(key)):
             raise ConfigError(f'{path}: reference.{key}: not a number; calibrate again')
-    seen = _map(tree, 'range', path)
+    _check_range(_map(tree, 'range', path), path)
+    _check_provenance(_map(tree, 'provenance', path), path)
+
+
+def _check_range(seen: Mapping[str, Any], path: Path) -> None:
     for key in ('low', 'high'):
         ends = seen.get(key)
         if not isinstance(ends, list) or len(ends) != 3 or not all(map(_is_number, ends)):
             raise ConfigError(f'{path}: range.{key}: must be three numbers; calibrate again')
-    given = _map(tree, 'provenance', path)
+
+
+def _check_provenance(given: dict[str, Any], path: Path) -> None:
     runs = given.get('recordings')
     if not isinstance(runs, list) or not all(isinstance(r, dict) and {'name', 'sha256'} <= r.keys() for r in runs):
         raise ConfigError(f'{path}: provenance.recordings: must be maps with name and sha256; calibrate again')
