@@ -58,6 +58,7 @@ BOUNDED_BY = {
     'measure/watch.py:_since': 'REMEMBER',
     'ros/camera.py:_since': 'one second',
     'ros/chain.py:_inputs': 'the links of the chain',
+    'ros/follow.py:_goals': 'MOST_WAITING, and MOST_GOALS a second that end within ANSWER_S of being replaced',
     'ros/chain.py:_told': 'the links of the chain',
     'ros/chain.py:_wires': 'the links of the chain',
     'ros/log.py:_lines': 'MOST_LINES',

@@ -91,6 +91,7 @@ UNNAMED = {
     'cyclonedds': 'another DDS as judge; not in rosdep',
     'rosbags': 'another reader as judge; from PyPI, so not forced on whoever builds the workspace',
     'selenium': 'the page in a browser; not tested in a build of ROS',
+    'prometheus_client': 'the judge of /metrics; not tested in a build of ROS',
     **dict.fromkeys(('psd_deflection', 'msg_adapters', 'test', 'tools', 'bench', 'blind'), 'ours'),
 }
 """What the sources import and package.xml does not name."""
@@ -106,7 +107,7 @@ def imported(*folders: str) -> set[str]:
             elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
                 names.add(node.module.partition('.')[0])
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and 'test' not in folders:
-                found = re.fullmatch(r'(\w+)(?:/msg/\w+|\.msg)', node.value)
+                found = re.fullmatch(r'(\w+)(?:/(?:msg|action)/\w+|\.msg)', node.value)
                 names |= {found[1]} if found else set()
     names -= {*sys.stdlib_module_names, *UNNAMED}
     ros = {n for n in names if n in ROS_PACKAGES or n.endswith(('_msgs', '_srvs'))}

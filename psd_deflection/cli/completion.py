@@ -36,7 +36,7 @@ FILES = (
     'PORT',
     'PATH',
 )
-FOLDERS = ('DIR', 'FOLDER')
+FOLDERS = ('DIR', 'FOLDER', 'CALIBRATION')
 """Names of values in the help that are to be completed as paths; a bag is a folder, and completed as a file is."""
 
 

@@ -76,7 +76,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     'run: measure, look on, note': ('estimator', 'monitor', 'chain', 'echo', 'zero', 'load', 'mark', 'record'),
     'rig: describe it, wire it, know what to expect': ('devices', 'check', 'params', 'design', 'budget'),
     'recording: compute again, draw, convert': ('replay', 'plot', 'info', 'convert', 'recover'),
-    'truth: an independent measurement': ('camera', 'validate', 'calibrate'),
+    'truth: an independent measurement': ('camera', 'validate', 'calibrate', 'certificate'),
     'model: simulate, find what is missing': ('simulate', 'discover', 'effects', 'compare-methods'),
     'motion: what rings, and an arm that moves': ('identify', 'compensator', 'shaper'),
 }

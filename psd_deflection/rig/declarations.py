@@ -134,7 +134,7 @@ class CalibrationConfig:
     range: tuple[float, ...] = parameter(
         (0.0,),
         '',
-        'poses that it was made with: least dx, dy (m), theta (rad), then the largest; 0: not known, nothing is said',
+        'poses that it was made with: least ΔX, ΔY (m), θ (rad), then the largest; 0: not known, nothing is said',
         minimum=-1000.0,
         maximum=1000.0,
     )

@@ -58,7 +58,7 @@ def test_calibration_json_has_the_documented_shape(made: Path) -> None:
     found: dict[str, Any] = json.loads((made / 'out' / 'calibration.json').read_text())
     assert set(found['parameters']) == NAMES
     for one in found['parameters'].values():
-        assert set(one) == {'value', 'sd', 'unit', 'file'}
+        assert set(one) == {'value', 'sd', 'unit', 'file', 'used'}
     matrix = np.array(found['covariance']['matrix'])
     at = found['covariance']['names']
     assert set(at) == NAMES

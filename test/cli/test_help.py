@@ -125,6 +125,11 @@ def test_its_examples_run(
     shutil.copy(ROOT / 'bags' / 'clean' / 'clean_0.mcap', tmp_path / 'lone.mcap')
     monkeypatch.chdir(tmp_path)
     assert main(['convert', 'bags/clean', '--out', 'run.csv']) == 0
+    if command == 'certificate':
+        loads = 'steps:0,0,0;0,-40,-20;40,0,15;-40,30,0;0,40,20;-40,-30,-15;20,0,-20;0,0,0:1'
+        words = ['--reference-noise', '1e-5,5e-4', '--effect', 'sensor_rotation,psd=2,angle=0.012']
+        assert main(['simulate', '--out', 'moved.csv', '--loads', loads, *words]) == 0
+        assert main(['calibrate', 'moved.csv', '--out', 'calibrated', '--quiet']) == 0
     for line in found:
         argv = shlex.split(line)[1:]
         args = make_parser([argv[0]]).parse_args(argv)

@@ -51,6 +51,6 @@ def test_the_quoted_figures_are_the_printed_ones(
     assert quoted in (ROOT / 'docs' / 'budget.md').read_text(encoding='utf-8')
     name = 'computation' if '--method' in arguments else 'total'
     line = next(line.split() for line in out.splitlines() if line.startswith(name))
-    figures = line[4:7] if name == 'computation' else line[1:4]
-    # 'computation  E_C  known bias  ΔX ΔY θ ...'
+    figures = line[6:9] if name == 'computation' else line[1:4]
+    # 'computation  E_C  known bias  B  ∞  ΔX ΔY θ ...'
     assert [w for w in quoted.replace('|', ' ').split() if w[0].isdigit()] == figures

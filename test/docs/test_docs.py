@@ -443,7 +443,7 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     assert {str(values[name]) for name in set(values) - as_path} == {
         '/NAME', 'ADDRESS', 'LINK', 'M', 'N', 'NAME', 'PPM', 'S', 'SECONDS', 'SEED', 'SOURCE', 'TEXT',
         'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'WHERE', 'X', 'X,Y', 'XY,THETA',
-        "('FX', 'FY', 'TZ')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
+        "('FX', 'FY', 'TZ')", "('DX', 'DY', 'THETA')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip
 
 

@@ -201,7 +201,7 @@ def _expanded(rows: Sequence[InputQuantity], correlations: FloatArray, pose: int
     return expanded(np.stack(variances), freedom, np.zeros(3))
 
 
-class Verdict(NamedTuple):
+class Conformity(NamedTuple):
     """Of one pose: as found and as left, each axis together."""
 
     found: str
@@ -211,12 +211,12 @@ class Verdict(NamedTuple):
 CONFORMS, FAILS, OPEN = 'conforms', 'does not conform', 'not decided'
 
 
-def verdict_of(found: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> Verdict:
+def verdict_of(found: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> Conformity:
     """Guarded acceptance with a guard band of U (JCGM 106:2012, 8.3.2): |error| + U within the limit on every axis.
 
     It does not conform if |error| - U is beyond the limit on any axis.
     """
-    return Verdict(*(_judged(np.abs(error), uncertainty, limits) for error in (found, np.zeros(3))))
+    return Conformity(*(_judged(np.abs(error), uncertainty, limits) for error in (found, np.zeros(3))))
 
 
 def _judged(error: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> str:

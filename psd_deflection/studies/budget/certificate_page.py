@@ -21,7 +21,7 @@ import numpy as np
 from psd_deflection import __version__
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import columns
-from psd_deflection.studies.budget.certificate import Certificate, CertificateProblem, Verdict, verdict_of
+from psd_deflection.studies.budget.certificate import Certificate, CertificateProblem, Conformity, verdict_of
 from psd_deflection.studies.budget.expanded import PROBABILITY
 from psd_deflection.studies.budget.result import AXES, UNITS, freedom_words, in_words, shown
 from psd_deflection.studies.study import PageSection, StudyResult
@@ -83,7 +83,7 @@ class Certified(StudyResult):
         return {name: self.problem.fields.get(name) or seen.get(name, '') for name in FIELDS}
 
     @property
-    def verdicts(self) -> list[Verdict]:
+    def verdicts(self) -> list[Conformity]:
         """Of each pose; empty without limits."""
         if self.problem.limits is None:
             return []
@@ -107,7 +107,7 @@ class Certified(StudyResult):
 
     def tree(self) -> dict[str, Any]:
         """SI; (ΔX, ΔY, θ) in this order."""
-        verdicts: Sequence[Verdict | None] = self.verdicts or [None] * len(self.found.poses)
+        verdicts: Sequence[Conformity | None] = self.verdicts or [None] * len(self.found.poses)
         rows = zip(self.found.poses, self.found.found, self.found.stated, verdicts, strict=True)
         return {
             'unit': ['m', 'm', 'rad'],

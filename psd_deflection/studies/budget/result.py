@@ -103,6 +103,7 @@ class Budgeted(StudyResult):
         stated = {
             'probability': PROBABILITY,
             **{name: value.tolist() for name, value in said._asdict().items()},
+            'freedom': [_or_none(value) for value in said.freedom.tolist()],
         }
         if self.interval is not None:
             stated['monte_carlo'] = {'half': self.interval.half.tolist(), 'middle': self.interval.middle.tolist()}
@@ -122,7 +123,7 @@ class Budgeted(StudyResult):
                     'share': budget.shares(line).tolist(),
                     'type': type_of(cause),
                     'distribution': cause.distribution.value,
-                    'freedom': cause.freedom(budget.at),
+                    'freedom': _or_none(cause.freedom(budget.at)),
                     'parameters': [
                         {'name': s.name, 'u': s.deviation, 'unit': cause.unit, 'sensitivity': s.coefficient.tolist()}
                         for s in cause.sensitivities(budget.at)
@@ -191,6 +192,11 @@ _RULES = (
 def type_of(cause: Cause) -> str:
     """A or B."""
     return 'A' if cause.observed else 'B'
+
+
+def _or_none(freedom: float) -> float | None:
+    """JSON has no infinity."""
+    return None if math.isinf(freedom) else freedom
 
 
 def freedom_words(freedom: float) -> str:
