@@ -4,12 +4,11 @@ A stand-in of joint_trajectory_controller serves the action. While a goal is und
 goal is cancelled, replaced, or cannot be followed. Every goal must end within a bounded time, and the command must not
 step; it is judged as in :mod:`bench.campaign.shaper_faults`.
 
-  python -m bench.campaign.action_faults 20
+  python -m bench.campaign.hold --times 20 --only action
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from typing import Any
 
@@ -133,7 +132,3 @@ def action_faults(times: int) -> float:
         print('action: control_msgs is not installed and cannot be built: not tried')
         return 0.0
     return injected(Followed(), (*REFUSED, *OTHERS), times, 'action')
-
-
-if __name__ == '__main__':
-    sys.exit(action_faults(int(sys.argv[1]) if len(sys.argv) > 1 else 1) > 1.0)

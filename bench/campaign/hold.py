@@ -91,7 +91,7 @@ SENT: dict[str, tuple[int, tuple[str, ...]]] = {
 
 ROBOT = ('protective stop', 'speed scaling 0', 'controller ended', 'joints do not follow', 'another publisher')
 """Faults of the robot and its controller."""
-COMPENSATOR, SHAPER = 'compensator', 'shaper'
+COMPENSATOR, SHAPER, ACTION = 'compensator', 'shaper', 'action'
 """All of their faults."""
 OWN = ('killed and started again', 'an error of its own')
 """Faults of the compensator."""
@@ -328,8 +328,9 @@ def main(argv: list[str] | None = None) -> int:
     names = (*DEFLECTIONS, *JOINTS, *ROBOT, *SENT, *OWN)
     parser = options(__doc__)
     parser.add_argument('--times', type=int, default=20, help='of each fault')
-    only = (*names, COMPENSATOR, SHAPER)
-    parser.add_argument('--only', nargs='+', choices=only, default=[COMPENSATOR, SHAPER], help='these faults alone')
+    all_of = (COMPENSATOR, SHAPER, ACTION)
+    only = (*names, *all_of)
+    parser.add_argument('--only', nargs='+', choices=only, default=all_of, help='these faults alone')
     parser.add_argument('--relay', choices=tuple(RELAYED), help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
     # As our nodes do: relays are killed, and would leave the campaign deaf.
@@ -340,7 +341,9 @@ def main(argv: list[str] | None = None) -> int:
     wanted = names if COMPENSATOR in args.only else [name for name in args.only if name in names]
     missed, worst = compensator_faults(wanted, args.times) if wanted else (0, 0.0)
     if SHAPER in args.only:
-        worst = max(worst, shaper_faults(args.times), action_faults(args.times))
+        worst = max(worst, shaper_faults(args.times))
+    if ACTION in args.only:
+        worst = max(worst, action_faults(args.times))
     return conclude(f'largest step of all: {worst:.3f} of what the rate allows', not missed and worst <= WITHIN)
 
 
