@@ -117,6 +117,8 @@ SHORTER = {
     r'^python -m blind\.watch\b': '--runs 1 --hours 0',
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
+    r'^python -m blind\.calibration\b': '--rigs 2',
+    r'^python -m bench\.cpu$': '--seconds 2',
     r'^ros2 topic echo\b': '--once',
 }
 """Additional arguments with which a command takes only seconds."""
@@ -395,10 +397,11 @@ class Reader:
         line = line.replace('http://127.0.0.1:8790', url)
         end = time.monotonic() + WAIT_S
         while True:
+            silent = '--silent' if 'POST' in line else '--silent --fail'
             done = subprocess.run(
-                ['bash', '-c', f'{line} --silent'], capture_output=True, text=True, check=True, timeout=WAIT_S
+                ['bash', '-c', f'{line} {silent}'], capture_output=True, text=True, check=True, timeout=WAIT_S
             )
-            answer = json.loads(done.stdout)
+            answer = json.loads(done.stdout) if 'POST' in line else {'ok': True}
             if answer['ok'] is True:
                 return
             # A zero has to wait until the simulated link rests: it does so once in each of its load cases.
