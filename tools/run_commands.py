@@ -25,7 +25,7 @@ import time
 import urllib.request
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from tools.program import PSD_DEFLECTION, ROOT, Program
 
@@ -401,7 +401,7 @@ class Reader:
             done = subprocess.run(
                 ['bash', '-c', f'{line} {silent}'], capture_output=True, text=True, check=True, timeout=WAIT_S
             )
-            answer = json.loads(done.stdout) if 'POST' in line else {'ok': True}
+            answer: dict[str, Any] = json.loads(done.stdout) if 'POST' in line else {'ok': True}
             if answer['ok'] is True:
                 return
             # A zero has to wait until the simulated link rests: it does so once in each of its load cases.
