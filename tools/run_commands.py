@@ -118,6 +118,7 @@ SHORTER = {
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
     r'^python -m blind\.calibration\b': '--rigs 2',
+    r'^python -m bench\.campaign\.hold\b': '--times 1',
     r'^python -m bench\.cpu$': '--seconds 2',
     r'^ros2 topic echo\b': '--once',
 }
