@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -12,7 +13,7 @@ from psd_deflection.studies.budget import environment, installation, sensor
 from psd_deflection.studies.budget.chain import measure
 from psd_deflection.studies.budget.computation import COMPUTATION
 from psd_deflection.studies.budget.expanded import Expanded, expanded
-from psd_deflection.studies.budget.term import Cause, Contribution, Kind, Situation
+from psd_deflection.studies.budget.term import Cause, Contribution, Kind, Sensitivity, Situation
 
 CAUSES: tuple[Cause, ...] = (*sensor.TERMS, *environment.TERMS, *installation.TERMS, COMPUTATION)
 """Every line of the budget."""
@@ -21,7 +22,7 @@ _CHUNK = 10_000
 """Number of draws computed at once; it limits memory."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Budget:
     """Contributions of all causes at ``at``, in the order of ``CAUSES``."""
 
@@ -34,6 +35,11 @@ class Budget:
         bias = np.sum([c.bias for c in chosen], axis=0, dtype=np.float64) + np.zeros(3)
         covariance = np.sum([c.covariance for c in chosen], axis=0, dtype=np.float64) + np.zeros((3, 3))
         return Contribution(bias, covariance)
+
+    @functools.cached_property
+    def sensitivities(self) -> tuple[list[Sensitivity], ...]:
+        """Those of each line, computed once: every report of a budget has the same digits."""
+        return tuple(cause.sensitivities(self.at) for cause, _ in self.lines)
 
     def expanded(self) -> Expanded:
         """The expanded uncertainty of an estimate, every cause as it is declared."""

@@ -126,10 +126,10 @@ class Budgeted(StudyResult):
                     'freedom': _or_none(cause.freedom(budget.at)),
                     'parameters': [
                         {'name': s.name, 'u': s.deviation, 'unit': cause.unit, 'sensitivity': s.coefficient.tolist()}
-                        for s in cause.sensitivities(budget.at)
+                        for s in sensitivities
                     ],
                 }
-                for cause, line in budget.lines
+                for (cause, line), sensitivities in zip(budget.lines, budget.sensitivities, strict=True)
             ],
             'totals': totals,
             'expanded': stated,
@@ -207,9 +207,9 @@ def freedom_words(freedom: float) -> str:
 def parameter_rows(budget: Budget) -> list[list[str]]:
     """Of every error parameter what a sum by hand needs, the head first; contributions in µm, µm, mdeg."""
     rows = [['cause', 'parameter', 'type', 'distribution', 'u', 'unit', 'ν', *(f'c {a}' for a in AXES), *UNITS]]
-    for cause, _ in budget.lines:
+    for (cause, _), sensitivities in zip(budget.lines, budget.sensitivities, strict=True):
         freedom = freedom_words(cause.freedom(budget.at))
-        for s in cause.sensitivities(budget.at):
+        for s in sensitivities:
             head = [cause.name, s.name, type_of(cause), cause.distribution.value, f'{s.deviation:.6g}', cause.unit]
             slopes = [f'{c:.6g}' for c in s.coefficient.tolist()]
             rows.append([*head, freedom, *slopes, *shown(np.abs(s.coefficient) * s.deviation)])
