@@ -22,6 +22,7 @@ from bench.damped_link import Swung, swing
 from bench.simulated_arm import LAG_S, SimulatedArm
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.compensation.trajectory import Trajectory, TrajectoryShaper, checked
+from psd_deflection.arms.inputs import standing
 from psd_deflection.arms.shapers import KINDS, Shaper, shaper
 from tools.program import ROOT
 
@@ -73,7 +74,10 @@ def unshaped() -> float:
 
 def left(by: Shaper) -> float:
     """Amplitude after the shaped move over that after the move as it is."""
-    return played(TrajectoryShaper(by).shape(0, move(), dict(zip(NAMES, START.tolist(), strict=True)))) / unshaped()
+    return (
+        played(TrajectoryShaper(by).shape(0, move(), standing(dict(zip(NAMES, START.tolist(), strict=True)))))
+        / unshaped()
+    )
 
 
 def rows() -> list[tuple[str, ...]]:
@@ -94,7 +98,7 @@ def link_move() -> Trajectory:
 def moved_links() -> dict[str, Swung]:
     """The one link moved as it is, shaped for a wrong frequency, and that with damping too."""
     by = shaper('zv', PAYLOAD_SHIFT * damped_link.FREQUENCY, damped_link.RATIO)
-    shaped = TrajectoryShaper(by).shape(0, link_move(), {'joint': 0.0})
+    shaped = TrajectoryShaper(by).shape(0, link_move(), standing({'joint': 0.0}))
     return {
         'no shaper': swing(LINK_S, link_move()),
         'shaper': swing(LINK_S, shaped),

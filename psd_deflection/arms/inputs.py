@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,8 @@ LONGEST_LIST = 1000
 """Joints in a message."""
 KNOWN_S = 0.5
 """For so long the position of a joint is known after it was told, s."""
+REST_S = 0.1
+"""The speed of a joint is that over at least this time, s: noise of its encoder is no motion."""
 UNIT_WITHIN = 1e-3
 """How far the length of a quaternion may be from 1."""
 
@@ -39,6 +42,34 @@ def is_position(value: float) -> bool:
     return abs(value) <= LARGEST_POSITION
 
 
+class MeasuredJoint(NamedTuple):
+    """``position``, rad or m; ``speed`` over ``REST_S`` or more, rad/s or m/s, NaN if it was not told for so long."""
+
+    position: float
+    speed: float
+
+
+def standing(positions: Mapping[str, float]) -> dict[str, MeasuredJoint]:
+    """Joints that are known to stand at ``positions``, rad or m."""
+    return {name: MeasuredJoint(position, 0.0) for name, position in positions.items()}
+
+
+class _Told(NamedTuple):
+    """What was told last, and two readings of before that are ``REST_S`` or more apart: (value, time)."""
+
+    last: tuple[float, float]
+    newer: tuple[float, float]
+    older: tuple[float, float] | None
+
+    def next(self, position: float, now: float) -> _Told:
+        last = position, now
+        return _Told(last, last, self.newer) if now - self.newer[1] >= REST_S else self._replace(last=last)
+
+    def measured(self) -> MeasuredJoint:
+        (at, then), older = self.last, self.older
+        return MeasuredJoint(at, abs(at - older[0]) / (then - older[1]) if older is not None else math.nan)
+
+
 class KnownJoints:
     """Where joints are, by name, of ``LONGEST_LIST`` of them at most, however many names are told.
 
@@ -46,19 +77,21 @@ class KnownJoints:
     """
 
     def __init__(self) -> None:
-        self._told: dict[str, tuple[float, float]] = {}
+        self._told: dict[str, _Told] = {}
 
     def tell(self, now: float, names: Sequence[str], positions: Sequence[float]) -> None:
         """Take what a message tells; a new name is passed over if there are too many of late."""
         if len(self._told) + len(names) > LONGEST_LIST:
-            self._told = {name: told for name, told in self._told.items() if now - told[1] <= KNOWN_S}
+            self._told = {name: told for name, told in self._told.items() if now - told.last[1] <= KNOWN_S}
         for name, position in zip(names, positions, strict=False):
             if is_position(position) and (name in self._told or len(self._told) < LONGEST_LIST):
-                self._told[name] = position, now
+                known, last = self._told.get(name), (position, now)
+                late = known is None or now - known.last[1] > KNOWN_S
+                self._told[name] = _Told(last, last, None) if late or known is None else known.next(position, now)
 
-    def positions(self, now: float) -> dict[str, float]:
-        """Of the joints that were told of late, rad or m."""
-        return {name: at for name, (at, then) in self._told.items() if now - then <= KNOWN_S}
+    def measured(self, now: float) -> dict[str, MeasuredJoint]:
+        """The joints that were told of late."""
+        return {name: told.measured() for name, told in self._told.items() if now - told.last[1] <= KNOWN_S}
 
     def __len__(self) -> int:
         return len(self._told)

@@ -18,7 +18,7 @@ from action_msgs.msg import GoalStatus
 from rclpy.clock import Clock, ClockType
 from trajectory_msgs.msg import JointTrajectory
 
-from psd_deflection.arms.compensation.trajectory import JointsError, OldStampError, TrajectoryShaper
+from psd_deflection.arms.compensation.trajectory import JointsError, MovingError, OldStampError, TrajectoryShaper
 from psd_deflection.arms.inputs import LONGEST_LIST, stamp_fault
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.ros.actions import OF_RCLPY
@@ -52,8 +52,8 @@ class _Goal:
     """One goal of a sender, by its ``handle``.
 
     ``sent``: the controller's handle of it, once it has taken it. ``future``: the answer that is
-    awaited. When, by a monotonic clock, s: ``asked`` it was sent, ``told`` feedback came last,
-    ``stopped`` it was cancelled, ``replaced`` by another.
+    awaited. When, by a monotonic clock, s: ``came`` it was accepted, ``asked`` it was sent,
+    ``told`` feedback came last, ``stopped`` it was cancelled, ``replaced`` by another.
     """
 
     def __init__(self, handle: Any) -> None:
@@ -61,6 +61,7 @@ class _Goal:
         self.sent: Any = None
         self.future: Any = None
         self.ended = False
+        self.came = time.monotonic()
         self.asked: float | None = None
         self.told: float | None = None
         self.stopped: float | None = None
@@ -168,10 +169,12 @@ class Follower:
             goal = self._waiting.popleft()
             if goal.stopped is not None:
                 self._end(goal, GoalStatus.STATUS_CANCELED, self._said('cancelled before it was sent', 'SUCCESSFUL'))
-            elif not goal.ended:
-                self._send(goal)
+            elif not goal.ended and not self._send(goal):
+                self._waiting.appendleft(goal)
+                return
 
-    def _send(self, goal: _Goal) -> None:
+    def _send(self, goal: _Goal) -> bool:
+        """Whether it was sent, or has ended; else it waits for joints that still move."""
         told = self._newest.told if self._newest is not None else None
         if told is not None and time.monotonic() - told > FRESH_S:
             self._shaper.forget()
@@ -184,13 +187,16 @@ class Follower:
             request.trajectory = self._shape(request.trajectory)
             future = self._client.send_goal_async(request, lambda message: self._fed(goal, message))
         except OF_RCLPY as error:
+            if isinstance(error, MovingError) and time.monotonic() - goal.came < ANSWER_S:
+                return False
             self._abort(goal, str(error), next((code for kind, code in CODES if isinstance(error, kind)), INVALID))
-            return
+            return True
         self._asked, goal.asked, goal.future = goal, time.monotonic(), future
         after = self._shaper.history
         self._when(future, lambda sent: self._answered(goal, sent, before, after))
         # rclpy keeps the handle of a goal for a while: not what may be large of it.
         request.trajectory = JointTrajectory()
+        return True
 
     def _when(self, future: Any, do: Callable[[Any], None]) -> None:
         """``do`` with what comes; what fails is refused, and the goal ends when it is due."""

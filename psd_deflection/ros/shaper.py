@@ -107,7 +107,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
         trajectory = _trajectory(message)
         stamp_ns = int(Time.from_msg(message.header.stamp).nanoseconds)
         start_ns = start_of(self.now_ns(), stamp_ns, self.settings.lead)
-        shaped = self._shaper.shape(start_ns, trajectory, self._known.positions(time.monotonic()))
+        shaped = self._shaper.shape(start_ns, trajectory, self._known.measured(time.monotonic()))
         self._shaped += 1
         # Whoever gets it begins when we did, however long the message takes: one that replaces
         # another makes no step.

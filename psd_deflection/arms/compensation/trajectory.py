@@ -13,6 +13,7 @@ it makes no step, whoever follows it must begin when we did: :func:`start_of`.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -21,6 +22,7 @@ import numpy as np
 from scipy.interpolate import PPoly
 
 from psd_deflection.arms.compensation.arm import JointLimits
+from psd_deflection.arms.inputs import MeasuredJoint
 from psd_deflection.arms.shapers import Shaper
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
@@ -35,6 +37,9 @@ SAME_S = 1e-6
 """Points of the shaped trajectory that are no further apart are one, s."""
 AT_REST = 1e-6
 """Velocity below which a trajectory ends at rest, rad/s or m/s."""
+STANDS = 0.05
+"""A joint that is measured to be slower than this stands, rad/s or m/s: until a trajectory begins, 0.1 s later by
+default, it goes a tenth of what ``max_step`` allows."""
 PARTS = 8
 """Parts of each piece of a trajectory whose ends are held against the limits."""
 OLDEST_S = 1.0
@@ -44,6 +49,10 @@ QUANTITIES = ('positions', 'velocities', 'accelerations')
 
 class JointsError(ConfigError):
     """The trajectory is of joints that cannot be: not named, not known, or other ones are under way."""
+
+
+class MovingError(ConfigError):
+    """The trajectory would begin at rest, while the joints still move, or are not known for long enough."""
 
 
 class OldStampError(ConfigError):
@@ -193,10 +202,11 @@ class TrajectoryShaper:
         start_ns, path = self.history[-1]
         return (t_ns - start_ns) / 1e9 < path.duration + self.shaper.duration
 
-    def shape(self, start_ns: int, given: Trajectory, measured: Mapping[str, float]) -> Trajectory:
-        """``given`` shaped, both from ``start_ns`` on. ``measured``: positions of joints; one that moves must be known.
+    def shape(self, start_ns: int, given: Trajectory, measured: Mapping[str, MeasuredJoint]) -> Trajectory:
+        """``given`` shaped, both from ``start_ns`` on. ``measured``: the joints; one that is to move must be known.
 
-        A trajectory without a point at 0 begins where the one before it is, or at the measured positions.
+        A trajectory without a point at 0 begins where the one before it is, or at the measured positions, if the joints
+        stand there: joints that still move, by a command that is forgotten, would be pulled back to where they were.
         Raises ConfigError with the reason; then nothing has changed.
         """
         moves = self.moves(start_ns)
@@ -215,7 +225,7 @@ class TrajectoryShaper:
         return out
 
     def _begun(
-        self, start_ns: int, given: Trajectory, pieces: Sequence[_Piece], measured: Mapping[str, float]
+        self, start_ns: int, given: Trajectory, pieces: Sequence[_Piece], measured: Mapping[str, MeasuredJoint]
     ) -> Trajectory:
         """``given`` with a point at 0. Raises ConfigError if it begins elsewhere than the joints are."""
         here = np.zeros_like(given.states[:1])
@@ -225,7 +235,12 @@ class TrajectoryShaper:
             missing = next((name for name in given.names if name not in measured), None)
             if missing is not None:
                 raise JointsError(f'the position of {missing} is not known')
-            here[0, 0] = [measured[name] for name in given.names]
+            here[0, 0] = [measured[name].position for name in given.names]
+            for name in given.names:
+                # NaN is not slow.
+                if not (speed := measured[name].speed) < STANDS:
+                    still = 'is known too shortly' if math.isnan(speed) else f'still moves, at {speed:.3g} rad/s or m/s'
+                    raise MovingError(f'{name} {still}: a trajectory begins at rest, or goes on from the one before it')
         if given.times[0] > 0.0:
             return Trajectory(given.names, np.append(0.0, given.times), np.concatenate([here, given.states]))
         away = np.abs(given.states[0, 0] - here[0, 0])

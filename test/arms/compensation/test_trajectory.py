@@ -15,14 +15,15 @@ from bench import damping
 from bench.steps import largest_step_in_time
 from bench.trajectory_controller import TrajectoryController
 from psd_deflection.arms.compensation.arm import JointLimits, read_limits
-from psd_deflection.arms.compensation.trajectory import Trajectory, TrajectoryShaper, checked, start_of
+from psd_deflection.arms.compensation.trajectory import MovingError, Trajectory, TrajectoryShaper, checked, start_of
+from psd_deflection.arms.inputs import MeasuredJoint, standing
 from psd_deflection.arms.shapers import KINDS, Shaper, in_series, shaper
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
 
 S = 1_000_000_000
 NAMES = ('shoulder', 'elbow')
-ZERO = {'shoulder': 0.0, 'elbow': 0.0, 'a': 0.0}
+ZERO = standing({'shoulder': 0.0, 'elbow': 0.0, 'a': 0.0})
 """Where the joints are."""
 ZVD = shaper('zvd', 12.0, 0.02)
 ZV = shaper('zv', 12.0, 0.02)
@@ -62,7 +63,7 @@ def test_positions_and_speeds_stay_within_those_that_were_given(legs: list[tuple
     times = np.cumsum([leg[0] for leg in legs]) - legs[0][0]
     points = [[[leg[1]], [0.0], []] for leg in legs]
     path = checked(['a'], times.tolist(), points)
-    shaped = TrajectoryShaper(shaper(kind, 9.0, 0.01)).shape(0, path, {'a': legs[0][1]})
+    shaped = TrajectoryShaper(shaper(kind, 9.0, 0.01)).shape(0, path, standing({'a': legs[0][1]}))
     (low, high, speed), (least, most, fastest) = path.fastest(), shaped.fastest()
     assert low[0] - 1e-6 <= least[0] <= most[0] <= high[0] + 1e-6
     assert fastest[0] <= speed[0] * 1.02 + 1e-6
@@ -96,7 +97,7 @@ def test_a_stream_of_set_points_is_shaped() -> None:
     for n in range(60):
         target = [min(0.01 * n, 0.3)]
         point = checked(['a'], [period], [[target, [], []]])
-        shaped = by.shape(round((10.0 + n * period) * S), point, {'a': 0.0})
+        shaped = by.shape(round((10.0 + n * period) * S), point, standing({'a': 0.0}))
         heard.append(shaped.at(np.array([0.0]))[0, 0, 0])
     # Point n is reached after n + 1 periods.
     wanted = sum(
@@ -114,8 +115,8 @@ def test_it_begins_where_the_joints_are() -> None:
     without_start = checked(NAMES, [0.5], [[[0.8, 0.1], [0.0, 0.0], []]])
     by = TrajectoryShaper(ZV)
     with pytest.raises(ConfigError, match='the position of elbow is not known'):
-        by.shape(0, without_start, {'shoulder': 0.3})
-    shaped = by.shape(0, without_start, {'shoulder': 0.3, 'elbow': 0.2, 'wrist': 0.0})
+        by.shape(0, without_start, standing({'shoulder': 0.3}))
+    shaped = by.shape(0, without_start, standing({'shoulder': 0.3, 'elbow': 0.2, 'wrist': 0.0}))
     assert shaped.times[0] == 0.0
     assert shaped.states[0].tolist() == [[0.3, 0.2], [0.0, 0.0]]
     # A joint of which nobody tells anything is not moved, wherever a trajectory says that it is.
@@ -125,9 +126,9 @@ def test_it_begins_where_the_joints_are() -> None:
     other = checked(['wrist'], [0.0], [[[0.1], [], []]])
     with pytest.raises(ConfigError, match='other joints are under way: shoulder, elbow'):
         by.shape(S // 10, other, {})
-    assert by.shape(3 * S, other, {'wrist': 0.1}).duration == pytest.approx(ZV.duration)
+    assert by.shape(3 * S, other, standing({'wrist': 0.1})).duration == pytest.approx(ZV.duration)
     with pytest.raises(ConfigError, match=r'begins 0.4 rad or m from where wrist is, must be at most 0.05'):
-        TrajectoryShaper(ZV).shape(0, other, {'wrist': 0.5})
+        TrajectoryShaper(ZV).shape(0, other, standing({'wrist': 0.5}))
 
 
 def test_a_stop_is_forgotten() -> None:
@@ -138,7 +139,10 @@ def test_a_stop_is_forgotten() -> None:
     by.forget()
     assert not by.moves(round(0.1 * S))
     elsewhere = checked(NAMES, [0.0], [[[2.0, 2.0], [], []]])
-    assert by.shape(round(0.1 * S), elsewhere, {'shoulder': 2.0, 'elbow': 2.0}).states[0, 0].tolist() == [2.0, 2.0]
+    assert by.shape(round(0.1 * S), elsewhere, standing({'shoulder': 2.0, 'elbow': 2.0})).states[0, 0].tolist() == [
+        2.0,
+        2.0,
+    ]
 
 
 def test_a_jump_under_way_is_refused_and_nothing_changes() -> None:
@@ -163,7 +167,7 @@ def test_limits_of_the_arm_are_those_of_its_file() -> None:
     with pytest.raises(ConfigError, match=r'shoulder is as fast as 2.4, must be at most 1 rad/s'):
         by.shape(0, moved(2, seconds=0.5, to=0.8), ZERO)
     with pytest.raises(ConfigError, match='wrist: the URDF file has no joint of that name'):
-        by.shape(0, checked(['wrist'], [0.0], [[[0.0], [], []]]), {'wrist': 0.0})
+        by.shape(0, checked(['wrist'], [0.0], [[[0.0], [], []]]), standing({'wrist': 0.0}))
     assert not by.moves(S)
     assert by.shape(0, moved(2, seconds=4.0, to=1.9), ZERO).states[-1, 0, 0] == 1.9
 
@@ -240,7 +244,7 @@ def replaced(orders: int, lead: float, latencies: FloatArray, stamped: bool = Tr
         if len(arriving) < len(sent) and sent[len(arriving)] <= now:
             point = [rng.uniform(-0.4, 0.4, 2).tolist(), *([[0.0, 0.0]] * (orders - 1)), *([[]] * (3 - orders))]
             start_ns = start_of(round(sent[len(arriving)] * S), 0, lead)
-            measured = dict(zip(NAMES, here.tolist(), strict=True))
+            measured = standing(dict(zip(NAMES, here.tolist(), strict=True)))
             shaped = by.shape(start_ns, checked(NAMES, [0.4], [point]), measured)
             fastest = max(fastest, float(by.history[-1].path.fastest()[2].max()))
             arriving.append((start_ns / S if stamped else 0.0, shaped))
@@ -293,3 +297,18 @@ def test_a_trajectory_begins_when_it_has_arrived() -> None:
     assert start_of(10 * S, 12 * S, 0.1) == 12 * S
     with pytest.raises(ConfigError, match='its stamp is 2 s old, must be at most 1 s'):
         start_of(10 * S, 8 * S, 0.1)
+
+
+@pytest.mark.parametrize(('speed', 'why'), [(0.3, 'shoulder still moves, at 0.3'), (math.nan, 'is known too shortly')])
+def test_a_trajectory_begins_at_joints_that_stand(speed: float, why: str) -> None:
+    """Whoever forgot the motion that is under way does not know where it will be when the next one begins."""
+    by = TrajectoryShaper(ZVD)
+    measured = ZERO | {'shoulder': MeasuredJoint(0.0, speed)}
+    with pytest.raises(MovingError, match=why):
+        by.shape(0, moved(2), measured)
+    by.shape(0, moved(2), ZERO)
+    # One that goes on from the motion that it knows may begin while they move.
+    by.shape(round(0.2 * S), checked(NAMES, [0.5], [[[0.1, 0.1], [0.0, 0.0], []]]), measured)
+    by.forget()
+    with pytest.raises(MovingError):
+        by.shape(round(0.3 * S), moved(2), measured)
