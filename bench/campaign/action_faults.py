@@ -9,6 +9,7 @@ step; it is judged as in :mod:`bench.campaign.shaper_faults`.
 
 from __future__ import annotations
 
+import signal
 import time
 from typing import Any
 
@@ -23,6 +24,7 @@ from tools.program import PSD_DEFLECTION, Program
 OTHERS = (
     'strange goals',
     'goal replaced',
+    'goal replaced, shaper starved',
     'goal cancelled',
     'controller rejects',
     'controller dies',
@@ -97,6 +99,15 @@ class Followed(Moved):
             for _ in range(5):
                 self.move()
                 self.spin(float(self._rng.uniform(0.02, 0.2)))
+        elif name == 'goal replaced, shaper starved':
+            # It is so late that it takes old feedback for the last, and forgets a motion that goes on.
+            for _ in range(4):
+                self.move()
+                for _ in range(4):
+                    self.shaper.process.send_signal(signal.SIGSTOP)
+                    self.spin(0.09)
+                    self.shaper.process.send_signal(signal.SIGCONT)
+                    self.spin(0.004)
         elif name == 'goal cancelled':
             self.under_way()
             self.spin(LONGEST_S, self._sent[-1].done, 'an answer to a goal')

@@ -18,6 +18,8 @@ from cyclonedds.pub import DataWriter
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+PERIOD_S = 0.05
+"""As many goals a second as are looked at: 20."""
 NAME = 'control_msgs::action::dds_::FollowJointTrajectory_SendGoal_Request_'
 
 
@@ -47,11 +49,14 @@ def main() -> None:
         Policy.DataRepresentation(use_cdrv0_representation=True),
     )
     writer = DataWriter(participant, Topic(participant, sys.argv[1], Half if half else Goal), qos=qos)
+    # Before, nobody would get what it sends.
+    while not writer.get_matched_subscriptions():
+        time.sleep(PERIOD_S)
     for number in range(10**6):
         own = [*number.to_bytes(4, 'little'), *([0] * 12)]
         writer.write(Half(own, 0) if half else Goal(own, 0, 0, list(b'\xff\xfe\0'), [0] * 4, [0], [0] * 8))
         print('sent', number, flush=True)
-        time.sleep(0.05)
+        time.sleep(PERIOD_S)
 
 
 if __name__ == '__main__':

@@ -115,13 +115,18 @@ def test_a_transition_lets_the_offsets_go_back_to_zero(compensator: Program, pee
     peer.until(lambda: plant.error() < 0.05 * free, 'offsets that follow')
     # So slowly that what was heard before it is stale by then.
     seconds = 1.5
-    slow = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=np.abs(plant.offsets[-1]).max() / seconds)
-    request = SetParameters.Request(parameters=[Parameter(name='max_rate', value=slow)])
-    assert peer.call(SetParameters, '/compensator/set_parameters', request).results[0].successful
+    assert changed(peer, 'max_rate', np.abs(plant.offsets[-1]).max() / seconds).successful
     for wanted in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_CLEANUP):
         assert changed_state(peer, wanted)
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
     assert plant.step() <= WITHIN
+
+
+def changed(peer: Any, name: str, value: float) -> Any:
+    """What the node answers when a parameter of a number is set."""
+    new = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
+    request = SetParameters.Request(parameters=[Parameter(name=name, value=new)])
+    return peer.call(SetParameters, '/compensator/set_parameters', request).results[0]
 
 
 def changed_state(peer: Any, wanted: int) -> bool:
@@ -138,18 +143,13 @@ def test_a_transition_with_offsets_that_stay_fails_and_says_so(compensator: Prog
     assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
     peer.until(lambda: plant.error() < 0.05 * free, 'offsets that follow')
 
-    def set_rate(value: float) -> None:
-        rate = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-        request = SetParameters.Request(parameters=[Parameter(name='max_rate', value=rate)])
-        assert peer.call(SetParameters, '/compensator/set_parameters', request).results[0].successful
-
-    set_rate(1e-4)
+    assert changed(peer, 'max_rate', 1e-4).successful
     asked = len(plant.offsets)
     assert not changed_state(peer, Transition.TRANSITION_DEACTIVATE)
     assert re.search(r'an offset of \S+ at \w+ is left after 10 s', compensator.text)
     # It goes on meanwhile, and the next attempt waits anew.
     assert 0.0 < np.abs(plant.offsets[-1]).max() < np.abs(plant.offsets[asked]).max()
-    set_rate(0.1)
+    assert changed(peer, 'max_rate', 0.1).successful
     assert changed_state(peer, Transition.TRANSITION_DEACTIVATE)
     peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
     assert changed_state(peer, Transition.TRANSITION_ACTIVATE)
@@ -274,15 +274,10 @@ def test_settings_are_parameters(compensator: Program, peer: Any) -> None:
     assert 'largest rate' in rate.description
     assert rate.floating_point_range[0].to_value == 10.0
 
-    def changed(name: str, value: float) -> Any:
-        new = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-        request = SetParameters.Request(parameters=[Parameter(name=name, value=new)])
-        return peer.call(SetParameters, '/compensator/set_parameters', request).results[0]
-
-    assert changed('max_rate', 0.05).successful
-    refused = changed('max_rate', 20.0)
+    assert changed(peer, 'max_rate', 0.05).successful
+    refused = changed(peer, 'max_rate', 20.0)
     assert not refused.successful
-    assert not changed('max_rat', 0.05).successful
+    assert not changed(peer, 'max_rat', 0.05).successful
 
 
 @pytest.mark.parametrize(
