@@ -2,7 +2,8 @@
 # make run      set-up of what a run needs (no test tools), then the daemon on the simulated rig, recorded below recordings/
 #               (make run PORT=/dev/ttyACM0 ARGS='--params-file my_rig.yaml' for a real one)
 # make test     set-up, then lint, types, import contracts and every test
-# make bench    what it costs, as ratios to peers measured in the same run (a few minutes)
+# make bench    what it costs, as ratios to peers measured in the same run (under five minutes on two idle cores)
+#               (BENCH=--full: longer and more often, into the files of docs/performance.md; a quarter of an hour)
 # make faults   a campaign of faults against the real node, each FAULT_TIMES=20 times (about 20 minutes)
 # make nodes    what every ROS node does alike: a table of check and node (five minutes)
 # make crash    kill -9 at 200 random instants while recording (about 8 minutes)
@@ -18,6 +19,7 @@
 # make colcon   build with colcon in a virtual environment of its own and look at what it installed
 # make docs     the documentation as a web site, in build/site
 # make axe      audit the web site with axe-core (needs Chromium)
+# make try-page  the page that tries it in the browser, run in Chromium: what is hidden must be named (TRY='--picture FILE' for its picture)
 # make notebooks  execute the notebooks of the documentation and keep what they answer
 # make wheel    sdist and wheel in dist/, tried in an environment of its own
 # make release-check  build all that a release publishes, try it, and look whether version, changelog, licences, addresses agree (RELEASE=1: as a release)
@@ -42,8 +44,10 @@
 # make clean    remove what the above made
 PYTHON ?= python3
 VENV ?= .venv
-# Further requirements, e.g. WITH='numpy<2' for what Ubuntu 24.04 has.
+# Further requirements, e.g. WITH='--constraint=packaging/ubuntu-24.04.txt' for what Ubuntu 24.04 has.
 WITH ?=
+# A build of OpenCV that is laid over PyPI's usual one, e.g. OPENCV='opencv-contrib-python-headless==4.6.0.66': Ubuntu's has boards.
+OPENCV ?=
 PORT ?=
 ARGS ?=
 # pip writes no byte code: half the time of a set-up goes into modules that nobody imports. The first import of a module
@@ -63,7 +67,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe page-soak gallery shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rosdep deb rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe try-page page-soak gallery shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rosdep deb rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -88,6 +92,7 @@ $(VENV)/.for_tests: $(VENV)/.requirements | $(VENV)/.installed
 	@echo 'the tools of the tests into $(VENV), once: a minute or so, 0.9 GB more'
 	$(BIN)/python -c 'import configparser; c = configparser.ConfigParser(); c.read("setup.cfg"); print(c["options.extras_require"]["test"])' > $(VENV)/test_tools
 	$(call INSTALL,$(VENV)) -r $(VENV)/test_tools $(if $(WITH),'$(WITH)')
+	$(if $(OPENCV),$(call INSTALL,$(VENV)) --no-deps '$(OPENCV)')
 	touch $@
 
 setup: $(READY)
@@ -110,23 +115,32 @@ unit: $(READY)
 run: $(VENV)/.installed
 	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT),--demo) $(ARGS)
 
-# Arguments, e.g. BENCH_LIVE='--seconds 5 --starts 1' for a first look.
-BENCH_LIVE ?=
-BENCH_LIMITS ?=
-BENCH_RIGS ?=
-BENCH_CPU ?=
-BENCH_SOLVERS ?=
-BENCH_ACCURACY ?=
-# Rows with peers and limits go into bench/results.json, of which docs/performance.md is made.
+BENCH ?=
+ifeq ($(BENCH),--full)
+# Rows with peers and limits go into the files of which docs/performance.md is made.
+INTO =
+BENCH_BEGIN = rm -f bench/results.json
+BENCH_PAGE = $(BIN)/python -m bench.page
+else
+INTO = --results build/bench/results.json
+BENCH_BEGIN = mkdir -p build/bench
+BENCH_PAGE = @echo 'make bench BENCH=--full: longer and more often, into docs/performance.md'
+BENCH_LIVE ?= --seconds 12 --settle 2 --starts 2
+BENCH_LIMITS ?= --minutes 2 --seconds 20 --times 3
+BENCH_RIGS ?= --most 32 --seconds 4
+BENCH_CPU ?= --no-native --seconds 8 --results build/bench/cpu.json
+BENCH_SOLVERS ?= --blocks 200000
+BENCH_ACCURACY ?= --blocks 1000
+endif
 bench: $(READY)
-	rm -f bench/results.json
-	$(BIN)/python -m bench.live $(BENCH_LIVE)
-	$(BIN)/python -m bench.limits $(BENCH_LIMITS)
-	$(BIN)/python -m bench.rigs $(BENCH_RIGS)
+	$(BENCH_BEGIN)
+	$(BIN)/python -m bench.live $(BENCH_LIVE) $(INTO)
+	$(BIN)/python -m bench.limits $(BENCH_LIMITS) $(INTO)
+	$(BIN)/python -m bench.rigs $(BENCH_RIGS) $(INTO)
 	$(BIN)/python -m bench.cpu $(BENCH_CPU)
-	$(BIN)/python -m bench.page
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)
 	$(BIN)/python bench/accuracy.py $(BENCH_ACCURACY)
+	$(BENCH_PAGE)
 
 # Words for pytest, e.g. NODES='-k camera' for one node.
 NODES ?=
@@ -197,12 +211,17 @@ golden: $(READY)
 docs: $(READY)
 	$(call INSTALL,$(VENV)) '.[docs]'
 	$(BIN)/python -m mkdocs build --strict --quiet --site-dir build/site
+	$(BIN)/python -m tools.pyodide_site build/site
 	@echo 'open build/site/index.html (its search needs a server: python -m http.server --directory build/site)'
 
 # AXE=--in-turn: each page in one of the four views only.
 AXE ?=
 axe: docs
 	$(BIN)/python -m tools.accessible build/site $(AXE)
+
+TRY ?=
+try-page: docs
+	$(BIN)/python -m tools.try_page build/site $(TRY)
 
 notebooks: $(READY)
 	$(BIN)/python -m pytest --nbmake --overwrite docs/*.ipynb

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from bench import damping
 from bench.simulated_arm import SimulatedArm
@@ -22,7 +21,9 @@ from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.arm import read_arm
 from psd_deflection.arms.compensation.compensator import Compensator, Observed, State
 from psd_deflection.arms.compensation.settings import CompensatorSettings
-from psd_deflection.base.pages import page, picture, table
+from psd_deflection.base.charts import Chart, Colour, Panel, Rule, Series, drawn
+from psd_deflection.base.figures import figure_of
+from psd_deflection.base.pages import page, table
 from psd_deflection.records import FloatArray
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -34,6 +35,7 @@ NOISE = 1e-6
 
 PAYLOAD = np.array([0.0, 0.0, -20.0])
 TAKEN, MOVED, ARRIVED, LOST, BACK, ENABLED, PUT_DOWN, END = 1.0, 8.0, 11.0, 16.0, 16.5, 3.0, 20.0, 26.0
+TONES: tuple[Colour, ...] = ('blue', 'orange')
 POSES = np.array([[1.2, 0.6], [0.7, 1.3]])
 
 WINDOWS = {
@@ -99,35 +101,31 @@ def rms(ran: Ran, window: tuple[float, float]) -> float:
     return float(np.sqrt(np.mean(ran.error[inside] ** 2)))
 
 
-def figure(without: Ran, ran: Ran) -> Figure:
+def chart(without: Ran, ran: Ran) -> Chart:
     """Errors and offsets over time."""
-    out = Figure(figsize=(10.0, 6.0), layout='constrained')
-    above, below = out.subplots(2, 1, sharex=True)
-    above.semilogy(without.t, without.error * 1e3, color='0.6', label='without')
-    above.semilogy(ran.t, ran.error * 1e3, color='C0', label='with')
-    above.set_ylabel('distance from the rigid pose (mm)')
-    above.legend(loc='lower right')
-    for name, column in zip(('shoulder', 'elbow'), ran.offsets.T, strict=True):
-        below.plot(ran.t, column * 1e3, label=name)
-    below.fill_between(
-        ran.t, 0, 1, ran.held > 0, transform=below.get_xaxis_transform(), color='C3', alpha=0.2, label='held'
-    )
-    below.set_ylabel('offset (mrad)')
-    below.set_xlabel('time (s)')
-    below.legend(loc='lower right')
-    for t, what in (
+    events = (
         (TAKEN, 'payload'),
         (ENABLED, 'enabled'),
         (MOVED, 'move'),
         (LOST, 'no estimates'),
         (PUT_DOWN, 'put down'),
-    ):
-        for axes in (above, below):
-            axes.axvline(t, color='0.8', lw=0.8, zorder=0)
-        above.annotate(
-            what, (t, 1.0), xycoords=('data', 'axes fraction'), xytext=(2, -10), textcoords='offset points', size=8
-        )
-    return out
+    )
+    rules = [Rule(t, what) for t, what in events]
+    errors = (
+        Series('without', without.t, without.error * 1e3, 'quiet'),
+        Series('with', ran.t, ran.error * 1e3, 'blue'),
+    )
+    joints = [
+        Series(name, ran.t, column * 1e3, tone)
+        for name, tone, column in zip(('shoulder', 'elbow'), TONES, ran.offsets.T, strict=True)
+    ]
+    held = ran.held > 0
+    joints.append(Series('held', np.tile(ran.t[held], 2), ran.offsets[held].T.ravel() * 1e3, 'red', 'points'))
+    panels = (
+        Panel(errors, 'time / s', 'distance from the rigid pose / mm', log='y', rules=rules, height=220),
+        Panel(joints, 'time / s', 'offset / mrad', rules=[Rule(t) for t, _ in events], height=220),
+    )
+    return Chart('distance from the rigid pose and offsets of the joints over time', panels)
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -141,7 +139,8 @@ def main(argv: list[str] | None = None) -> int:
         before, after = rms(without, window), rms(ran, window)
         rows.append((name, f'{before * 1e3:.4f}', f'{after * 1e3:.4f}', f'{100.0 * after / before:.2f} %'))
         print(f'{name:34}{before * 1e3:10.4f} mm{after * 1e3:10.4f} mm{100.0 * after / before:8.2f} %')
-    drawn, links = figure(without, ran), damping.moved_links()
+    links = damping.moved_links()
+    compensated, moves = chart(without, ran), damping.chart(links)
     print(f'vibration after a quick move without a shaper: {1e3 * damping.unshaped():.2f} mm')
     shapers, moved, knocks = damping.rows(), damping.moved_rows(links), damping.knock_rows()
     heads = damping.SHAPER_HEAD, damping.MOVED_HEAD, damping.KNOCK_HEAD
@@ -153,21 +152,21 @@ def main(argv: list[str] | None = None) -> int:
         '<p>Two links of the thesis, simulated, with a payload of 20 N at the end effector. The compensator sees the '
         'deflection 30 ms late and with noise, and moves both joints.</p>',
         table(head, rows),
-        picture(drawn, 'distance from the rigid pose and offsets of the joints over time'),
+        drawn(compensated),
         '<h1>A quick move, with and without a shaper and active damping</h1>',
         '<p>What each shaper leaves of the vibration of the arm. The frequency is right, or 5 % wrong.</p>',
         table(damping.SHAPER_HEAD, shapers),
         '<p>One link, of which the shaper has a frequency that is 10 % wrong, as with another payload. Active damping '
         'takes the velocity from the filter of the motion.</p>',
         table(damping.MOVED_HEAD, moved),
-        picture(damping.figure(links), 'deflection of the tip over time'),
+        drawn(moves),
         '<p>The same link, knocked.</p>',
         table(damping.KNOCK_HEAD, knocks),
     ]
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / 'report.html').write_text(page('Compensation', body), encoding='utf-8')
-    drawn.savefig(args.out / 'compensation.png', dpi=90)
-    damping.figure(links).savefig(args.out / 'damping.png', dpi=90)
+    figure_of(compensated).savefig(args.out / 'compensation.png', dpi=90)
+    figure_of(moves).savefig(args.out / 'damping.png', dpi=90)
     print(f'the page: {args.out / "report.html"}')
     return 0
 

@@ -46,7 +46,7 @@ ENOUGH = 0.98
 """Least share of the blocks that a node gets through which is not held up by others."""
 
 PARTS = {
-    'port: select and read': ('devices.serial_port:SerialPort.read',),
+    'port: select and read': ('devices.port:DescriptorPort.read',),
     'frames: bytes to samples': ('devices.protocol.frames:FrameDecoder.feed',),
     'sequence numbers, gathering': ('run.reading.acquisition:Acquisition.feed',),
     'clock map': ('run.reading.clock_watch:ClockWatch.observe',),

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from bench import damped_link
 from bench.damped_link import Swung, swing
@@ -24,6 +23,7 @@ from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.compensation.trajectory import Trajectory, TrajectoryShaper, checked
 from psd_deflection.arms.inputs import standing
 from psd_deflection.arms.shapers import KINDS, Shaper, shaper
+from psd_deflection.base.charts import Chart, Colour, Panel, Series
 from tools.program import ROOT
 
 FREQUENCY, RATIO = 12.0, 0.02
@@ -135,16 +135,15 @@ def knock_rows() -> list[tuple[str, ...]]:
     return out
 
 
-def figure(links: dict[str, Swung]) -> Figure:
+def chart(links: dict[str, Swung]) -> Chart:
     """Deflection over time."""
-    out = Figure(figsize=(10.0, 3.6), layout='constrained')
-    axes = out.subplots()
-    for (name, link), color in zip(links.items(), ('0.6', 'C0', 'C1'), strict=True):
-        axes.plot(link.t, link.deflection * 1e3, color=color, lw=1.0, label=name)
-    axes.set_xlabel('time (s)')
-    axes.set_ylabel('deflection of the tip (mm)')
-    axes.legend(loc='upper right')
-    return out
+    tones: tuple[Colour, ...] = ('quiet', 'blue', 'orange')
+    curves = [
+        Series(name, link.t, link.deflection * 1e3, tone)
+        for (name, link), tone in zip(links.items(), tones, strict=True)
+    ]
+    panel = Panel(curves, 'time / s', 'deflection of the tip / mm', height=240)
+    return Chart('deflection of the tip over time', [panel])
 
 
 SHAPER_HEAD = ('shaper', 'longer by', '5 % too low', 'right', '5 % too high')

@@ -1,6 +1,6 @@
-"""Makes docs/performance.md from bench/results.json and bench/cpu.json: ``python -m bench.page``.
+"""Makes docs/performance.md, and three rows of README, from bench/results.json and bench/cpu.json.
 
-It is the last step of ``make bench``.
+``python -m bench.page`` is the last step of ``make bench BENCH=--full``.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ from bench.rows import RESULTS, ROOT, Figure, Row, read
 
 TEMPLATE = ROOT / 'bench' / 'performance_template.md'
 PAGE = ROOT / 'docs' / 'performance.md'
+README = ROOT / 'README.md'
+PRINTED_BY = '| `make bench BENCH=--full` |'
+"""How the rows of README end that are made here."""
 
 
 def cell(f: Figure, unit: str) -> str:
@@ -65,7 +68,29 @@ def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cp
     return text.replace('<!-- cpu -->', shares(cpu, cpu_machine))
 
 
+def readme(text: str, rows: Sequence[Row]) -> str:
+    """``text`` of README with its rows of figures made of ``rows``."""
+    by = {row.work: row for row in rows}
+    live = 'live: last byte of a block to callback in another process'
+    median, late = by[f'{live}, median'], by[f'{live}, 99th percentile']
+    cpu, looked_at = (by[f'live{page}: CPU of the node, recording'] for page in ('', ', live page looked at'))
+    replay = by['replay of 10 minutes to estimates, all solvers']
+    bare = next(f for f in replay.figures if f.kind == 'limit')
+    ratios = [row.ratio(row.figures[1]) for row in (median, late)]
+    made = (
+        f'| latency, last byte → callback in another process | {median.figures[0].median:.2f} ms (median), '
+        f'{late.figures[0].median:.2f} ms (p99): {ratios[0]:.2f} × and {ratios[1]:.2f} × a bare publish → callback ',
+        f'| CPU of the node, recording | {cpu.figures[0].median:.1f} % of a core; '
+        f'{looked_at.figures[0].median:.1f} % with the live page ',
+        f'| replay of ten minutes | {600.0 / replay.figures[0].median:.0f} × real time; '
+        f'{replay.ratio(bare):.1f} × bare iteration of the file with `mcap` ',
+    )
+    lines = iter(f'{line}{PRINTED_BY}' for line in made)
+    return '\n'.join(next(lines) if line.endswith(PRINTED_BY) else line for line in text.split('\n'))
+
+
 def main() -> int:
+    README.write_text(readme(README.read_text(encoding='utf-8'), read(RESULTS)[0]), encoding='utf-8')
     PAGE.write_text(page(*read(RESULTS), *read(CPU)), encoding='utf-8')
     return 0
 

@@ -19,15 +19,11 @@ import time
 from pathlib import Path
 from typing import TextIO
 
-from selenium import webdriver
-
 from blind.campaign import conclude, options
-from tools.browser import open_browser
+from tools.browser import heap_bytes, open_browser
 
 SETTLED_MINUTES = 5
 ALLOWED_BYTES = 200_000
-READINGS = 9
-"""The least of so many counts: a frame that is drawn between the collection and the reading leaves 0.4 MB."""
 HEAD = ('minute', 'heap_bytes', 'nodes', 'rows')
 
 
@@ -46,12 +42,6 @@ def daemon(folder: Path, rate: float) -> tuple[subprocess.Popen[str], str]:
     raise RuntimeError(f'the daemon ended with {process.wait()} and served no page')
 
 
-def heap_of(driver: webdriver.Chrome) -> int:
-    """Bytes in use just after a collection, with what frames have allocated since."""
-    driver.execute_cdp_cmd('HeapProfiler.collectGarbage', {})
-    return int(driver.execute_cdp_cmd('Runtime.getHeapUsage', {})['usedSize'])
-
-
 def soak(minutes: int, rate: float, out: TextIO) -> list[dict[str, int]]:
     """One row a minute, written to ``out`` as it is read."""
     rows: list[dict[str, int]] = []
@@ -67,7 +57,7 @@ def soak(minutes: int, rate: float, out: TextIO) -> list[dict[str, int]]:
             began = time.monotonic()
             for minute in range(1, minutes + 1):
                 time.sleep(max(began + 60.0 * minute - time.monotonic(), 0.0))
-                heap = min(heap_of(driver) for _ in range(READINGS))
+                heap = heap_bytes(driver)
                 nodes, seen = driver.execute_script(
                     'return [document.querySelectorAll("*").length, Number(document.body.dataset.rows ?? 0)]'
                 )

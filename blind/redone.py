@@ -252,7 +252,8 @@ def judged(made: Bench, hung: Hung, stem: str, by: str) -> Any:
     reference = f'{hung.name}_{by}.csv'
     align = ['--align', '--exposure', str(made.plan.exposure)] if by == 'camera' else []
     rig = ('--params-file', f'{stem}.yaml')
-    return json.loads(made.run('validate', f'{hung.name}.csv', '--reference', reference, *rig, *align, '--json'))
+    words = ('--reference', reference, '--solver', 'all', *rig, *align, '--json')
+    return json.loads(made.run('validate', f'{hung.name}.csv', *words))
 
 
 def calibrated(made: Bench, runs: Sequence[Hung], stem: str) -> str:

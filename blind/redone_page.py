@@ -10,20 +10,21 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from blind.generator import Array
-from psd_deflection.base.pages import page, picture, table
+from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Series
+from psd_deflection.base.charts import drawn as drawn_chart
+from psd_deflection.base.pages import page, table
 
 SHOWN = (('theta', 2, 'θ / °', math.degrees(1.0)), ('dx', 0, 'ΔX / mm', 1e3), ('dy', 1, 'ΔY / mm', 1e3))
 """Axes in the order of the thesis: name, column, label, factor."""
 SYMBOLS = {'theta': 'θ', 'dx': 'ΔX', 'dy': 'ΔY'}
-STYLES = {
-    'wls_sidebar': ('weights [0.03, 0.5, 10, 0.1]', '#c44e52'),
-    'wls_link': ('weights [3, 0.5, 10, 0.1]', '#dd8452'),
-    'wls': ('WLS', '#55a868'),
-    'iterative': ('iterative', '#8172b3'),
-    'exact': ('exact', '#4c72b0'),
+STYLES: dict[str, tuple[str, Colour]] = {
+    'wls_sidebar': ('weights [0.03, 0.5, 10, 0.1]', 'red'),
+    'wls_link': ('weights [3, 0.5, 10, 0.1]', 'orange'),
+    'wls': ('WLS', 'green'),
+    'iterative': ('iterative', 'violet'),
+    'exact': ('exact', 'blue'),
 }
 PRINTED = {'theta': ('-7.4 %', '1.5 %'), 'dx': ('84 %', '21 %'), 'dy': ('5.8 %', '5.2 %')}
 """Table 5.1 of the thesis: iterative, weighted least squares."""
@@ -108,7 +109,7 @@ def _body(
         number = f'Figures {NUMBERS[name]}: ' if name in NUMBERS else ''
         title = f'{number}{weight[:-1]} N on {where}'
         yield f'<h3>{title}</h3>'
-        yield picture(_over_time(two, cameras[name], place == 'link'), f'{title}: camera and methods over time')
+        yield drawn_chart(_over_time(title, two, cameras[name], place == 'link'))
     yield '<h2>What was hidden</h2>'
     yield table(('parameter', 'true value, SI units'), [(name, f'{value:+.5g}') for name, value in truth.items()])
     yield '<h2>What calibrate says</h2>'
@@ -173,21 +174,16 @@ def _table_51(name: str, drawn: Mapping[str, Mapping[str, Curves]], cameras: Map
     return table(head, rows)
 
 
-def _over_time(two: Mapping[str, Curves], camera: Mapping[str, Array], on_link: bool) -> Figure:
-    figure = Figure(figsize=(11, 5.4), layout='constrained')
-    grid = figure.subplots(2, 3, sharex=True, sharey='col')
-    methods = [m for m in STYLES if on_link or m != 'wls_link']
-    for row, (stem, curves) in zip(grid, two.items(), strict=True):
-        for axes, (name, column, label, factor) in zip(row, SHOWN, strict=True):
-            axes.plot(camera['t'], factor * camera[name], 'k.', ms=3, label='camera')
-            for method in methods:
-                words, color = STYLES[method]
-                axes.plot(curves.t, factor * curves.poses[method][:, column], color=color, lw=1.1, label=words)
-            axes.set_ylabel(label)
-            axes.grid(alpha=0.25)
-        row[0].set_title({'before': 'rig file', 'after': 'calibrated'}[stem], loc='left', fontsize=10)
-    for axes in grid[1]:
-        axes.set_xlabel('time / s')
-    handles, labels = grid[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc='outside lower center', ncols=len(labels), frameon=False, fontsize=9)
-    return figure
+def _over_time(words: str, two: Mapping[str, Curves], camera: Mapping[str, Array], on_link: bool) -> Chart:
+    panels = []
+    for stem, curves in two.items():
+        rig = {'before': 'rig file', 'after': 'calibrated'}[stem]
+        for name, column, label, factor in SHOWN:
+            series = [
+                Series(STYLES[m][0], curves.t, factor * curves.poses[m][:, column], STYLES[m][1])
+                for m in STYLES
+                if on_link or m != 'wls_link'
+            ]
+            series.append(Series('camera', camera['t'], factor * camera[name], 'text', 'points'))
+            panels.append(Panel(series, 'time / s', f'{rig}: {label}', height=SMALL))
+    return Chart(f'{words}: camera and methods over time', panels, beside=3)

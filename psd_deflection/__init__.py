@@ -6,11 +6,13 @@
     recording = pd.open('recordings/run')                # a bag folder, an .mcap or a .csv
     recording.samples                                    # numpy, one row a sample, V
     recording.to_pandas()                                # the same as a DataFrame; .to_xarray() as a Dataset
+    recording.crop(2.0, 5.0).plot()                      # a part of it as a matplotlib figure
     estimates = pd.replay(recording)                     # the deflections, as the daemon computes them
     estimates.t, estimates.dx, estimates.dy              # s, m, m; .theta rad; .sd; .wrench N, N, N m
     pd.solve([0.0, -1e-3, 0.0, -2e-3], rig).pose         # dots in m (x1, y1, x2, y2) to dX m, dY m, theta rad
     pd.simulate(rig, (0, -10, -5.85), seconds=2)         # a recording of this rig under a load, N, N, N m
     pd.check(recording)                                  # is the rig wired and set up as its file says?
+    pd.watch(recording)                                  # since when is the rig not its model?
     pd.identify(recording)                               # the modes of the link
     pd.validate(recording, 'tracker.csv')                # against an independent reference
     pd.calibrate([recording]).save('calibrated')         # how the rig differs from its file; writes rig.yaml
@@ -19,8 +21,8 @@
     pd.discover_in(plant)                                # the same for a machine of yours that simulates itself
 
 The answers of these studies are :class:`psd_deflection.studies.study.StudyResult`:
-``sentences()`` for a person, ``tree()`` for a program, ``report()`` is the page, ``save(folder)`` writes what the
-command writes.
+``sentences()`` for a person, ``tree()`` for a program, ``to_pandas()`` as a table, ``plot()`` as a matplotlib figure,
+``report()`` is the page, ``save(folder)`` writes what the command writes.
 
 SI units everywhere. What is refused raises a subclass of ``psd_deflection.errors.PsdDeflectionError``: one line
 with the file or argument, the value and its bound. The command ``psd-deflection`` does the same from a shell, and more.
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
     from psd_deflection.studies.discover.result import Discovery
     from psd_deflection.studies.identify.result import Identified
     from psd_deflection.studies.validate.result import Validated
+    from psd_deflection.studies.watch.result import WatchedRun
 
 __version__ = '0.1.0'
 
@@ -66,6 +69,7 @@ __all__ = [
     'simulate',
     'solve',
     'validate',
+    'watch',
 ]
 
 
@@ -258,6 +262,31 @@ def identify(recording: Recording | str | Path, rig: Rig | str | Path | None = N
     return of_problem(read_identify(opened(recording, rig)))
 
 
+def watch(recording: Recording | str | Path, rig: Rig | str | Path | None = None) -> WatchedRun:
+    """Since when the rig is not its model: the alarms of the watch over a recording, as ``replay --watch`` has them.
+
+    ``recording``: from :func:`open` or :func:`simulate`, or its path. ``rig``: the rig or its parameter file; by
+    default the parameters that the recording began with. The result has ``alarms`` and ``to_pandas()``.
+    Raises :class:`psd_deflection.base.errors.RecordingError`, :class:`~psd_deflection.base.errors.ConfigError` and
+    :class:`~psd_deflection.base.errors.SolverError`.
+    """
+    import warnings
+
+    from psd_deflection.recordings.recording import Recording
+    from psd_deflection.recordings.replay.engine import rig_at_start, warnings_about_rig
+    from psd_deflection.rig.config import Rig
+    from psd_deflection.studies.watch.from_recordings import watch as of_recording
+
+    given = recording if isinstance(recording, Recording) else open(recording)
+    known = rig_at_start(given) if rig is None else _rig(rig)
+    if rig is None:
+        for warning in warnings_about_rig(given):
+            warnings.warn(warning, stacklevel=2)
+    described = 'the parameters in the recording' if rig is None else str('a Rig' if isinstance(rig, Rig) else rig)
+    sources = {'recording': str(given.path), 'rig': described}
+    return of_recording(given.with_block_size(known.estimator.block_size), known, sources)
+
+
 def validate(
     recording: Recording | str | Path,
     reference: str | Path | None = None,
@@ -266,12 +295,14 @@ def validate(
     align: bool = False,
     max_offset: float = 1.0,
     exposure: float = 0.0,
+    solvers: Sequence[str] = (),
 ) -> Validated:
     """How the estimates of a recording agree with an independent reference.
 
     ``recording`` and ``rig``: as for :func:`check`. ``reference``: a table ``t,dx,dy,theta`` or another recording; by
     default the reference in the recording. ``align``: remove the offset between the clocks, which is looked for up
-    to ``max_offset``, s. ``exposure``: time over which each reference is a mean, s.
+    to ``max_offset``, s. ``exposure``: time over which each reference is a mean, s. ``solvers``: names of those that
+    are compared beside the rig's; ``'all'``: every one that can solve the rig.
     Raises :class:`psd_deflection.base.errors.RecordingError` and :class:`~psd_deflection.base.errors.ConfigError`.
     """
     from psd_deflection.studies.study import opened
@@ -279,12 +310,13 @@ def validate(
     from psd_deflection.studies.validate.validate import validate as of_problem
 
     known = opened(recording, rig)
-    return of_problem(read_validate(known, reference, align=align, largest=max_offset, exposure=exposure))
+    problem = read_validate(known, reference, align=align, largest=max_offset, exposure=exposure, solvers=solvers)
+    return of_problem(problem)
 
 
 def calibrate(
-    recordings: Sequence[Recording | str | Path],
-    rig: str | Path | None = None,
+    recordings: Recording | str | Path | Sequence[Recording | str | Path],
+    rig: Rig | str | Path | None = None,
     *,
     references: Sequence[str | Path] = (),
     dark: Sequence[Recording | str | Path] = (),
@@ -293,23 +325,25 @@ def calibrate(
 ) -> Calibrated:
     """How a real rig differs from its rig file, by a reference or by known loads.
 
-    ``recordings``: from :func:`open` or :func:`simulate`, or paths. ``rig``: the parameter file of the rig as it is
-    known, which ``save`` writes anew with its comments; by default the parameters in the first recording.
+    ``recordings``: one or several, from :func:`open` or :func:`simulate`, or paths. ``rig``: the rig as it is
+    known, or its parameter file, which ``save`` writes anew with its comments; by default the parameters in the first
+    recording.
     ``references``: one for each recording, by default those in them. ``dark``: recordings with the lasers off.
     ``exposure``: time over which each reference is a mean, s. ``alone``: by the redundant reading alone.
     Raises :class:`psd_deflection.base.errors.RecordingError` and :class:`~psd_deflection.base.errors.ConfigError`.
     """
+    from pathlib import Path
+
     from psd_deflection.base.errors import ConfigError
     from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions
     from psd_deflection.studies.study import warn_caller
 
-    if not recordings:
-        raise ConfigError('recordings: must be at least one')
+    recordings = _several(recordings)
     if references and len(references) != len(recordings):
         raise ConfigError(f'references: {len(references)} for {len(recordings)} recordings; give one for each')
-    file = None if rig is None else str(rig)
+    file = str(rig) if isinstance(rig, (str, Path)) else None
     asked = CalibrationOptions(file, None, exposure, alone, tuple(references), tuple(dark))
-    known = asked.rig(recordings, warn_caller)
+    known = asked.rig(recordings, warn_caller) if rig is None or isinstance(rig, (str, Path)) else rig
     runs = asked.runs(recordings, known)
     return asked.calibrated(runs, known, asked.levels(known, runs), lambda words: None, warn_caller)
 
@@ -350,11 +384,15 @@ def budget(
 
 
 def discover(
-    recordings: Sequence[Recording | str | Path], rig: Rig | str | Path | None = None, *, seed: int = 0
+    recordings: Recording | str | Path | Sequence[Recording | str | Path],
+    rig: Rig | str | Path | None = None,
+    *,
+    seed: int = 0,
 ) -> Discovery:
     """Name the effects that the simulation lacks to explain ``recordings``.
 
-    ``recordings``: with loads; from :func:`open` or :func:`simulate`, or paths, or ``.yaml`` lists of them.
+    ``recordings``: one or several with loads; from :func:`open` or :func:`simulate`, or paths, or ``.yaml`` lists of
+    them.
     ``rig``: the known rig, or its parameter file; by default the parameters in the recordings. The same
     ``seed`` gives the same answer. Its ``save(folder)`` writes ``model.yaml``, ``result.json`` and ``report.html``.
     Raises :class:`psd_deflection.base.errors.RecordingError` if a
@@ -364,7 +402,7 @@ def discover(
     from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 
     asked = DiscoverOptions(rig, seed=seed)
-    return asked.discovered(asked.read(recordings))
+    return asked.discovered(asked.read(_several(recordings)))
 
 
 def discover_in(plant: Plant, *, seed: int = 0) -> PlantDiscovery:
@@ -378,6 +416,20 @@ def discover_in(plant: Plant, *, seed: int = 0) -> PlantDiscovery:
     from psd_deflection.studies.discover.plant_search import discover_in as of_plant
 
     return of_plant(plant, seed=seed)
+
+
+def _several(recordings: Recording | str | Path | Sequence[Recording | str | Path]) -> Sequence[Recording | str | Path]:
+    """At least one recording, in a row. Raises ConfigError if there is none."""
+    from pathlib import Path
+
+    from psd_deflection.base.errors import ConfigError
+    from psd_deflection.recordings.recording import Recording
+
+    if isinstance(recordings, Recording | str | Path):
+        return [recordings]
+    if not recordings:
+        raise ConfigError('recordings: must be at least one')
+    return recordings
 
 
 def _rig(rig: Rig | str | Path | None) -> Rig:

@@ -58,6 +58,7 @@ def test_help_teaches() -> None:
         'simulate',
         'solve',
         'validate',
+        'watch',
     ]
     for name in psd_deflection.__all__:
         assert f'\n    {name}(' in text
@@ -301,7 +302,7 @@ def test_every_study_can_be_asked_from_python(tmp_path: Path) -> None:
         'budget.json': psd_deflection.budget(load=(0.0, -10.0, 0.0), draws=200),
     }
     for name, answer in answers.items():
-        first, *_ = answer.sentences()
+        first, *_ = answer.page_sentences()
         files = {path.name: path for path in answer.save(tmp_path / answer.study)}
         assert {name, 'report.html'} <= set(files)
         assert json.loads(files[name].read_text()) == json.loads(answer.json())
@@ -338,6 +339,28 @@ def test_a_rig_is_varied_by_replace() -> None:
     assert len(longer.psds) == 3
     with pytest.raises(ConfigError, match=r'replace: link.lenght = 1.0: no parameter of that name'):
         rig.replace(link={'lenght': 1.0})
+
+
+def test_every_function_takes_a_rig_or_its_file() -> None:
+    functions = [getattr(psd_deflection, name) for name in psd_deflection.__all__]
+    asked = {
+        function.__name__: function.__annotations__['rig']
+        for function in functions
+        if 'rig' in getattr(function, '__annotations__', {})
+    }
+    assert len(asked) >= 8
+    assert set(asked.values()) == {'Rig | str | Path | None'}, asked
+
+
+@pytest.mark.repeatable
+def test_a_rig_is_calibrated_as_its_file_is(tmp_path: Path) -> None:
+    file = ROOT / 'config' / 'thesis_rig.yaml'
+    run = psd_deflection.simulate(None, [(0, 0, 0), (30, 0, 0), (0, -50, -29)], seconds=1, seed=3)
+    of_file = psd_deflection.calibrate(run, file)
+    of_rig = psd_deflection.calibrate([run], psd_deflection.load_rig(file))
+    assert of_rig.found.values.tolist() == of_file.found.values.tolist()
+    of_rig.save(tmp_path)
+    assert psd_deflection.load_rig(tmp_path / 'rig.yaml').link == psd_deflection.load_rig(file).link
 
 
 @pytest.mark.repeatable

@@ -363,6 +363,24 @@ def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
     assert pipeline.stamped.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'
 
 
+@pytest.mark.statistics
+@pytest.mark.parametrize(('solver', 'reading'), [('pose', 1), ('pose', 5), ('exact', 3)])
+def test_a_reading_that_drifts_slowly_is_held_by_the_covariance(three: Rig, solver: str, reading: int) -> None:
+    """A micrometre a second, from the fifth second on. One degree of freedom names nothing."""
+    n = 14_000
+    dots = np.zeros((n, 6))
+    dots[:, reading] = 1e-9 * np.maximum(np.arange(n) - 4000, 0)
+    volts = np.full((n, 9), 5.0)
+    for psd in range(3):
+        volts[:, 3 * psd : 3 * psd + 2] = dots[:, 2 * psd : 2 * psd + 2] / 5e-4
+    noisy = volts + np.random.default_rng(0).normal(0.0, 2e-3, volts.shape)
+    counts = np.rint(noisy / STEP).astype(np.int32)
+    found = primaries(list(Pipeline(with_solver(three, solver)).process(chunk_of(counts))))[200:]
+    off = np.abs([e.pose for e in found]) / np.sqrt([e.variances for e in found])
+    assert off.max() < 7.0
+    assert (off < 1.96).mean(axis=0).min() > 0.93
+
+
 # Bit for bit again.
 
 

@@ -33,7 +33,7 @@ NEEDED = (
     '.github',
     'packaging',
     'psd_deflection/__init__.py',
-    'psd_deflection/run/monitor/page',
+    'psd_deflection/base/page',
 )
 
 
@@ -91,7 +91,7 @@ def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None
         ),
         (lambda root: (root / 'LICENSE').unlink(), 'LICENSE: missing'),
         (
-            lambda root: (root / 'psd_deflection/run/monitor/page/vendor/uPlot.LICENSE').unlink(),
+            lambda root: (root / 'psd_deflection/base/page/vendor/uPlot.LICENSE').unlink(),
             'what is not ours has no licence beside it',
         ),
         (
@@ -146,7 +146,7 @@ def test_a_wheel_without_the_page_is_noticed(tmp_path: Path) -> None:
     assert list(check_wheel(ROOT, packed(tmp_path / 'whole.whl'))) == []
     said = list(check_wheel(ROOT, packed(tmp_path / 'bare.whl', '/page/vendor/')))
     assert said
-    assert all('lacks psd_deflection/run/monitor/page/vendor/' in line for line in said)
+    assert all('lacks psd_deflection/base/page/vendor/' in line for line in said)
 
 
 def test_a_check_of_a_wheel_without_the_page_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import argparse
 import functools
-import http.server
 import importlib.util
 import sys
 import tempfile
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from selenium.webdriver.support.ui import WebDriverWait
 
-from tools.browser import open_browser
+from tools.browser import open_browser, served
 from tools.program import WAIT_S
 
 VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390, 844, True), ('dark', 390, 844, True))
@@ -27,6 +25,8 @@ VIEWS = (('light', 1440, 900, False), ('dark', 1440, 900, False), ('light', 390,
 
 RUN = """
 const done = arguments[arguments.length - 1];
+// Colours on their way to others are not those that a person sees.
+for (const way of document.getAnimations()) if (way.effect.getComputedTiming().endTime !== Infinity) way.finish();
 axe.run(document, {resultTypes: ['violations']}).then(
   (found) => done(found.violations.map(
     (v) => [v.id, v.help, v.nodes.map((n) => [n.target.join(' '), n.failureSummary])],
@@ -81,22 +81,16 @@ def main() -> int:
     if not pages:
         raise SystemExit(f'{site}: no pages are there')
 
-    class Quiet(http.server.SimpleHTTPRequestHandler):
-        def log_message(self, *_: object) -> None:
-            """Say nothing."""
-
-    server = http.server.ThreadingHTTPServer(('127.0.0.1', 0), functools.partial(Quiet, directory=str(site)))
-    threading.Thread(target=server.serve_forever, daemon=True).start()
     failures = 0
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory() as profile, served(site) as address:
         driver = open_browser(Path(profile))
         try:
             for number, view in enumerate(views(driver)):
-                driver.get(f'http://127.0.0.1:{server.server_port}/{pages[0]}')
+                driver.get(f'{address}/{pages[0]}')
                 # The site keeps the colours that it was seen in first.
                 driver.execute_script('localStorage.clear()')
                 for page in pages[number :: len(VIEWS)] if args.in_turn else pages:
-                    driver.get(f'http://127.0.0.1:{server.server_port}/{page}')
+                    driver.get(f'{address}/{page}')
                     WebDriverWait(driver, WAIT_S).until(
                         lambda d: d.execute_script('return document.readyState') == 'complete'
                     )
@@ -105,8 +99,6 @@ def main() -> int:
                         print(f'{page} ({view}): {line}', flush=True)
         finally:
             driver.quit()
-            server.shutdown()
-            server.server_close()
     print(f'{len(pages)} pages, {1 if args.in_turn else len(VIEWS)} of {len(VIEWS)} views each: {failures} violations')
     return 1 if failures else 0
 

@@ -1,7 +1,7 @@
 """Makes docs/figures/calibrate_1.png to _5.png for docs/calibration.md: ``python -m tools.calibration_figures``.
 
 The five commands are taken from the page and run in a folder of their own; the pictures are those that the commands
-draw, smaller, and for the last one the p of each group.
+draw, smaller, or the first chart of their reports, and for the last one the p of each group. It needs Chromium.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import re
 import shlex
 import shutil
 import subprocess
@@ -20,12 +19,14 @@ from pathlib import Path
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
+from selenium.webdriver.support.ui import WebDriverWait
 
-from tools.program import PSD_DEFLECTION
+from tools.browser import open_browser
+from tools.program import PSD_DEFLECTION, WAIT_S
+from tools.shots import TWO_FRAMES, charted
 
 ROOT = Path(__file__).resolve().parents[1]
 FIGURES = ROOT / 'docs' / 'figures'
-INLINE = re.compile(r'data:image/png;base64,([^"]+)"')
 
 
 def commands() -> list[str]:
@@ -47,12 +48,23 @@ def run(line: str, folder: Path) -> str:
     return done.stdout
 
 
-def first_picture(page: Path) -> bytes:
-    """The first picture inside a report."""
-    found = INLINE.search(page.read_text())
-    if found is None:
-        raise SystemExit(f'{page}: holds no picture')
-    return base64.b64decode(found[1])
+def first_chart(page: Path) -> bytes:
+    """A picture of the first chart of a report, as a browser shows it."""
+    with tempfile.TemporaryDirectory() as profile:
+        driver = open_browser(Path(profile), '--window-size=1030,900')
+        try:
+            driver.get(page.as_uri())
+            driver.execute_script("document.documentElement.style.scrollbarWidth = 'none'")
+            WebDriverWait(driver, WAIT_S).until(charted)
+            driver.execute_async_script(TWO_FRAMES)
+            box = driver.execute_script(
+                'const b = document.querySelector("figure.chart").getBoundingClientRect();'
+                'return {x: b.x + scrollX, y: b.y + scrollY, width: b.width, height: b.height, scale: 1}'
+            )
+            shot = driver.execute_cdp_cmd('Page.captureScreenshot', {'clip': box, 'captureBeyondViewport': True})
+            return base64.b64decode(shot['data'])
+        finally:
+            driver.quit()
 
 
 def save(content: bytes, name: str) -> None:
@@ -91,8 +103,8 @@ def main() -> int:
         for recording, name in (('sidebar', 'calibrate_1.png'), ('link', 'calibrate_3.png')):
             run(f'psd-deflection plot {recording}.csv --out {recording}.png', folder)
             save((folder / f'{recording}.png').read_bytes(), name)
-        save(first_picture(folder / 'calibrated' / 'report.html'), 'calibrate_2.png')
-        save(first_picture(folder / 'validated' / 'report.html'), 'calibrate_4.png')
+        save(first_chart(folder / 'calibrated' / 'report.html'), 'calibrate_2.png')
+        save(first_chart(folder / 'validated' / 'report.html'), 'calibrate_4.png')
         save(groups(checked), 'calibrate_5.png')
     return 0
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import math
 import re
 import shlex
 import sys
@@ -23,19 +22,18 @@ from blind.campaign import conclude, options, over
 from psd_deflection.cli.main import main as psd_deflection
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.replay.engine import open_for_replay, replayed
+from psd_deflection.records import SampleBlock
 from psd_deflection.run.diagnostics import OK, Seen, estimates_entry, laser_entry
+from psd_deflection.run.monitor.spectrum import Spectrum, line_entry
 from tools.gallery_cases import CASES, STUDIES, Case
 from tools.program import ROOT
 
 PAGE = ROOT / 'docs' / 'gallery.md'
 FIGURES = ROOT / 'docs' / 'figures' / 'gallery'
-NUMBER = re.compile(r'\d+(?:\.\d+)?(?:e[+-]\d+)?')
+NUMBER = re.compile(r'(?<![\w.])[+\-−]?\d+(?:\.(\d+))?(?:e([+-]?\d+))?')
 WIDTH = 760
 """Pixels of a picture, as wide as the column of the site."""
 COLOURS = 24
-
-SAID = re.compile(r'^(?:RIGHT|WRONG|CANNOT TELL)[\s\S]*?(?=\n\n)|^note .*', re.M)
-"""What a person reads first of the answer of ``check``: a pattern of lines, all of which are taken."""
 
 
 def run(words: list[str]) -> str:
@@ -54,18 +52,22 @@ def record(case: Case, folder: Path) -> Path:
     run(['simulate', '--out', str(path), *shlex.split(case.simulate)])
     if case.change is not None:
         names = path.read_text().partition('\n')[0].split(',')
-        table = np.loadtxt(path, delimiter=',', skiprows=1, ndmin=2)
+        # A reference is in the rows of its frames only.
+        table = np.genfromtxt(path, delimiter=',', skip_header=1)
         columns = case.change({name: table[:, i] for i, name in enumerate(names)})
-        np.savetxt(path, np.column_stack(list(columns.values())), '%.10g', ',', header=','.join(names), comments='')
+        text = io.StringIO()
+        np.savetxt(text, np.column_stack(list(columns.values())), '%.10g', ',', header=','.join(names), comments='')
+        path.write_text(text.getvalue().replace('nan', ''))
     return path
 
 
 def said_live(path: Path) -> str:
     """What the live page and ``/diagnostics`` say at the end of the recording, from a report that covers it all."""
     recording, rig = open_for_replay(path)
-    pipeline = Pipeline(rig)
-    for _ in replayed(recording, pipeline):
-        pass
+    pipeline, spectrum = Pipeline(rig), Spectrum(rig)
+    for records in replayed(recording, pipeline):
+        for block in (record for record in records if isinstance(record, SampleBlock)):
+            spectrum.add(block)
     count = pipeline.counters
     new = Seen(
         0, count.samples, 0, 0, 0, count.blocks, count.estimates, count.degraded, pipeline.stamped.contradictions, 0, 0
@@ -74,6 +76,8 @@ def said_live(path: Path) -> str:
         estimates_entry(pipeline, new, 'unknown'),
         *(laser_entry(pipeline, psd) for psd in range(1, len(rig.psds) + 1)),
     ]
+    line = line_entry(rig, spectrum.frequencies, spectrum.density())
+    entries += [line] if line.level > OK else []
     wrong = [entry for entry in entries if entry.level > OK]
     return '\n'.join(f'{e.name.partition(": ")[2]}: {e.message}' for e in wrong or entries)
 
@@ -83,8 +87,10 @@ def answered(case: Case, folder: Path) -> str:
     path = record(case, folder)
     if case.study == 'live':
         return said_live(path)
-    answer = run([case.study, str(path)])
-    said = '\n'.join(line.strip() for found in SAID.findall(answer) for line in found.splitlines())
+    study = STUDIES[case.study]
+    names = {'REC': str(path), 'OUT': str(folder / 'out')}
+    answer = run([names.get(word, word) for word in study.command.split()])
+    said = '\n'.join(line.strip() for found in re.findall(study.said, answer, re.M) for line in found.splitlines())
     return said.replace(f'{folder}/', '')
 
 
@@ -130,11 +136,25 @@ def kept() -> dict[str, str]:
 
 
 def same(now: str, before: str) -> bool:
-    """Whether two answers have the same words, and numbers that agree within 5 %: other processors round otherwise."""
-    if NUMBER.split(now) != NUMBER.split(before):
+    """Whether two answers have the same words, and numbers that agree within 5 % or two of their last digit.
+
+    Other processors round otherwise. A number without a decimal point is a count, and the 2 of y2 a word.
+    """
+    if NUMBER.sub('#', now) != NUMBER.sub('#', before):
         return False
-    pairs = zip(NUMBER.findall(now), NUMBER.findall(before), strict=True)
-    return all(math.isclose(float(a), float(b), rel_tol=0.05, abs_tol=1e-9) for a, b in pairs)
+    for a, b in zip(NUMBER.finditer(now), NUMBER.finditer(before), strict=True):
+        one, other = (float(found[0].replace('−', '-')) for found in (a, b))
+        digit = max(_last_digit(found) for found in (a, b))
+        if abs(one - other) > 0.05 * max(abs(one), abs(other)) + 2.0 * digit:
+            return False
+    return True
+
+
+def _last_digit(found: re.Match[str]) -> float:
+    """What one in the last digit of a number is; 0 of a whole number."""
+    if found[1] is None and found[2] is None:
+        return 0.0
+    return 10.0 ** (int(found[2] or 0) - len(found[1] or ''))
 
 
 def shown(case: Case, renew: bool) -> str:

@@ -19,10 +19,15 @@ DOTS = ('x1', 'y1', 'x2', 'y2')
 
 
 class Study(NamedTuple):
-    """One part of the page."""
+    """One part of the page. ``command``: REC and OUT stand for the recording and a folder; '' for the live page.
+
+    ``said``: what of its answer a person reads first: a pattern of lines, all of which are taken.
+    """
 
     title: str
     about: str
+    command: str
+    said: str = '.+'
 
 
 class Case(NamedTuple):
@@ -43,11 +48,47 @@ STUDIES = {
     'check': Study(
         'check: is it wired as the rig file says?',
         'The picture is the recording: a push along +X, one along +Y, one turn. Each part below has one fault.',
+        'check REC',
+        r'^(?:RIGHT|WRONG|CANNOT TELL)[\s\S]*?(?=\n\n)|^note .*',
     ),
     'live': Study(
         'Live page and diagnostics',
         'The picture is the recording as `plot` draws it: where a trace has a gap there is no estimate. The words are '
-        'those of `/diagnostics` and of the health list of the page.',
+        'those of the health list of the page; all but those of the spectrum are in `/diagnostics` too.',
+        '',
+    ),
+    'discover': Study(
+        'discover: what is missing from the model?',
+        'The picture is the recording: forces along X and Y and a torque, 0.6 s each. `discover` says what the rig '
+        'file lacks, and how large it is.',
+        'discover REC --out OUT',
+        r'^(?!warning|see |next: |law: |\d+ forward ).+',
+    ),
+    'calibrate': Study(
+        'calibrate: how does the rig differ from its rig file?',
+        'The recording has a reference (here the true pose), and its second PSD is turned by 10 mrad. `calibrate` says '
+        'what the motion so far has determined.',
+        'calibrate REC --out OUT',
+        r'^\d+ of .+|^undetermined: .*psd_2\.(?:gain_x|crosstalk_yx|center_x).*;.+',
+    ),
+    'identify': Study(
+        'identify: which modes has the link?',
+        'The picture is the recording: a load is put on and let go.',
+        'identify REC',
+        r'^(?:ΔX|ΔY|θ): (?!input).+|^Nothing for .+',
+    ),
+    'validate': Study(
+        'validate: does it agree with an independent reference?',
+        'The recording has a reference, here the true pose. Each part below has something wrong with the reference or '
+        'with the rig.',
+        'validate REC',
+        r'^The (?:clocks|reference).+|^(?:ΔX|ΔY|θ): .+',
+    ),
+    'watch': Study(
+        'watch: is the rig still its model?',
+        'A recording of 12 s under a load that is held. `replay --watch` and the node with `watch: on` say the same.',
+        'replay REC --watch',
+        r'^  watch: .+',
     ),
 }
 
@@ -97,6 +138,28 @@ def exchanged(columns: Columns) -> Columns:
     """x and y of PSD 1 exchanged."""
     return columns | {'x1': columns['y1'], 'y1': columns['x1']}
 
+
+SOME_LOADS = "--loads 'steps:0,0,0;20,0,0;0,-20,0;0,0,2;0,0,0:0.6'"
+LET_GO = "--loads 'steps:0,0,0;10,10,1;0,0,0:2'"
+COMPARED = f'{SOME_LOADS} --true-pose'
+HELD = '--loads constant:0,0,0:12'
+RATE_HZ = 1000
+
+
+def shifted(names: tuple[str, ...], seconds: float) -> Callable[[Columns], Columns]:
+    """Columns that are late by so long; what was first holds before."""
+    late = round(seconds * RATE_HZ)
+    return lambda columns: (
+        columns | {n: np.concatenate((np.full(late, columns[n][0]), columns[n][:-late])) for n in names}
+    )
+
+
+def moved(offsets: dict[str, float], after: float) -> Callable[[Columns], Columns]:
+    """Columns that jump by so much after so many seconds."""
+    return lambda columns: columns | {n: columns[n] + offset * (columns['t'] >= after) for n, offset in offsets.items()}
+
+
+REFERENCE = ('ref_dx', 'ref_dy', 'ref_theta')
 
 CASES: tuple[Case, ...] = (
     Case('check_good', 'check', 'Good', PUSHES, 'Nothing is to be done.'),
@@ -213,8 +276,8 @@ CASES: tuple[Case, ...] = (
         'live',
         'A line that is aliased: 1040 Hz looks like 40 Hz',
         REST,
-        'No sentence says it: to the samples it is a motion at 40 Hz. The spectrum of the page shows a line where no '
-        'mode is; it moves if you sample at another rate. Put a low-pass before the converter.',
+        'To the samples it is a motion at 40 Hz. Record at another rate: if the line moves, put a low-pass before the '
+        'converter; if it stays, look for what moves.',
         line(1040.0, {'x1': 0.04, 'x2': 0.04}),
     ),
     Case(
@@ -238,5 +301,120 @@ CASES: tuple[Case, ...] = (
         'Other light on a detector',
         f'{REST} --effect ambient_light,psd=1,level=1.6,x=0.001',
         'Shade the detector.',
+    ),
+    Case('discover_good', 'discover', 'Good', SOME_LOADS, 'Nothing is to be done.'),
+    Case(
+        'discover_turned',
+        'discover',
+        'A turned PSD',
+        f'{SOME_LOADS} --effect sensor_rotation,psd=2,angle=0.01',
+        'Use the model.yaml that it writes: the estimates are corrected with it. Or turn the PSD back.',
+    ),
+    Case(
+        'discover_clamp',
+        'discover',
+        'A loose clamp',
+        f'{SOME_LOADS} --effect clamp_friction,width=0.0003',
+        'Tighten the clamp. The pose is measured rightly meanwhile; the load that is computed of it is not.',
+    ),
+    Case(
+        'discover_gain',
+        'discover',
+        'Another amplifier than the rig file says',
+        f'{SOME_LOADS} --effect sensor_gain,psd=1,x=0.03,y=0.03',
+        'Use the model.yaml, or put the gain into `psd_1.sensitivity`.',
+    ),
+    Case(
+        'discover_warm_up',
+        'discover',
+        'A laser that warms up',
+        f'{SOME_LOADS} --effect laser_pointing_drift,psd=1,rate_x=2e-6',
+        'Let the lasers warm up, take the zero again, and record again.',
+    ),
+    Case(
+        'discover_late',
+        'discover',
+        'Loads that were noted late',
+        "--loads 'steps:0,0,0;20,0,0;0,-20,0;0,0,2;0,0,0:1'",
+        'Nothing is to be done: the times of the motion are taken. Note loads when they hang, or with `--ago`.',
+        shifted(LOADS, 0.4),
+    ),
+    Case(
+        'calibrate_good',
+        'calibrate',
+        'Good for what the estimates need',
+        f'{COMPARED} --effect sensor_rotation,psd=2,angle=0.01',
+        'Use the rig.yaml that it writes. What stays undetermined has its tolerance in the ±.',
+    ),
+    Case(
+        'calibrate_one_way',
+        'calibrate',
+        'Pushed one way only',
+        "--true-pose --loads 'steps:0,0,0;0,-20,0;0,0,0:0.6' --effect sensor_rotation,psd=2,angle=0.01",
+        'Record again with the motions that it names.',
+    ),
+    Case('identify_good', 'identify', 'Good', LET_GO, 'Paste the lines for the rig file.'),
+    Case(
+        'identify_rest',
+        'identify',
+        'A link at rest',
+        '--loads constant:0,0,0:3',
+        'Record again, and knock on the link while it records.',
+    ),
+    Case(
+        'identify_two',
+        'identify',
+        'Two modes close to each other',
+        f'{LET_GO} --effect second_bending_mode,frequency=17,damping_ratio=0.02,gain=0.5',
+        'Look for what rings beside the link (a cable, the table). The input shaper that it names works for both.',
+    ),
+    Case('validate_good', 'validate', 'Good', COMPARED, 'Nothing is to be done.'),
+    Case(
+        'validate_late',
+        'validate',
+        'A reference whose clock is late',
+        COMPARED,
+        'Compare again with `--align`.',
+        shifted(REFERENCE, 0.03),
+    ),
+    Case(
+        'validate_mirrored',
+        'validate',
+        'A camera that sees X mirrored',
+        COMPARED,
+        'Look at `camera.view`: from outside, image right is +X; from the base it is −X.',
+        scaled({'ref_dx': -1.0}),
+    ),
+    Case(
+        'validate_zero',
+        'validate',
+        'A zero that is stale',
+        COMPARED,
+        'Take the zero with the link unloaded and at rest, of rig and reference alike.',
+        moved({'ref_dx': 3e-5, 'ref_dy': -2e-5}, -1.0),
+    ),
+    Case('watch_good', 'watch', 'Good', HELD, 'Nothing is to be done.'),
+    Case(
+        'watch_bumped',
+        'watch',
+        'A detector that was bumped',
+        HELD,
+        'Look at the mount of the channel that it names; then take the zero.',
+        moved({'x1': 0.01}, 6.0),
+    ),
+    Case(
+        'watch_warm_up',
+        'watch',
+        'A laser that wanders',
+        f'{HELD} --effect laser_pointing_drift,psd=1,rate_x=1e-6',
+        'Let it warm up, then take the zero. Is it fixed to the base?',
+    ),
+    Case(
+        'watch_unnoted',
+        'watch',
+        'A load that nobody noted',
+        "--loads 'steps:0,0,0;0,-1,0:8'",
+        'Note the load. If none hangs, look for what has slipped.',
+        scaled(dict.fromkeys(LOADS, 0.0)),
     ),
 )

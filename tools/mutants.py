@@ -6,7 +6,11 @@ the function run until one fails. What they do not notice is tried by the slow t
 no test notices is listed; tools/mutants_equivalent.txt has those that nobody could notice, each with the reason, and
 they do not count.
 
+With ``--by-hand`` the mutants are those of tools/mutants_by_hand.txt: errors that people make and no operator does, as
+a transposed matrix, half a sample, the index of another PSD.
+
   python -m tools.mutants --count 32 --rooms solvers plate
+  python -m tools.mutants --by-hand --rooms chains
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Container, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -29,6 +33,9 @@ from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
+from tools.mutant_rooms import ROOMS, Room
+from tools.mutants_by_hand import BY_HAND, HandMade, hand_made
+
 ROOT = Path(__file__).parent.parent
 EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
 NOTICED = ROOT / 'build' / 'mutants' / 'noticed_by.txt'
@@ -36,228 +43,6 @@ NOTICED = ROOT / 'build' / 'mutants' / 'noticed_by.txt'
 anew.
 """
 
-
-class Room(NamedTuple):
-    """``code``: files and folders that are broken. ``tests``: what should notice, in seconds.
-
-    ``leave``: files that only draw or word what others computed. ``slow``: what else CI runs; it takes minutes, and
-    tries what the ``tests`` do not notice.
-    """
-
-    code: tuple[str, ...]
-    tests: tuple[str, ...]
-    leave: tuple[str, ...] = ()
-    slow: tuple[str, ...] = ()
-
-
-_PIPELINE = (
-    'test/measure/test_pipeline.py -k not(drift or rms_errors or rotation or crosstalk or nonlinearity or iterative)'
-)
-_GOLDEN = 'test/test_golden.py'
-_SOLVERS = (
-    *('sensitivity', 'truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd'),
-)
-_UNCERTAINTY = (
-    *('formulas', 'consistency', 'combinations', 'stamped', 'redundancy', 'rest', 'block_fit', 'noise', 'converter'),
-)
-_RUNS = ('test/measure/test_pipeline.py', 'test/test_layouts.py')
-
-ROOMS: Mapping[str, Room] = {
-    'solvers': Room(
-        ('psd_deflection/model/solvers',),
-        (*(f'test/model/solvers/test_{n}.py' for n in _SOLVERS), _GOLDEN),
-        slow=('test/model/solvers/test_audit.py', 'test/studies/budget', *_RUNS),
-    ),
-    'plate': Room(
-        ('psd_deflection/model/plate',),
-        ('test/model/plate',),
-        slow=(
-            *(f'test/model/solvers/test_{n}.py' for n in ('sensitivity', 'truth', 'golden')),
-            'test/model/simulation/test_simulator.py',
-        ),
-    ),
-    'averaging': Room(('psd_deflection/measure/averaging.py',), ('test/measure/test_averaging.py', _GOLDEN)),
-    'timing': Room(
-        ('psd_deflection/measure/timing.py',),
-        ('test/measure/test_timing.py', 'test/run/test_clock_watch.py'),
-        slow=('test/run/test_acquisition.py', 'test/run/test_pinger.py'),
-    ),
-    'pipeline': Room(
-        (
-            'psd_deflection/measure/pipeline.py',
-            'psd_deflection/measure/estimation.py',
-            'psd_deflection/measure/correction.py',
-        ),
-        (
-            _PIPELINE,
-            'test/measure/test_estimation.py',
-            'test/measure/test_correction.py',
-            'test/model/misalignment/test_spread.py',
-            'test/measure/uncertainty/test_pipeline_state.py',
-            'test/measure/test_health.py',
-            'test/model/simulation/test_added_effect.py -k refused or heights',
-            'test/test_more_psds.py -k psd_left or without_one or contradicts or on_itself or all_psds or the_last',
-            'test/measure/motion/test_motion.py -k anew or begun_at or noted or is_refused',
-            _GOLDEN,
-        ),
-        slow=(
-            'test/measure/test_pipeline.py -k drift or an_effect_in or iterative',
-            'test/test_more_psds.py',
-            'test/measure/motion/test_motion.py -k recorded or coast or ahead or foretold or stated',
-            'test/measure/motion/test_inertia.py',
-            'test/model/simulation/test_base_pair.py',
-            'test/model/simulation/test_effects.py -k correction or together or the_wrench',
-        ),
-    ),
-    'detector': Room(
-        ('psd_deflection/model/detector', 'psd_deflection/measure/health.py', 'psd_deflection/rig/wiring.py'),
-        ('test/model/detector', 'test/measure/test_health.py', 'test/rig/test_wiring.py', _GOLDEN),
-        slow=_RUNS,
-    ),
-    'uncertainty': Room(
-        ('psd_deflection/measure/uncertainty',),
-        (
-            *(f'test/measure/uncertainty/test_{n}.py' for n in _UNCERTAINTY),
-            'test/measure/uncertainty/test_vibration.py -k tone or hum or regular or fit_states or counted',
-            'test/measure/test_pipeline.py -k zero or contradict',
-            'test/test_more_psds.py -k contradicts or degree or tells_on_itself or one_after or from_the_memory',
-            'test/measure/uncertainty/test_pipeline_state.py',
-        ),
-        slow=_RUNS,
-    ),
-    'adapters': Room(
-        ('msg_adapters',),
-        (
-            'test/recordings/test_adapters.py',
-            'test/recordings/test_contract.py',
-            'test/test_more_psds.py -k cloud_of_two',
-        ),
-        slow=(
-            *(f'test/recordings/test_{n}.py' for n in ('bag_writer', 'bag_reader', 'cdr', 'references')),
-            'test/arms/chains/test_chain.py',
-        ),
-    ),
-    'protocol': Room(
-        ('psd_deflection/devices/protocol', 'psd_deflection/base/sequence.py'),
-        (
-            'test/devices/protocol',
-            'test/base/test_sequence.py',
-            *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs')),
-            'test/recordings/test_bag_reader.py -k restart or wrap or again',
-        ),
-        slow=(
-            *(f'test/devices/test_{n}.py' for n in ('source', 'survey')),
-            *(f'test/run/test_{n}.py' for n in ('acquisition', 'hello', 'restarts')),
-        ),
-    ),
-    'effects': Room(
-        ('psd_deflection/model/simulation/effects',),
-        (
-            'test/model/simulation/test_catalogue.py',
-            'test/model/simulation/test_effect_terms.py',
-            'test/model/simulation/test_effect_formulas.py',
-            'test/model/simulation/test_effects.py -k back or play or pieces or (wrench and (creep or '
-            'friction or load))',
-        ),
-        slow=('test/model/simulation/test_effects.py', 'test/model/simulation/test_simulator.py'),
-    ),
-    'discover': Room(
-        ('psd_deflection/studies/discover',),
-        (
-            *(
-                f'test/studies/discover/test_{n}.py'
-                for n in (
-                    *('formulas', 'law_formulas', 'plant_formulas', 'answers', 'rules', 'steps', 'parts'),
-                    *('problem', 'limits', 'ties'),
-                )
-            ),
-            # Their pieces: a whole discovery of the catalogue takes seconds.
-            'test/studies/discover/test_discover.py -k stripped or refined or coarse or imagined',
-            'test/studies/discover/test_planning.py -k loop or words or every_proposal or pieces',
-            'test/studies/discover/test_setup.py -k put_right or other_unit or at_its or outliers or stuck',
-        ),
-        leave=('psd_deflection/studies/discover/report.py',),
-        slow=tuple(
-            f'test/studies/discover/test_{n}.py'
-            for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
-        ),
-    ),
-    'link': Room(
-        ('psd_deflection/model/link',),
-        ('test/model/link',),
-        slow=('test/model/simulation/test_simulator.py', 'test/studies/thesis'),
-    ),
-    'misalignment': Room(
-        ('psd_deflection/model/misalignment',),
-        ('test/model/misalignment',),
-        slow=('test/studies/calibrate', 'test/measure/test_estimation.py'),
-    ),
-    'motion': Room(
-        ('psd_deflection/measure/motion',),
-        (
-            'test/measure/motion/test_modal.py',
-            'test/measure/motion/test_unseen.py',
-            'test/measure/motion/test_inertia.py',
-        ),
-        slow=('test/measure/motion/test_motion.py',),
-    ),
-    'watch': Room(
-        ('psd_deflection/measure/watch.py',),
-        ('test/measure/test_watch.py',),
-        slow=('test/run/test_watcher.py',),
-    ),
-    'chains': Room(
-        ('psd_deflection/arms/chains',),
-        ('test/arms/chains',),
-        slow=('test/run/test_chain.py', 'test/cli/test_chain.py'),
-    ),
-    'compensation': Room(
-        ('psd_deflection/arms/compensation', 'psd_deflection/arms/shapers.py', 'psd_deflection/arms/inputs.py'),
-        ('test/arms/compensation', 'test/arms/test_shapers.py', 'test/arms/test_inputs.py'),
-        slow=('test/cli/test_shaper.py',),
-    ),
-    'camera': Room(
-        ('psd_deflection/camera',),
-        ('test/camera',),
-        leave=('psd_deflection/camera/preview.py', 'psd_deflection/camera/print_target.py'),
-        slow=('test/cli/test_camera.py',),
-    ),
-    'calibrate': Room(
-        ('psd_deflection/studies/calibrate',),
-        ('test/studies/calibrate/test_dark.py', 'test/studies/calibrate/test_fit.py'),
-        leave=('psd_deflection/studies/calibrate/pictures.py',),
-        slow=('test/studies/calibrate/test_calibrate.py', 'test/cli/test_calibrate.py'),
-    ),
-    'check': Room(
-        ('psd_deflection/studies/check', 'psd_deflection/studies/noted_loads.py'),
-        ('test/studies/check', 'test/studies/test_noted_loads.py'),
-        slow=('test/run/test_guided.py',),
-    ),
-    'identify': Room(
-        ('psd_deflection/studies/identify',),
-        ('test/studies/identify',),
-        leave=('psd_deflection/studies/identify/pictures.py',),
-        slow=('test/cli/test_identify.py',),
-    ),
-    'validate': Room(
-        ('psd_deflection/studies/validate',),
-        ('test/studies/validate',),
-        leave=('psd_deflection/studies/validate/pictures.py',),
-        slow=('test/cli/test_validate.py',),
-    ),
-    'budget': Room(
-        ('psd_deflection/studies/budget',),
-        ('test/studies/budget',),
-        leave=('psd_deflection/studies/budget/pictures.py',),
-        slow=('test/cli/test_budget.py',),
-    ),
-    'thesis': Room(
-        ('psd_deflection/studies/thesis',),
-        ('test/studies/thesis',),
-        leave=('psd_deflection/studies/thesis/figures.py',),
-        slow=('test/cli/test_compare_methods.py',),
-    ),
-}
 
 OPERATORS = (
     *('NumberReplacer', 'AddNot', 'ReplaceAndWithOr', 'ReplaceOrWithAnd', 'ReplaceTrueWithFalse'),
@@ -290,6 +75,20 @@ class Mutant(NamedTuple):
         lines = zip(text.splitlines(), self.code(text).splitlines(), strict=True)
         was, made = next((a.strip(), b.strip()) for a, b in lines if a != b)
         return f'{self.file}: {was} -> {made}'
+
+
+def in_room(file: str, room: Room) -> bool:
+    """Whether ``file`` belongs to what is broken in ``room``."""
+    return any(file == c or file.startswith(c + '/') for c in room.code)
+
+
+def of_room(room: Room) -> list[HandMade]:
+    """Those made by hand. Raises ValueError if one is of no room."""
+    every = hand_made()
+    for m in every:
+        if not any(in_room(m.file, r) for r in ROOMS.values()):
+            raise ValueError(f'{BY_HAND.name}: {m.file} is of no room')
+    return [m for m in every if in_room(m.file, room)]
 
 
 def copy_of_checkout(folder: Path) -> Path:
@@ -369,19 +168,19 @@ STAGES = ('quick', 'slow')
 
 
 def tried(
-    name: str, python: str, count: int, seed: int, known: Container[str], slow: bool
+    name: str, python: str, count: int, seed: int | None, known: Container[str], slow: bool
 ) -> Iterator[tuple[str, str]]:
     """The mutants of one room in words, and which of the ``STAGES`` noticed; '' if none did.
 
-    The slow tests, if they are asked (``slow``), do not try what is ``known`` to change no answer. Raises RuntimeError
-    if the tests fail without.
+    ``seed``: of those that are drawn; None: those made by hand. The slow tests, if they are asked (``slow``), do not
+    try what is ``known`` to change no answer. Raises RuntimeError if the tests fail without.
     """
     room = ROOMS[name]
     lines = NOTICED.read_text().splitlines() if NOTICED.exists() else []
     noticed = dict(line.split(' ') for line in lines)
     with tempfile.TemporaryDirectory() as scratch:
         folder = copy_of_checkout(Path(scratch))
-        left = drawn(folder, room, count, seed)
+        left: list[Mutant | HandMade] = [*(of_room(room) if seed is None else drawn(folder, room, count, seed))]
         stages = [
             (stage, tests)
             for stage, tests in zip(STAGES, (room.tests, room.slow if slow else ()), strict=True)
@@ -397,17 +196,18 @@ def tried(
                     text = file.read_text()
                     code = mutant.code(text)
                     words = mutant.words(text)
+                    line = mutant.line if isinstance(mutant, Mutant) else mutant.line_of(text)
                     key = hashlib.sha256(f'{mutant.file}\n{code}'.encode()).hexdigest()
                     seen = noticed.get(key, '')
                     if not seen and not (stage == 'slow' and words in known):
                         file.write_text(code)
-                        if not passed(mutant.file, function_at(text, mutant.line)):
+                        if not passed(mutant.file, function_at(text, line)):
                             seen = stage
                             with NOTICED.open('a') as stream:
                                 stream.write(f'{key} {stage}\n')
                         file.write_text(text)
                     if seen or stage == stages[-1][0]:
-                        yield f'{words}  (line {mutant.line})', seen
+                        yield f'{words}  (line {line})', seen
                     else:
                         left.append(mutant)
 
@@ -430,6 +230,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--rooms', nargs='+', choices=list(ROOMS), default=list(ROOMS))
     parser.add_argument('--count', type=int, default=32, help='mutants of each room (default 32)')
     parser.add_argument('--seed', type=int, default=1, help='another seed draws others (default 1)')
+    parser.add_argument('--by-hand', action='store_true', help=f'instead: those of {BY_HAND.name}')
     parser.add_argument('--quick', action='store_true', help='without the slow tests')
     parser.add_argument('--python', default=sys.executable, help='the Python that runs the tests (default this one)')
     arguments = parser.parse_args(argv)
@@ -442,7 +243,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     unnoticed: list[str] = []
     for name in arguments.rooms:
         same, left, noticed = 0, 0, dict.fromkeys(STAGES, 0)
-        for words, seen in tried(name, arguments.python, arguments.count, arguments.seed, known, not arguments.quick):
+        seed = None if arguments.by_hand else arguments.seed
+        for words, seen in tried(name, arguments.python, arguments.count, seed, known, not arguments.quick):
             print(f'{seen or "NOT noticed"}: {words}', file=sys.stderr, flush=True)
             if seen:
                 noticed[seen] += 1

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 
 from tools.program import PSD_DEFLECTION, ROOT, Program
 
-WAIT_S = 400.0
+WAIT_S = 1200.0
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
 FENCE = re.compile(r'^```(?P<kind>\w*)\n(?P<text>.*?)^```', re.M | re.S)
 INLINE = re.compile(r'`((?:make|psd-deflection|python|python3|pip|apt|sudo|colcon|ros2) [^`\n]+)`')
@@ -45,14 +45,16 @@ CI_RUNS = (
     (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test: lint types contracts unit'),
     (r'^make docs$', '.ci/run', 'make docs '),
     (r'^make axe$', '.ci/run', 'make axe '),
+    (r'^make try-page$', '.ci/run', 'make axe try-page '),
+    (r'^make try-page TRY=', 'Makefile', 'python -m tools.try_page build/site $(TRY)'),
     (r'^make colcon$', '.ci/run', 'make colcon '),
     (r'^make release-check$', '.github/workflows/ci.yml', 'make release-check '),
     (r'^make (rosdep|deb) ROSDISTRO=', '.github/workflows/ci.yml', 'make rosdep deb ROSDISTRO=../rosdistro'),
     (r'^make demo-thesis$', 'test/blind/test_redone.py', "main(['--short', "),
     (
-        r'^psd-deflection compare-methods --out ',
-        'test/cli/test_compare_methods.py',
-        "main(['compare-methods', '--out', ",
+        r'^psd-deflection thesis compare-methods --out ',
+        'test/cli/test_thesis.py',
+        "main(['thesis', 'compare-methods', '--out', ",
     ),
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
@@ -87,7 +89,7 @@ CI_RUNS = (
 SHORTEST = {
     'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 1 --starts 0" BENCH_SOLVERS="--blocks 1000" '
     'BENCH_ACCURACY="--blocks 100" BENCH_LIMITS="--times 1 --only frames" BENCH_RIGS="--most 1 --seconds 1" '
-    'BENCH_CPU="--seconds 2"',
+    'BENCH_CPU="--seconds 2 --results build/bench/cpu.json"',
     'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
     'crash': 'CRASH_TIMES=1',
     'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000 FUZZ_MINUTES=0.3',
@@ -139,7 +141,7 @@ VERDICTS = {
 
 TOOLS = {
     r'^make firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
-    r'^make (shots|page-soak)|first_look': ('chromium', 'chromedriver'),
+    r'^make (shots|page-soak)|first_look|tools\.shots': ('chromium', 'chromedriver'),
     r'^curl ': ('curl',),
     r'^ros2 ': ('ros2',),
 }
@@ -162,7 +164,7 @@ NEVER_HERE = ('a machine to administer', 'ros2', 'two hours', 'the data of other
 """Needs that NEED_TOOLS=1 (any other missing program is a failure) does not ask for."""
 
 QUICK = re.compile(
-    r'^psd-deflection (info|replay|convert|plot|budget|design|params|effects|completion|compare-methods)\b'
+    r'^psd-deflection (info|replay|convert|plot|budget|design|params|effects|completion|thesis)\b'
     r'|^psd-deflection simulate .*--(out|help)\b'
 )
 LIVE = re.compile(
@@ -171,6 +173,9 @@ LIVE = re.compile(
 )
 BESIDE = re.compile(r'^(ros2 (run|launch) psd_deflection|psd-deflection) (compensator|shaper)\b')
 """Nodes that run beside the lines below them."""
+
+AT_THE_BENCH = re.compile(r'^psd-deflection calibrate --live\b')
+"""Records with a running daemon while the lines below it load the tip."""
 
 ASKS = re.compile(r'^psd-deflection (echo|zero|record|load|mark)\b')
 """Commands that speak to a running daemon."""
@@ -231,8 +236,8 @@ def run_by_ci(line: str) -> tuple[str, str] | None:
     return next(((file, text) for pattern, file, text in CI_RUNS if re.search(pattern, line)), None)
 
 
-JOURNEY = 'docs/first-day.md'
-"""One path, of which every line is typed, in its order, also what is run elsewhere."""
+JOURNEYS = ('docs/first-day.md', 'docs/first-month.md')
+"""Paths of which every line is typed, in its order, also what is run elsewhere."""
 
 
 def is_quick(line: str) -> bool:
@@ -264,7 +269,7 @@ def blocks_to_run() -> list[list[Command]]:
         blocks.setdefault(command.block, []).append(command)
     out = []
     for block in blocks.values():
-        if block[0].page == JOURNEY:
+        if block[0].page in JOURNEYS:
             out.append([c for c in block if run_by_ci(c.line) is None])
             continue
         if all(is_quick(c.line) or run_by_ci(c.line) for c in block):
@@ -335,6 +340,10 @@ class Reader:
         elif BESIDE.search(line):
             self._background.append(self._start(line))
             self._background[-1].until('publishing ')
+        elif AT_THE_BENCH.search(line):
+            self._serve()
+            self._background.append(self._start(line))
+            self._background[-1].until('recording to ')
         elif ASKS.search(line):
             self._serve()
             self._to_the_end(line)

@@ -34,6 +34,7 @@ from psd_deflection.arms.compensation.compensator import State
 from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.arms.compensation.shaping import ShaperSettings
 from psd_deflection.arms.compensation.trajectory import KINK_S, Trajectory
+from psd_deflection.arms.inputs import REST_S
 from psd_deflection.base.log import unsaid
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.settings import CameraSettings
@@ -397,7 +398,7 @@ class Shaper(Attacked):
     words = ('--frequency', '12', '--urdf', 'robot_description')
 
     def __init__(self, folder: Path) -> None:
-        self._shaped, self.step = 0, 0.0
+        self._shaped, self.step, self._turns = 0, 0.0, 0
         self._wrong: list[str] = []
         self._last: tuple[int, Trajectory] | None = None
         super().__init__(ShaperNode(ShaperSettings(frequency=12.0, urdf='robot_description'), unsaid))
@@ -428,8 +429,14 @@ class Shaper(Attacked):
                 self.step = max(self.step, apart / (FASTEST * KINK_S))
 
     def right(self) -> None:
-        """The joints' limits and where they are, and a move now and then."""
+        """The joints' limits and where they are, and a move; one in a hundred begins at joints that stand."""
         self.give('/joint_states')
+        if self._turns % 100 == 0:
+            # Also if strange positions were told before.
+            for _ in range(2):
+                time.sleep(1.05 * REST_S)
+                self.give('/joint_states')
+        self._turns += 1
         if self._shaped % 50 == 0:
             self.give('/robot_description')
         self.give('/shaper/trajectory')

@@ -24,6 +24,7 @@ from scipy.ndimage import gaussian_filter
 
 from blind import render
 from blind.campaign import conclude, options
+from psd_deflection.camera import aruco
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.opencv import opencv
@@ -313,7 +314,7 @@ def board_picture(settings: CameraSettings) -> Any:
     """How a board of these settings is drawn: (scene, pose) -> grey levels without noise."""
     target = _board(settings)
     size = target.size
-    texture = target.board.generateImage((round(size[0] * 2e4), round(size[1] * 2e4)), None, 0, 1) / 255.0
+    texture = aruco.picture(target.board, (round(size[0] * 2e4), round(size[1] * 2e4))) / 255.0
 
     def picture(scene: render.Scene, pose: render.Pose) -> Any:
         return render.board(scene, pose, texture, size)

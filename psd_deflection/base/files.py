@@ -3,12 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 from psd_deflection.base.errors import RecordingError
+
+HOLDS = os.open in os.supports_dir_fd
+"""Whether the system makes files in a folder that is held open; Windows does not, and takes their paths instead."""
+_NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, 'O_CLOEXEC', 0) | getattr(os, 'O_BINARY', 0)
+"""O_EXCL: a link of that name, even one that leads nowhere, is refused."""
 
 
 def replace_file(path: Path, content: bytes) -> None:
@@ -30,9 +37,13 @@ class HeldFolder:
 
     def __init__(self, path: Path, *, follow: bool = True) -> None:
         self.path = path
-        # With O_PATH a folder that may not be listed can be written to all the same.
-        flags = getattr(os, 'O_PATH', os.O_RDONLY) | os.O_DIRECTORY | os.O_CLOEXEC
-        self._fd = os.open(path, flags | (0 if follow else os.O_NOFOLLOW))
+        self._fd = -1
+        if HOLDS:
+            # With O_PATH a folder that may not be listed can be written to all the same.
+            flags = getattr(os, 'O_PATH', os.O_RDONLY) | os.O_DIRECTORY | os.O_CLOEXEC
+            self._fd = os.open(path, flags | (0 if follow else os.O_NOFOLLOW))
+        elif not path.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(path))
 
     def create(self, name: str) -> BinaryIO:
         """A new file, open for writing. Raises FileExistsError if there is anything of that name."""
@@ -40,13 +51,15 @@ class HeldFolder:
 
     def unnamed(self, name: str) -> BinaryIO:
         """A new file that is gone once it is closed, made under ``name``, which must be free."""
+        if not HOLDS:
+            # An open file cannot be removed there.
+            return cast(BinaryIO, tempfile.TemporaryFile(dir=self.path))
         stream = os.fdopen(self._make(name), 'w+b')
         self.remove(name)
         return stream
 
     def _make(self, name: str) -> int:
-        # O_EXCL: a link of that name, even one that leads nowhere, is refused.
-        return os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666, dir_fd=self._fd)
+        return os.open(name, _NEW, 0o666, dir_fd=self._fd) if HOLDS else os.open(self.path / name, _NEW, 0o666)
 
     def replace(self, name: str, content: bytes) -> None:
         """Write ``name`` completely or not at all; a link of that name is replaced, not followed."""
@@ -58,7 +71,10 @@ class HeldFolder:
                 stream.write(content)
                 stream.flush()
                 os.fsync(stream.fileno())
-            os.replace(partial, name, src_dir_fd=self._fd, dst_dir_fd=self._fd)
+            if HOLDS:
+                os.replace(partial, name, src_dir_fd=self._fd, dst_dir_fd=self._fd)
+            else:
+                (self.path / partial).replace(self.path / name)
         except OSError:
             with contextlib.suppress(OSError):
                 self.remove(partial)
@@ -66,16 +82,22 @@ class HeldFolder:
 
     def remove(self, name: str) -> None:
         """Delete the file of that name."""
-        os.unlink(name, dir_fd=self._fd)
+        if HOLDS:
+            os.unlink(name, dir_fd=self._fd)
+        else:
+            (self.path / name).unlink()
 
     def holds(self, name: str, stream: BinaryIO) -> bool:
         """Whether ``name`` in this folder still is the file that ``stream`` writes. Raises nothing."""
         with contextlib.suppress(OSError):
-            return os.path.samestat(os.stat(name, dir_fd=self._fd, follow_symlinks=False), os.fstat(stream.fileno()))
+            there = os.stat(name, dir_fd=self._fd, follow_symlinks=False) if HOLDS else (self.path / name).lstat()
+            return os.path.samestat(there, os.fstat(stream.fileno()))
         return False
 
     def in_place(self) -> bool:
         """Whether ``path`` still leads to this folder. Raises nothing."""
+        if not HOLDS:
+            return self.path.is_dir()
         with contextlib.suppress(OSError):
             return os.path.samestat(self.path.stat(), os.fstat(self._fd))
         return False
@@ -91,6 +113,20 @@ class HeldFolder:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def lock(stream: BinaryIO, *, shared: bool = False) -> bool:
+    """Lock a file until it is closed; False if another program has locked it. Raises OSError if it cannot be."""
+    try:
+        import fcntl
+    except ImportError:
+        # Windows: files are not locked.
+        return True
+    try:
+        fcntl.flock(stream, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

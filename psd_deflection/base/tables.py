@@ -38,6 +38,15 @@ def columns_of(
     return [Column(n, values[:, i], u, d) for i, (n, u, d) in enumerate(zip(names, units, descriptions, strict=True))]
 
 
+def text_column(name: str, values: Sequence[object], description: str) -> Column:
+    """A column of words, or of whatever else there is."""
+    cells = np.empty(len(values), dtype=object)
+    # One by one: an array of tuples would have two dimensions.
+    for i, value in enumerate(values):
+        cells[i] = value
+    return Column(name, cells, '', description)
+
+
 @dataclass(frozen=True)
 class Table:
     """Columns of one length over ``index``. ``attributes``: of the whole."""

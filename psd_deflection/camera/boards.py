@@ -2,7 +2,7 @@
 
 The board's middle is ``link_tip``'s origin; seen from its front, its columns run to the right. Corners are matched
 by the numbers in the markers, so a board has no half turn, and may be partly hidden.
-Needs OpenCV 4.7 or later (``cv2.aruco`` of ``objdetect``).
+OpenCV makes and finds them (:mod:`psd_deflection.camera.aruco`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera import aruco
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.discs.rim_model import turned
 from psd_deflection.camera.lens import Lens
@@ -64,7 +65,8 @@ class Board(Target):
             dictionary=settings.dictionary or self.usual_dictionary,
         )
         super().__init__(settings)
-        self.board = self._made(_dictionary(settings, self._needed(settings)))
+        self._dictionary = _dictionary(settings, self._needed(settings))
+        self.board = self._made()
         wide, high = self.size = self._size()
         # OpenCV's board: origin in the corner, x right, y down as it is seen. Ours: middle, y up.
         self._middle = np.array([wide / 2, high / 2])
@@ -76,7 +78,7 @@ class Board(Target):
         """Number of markers."""
 
     @abc.abstractmethod
-    def _made(self, dictionary: Any) -> Any:
+    def _made(self) -> Any:
         """OpenCV's board."""
 
     @abc.abstractmethod
@@ -101,7 +103,7 @@ class Board(Target):
         wide, high = self.size
         across = self.settings.columns * _PIXELS_A_COLUMN
         pixels = (across, round(across * high / wide))
-        return Drawing(self.size, picture=np.asarray(self.board.generateImage(pixels, None, 0, 1)))
+        return Drawing(self.size, picture=np.asarray(aruco.picture(self.board, pixels)))
 
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
         """See :class:`Target`."""
@@ -233,17 +235,16 @@ def _fitted(
 
 def _dictionary(settings: CameraSettings, needed: int) -> Any:
     """OpenCV's dictionary, of at least ``needed`` markers. Raises ConfigError."""
-    aruco = getattr(opencv(), 'aruco', None)
-    if aruco is None or not hasattr(aruco, 'CharucoDetector'):
+    if not aruco.has_boards():
         raise ConfigError(
-            f'OpenCV {opencv().__version__} has no boards; target.kind {settings.target} needs 4.7 or later: '
-            "`pip install 'psd_deflection[camera]'` in a virtual environment (Ubuntu's own pip refuses it; see "
-            'docs/camera.md), or use the target circles'
+            f'OpenCV {opencv().__version__} has no boards; target.kind {settings.target} needs 4.7 or later, or '
+            "Ubuntu's 4.6: `pip install 'psd_deflection[camera]'` in a virtual environment (Ubuntu's own pip refuses "
+            'it; see docs/camera.md), or use the target circles'
         )
     name = settings.dictionary
-    if not name.startswith('DICT_') or not hasattr(aruco, name):
+    if not name.startswith('DICT_') or not hasattr(opencv().aruco, name):
         raise ConfigError(f'target.dictionary = {name}: no dictionary of OpenCV')
-    dictionary = aruco.getPredefinedDictionary(getattr(aruco, name))
+    dictionary = opencv().aruco.getPredefinedDictionary(getattr(opencv().aruco, name))
     columns, rows = settings.columns, settings.rows
     if min(columns, rows) < 3 or max(columns, rows) > 50:
         raise ConfigError(f'target.columns, target.rows = {columns}, {rows}: must be 3 to 50')
@@ -269,14 +270,15 @@ class Charuco(Board):
 
     def __init__(self, settings: CameraSettings) -> None:
         super().__init__(settings)
-        self._detector = opencv().aruco.CharucoDetector(self.board)
+        self._corners = aruco.chessboard_corners(self.board)
+        self._find = aruco.corner_finder(self.board, self._dictionary)
 
     def _needed(self, settings: CameraSettings) -> int:
         return settings.columns * settings.rows // 2
 
-    def _made(self, dictionary: Any) -> Any:
+    def _made(self) -> Any:
         s = self.settings
-        return opencv().aruco.CharucoBoard((s.columns, s.rows), s.square, s.marker, dictionary)
+        return aruco.charuco_board(s.columns, s.rows, s.square, s.marker, self._dictionary)
 
     def _size(self) -> tuple[float, float]:
         s = self.settings
@@ -291,11 +293,10 @@ class Charuco(Board):
         return np.ones((1, 2))
 
     def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
-        pixels, numbers, _, markers = self._detector.detectBoard(grey)
+        pixels, numbers, any_marker = self._find(grey)
         flat = [] if numbers is None else np.ravel(numbers).tolist()
-        known = self.board.getChessboardCorners()
-        at = np.array([known[i] for i in flat], dtype=float).reshape(-1, 3)[:, :2]
-        return flat, at, pixels, markers is not None and len(markers) > 0
+        at = np.array([self._corners[i] for i in flat], dtype=float).reshape(-1, 3)[:, :2]
+        return flat, at, pixels, any_marker
 
 
 class AprilTags(Board):
@@ -308,18 +309,15 @@ class AprilTags(Board):
 
     def __init__(self, settings: CameraSettings) -> None:
         super().__init__(settings)
-        aruco = opencv().aruco
-        parameters = aruco.DetectorParameters()
-        parameters.cornerRefinementMethod = aruco.CORNER_REFINE_SUBPIX
-        self._detector = aruco.ArucoDetector(self.board.getDictionary(), parameters)
-        self._by_id = dict(zip(np.ravel(self.board.getIds()).tolist(), self.board.getObjPoints(), strict=True))
+        self._find = aruco.tag_finder(self._dictionary)
+        self._by_id = aruco.tag_corners(self.board)
 
     def _needed(self, settings: CameraSettings) -> int:
         return settings.columns * settings.rows
 
-    def _made(self, dictionary: Any) -> Any:
+    def _made(self) -> Any:
         s = self.settings
-        return opencv().aruco.GridBoard((s.columns, s.rows), s.marker, s.gap, dictionary)
+        return aruco.tag_board(s.columns, s.rows, s.marker, s.gap, self._dictionary)
 
     def _size(self) -> tuple[float, float]:
         s = self.settings
@@ -337,7 +335,7 @@ class AprilTags(Board):
         return np.array(corners) * [self._mirror, 1.0]
 
     def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
-        corners, numbers, _ = self._detector.detectMarkers(grey)
+        corners, numbers = self._find(grey)
         flat = [] if numbers is None else np.ravel(numbers).tolist()
         ours = [(self._by_id[i], c) for i, c in zip(flat, corners, strict=True) if i in self._by_id]
         at = np.concatenate([a for a, _ in ours])[:, :2] if ours else np.zeros((0, 2))

@@ -17,7 +17,7 @@ from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.recordings.formats.registry import formats
-from psd_deflection.recordings.recording import MARK_WORD, WHOLE, Bound
+from psd_deflection.recordings.spans import MARK_WORD, WHOLE, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameter_files import read_parameter_file

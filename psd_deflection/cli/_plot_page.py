@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 import psd_deflection.run.monitor
 from psd_deflection import __version__
+from psd_deflection.base.page_files import CHARTS, UPLOT, UPLOT_STYLE, joined, packed, safe, text
 from psd_deflection.records import AppliedLoad, FloatArray, Mark, ReferencePose, dot_names
 from psd_deflection.rig.config import Rig
 
 PAGE = Path(psd_deflection.run.monitor.__file__).parent / 'page'
+STYLES = (UPLOT_STYLE, PAGE / 'style.css', PAGE / 'recording.css')
 
 KEYS = {
     'shift': (('ΔX', 'dx', 1, True), ('ΔY', 'dy', 4, True)),
@@ -72,16 +71,16 @@ class DrawnInputs(NamedTuple):
         held: dict[str, str] = {}
         if loads:
             times = [self.seconds(load.t_ns) for load in loads]
-            held['t'] = _packed([*times, max(end, times[-1])], np.float64)
+            held['t'] = packed([*times, max(end, times[-1])], np.float64)
             for i, name in enumerate(('fx', 'fy', 'tz'), start=1):
-                held[name] = _packed([load[i] for load in (*loads, loads[-1])])
+                held[name] = packed([load[i] for load in (*loads, loads[-1])])
         poses = enumerate(('dx', 'dy', 'theta'), start=1)
         return {
             'marks': [[t, *words] for t, words in sorted(marks, key=lambda mark: mark[0])],
             'loads': held,
             'references': {
-                't': _packed([self.seconds(r.t_ns) for r in references], np.float64),
-                **{name: _packed([r[i] for r in references]) for i, name in poses},
+                't': packed([self.seconds(r.t_ns) for r in references], np.float64),
+                **{name: packed([r[i] for r in references]) for i, name in poses},
             },
         }
 
@@ -100,11 +99,11 @@ def plot_page(
     m/sqrt(Hz). ``summary``: names and values for its table.
     """
     content = {
-        'columns': {n: _packed(v, np.float64 if n == 't' else np.float32) for n, v in table.items()},
+        'columns': {n: packed(v, np.float64 if n == 't' else np.float32) for n, v in table.items()},
         **inputs.content(float(table['t'][-1])),
         'spectrum': None
         if spectrum is None
-        else {'f': _packed(spectrum[0]), 'density': [_packed(row) for row in spectrum[1]]},
+        else {'f': packed(spectrum[0]), 'density': [packed(row) for row in spectrum[1]]},
         'modes': [['bending', rig.dynamics.bending_frequency], ['torsion', rig.dynamics.torsion_frequency]],
         'active_areas': [psd.active_area for psd in rig.psds],
         'sum_nominal': rig.amplifier.sum_nominal,
@@ -122,7 +121,7 @@ def plot_page(
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<title>{name}</title><style>{_text("vendor/uPlot.min.css")}{_text("style.css")}{_text("recording.css")}</style></head><body>'
+        f'<title>{name}</title><style>{"".join(map(text, STYLES))}</style></head><body>'
         f'<header><div class="title"><h1>{name}</h1> <span id="range" class="quiet"></span></div><div class="tools">'
         '<span class="quiet">drag over a trace to look closer</span>'
         '<button id="whole" type="button" aria-disabled="true">All of it</button></div></header>'
@@ -131,9 +130,9 @@ def plot_page(
         f'<div class="card"><h2>Summary</h2><table>{rows}</table><p class="quiet">psd_deflection {__version__}; '
         f'<code>psd-deflection plot {name}</code></p></div></section></main>'
         f'<noscript>This page draws with JavaScript.</noscript>'
-        f'<script type="application/json" id="recording">{_safe(json.dumps(content))}</script>'
-        f'<script>{_text("vendor/uPlot.iife.min.js")}</script>'
-        f'<script type="module">{_joined("charts.js", "recording.js")}</script></body></html>\n'
+        f'<script type="application/json" id="recording">{safe(json.dumps(content))}</script>'
+        f'<script>{text(UPLOT)}</script>'
+        f'<script type="module">{joined(CHARTS, PAGE / "recording.js")}</script></body></html>\n'
     )
 
 
@@ -152,22 +151,3 @@ def _figure(name: str, shown: Sequence[tuple[str, str, int, bool]]) -> str:
         f'<output class="at quiet right" data-plot="{name}"{unit}></output></figcaption>'
         f'<div id="plot_{name}"></div></figure>'
     )
-
-
-def _packed(values: npt.ArrayLike, kind: type[np.floating[Any]] = np.float32) -> str:
-    """Little-endian floats in base64: an hour is 13 MB, where its digits would be 25 MB."""
-    return base64.b64encode(np.asarray(values, np.dtype(kind).newbyteorder('<')).tobytes()).decode()
-
-
-def _text(name: str) -> str:
-    return (PAGE / name).read_text(encoding='utf-8')
-
-
-def _joined(*names: str) -> str:
-    """Modules as one: what they export to each other is in one file."""
-    return '\n'.join(re.sub(r'^import .*\n|^export (?=const|function|class)', '', _text(n), flags=re.M) for n in names)
-
-
-def _safe(text: str) -> str:
-    """JSON that ends no script element."""
-    return text.replace('<', '\\u003c')

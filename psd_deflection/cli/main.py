@@ -50,7 +50,7 @@ COMMANDS: dict[str, str] = {
     'mark': 'mark this moment in the recording of a running daemon, without ROS',
     'load': 'note a known load that acts on the tip from now on, for the recording',
     'replay': 'compute the estimates of a recording again, as the daemon did',
-    'simulate': 'simulate the rig: write a recording, or act as a device on a pseudo-terminal',
+    'simulate': 'simulate the rig: write a recording, or act as a device',
     'discover': 'find the physical effect that the simulation of a recording lacks',
     'calibrate': 'estimate how the real rig differs from its rig file, with a reference or known loads',
     'effects': 'list the effects that can be simulated and discovered, or explain one',
@@ -66,18 +66,21 @@ COMMANDS: dict[str, str] = {
     'budget': 'compute the error budget: what each cause adds to the error of ΔX, ΔY and θ',
     'certificate': 'write a calibration certificate: U at stated poses, with every input of it',
     'design': 'compute link stiffness and compare sensor placements',
-    'compare-methods': 'compare the errors of all methods, and explain Table 5.1 of the thesis',
+    'thesis': 'what concerns the thesis alone: compare its methods, explain its Table 5.1',
     'params': 'list every parameter with unit, bounds and default',
     'completion': 'print a completion script for bash, zsh or tcsh',
 }
 """Command name to one-line summary; the module is ``NAME.py`` (``-`` as ``_``) in ``cli`` or one of ``FOLDERS``."""
+
+OLDER_NAMES: dict[str, tuple[str, ...]] = {'compare-methods': ('thesis', 'compare-methods')}
+"""What commands were called once, which still works and is listed nowhere, and what they are called now."""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     'run: measure, look on, note': ('estimator', 'monitor', 'chain', 'echo', 'zero', 'load', 'mark', 'record'),
     'rig: describe it, wire it, know what to expect': ('devices', 'check', 'params', 'design', 'budget'),
     'recording: compute again, draw, convert': ('replay', 'plot', 'info', 'convert', 'recover'),
     'truth: an independent measurement': ('camera', 'validate', 'calibrate', 'certificate'),
-    'model: simulate, find what is missing': ('simulate', 'discover', 'effects', 'compare-methods'),
+    'model: simulate, find what is missing': ('simulate', 'discover', 'effects', 'thesis'),
     'motion: what rings, and an arm that moves': ('identify', 'compensator', 'shaper'),
 }
 """Commands by what one wants to do, in the order of the help; those of no group come last."""
@@ -236,6 +239,7 @@ def _discard_output() -> None:
 
 
 def _run(argv: list[str]) -> int:
+    argv = _renamed(argv)
     chosen = [a for a in argv if a and not a.startswith('-')][:1]
     # `ros2 run` and `ros2 launch` add arguments for rclpy, which argparse must not see.
     own, ros_arguments = _split_ros_arguments(argv)
@@ -275,13 +279,20 @@ def _run(argv: list[str]) -> int:
         return error.exit_status
 
 
+def _renamed(argv: list[str]) -> list[str]:
+    """``argv`` with today's name of its command."""
+    at = next((n for n, a in enumerate(argv) if a and not a.startswith('-')), len(argv))
+    return [*argv[:at], *OLDER_NAMES.get(argv[at], argv[at : at + 1]), *argv[at + 1 :]] if at < len(argv) else argv
+
+
 @contextlib.contextmanager
 def _ended_like_ctrl_c() -> Iterator[None]:
     """Treat `timeout` and a closed terminal like Ctrl-C, so that no unfinished output looks complete."""
     before = {}
     # Only the main thread may set signal handlers.
     with contextlib.suppress(ValueError):
-        for number in (signal.SIGTERM, signal.SIGHUP):
+        # Windows has no SIGHUP.
+        for number in (signal.SIGTERM, *([signal.SIGHUP] if hasattr(signal, 'SIGHUP') else [])):
             if signal.getsignal(number) is signal.SIG_DFL:
                 before[number] = signal.signal(number, signal.default_int_handler)
     try:

@@ -39,8 +39,8 @@ from psd_deflection.devices.protocol.frames import (
     StopFrame,
     encode,
 )
-from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import REOPEN_S, Event, Received
+from psd_deflection.devices.udp_port import Datagrams, Judge
 from psd_deflection.records import FLAG_DEVICE_DROPPED, FLAG_OVER_RANGE, MOST_PSDS, channel_names
 from psd_deflection.rig.config import Rig
 
@@ -64,9 +64,15 @@ class ContractFrames(PortSource):
         self._given = rig.acquisition.port
         self._baud = rig.acquisition.baud
         self._psds = len(rig.psds)
+        self.datagrams = Datagrams(self._judge)
         self._decoder = FrameDecoder(self._psds)
         self._early: list[Event] = []
         self._next_candidate = 0
+
+    def _judge(self) -> Judge:
+        """Whether a sender of datagrams speaks our frames."""
+        decoder = FrameDecoder(self._psds)
+        return lambda piece: any(not isinstance(frame, BadFrame) for frame in decoder.feed(piece))
 
     def open(self, timeout: float) -> HelloFrame:
         """Open the port and wait for a HELLO; of a pattern, the first port on which the device answers."""
@@ -88,7 +94,7 @@ class ContractFrames(PortSource):
     def _open(self, name: str, timeout: float) -> HelloFrame:
         """Open ``name`` and wait for its HELLO; the first read returns the frames that came before it."""
         self.name = name
-        port = self._port = SerialPort(name, self._baud)
+        port = self.open_port(self._baud)
         self._early = []
         try:
             port.write(_WAKE)
@@ -115,8 +121,8 @@ class ContractFrames(PortSource):
             raise DeviceError(f'{self.name}: samples come but no HELLO in {timeout:g} s; does the firmware send it?')
         if received:
             raise DeviceError(
-                f'{self.name}: {received} bytes but no frame in {timeout:g} s; is the baud rate '
-                f'({self._baud}) right, and is this the PSD device? (`psd-deflection devices` tells what answers)'
+                f'{self.name}: {received} bytes but no frame in {timeout:g} s; {self._is_speed_right(self._baud)}, '
+                'and is this the PSD device? (`psd-deflection devices` tells what answers)'
             )
         raise DeviceError(f'{self.name}: no frame in {timeout:g} s; is the device powered and this its port?')
 
@@ -161,8 +167,8 @@ class ContractFrames(PortSource):
         received = port.read(timeout)
         now = time.monotonic_ns()
         if not received:
-            return Received((), now, 0)
-        return Received(self._decoder.feed(received), now, len(received))
+            return Received(self._notices(), now, 0)
+        return Received([*self._notices(), *self._decoder.feed(received)], now, len(received))
 
     def ping(self, cookie: int) -> bool:
         """Send PING."""
@@ -177,9 +183,9 @@ class ContractFrames(PortSource):
             self._port.write(_WAKE)
 
     def describe(self) -> Mapping[str, str]:
-        """Port and line speed."""
+        """Port, its state, and line speed."""
         return {
-            'source': f'contract frames on {self.name}, {self._baud} baud',
+            **self._describe_port('contract frames', self._baud),
             'sample numbers': 'of the device',
             'sample times': 'of the device',
         }

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe
-from psd_deflection.devices.port_source import PortSource
+from psd_deflection.devices.port_source import PortSource, refuse_datagrams
 from psd_deflection.devices.protocol.dataq import (
     ANALOG,
     CLOCK_HZ,
@@ -34,7 +34,6 @@ from psd_deflection.devices.protocol.dataq import (
     scan_list,
 )
 from psd_deflection.devices.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
-from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, PortClosedError, Received, Sample
 from psd_deflection.records import CHANNELS, FLAG_OVER_RANGE
 from psd_deflection.rig.config import Rig
@@ -66,6 +65,7 @@ class Dataq(PortSource):
 
     def __init__(self, rig: Rig) -> None:
         super().__init__(rig.acquisition.port)
+        refuse_datagrams('dataq', self.name)
         self._wanted = rig.converter.sample_rate_hz
         if abs(rig.converter.volts_per_count - VOLTS_PER_COUNT) > 1e-3 * VOLTS_PER_COUNT:
             raise ConfigError(
@@ -79,7 +79,7 @@ class Dataq(PortSource):
 
     def open(self, timeout: float) -> HelloFrame:
         """Stop a running scan, identify the device, set up the scan list, and measure the actual rate."""
-        self._port = SerialPort(self.name, BAUD)
+        self.open_port(BAUD)
         try:
             return self._configure(timeout)
         except BaseException:

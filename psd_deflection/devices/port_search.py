@@ -10,12 +10,15 @@ import glob
 
 from serial.tools import list_ports
 
+from psd_deflection.devices.port_names import network_address
+
 MAX_PORTS = 64
 
 
 def is_pattern(port: str) -> bool:
     """Whether ``port`` is a pattern, which may match several ports."""
-    return glob.has_magic(port)
+    # [::1] is no pattern.
+    return network_address(port) is None and glob.has_magic(port)
 
 
 def matching(pattern: str) -> list[str]:
@@ -26,8 +29,10 @@ def matching(pattern: str) -> list[str]:
 def candidate_ports(port: str, wanted_serial: str) -> list[str]:
     """Other ports where the device may have come back, the likeliest first.
 
-    A port whose USB descriptor has ``wanted_serial`` goes first.
+    A port whose USB descriptor has ``wanted_serial`` goes first. A port of the network is one place.
     """
+    if network_address(port) is not None:
+        return []
     if is_pattern(port):
         return matching(port)
     ports = [p for p in list_ports.comports() if p.vid is not None and p.device != port]

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-import tty
+import select
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from psd_deflection.base.errors import ConfigError
+
+ABSENT_S = 1e-3
+"""A line that nobody has open is always "ready": how long to wait instead."""
 
 PORT_LINE = 'port: '
 """Start of the line in which a program that serves a simulated device prints its port."""
@@ -21,12 +25,17 @@ class PseudoTerminal:
     """
 
     def __init__(self, link: str | Path | None = None) -> None:
+        # Windows has none; what needs no pseudo-terminal runs there.
+        import tty
+
         self.master, slave = os.openpty()
         tty.setraw(slave)
         self.name = os.ttyname(slave)
         # The kernel reports that no one has it open only after it was opened and closed once.
         os.close(slave)
         os.set_blocking(self.master, False)
+        self._poll = select.poll()
+        self._poll.register(self.master, select.POLLIN)
         self._link = Path(link) if link is not None else None
         if self._link is not None:
             try:
@@ -36,6 +45,28 @@ class PseudoTerminal:
             except OSError as error:
                 os.close(self.master)
                 raise ConfigError(f'{self._link}: no link can be made there ({error.strerror})') from None
+
+    def listen(self, seconds: float) -> bytes | None:
+        """What the host has sent, after at most ``seconds``; None if nobody has the port open.
+
+        Raises OSError if it was closed just now.
+        """
+        events = self._poll.poll(seconds * 1e3)
+        mask = events[0][1] if events else 0
+        if mask & select.POLLHUP:
+            time.sleep(ABSENT_S)
+            return None
+        try:
+            return os.read(self.master, 4096) if mask & select.POLLIN else b''
+        except BlockingIOError:
+            return b''
+
+    def send(self, stream: bytes) -> int:
+        """Send as much as there is room for; return how many bytes. Raises OSError if nobody has it open."""
+        try:
+            return os.write(self.master, stream)
+        except BlockingIOError:
+            return 0
 
     def close(self) -> None:
         """Remove the port, as if the cable were unplugged."""

@@ -1,4 +1,4 @@
-"""A serial port as a source of bytes: opened by pyserial, read with select and ``os.read``.
+"""A serial port of this machine as a source of bytes: opened by pyserial, read from its descriptor.
 
 pyserial opens, locks and configures the port; reading one byte at a time through it would cost a
 quarter of a core at 1 kHz, so the bytes are read from the descriptor.
@@ -8,33 +8,28 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import os
 import select
 import sys
-import termios
+import threading
 from pathlib import Path
 
 import serial
 
 from psd_deflection.base.errors import DeviceError
+from psd_deflection.devices.port import WRITE_S, DescriptorPort
 from psd_deflection.devices.source import PortClosedError
 
-READ_SIZE = 4096
 MAX_EMPTY_READS = 1000
 """After this many reads in a row that are ready but return no byte, the port counts as gone."""
 
-SLICE_S = 0.1
-"""Longest single wait of a read, so that ``give_up`` takes effect soon."""
 
+class SerialPort(DescriptorPort):
+    """A serial port. Raises DeviceError with its name if it cannot be opened."""
 
-class SerialPort:
-    """An open port. ``name``: as given. Raises DeviceError with the name if it cannot be opened."""
-
-    def __init__(self, name: str, baud: int, rtscts: bool = False) -> None:
-        self.name = name
-        self._given_up = False
+    def __init__(self, name: str, baud: int, rtscts: bool = False, given_up: threading.Event | None = None) -> None:
+        super().__init__(name, given_up)
         try:
-            self._serial = serial.Serial(name, baud, timeout=0, write_timeout=1.0, exclusive=True, rtscts=rtscts)
+            self._serial = serial.Serial(name, baud, timeout=0, write_timeout=WRITE_S, exclusive=True, rtscts=rtscts)
         except serial.SerialException as error:
             raise DeviceError(f'{name}: {_why(error, name)}') from None
         except (OSError, ValueError) as error:
@@ -47,46 +42,24 @@ class SerialPort:
                 self._serial.set_low_latency_mode(True)
         self.discard_input()
 
-    def read(self, timeout: float) -> bytes:
-        """Return the bytes that have arrived, at most 4096; empty after ``timeout`` s, but at most 0.1 s.
-
-        Raises PortClosedError if the port is gone or was given up.
-        """
-        if self._given_up:
-            raise PortClosedError(f'{self.name}: given up')
-        try:
-            ready, _, _ = select.select((self._fd,), (), (), min(timeout, SLICE_S))
-            if not ready:
-                return b''
-            received = os.read(self._fd, READ_SIZE)
-        except BlockingIOError:
-            return b''
-        except OSError as error:
-            raise PortClosedError(f'{self.name}: the device is gone ({error.strerror})') from None
+    def _came(self, received: bytes) -> None:
+        """A read that was ready and returned no bytes: the line hung up, or another program took them."""
         if received:
             self._empty_reads = 0
         elif self._is_gone():
             raise PortClosedError(f'{self.name}: the device is gone')
-        return received
 
     def _is_gone(self) -> bool:
-        """A read that was ready returned no bytes: the line hung up, or another program took them."""
         self._empty_reads += 1
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
         hung_up = any(mask & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, mask in poll.poll(0))
         return hung_up or self._empty_reads > MAX_EMPTY_READS
 
-    def give_up(self) -> None:
-        """End every wait for this port. Any thread may call it."""
-        self._given_up = True
-
-    def fileno(self) -> int:
-        """The descriptor, for ``select``."""
-        return self._fd
-
     def discard_input(self) -> None:
         """Discard unread bytes: they are older than their time of reading."""
+        import termios
+
         # A terminal that is gone raises termios.error, which is not an OSError.
         with contextlib.suppress(OSError, termios.error, serial.SerialException):
             self._serial.reset_input_buffer()

@@ -1,4 +1,4 @@
-"""Serves a simulated device on pseudo-terminals, in real time.
+"""Serves a simulated device on pseudo-terminals or on the network, in real time.
 
 Like a USB device it sends nothing while no one has its port open. A daemon starts
 ``python -m psd_deflection.devices.serve`` if no port is named: this process reads the parameters as a line of
@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import select
 import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError
 from psd_deflection.devices.device import OUTPUT_LIMIT, LineDevice, PowerUp
-from psd_deflection.devices.pseudo_terminal import PORT_LINE, PseudoTerminal, link_names, open_terminals
+from psd_deflection.devices.pseudo_terminal import PORT_LINE, link_names, open_terminals
 from psd_deflection.devices.registry import SIMULATED, find_device
 from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.model.simulation.loads import CyclicLoads, thesis_load_cases
@@ -75,30 +74,36 @@ def simulated_devices(
     return simulate(RigFeed(rig, lambda _, n: loads.take(n), seed=seed), power_up or PowerUp())
 
 
-def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool]) -> None:
+class HostSide(Protocol):
+    """Where a simulated device is reached. ``name``: what the host opens."""
+
+    name: str
+
+    def listen(self, seconds: float) -> bytes | None:
+        """What the host has sent, after at most ``seconds``; None if nobody has the port open. Raises OSError."""
+
+    def send(self, stream: bytes) -> int:
+        """Send as much as there is room for; return how many bytes. Raises OSError if nobody has it open."""
+
+
+def serve(device: LineDevice, port: HostSide, stopped: Callable[[], bool]) -> None:
     """Run the device in real time until ``stopped()``."""
-    poll = select.poll()
-    poll.register(port.master, select.POLLIN)
     start = time.monotonic_ns()
     pending = b''
     listening = False
     while not stopped():
-        wait_ms = max(device.due_in_ns(time.monotonic_ns() - start), 0) / 1e6
-        events = poll.poll(wait_ms)
-        mask = events[0][1] if events else 0
-        now = time.monotonic_ns() - start
-        if mask & select.POLLHUP:
-            listening, pending = False, b''
-            device.take(now, room=1 << 30)
-            # A closed line is always "ready": wait for the next sample by the clock instead.
-            time.sleep(1e-3)
-            continue
-        if not listening:
-            listening = True
-            pending = device.greeting()
         try:
-            if mask & select.POLLIN:
-                pending += device.receive(os.read(port.master, 4096), now)
+            heard = port.listen(max(device.due_in_ns(time.monotonic_ns() - start), 0) / 1e9)
+            now = time.monotonic_ns() - start
+            if heard is None:
+                listening, pending = False, b''
+                device.take(now, room=1 << 30)
+                continue
+            if not listening:
+                listening = True
+                pending = device.greeting()
+            if heard:
+                pending += device.receive(heard, now)
             until = now + min(device.due_in_ns(now), 0)
             caught_up = False
             while not caught_up:
@@ -108,15 +113,15 @@ def serve(device: LineDevice, port: PseudoTerminal, stopped: Callable[[], bool])
                 caught_up = until == now
                 pending += device.take(until, room=OUTPUT_LIMIT - len(pending))
                 if pending:
-                    pending = pending[os.write(port.master, pending) :]
-        except BlockingIOError:
-            pass
+                    sent = port.send(pending)
+                    pending = pending[sent:]
+                    caught_up = caught_up or not sent
         except OSError:
             # The host closed the port between poll and write.
             listening, pending = False, b''
 
 
-def serve_all(devices: Sequence[LineDevice], ports: Sequence[PseudoTerminal], stopped: Callable[[], bool]) -> None:
+def serve_all(devices: Sequence[LineDevice], ports: Sequence[HostSide], stopped: Callable[[], bool]) -> None:
     """Serve each device on its port until ``stopped()``, the first one in this thread."""
     others = [
         threading.Thread(target=serve, args=(device, port, stopped), name=port.name, daemon=True)

@@ -55,9 +55,15 @@ class Sample(NamedTuple):
     readings: tuple[float, ...]
 
 
-Event = Sample | Frame
-"""What a read gives: samples, HELLO, STATUS, PONG, and :class:`BadFrame` (with a reason) for bytes that are not a valid
-frame."""
+class Notice(NamedTuple):
+    """Something beside the device's data that a person should be told once: ``text``, one line."""
+
+    text: str
+
+
+Event = Sample | Frame | Notice
+"""What a read gives: samples, HELLO, STATUS, PONG, :class:`BadFrame` (with a reason) for bytes that are not a valid
+frame, and :class:`Notice`."""
 
 
 class Received(NamedTuple):
@@ -158,6 +164,7 @@ __all__ = [
     'Clock',
     'Event',
     'HelloFrame',
+    'Notice',
     'PortClosedError',
     'Received',
     'Sample',

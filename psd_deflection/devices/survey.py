@@ -18,7 +18,9 @@ from serial.tools import list_ports
 
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.device import Answer, Device, Probe
-from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.port import OpenPort
+from psd_deflection.devices.port_names import has_baud
+from psd_deflection.devices.ports import open_port
 
 COMMON_BAUD = 115_200
 ANSWER_S = 0.4
@@ -75,7 +77,10 @@ class _Ears:
         self._port.answer = answer.text
         if answer.usable:
             self._port.source = name
-            self._port.suggested = {'source': name, 'port': stable_name(self._port.port), **answer.parameters}
+            suggested = {'source': name, 'port': stable_name(self._port.port), **answer.parameters}
+            if not has_baud(self._port.port):
+                suggested.pop('baud', None)
+            self._port.suggested = suggested
 
 
 def stable_name(port: str) -> str:
@@ -98,11 +103,17 @@ def serial_ports() -> list[Port]:
 
 
 def identify(port: Port, devices: Sequence[Device]) -> Port:
-    """Fill in which of ``devices`` answers on ``port``; takes up to about five seconds per line speed."""
+    """Fill in which of ``devices`` answers on ``port``; takes up to about five seconds per line speed.
+
+    Raises ConfigError if it is no name of a port.
+    """
     probes = [(d.name, d.probe) for d in devices if d.probe is not None]
     # A stable sort: the others keep their order.
     probes.sort(key=lambda named: not named[1].first)
-    speeds = dict.fromkeys([COMMON_BAUD, *(probe.baud for _, probe in probes)])
+    speeds = list(dict.fromkeys([COMMON_BAUD, *(probe.baud for _, probe in probes)]))
+    if not has_baud(port.port):
+        # Whichever it is, it is set at the other end.
+        speeds = speeds[:1]
     try:
         for baud in speeds:
             ears = _ask(port, baud, probes)
@@ -116,7 +127,7 @@ def identify(port: Port, devices: Sequence[Device]) -> Port:
 
 
 def _ask(port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> _Ears:
-    line = SerialPort(port.port, baud)
+    line = open_port(port.port, baud)
     ears = _Ears(port, baud, probes)
     try:
         for _, probe in probes:
@@ -129,13 +140,14 @@ def _ask(port: Port, baud: int, probes: Sequence[tuple[str, Probe]]) -> _Ears:
         if ears.promising:
             port.answer = 'samples come, but the device does not say what it is'
         elif ears.bytes:
-            port.answer = f'{ears.bytes} bytes that we cannot read at {baud} baud'
+            speed = f' at {baud} baud' if has_baud(port.port) else ''
+            port.answer = f'{ears.bytes} bytes that we cannot read{speed}'
     finally:
         line.close()
     return ears
 
 
-def _listen(line: SerialPort, ears: _Ears, seconds: float) -> bool:
+def _listen(line: OpenPort, ears: _Ears, seconds: float) -> bool:
     deadline = time.monotonic() + seconds
     while (left := deadline - time.monotonic()) > 0:
         if ears.hear(line.read(left)):
@@ -146,7 +158,8 @@ def _listen(line: SerialPort, ears: _Ears, seconds: float) -> bool:
 def survey(devices: Sequence[Device], names: Sequence[str] = ()) -> list[Port]:
     """Every port, or only the named ones, with the one of ``devices`` that answers.
 
-    Pseudo-terminals must be named, since the system does not list them.
+    Pseudo-terminals and ports of the network must be named, since the system does not list them.
+    Raises ConfigError for what is no name of a port.
     """
     ports = [Port(name) for name in names] or serial_ports()
     if not ports:

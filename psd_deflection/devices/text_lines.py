@@ -40,8 +40,8 @@ from psd_deflection.devices.protocol.text_lines import (
     positive,
     with_check,
 )
-from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Event, Received, Sample
+from psd_deflection.devices.udp_port import Datagrams, Judge
 from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.records import FLAG_OVER_RANGE, MOST_PSDS, channel_names
 from psd_deflection.rig.config import Rig
@@ -53,8 +53,17 @@ BOOT_S = 4.0
 """An Arduino restarts when its port is opened, and its boot loader takes two seconds."""
 
 
+def _judge() -> Judge:
+    """Whether a sender of datagrams speaks text lines."""
+    decoder = LineDecoder()
+    return lambda piece: any(not isinstance(item, BadFrame) for item in decoder.feed(piece))
+
+
 class TextLines(PortSource):
     """``source: lines``."""
+
+    # A line without a check that was put together of two datagrams may be of two lines, and nobody would see it.
+    datagrams = Datagrams(_judge, end=b'\n')
 
     def __init__(self, rig: Rig) -> None:
         super().__init__(rig.acquisition.port)
@@ -71,7 +80,7 @@ class TextLines(PortSource):
 
     def open(self, timeout: float) -> HelloFrame:
         """Open the port and wait for the line that describes the device."""
-        port = self._port = SerialPort(self.name, self._baud)
+        port = self.open_port(self._baud)
         timeout = max(timeout, BOOT_S)
         lines = received = 0
         try:
@@ -92,7 +101,7 @@ class TextLines(PortSource):
         if lines:
             why = 'samples come but no line that describes them: # {"sample_rate_hz": 200}'
         elif received:
-            why = f'{received} bytes but no line of ours; is the baud rate ({self._baud}) right?'
+            why = f'{received} bytes but no line of ours; {self._is_speed_right(self._baud)}?'
         else:
             why = 'nothing comes; does the sketch run, and is this its port?'
         raise DeviceError(f'{self.name}: {why} (waited {timeout:g} s)')
@@ -107,7 +116,7 @@ class TextLines(PortSource):
         """Return the lines that have arrived."""
         received = self._opened().read(timeout)
         now = time.monotonic_ns()
-        events: list[Event] = []
+        events: list[Event] = [*self._notices()]
         for item in self._decoder.feed(received) if received else ():
             if isinstance(item, Line):
                 events.append(self._sample(item))
@@ -168,9 +177,9 @@ class TextLines(PortSource):
         return FLAG_OVER_RANGE if max(counts) >= self._top or min(counts) <= -self._top - 1 else 0
 
     def describe(self) -> Mapping[str, str]:
-        """Port and line speed."""
+        """Port, its state, and line speed."""
         return {
-            'source': f'text lines on {self.name}, {self._baud} baud',
+            **self._describe_port('text lines', self._baud),
             'sample numbers': 'of the device',
             'sample times': 'of the device',
         }

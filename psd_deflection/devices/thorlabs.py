@@ -19,6 +19,9 @@ from typing import TYPE_CHECKING
 
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe
+from psd_deflection.devices.port import OpenPort
+from psd_deflection.devices.port_source import refuse_datagrams
+from psd_deflection.devices.ports import open_port
 from psd_deflection.devices.protocol.apt import (
     DEVICE_ADDRESS,
     FULL_SCALE,
@@ -34,7 +37,6 @@ from psd_deflection.devices.protocol.apt import (
     encode_readings,
 )
 from psd_deflection.devices.protocol.frames import PROTOCOL_VERSION, BadFrame, HelloFrame
-from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source
 from psd_deflection.records import CHANNELS
 from psd_deflection.rig.config import Rig
@@ -45,6 +47,9 @@ if TYPE_CHECKING:
 BAUD = 115_200
 ANSWER_S = 0.1
 """An answer that takes longer is given up; the devices take about 2 ms."""
+
+POLL_S = 0.5e-3
+"""How often a port without a descriptor is asked whether its answer has come."""
 
 TRIAL = 50
 HEADROOM = 0.8
@@ -71,13 +76,15 @@ class ThorlabsPair(Source):
                 f'source = thorlabs: port = {self.name!r}: two ports are needed, PSD 1 first, with a comma between: '
                 '/dev/ttyUSB0,/dev/ttyUSB1'
             )
+        refuse_datagrams('thorlabs', *self._names)
         self._rate = rig.converter.sample_rate_hz
         self._period_ns = round(SECOND_NS / self._rate)
         # Two independent drivers found that x has the opposite sign; here a parameter sets it.
         self._x_sign = rig.acquisition.thorlabs_x_sign
         if abs(self._x_sign) != 1.0:
             raise ConfigError(f'thorlabs.x_sign = {self._x_sign:g}: must be 1 or -1')
-        self._ports: list[SerialPort] = []
+        self._ports: list[OpenPort] = []
+        self._given_up = threading.Event()
         self._decoders = [AptDecoder(), AptDecoder()]
         self._origin_ns: int | None = None
         self._slot = -1
@@ -90,8 +97,7 @@ class ThorlabsPair(Source):
         """Open both, read their hardware info, and measure how many readings per second they give."""
         try:
             for name in self._names:
-                port = SerialPort(name, BAUD, rtscts=True)
-                self._ports.append(port)
+                self._ports.append(open_port(name, BAUD, rtscts=True, given_up=self._given_up))
             infos = [self._identify(number, timeout) for number in range(2)]
             self._models = (infos[0].model, infos[1].model)
             self._reach = self._measure()
@@ -154,7 +160,7 @@ class ThorlabsPair(Source):
         deadline = asked + round(ANSWER_S * 1e9)
         while None in found and (left := deadline - time.monotonic_ns()) > 0:
             waiting = [p for p, f in zip(self._ports, found, strict=True) if f is None]
-            select.select([p.fileno() for p in waiting], (), (), left * 1e-9)
+            _await(waiting, left * 1e-9)
             for number, port in enumerate(self._ports):
                 if found[number] is None:
                     piece = port.read(0.0)
@@ -202,8 +208,7 @@ class ThorlabsPair(Source):
 
     def give_up(self) -> None:
         """Stop waiting for the devices."""
-        for port in tuple(self._ports):
-            port.give_up()
+        self._given_up.set()
 
     def close(self) -> None:
         """Give both ports back."""
@@ -225,6 +230,15 @@ class ThorlabsPair(Source):
             'sample numbers': 'slots of the host; a slot without an answer is a lost sample',
             'sample times': 'of the host, half-way between question and answer',
         }
+
+
+def _await(ports: Sequence[OpenPort], seconds: float) -> None:
+    """Wait for bytes on one of ``ports``; if one has no descriptor, only until it is to be asked again."""
+    found = [fd for port in ports if (fd := port.fileno()) is not None]
+    if len(found) == len(ports):
+        select.select(found, (), (), seconds)
+    else:
+        time.sleep(min(seconds, POLL_S))
 
 
 def _reading(messages: list[AptMessage], events: list[Event]) -> QuadrantReadings | None:

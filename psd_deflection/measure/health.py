@@ -8,7 +8,7 @@ from block to block: for how many in a row a detector's values did not change.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import ARITHMETICS
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.memory import Memory, Value, numbers
+from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock, channel_names, dot_names
 from psd_deflection.rig.config import Rig
 
@@ -28,6 +28,15 @@ NOISY = 5.0
 
 FROZEN = 'state.frozen_blocks'
 """Name under which the counts of :class:`Stillness` are recorded."""
+
+LOUD = 'state.noisy'
+"""Name under which what :class:`Loudness` has is recorded."""
+
+LOUD_BLOCKS = 50
+"""Blocks over which the noise of a noisy detector is averaged: one block tells it within 25 %, so many within 3 %."""
+
+QUIET_BLOCKS = 10
+"""Blocks in a row without it after which a noise is over."""
 
 HALF_LIGHT = (0.35, 0.65)
 """Fraction of ``sum_nominal`` on all detectors if one of the splitter's two lasers fails."""
@@ -84,6 +93,44 @@ class Stillness:
         row = numbers(values, FROZEN, 'one count for each PSD', len(self.blocks))
         if row is not None:
             self.blocks = tuple(map(int, row))
+
+
+class Loudness:
+    """How noisy the noisy detectors are: x, y and sum of each, averaged since it became so. Nothing of the others."""
+
+    part = 'the noise of noisy detectors'
+    remembers = (LOUD,)
+
+    def __init__(self) -> None:
+        # By PSD: blocks that were averaged, blocks in a row that were quiet, mean squares of x, y and sum, V^2.
+        self._noises: dict[int, tuple[float, ...]] = {}
+
+    def take(self, psd: int, level: Sequence[float], noisy: bool) -> list[float]:
+        """Take a block of detector ``psd`` (from 1): rms of x, y, sum, V; return those of the last blocks, V."""
+        blocks, quiet, *squares = self._noises.get(psd, (0.0, 0.0, 0.0, 0.0, 0.0))
+        quiet = 0.0 if noisy else quiet + 1.0
+        if not noisy and (blocks == 0.0 or quiet > QUIET_BLOCKS):
+            self._noises.pop(psd, None)
+            return list(level)
+        blocks = min(blocks + 1.0, float(LOUD_BLOCKS))
+        squares = [old + (new * new - old) / blocks for old, new in zip(squares, level, strict=True)]
+        self._noises[psd] = (blocks, quiet, *squares)
+        return [math.sqrt(square) for square in squares]
+
+    def memory(self) -> Memory:
+        """The noises, if there are any."""
+        rows = [(float(psd), *noise) for psd, noise in sorted(self._noises.items())]
+        return {LOUD: tuple(value for row in rows for value in row)} if rows else {}
+
+    def restore(self, values: Mapping[str, Value]) -> None:
+        """Take the noises. Raises ValueError if they are no rows of six."""
+        row = numbers(values, LOUD, 'six numbers for each noisy detector') or ()
+        if len(row) % _LOUD_ROW or not all(0.0 <= value < math.inf for value in row):
+            raise misfit(LOUD, row, 'six numbers for each noisy detector')
+        self._noises = {int(row[at]): row[at + 1 : at + _LOUD_ROW] for at in range(0, len(row), _LOUD_ROW)}
+
+
+_LOUD_ROW = 6
 
 
 class OpticsHealth:
@@ -208,9 +255,12 @@ class OpticsHealth:
         return tuple(out)
 
     def late_findings(
-        self, volts: npt.NDArray[np.float32], verdict: Verdict, frozen: tuple[int, ...]
+        self, volts: npt.NDArray[np.float32], verdict: Verdict, frozen: tuple[int, ...], loudness: Loudness
     ) -> tuple[str, ...]:
-        """Findings computed after the estimate: a noisy detector, a detector whose values do not change."""
+        """Findings computed after the estimate: a noisy detector, a detector whose values do not change.
+
+        ``loudness``: goes on with this block.
+        """
         faulty = verdict.faults
         out = []
         if len(volts) == self._size >= 10:
@@ -219,9 +269,10 @@ class OpticsHealth:
             level = np.sqrt(self._by.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE))
             for psd in range(1, self._psds + 1):
                 own = level[3 * psd - 3 : 3 * psd]
-                noisy = own[own > self._noise[psd - 1]]
-                if psd not in faulty and noisy.size:
-                    out.append(f'psd_{psd} is noisy: {float(noisy.max()) * 1e3:.1f} mV a sample')
+                noisy = psd not in faulty and bool((own > self._noise[psd - 1]).any())
+                usual = loudness.take(psd, own.tolist(), noisy)
+                if noisy:
+                    out.append(f'psd_{psd} is noisy: {max(usual) * 1e3:.1f} mV a sample')
         if not self.refuses_frozen:
             out += [reason for psd, reason in _long(frozen) if psd not in faulty]
         return tuple(out)

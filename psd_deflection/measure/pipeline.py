@@ -23,7 +23,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
 from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, SeenBlock
-from psd_deflection.measure.health import CalibratedRange, OpticsHealth, Stillness, Verdict
+from psd_deflection.measure.health import CalibratedRange, Loudness, OpticsHealth, Stillness, Verdict
 from psd_deflection.measure.memory import STATE, WHOLE, Memory, Part, Value, numbers, restore
 from psd_deflection.measure.motion.known import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
@@ -98,6 +98,7 @@ class Pipeline:
         self._recent: list[Dots] = []
         self._surroundings = Surroundings()
         self._stillness = Stillness(len(rig.psds))
+        self._loudness = Loudness()
         self.estimation = Estimation(rig, self._effects)
         self.stamped = self.estimation.stamped
         self._take(rig)
@@ -106,7 +107,7 @@ class Pipeline:
     @property
     def _parts(self) -> tuple[Part, ...]:
         """Everything that remembers."""
-        parts = (self._surroundings, self._stillness, self.estimation, self.tip_loads, self.stamped)
+        parts = (self._surroundings, self._stillness, self._loudness, self.estimation, self.tip_loads, self.stamped)
         return parts if self.motion_filter is None else (*parts, self.motion_filter)
 
     def _new_filter(self) -> ModalFilter | None:
@@ -419,7 +420,7 @@ class Pipeline:
             self.stamped.suspect(seen.index, used.dots, used.checked)
         if not self._optics.refuses_frozen:
             self._stillness.count(self._optics.still(volts))
-        findings += self._optics.late_findings(volts, seen.verdict, self._stillness.blocks)
+        findings += self._optics.late_findings(volts, seen.verdict, self._stillness.blocks, self._loudness)
         if vibrates:
             findings += (f'vibrates: {vibrates}',)
         if answer.estimate is not None:

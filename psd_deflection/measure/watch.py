@@ -8,9 +8,10 @@ Three tests, each on means over windows of half a second that are not spoilt by 
   needs no load.
 * **load**, if it is known: from one load to the next the pose must move as the link model says, within ``SHARE``.
 
-A CUSUM counts what exceeds ``allowed``: two standard deviations of a window's mean, and at least ``LEAST``. The level
-follows slow drift. The alarm comes ``CONFIRM_S`` later, unless a load is noted meanwhile: people note a load after they
-have put it on. The object owns no clock and no thread; the same records give the same alarms, live and in replay.
+A CUSUM counts what exceeds ``allowed``: two standard deviations of a window's mean, and at least the rig's
+``watch_wander``. The level follows slow drift. The alarm comes ``CONFIRM_S`` later, unless a load is noted meanwhile:
+people note a load after they have put it on. The object owns no clock and no thread; the same records give the same
+alarms, live and in replay.
 """
 
 from __future__ import annotations
@@ -44,8 +45,6 @@ REMEMBER = 60
 """Windows whose scatter tells what is usual."""
 MOVING = 3.0
 """A window that scatters by more than this factor of the usual is spoilt by motion."""
-LEAST = 0.7e-6
-"""Shift of a reading that is never counted, m."""
 SIGMAS = 2.0
 """Standard deviations of a window's mean that are never counted."""
 ALARM = 10.0
@@ -87,7 +86,7 @@ class Alarm:
     @property
     def words(self) -> str:
         """What is seen, without the time."""
-        unit = 'urad' if self.channel == 'theta' else 'um'
+        unit = 'µrad' if self.channel == 'theta' else 'µm'
         also = f'; {", ".join(self.also)} too' if self.also else ''
         return (
             f'{self.channel} is {1e6 * self.shift:+.2f} {unit} off ({self.sigmas:.0f} standard deviations){also}: '
@@ -165,8 +164,8 @@ class _Channel:
         self.level = statistics.median(self._learned)
         return True
 
-    def count(self, mean: float, began_ns: int, blocks: int, more: float) -> float:
-        """A window's mean: the greater of the two sums. ``more``: what is allowed besides, m."""
+    def count(self, mean: float, began_ns: int, blocks: int, least: float) -> float:
+        """A window's mean: the greater of the two sums. ``least``: shift that is not counted whatever the noise, m."""
         if self._last is not None:
             self._steps.append(abs(mean - self._last))
         self._last = mean
@@ -174,7 +173,7 @@ class _Channel:
         level = self.level
         if level is None:
             return 0.0
-        allowed = max(SIGMAS * sigma, LEAST + more)
+        allowed = max(SIGMAS * sigma, least)
         z = (mean - level) / sigma
         k = allowed / sigma
         up = max(0.0, self._up + min(max(z - k, -MOST), MOST))
@@ -217,6 +216,7 @@ class Watch:
 
     def __init__(self, rig: Rig, compliance: Sequence[float]) -> None:
         self._compliance = tuple(compliance)
+        self._wander = rig.acquisition.watch_wander
         self._blocks = max(5, round(WINDOW_S * rig.converter.sample_rate_hz / rig.estimator.block_size))
         self._window_ns = round(1e9 * self._blocks * rig.estimator.block_size / rig.converter.sample_rate_hz)
         count = len(rig.psds)
@@ -360,7 +360,7 @@ class Watch:
             moved = 0.0
             if self._line_pose is not None:
                 moved = math.dist(pose[:2], self._line_pose[:2]) + self._reach * abs(pose[2] - self._line_pose[2])
-            channel.count(window.mean, began_ns, blocks, RELATIVE * moved)
+            channel.count(window.mean, began_ns, blocks, self._wander + RELATIVE * moved)
 
     def _held_readings(
         self, windows: Sequence[_Window], pose: list[float], off: list[float], began_ns: int, blocks: int
@@ -370,7 +370,7 @@ class Watch:
             if channel.level is None:
                 learned = channel.learn(window.mean)
             else:
-                channel.count(window.mean, began_ns, blocks, 0.0)
+                channel.count(window.mean, began_ns, blocks, self._wander)
         self._recent.append((began_ns + self._window_ns, pose, off))
         if learned:
             self._known = True

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.tables import Column, Table, columns_of, html_table
+from psd_deflection.recordings.charts import estimates_chart
 from psd_deflection.records import FloatArray, IntArray
 
 if TYPE_CHECKING:
     import pandas
     import xarray
+
+    from psd_deflection.base.figures import ShownFigure
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -53,6 +57,15 @@ class EstimateSeries:
 
     def __len__(self) -> int:
         return len(self.t_ns)
+
+    def __getitem__(self, part: slice) -> EstimateSeries:
+        """Those of a part of time: ``estimates[1.0:2.0]``, s; times stay as they are."""
+        if not isinstance(part, slice) or part.step is not None:
+            raise ConfigError(f'estimates[{part!r}]: must be a part of time, as estimates[1.0:2.0]')
+        t = self.t
+        first, last = (-np.inf if part.start is None else part.start), (np.inf if part.stop is None else part.stop)
+        chosen = self.rows((t >= first) & (t < last))
+        return replace(chosen, start_ns=self.start_ns if self.start_ns is not None or not len(t) else int(self.t_ns[0]))
 
     @property
     def t(self) -> FloatArray:
@@ -116,6 +129,12 @@ class EstimateSeries:
         Raises ConfigError if xarray is not installed.
         """
         return self.table().to_xarray()
+
+    def plot(self) -> ShownFigure:
+        """dX, dY and theta over time with their 95 % intervals, as a matplotlib figure, which a notebook shows."""
+        from psd_deflection.base.figures import figure_of
+
+        return figure_of(estimates_chart(self.t, self.pose, self.sd, self.topic))
 
     def _summary(self) -> list[tuple[str, str]]:
         rows = [('estimates', str(len(self)))]

@@ -5,10 +5,8 @@ from __future__ import annotations
 import abc
 import copy
 import functools
-import json
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -18,19 +16,19 @@ import numpy.typing as npt
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.printable import printable
-from psd_deflection.base.spelling import did_you_mean
-from psd_deflection.base.tables import Column, Table, columns_of, html_table
+from psd_deflection.base.tables import Table, html_table
 from psd_deflection.measure.averaging import BlockCutter
+from psd_deflection.recordings.charts import samples_chart
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.allowance import Warnings
 from psd_deflection.recordings.read.grid import digest_of
 from psd_deflection.recordings.read.mcap_reader import RawMessage
+from psd_deflection.recordings.sample_table import sample_dtype, samples_table
+from psd_deflection.recordings.spans import Bound, span_ns
 from psd_deflection.records import (
     RESTART,
     AppliedLoad,
     BaseAcceleration,
-    FloatArray,
-    IntArray,
     Mark,
     ParameterChange,
     RawChunk,
@@ -45,29 +43,12 @@ if TYPE_CHECKING:
     import pandas
     import xarray
 
+    from psd_deflection.base.figures import ShownFigure
+
 DEFAULT_BLOCK_SIZE = 20
 LONGEST_REPR = 2000
-MOST_NAMED = 20
-"""Marks that are named if the one that is wanted is not there."""
 
-Bound = float | datetime | str
-"""s from the first sample, a time with a time zone, or ``mark:TEXT``: the time of the mark with this text."""
-MARK_WORD = 'mark:'
-"""Begins a bound that is a mark."""
-Span = tuple[Bound | None, Bound | None]
-"""From and up to; None: the start or the end."""
-WHOLE: Span = (None, None)
 Held = TypeVar('Held', AppliedLoad, TemperatureReading)
-
-LOAD_COLUMNS = ('load_fx', 'load_fy', 'load_tz')
-TEMPERATURE_COLUMN = 'temperature'
-REFERENCE_COLUMNS = ('ref_dx', 'ref_dy', 'ref_theta')
-
-
-def sample_dtype(psds: int) -> np.dtype[np.void]:
-    """A sample. ``t``: s from the first sample. ``t_ns``: ns since the epoch, or since the CSV's zero."""
-    volts = [(c, '<f4') for c in channel_names(psds)]
-    return np.dtype([('t', '<f8'), ('t_ns', '<i8'), ('seq', '<i8'), *volts, ('flags', 'u1')])
 
 
 class Recording(abc.ABC):
@@ -136,6 +117,12 @@ class Recording(abc.ABC):
         it, or it has no such mark; ConfigError if ``first`` is not below ``last``, or a text is no bound.
         """
         return RecordingWindow(self, first, last)
+
+    def __getitem__(self, part: slice) -> Recording:
+        """``recording[2.0:5.0]`` is ``recording.crop(2.0, 5.0)``."""
+        if not isinstance(part, slice) or part.step is not None:
+            raise ConfigError(f'recording[{part!r}]: must be a part of time, as recording[2.0:5.0]')
+        return self.crop(part.start, part.stop)
 
     def _noted_restarts(self) -> set[tuple[int, int]]:
         """The restarts that the recorder noted, before any pass over the recording."""
@@ -233,6 +220,11 @@ class Recording(abc.ABC):
         """Recorded deflections by topic; {} if none were recorded."""
 
     @property
+    def name(self) -> str:
+        """Its file or folder and, if it is a part, from when to when: for what is computed from it."""
+        return self.path.name
+
+    @property
     def digest(self) -> str:
         """SHA-256 of its files; '' if it has none. Raises RecordingError if one cannot be read."""
         return digest_of(self.path)
@@ -270,23 +262,8 @@ class Recording(abc.ABC):
         return out
 
     def _table(self) -> Table:
-        samples = self.samples
-        t_ns = samples['t_ns']
-        columns = [
-            Column('seq', samples['seq'], '', 'number of the sample'),
-            Column('t_ns', t_ns, 'ns', 'time, since the epoch if the recording has it'),
-            *(Column(name, samples[name], 'V', f'channel {name}') for name in channel_names(self.psds)),
-            Column('flags', samples['flags'], '', 'bit 0: over range, bit 1: samples were dropped before this one'),
-        ]
-        if loads := self.loads():
-            words = ['applied force along X', 'applied force along Y', 'applied torque about Z']
-            columns += columns_of(_held(loads, t_ns), LOAD_COLUMNS, ('N', 'N', 'N m'), words)
-        if temperatures := self.temperatures():
-            columns += columns_of(_held(temperatures, t_ns), (TEMPERATURE_COLUMN,), ('degC',), ['ambient temperature'])
-        if references := self.references():
-            words = ['reference displacement along X', 'reference displacement along Y', 'reference twist about Z']
-            columns += columns_of(_once(references, t_ns), REFERENCE_COLUMNS, ('m', 'm', 'rad'), words)
-        return Table(Column('t', samples['t'], 's', 'time from the first sample'), columns, {'path': str(self.path)})
+        beside = (self.loads(), self.temperatures(), self.references())
+        return samples_table(self.samples, self.psds, *beside, str(self.path))
 
     def to_pandas(self) -> pandas.DataFrame:
         """One row a sample over ``t`` (s), in volts, with the columns of a CSV recording.
@@ -303,6 +280,15 @@ class Recording(abc.ABC):
         Raises RecordingError if there are no samples, ConfigError if xarray is not installed.
         """
         return self._table().to_xarray()
+
+    def plot(self) -> ShownFigure:
+        """The samples over time, with the marks, as a matplotlib figure; of a part: ``.crop(2.0, 5.0).plot()``.
+
+        A notebook shows it; ``.savefig('a.png')`` writes it. Raises RecordingError if there are no samples.
+        """
+        from psd_deflection.base.figures import figure_of
+
+        return figure_of(samples_chart(self.samples, self.psds, self.marks()))
 
     def _summary(self) -> list[tuple[str, object]]:
         """What is known without reading all of it."""
@@ -351,6 +337,8 @@ class RecordingWindow(Recording):
         self._source, self._bounds = source, (first, last)
         start = next((int(block.t_ns[0]) for block in source.blocks()), 0)
         self.first_ns, self.end_ns = span_ns(source, start, (first, last))
+        ends = '' if last is None else f' to {(self.end_ns - start) / 1e9:g} s'
+        self._part = f'from {(self.first_ns - start) / 1e9:g} s{ends}'
         if self.first_ns >= self.end_ns:
             raise ConfigError(f'{source.path}: from {first} to {last}: must rise')
         self.parameters, self.hello, self.version = source.parameters, source.hello, source.version
@@ -365,6 +353,11 @@ class RecordingWindow(Recording):
     def namespace(self) -> str:
         """That of the recorded node."""
         return self._source.namespace
+
+    @property
+    def name(self) -> str:
+        """That of the whole, and which part: s from its first sample."""
+        return f'{self._source.name}, {self._part}'
 
     @property
     def digest(self) -> str:
@@ -407,9 +400,10 @@ class RecordingWindow(Recording):
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
         """Those that were recorded in it; none from a CSV."""
-        return (m for m in self._source.messages(topics) if self._has(m.log_time))
+        return (m for m in self._source.messages(topics) if self.has(m.log_time))
 
-    def _has(self, t_ns: int) -> bool:
+    def has(self, t_ns: int) -> bool:
+        """Whether a time lies in it, ns."""
         return self.first_ns <= t_ns < self.end_ns
 
     def _held(self, found: Sequence[Held]) -> list[Held]:
@@ -437,19 +431,19 @@ class RecordingWindow(Recording):
 
     def marks(self) -> list[Mark]:
         """Those that were set in it."""
-        return [one for one in self._source.marks() if self._has(one.t_ns)]
+        return [one for one in self._source.marks() if self.has(one.t_ns)]
 
     def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
         """Those that came in it."""
-        return ((t_ns, one) for t_ns, one in self._source.accelerations() if self._has(t_ns))
+        return ((t_ns, one) for t_ns, one in self._source.accelerations() if self.has(t_ns))
 
     def references(self) -> list[ReferencePose]:
         """Independent measurements of the tip."""
-        return [one for one in self._source.references() if self._has(one.t_ns)]
+        return [one for one in self._source.references() if self.has(one.t_ns)]
 
     def references_with_covariance(self) -> list[ReferenceWithCovariance]:
         """The same with their covariances, if they were recorded."""
-        return [one for one in self._source.references_with_covariance() if self._has(one.t_ns)]
+        return [one for one in self._source.references_with_covariance() if self.has(one.t_ns)]
 
     def temperatures(self) -> list[TemperatureReading]:
         """Ambient temperatures; the first is the last one before the start."""
@@ -465,76 +459,9 @@ class RecordingWindow(Recording):
         return out
 
 
-def span_ns(recording: Recording, start_ns: int, span: Span) -> tuple[int, int]:
-    """From when and up to when, ns by the clock of ``recording``; its first sample is at ``start_ns``.
-
-    Raises RecordingError if it lacks a mark, ConfigError if a text is no bound.
-    """
-    first, last = span
-    first_ns = start_ns if first is None else _ns(recording, first, start_ns)
-    end_ns = np.iinfo(np.int64).max if last is None else _ns(recording, last, start_ns, first_ns)
-    return first_ns, end_ns
-
-
-def _mark_ns(recording: Recording, bound: str, after_ns: int | None) -> int:
-    if not bound.startswith(MARK_WORD):
-        raise ConfigError(f'{bound!r}: must be s from the first sample, a time with a time zone, or {MARK_WORD}TEXT')
-    text = bound.removeprefix(MARK_WORD).strip()
-    there = recording.marks()
-    found = [mark.t_ns for mark in there if mark.text == text]
-    if not found:
-        names = sorted({mark.text for mark in there})
-        have = f'its marks are {", ".join(names[:MOST_NAMED])}' if names else 'it has no marks'
-        raise RecordingError(
-            f'{recording.path}: has no mark {printable(text, LONGEST_REPR)!r}; {have}{did_you_mean(text, names)}'
-        )
-    # To the mark that it begins with there is nothing: the next one is meant.
-    return next((t_ns for t_ns in found if after_ns is None or t_ns > after_ns), found[-1])
-
-
-def _ns(recording: Recording, bound: Bound, start_ns: int, after_ns: int | None = None) -> int:
-    """A bound in ns, by the clock of the recording. ``after_ns``: of marks of one name the first after it."""
-    if isinstance(bound, str):
-        return _mark_ns(recording, bound, after_ns)
-    if isinstance(bound, datetime):
-        return (bound - datetime(1970, 1, 1, tzinfo=UTC)) // timedelta(microseconds=1) * 1000
-    return start_ns + round(bound * 1e9)
-
-
-def _held(found: Sequence[AppliedLoad] | Sequence[TemperatureReading], t_ns: IntArray) -> FloatArray:
-    """The values of ``found`` (n, number of values) at ``t_ns``, each held from its time; NaN before the first."""
-    times = np.array([f.t_ns for f in found], dtype=np.int64)
-    order = np.argsort(times, kind='stable')
-    values = np.array([found[i][1:] for i in order], dtype=np.float64)
-    index = np.searchsorted(times[order], t_ns, side='right') - 1
-    out: FloatArray = values[np.maximum(index, 0)]
-    out[index < 0] = np.nan
-    return out
-
-
-def _once(found: Sequence[ReferencePose], t_ns: IntArray) -> FloatArray:
-    """The values of ``found`` (n, 3), each at the first of ``t_ns`` at or after its time; NaN in the others."""
-    out = np.full((len(t_ns), 3), np.nan)
-    index = np.searchsorted(t_ns, [f.t_ns for f in found], side='left')
-    inside = index < len(t_ns)
-    out[index[inside]] = np.array([f[1:] for f in found], dtype=np.float64)[inside]
-    return out
-
-
 def _restart_in(change: ParameterChange) -> tuple[int, int] | None:
     value = dict(change.values).get(RESTART)
     if not isinstance(value, tuple) or len(value) != 2 or not all(isinstance(n, int) for n in value):
         return None
     before, after = int(value[0]), int(value[1])
     return (before, after) if 0 <= before < after < 2**62 else None
-
-
-def from_json(values: Mapping[str, str]) -> dict[str, Any]:
-    """Metadata values parsed as JSON; other values stay text."""
-    out: dict[str, Any] = {}
-    for key, text in values.items():
-        try:
-            out[key] = json.loads(text)
-        except (ValueError, RecursionError):
-            out[key] = text
-    return out

@@ -8,7 +8,6 @@ have their end are not touched.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from typing import BinaryIO
 
 from psd_deflection import __version__
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.base.files import HeldFolder
+from psd_deflection.base.files import HeldFolder, lock
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
 from psd_deflection.recordings.mcap_format import MAGIC, Channel, McapMessage, McapRecord, Metadata, Schema
 from psd_deflection.recordings.read.allowance import DamagedError
@@ -177,10 +176,8 @@ def _recover_file(path: Path) -> RecoveredFile:
 
 def _refuse_if_written(path: Path) -> None:
     with path.open('rb') as stream:
-        try:
-            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RecordingError(f'{path}: is being recorded at this moment; end the recording first') from None
+        if not lock(stream, shared=True):
+            raise RecordingError(f'{path}: is being recorded at this moment; end the recording first')
 
 
 def recover(path: str | Path) -> Recovered:

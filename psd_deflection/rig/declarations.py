@@ -217,6 +217,14 @@ class EstimatorConfig:
         choices=('widen', 'refuse', 'report'),
         before='report',
     )
+    contradiction_memory: str = parameter(
+        'lasting',
+        '',
+        'of three and more PSDs: whether the covariance is widened by large contradictions of late alone (recent), or '
+        'besides by small ones that last, as with two PSDs (lasting)',
+        choices=('lasting', 'recent'),
+        before='recent',
+    )
     motion_memory: str = parameter(
         'lasting',
         '',

@@ -23,10 +23,17 @@ class AcquisitionConfig:
     port: str = parameter(
         '',
         '',
-        'serial port (two with a comma between, if the device has two) or recording; empty starts the simulated rig',
+        'serial port, socket://HOST:PORT (TCP), rfc2217://HOST:PORT or udp://HOST:PORT (two with a comma between, if '
+        'the device has two), or recording; empty starts the simulated rig',
     )
     psds_exchanged: bool = parameter(False, '', "the device's x1 y1 sum1 come from PSD 2 and its x2 y2 sum2 from PSD 1")
-    baud: int = parameter(921_600, 'baud', 'line speed (USB-CDC devices ignore it)', minimum=1200, maximum=12_000_000)
+    baud: int = parameter(
+        921_600,
+        'baud',
+        'line speed (USB-CDC devices, socket:// and udp:// ignore it)',
+        minimum=1200,
+        maximum=12_000_000,
+    )
     latency_offset: float = parameter(
         0.0, 's', 'constant delay of the link to take off every stamp', minimum=-1.0, maximum=1.0
     )
@@ -99,8 +106,27 @@ class AcquisitionConfig:
         # YAML reads on and off as booleans.
         synonyms=((True, 'on'), (False, 'off')),
     )
+    watch_wander: float = parameter(
+        0.7e-6,
+        'm',
+        'by so much the readings of a sound rig may wander within a minute, without an alarm of the watch',
+        minimum=0.0,
+        maximum=1e-3,
+    )
     watch_dir: str = parameter(
         '', '', 'folder in which the minutes around an alarm of the watch are kept as a recording; empty: none are kept'
+    )
+    watch_command: str = parameter(
+        '',
+        '',
+        'program, with its arguments, that is run at each alarm of the watch, without a shell; it gets the alarm as '
+        'JSON on its standard input; empty: none',
+    )
+    watch_webhook: str = parameter(
+        '',
+        '',
+        'web address to which each alarm of the watch is posted as JSON, or the file that holds it (parameters are '
+        'recorded: an address that is a secret belongs into a file); empty: none',
     )
     watch_minutes: float = parameter(
         5.0, 'min', 'how long before an alarm what is kept begins', minimum=0.5, maximum=60.0
@@ -161,6 +187,12 @@ class MonitorConfig:
         # YAML reads on and off as booleans.
         synonyms=((True, 'on'), (False, 'off')),
         name='monitor_control',
+    )
+    history: bool = parameter(
+        True,
+        '',
+        'the hours and days on the page hold for later runs with the same device as well',
+        name='monitor_history',
     )
     foxglove: bool = parameter(False, '', 'serve the messages to Foxglove, without ROS')
     foxglove_address: str = parameter('127.0.0.1', '', 'address of that; 0.0.0.0 shows it to the network')

@@ -312,11 +312,11 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         """Hold while the robot does not run, or while another node publishes what we publish."""
         now = time.monotonic()
         rivals = self.rivals() if self._drive else []
-        why = f'another node publishes {rivals[0]}' if rivals else self._robot.fault(now)
+        other = f'another node publishes {rivals[0]}' if rivals else ''
         if self._drive and now - self._begun < LOOK_S:
-            why = why or 'it looks whether another node commands the robot'
+            other = other or 'it looks whether another node commands the robot'
         with self._lock:
-            self.compensator.stop(why)
+            self.compensator.stop(other or self._robot.fault(now), rival=bool(other))
 
     def _send_until_the_end(self) -> None:
         """Send the offsets every ``PERIOD_S``; a time that was missed is left out."""

@@ -29,7 +29,8 @@ from psd_deflection.ros.declared import AT_START, SOURCE, descriptor, meant, pla
 from psd_deflection.run.session import Session
 
 _READ = 'read when the node is configured'
-_AT_START = {'autostart': AT_START}
+# Who may set parameters over ROS shall not run programs as the daemon's user, nor send what it sees elsewhere.
+_AT_START = {'autostart': AT_START, 'watch_command': AT_START, 'watch_webhook': AT_START}
 
 _SIMULATED = ParameterDescriptor(
     name=SIMULATED,

@@ -145,14 +145,24 @@ class ShaperNode(BaseNode[ShaperSettings]):
         if self._follow is not None:
             self._follow.stop(why)
 
+    def _state(self) -> tuple[int, str]:
+        if not self.active:
+            return STALE, 'not active'
+        if self._why:
+            return WARN, f'the last trajectory was refused: {self._why}'
+        if self._undescribed:
+            return WARN, f'nobody has told the limits of the joints on {DESCRIPTION} yet'
+        if not self._known.measured(time.monotonic()):
+            return WARN, f'nobody tells where the joints are on {JOINT_STATES}'
+        return OK, self._described
+
     def health(self) -> Iterable[Health]:
         """What was shaped and refused."""
         self._repeats.settle(time.monotonic())
-        level, text = (WARN, f'the last trajectory was refused: {self._why}') if self._why else (OK, self._described)
-        if not self.active:
-            level, text = STALE, 'not active'
+        level, text = self._state()
         shaper = self._shaper.shaper
         values = (
+            ('joints known', str(len(self._known.measured(time.monotonic())))),
             ('shaper', shaper.name),
             ('delay (s)', f'{shaper.duration:.4f}'),
             ('trajectories shaped', str(self._shaped)),

@@ -9,7 +9,6 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-import resource
 import socket
 import time
 from collections.abc import Callable
@@ -36,6 +35,10 @@ def lock_memory() -> str:
     Pages are locked as they are touched: unused stacks cost nothing. Under a finite limit nothing is
     locked, because a later allocation would be refused and end the process.
     """
+    try:
+        import resource
+    except ImportError:
+        return 'memory: not locked, this system has no mlockall'
     limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
     if limit != resource.RLIM_INFINITY and os.geteuid() != 0:
         return f'memory: not locked, the limit is {limit} bytes (memlock; see docs/deploy)'

@@ -464,8 +464,8 @@ class Session:
         self.acquisition.stop()
         self._finish()
         folder = self.recorder.close()
-        if self.watcher is not None and not self.watcher.close(KEEP_S):
-            self._tell(f'watch: not written within {KEEP_S:g} s; what was to be kept may lack its end', WARNING)
+        if self.watcher is not None and (left := self.watcher.close(KEEP_S)):
+            self._tell(f'watch: {left}', WARNING)
         if self._store is not None and not self._store.join(KEEP_S):
             self._tell(f'{self._store.path}: not written within {KEEP_S:g} s; the zero may not be kept', WARNING)
         if self._simulated is not None:

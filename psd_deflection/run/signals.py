@@ -29,7 +29,8 @@ class Signals:
         self.stop = False
         self._raise = False
         heard = [signal.SIGINT, signal.SIGTERM]
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        # Windows has none.
+        if hasattr(signal, 'SIGHUP') and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
             heard.append(signal.SIGHUP)
         self._previous = {s: signal.signal(s, self._received) for s in heard}
 

@@ -28,6 +28,7 @@ from psd_deflection.measure.watch import Alarm, Watch
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import AppliedLoad, DiagnosticEntry, ParameterChange, Record, SampleBlock
 from psd_deflection.rig.config import Rig
+from psd_deflection.run.alarm_out import AlarmOut
 from psd_deflection.run.recorder import missing_room, new_folder
 
 SEGMENT_NS = 30_000_000_000
@@ -56,7 +57,8 @@ class _Segment:
 class Watcher:
     """A sink of records, after the one that publishes them, and a wire. ``say``: takes a line for each alarm.
 
-    ``hello``: the device's. ``node``: full name of the ROS node, for what is kept.
+    ``hello``: the device's. ``node``: full name of the ROS node, for what is kept and handed on. Raises ConfigError
+    if ``watch_command`` or ``watch_webhook`` cannot be used.
     """
 
     def __init__(self, pipeline: Pipeline, say: Say, hello: Mapping[str, object] | None, node: str = '') -> None:
@@ -67,6 +69,8 @@ class Watcher:
         self._pipeline, self._say, self._hello, self._node = pipeline, say, hello, node
         self._parent = Path(config.watch_dir).expanduser() if config.watch_dir else None
         self._config = config
+        serial = str((hello or {}).get('serial', ''))
+        self._out = AlarmOut(config.watch_command, config.watch_webhook, say, {'device': serial, 'node': node})
         self._window_ns = round(60e9 * config.watch_minutes) + 2 * SEGMENT_NS
         self._memory = ByteBudget(config.watch_memory)
         self._forgotten = 0
@@ -96,6 +100,7 @@ class Watcher:
         if self.watch.alarms > self._said and self.watch.alarm is not None:
             self._said = self.watch.alarms
             self._say(f'watch: since {_clock(self.watch.alarm.since_ns)}: {self.watch.alarm.words}', WARNING)
+            self._out.put(self.watch.alarm)
             if self._parent is not None and self._due_ns is None:
                 self._due_ns = t_ns + AFTER_NS
         if self._due_ns is not None and t_ns >= self._due_ns:
@@ -156,14 +161,15 @@ class Watcher:
         """What is held in memory, with what Python needs for it."""
         return self._memory.held
 
-    def close(self, patience_s: float) -> bool:
-        """Write what is still to be kept; whether the disk has taken it within ``patience_s``."""
+    def close(self, patience_s: float) -> str:
+        """Write what is to be kept and hand on what waits, each within ``patience_s``; what is not done, or ''."""
         if self._due_ns is not None:
             self._keep()
+        left = [] if self._out.close(patience_s) else ['an alarm may not be handed on']
         if self._writing is not None:
             self._writing.join(patience_s)
-            return not self._writing.is_alive()
-        return True
+            left += ['what was to be kept may lack its end'] * self._writing.is_alive()
+        return f'not ended within {patience_s:g} s: {", ".join(left)}' if left else ''
 
     def entry(self) -> DiagnosticEntry:
         """The state, for ``/diagnostics``."""
@@ -176,6 +182,7 @@ class Watcher:
             ('kept', str(self.folder or '')),
             ('held in memory (MB)', f'{self.held_bytes / 1e6:.1f}'),
             ('dropped from memory, because it was full', str(self._forgotten)),
+            *self._out.values(),
         ]
         if alarm is not None:
             values += _told(alarm)
@@ -290,13 +297,13 @@ def _clock(t_ns: int) -> str:
 
 
 def _told(alarm: Alarm) -> list[tuple[str, str]]:
-    unit = 'urad' if alarm.channel == 'theta' else 'um'
+    unit = '(urad)' if alarm.channel == 'theta' else '(um)'
     return [
         ('since', _clock(alarm.since_ns)),
         ('sure since', _clock(alarm.seen_ns)),
         ('channel', alarm.channel),
-        (f'shift ({unit})', f'{1e6 * alarm.shift:.3f}'),
-        (f'its standard deviation ({unit})', f'{1e6 * alarm.sd:.3f}'),
+        (f'shift {unit}', f'{1e6 * alarm.shift:.3f}'),
+        (f'its standard deviation {unit}', f'{1e6 * alarm.sd:.3f}'),
         ('standard deviations', f'{alarm.sigmas:.1f}'),
         ('also shifted', ', '.join(alarm.also)),
     ]

@@ -9,10 +9,7 @@ that taking a zero does not wait for the disk.
 
 from __future__ import annotations
 
-import hashlib
 import json
-import os
-import re
 import threading
 from pathlib import Path
 from typing import Any
@@ -23,13 +20,9 @@ from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import check_value
+from psd_deflection.run.state import device_file
 
 MAX_BYTES = 10_000
-
-
-def state_folder() -> Path:
-    """Folder for the state of programs (XDG base directory specification)."""
-    return Path(os.environ.get('XDG_STATE_HOME') or Path.home() / '.local' / 'state') / 'psd_deflection'
 
 
 class ZeroStore:
@@ -41,13 +34,8 @@ class ZeroStore:
     def __init__(self, configured: Rig, serial: object) -> None:
         self._configured = configured.zeros_by_name
         named = configured.acquisition.zero_file
-        # The device chooses its serial number: it must not lead out of the folder.
         self._serial = str(serial)
-        safe = re.sub(r'[^A-Za-z0-9._-]', '_', self._serial)[:64].strip('.') or 'unknown'
-        if safe != self._serial:
-            # Serial numbers that differ only in characters that were replaced or cut need two files.
-            safe += '_' + hashlib.sha256(self._serial.encode(errors='backslashreplace')).hexdigest()[:12]
-        self.path = Path(named).expanduser() if named else state_folder() / f'zero_{safe}.json'
+        self.path = Path(named).expanduser() if named else device_file('zero', self._serial, '.json')
         self.loaded = False
         self._saving = threading.Lock()
         self._wanted: Rig | None = None

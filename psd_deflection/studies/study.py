@@ -12,22 +12,30 @@ import html
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import yaml
 
+from psd_deflection.base.drawings import Drawing, in_page
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import replace_file
 from psd_deflection.base.json_text import json_text
 from psd_deflection.base.pages import page, table
+from psd_deflection.base.tables import Table
 from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.recording import WHOLE, Recording, Span
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import rig_at_end, warnings_about_rig
+from psd_deflection.recordings.spans import WHOLE, Span
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.declarations import DESCRIPTION
 from psd_deflection.rig.parameter_files import nested, parameter_text
+
+if TYPE_CHECKING:
+    import pandas
+
+    from psd_deflection.base.figures import ShownFigure
 
 Tell = Callable[[str], None]
 """Takes a warning."""
@@ -39,10 +47,10 @@ def warn_caller(warning: str) -> None:
 
 
 class PageSection(NamedTuple):
-    """A part of the page: ``title`` ('' if it belongs to what is above) and HTML."""
+    """A part of the page: ``title`` ('' if it belongs to what is above), HTML and drawings."""
 
     title: str
-    parts: tuple[str, ...]
+    parts: tuple[str | Drawing, ...]
 
 
 class StudyResult(abc.ABC):
@@ -64,6 +72,14 @@ class StudyResult(abc.ABC):
     def sections(self) -> Iterable[PageSection]:
         """The page below the sentences."""
 
+    @abc.abstractmethod
+    def table(self) -> Table:
+        """The answer as columns with units, a row for each thing that was found."""
+
+    def page_sentences(self) -> list[str]:
+        """Those of :meth:`sentences` that stand above the sections of the page; a section may have the others."""
+        return self.sentences()
+
     @property
     def sources(self) -> Mapping[str, str]:
         """What the answer was made from, by what it is."""
@@ -75,15 +91,39 @@ class StudyResult(abc.ABC):
 
     def report(self) -> str:
         """The page as HTML, with its pictures inside."""
-        first, *others = self.sentences()
+        first, *others = self.page_sentences()
         body = [f'<h1>{html.escape(self.title)}</h1><p class=verdict>{html.escape(first)}</p>']
         body += [f'<p>{html.escape(text)}</p>' for text in others]
         for section in self.sections():
             body += [f'<h2>{html.escape(section.title)}</h2>'] if section.title else []
-            body += section.parts
+            body += map(in_page, section.parts)
         if self.sources:
             body += ['<h2>Made from</h2>', table(('what', 'from'), list(self.sources.items()))]
         return page(f'psd-deflection {self.study}', body)
+
+    def drawings(self) -> list[Drawing]:
+        """What is drawn on the page, in its order. ``words`` of each say what it shows."""
+        return [part for section in self.sections() for part in section.parts if not isinstance(part, str)]
+
+    def plot(self, number: int = 0) -> ShownFigure:
+        """The drawing ``number`` of :meth:`drawings` as a matplotlib figure, which a notebook shows.
+
+        ``figure.savefig('a.png')`` writes it. Raises ConfigError if there is no such drawing.
+        """
+        from psd_deflection.base.figures import figure_of
+
+        shown = self.drawings()
+        if not 0 <= number < len(shown):
+            there = '; '.join(f'{i}: {one.words}' for i, one in enumerate(shown)) or 'none, for nothing was found'
+            raise ConfigError(f'number: {number}: no such drawing; there are {there}')
+        return figure_of(shown[number])
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """:meth:`table` as a DataFrame; ``.attrs['units']`` has the units.
+
+        Raises ConfigError if pandas is not installed.
+        """
+        return self.table().to_pandas()
 
     def json(self) -> str:
         """The tree as text; null for numbers that JSON does not have."""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.tables import Column, Table, columns_of, html_table
+from psd_deflection.base.tables import Column, Table, columns_of, html_table, text_column
 
 T = Column('t', np.arange(3) * 0.5, 's', 'time')
 TABLE = Table(T, columns_of(np.arange(6.0).reshape(3, 2), ('a', 'b'), ('m', ''), ('one', 'two')), {'path': 'somewhere'})
@@ -20,6 +20,11 @@ def test_pandas_has_the_units() -> None:
     assert list(frame.index) == [0.0, 0.5, 1.0]
     assert frame['b'].tolist() == [1.0, 3.0, 5.0]
     assert frame.attrs == {'path': 'somewhere', 'units': {'t': 's', 'a': 'm', 'b': ''}}
+
+
+def test_a_column_may_have_words_numbers_and_none() -> None:
+    values = text_column('value', [(1.0, 2.0), -1.0, None], 'of anything').values
+    assert values.tolist() == [(1.0, 2.0), -1.0, None]
 
 
 def test_xarray_has_the_units() -> None:

@@ -50,6 +50,9 @@ def test_the_page_is_made_of_the_results() -> None:
     assert page.PAGE.read_text(encoding='utf-8') == page.page(*read(), *read(cpu.RESULTS))
     assert '<!--' not in page.PAGE.read_text(encoding='utf-8')
     assert page.PAGE == ROOT / 'docs' / 'performance.md'
+    text = page.README.read_text(encoding='utf-8')
+    assert page.readme(text, read()[0]) == text
+    assert sum(line.endswith(page.PRINTED_BY) for line in text.split('\n')) == 3
 
 
 @pytest.mark.parametrize('rows', [lambda: limits.frames(1), lambda: limits.simulation(1)], ids=['frames', 'simulation'])

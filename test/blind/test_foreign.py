@@ -143,4 +143,4 @@ def test_the_command_writes_result_and_report(
     assert tree['gap']['unit'] == 'm'
     assert {e['name'] for e in tree['effects']} <= {'self_weight', 'tip_force', 'root_length', 'clamp_compliance'}
     assert 'self_weight' in capsys.readouterr().out
-    assert '<img' in (tmp_path / 'boom' / 'report.html').read_text()
+    assert '<figure class="chart"' in (tmp_path / 'boom' / 'report.html').read_text()

@@ -13,7 +13,7 @@ import pytest
 
 from blind.render import Pose, Scene, board, developed
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.camera import boards
+from psd_deflection.camera import aruco, boards
 from psd_deflection.camera.answer import Status
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.intrinsics import calibrated
@@ -34,7 +34,7 @@ def shot(scene: Scene, settings: CameraSettings, pose: Pose, rng: np.random.Gene
     target = target_of(settings)
     assert isinstance(target, Board)
     pixels = (round(target.size[0] * 2e4), round(target.size[1] * 2e4))
-    texture = target.board.generateImage(pixels, None, 0, 1) / 255.0
+    texture = aruco.picture(target.board, pixels) / 255.0
     return developed(scene, board(scene, pose, texture, target.size), rng)
 
 
@@ -134,11 +134,20 @@ def test_a_printed_board_is_read_again(settings: CameraSettings) -> None:
 
 
 @pytest.mark.parametrize('kind', ['charuco', 'apriltag'])
-def test_with_ubuntus_opencv_a_board_is_refused_with_a_way_that_its_pip_takes(
-    kind: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ('version', 'there'),
+    [
+        ('4.6.0', {}),  # Of PyPI: without opencv_contrib.
+        ('4.5.4', {'CharucoBoard_create': None}),  # Its boards have other axes.
+    ],
+)
+def test_an_opencv_without_boards_is_refused_with_a_way_that_ubuntus_pip_takes(
+    kind: str, version: str, there: dict[str, None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """4.6 has the boards of opencv_contrib alone, under other names."""
-    old = SimpleNamespace(__version__='4.6.0', aruco=SimpleNamespace(DICT_4X4_50=0))
+    old = SimpleNamespace(__version__=version, aruco=SimpleNamespace(DICT_4X4_50=0, **there))
     monkeypatch.setattr(boards, 'opencv', lambda: old)
-    with pytest.raises(ConfigError, match=rf'OpenCV 4\.6\.0 has no boards; target.kind {kind} .* virtual environment'):
+    monkeypatch.setattr(aruco, 'opencv', lambda: old)
+    with pytest.raises(
+        ConfigError, match=rf'OpenCV {version} has no boards; target.kind {kind} .* virtual environment'
+    ):
         target_of(CameraSettings(target=kind))

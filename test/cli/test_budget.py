@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +47,23 @@ def test_the_chart_is_drawn_if_it_is_asked_for(tmp_path: Path, capsys: pytest.Ca
     assert main(['budget', '--params-file', RIG, '--out', str(chart)]) == 0
     assert capsys.readouterr().out.rstrip().endswith(str(chart))
     assert chart.read_bytes().startswith(b'\x89PNG')
+
+
+def test_the_page_has_a_bar_for_every_cause_and_the_same_numbers(tmp_path: Path) -> None:
+    assert main(['budget', '--params-file', RIG, '--out', str(tmp_path)]) == 0
+    terms = json.loads((tmp_path / 'budget.json').read_text())['terms']
+    page = (tmp_path / 'report.html').read_text()
+    bars = dict(re.findall(r'<th scope="row">([^<]+(?:<wbr>[^<]+)*)</th>(.*?)</tr>', page))
+    drawn = {name.replace('<wbr>', '').partition(' ')[0]: row for name, row in bars.items()}
+    # What is mere rounding has none.
+    assert drawn.keys() == {'total', *(t['name'] for t in terms if max(t['rms']) > 1e-12)}
+    for term in terms:
+        if term['name'] in drawn:
+            shown = [float(v) for v in re.findall(r'</i>([^<]+)<', drawn[term['name']])]
+            wanted = np.array(term['rms']) * (1e6, 1e6, math.degrees(1e3))
+            assert shown == pytest.approx(wanted, rel=6e-3)
+    # No script is needed for them.
+    assert '<script' not in page
 
 
 SMALL = """\

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import csv
 import json
 import math
@@ -9,6 +10,7 @@ import re
 from collections import defaultdict
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
@@ -89,6 +91,21 @@ def test_the_tables_give_every_u_again(certified: Path) -> None:
             assert float(result[f'u_c_{axis}']) == pytest.approx(math.sqrt(total), rel=1e-9)
             assert float(result[f'nu_eff_{axis}']) == effective
             assert float(result[f'U_{axis}']) == pytest.approx(k * math.sqrt(total), rel=1e-6)
+
+
+def test_the_chart_has_the_errors_and_their_u(certified: Path) -> None:
+    page = (certified / 'certificate.html').read_text(encoding='utf-8')
+    (text,) = re.findall(r'<script type="application/json">(.*?)</script>', page)
+    content = json.loads(text)
+    columns = [np.frombuffer(base64.b64decode(one[1:]), '<f4') for one in content['columns']]
+    results = _rows(certified / 'results.csv')
+    scales = (1e6, 1e6, math.degrees(1e3))
+    for axis, scale, panel in zip(AXES, scales, content['panels'], strict=True):
+        (curve,) = panel['series']
+        assert columns[curve['x']].tolist() == [1, 2, 3, 4, 5, 6, 7]
+        for name, kind in (('y', 'as_found'), ('spread', 'U')):
+            wanted = [scale * float(row[f'{kind}_{axis}']) for row in results]
+            assert columns[curve[name]] == pytest.approx(wanted, rel=1e-5, abs=1e-6)
 
 
 def test_the_page_has_the_same_numbers(certified: Path) -> None:

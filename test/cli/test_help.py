@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.base.errors import EXIT_STATUSES
-from psd_deflection.cli.main import COMMANDS, GROUPS, main, make_parser
+from psd_deflection.cli.main import COMMANDS, GROUPS, OLDER_NAMES, main, make_parser
 from psd_deflection.cli.params import NEEDED
 
 ROOT = Path(__file__).parent.parent.parent
@@ -37,7 +37,7 @@ ENDLESS = (
     'validate',
     'calibrate',
     'identify',
-    'compare-methods --out',
+    'thesis compare-methods --out',
 )
 """Examples that go on until Ctrl-C, take long, or want a device or a reference: only their options are parsed."""
 
@@ -83,6 +83,18 @@ def test_the_short_list_of_parameters_is_short(capsys: pytest.CaptureFixture[str
     assert set(named) == set(NEEDED)
     assert main(['params', '--short', '--json']) == 0
     assert set(json.loads(capsys.readouterr().out)) == set(NEEDED)
+
+
+def test_an_older_name_of_a_command_works_and_is_listed_nowhere(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert 'compare-methods' not in help_of('', capsys, monkeypatch, 80)
+    for older, now in OLDER_NAMES.items():
+        assert older not in COMMANDS
+        assert main([*now, '--json']) == 0
+        said = capsys.readouterr().out
+        assert main([older, '--json']) == 0
+        assert capsys.readouterr().out == said
 
 
 def options_of(command: str) -> set[str]:

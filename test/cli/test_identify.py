@@ -52,7 +52,10 @@ def test_a_person_reads_sentences_and_sees_pictures(
     assert 'min_samples: 12 # mine' in text
     assert load_rig(out / 'rig.yaml').dynamics.bending_frequency == pytest.approx(11.0, rel=5e-4)
     page = (out / 'report.html').read_text()
-    assert page.count('data:image/png') == 3
+    assert page.count('<figure class="chart"') == 3
+    # The modes are a table: one row for each, with the axis in its first cell.
+    assert [page.count(f'<tr><td>{axis}</td><td>1') for axis in ('ΔX', 'ΔY')] == [1, 1]
+    assert '<p class=verdict>Modes: 1 along ΔX, 1 along ΔY, 1 along θ.</p>' in page
     assert json.loads((out / 'identify.json').read_text())['axes']['theta']['modes']
 
 

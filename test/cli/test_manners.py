@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -60,6 +61,14 @@ def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
         (['simulate', '--out', 'a.csv', '--effect', 'sensor_gain,psd=9'], "psd = '9': must be one of 1, 2"),
         (['discover', CLEAN, '--out', 'found', '--seed', '-1'], '--seed -1'),
         (['discover', CLEAN, '--out', 'found', '--without', 'everything'], 'no effect of that name'),
+        (['discover', '--out', 'found'], 'REC: needed: one recording or several; --isolable LOADS needs none'),
+        (['discover', CLEAN, '--out', 'found', '--isolable', 'thesis:1'], '--isolable thesis:1 needs no recording'),
+        (['discover', '--out', 'found', '--isolable', 'nothing'], '--isolable nothing: not a load history'),
+        (['discover', '--out', 'found', '--isolable', 'thesis:1', '--next'], '--next needs a REC'),
+        (['discover', '--out', 'found', '--isolable', 'thesis:1', '--from', '2'], '--from, --to: need a REC'),
+        (['calibrate', CLEAN, '--live', '--out', 'new'], 'REC, --from, --to: --live makes a recording of its own'),
+        (['calibrate', '--live', '--check', RIG], '--check is for recordings that are there'),
+        (['calibrate', CLEAN, '--out', 'new', '--url', 'http://127.0.0.1:1/'], '--url: is for --live'),
         (['monitor', '--speed', '2'], '--speed is for a recording'),
         (['monitor', '--loop'], '--loop is for a recording'),
         (['monitor', CLEAN, '--demo'], '--demo is for a rig'),
@@ -396,7 +405,7 @@ def test_another_error_of_ours_is_still_a_traceback(monkeypatch: pytest.MonkeyPa
     'words',
     [
         ['budget'], ['budget', '--explain'], ['design'], ['design', '--params-file', RIG], ['effects'],
-        ['effects', 'plane_tilt'], ['params'], ['compare-methods'], ['replay', CLEAN], ['info', CLEAN],
+        ['effects', 'plane_tilt'], ['params'], ['thesis', 'compare-methods'], ['replay', CLEAN], ['info', CLEAN],
     ],
     ids=' '.join,
 )  # fmt: skip
@@ -407,6 +416,22 @@ def test_quantities_are_written_alike_and_nothing_is_written_to_disk(
     out = capsys.readouterr().out
     assert not re.search(r'(?<![\w.])(um|dX|dY|theta|phi|omega)(?!\w)', out), out
     assert list(folder.iterdir()) == []
+
+
+def told() -> Iterator[tuple[Path, str]]:
+    """Every text of the package that is no docstring."""
+    for path in sorted((ROOT / 'psd_deflection').rglob('*.py')):
+        tree = ast.parse(path.read_text(encoding='utf-8'))
+        alone = {id(n.value) for n in ast.walk(tree) if isinstance(n, ast.Expr)}
+        for n in ast.walk(tree):
+            if isinstance(n, ast.Constant) and isinstance(n.value, str) and id(n) not in alone:
+                yield path, n.value
+
+
+def test_micrometres_are_written_alike_wherever_somebody_reads_them() -> None:
+    # Names that scripts read, of columns and of keys of /diagnostics, are ASCII: `shift (um)`.
+    wrong = [(path.name, text) for path, text in told() if re.search(r'(?<![\w(])(um|urad)(?!\w)', text)]
+    assert wrong == []
 
 
 def rig_file(folder: Path, body: str) -> str:

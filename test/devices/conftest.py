@@ -19,7 +19,7 @@ import pytest
 
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.base.log import texts
-from psd_deflection.devices import LineDevice, PortClosedError, dataq, text_lines, thorlabs
+from psd_deflection.devices import LineDevice, Notice, PortClosedError, dataq, port_source, text_lines, thorlabs
 from psd_deflection.devices.pseudo_terminal import PseudoTerminal
 from psd_deflection.devices.rig_feed import RigFeed
 from psd_deflection.devices.serve import serve
@@ -128,7 +128,7 @@ class Wired:
 
 
 class WiredPort:
-    """Stands for ``SerialPort``."""
+    """Stands for an open port."""
 
     def __init__(self, lines: list[Wired], name: str) -> None:
         self._number = next(i for i, line in enumerate(lines) if line.link == name)
@@ -141,8 +141,11 @@ class WiredPort:
     def fileno(self) -> int:
         return self._number
 
-    def give_up(self) -> None:
-        """It never waits long."""
+    def notices(self) -> list[Notice]:
+        return []
+
+    def describe(self) -> dict[str, str]:
+        return {}
 
     def close(self) -> None:
         """Nothing is held."""
@@ -210,7 +213,7 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
         made.append(one)
         return one
 
-    def port(name: str, baud: int, rtscts: bool = False) -> WiredPort:
+    def port(name: str, baud: int, **others: object) -> WiredPort:
         return WiredPort(made, name)
 
     def select(ports: Sequence[int], _: object, __: object, timeout: float) -> None:
@@ -219,7 +222,8 @@ def wired(monkeypatch: pytest.MonkeyPatch) -> Callable[[LineDevice], Wired]:
 
     for module in (thorlabs, dataq, text_lines):
         monkeypatch.setattr(module, 'time', clock)
-        monkeypatch.setattr(module, 'SerialPort', port)
+    for opener in (thorlabs, port_source):
+        monkeypatch.setattr(opener, 'open_port', port)
     monkeypatch.setattr(thorlabs, 'select', SimpleNamespace(select=select))
     monkeypatch.setattr(acquisition, 'time', clock)
     return make

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import socket
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +18,8 @@ from psd_deflection.devices.contract_frames import SimulatedFrames
 from psd_deflection.devices.dataq import SimulatedDataq
 from psd_deflection.devices.registry import known_devices
 from psd_deflection.devices.serial_port import SerialPort
+from psd_deflection.devices.serve import serve
+from psd_deflection.devices.served_sockets import open_sockets
 from psd_deflection.devices.survey import serial_ports, survey
 from psd_deflection.devices.text_lines import SimulatedLines
 from psd_deflection.devices.thorlabs import SharedRig, SimulatedAligner
@@ -26,6 +30,44 @@ from psd_deflection.rig.parameter_files import read_parameter_file
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(port_survey, 'BOOT_S', 0.3)
+
+
+@pytest.mark.parametrize('scheme', ['socket', 'udp'])
+def test_a_port_of_the_network_is_asked_too(
+    scheme: str, unloaded: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 60.0)
+    monkeypatch.setattr(port_survey, 'BOOT_S', 60.0)
+    kind = socket.SOCK_STREAM if scheme == 'socket' else socket.SOCK_DGRAM
+    with socket.socket(socket.AF_INET, kind) as free:
+        free.bind(('127.0.0.1', 0))
+        name = f'{scheme}://127.0.0.1:{free.getsockname()[1]}'
+    stop = threading.Event()
+    with open_sockets(name, 1) as (line,):
+        twin = SimulatedFrames(unloaded(load_rig()))
+        thread = threading.Thread(target=serve, args=(twin, line, stop.is_set), daemon=True)
+        thread.start()
+        try:
+            assert main(['devices', name]) == 0
+        finally:
+            stop.set()
+            thread.join()
+    said = capsys.readouterr().out
+    assert 'PSD device SIM-0001' in said
+    assert f'port: "{name}"' in said
+    assert 'baud' not in said
+
+
+def test_a_name_that_is_no_port_is_a_mistake_of_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['devices', 'tcp://rig:4000']) == 2
+    assert 'did you mean socket://?' in capsys.readouterr().err
+
+
+def test_a_host_that_is_not_there_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.create_server(('127.0.0.1', 0)) as free:
+        name = f'socket://127.0.0.1:{free.getsockname()[1]}'
+    assert main(['devices', name]) == 5
+    assert f'{name}: the host is there, but nothing listens' in capsys.readouterr().err
 
 
 def test_each_is_known_by_its_answer(

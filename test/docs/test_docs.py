@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import doctest
 import importlib.util
+import itertools
 import json
 import os
 import pydoc
@@ -31,7 +32,7 @@ from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from tools import run_commands
 from tools.program import ROOT
-from tools.run_commands import FENCE, JOURNEY, PAGES, Command
+from tools.run_commands import FENCE, JOURNEYS, PAGES, Command
 
 ALL = list(run_commands.commands())
 OURS = [c for c in ALL if c.line.startswith('psd-deflection ')]
@@ -57,14 +58,27 @@ def test_there_are_commands_and_python_blocks() -> None:
     assert {'README.md', 'docs/quickstart.md', 'docs/monitor.md', 'docs/security.md'} <= {c.page for c in ALL}
 
 
+def test_no_two_commands_write_the_same_recording() -> None:
+    """All are typed in one folder, and a recording is never overwritten."""
+    written: dict[str, Command] = {}
+    for command in itertools.chain(*run_commands.blocks_to_run()):
+        found = re.match(
+            r'psd-deflection (?:simulate|convert|replay)\b.* --out (\S+)', run_commands.filled(command.line)
+        )
+        if found is not None:
+            assert found[1] not in written, (command, written[found[1]])
+            written[found[1]] = command
+    assert len(written) > 10
+
+
 def test_every_command_is_run() -> None:
     here = {run_commands.typed_as(c.line) for block in run_commands.blocks_to_run() for c in block}
     quick = {c.line for c in ALL if run_commands.is_quick(c.line) or run_commands.run_by_ci(c.line)}
-    journey = {c.line for c in ALL if c.page == JOURNEY} & quick
+    journey = {c.line for c in ALL if c.page in JOURNEYS} & quick
     for command in ALL:
         line = command.line
         elsewhere = run_commands.is_quick(line) or run_commands.run_by_ci(line) is not None
-        if command.page == JOURNEY:
+        if command.page in JOURNEYS:
             assert run_commands.typed_as(line) in here or run_commands.run_by_ci(line) is not None, command
         else:
             assert elsewhere != (run_commands.typed_as(line) in here - journey) or line.startswith(
@@ -92,8 +106,8 @@ def test_a_command_is_understood(command: Command) -> None:
 
 @pytest.mark.parametrize(
     'line',
-    # The lines of the one path need each other: ``make doc-commands`` types them in their order.
-    sorted({' '.join(words(c.line)) for c in OURS if run_commands.is_quick(c.line) and c.page != JOURNEY}),
+    # The lines of a path need each other: ``make doc-commands`` types them in their order.
+    sorted({' '.join(words(c.line)) for c in OURS if run_commands.is_quick(c.line) and c.page not in JOURNEYS}),
     ids=lambda line: str(line)[:80],
 )
 def test_a_command_runs(
@@ -151,6 +165,22 @@ QUESTIONS = {
     "What sets the page's port in a rig file?": ('monitor.md', '`monitor_port`'),
     'How is a recording cut?': ('recording.md', '## A part of a recording'),
     'How many loads does discover need?': ('discover.md', 'How much is enough?'),
+    # Of the first month.
+    'Does it run on Windows or on a Mac?': ('quickstart.md', '**Windows and macOS**'),
+    'Does it run on a Raspberry Pi?': ('quickstart.md', 'Raspberry Pi'),
+    'How is it updated, and what becomes of old recordings?': ('quickstart.md', '## Updating'),
+    'How is it cited?': ('quickstart.md', 'CITATION.cff'),
+    'How does MATLAB read a recording?': ('recording.md', 'ros2bagreader'),
+    'How is a device behind a network connected?': ('devices/network.md', 'socket://'),
+    'How is a bump marked?': ('first-month.md', 'psd-deflection mark'),
+    'Who is told at night that the rig has moved?': ('watch.md', '`watch_webhook`'),
+    'The beams wander: how does the alarm become quiet?': ('watch.md', '`watch_wander`'),
+    'Can I calibrate without a reference?': ('calibration.md', '**Without a reference.**'),
+    'What does a calibration still lack?': ('calibration.md', 'calibrate --live'),
+    'Are the clocks of two computers the same?': ('topics.md', 'chrony'),
+    'How is a trajectory of MoveIt shaped?': ('shaping.md', '### MoveIt'),
+    'How is the drift of a night seen?': ('monitor.md', '### The last hours and days'),
+    'What happens if the disk is full?': ('robustness.md', '| disk nearly full |'),
 }
 """What newcomers looked for, and the words that answer it."""
 
@@ -441,8 +471,8 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     # What is left is numbers and words: a new kind of value is to be put here or among the paths. Options that may be
     # repeated have an action of their own and are not completed.
     assert {str(values[name]) for name in set(values) - as_path} == {
-        '/NAME', 'ADDRESS', 'LINK', 'M', 'N', 'NAME', 'PPM', 'S', 'SECONDS', 'SEED', 'SOURCE', 'TEXT',
-        'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'WHERE', 'X', 'X,Y', 'XY,THETA',
+        '/NAME', 'ADDRESS', 'COMMAND', 'LINK', 'LOADS', 'M', 'N', 'NAME', 'PPM', 'S', 'SECONDS', 'SEED', 'SOURCE',
+        'TEXT', 'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'W', 'WEBHOOK', 'WHERE', 'X', 'X,Y', 'XY,THETA', "('W', 'W')",
         "('FX', 'FY', 'TZ')", "('DX', 'DY', 'THETA')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip
 

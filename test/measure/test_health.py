@@ -7,7 +7,7 @@ import pytest
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.estimation import HELD
-from psd_deflection.measure.health import FROZEN
+from psd_deflection.measure.health import FROZEN, LOUD
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers.one_psd import OnePsd
@@ -262,6 +262,48 @@ def test_noise_is_held_against_the_readings_own() -> None:
     assert findings_of(load_rig(overrides={'psd_2.noise': [0.05, 0.0]}), counts)[0].findings == ()
     (finding,) = findings_of(load_rig(overrides={'psd_2.noise': [0.0, 0.05]}), counts)[0].findings
     assert finding.startswith('psd_2 is noisy')
+
+
+def noisy_blocks(blocks: int, volts: float) -> Counts:
+    """PSD 2's x with white noise of so many V rms."""
+    counts = moving(blocks)
+    noise = np.random.default_rng(7).normal(0.0, volts / STEP, blocks * SIZE)
+    counts[:, 3] = np.rint(noise).astype(np.int16)
+    return counts
+
+
+def levels_of(pipeline: Pipeline, counts: Counts, first: int = 0) -> list[float]:
+    """The level, mV, that each finding names."""
+    found = [f for spot in spots(records_of(pipeline, counts, first)) for f in spot.findings if 'is noisy' in f]
+    return [float(f.partition(': ')[2].removesuffix(' mV a sample')) for f in found]
+
+
+def test_the_noise_that_is_named_is_that_of_many_blocks() -> None:
+    levels = levels_of(Pipeline(load_rig()), noisy_blocks(100, 0.02))
+    assert len(levels) > 95
+    assert levels[-1] == pytest.approx(20.0, rel=0.1)
+    # One block alone tells it within a quarter, and the largest of three channels is more than each.
+    assert max(abs(level / 20.0 - 1.0) for level in levels[50:]) < 0.12
+
+
+def test_a_burst_of_noise_is_not_named_after_what_came_before() -> None:
+    counts = noisy_blocks(60, 0.02)
+    counts[30 * SIZE : 50 * SIZE, 3] = 0
+    counts[50 * SIZE :, 3] = np.rint(4.0 * counts[50 * SIZE :, 3]).astype(np.int16)
+    levels = levels_of(Pipeline(load_rig()), counts)
+    assert levels[-1] == pytest.approx(80.0, rel=0.25)
+
+
+def test_a_pipeline_goes_on_with_the_noise_of_another() -> None:
+    counts = noisy_blocks(40, 0.02)
+    live, replay = Pipeline(load_rig()), Pipeline(load_rig())
+    levels_of(live, counts[: 20 * SIZE])
+    memory = live.memory(live.rig)
+    assert memory is not None
+    assert dict(memory.values)[LOUD][:2] == (2.0, 20.0)  # type: ignore[index]
+    replay.apply(memory)
+    later = counts[20 * SIZE :]
+    assert levels_of(replay, later, 20 * SIZE) == levels_of(live, later, 20 * SIZE)
 
 
 def test_a_spot_at_the_edge_is_told() -> None:

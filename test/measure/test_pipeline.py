@@ -313,7 +313,7 @@ def test_a_zero_is_refused_while_the_link_moves(rig: Rig) -> None:
     run(pipeline.process, exact_chunk(dots))
     assert pipeline.zero() is None
     assert re.fullmatch(
-        r'the link moves: y1 varied by 1\d\.\d um rms in the last 25 blocks, noise .*', why_no_zero(pipeline)
+        r'the link moves: y1 varied by 1\d\.\d µm rms in the last 25 blocks, noise .*', why_no_zero(pipeline)
     )
     assert pipeline.rig.psds[0].zero == (0.0, 0.0)
     run(pipeline.process, exact_chunk(np.zeros((600, 4)), 600))

@@ -20,10 +20,10 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
-from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.config import Rig, load_rig
 
 RIG = load_rig()
-SOLVER = solver_from_rig('exact', RIG)
+THREE = load_rig(overrides={'psd_3.center': [0.08, -0.05]})
 COMPLIANCE = Pipeline(RIG).tip_loads.compliance
 NOISE = 0.3e-6
 REST = RIG.zeros.ravel()
@@ -32,11 +32,14 @@ SECOND = 50
 
 
 class Fed:
-    """A watch that is fed block means."""
+    """A watch of ``rig`` that is fed block means with this noise, m."""
 
-    def __init__(self) -> None:
-        self.watch = Watch(RIG, COMPLIANCE)
+    def __init__(self, rig: Rig = RIG, noise: float = NOISE) -> None:
+        self.watch = Watch(rig, COMPLIANCE)
         self.block = 0
+        self._noise = noise
+        self._solver = solver_from_rig('exact', rig)
+        self._readings = 2 * len(rig.psds)
         self._rng = np.random.default_rng(1)
 
     def load(self, fx: float, fy: float, tz: float = 0.0) -> None:
@@ -46,9 +49,10 @@ class Fed:
         self, seconds: float, of: Callable[[FloatArray], FloatArray] | FloatArray, status: BlockStatus = BlockStatus.OK
     ) -> None:
         """Blocks with the readings ``of`` (4,) m, or a function of the time in this run (n,) that gives (n, 4)."""
-        t = np.arange(round(seconds * SECOND)) / SECOND
-        dots = (of(t) if callable(of) else np.tile(of, (len(t), 1))) + NOISE * self._rng.standard_normal((len(t), 4))
-        poses = SOLVER.solve_many(dots, np.full(4, NOISE**2)).pose
+        t, many = np.arange(round(seconds * SECOND)) / SECOND, self._readings
+        dots = of(t) if callable(of) else np.tile(of, (len(t), 1))
+        dots = dots + self._noise * self._rng.standard_normal((len(t), many))
+        poses = self._solver.solve_many(dots, np.full(many, NOISE**2)).pose
         for four, pose in zip(dots.tolist(), poses[:, :3].tolist(), strict=True):
             t_ns = self.block * 20_000_000
             loads = (p / c for p, c in zip(pose, COMPLIANCE, strict=True))
@@ -56,7 +60,9 @@ class Fed:
             for record in (
                 DeflectionEstimate(t_ns, self.block, 'exact', dx, dy, theta, 0.0, 0.0, (0.0,) * 9, 0.0, True),
                 TipLoad(t_ns, *loads),
-                SpotMeans(t_ns, self.block, tuple(four), (5.0, 5.0), np.zeros((4, 4)), 20, 0, status, ''),
+                SpotMeans(
+                    *(t_ns, self.block, tuple(four), (5.0,) * (many // 2), np.zeros((many, many)), 20, 0, status, '')
+                ),
             ):
                 self.watch.put(record)
             self.block += 1
@@ -67,11 +73,48 @@ def under(fx: float, fy: float) -> FloatArray:
     return np.asarray(REST - np.tile([fx * COMPLIANCE[0], fy * COMPLIANCE[1]], 2))
 
 
+def twisted(tz: float) -> FloatArray:
+    """The readings under a torque, m: R(-theta) l - c of each PSD."""
+    theta = tz * COMPLIANCE[2]
+    c, s = np.cos(theta), np.sin(theta)
+    beams = RIG.centers + RIG.zeros
+    return np.asarray((beams @ np.array([[c, -s], [s, c]]) - RIG.centers).ravel())
+
+
 def alarmed(fed: Fed) -> bool:
     return fed.watch.alarm is not None
 
 
 X1 = np.array([5e-6, 0.0, 0.0, 0.0])
+
+
+def wandering(t: FloatArray, rms: float = 1e-6, tau: float = 20.0) -> FloatArray:
+    """Readings whose beams wander, each by itself: a Gauss-Markov process of ``rms`` m and ``tau`` s."""
+    rng = np.random.default_rng(7)
+    keep = np.exp(-1.0 / (SECOND * tau))
+    steps = rms * np.sqrt(1.0 - keep**2) * rng.standard_normal((len(t), 4))
+    out = np.empty_like(steps)
+    last = np.zeros(4)
+    for row, step in zip(out, steps, strict=True):
+        last = keep * last + step
+        row[:] = last
+    return np.asarray(REST + out)
+
+
+def test_beams_that_wander_are_an_alarm_unless_the_rig_says_so() -> None:
+    """Review: 1 um rms with 20 s between one place and another."""
+    allowed = {'watch_wander': 4e-6}
+    alarms = []
+    for rig in (RIG, load_rig(overrides=allowed)):
+        fed = Fed(rig)
+        fed.load(0.0, 0.0)
+        fed.run(600.0, wandering)
+        alarms.append(fed.watch.alarms)
+    assert alarms[0] > 0
+    assert alarms[1] == 0
+    # What is larger is seen all the same.
+    fed.run(10.0, REST + 3.0 * X1)
+    assert alarmed(fed)
 
 
 def test_a_bump_is_told_with_its_time_channel_and_size() -> None:
@@ -87,6 +130,8 @@ def test_a_bump_is_told_with_its_time_channel_and_size() -> None:
     assert alarm.shift == pytest.approx(5e-6, abs=0.3e-6)
     assert alarm.since_ns / 1e9 == pytest.approx(10.0, abs=0.6)
     assert alarm.seen_ns / 1e9 - 10.0 < 6.0
+    # Of two means of four windows, which are means of 25 blocks.
+    assert alarm.sd == pytest.approx(NOISE / 5.0 * 0.5**0.5, rel=0.4)
     assert alarm.sigmas > 20.0
     assert fed.watch.alarms == 1
     assert 'x1 is +5' in alarm.words.replace('+4.9', '+5')
@@ -122,6 +167,71 @@ def test_the_base_line_may_be_wrong_by_two_thousandths_of_a_movement() -> None:
         longer = wrong * np.array([1.0, 1.0, -1.0, -1.0])
         fed.run(8.0, under(0.0, -45.0) + longer)
         assert alarmed(fed) is alarm
+
+
+def test_three_seconds_pass_from_what_is_sure_to_the_alarm() -> None:
+    """A large shift is sure after two windows of half a second."""
+    fed = Fed()
+    fed.load(0.0, 0.0)
+    fed.run(10.0, REST)
+    fed.run(6.0, REST + 10.0 * X1)
+    assert fed.watch.alarm is not None
+    assert fed.watch.alarm.seen_ns / 1e9 == pytest.approx(14.0, abs=0.3)
+
+
+def test_the_readings_under_a_load_are_learnt_in_two_seconds() -> None:
+    fed = Fed()
+    assert fed.watch.state == 'no window yet'
+    fed.run(6.0, REST)
+    fed.load(0.0, 0.0)
+    # Four whole windows; the first one begins up to half a second later.
+    fed.run(1.9, REST)
+    assert fed.watch.state == 'learns the readings under this load'
+    fed.run(0.7, REST)
+    assert fed.watch.state == 'readings, base line and load'
+
+
+def test_readings_without_noise_are_watched_too() -> None:
+    fed = Fed(noise=0.0)
+    fed.load(0.0, 0.0)
+    fed.run(10.0, REST)
+    assert not alarmed(fed)
+    fed.run(6.0, REST + X1)
+    assert fed.watch.alarm is not None
+    assert fed.watch.alarm.channel == 'x1'
+
+
+@pytest.mark.parametrize(('a', 'b'), [(1, 2), (1, 3), (2, 3)])
+def test_each_base_line_of_three_psds_is_watched(a: int, b: int) -> None:
+    """Both dots go apart along the line between their PSDs, soon after the begin."""
+    rest = THREE.zeros.ravel()
+    along = THREE.centers[b - 1] - THREE.centers[a - 1]
+    apart = np.zeros((3, 2))
+    apart[b - 1] = 12e-6 * along / np.linalg.norm(along)
+    apart[a - 1] = -apart[b - 1]
+    fed = Fed(THREE)
+    # Four windows tell what scatter is usual, four the level.
+    fed.run(4.1, rest)
+    fed.run(8.0, rest + apart.ravel())
+    assert fed.watch.alarm is not None
+    assert fed.watch.alarm.channel == f'base line of psd_{a} and psd_{b}'
+    assert fed.watch.alarm.shift == pytest.approx(24e-6, abs=0.5e-6)
+
+
+@pytest.mark.parametrize(('share', 'alarm'), [(1.01, False), (1.06, True)])
+def test_a_torque_must_do_what_the_link_model_says_from_one_to_the_other(share: float, alarm: bool) -> None:
+    """Two per cent of the movement, which is from one side to the other, and 40 urad."""
+    fed = Fed()
+    fed.load(0.0, 0.0, 10.0)
+    fed.run(6.0, twisted(10.0))
+    fed.load(0.0, 0.0, -10.0)
+    fed.run(6.0, twisted(-10.0 * share))
+    assert alarmed(fed) is alarm
+    if fed.watch.alarm is not None:
+        assert fed.watch.alarm.channel == 'theta'
+        shift = -10.0 * (share - 1.0) * COMPLIANCE[2]
+        assert fed.watch.alarm.shift == pytest.approx(shift, rel=0.05)
+        assert fed.watch.alarm.words.startswith(f'theta is {1e6 * fed.watch.alarm.shift:+.2f} µrad off')
 
 
 def test_what_comes_back_ends_the_alarm_and_a_zero_too() -> None:
@@ -187,7 +297,9 @@ def test_a_load_must_do_what_the_link_model_says(share: float, alarm: bool) -> N
         assert found.shift == pytest.approx(-40.0 * (share - 1.0) * COMPLIANCE[1], rel=0.05)
         # Six of these are what is allowed: 5 um and 2 % of the movement.
         assert found.sd == pytest.approx((5e-6 + 0.02 * abs(40.0 * share * COMPLIANCE[1])) / 6.0, rel=0.01)
-        # It is not seen to end under another load.
+        # What the level under this load is does not end it, and it is not seen to end under another one.
+        fed.run(20.0, under(0.0, -40.0 * share))
+        assert fed.watch.alarm is found
         fed.load(0.0, 0.0)
         fed.run(20.0, under(0.0, 0.0))
         assert fed.watch.alarm is not None

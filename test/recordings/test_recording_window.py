@@ -17,6 +17,7 @@ from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import COMMANDS, main, make_parser
 from psd_deflection.recordings.conversion import Beside, convert
 from psd_deflection.recordings.recording import Recording, RecordingWindow
+from psd_deflection.recordings.replay.comparison import ReplayComparison
 from psd_deflection.recordings.replay.engine import rig_at_end
 from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import ParameterChange
@@ -24,8 +25,6 @@ from tools.program import ROOT
 
 BAGS = ROOT / 'bags'
 WITHOUT = {
-    'monitor': 'its page has a window of its own',
-    'replay': 'the estimates of a block depend on those before it; plot and convert cut',
     'recover': 'it saves what is whole',
 }
 """Commands that take a recording and no part of it."""
@@ -35,6 +34,22 @@ def staircase() -> Recording:
     """Rest, 5 N along X, 8 N along Y, rest; a second each; 20 to 23 degrees."""
     loads = [(0, 0, 0), (5, 0, 0), (0, -8, 0), (0, 0, 0)]
     return psd_deflection.simulate(None, loads, seconds=1, temperature=[20.0, 23.0])
+
+
+def test_a_slice_is_a_part() -> None:
+    recording = psd_deflection.open(BAGS / 'clean')
+    part = recording[1.0:2.5]
+    assert part.samples['seq'].tolist() == list(range(1000, 2500))
+    assert recording[3.5:].samples['seq'].tolist() == list(range(3500, 4000))
+    estimates = psd_deflection.replay(recording)
+    inside = estimates[1.0:2.0]
+    assert inside.t.tolist() == [t for t in estimates.t.tolist() if 1.0 <= t < 2.0]
+    assert inside[:1.5].t.tolist() == [t for t in inside.t.tolist() if t < 1.5]
+    assert len(estimates[9.0:]) == 0
+    for whole in (recording, estimates):
+        for wrong in (3, 'a', slice(1.0, 2.0, 0.5)):
+            with pytest.raises(ConfigError, match=r'must be a part of time, as (recording|estimates)\['):
+                whole[wrong]  # type: ignore[index]
 
 
 def test_samples_keep_number_time_and_volts() -> None:
@@ -159,3 +174,123 @@ def test_every_command_that_reads_a_recording_takes_a_part_of_it() -> None:
         ):
             without.append(name)
     assert without == [name for name in COMMANDS if name in WITHOUT]
+
+
+ASKED = {
+    'calibrate': ['--out', 'calibrated'],
+    'check': [],
+    'convert': ['--out', 'converted.csv'],
+    'discover': ['--out', 'found', '--quiet'],
+    'identify': [],
+    'info': [],
+    'plot': ['--out', 'drawn.png'],
+    'replay': [],
+    'validate': [],
+}
+"""Commands that answer in JSON of a part of a recording, with the options that they cannot do without."""
+ALL_BEFORE = {'plot', 'replay'}
+"""They have estimates, and that of a block depends on the blocks before it, which a file with the part alone lacks."""
+OF_THE_FILE = {'bytes', 'path', 'name', 'sha256', 'recording'}
+
+
+def parted(name: str) -> set[str]:
+    """Options of the command ``name``."""
+    (commands,) = [a for a in make_parser([name])._actions if isinstance(a, argparse._SubParsersAction)]
+    return {option for action in commands.choices[name]._actions for option in action.option_strings}
+
+
+def answer_without_names(text: str) -> object:
+    """The answer in ``text`` without what tells files apart."""
+    return json.loads(text, object_hook=lambda d: {k: v for k, v in d.items() if k not in OF_THE_FILE})
+
+
+@pytest.fixture(scope='module')
+def two_files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A recording with loads, references and a link that rings, and a file with a part of it alone."""
+    folder = tmp_path_factory.mktemp('parts')
+    whole, part = folder / 'whole.csv', folder / 'part.csv'
+    rest = (0, 0, 0)
+    loads = [rest, (20, 0, 0), rest, (0, -30, 0), rest, (0, 0, 2), rest, (30, 0, 0)]
+    made = psd_deflection.simulate(None, loads, seconds=1, seed=2)
+    convert(made, whole, made.parameters, Beside.of(made), made.blocks())
+    assert main(['convert', str(whole), '--out', str(part), '--from', '0.5', '--to', '5.5']) == 0
+    return whole, part
+
+
+@pytest.mark.repeatable
+@pytest.mark.parametrize('name', [name for name in COMMANDS if {'--from', '--json'} <= parted(name)])
+def test_the_answer_of_a_part_is_that_of_a_file_with_the_part_alone(
+    name: str,
+    two_files: tuple[Path, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    whole, part = (str(path) for path in two_files)
+    answers: list[object] = []
+    for recording in ([whole, '--from', '0.5', '--to', '5.5'], [part], [whole]):
+        folder = tmp_path / str(len(answers))
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        capsys.readouterr()
+        assert main([name, *recording, *ASKED[name], '--json']) == 0
+        answers.append(answer_without_names(capsys.readouterr().out))
+    of_the_part, of_the_file, of_the_whole = answers
+    assert of_the_part == of_the_file or name in ALL_BEFORE
+    assert of_the_part != of_the_whole
+
+
+def test_what_is_computed_from_a_part_says_which(two_files: tuple[Path, Path]) -> None:
+    whole = psd_deflection.open(two_files[0])
+    assert whole.crop(0.5, 5.5).name == 'whole.csv, from 0.5 s to 5.5 s'
+    assert whole.crop(0.5, None).crop(1.0, None).name == 'whole.csv, from 0.5 s, from 1 s'
+    found = psd_deflection.calibrate(whole.crop(0.5, 5.5), ROOT / 'config' / 'thesis_rig.yaml')
+    assert found.tree()['provenance']['recordings'][0]['name'] == 'whole.csv, from 0.5 s to 5.5 s'
+
+
+@pytest.mark.parametrize('bag', ['clean', 'lost_samples', 'laser_off'])
+def test_a_part_of_a_replay_is_what_it_is_in_the_whole(
+    bag: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Also where the part begins and ends within a block; what is refused in it is counted, and no more."""
+    whole, part = tmp_path / 'whole.csv', tmp_path / 'part.csv'
+    assert main(['replay', str(BAGS / bag), '--out', str(whole), '--json']) == 0
+    everything = json.loads(capsys.readouterr().out)
+    words = ['--from', '1.013', '--to', '2.505']
+    assert main(['replay', str(BAGS / bag), *words, '--out', str(part), '--json', '--compare', '--strict']) in (0, 1)
+    found = json.loads(capsys.readouterr().out)
+    assert found['compared']['different'] == found['compared']['rounded']
+    assert found['compared']['equal'] + found['compared']['rounded'] > 100
+    assert found['compared']['only_recorded'] == found['compared']['only_replayed'] == 0
+    head, *rows = whole.read_text().splitlines()
+    first, *others = part.read_text().splitlines()
+    assert first == head
+    start = int(next(psd_deflection.open(BAGS / bag).blocks()).t_ns[0])
+    since = [int(row.partition(',')[0].replace('.', '')) - start for row in rows]
+    assert others == [row for row, t_ns in zip(rows, since, strict=True) if 1_013_000_000 <= t_ns < 2_505_000_000]
+    assert found['blocks'] == found['estimates'] + sum(found['refused'].values())
+    assert sum(found['refused'].values()) <= sum(everything['refused'].values())
+    assert found['samples'] + found['lost'] == pytest.approx(1492, abs=40)
+
+
+def test_several_recordings_are_replayed_in_the_same_part(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['replay', str(BAGS / 'clean'), str(BAGS / 'lost_samples'), '--from', '1', '--to', '2', '--json']) == 0
+    assert [json.loads(line)['samples'] for line in capsys.readouterr().out.splitlines()] == [1000, 973]
+
+
+def test_what_comes_before_the_memory_of_a_run_is_told_cannot_be_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recorder that joins late hears of the memory some seconds later."""
+    opened = psd_deflection.open(BAGS / 'clean')
+    start = int(next(opened.blocks()).t_ns[0])
+    first = next(opened.blocks()).index
+    memory = ParameterChange(start + 2_000_000_000, first + 100, (('state.whole', 1.0),))
+    monkeypatch.setattr(type(opened), 'memory_from', lambda self, index: memory)
+    with pytest.raises(RecordingError, match=r'says 2\.0 s after its first sample what the pipeline remembers'):
+        ReplayComparison(opened, RecordingWindow(opened, 0.5, 1.5))
+    ReplayComparison(opened, RecordingWindow(opened, 0.5, 2.5))
+
+
+def test_the_page_plays_a_part_of_a_recording_and_no_part_of_a_rig(capsys: pytest.CaptureFixture[str]) -> None:
+    assert make_parser(['monitor']).parse_args(['monitor', 'run', '--from', '1', '--to', '3']).span == (1.0, 3.0)
+    assert main(['monitor', '--from', '1']) == 2
+    assert '--from and --to are for a recording' in capsys.readouterr().err

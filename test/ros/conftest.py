@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import math
 import os
 import signal
 import sys
@@ -25,6 +26,8 @@ WARNINGS += "ignore:module 'sre_constants' is deprecated:DeprecationWarning"
 BLOCK_NS = 20_000_000
 
 ASK_AGAIN_S = 20.0
+SEND_AGAIN_S = 1.0
+"""A message is sent again after it: a node that is late loses some, and one that is flooded refuses them as a flood."""
 """An answer that has not come by then is lost."""
 
 
@@ -135,6 +138,19 @@ class Peer:
             if time.monotonic() > deadline:
                 pytest.fail(f'waited {WAIT_S:g} s for {what}')
             self.executor.spin_once(timeout_sec=0.1)
+
+    def until_sent(self, send: Callable[[], object], condition: Callable[[], bool], what: str) -> None:
+        """Until ``condition``; ``send`` is called at once and each ``SEND_AGAIN_S``."""
+        due = -math.inf
+
+        def sent() -> bool:
+            nonlocal due
+            if time.monotonic() >= due:
+                send()
+                due = time.monotonic() + SEND_AGAIN_S
+            return condition()
+
+        self.until(sent, what)
 
     def until_of_now(self, messages: list[Any], what: str) -> None:
         """Until the last message is of a block that began after this call: not of those that are on their way."""

@@ -6,11 +6,12 @@ from the ROS definition alone: a string lies in a message as bytes do.
 """
 
 import os
+import signal
 import sys
-import time
+import threading
 from dataclasses import dataclass
 
-from cyclonedds.core import Policy, Qos
+from cyclonedds.core import Listener, Policy, Qos
 from cyclonedds.domain import DomainParticipant
 from cyclonedds.idl import IdlStruct
 from cyclonedds.idl.types import array, int32, sequence, uint8, uint32
@@ -41,6 +42,8 @@ class Half(IdlStruct, typename=NAME):
 
 
 def main() -> None:
+    # Before DDS starts its threads, which would get it otherwise.
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGALRM})
     half = sys.argv[2] == 'half'
     participant = DomainParticipant(int(os.environ['ROS_DOMAIN_ID']))
     qos = Qos(
@@ -48,15 +51,17 @@ def main() -> None:
         Policy.History.KeepLast(10),
         Policy.DataRepresentation(use_cdrv0_representation=True),
     )
-    writer = DataWriter(participant, Topic(participant, sys.argv[1], Half if half else Goal), qos=qos)
+    heard = threading.Event()
+    listener = Listener(on_publication_matched=lambda *_: heard.set())
+    writer = DataWriter(participant, Topic(participant, sys.argv[1], Half if half else Goal), qos, listener=listener)
     # Before, nobody would get what it sends.
-    while not writer.get_matched_subscriptions():
-        time.sleep(PERIOD_S)
+    heard.wait()
+    signal.setitimer(signal.ITIMER_REAL, PERIOD_S, PERIOD_S)
     for number in range(10**6):
         own = [*number.to_bytes(4, 'little'), *([0] * 12)]
         writer.write(Half(own, 0) if half else Goal(own, 0, 0, list(b'\xff\xfe\0'), [0] * 4, [0], [0] * 8))
         print('sent', number, flush=True)
-        time.sleep(PERIOD_S)
+        signal.sigwait({signal.SIGALRM})
 
 
 if __name__ == '__main__':

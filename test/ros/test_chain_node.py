@@ -66,8 +66,12 @@ def test_end_effector_links_joints_zero_and_recording(chain: Program, peer: Any,
     assert 1e-8 < covariance[0, 0] ** 0.5 < 1e-4
     names = {s.name for m in health for s in m.status}
     assert {'chain: end effector', 'chain/upper: acquisition', 'chain/fore: acquisition'} <= names
-    levels = [s.level for m in health for s in m.status if s.name == 'chain: end effector']
-    assert DiagnosticStatus.OK in levels
+
+    def sound() -> bool:
+        return DiagnosticStatus.OK in [s.level for m in health for s in m.status if s.name == 'chain: end effector']
+
+    # A busy machine may be too slow for both links at first.
+    peer.until(sound, 'an end effector that is composed')
     folders = [Path(name) for name in ended.message.removeprefix('recording ended: ').split(', ')]
     assert [folder.parts[:2] for folder in folders] == [('recordings', 'upper'), ('recordings', 'fore')]
     for folder in folders:

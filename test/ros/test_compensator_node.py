@@ -9,7 +9,8 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,8 @@ from psd_deflection.arms.compensation.settings import SETTINGS  # noqa: E402
 from test.ros.conftest import WARNINGS  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
+STALE = '0.8'
+"""s. On a busy machine this process is late too; test/arms/compensation has the default of 0.08 s."""
 ARGUMENTS = ('compensator', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive')
 
 HANGS = """
@@ -56,8 +59,7 @@ sys.exit(main())
 
 @pytest.fixture
 def compensator(domain: int) -> Iterator[Program]:
-    # A busy machine is late; test/arms/compensation has the default of 0.08 s.
-    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', '0.5']
+    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE]
     one = Program(command, env={'PYTHONWARNINGS': WARNINGS})
     yield one
     one.end()
@@ -92,10 +94,11 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
             return re.search(f'holding: .*{why}', compensator.text[said:]) is not None
 
         peer.until(holds, why)
-        # What was on its way before it held has come.
-        held = len(plant.offsets) + 5
-        peer.until(lambda held=held: len(plant.offsets) > held + 20, 'offsets that are held')
-        assert np.ptp(plant.offsets[held:], axis=0).max() == 0.0
+        # What was on its way before it held has come, however much that was.
+        peer.until(lambda: not np.ptp(plant.offsets[-20:], axis=0).any(), 'offsets that are held')
+        held = len(plant.offsets)
+        peer.until(lambda held=held: len(plant.offsets) > held + 20, 'more of them')
+        assert not np.ptp(plant.offsets[held - 20 :], axis=0).any()
         said = len(compensator.text)
         plant.tell = plant.tell_joints = faithful
         peer.until(lambda said=said: 'following' in compensator.text[said:], 'following')
@@ -143,10 +146,13 @@ def test_a_transition_with_offsets_that_stay_fails_and_says_so(compensator: Prog
     assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
     peer.until(lambda: plant.error() < 0.05 * free, 'offsets that follow')
 
+    # This process may be silent for longer than that on a busy machine, and is no controller that tells nothing.
+    assert changed(peer, 'stale', 10.0).successful
     assert changed(peer, 'max_rate', 1e-4).successful
     asked = len(plant.offsets)
     assert not changed_state(peer, Transition.TRANSITION_DEACTIVATE)
-    assert re.search(r'an offset of \S+ at \w+ is left after 10 s', compensator.text)
+    left = re.compile(r'an offset of \S+ at \w+ is left after 10 s')
+    peer.until(lambda: left.search(compensator.text) is not None, 'what is left')
     # It goes on meanwhile, and the next attempt waits anew.
     assert 0.0 < np.abs(plant.offsets[-1]).max() < np.abs(plant.offsets[asked]).max()
     assert changed(peer, 'max_rate', 0.1).successful
@@ -164,7 +170,7 @@ def test_a_transition_with_offsets_that_stay_fails_and_says_so(compensator: Prog
 
 def test_a_main_thread_that_hangs_does_not_keep_the_offsets_from_holding(domain: int, peer: Any) -> None:
     reading, writing = os.pipe()
-    process = subprocess.Popen([sys.executable, '-c', HANGS, *ARGUMENTS, '--stale', '0.5'], cwd=ROOT, stdin=reading)
+    process = subprocess.Popen([sys.executable, '-c', HANGS, *ARGUMENTS, '--stale', STALE], cwd=ROOT, stdin=reading)
     os.close(reading)
     try:
         plant = Plant(peer.node)
@@ -238,24 +244,13 @@ def test_what_strangers_send_is_refused_and_moves_nothing(compensator: Program, 
         values = {v.key: v.value for s in states[-1].status for v in s.values} if states else {}
         return int(values.get(f'messages refused: {topic.strip("/")}', '0'))
 
+    def refused(topic: str, why: str) -> Callable[[], bool]:
+        said, before = compensator.text.count(why), counted(topic)
+        return lambda: compensator.text.count(why) > said or (before >= 3 and counted(topic) > before)
+
     for name, (message, topic, why) in strange_messages().items():
-        # A node that is late loses what it has no room for: it is sent again until it is refused.
-        said, before, sent = compensator.text.count(why), counted(topic), [-math.inf]
-
-        def refused(
-            topic: str = topic,
-            why: str = why,
-            said: int = said,
-            before: int = before,
-            message: Any = message,
-            sent: list[float] = sent,
-        ) -> bool:
-            if time.monotonic() > sent[-1] + 1.0:
-                senders[topic].publish(message)
-                sent.append(time.monotonic())
-            return compensator.text.count(why) > said or (before >= 3 and counted(topic) > before)
-
-        peer.until(refused, f'the refusal of what is {name}')
+        send = partial(senders[topic].publish, message)
+        peer.until_sent(send, refused(topic, why), f'the refusal of what is {name}')
     peer.until(lambda: counted('/end_effector/deflection') >= 4 and counted('/joint_states') >= 5, 'their counts')
     assert compensator.process.poll() is None
     assert plant.step() <= WITHIN
@@ -267,7 +262,7 @@ def test_settings_are_parameters(compensator: Program, peer: Any) -> None:
     assert {p.name for p in SETTINGS.parameters.values()} <= set(names)
     asked = GetParameters.Request(names=['joints', 'stale', 'axes'])
     joints, stale, axes = peer.call(GetParameters, '/compensator/get_parameters', asked).values
-    assert (list(joints.string_array_value), stale.double_value) == (['shoulder', 'elbow'], 0.5)
+    assert (list(joints.string_array_value), stale.double_value) == (['shoulder', 'elbow'], float(STALE))
     assert list(axes.string_array_value) == ['x', 'z']
     described = DescribeParameters.Request(names=['max_rate'])
     (rate,) = peer.call(DescribeParameters, '/compensator/describe_parameters', described).descriptors
@@ -311,7 +306,7 @@ def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> 
             states.publish(Float64())
 
     peer.node.create_timer(0.05, told)
-    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', '0.5', '--controller-state', 'std_msgs/msg/Float64']
+    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE, '--controller-state', 'std_msgs/msg/Float64']
     node = Program(command, env={'PYTHONWARNINGS': WARNINGS})
     try:
         peer.until(lambda: plant.error() > 2e-3, 'a deflection')
@@ -350,7 +345,7 @@ def test_a_controller_state_that_is_not_installed_is_refused(domain: int) -> Non
 def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(domain: int, peer: Any, tmp_path: Path) -> None:
     flag = tmp_path / 'flag'
     plant = Plant(peer.node)
-    node = Program([sys.executable, '-c', BREAKS, str(flag), *ARGUMENTS, '--stale', '0.5'])
+    node = Program([sys.executable, '-c', BREAKS, str(flag), *ARGUMENTS, '--stale', STALE])
     try:
         peer.until(lambda: plant.error() > 2e-3, 'a deflection')
         assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
@@ -367,7 +362,7 @@ def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(domain: int, peer
 
 def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> None:
     """The controller keeps the offsets that it had, and says so; ours begin there. Two at once hold."""
-    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', '0.5']
+    command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE]
     plant = Plant(peer.node)
     first = Program(command)
     second: Program | None = None

@@ -400,15 +400,17 @@ def refuses(running: Running, sent: Sent, words: tuple[str, ...]) -> bool:
     """Whether the message is counted as refused in the node's diagnostics, for a reason with one of ``words``."""
     before, reports = running.refusals(), len(running.reports)
 
-    def counted() -> bool:
+    def send() -> None:
         running.send(sent)
         if running.name == 'shaper':
             # Without it every trajectory is refused.
             running.send((JointState, 'joint_states', JointState(name=['joint_0'], position=[0.5])))
+
+    def counted() -> bool:
         why = running.texts(reports)
         return running.refusals() > before and any(word in why for word in words)
 
-    running.peer.until(counted, f'the refusal of {sent[1]} for one of {words}')
+    running.peer.until_sent(send, counted, f'the refusal of {sent[1]} for one of {words}')
     return running.program.process.poll() is None
 
 
@@ -541,16 +543,13 @@ def test_simulated_time_acts_or_is_refused(running: Running) -> None:
         clock.publish(message)
 
     def of_that_time() -> bool:
-        told(1234)
         return any(report.header.stamp.sec == 1234 for report in running.reports[seen:])
 
-    def of_no_time() -> bool:
-        told(-5)
-        return running.refusals() > refused
-
     try:
-        running.peer.until(of_that_time, 'diagnostics in simulated time')
-        running.peer.until(of_no_time, 'the refusal of a time before 1970')
+        running.peer.until_sent(lambda: told(1234), of_that_time, 'diagnostics in simulated time')
+        running.peer.until_sent(
+            lambda: told(-5), lambda: running.refusals() > refused, 'the refusal of a time before 1970'
+        )
     finally:
         running.peer.node.destroy_publisher(clock)
         assert running.set('use_sim_time', False).successful
@@ -580,11 +579,7 @@ def test_refusals_are_warnings(running: Running) -> None:
     # Each test may run in a process of its own: what the others sent may not have been sent here.
     sent = next(sent for sent in running.profile.refused.values() if not isinstance(sent, str))
 
-    def told() -> bool:
-        running.send(sent)
-        return running.said('refused', 30)
-
-    running.peer.until(told, 'a warning')
+    running.peer.until_sent(lambda: running.send(sent), lambda: running.said('refused', 30), 'a warning')
     levels = {line.level for line in running.logged if 'refused: ' in line.msg}
     assert levels == {30}
 

@@ -14,11 +14,46 @@ from std_msgs.msg import String
 
 from msg_adapters import RIG
 from psd_deflection.cli.main import main
+from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.rig.config import load_rig
 from psd_deflection.ros.endpoints import message_class, qos
 from psd_deflection.ros.topics import PUBLISHED
 from psd_deflection.run.fanout import published
 from test.late import Heard, written
+from tools.program import WAIT_S
+
+
+def recorded_late(peer: Any, poses: list[Any], folder: Path) -> Path:
+    """A bag of what is heard from now on until two seconds after the node has told all that it remembers."""
+    heard: list[Heard] = []
+    listening = []
+    # Those that a rig publishes in its namespace; of the samples none may be lost, so the rig first.
+    for topic, kind in published(load_rig()).items():
+        name = topic if topic == '/diagnostics' else f'/arm{topic}'
+
+        def take(message: bytes, name: str = name, kind: str = kind) -> None:
+            heard.append(Heard(name, kind, message, time.time_ns()))
+
+        delivery = qos(PUBLISHED[topic].delivery)
+        listening.append(peer.node.create_subscription(message_class(kind), name, take, delivery, raw=True))
+
+    def memories() -> int:
+        texts = (deserialize_message(m.cdr, String).data for m in heard if m.topic == f'/arm{RIG}')
+        return sum('memory' in json.loads(text) for text in texts)
+
+    # The latched one is of before it joined.
+    peer.until(lambda: memories() >= 2, 'the next memory')
+    seen = len(poses)
+    peer.until(lambda: len(poses) >= seen + 100, 'two seconds after it')
+    for one in listening:
+        peer.node.destroy_subscription(one)
+    return written(folder / f'late_{len(list(folder.iterdir()))}', heard)
+
+
+def lost_in(bag: Path) -> int:
+    """Samples that are missing in it."""
+    seq = open_recording(bag).samples['seq']
+    return int(seq[-1] - seq[0] + 1 - len(seq))
 
 
 def test_a_recorder_that_joins_a_running_node_replays_bit_for_bit(
@@ -31,25 +66,10 @@ def test_a_recorder_that_joins_a_running_node_replays_bit_for_bit(
     start('--port', simulated_port, '--ros-args', '-p', 'keep_zero:=false', '-r', '__ns:=/arm')
     poses = peer.collect(message_class('geometry_msgs/msg/PoseStamped'), '/arm/link_tip/deflection')
     peer.until(lambda: len(poses) >= 150, 'a run of three seconds')
-    heard: list[Heard] = []
-    # Those that a rig publishes in its namespace; of the samples none may be lost, so the rig first.
-    for topic, kind in published(load_rig()).items():
-        name = topic if topic == '/diagnostics' else f'/arm{topic}'
-
-        def take(message: bytes, name: str = name, kind: str = kind) -> None:
-            heard.append(Heard(name, kind, message, time.time_ns()))
-
-        peer.node.create_subscription(message_class(kind), name, take, qos(PUBLISHED[topic].delivery), raw=True)
-
-    def memories() -> int:
-        texts = (deserialize_message(m.cdr, String).data for m in heard if m.topic == f'/arm{RIG}')
-        return sum('memory' in json.loads(text) for text in texts)
-
-    # The latched one is of before it joined.
-    peer.until(lambda: memories() >= 2, 'the next memory')
-    seen = len(poses)
-    peer.until(lambda: len(poses) >= seen + 100, 'two seconds after it')
-    bag = written(tmp_path / 'late', heard)
+    deadline = time.monotonic() + WAIT_S
+    # Where this process is starved, DDS drops messages before they are taken: what is then written is no judge.
+    while lost_in(bag := recorded_late(peer, poses, tmp_path)):
+        assert time.monotonic() < deadline, f'{bag}: nothing but recordings with losses'
     assert main(['replay', str(bag), '--compare']) == 0
     said = capsys.readouterr().out
     assert 'starts in mid-run; compared from block' in said

@@ -149,6 +149,9 @@ def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
     assert "solver = 'magic': must be one of" in put(peer, solver='magic')
     assert 'comparison only' in put(peer, solver='appendix_d')
     assert put(peer, autostart=True) == 'autostart: is read at the start of the process'
+    # Nobody on the network shall run programs here.
+    assert put(peer, watch_command='true') == 'watch_command: is read at the start of the process'
+    assert put(peer, watch_webhook='http://a') == 'watch_webhook: is read at the start of the process'
     assert value_of(peer, 'solver') == 'exact'
     assert put(peer, port=simulated_port, solver='ols', block_size=10, sum_min=2.4, markers=True) == ''
     assert put(peer, effects__axis_crosstalk__xy=0.02) == ''

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.ros
 rclpy = pytest.importorskip('rclpy')
 
 from action_msgs.msg import GoalStatus  # noqa: E402
-from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from lifecycle_msgs.msg import Transition  # noqa: E402
 from lifecycle_msgs.srv import ChangeState  # noqa: E402
 from rclpy.action import ActionClient  # noqa: E402
@@ -66,8 +66,11 @@ class Arm:
 
     def ready(self) -> None:
         """The shaper has found the controller, and the joints."""
-        told = 'goals go to'
-        self.peer.until(lambda: any(told in s.message for r in self.reports for s in r.status), 'the controller')
+        self.peer.until(self._ready, 'the controller and the joints')
+
+    def _ready(self) -> bool:
+        seen = {s.name: s for r in self.reports for s in r.status if s.name.startswith('shaper: ')}
+        return len(seen) == 2 and all(s.level == DiagnosticStatus.OK for s in seen.values())
 
     def goal(self, end: tuple[float, ...] = (0.5, 0.1), seconds: float = 0.3, names: tuple[str, ...] = NAMES) -> Any:
         at = Duration(nanoseconds=round(1e9 * seconds)).to_msg()

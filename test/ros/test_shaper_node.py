@@ -63,6 +63,8 @@ def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> Non
     peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
     peer.until(lambda: peer.node.count_publishers('/shaper/shaped') > 0, 'its answers')
 
+    unknown = 'nobody tells where the joints are on joint_states'
+    peer.until(lambda: any(r.status[0].message == unknown for r in reports), 'diagnostics without joints')
     # Refused: a joint of which nobody tells anything, too.
     given.publish(message(point(0.0, [0.0]), names=('z',)))
     node.until('trajectory refused: the position of z is not known')

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.base.log import INFO, WARNING, texts, unsaid
-from psd_deflection.devices import contract_frames
+from psd_deflection.devices import contract_frames, port_source
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
@@ -206,7 +206,10 @@ def hear_out(monkeypatch: pytest.MonkeyPatch, answer: bytes) -> None:
             heard.extend(piece)
             return piece
 
-    monkeypatch.setattr(contract_frames, 'SerialPort', Ear)
+    def port(name: str, baud: int, **others: object) -> SerialPort:
+        return Ear(name, baud)
+
+    monkeypatch.setattr(port_source, 'open_port', port)
     clock = SimpleNamespace(monotonic=lambda: 1e6 if heard.endswith(answer) else 0.0)
     monkeypatch.setattr(contract_frames, 'time', clock)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from psd_deflection.arms.chains.chain import Chain, EndEffector
 from psd_deflection.arms.chains.chain_file import ChainFile, read_chain
 from psd_deflection.arms.chains.joining import PATIENCE
 from psd_deflection.base.errors import DeviceError
@@ -123,6 +124,25 @@ def test_a_turned_joint_counts_from_the_next_time_on(
     two = running.until(lambda c: c.end is not None and c.end.angles[0] > 0.0)
     assert two.end is not None
     assert two.end.rigid.position == pytest.approx([1.27, 0.0, 0.0], abs=1e-12)
+
+
+def test_what_cannot_be_composed_ends_no_measurement(
+    running: Running, devices: list[ScriptedDevice], sample: Sample, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    running.until(lambda c: c.end is not None)
+
+    def no_answer(*_: object) -> EndEffector:
+        raise np.linalg.LinAlgError('SVD did not converge')
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Chain, 'compose', no_answer)
+        running.send(devices, sample, 200)
+        one = running.until(lambda c: c.end is None)
+        assert one.why == 'cannot be composed (SVD did not converge)'
+        running.heard('end effector: not composed: cannot be composed (SVD did not converge)')
+    running.send(devices, sample, 200)
+    running.until(lambda c: c.end is not None and c.t_ns > one.t_ns)
+    assert running.chain.failed is None
 
 
 def test_all_links_are_zeroed_and_recorded(

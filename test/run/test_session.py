@@ -6,6 +6,7 @@ import queue
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
@@ -189,6 +190,29 @@ def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_told_now(
     assert recording.loads() == [first]
     (message,) = recording.messages([LOAD])
     assert message.log_time >= asked_ns
+
+
+@pytest.mark.parametrize(
+    ('values', 'simulated', 'info', 'kept'),
+    [
+        ({}, False, {'serial': 'A-1'}, 'history_A-1.sqlite'),
+        ({}, True, {'serial': 'A-1'}, ''),
+        ({'source': 'replay', 'port': 'a.csv'}, False, {'serial': 'A-1'}, ''),
+        ({}, False, {}, ''),
+        ({}, False, None, ''),
+    ],
+)
+def test_the_hours_of_a_device_are_kept_by_its_serial_number(
+    values: dict[str, object], simulated: bool, info: dict[str, object] | None, kept: str
+) -> None:
+    hello = None if info is None else SimpleNamespace(info=info)
+    session = SimpleNamespace(
+        rig=load_rig(overrides=values), simulated=simulated, acquisition=SimpleNamespace(hello=hello)
+    )
+    shown = ShownSession.__new__(ShownSession)
+    shown._session = session  # type: ignore[assignment]
+    found = shown.history_file()
+    assert (found.name if found is not None else '') == kept
 
 
 def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDevice, sample: Sample) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -77,6 +78,20 @@ class Chain:
 BUMP = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
+def test_an_alarm_is_handed_on(tmp_path: Path) -> None:
+    kept = tmp_path / 'alarms'
+    chain = Chain(None, watch_command=f'sh -c "cat >> {kept}"')
+    chain.feed(1.0)
+    chain.load(0.0, 0.0, 0.0)
+    chain.feed(10.0)
+    chain.feed(10.0, BUMP)
+    assert chain.watcher.close(WAIT_S) == ''
+    told = json.loads(kept.read_text())
+    assert (told['channel'], told['device'], told['node']) == ('x1', 'abc', '/arm/psd_estimator')
+    values = dict(chain.watcher.entry().values)
+    assert (values['alarms handed on'], values['alarms not handed on']) == ('1', '0')
+
+
 def volts_of(folder: Path) -> FloatArray:
     return read_observation(folder).volts
 
@@ -92,7 +107,7 @@ def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(
     assert chain.watcher.entry().level == OK
     assert not list(tmp_path.iterdir())
     chain.feed(10.0, BUMP)
-    assert chain.watcher.close(60.0)
+    assert chain.watcher.close(60.0) == ''
     (folder,) = tmp_path.iterdir()
     assert folder == chain.watcher.folder
     entry = chain.watcher.entry()
@@ -125,7 +140,7 @@ def test_what_is_still_to_be_kept_is_kept_at_the_end(tmp_path: Path) -> None:
     chain.feed(8.0)
     chain.feed(6.0, BUMP)
     assert chain.watcher.watch.alarms == 1
-    assert chain.watcher.close(60.0)
+    assert chain.watcher.close(60.0) == ''
     assert chain.watcher.folder is not None
     assert 13.0 < read_observation(chain.watcher.folder).duration < 15.0
 
@@ -137,7 +152,7 @@ def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     chain.feed(8.0)
     chain.feed(6.0, BUMP)
     assert chain.watcher.watch.alarms == 1
-    assert chain.watcher.close(1.0)
+    assert chain.watcher.close(1.0) == ''
     assert chain.watcher.folder is None
     assert not list(tmp_path.iterdir())
     assert len(chain.said) == 1
@@ -150,7 +165,7 @@ def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     chain.load(0.0, 0.0, 0.0)
     chain.feed(8.0)
     chain.feed(6.0, BUMP)
-    assert chain.watcher.close(60.0)
+    assert chain.watcher.close(60.0) == ''
     assert not list(tmp_path.iterdir())
     assert 'disk_reserve' in chain.said[-1]
     assert 'disk_reserve' in chain.watcher.failure
@@ -200,7 +215,7 @@ def test_after_full_memory_what_is_kept_replays_as_the_run_computed_it(tmp_path:
     chain.feed(3.0)
     chain.feed(6.0, BUMP)
     assert chain.watcher.watch.alarms == 1
-    assert chain.watcher.close(60.0)
+    assert chain.watcher.close(60.0) == ''
     assert chain.watcher.folder is not None
     assert chain.watcher.held_bytes == 0
     recording = open_recording(chain.watcher.folder)
@@ -223,7 +238,7 @@ def an_alarm(chain: Chain) -> Path:
     chain.load(0.0, 0.0, 0.0)
     chain.feed(8.0)
     chain.feed(6.0, BUMP)
-    assert chain.watcher.close(60.0)
+    assert chain.watcher.close(60.0) == ''
     assert chain.watcher.folder is not None
     return chain.watcher.folder
 

@@ -4,14 +4,17 @@ A link is clamped in its frame ``link_base``; Z leads along it. ``mount`` places
 before, and the joint turns it there. At rest the tip is at (0, 0, L). The rig measures dX, dY and theta of
 the tip. The tilts of the tip come from the link as a beam, in one of two ways:
 
-- ``ratio``: phi = -k dY/L, omega = k dX/L with the rig file's slope ratio k. A force at the tip gives k = 3/2.
 - ``end_force``: a force at the end effector is all that loads the chain, and it has a lever on each tip. The force is
   found from all deflections by least squares; each residual counts by the strain energy that it stands for. With
   the moments M about X and Y at the tip, phi = -3/2 dY/L + Mx L/4EI and omega = 3/2 dX/L + My L/4EI
   (from dX = F L^3/3EI + M L^2/2EI and omega = F L^2/2EI + M L/EI).
+- ``ratio``: phi = -k dY/L, omega = k dX/L with the rig file's slope ratio k. A force at the tip gives k = 3/2.
 
 The poses are composed without approximation. The covariance is of first order: each tip's errors are carried to the
-end effector by the adjoint of what lies between (Barfoot, State Estimation for Robotics, 2017, 7.1).
+end effector by the adjoint of what lies between (Barfoot, State Estimation for Robotics, 2017, 7.1). It holds what the
+assumption may be wrong by, too: of ``ratio`` the tilts by the moments that a force at the end would have; of
+``end_force`` a share of these tilts, because a stiffness is not known exactly, and the tilts of moments that would
+explain what no force at the end does.
 """
 
 from __future__ import annotations
@@ -29,9 +32,16 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.link.statics import LinkStatics
 from psd_deflection.records import FloatArray
 
-SLOPES = ('ratio', 'end_force')
+SLOPES = ('end_force', 'ratio')
 FORCE_RATIO = 1.5
 """Slope ratio of a link under a force at its tip."""
+
+STIFFNESS_DOUBT = 0.05
+"""Share by which a link's bending stiffness may differ from the rig file's, one standard deviation."""
+UNEXPLAINED = 0.5
+"""Slope ratio of a moment less that of a force: a deflection that no force at the end explains is by a moment or by a
+force.
+"""
 
 _WEAKEST = 1e-9
 """A direction of the force that bends the chain less than this share of the strongest one is not seen."""
@@ -74,6 +84,7 @@ class EndEffector(NamedTuple):
 
     ``rigid``, ``deflected``: its pose in the base. ``deflection``: the deflected pose in the frame of the rigid one.
     ``covariance`` (6, 6): of position (m) and rotation (rad) about the fixed axes of that frame, as ROS orders them.
+    ``of_model`` (6, 6): that part of it which the assumption about the load leaves.
     ``tips``: the pose of each tip in its own rest frame. ``angles``: of the joints, rad.
     """
 
@@ -81,6 +92,7 @@ class EndEffector(NamedTuple):
     deflected: Transform
     deflection: Transform
     covariance: FloatArray
+    of_model: FloatArray
     tips: tuple[Transform, ...]
     angles: tuple[float, ...]
 
@@ -101,7 +113,7 @@ class Chain:
     Raises ConfigError if there is no link, two have one name, or ``slopes`` is unknown.
     """
 
-    def __init__(self, links: Sequence[ChainLink], end: Transform = IDENTITY, slopes: str = 'ratio') -> None:
+    def __init__(self, links: Sequence[ChainLink], end: Transform = IDENTITY, slopes: str = SLOPES[0]) -> None:
         if not links:
             raise ConfigError('a chain has at least one link')
         names = [link.name for link in links]
@@ -125,7 +137,8 @@ class Chain:
         if len(tips) != len(self.links):
             raise ValueError(f'{len(tips)} deflections for {len(self.links)} links')
         # (dX, dY, dZ, phi, omega, theta) of each tip, one below the other.
-        state = rest.tip_of_measured @ np.concatenate([tip.pose for tip in tips])
+        measured = np.concatenate([tip.pose for tip in tips])
+        state = rest.tip_of_measured @ measured
         state = state.reshape(-1, 6)
 
         # Forward: every frame in the base, as it is now.
@@ -163,7 +176,27 @@ class Chain:
                 per_ratio = np.array([-tip.pose[1], tip.pose[0]]) / link.length
                 by_ratio = carried[:, 6 * i + 3 : 6 * i + 5] @ per_ratio * link.slope_ratio_sd
                 covariance += np.outer(by_ratio, by_ratio)
-        return EndEffector(rest.end, deflected, deflection, covariance, tuple(poses), rest.angles)
+        of_model = self._of_model(rest, measured, carried)
+        return EndEffector(rest.end, deflected, deflection, covariance + of_model, of_model, tuple(poses), rest.angles)
+
+    def _of_model(self, rest: _Rest, measured: FloatArray, carried: FloatArray) -> FloatArray:
+        """(6, 6): covariance of what the assumption about the load leaves.
+
+        ``measured`` (3N,); ``carried`` (6, 6N): what a small change of each tip does to the end effector.
+        """
+        count = len(self.links)
+        # Of the tilts (phi, omega) alone.
+        carried = carried.reshape(6, count, 6)[:, :, 3:5]
+        by_moment = carried * (rest.tilt_of_moment @ measured).reshape(count, 2)
+        if self.slopes == 'ratio':
+            # One load makes all of them.
+            wrong = by_moment.reshape(6, -1) @ np.ones((2 * count, 1))
+        else:
+            left = (rest.unexplained @ measured).reshape(count, 3)[:, 1::-1]
+            lengths = np.array([[link.length] for link in self.links])
+            doubted = STIFFNESS_DOUBT * (by_moment @ np.ones(2))
+            wrong = np.hstack((doubted, (carried * (UNEXPLAINED * left / lengths)).reshape(6, -1)))
+        return np.asarray(wrong @ wrong.T, np.float64)
 
     def tips_under(self, force: FloatArray, angles: Sequence[float] | None = None) -> FloatArray:
         """(N, 3): dX, dY, theta of each tip under ``force`` (3,), N in the base, at the end effector; to first order.
@@ -203,11 +236,18 @@ class _Rest:
         for i, link in enumerate(chain.links):
             ratio = link.slope_ratio if chain.slopes == 'ratio' else FORCE_RATIO
             self.tip_of_measured[6 * i : 6 * i + 6, 3 * i : 3 * i + 3] = _tip_of_own(ratio / link.length)
+        force_of_measured = self._force_of_measured(chain.links)
+        # (2N, 3N): phi and omega of each tip by the moments there. (3N, 3N): what no force at the end explains.
+        self.tilt_of_moment = np.vstack(
+            [
+                link.length / (4.0 * link.statics.bending_stiffness) * load[3:] @ force_of_measured
+                for link, load in zip(chain.links, loads, strict=True)
+            ]
+        )
+        self.unexplained = np.eye(3 * len(tips)) - self.measured_of_force @ force_of_measured
         if chain.slopes == 'end_force':
-            force_of_measured = self._force_of_measured(chain.links)
-            for i, (link, load) in enumerate(zip(chain.links, loads, strict=True)):
-                per_moment = link.length / (4.0 * link.statics.bending_stiffness)
-                self.tip_of_measured[6 * i + 3 : 6 * i + 5] += per_moment * load[3:] @ force_of_measured
+            for i in range(len(tips)):
+                self.tip_of_measured[6 * i + 3 : 6 * i + 5] += self.tilt_of_moment[2 * i : 2 * i + 2]
 
     def _force_of_measured(self, links: Sequence[ChainLink]) -> FloatArray:
         """(3, 3N): the force at the end effector of all deflections, by least squares in strain energy."""

@@ -2,7 +2,7 @@
 
 ::
 
-    slopes: end_force                # or ratio (the default)
+    slopes: end_force                # the default, or ratio
     base_frame: base_link
     frame_prefix: left_              # before the name of each frame
     links:

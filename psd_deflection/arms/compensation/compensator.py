@@ -110,6 +110,8 @@ class Compensator:
         self._joints: FloatArray | None = None
         self._joints_t = -math.inf
         self._last_move = self._offsets
+        # What the offsets were when positions of the joints, and when the applied offsets came last.
+        self._at_joints = self._at_applied = self._offsets
         # Output of commands: where the joints would be without offsets.
         self._pose: FloatArray | None = None
         self._applied: FloatArray | None = None
@@ -117,6 +119,7 @@ class Compensator:
         self._anchor: tuple[FloatArray, FloatArray] | None = None
         self._away_t: float | None = None
         self._stop = self._broken = ''
+        self._rival = False
         self._last: Observed | None = None
         self._last_now = -math.inf
         self._good = settings.good
@@ -151,16 +154,20 @@ class Compensator:
         self._broken = ''
         self._anchor = self._away_t = self._held_t = None
 
-    def stop(self, why: str) -> None:
-        """Hold for as long as ``why`` is not '': the robot does not run, or somebody else commands it."""
+    def stop(self, why: str, *, rival: bool = False) -> None:
+        """Hold for as long as ``why`` is not '': the robot does not run, or, with ``rival``, somebody else commands it.
+
+        While a rival does, offsets that the controller still has after we fell silent are not taken back either.
+        """
         if self._stop and not why and self._fault == self._stop:
             # That is over. What it waits for now is what comes next, or does not come.
             self._fault = AWAITED
-        self._stop = why
+        self._stop, self._rival = why, rival
 
     def applied(self, now: float, offsets: FloatArray) -> None:
         """The offsets that the controller says it applies: where ours begin when they are enabled."""
         self._applied, self._applied_t = np.array(offsets, dtype=np.float64), now
+        self._at_applied = self._offsets
 
     def joints(self, now: float, positions: FloatArray, age: float = 0.0) -> None:
         """Where the joints are, offsets included unless ``dry``, in the order of the arm; ``age``, s, of the positions.
@@ -172,6 +179,7 @@ class Compensator:
         seen = np.array(positions, dtype=np.float64)
         before, then = self._joints, self._joints_t
         self._joints, self._joints_t = seen, now - max(age, 0.0)
+        self._at_joints = self._offsets
         if before is None:
             return
         move, settings = seen - before, self.settings
@@ -218,7 +226,7 @@ class Compensator:
         self._look(now)
         if not self._speaks and self.enabled:
             self._unready = '' if self._fault else self._begin(now)
-        elif not self._speaks and self._owed and not self._stop:
+        elif not self._speaks and self._owed and not self._rival:
             self._begin(now)
         self._give_up(now)
         elapsed = 0.0 if self._moved_t is None else min(max(now - self._moved_t, 0.0), LONGEST_S)
@@ -274,7 +282,7 @@ class Compensator:
             sent, then = self._sent
             if np.abs((offsets if pose is None else pose) - sent).max() > settings.max_rate * (now - then):
                 return 'the controller is elsewhere than it was sent last: the rate allows for it soon'
-        self._offsets = self._wanted = offsets
+        self._offsets = self._wanted = self._at_joints = self._at_applied = offsets
         self._pose, self._speaks, self._owed = pose, True, False
         self._anchor = self._away_t = self._held_t = None
         return ''
@@ -298,12 +306,12 @@ class Compensator:
         if self._sums:
             if self._pose is None or self._joints is None:
                 return ''
-            return self._away(now, self._pose + self._offsets, self._joints)
+            return self._away(now, self._pose + self._at_joints, self._joints)
         if self.settings.takeover and now - self._applied_t > self.settings.stale:
             # It may come back with none, so it hears nothing from us until it tells what it has.
             self._fall_silent()
             return UNTOLD
-        away = '' if self._applied is None else self._away(now, self._offsets, self._applied)
+        away = '' if self._applied is None else self._away(now, self._at_applied, self._applied)
         return away or self._stands_still()
 
     def _away(self, now: float, asked: FloatArray, seen: FloatArray) -> str:
@@ -328,9 +336,9 @@ class Compensator:
         if self._joints is None or self._broken or not self.enabled:
             return ''
         if self._anchor is None:
-            self._anchor = self._offsets, self._joints
+            self._anchor = self._at_joints, self._joints
         offsets, joints = self._anchor
-        sent = np.abs(self._offsets - offsets).max()
+        sent = np.abs(self._at_joints - offsets).max()
         if sent < self.settings.follow_error:
             return ''
         self._anchor = None

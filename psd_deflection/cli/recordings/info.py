@@ -36,7 +36,7 @@ from psd_deflection.cli._report import print_json, show
 from psd_deflection.recordings.provenance import NAMES
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import described, is_table
-from psd_deflection.recordings.recording import Span
+from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.summary import summary
 from psd_deflection.run.fleet.parquet import Field, ParquetFile
 
@@ -208,7 +208,7 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
     if (moved := found['vibration']) is not None:
         size, hz, share = moved['rms_m'] * 1e6, moved['hz'], moved['share']
         out.append(
-            row('vibrates', f'up to {size:.1f} um rms near {hz:.3g} Hz, in {100.0 * share:.3g} % of the seconds')
+            row('vibrates', f'up to {size:.1f} µm rms near {hz:.3g} Hz, in {100.0 * share:.3g} % of the seconds')
         )
     out.append(row('blocks', f'{found["blocks"]} of up to {found["block_size"]} samples'))
     return out

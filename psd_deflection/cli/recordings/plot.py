@@ -28,8 +28,9 @@ from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.formats.registry import endings_of_recordings
-from psd_deflection.recordings.recording import WHOLE, Recording, span_ns
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import open_for_replay, replayed, warnings_about_rig
+from psd_deflection.recordings.spans import WHOLE, span_ns
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,

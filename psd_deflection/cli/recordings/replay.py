@@ -5,13 +5,15 @@ With the recorded parameters (the default) the estimates are the published ones,
 both hold. If another version made the recording, rounding may differ: then a sentence says so, and
 the status is 0. --strict counts rounding too, and messages that only one side has. With --params-file
 you see what another rig would have estimated from the same samples. --watch says since when the rig
-is not its model.
+is not its model. --from and --to take a part: what comes before is computed too, because the estimates depend
+on it, so that the part is what it is in the whole.
 
 Of several recordings you get a table; REC may also be a pattern, or a .txt file that lists recordings and patterns.
 Then --out X.parquet takes the estimates of all.
 
   psd-deflection replay recordings/psd_20260101_120000 --compare
   psd-deflection replay run.csv --params-file my_rig.yaml --out estimates.csv
+  psd-deflection replay run.csv --from 1 --to 3 --out part.csv
   psd-deflection replay recordings/psd_20260101_120000 --out again.mcap
   psd-deflection replay 'recordings/*' --executor processes --out all.parquet
 """
@@ -21,6 +23,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
@@ -30,24 +33,43 @@ from typing import Any
 import numpy as np
 
 from psd_deflection.base.errors import UsageError
+from psd_deflection.base.log import texts
 from psd_deflection.base.tables import Column
 from psd_deflection.cli._fleet import absolute, executor_option, recordings_argument, run_each, several, tell_each
-from psd_deflection.cli._options import namespace_option, recording_name, refuse
+from psd_deflection.cli._options import (
+    given_as_option,
+    namespace_option,
+    parameter_option,
+    recording_name,
+    refuse,
+    span_options,
+)
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, show_text, warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.formats.format import Sink
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.recordings.replay.comparison import ReplayComparison
-from psd_deflection.recordings.replay.engine import GatheredEstimates, open_for_replay, replayed, warnings_about_rig
+from psd_deflection.recordings.replay.engine import (
+    GatheredEstimates,
+    open_for_replay,
+    part_of,
+    replayed,
+    warnings_about_rig,
+)
 from psd_deflection.recordings.replay.watched import WatchedReplay
+from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.write.sinks import open_sink
-from psd_deflection.records import DeflectionEstimate, Record, SampleBlock
+from psd_deflection.records import DeflectionEstimate, Record, SampleBlock, SpotMeans
 from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.alarm_out import AlarmOut
 from psd_deflection.run.fleet.parquet import ENDING, Field, ParquetFile, is_parquet
+from psd_deflection.studies.watch.result import WatchedRun
 
 DIFFERS = 1
+END_S = 60.0
+"""How long the end waits for alarms to be handed on."""
 HEAD = ('state', 'seconds', 'samples', 'lost', 'blocks', 'estimates', 'refused')
 
 
@@ -76,6 +98,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--watch', action='store_true', help='test whether the rig stays its model, as the node does with watch: on'
     )
+    parameter_option(parser, '--watch-command', 'watch_command')
+    parameter_option(parser, '--watch-webhook', 'watch_webhook')
+    span_options(parser)
     namespace_option(parser)
     executor_option(parser)
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
@@ -93,6 +118,8 @@ class Totals:
     first_ns: int = 0
     last_ns: int = 0
     poses: list[tuple[float, float, float]] = field(default_factory=list)
+    refused: Counter[str] = field(default_factory=Counter)
+    _estimated: int | None = None
 
     def add(self, record: Record) -> None:
         """Count one record."""
@@ -104,6 +131,10 @@ class Totals:
             self.last_seq, self.last_ns = int(record.seq[-1]), int(record.t_ns[-1])
         elif isinstance(record, DeflectionEstimate) and record.primary:
             self.poses.append((record.dx, record.dy, record.theta))
+            self._estimated = record.block
+        elif isinstance(record, SpotMeans) and record.index != self._estimated:
+            # The estimate of a block comes before its means.
+            self.refused[record.status.name.lower()] += 1
 
     @property
     def seconds(self) -> float:
@@ -130,13 +161,12 @@ class ReplayTask:
 
     def summary(self) -> dict[str, object]:
         """What came out, for programs."""
-        counters = self.pipeline.counters
         return {
             'samples': self.totals.samples,
             'lost': self.totals.lost,
             'blocks': self.totals.blocks,
-            'estimates': counters.estimates,
-            'refused': counters.refused,
+            'estimates': len(self.totals.poses),
+            'refused': dict(self.totals.refused),
             'solver': self.rig.estimator.solver,
             'seconds': self.totals.seconds,
             'compared': None if self.comparison is None else self.comparison.counts(),
@@ -147,6 +177,8 @@ def run(args: argparse.Namespace) -> int:
     """Replay."""
     if not args.compare:
         refuse(args, {'strict': False}, 'needs --compare')
+    if not args.watch:
+        refuse(args, {'watch_command': None, 'watch_webhook': None}, 'needs --watch')
     names = several(args)
     if names is not None:
         refuse(args, {'watch': False}, 'is for one recording')
@@ -154,24 +186,28 @@ def run(args: argparse.Namespace) -> int:
     path = args.recordings[0]
     recording, rig = open_for_replay(path, args.params_file, args.namespace)
     with told('looking for what was recorded', quiet=args.json):
-        comparison = ReplayComparison(recording) if args.compare else None
+        part = part_of(recording, args.span)
+        comparison = ReplayComparison(recording, part) if args.compare else None
     sink: Sink | None = None
     if args.out is not None:
         sink = open_sink(args.out, rig.flat(), device_hello=recording.hello)
-    watched = WatchedReplay(rig, recording) if args.watch else None
+    out = _alarm_out(args, recording)
+    watched = WatchedReplay(rig, recording, out.put, part) if args.watch else None
     takers = [taker.put for taker in (sink, watched) if taker is not None]
     bar = progress_of(recording.blocks(), quiet=args.json)
     try:
-        done = _replayed(recording, rig, args.params_file, comparison, takers, bar)
+        done = _replayed(recording, rig, args.params_file, comparison, takers, bar, part)
     finally:
         bar.close()
         if sink is not None:
             sink.close()
+        if not out.close(END_S):
+            warn(f'alarms: not all handed on within {END_S:g} s')
     for warning in done.warnings:
         warn(warning)
     _print_summary(args, done)
     if watched is not None:
-        show(*watched.said(done.totals.first_ns), aside=args.json)
+        show(*_watch_lines(watched, done.totals.first_ns), aside=args.json)
     if comparison is None:
         return 0
     text = comparison.summary()
@@ -183,6 +219,18 @@ def run(args: argparse.Namespace) -> int:
     return 0 if _agrees(comparison.counts(), args.strict) else DIFFERS
 
 
+def _watch_lines(watched: WatchedReplay, first_ns: int) -> list[str]:
+    found = WatchedRun(tuple(watched.alarms), str(watched.watch.state), first_ns, {})
+    return [f'  watch: {sentence}' for sentence in found.sentences()]
+
+
+def _alarm_out(args: argparse.Namespace, recording: Recording) -> AlarmOut:
+    """Where alarms go. What the recording's own rig names is not run: the file may be a stranger's."""
+    about = {'recording': str(recording.path)}
+    with given_as_option('watch_command', 'watch_webhook'):
+        return AlarmOut(args.watch_command or '', args.watch_webhook or '', texts(warn), about)
+
+
 def _replayed(
     recording: Recording,
     rig: Rig,
@@ -190,11 +238,12 @@ def _replayed(
     comparison: ReplayComparison | None,
     takers: Iterable[Callable[[Record], None]],
     blocks: Iterable[SampleBlock] | None = None,
+    part: RecordingWindow | None = None,
 ) -> ReplayTask:
-    """Every record to each of ``takers``; ``comparison`` is finished."""
+    """Every record of ``part`` to each of ``takers``; ``comparison`` is finished."""
     pipeline, totals = Pipeline(rig), Totals(recording)
     began = time.perf_counter()
-    for records in replayed(recording, pipeline, blocks):
+    for records in replayed(recording, pipeline, blocks, part):
         for record in records:
             totals.add(record)
             for take in takers:
@@ -221,12 +270,15 @@ class Replayed:
     columns: list[Column]
 
 
-def replay_of(path: str, *, params_file: str | None, namespace: str | None, compare: bool, columns: bool) -> Replayed:
+def replay_of(
+    path: str, *, params_file: str | None, namespace: str | None, span: Span, compare: bool, columns: bool
+) -> Replayed:
     """The task for one of many recordings."""
     recording, rig = open_for_replay(path, params_file, namespace)
     gathered = GatheredEstimates()
-    comparison = ReplayComparison(recording) if compare else None
-    done = _replayed(recording, rig, params_file, comparison, [gathered.add] if columns else [])
+    part = part_of(recording, span)
+    comparison = ReplayComparison(recording, part) if compare else None
+    done = _replayed(recording, rig, params_file, comparison, [gathered.add] if columns else [], part=part)
     return Replayed(done.summary(), done.warnings, _columns(gathered.series()) if columns else [])
 
 
@@ -263,6 +315,7 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
             replay_of,
             params_file=absolute(args.params_file),
             namespace=args.namespace,
+            span=args.span,
             compare=args.compare,
             columns=args.out is not None,
         )
@@ -303,7 +356,7 @@ def _rate_warning(recording: Recording, rig: Rig) -> list[str]:
 
 
 def _print_summary(args: argparse.Namespace, done: ReplayTask) -> None:
-    totals, counters = done.totals, done.pipeline.counters
+    totals = done.totals
     path = args.recordings[0]
     poses = np.array(totals.poses).reshape(-1, 3)
     if args.json:
@@ -321,9 +374,9 @@ def _print_summary(args: argparse.Namespace, done: ReplayTask) -> None:
         return
     show(
         f'{path}: {totals.samples} samples, {totals.lost} lost, {totals.blocks} blocks, '
-        f'{counters.estimates} estimates ({done.rig.estimator.solver})'
+        f'{len(totals.poses)} estimates ({done.rig.estimator.solver})'
     )
-    for cause, count in sorted(counters.refused.items()):
+    for cause, count in sorted(totals.refused.items()):
         show(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
     if len(poses):
         low, high = poses.min(axis=0), poses.max(axis=0)

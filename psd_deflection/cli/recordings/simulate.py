@@ -1,4 +1,4 @@
-"""Simulate the rig: write a recording (--out), or act as a device on a pseudo-terminal (--serve).
+"""Simulate the rig: write a recording (--out), or act as a device (--serve).
 
 The rig file describes the rig and its known effects. --effect adds a hidden effect: the samples
 contain it, but the estimates do not correct for it and the recorded parameters do not list it.
@@ -11,6 +11,7 @@ given, and the true pose with --true-pose or, with noise, --reference-noise. A .
   psd-deflection simulate --out s.mcap --loads 'steps:0,0,0;0,-10,-5.85:2'
   psd-deflection simulate --out wired.csv --world 'psd_1.axes=[x, -y]'
   psd-deflection simulate --serve --link rig_port
+  psd-deflection simulate --serve socket://127.0.0.1:4000
 """
 
 from __future__ import annotations
@@ -91,7 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve or write."""
-    if args.serve:
+    if args.serve is not None:
         refuse(args, OF_A_RECORDING, 'is for a recording (--out), not for a device (--serve)')
         return serve.run_device(args)
     if args.out is None:

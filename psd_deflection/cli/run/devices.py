@@ -1,6 +1,7 @@
 """List the serial ports, find out which device is on each, and print parameters for it.
 
-Without PORT it tries every port that the system lists; a pseudo-terminal must be named. A port that
+Without PORT it tries every port that the system lists; a pseudo-terminal or a port of the network
+(socket://HOST:PORT, rfc2217://HOST:PORT, udp://HOST:PORT) must be named. A port that
 another program has open is listed but not tried. Exit status 5: a port that you named is missing, in
 use or cannot be opened.
 
@@ -16,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from psd_deflection.base.errors import DeviceError
+from psd_deflection.cli._options import given_as_option
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, show, show_text
 from psd_deflection.devices.device import Device
@@ -36,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     devices, refusals = known_devices()
     for refusal in refusals:
         show(f'psd-deflection devices: not asked for: {refusal}', aside=True)
-    with told('asking; a port that stays silent takes some seconds', quiet=args.json):
+    with told('asking; a port that stays silent takes some seconds', quiet=args.json), given_as_option():
         ports = survey(devices, args.ports)
     if args.json:
         print_json({'ports': [asdict(p) for p in ports], 'suggested': suggestions(devices, ports)}, indent=2)

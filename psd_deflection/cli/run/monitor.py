@@ -35,17 +35,19 @@ from psd_deflection.cli._options import (
     parameter_option,
     refuse,
     refuse_demo,
+    span_options,
 )
 from psd_deflection.cli._report import warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.replay.engine import open_for_replay, replayed, warnings_about_rig
+from psd_deflection.recordings.replay.engine import open_for_replay, part_of, replayed, warnings_about_rig
+from psd_deflection.recordings.spans import WHOLE
 from psd_deflection.records import Record
 from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.declarations import MONITOR
 from psd_deflection.run.headless import run_headless
 from psd_deflection.run.monitor.feed import Feed
-from psd_deflection.run.monitor.shown import ShownRecording
+from psd_deflection.run.monitor.shown_recording import ShownRecording
 from psd_deflection.run.monitor.start import need_server, start_views
 from psd_deflection.run.simulated_rig import simulates, started_early
 
@@ -81,6 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     play = parser.add_argument_group('a recording (with REC)')
     namespace_option(play)
+    span_options(play)
     play.add_argument(
         '--speed', type=plain_number, default=1, metavar='X', help='times as fast as recorded (default 1)'
     )
@@ -92,6 +95,8 @@ def _check(args: argparse.Namespace) -> None:
         raise UsageError(f'--speed {args.speed:g}: must be above 0')
     refuse_demo(args)
     if args.recording is None:
+        if args.span != WHOLE:
+            raise UsageError('--from and --to are for a recording: give REC')
         refuse(args, {'speed': 1.0, 'loop': False, 'namespace': None}, 'is for a recording: give REC')
     for name in ('port', 'baud', 'record', 'demo'):
         if args.recording is not None and getattr(args, name) not in (None, False):
@@ -116,6 +121,8 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     from psd_deflection.run.monitor.server import MonitorServer
 
     opened, rig = open_for_replay(args.recording, args.params_file, args.namespace)
+    part = part_of(opened, args.span)
+    shown_part = opened if part is None else part
     if args.params_file is None:
         # Where the page was served when it was recorded says nothing of today.
         rig = replace_values(rig, {p.name: p.default for p in MONITOR.parameters.values()})
@@ -126,7 +133,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
         recording = open_recording(args.recording, block_size=rig.estimator.block_size, namespace=args.namespace)
         pipeline = Pipeline(rig)
-        return pipeline, replayed(recording, pipeline)
+        return pipeline, replayed(recording, pipeline, part=part)
 
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -143,7 +150,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
 
     def find_span() -> tuple[int, int]:
         first = last = None
-        for block in opened.blocks():
+        for block in shown_part.blocks():
             first, last = first or block, block
         return (int(first.t_ns[0]), int(last.t_ns[-1])) if first is not None and last is not None else (0, 0)
 
@@ -154,7 +161,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         say,
         speed=args.speed,
         loop=args.loop,
-        inputs=[*opened.loads(), *opened.references(), *opened.marks()],
+        inputs=[*shown_part.loads(), *shown_part.references(), *shown_part.marks()],
         find_span=find_span,
     )
     server = MonitorServer(shown, feed, rig.monitor, display.say)

@@ -1,4 +1,4 @@
-"""``simulate --serve``: the simulated rig as a device on a pseudo-terminal, in real time."""
+"""``simulate --serve``: the simulated rig as a device on a pseudo-terminal or on the network, in real time."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import argparse
 import contextlib
 import shlex
 import sys
+from collections.abc import Sequence
 
-from psd_deflection.cli._options import given_as_option, in_the_world, number, whole
+from psd_deflection.cli._options import given_as_option, in_the_world, number, refuse, whole
 from psd_deflection.cli._program import program
 from psd_deflection.devices.device import PowerUp
 from psd_deflection.devices.pseudo_terminal import PORT_LINE, link_names, open_terminals
 from psd_deflection.devices.registry import SIMULATED
-from psd_deflection.devices.serve import Hand, serve_all, simulated_devices, stopped_by_signals
+from psd_deflection.devices.serve import Hand, HostSide, serve_all, simulated_devices, stopped_by_signals
+from psd_deflection.devices.served_sockets import open_sockets
 from psd_deflection.model.simulation.load_words import load_histories
 from psd_deflection.model.simulation.loads import CyclicLoads
 from psd_deflection.rig.config import load_rig
@@ -27,7 +29,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what --serve takes besides the rig."""
     group = parser.add_argument_group('as a device (--serve)')
     group.add_argument(
-        '--serve', action='store_true', help='act as a device on a pseudo-terminal in real time; print its port'
+        '--serve',
+        nargs='?',
+        const='',
+        metavar='WHERE',
+        help='act as a device in real time and print its port: on a pseudo-terminal, at socket://HOST:PORT (TCP; port '
+        '0: any), or by datagrams to udp://HOST:PORT',
     )
     group.add_argument(
         '--device',
@@ -64,10 +71,13 @@ def run_device(args: argparse.Namespace) -> int:
         with given_as_option():
             hand = Hand(CyclicLoads(load_histories(args.loads, rig.converter.sample_rate_hz, '--loads')))
     devices = simulated_devices(name, rig, args.seed, PowerUp(args.skew_ppm, args.first_seq), hand)
+    if args.serve:
+        refuse(args, {'link': None}, 'is for a pseudo-terminal: give --serve alone')
     links = link_names(args.link, len(devices))
     with contextlib.ExitStack() as stack:
-        with given_as_option():
-            ports = stack.enter_context(open_terminals(links))
+        ports: Sequence[HostSide]
+        with given_as_option('serve'):
+            ports = stack.enter_context(open_sockets(args.serve, len(devices)) if args.serve else open_terminals(links))
         names = ','.join(port.name for port in ports)
         print(f'{PORT_LINE}{names}', flush=True)
         source = '' if name == 'serial' else f' --source {name}'

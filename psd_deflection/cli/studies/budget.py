@@ -45,7 +45,6 @@ from psd_deflection.studies.budget.environment import averaging_gain
 from psd_deflection.studies.budget.estimate import METHODS
 from psd_deflection.studies.budget.evaluate import CAUSES
 from psd_deflection.studies.budget.inputs import INPUTS, read_inputs
-from psd_deflection.studies.budget.pictures import chart
 
 MAX_DRAWS = 10_000_000
 
@@ -115,7 +114,7 @@ def run(args: argparse.Namespace) -> int:
     if not chart_alone:
         return answer(args, found)
     print_answer(args, found)
-    save_figure(chart(found.budget), Path(args.out), dpi=150)
+    save_figure(found.plot(), Path(args.out), dpi=150)
     if not args.json:
         show('', args.out)
     return 0

@@ -10,6 +10,10 @@ then read is written as psd_N.dark and taken off every reading. Without REC that
 the room has changed.
 --self takes recordings without reference and loads: the one redundant reading tells relative gains and turns.
 
+--live calibrates at the bench: it starts a recording of the running daemon (`monitor`, `estimator --monitor`), shows
+what the motion so far has determined, what is open and what to do next, and ends when nothing is open, with
+`psd-deflection record stop` or with Ctrl-C; the answer is that of the recording.
+
 All REC together make one calibration. With --each every REC is one for itself: DIR/REC gets its files, or X.parquet a
 row. REC may then be a pattern, or a .txt file that lists recordings and patterns.
 
@@ -19,6 +23,7 @@ row. REC may then be a pattern, or a .txt file that lists recordings and pattern
   psd-deflection calibrate --dark off.csv --params-file new/rig.yaml --out b
   psd-deflection calibrate today.csv --check new/rig.yaml
   psd-deflection calibrate run --self --params-file my_rig.yaml --out new
+  psd-deflection calibrate --live --params-file my_rig.yaml --out new
   psd-deflection calibrate 'archive/*' --each --out calibrations.parquet
 """
 
@@ -35,6 +40,7 @@ from tqdm import tqdm
 
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError, UsageError
+from psd_deflection.cli._daemon import url_option
 from psd_deflection.cli._fleet import (
     ERROR,
     TaskResult,
@@ -44,11 +50,13 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import make_writable, namespace_option, number, span_options
+from psd_deflection.cli._options import make_writable, namespace_option, number, refuse, span_options
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
+from psd_deflection.cli.studies._calibrate_live import calibrate_live
 from psd_deflection.model.misalignment.rig import is_calibrated
 from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.recordings.spans import WHOLE
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.parameter_files import with_values
 from psd_deflection.run.fleet.parquet import Field
@@ -62,6 +70,7 @@ from psd_deflection.studies.calibrate.dark import (
 )
 from psd_deflection.studies.calibrate.fit import NAMES, REPORTED, UNITS
 from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions, read_runs
+from psd_deflection.studies.calibrate.result import Calibrated
 from psd_deflection.studies.study import described, edited_rig_file
 
 MOST_EXPOSURE = 0.02
@@ -104,6 +113,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--self', action='store_true', dest='alone', help='by the redundant reading alone, without reference and loads'
     )
+    parser.add_argument(
+        '--live', action='store_true', help='at the bench: record and calibrate with a running daemon, without REC'
+    )
+    url_option(parser)
     span_options(parser)
     namespace_option(parser)
     parser.add_argument('--quiet', action='store_true', help='no progress bar')
@@ -117,7 +130,21 @@ def _refuse_mixed(args: argparse.Namespace) -> None:
             f'--reference is given {len(args.reference)} times for {len(args.recordings)} recordings: '
             f'give one for each, in the same order'
         )
-    if not args.recordings and (args.check is not None or args.alone or args.each or not args.dark):
+    if args.live:
+        if args.recordings or args.span != WHOLE:
+            raise UsageError('REC, --from, --to: --live makes a recording of its own and takes all of it')
+        made: dict[str, object] = {
+            'check': None,
+            'each': False,
+            'executor': None,
+            'reference': [],
+            'dark': [],
+            'namespace': None,
+        }
+        refuse(args, made, 'is for recordings that are there: --live makes its own')
+    elif args.url is not None:
+        raise UsageError('--url: is for --live')
+    elif not args.recordings and (args.check is not None or args.alone or args.each or not args.dark):
         raise UsageError('REC is missing: a recording with a reference or with known loads; --dark alone needs none')
     if args.check is not None:
         others = (args.params_file, args.out, args.each or None, args.executor, args.dark or None)
@@ -143,10 +170,11 @@ def run(args: argparse.Namespace) -> int:
         tuple(args.dark),
         span=args.span,
     )
+    if args.live:
+        return _live(args, asked)
     names = each_for_itself(args)
     if names is not None:
         return _each(args, names, asked)
-    out = Path(args.out)
     rig = asked.rig(args.recordings or args.dark, warn)
     with told('reading', quiet=args.quiet or args.json):
         runs = asked.runs(args.recordings, rig)
@@ -164,6 +192,20 @@ def run(args: argparse.Namespace) -> int:
         found = asked.calibrated(runs, rig, levels, progress, warn)
         progress('report')
         files = found.files()
+    return _answer(args, found, files)
+
+
+def _live(args: argparse.Namespace, asked: CalibrationOptions) -> int:
+    if asked.params_file is not None:
+        load_rig(asked.params_file)
+    make_writable(args.out)
+    found = calibrate_live(args, asked)
+    return _answer(args, found, found.files())
+
+
+def _answer(args: argparse.Namespace, found: Calibrated, files: Mapping[str, str]) -> int:
+    """Write the files and say the answer."""
+    out = Path(args.out)
     save_all(files, out)
     if args.json:
         print(files[found.json_name].removesuffix('\n'))  # noqa: T201 - no control characters, long lines
@@ -266,7 +308,7 @@ def _check(args: argparse.Namespace) -> int:
     show(checking.sentence(found))
     worst = int(abs(found.zero / found.zero_sd).argmax())
     show(
-        f'unloaded readings against the file (um): {", ".join(f"{v * 1e6:+.1f}" for v in found.zero)} '
+        f'unloaded readings against the file (µm): {", ".join(f"{v * 1e6:+.1f}" for v in found.zero)} '
         f'± {found.zero_sd[worst] * 1e6:.1g}; ~/zero takes them anew'
     )
     return 0

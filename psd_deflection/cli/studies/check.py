@@ -37,8 +37,8 @@ from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import LONGEST_LINE, show
 from psd_deflection.cli.studies._answer import answer, answer_arguments
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.recording import WHOLE
 from psd_deflection.recordings.replay.engine import rig_at_end
+from psd_deflection.recordings.spans import WHOLE
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.run.guided import run_guided

@@ -3,17 +3,20 @@
 Without --params-file it recomputes Tables B1 and B2 of the thesis and explains every difference.
 With it, it prints the stiffness of the rig's link and searches for the placement of the two sensors
 with the smallest errors, inside the space that --radius, --keep-out and --box allow (m, in the
-frame link_tip).
+frame link_tip). With --splitter it asks instead whether two lasers over one beam splitter keep the
+three rules of the thesis (5.4), and simulates the failure of one, with the other beside it or as a cold spare.
 
   psd-deflection design
   psd-deflection design --params-file config/thesis_rig.yaml --out placement.png
   psd-deflection design --params-file config/thesis_rig.yaml --json
+  psd-deflection design --splitter 1e-3 1e-3 --allowed 1e-3
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,6 +33,7 @@ from psd_deflection.model.plate import placement
 from psd_deflection.model.plate.linear import condition_number, design_matrix
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.studies import splitter
 from psd_deflection.studies.budget.load import default_load
 from psd_deflection.studies.thesis import scaling
 
@@ -66,12 +70,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX'),
         help='sensor centres inside this box, m',
     )
+    parser.add_argument(
+        '--splitter', type=plain_number, nargs=2, metavar=('W', 'W'), help='powers of two lasers over one beam splitter'
+    )
+    parser.add_argument('--allowed', type=plain_number, metavar='W', help='power that one PSD is allowed to get')
+    parser.add_argument(
+        '--warm-up', type=plain_number, metavar='S', help='until a cold spare has its power, s (default 1)'
+    )
     parser.add_argument('--out', type=picture_name(*PICTURES), metavar='FILE.png|svg|pdf', help='draw the placements')
     parser.add_argument('--json', action='store_true', help='print link and placements as JSON in SI units')
 
 
 def run(args: argparse.Namespace) -> int:
     """Print the tables or the study."""
+    if args.splitter is not None:
+        return splitter_of(args)
+    refuse(args, {'allowed': None, 'warm_up': None}, 'is of two lasers: give --splitter W W')
     if args.params_file is None:
         placing = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None, 'json': False}
         refuse(args, placing, 'is for the placement of a rig: give --params-file RIG.yaml')
@@ -105,6 +119,50 @@ def run(args: argparse.Namespace) -> int:
     if args.out is not None:
         show('', args.out)
     return 0
+
+
+# ---- Two lasers over one beam splitter ----
+
+
+def splitter_of(args: argparse.Namespace) -> int:
+    """Print the rules and the simulation; 1 if a rule is broken."""
+    of_placements = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None}
+    refuse(args, of_placements, 'is for the placement of a rig, not for --splitter')
+    if args.allowed is None:
+        raise UsageError('--splitter: give --allowed W too, the power that one PSD is allowed to get')
+    rig = load_rig(args.params_file)
+    with given_as_option('splitter', 'allowed', 'warm_up'):
+        warm_up = {} if args.warm_up is None else {'warm_up': args.warm_up}
+        lasers = splitter.Lasers(tuple(args.splitter), args.allowed, **warm_up)
+    rules = splitter.rules(rig, lasers)
+    phases = splitter.simulated(rig, lasers)
+    if args.json:
+        shown = [{**p._asdict(), 'status': p.status.name, 'deviations': p.deviations.tolist()} for p in phases]
+        print_json({'rules': [rule._asdict() for rule in rules], 'phases': shown})
+    else:
+        show_text(rules_text(rules))
+        show()
+        show_text(phases_text(phases))
+    return 0 if all(rule.kept for rule in rules) else 1
+
+
+def rules_text(rules: Sequence[splitter.SplitterRule]) -> str:
+    """A row for each rule."""
+    rows = [['rule', 'is', 'limit', 'unit', 'kept']]
+    for rule in rules:
+        rows.append([rule.words, f'{rule.value:.4g}', f'{rule.limit:.4g}', rule.unit, 'yes' if rule.kept else 'NO'])
+    return columns(rows)
+
+
+def phases_text(phases: Sequence[splitter.LightPhase]) -> str:
+    """A row for each phase of the simulation, and what is said in it."""
+    rows = [['simulated', 'blocks with an estimate', 'ΔX ± µm', 'ΔY ± µm', 'θ ± mdeg', 'largest error, in ±']]
+    for p in phases:
+        sds = (p.deviations * np.array([1e6, 1e6, math.degrees(1e3)])).tolist()
+        numbers = [f'{v:.3f}' for v in sds] if p.estimates else ['–'] * 3
+        rows.append([p.name, f'{p.estimates:.0%}', *numbers, f'{p.largest:.1f}' if p.estimates else '–'])
+    said = [f'{p.name}: {p.said}' for p in phases if p.said]
+    return '\n'.join([columns(rows), *(['', *said] if said else [])])
 
 
 # ---- Appendix B ----

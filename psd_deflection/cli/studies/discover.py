@@ -14,6 +14,9 @@ With --next, DIR also gets next_loads.csv: the loads of the recording that best 
 explain these recordings equally well; simulate --loads takes it. With --run that recording is made on the
 simulated rig and searched, and so on, until the answer is unique or no recording within the limits would help.
 
+With --isolable LOADS nothing is recorded: it says which effects a recording of the rig under these loads could tell
+apart, each from which size on, and what imitates it. LOADS are words as in simulate --loads.
+
 REC may also be a table of readings: a .csv with one row for each load that was hung on the link, and no times. Such
 tables have no set-up check, law or --next.
 
@@ -24,6 +27,7 @@ X.parquet a row. REC may then be a pattern, or a .txt file that lists recordings
   psd-deflection discover a.csv b.csv --params-file my_rig.yaml --out found
   psd-deflection discover odd.csv --out found --next --limit lengths=0.4,0.5
   psd-deflection discover 'archive/*' --each --executor processes --out found
+  psd-deflection discover --isolable thesis:1 --out before
 """
 
 from __future__ import annotations
@@ -49,17 +53,19 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import make_writable, namespace_option, refuse, seed, span_options
+from psd_deflection.cli._options import given_as_option, make_writable, namespace_option, refuse, seed, span_options
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save_all, show, warn
 from psd_deflection.cli.studies._answer import print_answer
 from psd_deflection.model.simulation.catalogue import effect_folders, effect_names
-from psd_deflection.recordings.recording import WHOLE
+from psd_deflection.model.simulation.load_words import load_history
+from psd_deflection.recordings.spans import WHOLE
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.fleet.parquet import Field
 from psd_deflection.studies.discover.conclusion import adopting_folder
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.from_recordings import DiscoverOptions
+from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import Settled, planned, settle
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
@@ -91,7 +97,7 @@ HEAD = ('verdict', 'effects', 'gap before (um)', 'after', 'floor')
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    recordings_argument(parser, 'recordings, or .yaml lists of them')
+    recordings_argument(parser, 'recordings, or .yaml lists of them', nargs='*')
     parser.add_argument(
         '--params-file', metavar='RIG.yaml', help='the rig as it is known (default: the parameters in the recording)'
     )
@@ -106,6 +112,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='append',
         default=[],
         help='do not consider this effect; repeatable',
+    )
+    parser.add_argument(
+        '--isolable', metavar='LOADS', help='without REC: which effects a recording under these loads could tell apart'
     )
     parser.add_argument(
         '--adopt',
@@ -123,6 +132,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, discover, write, and say it in a sentence."""
     asked = _options(args)
+    if args.isolable is not None:
+        return _before(args, asked)
+    if not args.recordings:
+        raise UsageError('REC: needed: one recording or several; --isolable LOADS needs none')
     names = each_for_itself(args)
     if names is not None:
         refuse(args, {'next': False}, 'is not for --each')
@@ -151,6 +164,24 @@ def run(args: argparse.Namespace) -> int:
         progress('report')
         files = found.files()
     return _answered(args, found, files, _hints(args, found))
+
+
+def _before(args: argparse.Namespace, asked: DiscoverOptions) -> int:
+    if args.recordings:
+        raise UsageError(f'{args.recordings[0]}: --isolable {args.isolable} needs no recording')
+    refuse(args, {'adopt': None, 'each': False, 'next': False, 'make_it': False, 'namespace': None}, 'needs a REC')
+    if args.span != WHOLE:
+        raise UsageError('--from, --to: need a REC')
+    rig = asked.rig() or load_rig()
+    with given_as_option():
+        loads = load_history(args.isolable, rig.converter.sample_rate_hz, '--isolable').loads
+    make_writable(args.out)
+    file = 'the thesis rig' if args.params_file is None else args.params_file
+    with _progress(args) as progress:
+        found = isolable(rig, loads, args.isolable, without=args.without, params_file=file, progress=progress)
+        progress('report')
+        files = found.files()
+    return _answered(args, found, files, [])
 
 
 def _options(args: argparse.Namespace) -> DiscoverOptions:

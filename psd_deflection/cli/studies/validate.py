@@ -2,13 +2,14 @@
 
 The reference is in the recording (topic /reference/deflection, CSV columns ref_dx, ref_dy, ref_theta), or in a
 file of its own: the table that `psd-deflection camera` writes, or another recording. The offset between
-the two clocks is found from the motion and told with its 95 % interval; --align removes it. Every solver that can
-solve the rig is compared: bias, scale, noise, largest difference. --out writes a page with pictures
+the two clocks is found from the motion and told with its 95 % interval; --align removes it. Bias, scale, noise and
+largest difference are those of the rig's solver; --solver adds another one, or all. --out writes a page with pictures
 and validate.json.
 
   psd-deflection validate recordings/run
   psd-deflection validate run.csv --reference camera.csv --align --out validated
   psd-deflection validate run.csv --params-file calibrated.yaml --json
+  psd-deflection validate run.csv --solver beam --solver wls
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ import argparse
 from psd_deflection.cli._options import number
 from psd_deflection.cli._progress import told
 from psd_deflection.cli.studies._answer import answer, answer_arguments, counted, opened_recording, recording_arguments
-from psd_deflection.studies.validate.from_recordings import read_validate
+from psd_deflection.model.solvers.registry import SOLVERS
+from psd_deflection.studies.validate.from_recordings import ALL, read_validate
 from psd_deflection.studies.validate.validate import validate
 
 
@@ -43,6 +45,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='S',
         help='time over which each reference is a mean, s: the exposure of a camera (default 0)',
     )
+    parser.add_argument(
+        '--solver',
+        action='append',
+        default=[],
+        choices=(*SOLVERS, ALL),
+        metavar='NAME',
+        help="compare this solver beside the rig's; repeatable; all: every one that can solve the rig",
+    )
     answer_arguments(parser, 'report.html and validate.json')
 
 
@@ -54,6 +64,7 @@ def run(args: argparse.Namespace) -> int:
         align=args.align,
         largest=args.max_offset,
         exposure=args.exposure,
+        solvers=args.solver,
         counted=counted(args),
     )
     with told('comparing', quiet=args.json):

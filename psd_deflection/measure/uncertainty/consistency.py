@@ -41,7 +41,7 @@ LASTING = 2.5
 """The same for the mean r of the last blocks, over the variance of one block. Hum of constant phase, which is in that
 variance, has at most 2."""
 
-_SLOWLY = 1.0 / 8.0
+SLOWLY = 1.0 / 8.0
 """Share of the newest block in that mean."""
 
 _MORE = 1.5
@@ -116,7 +116,7 @@ class Consistency:
         held = max(_FADE * self.held, r * r if contradict else 0.0)
         self.held = held if held > limit * variance else 0.0
         one_x, one_y = [1.0 / p if abs(p) > _UNSEEN else 0.0 for p in (ax, ay)]
-        self.mean += _SLOWLY * (r - self.mean)
+        self.mean += SLOWLY * (r - self.mean)
         square = self.mean * self.mean
         # Chance takes the mean of an r that lasts below the limit for some blocks.
         lasts = square * LIMIT > LASTING * limit * variance

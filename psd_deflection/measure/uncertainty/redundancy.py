@@ -9,7 +9,8 @@ wrong, it is wrong by e_i = Q_ii^-1 (Q r)_i (Baarda's data snooping, by pairs). 
 contradict each other with it and agree without it, and no other PSD could be blamed. It is then left out for a second:
 while the link rings, its readings may be right for a block. If several PSDs could be blamed, or none alone, the
 covariance is widened by what each would cause. One degree of freedom (``pose`` with three PSDs) tells no PSD from
-another: then each reading could be blamed.
+another: then each reading could be blamed. A residual that lasts is widened for at a smaller size than that of a single
+block, as with two PSDs.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.measure.uncertainty.block_fit import inverse
-from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck
+from psd_deflection.measure.uncertainty.consistency import LASTING, SLOWLY, ConsistencyCheck
 from psd_deflection.records import FloatArray
 
 CONTRADICTS, DOUBTFUL = 5.7330e-7, 0.01
@@ -42,8 +43,11 @@ _UNSEEN = 4e-4
 class Redundancy:
     """Checks the readings of block after block. It remembers who was wrong lately, and by how much."""
 
-    def __init__(self, psds: int, unknowns: int, by: Arithmetic = FIXED) -> None:
-        """``psds``: P. ``unknowns``: p; with as many readings or fewer nothing is redundant."""
+    def __init__(self, psds: int, unknowns: int, by: Arithmetic = FIXED, lasting: bool = False) -> None:
+        """``psds``: P. ``unknowns``: p; with as many readings or fewer nothing is redundant.
+
+        ``lasting``: whether a small residual that lasts widens, too.
+        """
         self._psds = psds
         self._by = by
         self.freedom = max(2 * psds - unknowns, 0)
@@ -56,6 +60,8 @@ class Redundancy:
         self._wrong = 0
         self._left = 0
         self._held = np.zeros(2 * psds)
+        self._lasts = lasting
+        self._mean, self._lasting = np.zeros(2 * psds), np.zeros(2 * psds)
 
     def agrees(self, residual: tuple[float, ...], slopes: FloatArray, covariance: FloatArray, times: float) -> bool:
         """Whether these readings agree with each other, and there are enough of them to tell; as :meth:`check`."""
@@ -99,6 +105,8 @@ class Redundancy:
         elif self._wrong:
             self._left -= 1
             self._wrong = self._wrong if self._left > 0 and agree_without(self._wrong) else 0
+        if self._lasts:
+            self._last(q, r, times)
         possible = self._possible(q, errors, suspects, chi_square, contradict and not self._wrong, times)
         if self._wrong:
             return ConsistencyCheck(chi_square, True, tuple(errors), none, self._wrong, self.freedom)
@@ -125,6 +133,17 @@ class Redundancy:
             errors += [x, y]
         return errors
 
+    def _last(self, q: FloatArray, r: FloatArray, times: float) -> None:
+        """Take the residual into the mean of the last blocks, and hold the errors of one that lasts."""
+        self._mean = self._mean + SLOWLY * (r - self._mean)
+        pull = self._by.einsum('ij,j->i', q, self._mean)
+        squares = np.zeros(len(r))
+        if self._by.sum(self._mean * pull, 0) > times * LASTING:
+            squares = np.square(self._errors(q, pull))
+        self._lasting = np.maximum(_FADE * self._lasting, squares)
+        if not (self._lasting * np.diag(q) > 1.0).any():
+            self._lasting = np.zeros(len(r))
+
     def _possible(
         self, q: FloatArray, errors: list[float], suspects: list[int], chi_square: float, hold: bool, times: float
     ) -> FloatArray:
@@ -139,18 +158,25 @@ class Redundancy:
             self._held = np.zeros(len(errors))
         # Both readings of a PSD may be wrong together: the sum of two outer products is at least half of theirs.
         together = 2.0 if self.freedom >= 3 else 1.0
-        return np.asarray(_MORE * np.sqrt(together * np.maximum(squares, self._held)))
+        return np.asarray(_MORE * np.sqrt(together * np.maximum(np.maximum(squares, self._held), self._lasting)))
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
-        return (float(self._wrong), float(self._left), *self._held.tolist())
+        more = (*self._mean.tolist(), *self._lasting.tolist()) if self._lasts else ()
+        return (float(self._wrong), float(self._left), *self._held.tolist(), *more)
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError if it is of another number of PSDs."""
-        wrong, left, *held = values
-        if len(held) != 2 * self._psds or not 0 <= wrong <= self._psds:
-            raise ValueError(f'the check of {self._psds} PSDs has {2 + 2 * self._psds} values, not {len(values)}')
-        self._wrong, self._left, self._held = int(wrong), int(left), np.array(held)
+        wrong, left, *arrays = values
+        many = 3 if self._lasts else 1
+        if len(arrays) != many * 2 * self._psds or not 0 <= wrong <= self._psds:
+            raise ValueError(
+                f'the check of {self._psds} PSDs has {2 + many * 2 * self._psds} values, not {len(values)}'
+            )
+        self._wrong, self._left = int(wrong), int(left)
+        self._held, *rest = np.reshape(arrays, (many, -1))
+        if rest:
+            self._mean, self._lasting = rest
 
 
 def survival(chi_square: float, freedom: int) -> float:

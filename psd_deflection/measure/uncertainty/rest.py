@@ -29,6 +29,6 @@ def why_moving(dots: FloatArray, noise: tuple[float, ...]) -> str:
     if beyond[worst] <= 1.0:
         return ''
     return (
-        f'the link moves: {dot_names(len(noise) // 2)[worst]} varied by {scatter[worst] * 1e6:.1f} um rms in the last '
-        f'{len(dots)} blocks, noise explains {noise[worst] ** 0.5 * 1e6:.1f} um; wait until it is at rest'
+        f'the link moves: {dot_names(len(noise) // 2)[worst]} varied by {scatter[worst] * 1e6:.1f} µm rms in the last '
+        f'{len(dots)} blocks, noise explains {noise[worst] ** 0.5 * 1e6:.1f} µm; wait until it is at rest'
     )

@@ -98,7 +98,8 @@ class SomePsds:
         lasting = rig.estimator.motion_memory == 'lasting'
         self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, poly, rest, by, lasting)
         # Of a plate whose tilt is not known, dots may contradict each other.
-        self._redundancy = Redundancy(len(at), 2 * len(at) if tilts == 'bounded' else rest.shape[1], by)
+        unknowns = 2 * len(at) if tilts == 'bounded' else rest.shape[1]
+        self._redundancy = Redundancy(len(at), unknowns, by, _lasts(rig))
 
     def set_noise(self, noise: StreamNoise) -> None:
         """Use their part of what is known of all readings."""
@@ -160,6 +161,7 @@ class StampedDots:
         ``tilts``: what the rig's solver says of the plate's tilts; it counts for more than two PSDs.
         """
         config = rig.estimator
+        self._rig = rig
         self.flat = flat
         by = self._by = ARITHMETICS[config.arithmetic]
         poly = config.block_fit == 'poly'
@@ -187,12 +189,11 @@ class StampedDots:
         self._fit.set_noise(self.noise.gamma)
         self._consistency = Consistency(self._by)
         self._suspect = Suspect(rig.centers, self._beams)
-        self._redundancy = None if slopes is None else Redundancy(len(rig.psds), slopes.shape[1], self._by)
+        self._redundancy = None if slopes is None else self._check_of(slopes)
         self._some: dict[tuple[int, ...], SomePsds] = {}
         self._told: dict[tuple[int, ...], tuple[float, ...]] = {}
         self.left_out: tuple[int, ...] = ()
         self.freedom = 1
-        self._rig = rig
         self._size = config.block_size
         self.vibrates = ''
         self.contradictions = 0
@@ -212,8 +213,12 @@ class StampedDots:
         self._suspect = Suspect(rig.centers, self._beams)
         self._consistency = Consistency(self._by)
         if slopes is not None:
-            self._redundancy = Redundancy(len(rig.psds), slopes.shape[1], self._by)
+            self._redundancy = self._check_of(slopes)
             self._some, self._told = {}, {}
+
+    def _check_of(self, slopes: FloatArray) -> Redundancy:
+        psds, unknowns = len(self._rig.psds), slopes.shape[1]
+        return Redundancy(psds, unknowns, self._by, _lasts(self._rig))
 
     @property
     def _left(self) -> Left | None:
@@ -446,7 +451,8 @@ class StampedDots:
         for name in values:
             if name.startswith(SOME):
                 kept = self._kept_of(name)
-                count = 3 + (2 + len(self._fit.state()) // len(self._beams)) * len(kept)
+                own = (6 if _lasts(self._rig) else 2) + len(self._fit.state()) // len(self._beams)
+                count = 3 + own * len(kept)
                 # They need the method that solves them, so that they begin when they are first asked for.
                 self._told[kept] = numbers(values, name, 'the fit of these PSDs', count) or ()
                 self._some.pop(kept, None)
@@ -457,6 +463,11 @@ class StampedDots:
         if len(kept) < 2 or max(kept) >= len(self._beams):
             raise ValueError(f'{name}: expected two or more of {len(self._beams)} PSDs')
         return kept
+
+
+def _lasts(rig: Rig) -> bool:
+    """Whether small contradictions of three and more PSDs are remembered."""
+    return rig.estimator.contradiction_memory == 'lasting'
 
 
 def _tones(values: tuple[float, ...], count: int) -> tuple[Tone, ...]:

@@ -154,4 +154,4 @@ def words_of(tones: tuple[Tone, ...], rate_hz: float) -> str:
 
 def _micrometres(size: float) -> str:
     value = size * 1e6
-    return f'{value:.0f} um' if value >= 9.95 else f'{value:.1f} um'
+    return f'{value:.0f} µm' if value >= 9.95 else f'{value:.1f} µm'

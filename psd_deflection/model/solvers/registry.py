@@ -106,7 +106,7 @@ def check_arrangement(rig: Rig) -> None:
 def check_live(name: str) -> None:
     """Raise ConfigError if ``name`` is for comparison only: its answer must not be ``/link_tip/deflection``.
 
-    Replay and ``compare-methods`` take it, and so does a live run's list ``solvers``, on a topic of its own.
+    Replay and ``thesis compare-methods`` take it, and so does a live run's list ``solvers``, on a topic of its own.
     """
     entry = SOLVERS.get(name)
     if entry is not None and entry.instead:

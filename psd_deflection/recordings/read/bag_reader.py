@@ -47,7 +47,7 @@ from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.allowance import Warnings
 from psd_deflection.recordings.read.clouds import CloudDecoder, joined_points
 from psd_deflection.recordings.read.mcap_reader import McapReader, RawMessage
-from psd_deflection.recordings.recording import Recording, from_json
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.write.bag_writer import (
     META_CHANGE,
     META_DROPPED,
@@ -101,8 +101,8 @@ class BagRecording(Recording):
         metadata: dict[str, dict[str, str]] = {}
         for source in self._sources:
             metadata.update(source.metadata)
-        self.parameters = from_json(metadata.get(META_PARAMETERS, {}))
-        self.hello = from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
+        self.parameters = _from_json(metadata.get(META_PARAMETERS, {}))
+        self.hello = _from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
         software = metadata.get(META_SOFTWARE, {})
         self.version, self.node = software.get('version', ''), software.get(META_NODE, '')
         self.made_with = metadata.get(META_MADE_WITH, {})
@@ -465,3 +465,14 @@ def _dropped(entry: Mapping[str, str]) -> tuple[int, int]:
     counts = [entry.get(name, '0') for name in ('samples', 'messages')]
     samples, messages = (int(c) if c.isascii() and c.isdecimal() and len(c) < 16 else 0 for c in counts)
     return samples, messages
+
+
+def _from_json(values: Mapping[str, str]) -> dict[str, Any]:
+    """Metadata values parsed as JSON; other values stay text."""
+    out: dict[str, Any] = {}
+    for key, text in values.items():
+        try:
+            out[key] = json.loads(text)
+        except (ValueError, RecursionError):
+            out[key] = text
+    return out

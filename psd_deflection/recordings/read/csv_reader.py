@@ -18,7 +18,8 @@ from psd_deflection.base.numbers import NUMBER
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.csv_rows import CsvRows, CsvTable
 from psd_deflection.recordings.read.mcap_reader import RawMessage
-from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.sample_table import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
 from psd_deflection.records import (
     MOST_PSDS,
     AppliedLoad,

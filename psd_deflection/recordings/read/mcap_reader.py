@@ -14,9 +14,6 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import BinaryIO, NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
-
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings.mcap_format import (
     MAGIC,
@@ -276,6 +273,10 @@ def _decompress(packed: bytes, compression: str, size: int) -> bytes:
         return packed
     if size == 0:
         return b''
+    # In a browser neither is there, and no chunk is read.
+    import lz4.frame  # type: ignore[import-untyped]
+    import zstandard
+
     try:
         if compression == 'zstd':
             declared = zstandard.frame_content_size(packed)

@@ -9,7 +9,8 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.recordings.formats.format import ReadOptions
 from psd_deflection.recordings.formats.registry import format_of_content, formats
-from psd_deflection.recordings.recording import WHOLE, Recording, Span
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.spans import WHOLE, Span
 
 MOST_NAMES = 1000
 """Names of a folder that are looked at for one that was meant."""

@@ -14,7 +14,8 @@ import numpy as np
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.numbers import plain_number
-from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN, Recording
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.sample_table import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
 from psd_deflection.records import FloatArray
 
 GRAVITY = 9.80665

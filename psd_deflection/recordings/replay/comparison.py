@@ -22,7 +22,7 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.measure.memory import WHOLE
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import differences, provenance
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.records import ParameterChange, Record
 from psd_deflection.rig.declarations import FRAME_PREFIX
 
@@ -51,13 +51,19 @@ class ReplayComparison:
     ``only_recorded``, ``only_replayed``: messages that the other side lacks. ``missing``: how many of them neither the
     edges of the recording nor a topic that it does not have explains.
 
-    Raises RecordingError if the recording holds no estimates to compare with.
+    ``part``: only what lies in this part of the recording is compared, by its stamps.
+
+    Raises RecordingError if the recording holds no estimates to compare with, or if ``part`` ends before it says what
+    the pipeline remembered when it began.
     """
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, part: RecordingWindow | None = None) -> None:
         topics = [t for t in recording.topics() if t not in _NOT_ESTIMATED]
         if not topics:
             raise RecordingError(f'{recording.path}: holds no estimates to compare with')
+        self._part = part
+        if part is not None:
+            _check_memory(recording, part)
         self.equal = 0
         self.different = 0
         self.rounded = 0
@@ -111,6 +117,8 @@ class ReplayComparison:
                     self._begin(record)
                 continue
             for topic, type_name, t_ns, fields in to_messages(record, self._frame_prefix):
+                if self._part is not None and not self._part.has(t_ns):
+                    continue
                 if topic in self._replayed:
                     self._types[topic] = type_name
                     self._replayed[topic].append((t_ns, cdr.encode(type_name, fields)))
@@ -226,7 +234,12 @@ class ReplayComparison:
                 self._ended = True
                 return
             topic, log_time, encoded = message
-            self._recorded[topic].append((_stamp(encoded, log_time), encoded))
+            stamp = _stamp(encoded, log_time)
+            if self._part is None or self._part.has(stamp):
+                self._recorded[topic].append((stamp, encoded))
+            elif log_time > self._part.end_ns + _LAG_NS:
+                self._ended = True
+                return
             if t_ns is not None and log_time > t_ns:
                 return
 
@@ -276,6 +289,18 @@ class ReplayComparison:
 
     def _worsen(self, name: str, difference: float) -> None:
         self._worst[name] = max(self._worst.get(name, 0.0), difference)
+
+
+def _check_memory(recording: Recording, part: RecordingWindow) -> None:
+    """Raise RecordingError if nothing of ``part`` can be compared, because the recording starts in mid-run."""
+    first = next(recording.blocks())
+    memory = recording.memory_from(first.index)
+    if memory is not None and memory.block > first.index and memory.t_ns >= part.end_ns:
+        told_s = (memory.t_ns - int(first.t_ns[0])) / 1e9
+        raise RecordingError(
+            f'{recording.path}: starts in mid-run and says {told_s:.1f} s after its first sample what the pipeline '
+            'remembers; nothing before that can be compared: give a later --to'
+        )
 
 
 def _stamp(encoded: bytes, log_time: int) -> int:

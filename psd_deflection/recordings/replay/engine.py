@@ -17,7 +17,8 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.recording import WHOLE, Recording, Span
+from psd_deflection.recordings.recording import Recording, RecordingWindow
+from psd_deflection.recordings.spans import WHOLE, Span
 from psd_deflection.recordings.summary import NO_PARAMETERS
 from psd_deflection.records import (
     ENVIRONMENT,
@@ -75,6 +76,11 @@ def open_for_replay(
     return recording, rig
 
 
+def part_of(recording: Recording, span: Span) -> RecordingWindow | None:
+    """The part of ``recording`` that is meant, None if that is the whole. Raises as :meth:`Recording.crop` does."""
+    return None if span == WHOLE else RecordingWindow(recording, *span)
+
+
 def check_psds(recording: Recording, rig: Rig) -> None:
     """Raise ConfigError if ``recording`` has samples of another number of PSDs than ``rig``."""
     if recording.psds != len(rig.psds):
@@ -84,17 +90,46 @@ def check_psds(recording: Recording, rig: Rig) -> None:
 
 
 def replayed(
-    recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock] | None = None
+    recording: Recording,
+    pipeline: Pipeline,
+    blocks: Iterable[SampleBlock] | None = None,
+    part: RecordingWindow | None = None,
 ) -> Iterator[list[Record]]:
     """The records of each step; each recorded change of parameters applies at its block.
 
-    ``blocks``: the recording's blocks, for a caller that counts them.
+    ``blocks``: the recording's blocks, for a caller that counts them. ``part`` of the recording: only its records, by
+    the middle of their block. What comes before it is computed all the same, because the estimates of a block depend
+    on the blocks before.
     """
+    steps = _steps(recording, pipeline, blocks, np.iinfo(np.int64).max if part is None else part.end_ns)
+    if part is None:
+        yield from steps
+        return
+    for records in steps:
+        yield [record for record in records if _is_in(part, record)]
+
+
+def _steps(
+    recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock] | None, end_ns: int
+) -> Iterator[list[Record]]:
+    """The records of each step, up to the first block that begins at ``end_ns`` or later."""
     beside = _BesideSamples(recording, pipeline)
     for block in recording.blocks() if blocks is None else blocks:
         yield from beside.until(block)
         yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
+        if block.t_ns[0] >= end_ns:
+            # The blocks of the part are complete, as they were in the run.
+            return
     yield list(pipeline.flush())
+
+
+def _is_in(part: RecordingWindow, record: Record) -> bool:
+    if isinstance(record, ParameterChange):
+        # What was changed before holds in it.
+        return record.t_ns < part.end_ns
+    if isinstance(record, SampleBlock):
+        return part.has((int(record.t_ns[0]) + int(record.t_ns[-1])) // 2)
+    return part.has(record.t_ns)
 
 
 class _BesideSamples:

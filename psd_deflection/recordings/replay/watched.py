@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from psd_deflection.measure.watch import Alarm, Watch
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.tip_load import TipLoads
-from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.recording import Recording, RecordingWindow
 from psd_deflection.records import ParameterChange, Record, SampleBlock
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.declarations import BY_NAME
 
 
 class WatchedReplay:
-    """Takes the records of a replay of ``recording`` with ``rig``. ``alarms``: all, the first first."""
+    """Takes the records of a replay of ``recording`` with ``rig``. ``alarms``: all, the first first.
 
-    def __init__(self, rig: Rig, recording: Recording) -> None:
+    ``raised``: gets each, as soon as it is sure. ``part``: what is given, if it is not the whole; its loads.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        recording: Recording,
+        raised: Callable[[Alarm], None] = lambda alarm: None,
+        part: RecordingWindow | None = None,
+    ) -> None:
         effects = effects_of_rig(rig) if rig.estimator.wrench == 'effects' else ()
         self.watch = Watch(rig, TipLoads(rig, effects).compliance)
         self.alarms: list[Alarm] = []
-        self._rig = rig
-        self._loads = recording.loads()[::-1]
+        self._rig, self._raised = rig, raised
+        self._loads = (recording if part is None else part).loads()[::-1]
 
     def put(self, record: Record) -> None:
         """One record."""
@@ -32,11 +43,7 @@ class WatchedReplay:
         if isinstance(record, SampleBlock):
             if self.watch.alarms > len(self.alarms) and self.watch.alarm is not None:
                 self.alarms.append(self.watch.alarm)
+                self._raised(self.watch.alarm)
             # As live: a load is noted between two blocks.
             while self._loads and self._loads[-1].t_ns <= record.t_ns[-1]:
                 self.watch.put(self._loads.pop())
-
-    def said(self, start_ns: int) -> list[str]:
-        """Each alarm, in s since ``start_ns``; or what was watched."""
-        lines = [f'  watch: since {(a.since_ns - start_ns) / 1e9:.1f} s: {a.words}' for a in self.alarms]
-        return lines or [f'  watch: the rig is its model; watched: {self.watch.state}']

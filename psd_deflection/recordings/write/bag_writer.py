@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import abc
 import contextlib
-import fcntl
 import json
 import os
 from collections.abc import Mapping
@@ -21,7 +20,7 @@ from typing import Any, BinaryIO, Self
 from msg_adapters import BY_NAME, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.base.files import HeldFolder, creating
+from psd_deflection.base.files import HeldFolder, creating, lock
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import provenance
 from psd_deflection.recordings.write.bag_metadata import (
@@ -141,7 +140,7 @@ class McapFile(_RecordSink):
         with creating(path), HeldFolder(path.parent) if folder is None else contextlib.nullcontext(folder) as held:
             self._stream = held.create(path.name)
             with contextlib.suppress(OSError):
-                fcntl.flock(self._stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock(self._stream)
             spool = self._spool = held.unnamed(f'.{path.name}.index')
         with self._guard():
             self._writer = McapWriter(self._stream, spool, library=f'psd_deflection {__version__}')

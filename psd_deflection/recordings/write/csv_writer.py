@@ -15,7 +15,7 @@ from typing import TextIO
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import creating
-from psd_deflection.recordings.recording import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
+from psd_deflection.recordings.sample_table import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
 from psd_deflection.records import (
     AppliedLoad,
     DeflectionEstimate,

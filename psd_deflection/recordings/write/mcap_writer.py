@@ -12,8 +12,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import BinaryIO
 
-import zstandard
-
 from psd_deflection.recordings.mcap_format import (
     MAGIC,
     MESSAGE_HEAD,
@@ -111,6 +109,8 @@ class McapWriter:
     def _end_chunk(self) -> None:
         if not self._indexes:
             return
+        import zstandard
+
         self._chunks += 1
         plain = bytes(self._chunk)
         chunk = Chunk(

@@ -119,6 +119,13 @@ def check_engine(word: str) -> str:
     raise UsageError(f'--executor {word}: must be {FORMS}')
 
 
+def _cores() -> int:
+    """Processors that this process may use; not every system tells."""
+    if hasattr(os, 'sched_getaffinity'):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 @contextlib.contextmanager
 def open_engine(word: str, tell: Callable[[str], None] = lambda _: None) -> Iterator[Engine]:
     """The engine of that name. At the end its processes have ended; a cluster of others is left as it is.
@@ -130,7 +137,7 @@ def open_engine(word: str, tell: Callable[[str], None] = lambda _: None) -> Iter
     if word == SERIAL:
         yield _Here()
     elif (processes := _PROCESSES.fullmatch(word)) is not None:
-        pool = _Processes(int(processes[1] or len(os.sched_getaffinity(0))))
+        pool = _Processes(int(processes[1] or _cores()))
         try:
             yield pool
         except BaseException:

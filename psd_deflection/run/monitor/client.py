@@ -109,6 +109,20 @@ async def messages(daemon: Daemon) -> AsyncGenerator[dict[str, Any], None]:
         raise _unreachable(daemon, error) from None
 
 
+def recording_of(daemon: Daemon) -> str | None:
+    """The folder that the daemon records into now, None if it does not record. Raises DaemonError."""
+    return asyncio.run(_recording_of(daemon))
+
+
+async def _recording_of(daemon: Daemon) -> str | None:
+    async with contextlib.aclosing(messages(daemon)) as told:
+        hello = (await anext(told)).get('hello')
+    if not isinstance(hello, dict):
+        raise DaemonError(f'{daemon.url}: no page of this program is there')
+    folder = hello.get('recording')
+    return folder if isinstance(folder, str) else None
+
+
 def _unreachable(daemon: Daemon, error: Exception) -> DaemonError:
     why = error.strerror if isinstance(error, OSError) and error.strerror else str(error) or 'no answer in time'
     return DaemonError(

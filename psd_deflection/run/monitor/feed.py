@@ -10,7 +10,9 @@ import math
 import queue
 from typing import NamedTuple, TypeGuard
 
+from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import (
+    RESTART,
     AppliedLoad,
     DeflectionEstimate,
     Mark,
@@ -50,10 +52,11 @@ COLUMNS = row_columns(2)
 
 
 class BlockResult(NamedTuple):
-    """One block's dots, and its primary estimate if it has one."""
+    """One block's dots, and its primary estimate if it has one. ``gone``: blocks before it of which no sample came."""
 
     spots: SpotMeans
     estimate: DeflectionEstimate | None
+    gone: int = 0
 
 
 Item = BlockResult | SampleBlock | AppliedLoad | Mark | ReferencePose | ParameterChange
@@ -69,6 +72,7 @@ class Feed:
         self.dropped = 0
         self._limit = limit
         self._estimate: DeflectionEstimate | None = None
+        self._index: int | None = None
         self._queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
 
     def put(self, record: Record) -> None:
@@ -78,9 +82,18 @@ class Feed:
                 self._estimate = record
         elif isinstance(record, SpotMeans):
             best, self._estimate = self._estimate, None
-            self._offer(BlockResult(record, best if best is not None and best.block == record.index else None))
+            last, self._index = self._index, record.index
+            gone = max(record.index - last - 1, 0) if last is not None else 0
+            self._offer(BlockResult(record, best if best is not None and best.block == record.index else None, gone))
         elif isinstance(record, SampleBlock | AppliedLoad | Mark | ReferencePose) or is_zero(record):
             self._offer(record)
+        elif isinstance(record, ParameterChange) and any(name == RESTART for name, _ in record.values):
+            # The numbers between belong to no sample.
+            self.skip()
+
+    def skip(self) -> None:
+        """What comes next does not follow on what came: no block between them is lost."""
+        self._index = None
 
     @property
     def waiting(self) -> int:
@@ -103,8 +116,13 @@ def is_zero(record: Record) -> TypeGuard[ParameterChange]:
     return isinstance(record, ParameterChange) and any(name in ZEROS for name, _ in record.values)
 
 
-def mark_json(record: AppliedLoad | Mark | ParameterChange) -> str:
-    """A load as ``[t, "load", fx, fy, tz]``, a mark ``[t, "mark", text]``, a zero ``[t, "zero"]``: s, N, N, N m."""
+def mark_json(record: AppliedLoad | Mark | ParameterChange | Alarm) -> str:
+    """A load as ``[t, "load", fx, fy, tz]``, a mark ``[t, "mark", text]``, a zero ``[t, "zero"]``: s, N, N, N m.
+
+    An alarm of the watch as ``[t, "alarm", words]``, at the time since which the rig is not its model.
+    """
+    if isinstance(record, Alarm):
+        return f'[{_seconds(record.since_ns)},"alarm",{json.dumps(record.words)}]'
     if isinstance(record, Mark):
         return f'[{_seconds(record.t_ns)},"mark",{json.dumps(record.text)}]'
     if isinstance(record, AppliedLoad):
@@ -124,7 +142,7 @@ def _seconds(t_ns: int) -> str:
 
 def row_json(result: BlockResult) -> str:
     """One row in the order of :func:`row_columns`, as JSON; null for missing numbers."""
-    spots, estimate = result
+    spots, estimate, _ = result
     values: list[float] = [*spots.dots, *spots.sums]
     if estimate is not None:
         values += [*estimate.pose, *(math.sqrt(max(v, 0.0)) for v in estimate.variances)]

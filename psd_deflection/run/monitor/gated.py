@@ -1,9 +1,9 @@
 """A web server in a thread of its own, with the gate that every view of the daemon has.
 
-A request must name this machine, and one that opens a websocket or changes something must come from a page that may
-(:mod:`.access`). The number of viewers and of connections is bounded; a viewer that does not read is dropped after
-``HEARTBEAT_S``; nothing waits for one. The end takes less than a second. A bad request gets an error response, never
-a traceback in the log.
+A request must name this machine, and one that opens a websocket, asks for data or changes something must come from a
+page that may (:mod:`.access`). The number of viewers and of connections is bounded; a viewer that does not read is
+dropped after ``HEARTBEAT_S``; nothing waits for one. The end takes less than a second. A bad request gets an error
+response, never a traceback in the log.
 """
 
 from __future__ import annotations
@@ -206,7 +206,8 @@ class GatedServer(abc.ABC):
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         if not access.is_own_host(request.headers.get('Host', ''), self._address):
             return web.Response(status=403, text='this is not the name of this machine')
-        if (request.method != 'GET' or request.path == self.websocket_path) and not self._may(request):
+        asks = request.method != 'GET' or request.path == self.websocket_path or request.path.startswith('/api/')
+        if asks and not self._may(request):
             return web.Response(status=403, text='refused: asked for by another site')
         if 'Content-Encoding' in request.headers:
             return web.Response(status=415, text='refused: a body must not be encoded')

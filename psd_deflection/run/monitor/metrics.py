@@ -39,6 +39,11 @@ def counter(name: str, about: str, value: float) -> Family:
     return Family(name, 'counter', about, (({}, value),))
 
 
+def memory(name: str, about: str, size: int) -> Family:
+    """What something takes, bytes."""
+    return Family(name, 'gauge', about, (({}, size),), 'bytes')
+
+
 def counters(name: str, label: str, about: str, values: Mapping[str, int]) -> Family:
     """Counts since the start of the run, by ``label``."""
     return Family(name, 'counter', about, tuple(({label: word}, count) for word, count in sorted(values.items())))

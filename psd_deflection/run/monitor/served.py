@@ -13,7 +13,7 @@ import os
 from pathlib import Path
 from typing import NamedTuple
 
-from psd_deflection.run.zero_store import state_folder
+from psd_deflection.run.state import state_folder
 
 MAX_BYTES = 10_000
 
@@ -39,7 +39,9 @@ def announce(page: Served) -> Path | None:
         path.parent.mkdir(parents=True, exist_ok=True)
         # Left by a process that had the same number.
         path.unlink(missing_ok=True)
-        with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600), 'w') as stream:
+        with os.fdopen(
+            os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, 'O_CLOEXEC', 0), 0o600), 'w'
+        ) as stream:
             json.dump(page._asdict(), stream)
     except (OSError, RuntimeError):
         # RuntimeError: a user without a home folder.
@@ -66,7 +68,9 @@ def _read(path: Path) -> Served | None:
         with path.open('rb') as stream:
             kept = json.loads(stream.read(MAX_BYTES))
         page = Served(str(kept['url']), str(kept['token']), str(kept['name']), int(kept['pid']))
-        os.kill(page.pid, 0)
+        if os.name == 'posix':
+            # Elsewhere 0 is no question but Ctrl-C.
+            os.kill(page.pid, 0)
     except ProcessLookupError:
         withdraw(path)
         return None

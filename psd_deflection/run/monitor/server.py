@@ -1,9 +1,9 @@
 """The page's own thread: an aiohttp server with the page, a websocket and two buttons.
 
-All its buffers have a fixed size: the rows of the last minute, the last messages, one cursor per
-browser. A browser gets new rows once its last message has been sent. If it is too slow it misses rows
-(its traces have gaps), and nothing waits for it. A bad request gets an error response, never a
-traceback in the log. Idle connections are closed before they use up the daemon's file descriptors.
+All its buffers have a fixed size: the rows of the last minute, the cells of the last days (:mod:`.history`), the last
+messages, one cursor per browser. A browser gets new rows once its last message has been sent. If it is too slow it
+misses rows (its traces have gaps), and nothing waits for it. A bad request gets an error response, never a traceback
+in the log. Idle connections are closed before they use up the daemon's file descriptors.
 """
 
 from __future__ import annotations
@@ -22,15 +22,30 @@ from typing import Any
 from aiohttp import web
 
 from psd_deflection import __version__
+from psd_deflection.base import page_files
 from psd_deflection.base.log import INFO, Say
-from psd_deflection.records import BlockStatus, DiagnosticReport, ReferencePose, SampleBlock
+from psd_deflection.measure.watch import Alarm
+from psd_deflection.records import (
+    AppliedLoad,
+    BlockStatus,
+    DiagnosticReport,
+    FloatArray,
+    Mark,
+    ParameterChange,
+    ReferencePose,
+    SampleBlock,
+)
 from psd_deflection.rig.running import MonitorConfig
 from psd_deflection.run.monitor import access, metrics
+from psd_deflection.run.monitor.calibrating import PageCalibration
 from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, reference_json, row_columns, row_json
 from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer
+from psd_deflection.run.monitor.history import AskedError, History, asked
+from psd_deflection.run.monitor.kept_history import HistoryKeeper
 from psd_deflection.run.monitor.served import MAX_AGO_S, SINCE_STEP, Served, announce, withdraw
 from psd_deflection.run.monitor.shown import RefusedError, Shown
-from psd_deflection.run.monitor.spectrum import Spectrum, density_json
+from psd_deflection.run.monitor.spectrum import Spectrum, density_json, line_entry
+from psd_deflection.run.recorder import new_folder
 
 PAGE = Path(__file__).parent / 'page'
 TOKEN_VARIABLE = 'PSD_DEFLECTION_MONITOR_TOKEN'
@@ -40,6 +55,7 @@ PUMP_S = 0.03
 SPECTRUM_EVERY_S = 0.5
 HEALTH_S = 0.9
 HISTORY_S = 60.0
+KEEP_EVERY_S, RESTORE_S = 60.0, 0.1
 FRESH_S = 2.0
 """A block that came longer ago, s, is in no metrics: the device is away, and a scrape may come once a minute."""
 MESSAGES = 50
@@ -84,6 +100,11 @@ class MonitorServer(GatedServer):
         self._block_ns = 1e9 / rate
         self._marks: deque[str] = deque(maxlen=MARKS)
         self._mark_count = 0
+        self._alarm: Alarm | None = None
+        self._history = History(len(shown.rig.psds), shown.rig.estimator.block_size)
+        kept_in = shown.history_file() if config.history else None
+        self._keeper = None if kept_in is None else HistoryKeeper(kept_in, self._history, say)
+        self._calibration = PageCalibration()
         self._messages: deque[tuple[int, float, str]] = deque(maxlen=MESSAGES)
         self._message_count = 0
         self._health: tuple[int, str] = (0, 'null')
@@ -91,6 +112,7 @@ class MonitorServer(GatedServer):
         self._report_at = 0.0
         self._spectrum = Spectrum(shown.rig)
         self._density: tuple[int, str] = (0, 'null')
+        self._last_density: FloatArray | None = None
         alone = access.is_loopback(config.address)
         self._control = config.control == 'on' or (config.control == 'local' and alone)
         self._announced: Path | None = None
@@ -99,6 +121,8 @@ class MonitorServer(GatedServer):
 
     def start(self) -> str:
         """Start the thread; return the page's address. Raises ConfigError if it cannot be served."""
+        if self._keeper is not None:
+            self._keeper.start()
         self.url = f'http:{self.start_thread()}/'
         self._announced = announce(Served(self.url, self.token, str(self._shown.describe()['name']), os.getpid()))
         self.say(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
@@ -108,6 +132,9 @@ class MonitorServer(GatedServer):
         """Close the connections to the browsers and end the thread; a second call does nothing."""
         withdraw(self._announced)
         super().close()
+        if self._keeper is not None:
+            self._keeper.end()
+            self._keeper = None
 
     def tell(self, text: str, level: int = INFO, /) -> None:
         """Show a message on the page; from any thread."""
@@ -119,18 +146,24 @@ class MonitorServer(GatedServer):
         application.router.add_get('/', self._index)
         application.router.add_get(self.websocket_path, self._websocket)
         application.router.add_get('/metrics', self._metrics)
+        application.router.add_get('/api/history', self._get_history)
         application.router.add_post('/api/zero', self._zero)
         application.router.add_post('/api/record', self._record)
         application.router.add_post('/api/load', self._load)
         application.router.add_post('/api/step', self._step)
         application.router.add_post('/api/mark', self._mark)
         application.router.add_post('/api/play', self._play)
+        application.router.add_post('/api/calibrate', self._calibrate)
+        application.on_shutdown.append(lambda _: self._calibration.close())
+        application.router.add_get('/page/charts.js', self._charts)
+        application.router.add_static('/page/vendor', page_files.FOLDER / 'vendor')
         application.router.add_static('/page', PAGE)
         application.on_response_prepare.append(_add_headers)
 
     def jobs(self) -> list[Coroutine[Any, Any, None]]:
         """What comes from the run, and its health."""
-        return [self._pump(), self._once_a_second()]
+        keeping = [] if self._keeper is None else [self._keep_history(self._keeper)]
+        return [self._pump(), self._once_a_second(), *keeping]
 
     # Data from the threads of the run.
 
@@ -141,6 +174,7 @@ class MonitorServer(GatedServer):
             for item in self._feed.take():
                 if isinstance(item, BlockResult):
                     self._rows.append(row_json(item))
+                    self._history.add(item)
                     self._last_block, self._block_came = item, time.monotonic()
                     self._row_count += 1
                     new = True
@@ -149,17 +183,23 @@ class MonitorServer(GatedServer):
                 elif isinstance(item, ReferencePose):
                     new = self._take_reference(item) or new
                 else:
-                    self._marks.append(mark_json(item))
-                    self._mark_count += 1
+                    self._take_mark(item)
                     new = True
             now = time.monotonic()
             if self.viewers and now >= due:
                 due = now + SPECTRUM_EVERY_S
-                self._density = (self._density[0] + 1, density_json(self._spectrum.density()))
+                self._last_density = self._spectrum.density()
+                self._density = (self._density[0] + 1, density_json(self._last_density))
                 new = True
             if new:
                 self.wake()
             await asyncio.sleep(PUMP_S)
+
+    def _take_mark(self, item: AppliedLoad | Mark | ParameterChange | Alarm) -> None:
+        text = mark_json(item)
+        self._marks.append(text)
+        self._mark_count += 1
+        self._history.mark(item.since_ns if isinstance(item, Alarm) else item.t_ns, text)
 
     def _take_reference(self, reference: ReferencePose) -> bool:
         last = self._reference_ns
@@ -172,9 +212,19 @@ class MonitorServer(GatedServer):
 
     async def _once_a_second(self) -> None:
         while True:
+            last, self._alarm = self._alarm, self._shown.alarm()
+            if self._alarm is not None and (last is None or last.seen_ns != self._alarm.seen_ns):
+                self._take_mark(self._alarm)
             if self.viewers:
                 self._take_health()
             await asyncio.sleep(1.0)
+
+    async def _keep_history(self, keeper: HistoryKeeper) -> None:
+        while not keeper.restore():
+            await asyncio.sleep(RESTORE_S)
+        while True:
+            await asyncio.sleep(KEEP_EVERY_S)
+            keeper.save()
 
     def _take_health(self) -> None:
         now = time.monotonic()
@@ -192,7 +242,7 @@ class MonitorServer(GatedServer):
                 'message': e.message,
                 'values': e.values,
             }
-            for e in report.entries
+            for e in (*report.entries, line_entry(self._shown.rig, self._spectrum.frequencies, self._last_density))
         ]
         return json.dumps(
             {
@@ -201,6 +251,7 @@ class MonitorServer(GatedServer):
                 'dropped': self._feed.dropped,
                 'browsers': len(self.viewers),
                 'sum_min': self._shown.rig.estimator.sum_min,
+                'calibration': self._calibration.state,
                 **self._shown.describe(),
             }
         )
@@ -210,12 +261,22 @@ class MonitorServer(GatedServer):
     async def _index(self, request: web.Request) -> web.StreamResponse:
         return web.FileResponse(PAGE / 'index.html')
 
+    async def _charts(self, request: web.Request) -> web.StreamResponse:
+        return web.FileResponse(page_files.CHARTS)
+
     async def _metrics(self, request: web.Request) -> web.StreamResponse:
         families = self._shown.metrics()
         families.append(metrics.counter('page_dropped', 'Items for which the page was too slow', self._feed.dropped))
+        families.append(metrics.memory('page_history_bytes', 'Memory of the history', self._history.bytes))
         if self._last_block is not None and time.monotonic() - self._block_came < FRESH_S:
             families += metrics.of_block(self._last_block)
         return web.Response(text=metrics.text_of(families), headers={'Content-Type': metrics.CONTENT_TYPE})
+
+    async def _get_history(self, request: web.Request) -> web.StreamResponse:
+        try:
+            return web.Response(text=self._history.answer(asked(request.query)), content_type='application/json')
+        except AskedError as error:
+            return _answer(400, f'refused: {error}')
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
         # A browser that does not read for this long is gone.
@@ -308,6 +369,20 @@ class MonitorServer(GatedServer):
             return self._shown.record(bool(wanted))
 
         return await self._act(request, 'record', record)
+
+    async def _calibrate(self, request: web.Request) -> web.StreamResponse:
+        async def calibrate(body: dict[str, Any]) -> str:
+            wanted = body.get('calibrate')
+            _need(isinstance(wanted, bool), '{"calibrate": true} or {"calibrate": false}')
+            if not wanted:
+                return self._calibration.stop()
+            if self._shown.describe()['kind'] == 'replay':
+                raise RefusedError('a recording is played; psd-deflection calibrate takes it')
+            parent = Path(self._shown.rig.acquisition.bag_dir).expanduser().absolute()
+            out = new_folder(parent, 'calibration')
+            return await self._calibration.start(self.url, TOKEN_VARIABLE, self.token, out)
+
+        return await self._act(request, 'calibrate', calibrate)
 
     async def _load(self, request: web.Request) -> web.StreamResponse:
         def load(body: dict[str, Any]) -> Awaitable[str]:

@@ -13,11 +13,27 @@ from collections import deque
 import numpy as np
 
 from psd_deflection.model.detector import VoltsToDots
-from psd_deflection.records import FloatArray, SampleBlock
+from psd_deflection.records import DiagnosticEntry, FloatArray, SampleBlock, dot_names
 from psd_deflection.rig.config import Rig
 
 SEGMENT = 1024
 SECONDS = 4.0
+
+NAME = 'psd_deflection: spectrum'
+STANDS_OUT = 100.0
+"""Times the power about it: a line. Noise alone reaches that once in 10^9 seconds (a mean of seven segments)."""
+NARROW = 30.0
+"""Times the power ``SIDE`` bins beside it: what a load step leaves is broad."""
+SIDE = 5
+"""Bins from a line to what is no longer of it: a Hann window spreads a line over two on each side."""
+ABOUT = 32
+"""Bins to each side that are about a line."""
+NEAR = 0.15
+"""Share of the frequency of a mode within which a line is that mode."""
+LEAST = 1e-18
+"""m^2/Hz: (1 nm)^2/Hz. A reading that does not vary has no lines."""
+LOWEST_HZ = 3.0
+"""What is slower is drift and how the link is loaded."""
 
 
 class Spectrum:
@@ -77,6 +93,51 @@ class Spectrum:
         count[count == 0] = np.nan
         power = 2.0 * total / (count * self.rate_hz * float((self._window**2).sum()))
         return np.asarray(np.sqrt(power[1:]).T, np.float64)
+
+
+def line_entry(rig: Rig, frequencies: FloatArray, density: FloatArray | None) -> DiagnosticEntry:
+    """Whether the spectrum has a line where the rig file has no mode: ``density`` (2P, k) at ``frequencies`` (k,), Hz.
+
+    One recording cannot tell a vibration from one that sampling folds to its frequency; the message says what can.
+    """
+    found = None if density is None else _line(rig, frequencies, np.nan_to_num(density) ** 2)
+    if found is None:
+        return DiagnosticEntry(NAME, 0, 'no line but those of the modes', ())
+    hz, sizes = found
+    there = [n for n, size in zip(dot_names(len(rig.psds)), sizes.tolist(), strict=True) if size > 0.3 * sizes.max()]
+    rate = rig.converter.sample_rate_hz
+    size = 1e6 * sizes.max()
+    message = (
+        f'a line of {size:.3g} µm rms at {hz:.0f} Hz on {" ".join(there)}, where the rig file has no mode: '
+        f'it vibrates there, has a mode there, or something at {rate - hz:.0f} or {rate + hz:.0f} Hz is folded by the '
+        f'sampling; record at another rate: a line that moves was folded'
+    )
+    return DiagnosticEntry(NAME, 1, message, (('line (Hz)', f'{hz:.1f}'),))
+
+
+def _line(rig: Rig, frequencies: FloatArray, power: FloatArray) -> tuple[float, FloatArray] | None:
+    """Frequency, Hz, and rms (2P,), m, of the line that stands out most; None if none does."""
+    step = float(frequencies[0])
+    inner = slice(SIDE, len(frequencies) - SIDE)
+    hz = frequencies[inner]
+    free = hz >= LOWEST_HZ
+    for mode in (rig.dynamics.bending_frequency, rig.dynamics.torsion_frequency):
+        free &= np.abs(hz - mode) > NEAR * mode + SIDE * step
+    best: tuple[float, int] | None = None
+    for row in power:
+        here = row[inner]
+        beside = np.maximum(row[: len(here)], row[2 * SIDE :])
+        highest = (here >= row[SIDE - 1 : SIDE - 1 + len(here)]) & (here >= row[SIDE + 1 : SIDE + 1 + len(here)])
+        for at in np.flatnonzero(free & highest & (here > NARROW * beside)).tolist():
+            k = at + SIDE
+            about = max(float(np.median(row[max(k - ABOUT, 0) : k + ABOUT + 1])), LEAST)
+            stands = float(row[k]) / about
+            if stands >= STANDS_OUT and (best is None or stands > best[0]):
+                best = (stands, k)
+    if best is None:
+        return None
+    band = slice(best[1] - SIDE + 1, best[1] + SIDE)
+    return float(frequencies[best[1]]), np.sqrt(power[:, band].sum(axis=1) * step)
 
 
 def density_json(density: FloatArray | None) -> str:

@@ -23,7 +23,7 @@ from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.base.sequence import SequenceExtender, Step
 from psd_deflection.devices.protocol.frames import BadFrame, BadReason, HelloFrame, PongFrame, SampleFrame, StatusFrame
 from psd_deflection.devices.registry import make_source
-from psd_deflection.devices.source import Clock, Event, Sample, Source, SourceEndedError
+from psd_deflection.devices.source import Clock, Event, Notice, Sample, Source, SourceEndedError
 from psd_deflection.measure.timing import ClockState
 from psd_deflection.records import FLAG_DEVICE_DROPPED, RESTART, IntArray, ParameterChange, RawChunk
 from psd_deflection.rig.config import Rig
@@ -220,7 +220,7 @@ class Acquisition:
                     continue
                 try:
                     events, now, size = self.source.read(READ_TIMEOUT_S)
-                    if size:
+                    if events or size:
                         self.counters.bytes += size
                         if self.feed(events, now):
                             silent_since = now / 1e9
@@ -413,6 +413,8 @@ class Acquisition:
             self.counters.device_overruns = frame.overruns
             if frame.temperature_centi is not None:
                 self.counters.temperature = frame.temperature_centi / 100.0
+        elif isinstance(frame, Notice):
+            self._repeats.tell('notice', f'{self._name}: {frame.text}', WARNING, now / 1e9, NEWS)
         elif isinstance(frame, HelloFrame) and frame != self.hello:
             try:
                 self._gate.take(frame, self._name, volts=self.source.volts)

@@ -19,11 +19,14 @@ from typing import Any
 import numpy as np
 
 from psd_deflection import __version__
+from psd_deflection.base.charts import SMALL, Chart, Panel, Rule, Series
 from psd_deflection.base.pages import table
-from psd_deflection.base.tables import columns
+from psd_deflection.base.tables import Column, Table, columns, columns_of
+from psd_deflection.studies.axes import AXES as POSE
+from psd_deflection.studies.axes import UNITS as POSE_UNITS
 from psd_deflection.studies.budget.certificate import Certificate, CertificateProblem, Conformity, verdict_of
 from psd_deflection.studies.budget.expanded import PROBABILITY
-from psd_deflection.studies.budget.result import AXES, UNITS, freedom_words, in_words, shown
+from psd_deflection.studies.budget.result import AXES, SHOWN, UNITS, freedom_words, in_words, shown
 from psd_deflection.studies.study import PageSection, StudyResult
 
 OBJECT = {
@@ -129,6 +132,20 @@ class Certified(StudyResult):
             'provenance': {'version': __version__, 'calibration': self.problem.calibration['provenance']},
         }
 
+    def table(self) -> Table:
+        """One row a pose: what it was, how far the estimate was off as found, u_c and U; m, m, rad."""
+        stated = self.found.stated
+        parts = (
+            ('', self.found.poses, 'pose'),
+            ('as_found_', self.found.found, 'error as found'),
+            ('standard_', np.array([said.standard for said in stated]), 'standard uncertainty'),
+            ('expanded_', np.array([said.uncertainty for said in stated]), 'expanded uncertainty, 95 %'),
+        )
+        out = []
+        for before, values, words in parts:
+            out += columns_of(np.asarray(values), [f'{before}{a}' for a in POSE], POSE_UNITS, [words] * 3)
+        return Table(Column('number', np.arange(1, len(stated) + 1), '', 'of the pose'), out)
+
     def files(self) -> dict[str, str]:
         """The page, the JSON, and the tables with all their digits."""
         return {
@@ -144,7 +161,7 @@ class Certified(StudyResult):
         return [
             PageSection('Object and surroundings', (self._filled(OBJECT),)),
             PageSection('Reference', (self._filled(TRACEABLE),)),
-            PageSection('Results', (_table(self._results()), self._range())),
+            PageSection('Results', (_table(self._results()), self._chart(), self._range())),
             PageSection('Decision rule', (f'<p>{html.escape(self._rule())}</p>',)),
             PageSection('How U was computed', (_HOW, _table(self._inputs(_six)))),
             PageSection('Correlations of the calibration', (_table(self._correlations(_six)),)),
@@ -169,6 +186,20 @@ class Certified(StudyResult):
             row += [f'{k:.3f}' for k in said.factor.tolist()] + shown(said.uncertainty)
             rows.append(row + (list(judged[n]) if judged else []))
         return rows
+
+    def _chart(self) -> Chart:
+        """The error of each pose as found with its expanded uncertainty, and the limits."""
+        number = np.arange(1.0, len(self.found.poses) + 1.0)
+        limits = self.problem.limits
+        panels = []
+        for i, (axis, unit) in enumerate(zip(AXES, ('µm', 'µm', 'mdeg'), strict=True)):
+            errors = SHOWN[i] * np.array([error[i] for error in self.found.found])
+            spread = SHOWN[i] * np.array([said.uncertainty[i] for said in self.found.stated])
+            curve = Series('as found ± U', number, errors, 'blue', 'points', spread=spread)
+            ends = () if limits is None else (-SHOWN[i] * limits[i], SHOWN[i] * limits[i])
+            rules = [Rule(float(at), 'limit', across=True, colour='red') for at in ends]
+            panels.append(Panel((curve,), 'pose', f'{axis} / {unit}', rules=rules, height=SMALL))
+        return Chart('error of each pose as found, with its expanded uncertainty', panels, beside=3)
 
     def _numbers(self) -> list[list[str]]:
         """As ``_results``, in SI units with all digits."""

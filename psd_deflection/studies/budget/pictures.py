@@ -1,42 +1,57 @@
-"""The picture of an error budget."""
+"""The bars of an error budget, for its page and for a file."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
+from psd_deflection.base.charts import Colour
+from psd_deflection.base.drawings import BarColumn, Bars
+from psd_deflection.records import FloatArray
 from psd_deflection.studies.budget.evaluate import Budget
 from psd_deflection.studies.budget.term import Kind
 
-# Okabe & Ito: told apart by a colour-blind reader too.
-COLOURS = {Kind.PER_ESTIMATE: '#56B4E9', Kind.SYSTEMATIC: '#E69F00', Kind.KNOWN: '#999999'}
+TITLES = ('ΔX, µm', 'ΔY, µm', 'θ, mdeg')
+LEAST = 1e-3
+"""Share of the total at which a bar begins."""
+
+COLOURS: dict[Kind, Colour] = {Kind.PER_ESTIMATE: 'blue', Kind.SYSTEMATIC: 'red', Kind.KNOWN: 'quiet'}
 
 
-def chart(budget: Budget) -> Figure:
-    """Bars of every cause, largest first, beside the total."""
-    shown = np.array([1e6, 1e6, math.degrees(1e3)])
-    total = budget.total().rms * shown
+class DrawnCause(NamedTuple):
+    """What the chart has of a cause: ``values`` (3,) µm, µm, mdeg."""
+
+    name: str
+    kind: Kind
+    values: FloatArray
+
+
+def shown(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
+    """Every cause that does something, the largest first, and the total (3,)."""
+    factors = np.array([1e6, 1e6, math.degrees(1e3)])
+    total = budget.total().rms * factors
     # What does nothing, or only rounds, has no place on a logarithmic axis.
     least = 1e-9 * budget.total().rms
-    lines = [(c, line.rms * shown) for c, line in budget.lines if np.any(line.rms > least)]
-    lines.sort(key=lambda entry: float(np.max(entry[1] / np.where(total > 0.0, total, 1.0))))
-    names = [f'{c.name} ({c.row})' if c.row else c.name for c, _ in lines]
-    figure = Figure(figsize=(11.0, 0.28 * len(lines) + 1.8), layout='constrained')
-    panels: Any = figure.subplots(1, 3, sharey=True)
-    for i, (panel, title) in enumerate(zip(panels, ('ΔX, µm', 'ΔY, µm', 'θ, mdeg'), strict=True)):
-        values = [v[i] for _, v in lines]
-        panel.barh(names, values, color=[COLOURS[c.kind] for c, _ in lines])
-        panel.axvline(total[i], color='black', linewidth=1.0)
-        panel.text(total[i], len(lines) - 0.4, f' {total[i]:.3g}', ha='right', va='bottom', fontsize=9)
-        panel.set(xscale='log', xlabel=title, xlim=(total[i] * 1e-3, total[i] * 2.0))
-        panel.grid(axis='x', alpha=0.3)
-        panel.set_axisbelow(True)
-    handles = [Patch(color=COLOURS[kind], label=kind.value) for kind in Kind]
-    handles.append(Patch(facecolor='white', edgecolor='black', label='total (line)'))
-    figure.legend(handles=handles, loc='outside lower center', ncols=4, frameon=False)
-    figure.suptitle(f'Error budget, method {budget.at.method}: standard deviation or known bias')
-    return figure
+    causes = [
+        DrawnCause(f'{cause.name} ({cause.row})' if cause.row else cause.name, cause.kind, line.rms * factors)
+        for cause, line in budget.lines
+        if np.any(line.rms > least)
+    ]
+    causes.sort(key=lambda one: -float(np.max(one.values / np.where(total > 0.0, total, 1.0))))
+    return causes, total
+
+
+def bars_of(budget: Budget) -> Bars:
+    """Every cause, the largest first, below the total."""
+    causes, total = shown(budget)
+    names = ['total', *(one.name for one in causes)]
+    colours: list[Colour] = ['text', *(COLOURS[one.kind] for one in causes)]
+    columns = [
+        BarColumn(title, [float(total[i]), *(float(one.values[i]) for one in causes)], total[i], LEAST * total[i])
+        for i, title in enumerate(TITLES)
+    ]
+    keys: list[tuple[str, Colour]] = [(kind.value, COLOURS[kind]) for kind in Kind]
+    words = f'Error budget, method {budget.at.method}: standard deviation or known bias'
+    return Bars(words, names, colours, columns, legend=keys)

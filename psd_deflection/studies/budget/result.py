@@ -9,11 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.base.pages import picture, table
-from psd_deflection.base.tables import columns
+from psd_deflection.base.pages import table
+from psd_deflection.base.tables import Column, Table, columns, columns_of, text_column
 from psd_deflection.records import FloatArray
+from psd_deflection.studies.axes import AXES as POSE
+from psd_deflection.studies.axes import UNITS as POSE_UNITS
 from psd_deflection.studies.budget.evaluate import Budget
 from psd_deflection.studies.budget.expanded import PROBABILITY, Interval, difference
+from psd_deflection.studies.budget.pictures import LEAST, bars_of
 from psd_deflection.studies.budget.term import Cause, Contribution, Kind
 from psd_deflection.studies.study import PageSection, StudyResult
 
@@ -78,14 +81,11 @@ class Budgeted(StudyResult):
 
     def sections(self) -> Iterable[PageSection]:
         """The chart, the totals, every cause."""
-        from psd_deflection.studies.budget.pictures import chart
-
         head, *rows = self._causes()
         totals_head, *totals = self._totals()
-        drawn = picture(chart(self.budget), 'every cause of error beside the total, for ΔX, ΔY and θ')
         return [
             PageSection('', (f'<p class=quiet>{self._situation()}</p>',)),
-            PageSection('Every cause beside the total', (drawn,)),
+            PageSection('Every cause beside the total', (_BARS, bars_of(self.budget))),
             PageSection('Totals', (table(totals_head, totals),)),
             PageSection('Every cause', (table(head, rows),)),
             PageSection('Expanded uncertainty (GUM)', (table(*_split(self._expanded())), _RULES)),
@@ -135,6 +135,23 @@ class Budgeted(StudyResult):
             'expanded': stated,
         }
 
+    def table(self) -> Table:
+        """One row a cause: its kind, rms and share of the mean square for dX, dY, theta; m, m, rad."""
+        lines = self.budget.lines
+        rms = np.array([line.rms for _, line in lines])
+        share = np.array([self.budget.shares(line) for _, line in lines])
+        causes = [cause for cause, _ in lines]
+        return Table(
+            text_column('cause', [cause.name for cause in causes], 'source of error'),
+            [
+                text_column('kind', [cause.kind.value for cause in causes], 'how it acts'),
+                Column('freedom', np.array([c.freedom(self.budget.at) for c in causes]), '', 'degrees of freedom'),
+                *columns_of(rms, [f'rms_{a}' for a in POSE], POSE_UNITS, [f'error of {a}' for a in POSE]),
+                *columns_of(share, [f'share_{a}' for a in POSE], ('',) * 3, ['of the mean square'] * 3),
+            ],
+            {'method': self.budget.at.method, 'load': self.load},
+        )
+
     def _situation(self) -> str:
         at, load = self.budget.at, self.load
         dx, dy, theta = at.pose.tolist()
@@ -181,6 +198,9 @@ class Budgeted(StudyResult):
         return [*rows, ['total', *_figures(self.budget.total())]]
 
 
+_BARS = (
+    f'<p class=quiet>Standard deviation or known bias; the bars are logarithmic, from {LEAST:g} of the total on.</p>'
+)
 _RULES = (
     '<p class=quiet>JCGM 100:2008: u_c is the root of the sum of the squares of the causes; ν_eff by '
     'Welch-Satterthwaite (G.2b), each cause as one, down to a whole number; k is the quantile of Student’s t for 95 %; '

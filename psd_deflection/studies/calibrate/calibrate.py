@@ -184,7 +184,7 @@ def calibrate(
     if worse:
         refused = (
             f'on motion that was not fitted the calibrated rig predicts the readings worse than the rig file '
-            f'({gap.heldout_after * 1e6:.2f} um rms against {gap.heldout_before * 1e6:.2f} um); '
+            f'({gap.heldout_after * 1e6:.2f} µm rms against {gap.heldout_before * 1e6:.2f} µm); '
             f'the rig file keeps its values'
         )
     return Calibration(
@@ -419,7 +419,9 @@ _NEEDS = {
     'torsional_compliance': 'known torques held for some seconds each',
     'zero': 'the unloaded link, with its reference',
 }
-_TURNED = (
+MOTIONS = tuple(dict.fromkeys(_NEEDS.values()))
+"""What determines parameters, what is easily done first."""
+TURNED = (
     'no motion of the link: a turned PSD and one whose axes are not square look alike; the estimate needs only the sum'
 )
 
@@ -429,7 +431,7 @@ def needs_of(names: Sequence[str]) -> str:
     kinds = [name.partition('.')[2] for name in names]
     short = [next(k for k in _NEEDS if kind.startswith(k)) for kind in kinds]
     if set(short) == {'rotation', 'crosstalk'}:
-        return _TURNED
+        return TURNED
     return '; '.join(dict.fromkeys(_NEEDS[k] for k in short))
 
 

@@ -13,8 +13,9 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings.read.grid import MAX_SAMPLES, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import References, read_references, references_in
-from psd_deflection.recordings.recording import WHOLE, Recording, Span
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds
+from psd_deflection.recordings.spans import WHOLE, Span
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -66,7 +67,7 @@ def read_run(
         grace = 0.25e9 / rig.converter.sample_rate_hz
         loads = held_at(times, np.array([a[1:] for a in applied]), t * 1e9, grace, np.zeros(3))
     return CalibrationRun(
-        path.name,
+        recording.name,
         t,
         Wiring.from_rig(rig).to_psds(volts),
         (references.t_ns - start).astype(np.float64) * 1e-9,
@@ -145,7 +146,14 @@ class CalibrationOptions:
 
     def runs(self, recordings: Sequence[Recording | str | Path], rig: Rig) -> list[CalibrationRun]:
         """The recordings with their references."""
-        return read_runs(recordings, rig, references=self.references, exposure=self.exposure, namespace=self.namespace)
+        return read_runs(
+            recordings,
+            rig,
+            references=self.references,
+            exposure=self.exposure,
+            namespace=self.namespace,
+            span=self.span,
+        )
 
     def levels(self, rig: Rig, runs: Sequence[CalibrationRun]) -> list[DarkLevel]:
         """The light in the recordings of ``dark``; ``runs``: with the lasers on."""

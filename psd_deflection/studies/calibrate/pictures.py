@@ -6,21 +6,16 @@ import html
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from psd_deflection.base.pages import picture, table
-from psd_deflection.model.misalignment.model import ALL, COUNT, ZERO
+from psd_deflection.base.charts import Chart, Panel, Series
+from psd_deflection.base.drawings import Matrix
+from psd_deflection.base.pages import table
+from psd_deflection.model.misalignment.model import COUNT, ZERO
 from psd_deflection.studies.calibrate.calibrate import Calibration
-from psd_deflection.studies.calibrate.fit import CLOCK, NAMES, REPORTED, UNITS, linearised
+from psd_deflection.studies.calibrate.fit import CLOCK, NAMES, REPORTED, linearised
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
+from psd_deflection.studies.calibrate.progress import WORDS, in_words
 from psd_deflection.studies.study import PageSection
-
-BEFORE, AFTER = '#c44e52', '#4c72b0'
-_READ = {'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 's': (1e3, 'ms'), '': (1.0, '')}
-_WORDS = {p.name: p.words for p in ALL} | {
-    'clamp.bending_compliance': 'turn of the clamp per moment',
-    'clamp.torsional_compliance': 'twist of the clamp per torque',
-}
 
 
 def sections(found: Calibration) -> list[PageSection]:
@@ -29,12 +24,10 @@ def sections(found: Calibration) -> list[PageSection]:
         '<p class=quiet>Left open: the standard deviation over that of the rig file or its tolerance; 1: nothing was '
         'learnt, and the file keeps its value.</p>'
     )
-    residuals = picture(_residuals(found), 'reading minus model over time, before and after')
-    correlations = picture(_correlations(found), 'correlations of the parameters')
     todo = ''.join(f'<li>{html.escape(words)}</li>' for words in advice(found))
     return [
-        PageSection('Before and after', (residuals, _gap(found))),
-        PageSection('Parameters', (open_words, _parameters(found), correlations)),
+        PageSection('Before and after', (_residuals(found), _gap(found))),
+        PageSection('Parameters', (open_words, _parameters(found), *_correlations(found))),
         PageSection('What these recordings cannot determine', (_undetermined(found),)),
         PageSection('Noise', (_noise(found),)),
         *([PageSection('Dark levels and other light', (_dark(found),))] if found.dark else []),
@@ -49,7 +42,7 @@ def advice(found: Calibration) -> list[str]:
         out.append('Check the reference: its axes, units, signs and clock. The rig file was left as it is.')
     for name in found.widened:
         out.append(
-            f'{name} is {_in_words(NAMES.index(name), found.values[NAMES.index(name)])}: outside the tolerance of the '
+            f'{name} is {in_words(NAMES.index(name), found.values[NAMES.index(name)])}: outside the tolerance of the '
             f'file. Look at the mount; if it is right, state the tolerance in the file.'
         )
     for name in found.dropped:
@@ -68,18 +61,12 @@ def advice(found: Calibration) -> list[str]:
     return out
 
 
-def _in_words(i: int, value: float, sd: float | None = None) -> str:
-    factor, unit = _READ.get(UNITS[i], (1.0, UNITS[i]))
-    text = f'{factor * value:.5g}' if sd is None else f'{factor * value:.5g} ± {factor * sd:.2g}'
-    return f'{text} {unit}'.strip()
-
-
 def _parameters(found: Calibration) -> str:
     rows = []
     for i in (*REPORTED, *range(ZERO, COUNT)):
         sd, before = float(found.sd[i]), float(found.prior.sd[i])
-        words = (_in_words(i, float(found.prior.mean[i]), before), _in_words(i, float(found.values[i]), sd))
-        rows.append((NAMES[i], _WORDS[NAMES[i]], *words, f'{sd / before:.2g}' if before else ''))
+        words = (in_words(i, float(found.prior.mean[i]), before), in_words(i, float(found.values[i]), sd))
+        rows.append((NAMES[i], WORDS[NAMES[i]], *words, f'{sd / before:.2g}' if before else ''))
     return table(('parameter', 'meaning', 'rig file', 'calibrated', 'left open'), rows)
 
 
@@ -139,34 +126,31 @@ def _dark(found: Calibration) -> str:
     return f'<p class=quiet>{words}</p>' + table(head, rows)
 
 
-def _residuals(found: Calibration) -> Figure:
+def _residuals(found: Calibration) -> Chart:
     before: Any = linearised(found.rows, found.used, found.rig, found.kind).residual
     after = found.fit.linear.residual
-    figure = Figure(figsize=(10, 6.4), layout='constrained')
-    axes = figure.subplots(4, 1, sharex=True)
     starts = np.concatenate(([0.0], np.cumsum([run.t[-1] for run in found.runs])))
     t = found.rows.t + starts[found.rows.run]
-    for row, axis in enumerate(axes):
-        axis.plot(t, before[:, row] * 1e6, '.', ms=2, color=BEFORE, label='before' if row == 0 else None)
-        axis.plot(t, after[:, row] * 1e6, '.', ms=2, color=AFTER, label='after' if row == 0 else None)
-        axis.set_ylabel(f'{CHANNEL_NAMES[row]} / µm')
-        axis.grid(alpha=0.25)
-        low, high = np.percentile(np.concatenate((before[:, row], after[:, row])) * 1e6, [0.5, 99.5])
-        axis.set_ylim(low - 0.2 * (high - low), high + 0.2 * (high - low))
-    axes[0].legend(loc='upper right', ncols=2, frameon=False)
-    axes[-1].set_xlabel('time / s (recordings one after another)')
-    return figure
+    panels = []
+    for row, name in enumerate(CHANNEL_NAMES):
+        curves = (
+            Series('before', t, before[:, row] * 1e6, 'red', 'points'),
+            Series('after', t, after[:, row] * 1e6, 'blue', 'points'),
+        )
+        low, high = np.percentile(np.concatenate([one.y for one in curves]), [0.5, 99.5])
+        room = 0.2 * (high - low)
+        panels.append(
+            Panel(curves, 'time / s (recordings one after another)', f'{name} / µm', y_range=(low - room, high + room))
+        )
+    return Chart('reading minus model over time, before and after', panels)
 
 
-def _correlations(found: Calibration) -> Figure:
+def _correlations(found: Calibration) -> tuple[str | Matrix, ...]:
     at = [i for i in REPORTED if found.fit.free[i]]
-    figure = Figure(figsize=(8, 7), layout='constrained')
-    axis = figure.subplots()
-    if at:
-        sd = found.sd[at]
-        matrix = found.covariance[np.ix_(at, at)] / np.outer(sd, sd)
-        drawn = axis.imshow(matrix, vmin=-1.0, vmax=1.0, cmap='RdBu_r')
-        axis.set_xticks(range(len(at)), [NAMES[i] for i in at], rotation=90, fontsize=7)
-        axis.set_yticks(range(len(at)), [NAMES[i] for i in at], fontsize=7)
-        figure.colorbar(drawn, ax=axis, label='correlation')
-    return figure
+    if not at:
+        return ('<p>No parameter was free.</p>',)
+    sd = found.sd[at]
+    values = found.covariance[np.ix_(at, at)] / np.outer(sd, sd)
+    names = [NAMES[i] for i in at]
+    words = 'Correlations of the parameters: blue positive, red negative, darkest 1.'
+    return f'<p class=quiet>{words}</p>', Matrix(words, values, names, names, most=1.0)

@@ -10,16 +10,18 @@ from typing import Any
 import numpy as np
 
 from psd_deflection import __version__
+from psd_deflection.base.tables import Column, Table, text_column
 from psd_deflection.model.misalignment.model import COUNT, ZERO
 from psd_deflection.model.misalignment.rig import CLAMP, rig_values
 from psd_deflection.model.simulation.catalogue import effects_of_rig, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
-from psd_deflection.studies.calibrate.calibrate import Calibration
+from psd_deflection.studies.calibrate.calibrate import TURNED, Calibration
 from psd_deflection.studies.calibrate.dark import result_of_levels, source_of_levels, values_of_levels, words_of_level
 from psd_deflection.studies.calibrate.fit import CLAMP_AT, CLOCK, NAMES, REPORTED, UNITS
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
+from psd_deflection.studies.calibrate.progress import progress_of
 from psd_deflection.studies.study import PageSection, StudyResult, Tell, described, edited_rig_file, named, warn_caller
 
 
@@ -49,11 +51,29 @@ class Calibrated(StudyResult):
         """The answer in one sentence, the dark levels, and what is left open."""
         found = self.found
         said = [sentence(found), *map(words_of_level, found.dark)]
-        return said + [f'undetermined: {", ".join(d.parts)}; it needs {d.needs}' for d in found.undetermined]
+        said += [f'undetermined: {", ".join(n.names)}; needed: {n.motion}' for n in progress_of(found).needs]
+        if any(d.needs == TURNED for d in found.undetermined):
+            said.append(TURNED.partition(': ')[2])
+        return said
 
     def tree(self) -> dict[str, Any]:
         """Parameters with covariance, what is left open, noise, gap, provenance."""
         return result(self.found, self.date)
+
+    def table(self) -> Table:
+        """One row a parameter: ``value``, ``sd``, what the ``file`` had, what the new one has (``used``), ``unit``."""
+        found, at = self.found, list(REPORTED)
+        return Table(
+            text_column('parameter', [NAMES[i] for i in at], 'of the rig'),
+            [
+                Column('value', found.values[at], '', 'calibrated, in the unit of the row'),
+                Column('sd', found.sd[at], '', 'its standard deviation'),
+                Column('file', found.prior.mean[at], '', 'of the rig file before'),
+                Column('used', found.used[at], '', 'of the rig file after'),
+                text_column('unit', [UNITS[i] for i in at], 'of the row'),
+            ],
+            {'kind': found.kind, 'gap_before_m': found.gap.before, 'gap_after_m': found.gap.after},
+        )
 
     def sections(self) -> Iterable[PageSection]:
         """Before and after, parameters, what is left open, noise, dark levels, what to do next."""

@@ -81,10 +81,12 @@ def check(problem: CheckProblem) -> Checkup:
         findings += _wiring_findings(file, seen, found, best, lines)
         findings += _load_findings(seen, best)
     findings += _level_findings(rig, measured, best.wiring, lines)
+    light = _light(rig, measured, best.wiring)
     told = not dead and len(found) == 1
     if not told and not dead:
         findings += _coverage(pushes, seen, found)
-    verdict = WRONG if any(f.name != 'load_coverage' for f in findings) else RIGHT if told else CANNOT_TELL
+    wrong = light or any(f.name != 'load_coverage' for f in findings)
+    verdict = WRONG if wrong else RIGHT if told else CANNOT_TELL
     sizes = tuple(p.misfit(best.wiring)[1] if p.seen else math.nan for p in pushes)
     return Checkup(
         rig=rig,
@@ -97,6 +99,7 @@ def check(problem: CheckProblem) -> Checkup:
         levels=measured,
         drift=problem.drift,
         drift_sd=problem.drift_sd,
+        light=light,
         notes=tuple(_notes(problem, best.wiring, sizes)),
         source=problem.source,
     )
@@ -158,6 +161,28 @@ def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str,
     return [*found, *steps]
 
 
+def _light(rig: Rig, measured: Levels, wiring: Wiring) -> dict[str, str]:
+    """Sums beyond the rig file's limits: below them no block has an estimate, above them each is in doubt."""
+    out = {}
+    low, high = rig.estimator.sum_min, rig.estimator.sum_max
+    for psd in (1, 2):
+        number = wiring.input_of(psd)
+        level = float(measured.sums[number - 1])
+        if low <= level <= high or f'sum{number}' in measured.stuck:
+            continue
+        text = (
+            f'too little: sum {level:.2f} V, below sum_min {low:g} V, so no block will have an estimate; '
+            'look at the laser, its aim and the window, or whether sum is on this input'
+        )
+        if level > high:
+            text = (
+                f'too much: sum {level:.2f} V, above sum_max {high:g} V, so the estimates are in doubt; '
+                'look for other light, or for a wrong gain'
+            )
+        out[f'psd_{psd}'] = text
+    return out
+
+
 def _coverage(
     pushes: Sequence[PushResponse], seen: Sequence[PushResponse], found: Sequence[WiringFit]
 ) -> list[Finding]:
@@ -187,13 +212,8 @@ def _notes(problem: CheckProblem, wiring: Wiring, sizes: Sequence[float]) -> lis
     nominal = rig.amplifier.sum_nominal
     for psd in (1, 2):
         level = float(measured.sums[wiring.input_of(psd) - 1])
-        if not rig.estimator.sum_min <= level <= rig.estimator.sum_max:
-            what = 'no light, or the wrong input' if level < rig.estimator.sum_min else 'other light, or a wrong gain'
-            out.append(
-                f'psd_{psd}: sum {level:.2f} V, outside sum_min {rig.estimator.sum_min:g} to sum_max '
-                f'{rig.estimator.sum_max:g} V: {what}'
-            )
-        elif not 1.0 / SUM_FACTOR <= level / nominal <= SUM_FACTOR:
+        sound = rig.estimator.sum_min <= level <= rig.estimator.sum_max
+        if sound and not 1.0 / SUM_FACTOR <= level / nominal <= SUM_FACTOR:
             out.append(f'psd_{psd}: sum {level:.2f} V, the rig file says {nominal:g} V; see amplifier.sum_nominal')
     if measured.hum.max() > 0.0:
         worst = int(np.argmax(measured.hum))

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.charts import SMALL, Chart, Panel, Series
 from psd_deflection.base.pages import table
-from psd_deflection.base.tables import columns
+from psd_deflection.base.tables import Column, Table, columns, text_column
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
@@ -88,8 +89,8 @@ def finding_tree(finding: Finding) -> dict[str, Any]:
 class Checkup(StudyResult):
     """``findings``: what is wrong. ``values``: parameters for the rig file. ``sizes``: movement of
     each push over the expected one, NaN if it was not seen. ``found``: the wirings that explain the
-    pushes. ``drift``, ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``notes``: what
-    else is worth a look. ``source``: the recording.
+    pushes. ``drift``, ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``light``: of a PSD,
+    in words, that it has too little or too much of it. ``notes``: what else is worth a look. ``source``: the recording.
     """
 
     study, json_name = 'check', 'check.json'
@@ -105,6 +106,7 @@ class Checkup(StudyResult):
     levels: Levels
     drift: FloatArray
     drift_sd: FloatArray
+    light: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = field(default=())
     source: str = ''
 
@@ -134,11 +136,26 @@ class Checkup(StudyResult):
     def sections(self) -> Iterable[PageSection]:
         """Pushes, lines for the rig file, levels."""
         head, *rows = _pushes(self)
-        out = [PageSection('How each channel answered', (table(head, rows),))]
+        answers = (table(head, rows), _answers(self)) if self.pushes else (table(head, rows),)
+        out = [PageSection('How each channel answered', answers)]
         if self.values:
             lines = [(line(name, value),) for name, value in self.values.items()]
             out.append(PageSection('Lines for the rig file', (table(('below ros__parameters',), lines),)))
         return [*out, PageSection('Noise, light and drift', (table(('', ''), _levels(self)),))]
+
+    def table(self) -> Table:
+        """One row a finding: ``where``, ``value`` (a number, numbers, or None), ``fix``, ``evidence``."""
+        found = self.findings
+        return Table(
+            text_column('finding', [f.name for f in found], 'what is wrong'),
+            [
+                text_column('where', [f.where for f in found], 'channel, PSD, load, or when'),
+                text_column('value', [f.value for f in found], 'as it is'),
+                text_column('fix', [f.fix for f in found], 'what puts it right'),
+                Column('evidence', np.array([f.evidence for f in found], dtype=np.float64), '', 'for it'),
+            ],
+            {'verdict': self.verdict},
+        )
 
     def tree(self) -> dict[str, Any]:
         """In SI units."""
@@ -161,6 +178,7 @@ class Checkup(StudyResult):
             'noise': {**_by(CHANNELS, measured.noise.tolist()), 'rig_file': measured.stated},
             'hum': {'hz': measured.hum_hz, **_by(CHANNELS, measured.hum.tolist())},
             'sums': measured.sums.tolist(),
+            'light': dict(self.light),
             'drift': _by(DOTS, self.drift.tolist()),
             'drift_sd': _by(DOTS, self.drift_sd.tolist()),
             'notes': list(self.notes),
@@ -180,6 +198,23 @@ def _pushes(found: Checkup) -> list[list[str]]:
     if not any(row[-1] for row in rows[1:]):
         rows = [row[:-1] for row in rows]
     return rows
+
+
+def _answers(found: Checkup) -> Chart:
+    """How each channel moved at each push, and how it would by the rig file."""
+    wiring = Wiring.from_rig(found.rig)
+    at = np.arange(1.0, len(found.pushes) + 1.0)
+    expected = np.array([on_channels(wiring, push.expected) for push in found.pushes]) * 1e6
+    moved = np.array([push.channels for push in found.pushes]) * 1e6
+    spread = np.array([push.sd for push in found.pushes]) * 1e6
+    panels = []
+    for i, name in enumerate(DOTS):
+        curves = (
+            Series('by the rig file', at, expected[:, i], 'red', 'rings'),
+            Series('measured', at, moved[:, i], 'blue', 'points', spread[:, i]),
+        )
+        panels.append(Panel(curves, 'push', f'{name} / µm', height=SMALL))
+    return Chart('how each channel moved at each push', panels, beside=2)
 
 
 def _arrow(value: float, size: float) -> str:
@@ -212,7 +247,7 @@ def _findings(found: Checkup) -> list[tuple[str, str]]:
         elif f.name == 'load_coverage':
             where, name = 'pushes', 'not enough to tell'
         rows.append((f'{where}: {name}', f.fix))
-    return rows
+    return [*rows, *((f'{psd}: light', text) for psd, text in found.light.items())]
 
 
 def _other_causes(found: Checkup) -> list[str]:

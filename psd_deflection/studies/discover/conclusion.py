@@ -11,9 +11,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+import numpy as np
+
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import replace_file
+from psd_deflection.base.tables import Column, Table, text_column
 from psd_deflection.model.simulation.catalogue import FOLDERS, effect_folders, effect_names, effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import Law, effect_of, law_text, values_of
@@ -132,6 +135,23 @@ class Conclusion(StudyResult):
                 'recordings': self.workspace.provenance(),
             },
         }
+
+    def table(self) -> Table:
+        """One row a parameter of each effect that was named: ``value``, ``sd``, ``unit``, and what speaks for it."""
+        rows = [(e, name, told) for e in self.effects for name, told in parameters_of(e).items()]
+        told = [t if isinstance(t, dict) else {'value': t, 'sd': 0.0, 'unit': ''} for *_, t in rows]
+        return Table(
+            text_column('effect', [e.active.label for e, *_ in rows], 'that was missing'),
+            [
+                text_column('parameter', [name for _, name, _ in rows], 'of the effect'),
+                Column('value', np.array([t['value'] for t in told], dtype=np.float64), '', 'in the unit of the row'),
+                Column('sd', np.array([t['sd'] for t in told], dtype=np.float64), '', 'its standard deviation'),
+                text_column('unit', [t['unit'] for t in told], 'of the row'),
+                Column('delta_bic', np.array([e.delta_bic for e, *_ in rows], dtype=np.float64), '', 'BIC better by'),
+                Column('p', np.array([e.p for e, *_ in rows], dtype=np.float64), '', 'over the whole library'),
+            ],
+            {'verdict': self.verdict, 'gap_before': self.gap_before, 'gap_after': self.gap_after},
+        )
 
     def _where(self) -> list[dict[str, Any]]:
         return [

@@ -15,8 +15,10 @@ from psd_deflection.base.foreign_yaml import tree_of_file
 from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
-from psd_deflection.recordings.recording import TEMPERATURE_COLUMN, WHOLE, Recording, Span
+from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds, rig_at_end, warnings_about_rig
+from psd_deflection.recordings.sample_table import TEMPERATURE_COLUMN
+from psd_deflection.recordings.spans import WHOLE, Span
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
@@ -78,7 +80,7 @@ def read_observation(
     t_ns = np.rint(np.interp(np.arange(n), place, (samples['t_ns'] - samples['t_ns'][0]).astype(np.float64)))
     held, unknown = _held_loads(recording, t_ns, 0.25 * period)
     return Observation(
-        path.name,
+        recording.name,
         rig,
         Wiring.from_rig(rig).to_psds(volts),
         held,

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import yaml
 
+from psd_deflection.base.tables import Table
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan, plan_next
@@ -75,6 +76,10 @@ class Settled(StudyResult):
             made = [{'file': recorded_name(i), **p.tree()} for i, p in enumerate(self.plans, start=1)]
             out['run'] = {'outcome': self.outcome, 'sentence': self.sentence, 'recordings': made}
         return out
+
+    def table(self) -> Table:
+        """That of the answer."""
+        return self.found.table()
 
     def sections(self) -> Iterable[PageSection]:
         """Those of the answer."""

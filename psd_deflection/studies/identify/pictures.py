@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from psd_deflection.arms.shapers import KINDS, Shaper, shaper
-from psd_deflection.base.pages import picture, table
+from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Rule, Series
+from psd_deflection.base.pages import table
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.studies.identify.axis_modes import AxisModes
 from psd_deflection.studies.study import PageSection
 
-MEASURED, FITTED, MARK = '#4c72b0', '#c44e52', '#555555'
-DRAWN = 6000
+MEASURED: Final = 'blue'
+FITTED: Final = 'red'
+TONES: tuple[Colour, ...] = ('blue', 'red', 'green', 'violet')
 
 
 @dataclass(frozen=True)
@@ -32,17 +34,16 @@ class DrawnModes:
 
 def sections(found: DrawnModes) -> list[PageSection]:
     """The page below the sentences."""
-    out = [PageSection('Spectra', (picture(_spectra(found), 'spectrum of each axis with its modes'),))]
+    out = [PageSection('Spectra', (_spectra(found),))]
     if any(a.stretches for a in found.axes):
-        out.append(PageSection('Ring-downs', (picture(_ring_downs(found), 'ring-downs and their fits'),)))
+        out.append(PageSection('Ring-downs', (_ring_downs(found),)))
     if any(a.modes for a in found.axes):
         words = (
             '<p class=quiet>Share of the vibration that is left if the frequency is another. '
             'The recommended one is the shortest that leaves at most 5 % about the mode.</p>'
         )
-        drawn = picture(_shapers(found), 'what is left of the vibration over the frequency, for each shaper')
         rows = table(('axis', 'shaper', 'longer by, ms', 'impulses'), _shaper_rows(found))
-        out.append(PageSection('Input shapers', (words, drawn, rows)))
+        out.append(PageSection('Input shapers', (words, _shapers(found), rows)))
     return out
 
 
@@ -60,62 +61,50 @@ def _shaper_rows(found: DrawnModes) -> list[tuple[str, str, str, str]]:
     return rows
 
 
-def _spectra(found: DrawnModes) -> Figure:
-    figure = Figure(figsize=(10, 6.5), layout='constrained')
-    for i, axis in enumerate(figure.subplots(3, 1, sharex=True)):
+def _spectra(found: DrawnModes) -> Chart:
+    panels = []
+    for i, axis in enumerate(found.axes):
         samples = found.poses[:, i]
         there = np.flatnonzero(np.isfinite(samples))
         filled = np.interp(np.arange(len(samples)), there, samples[there])
         f, p = welch(filled, found.rate, nperseg=min(len(filled), int(8 * found.rate)))
         shown = (f > 0.3) & (f < 0.25 * found.rate)
-        axis.loglog(f[shown], SHOWN[i] * np.sqrt(p[shown]), color=MEASURED, lw=0.9)
-        for mode in found.axes[i].modes:
-            axis.axvline(mode.frequency, color=FITTED, lw=1)
-            axis.annotate(
-                f'{mode.frequency:.3f} Hz', (mode.frequency, 0.9), xycoords=('data', 'axes fraction'), fontsize=9
-            )
-        axis.set_ylabel(f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}/√Hz')
-        axis.grid(alpha=0.25, which='both')
-    axis.set_xlabel('frequency / Hz')
-    return figure
+        curve = Series('', f[shown], SHOWN[i] * np.sqrt(p[shown]), MEASURED)
+        rules = [Rule(mode.frequency, f'{mode.frequency:.3f} Hz', colour=FITTED) for mode in axis.modes]
+        label = f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}/√Hz'
+        panels.append(Panel((curve,), 'frequency / Hz', label, log='x, y', rules=rules, height=180))
+    return Chart('spectrum of each axis with its modes', panels)
 
 
-def _ring_downs(found: DrawnModes) -> Figure:
-    figure = Figure(figsize=(10, 7), layout='constrained')
-    for i, axis in enumerate(figure.subplots(3, 1)):
-        modes = found.axes[i]
-        axis.set_ylabel(f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}')
-        axis.grid(alpha=0.25)
+def _ring_downs(found: DrawnModes) -> Chart:
+    panels = []
+    for i, modes in enumerate(found.axes):
         if not modes.stretches:
-            axis.text(0.5, 0.5, 'no ring-down', ha='center', va='center', transform=axis.transAxes, color=MARK)
             continue
         first, last = max(
             modes.stretches, key=lambda s: np.nanmax(np.abs(modes.fitted[s[0] : s[1]] - modes.fitted[s[1] - 1]))
         )
-        last = min(last, first + DRAWN)
         t = np.arange(first, last) / found.rate
-        axis.plot(t, SHOWN[i] * found.poses[first:last, i], '.', ms=2, color=MEASURED, label='samples')
-        axis.plot(t, SHOWN[i] * modes.fitted[first:last], color=FITTED, lw=0.8, label='fit')
-        axis.legend(loc='upper right', ncols=2, frameon=False)
-    axis.set_xlabel('time / s')
-    return figure
+        curves = (
+            Series('samples', t, SHOWN[i] * found.poses[first:last, i], MEASURED, 'points'),
+            Series('fit', t, SHOWN[i] * modes.fitted[first:last], FITTED),
+        )
+        panels.append(Panel(curves, f'{SYMBOLS[i]}: time / s', f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}', height=180))
+    return Chart('the largest ring-down of each axis and its fit', panels)
 
 
-def _shapers(found: DrawnModes) -> Figure:
-    figure = Figure(figsize=(10, 3.4), layout='constrained')
-    for i, axis in enumerate(figure.subplots(1, 3, sharey=True)):
-        axis.set_xlabel(f'{SYMBOLS[i]}: frequency / Hz')
-        axis.grid(alpha=0.25)
-        if not found.axes[i].modes:
+def _shapers(found: DrawnModes) -> Chart:
+    panels = []
+    for i, axis in enumerate(found.axes):
+        if not axis.modes:
             continue
-        mode = found.axes[i].modes[0]
-        best = found.shapers[i]
+        mode, best = axis.modes[0], found.shapers[i]
         f = np.linspace(0.6 * mode.frequency, 1.4 * mode.frequency, 300)
-        for kind in KINDS:
-            thick = 2.2 if best is not None and best.name == kind else 0.9
+        curves = []
+        for kind, tone in zip(KINDS, TONES, strict=True):
             left = shaper(kind, mode.frequency, mode.damping).residual(f, mode.damping)
-            axis.plot(f, 100.0 * left, lw=thick, label=kind.upper())
-        axis.axvline(mode.frequency, color=MARK, lw=0.8, ls='--')
-        axis.legend(frameon=False, fontsize=8)
-    figure.supylabel('vibration left / %')
-    return figure
+            bold = best is not None and best.name == kind
+            curves.append(Series(kind.upper(), f, 100.0 * left, tone, bold=bold))
+        rules = (Rule(mode.frequency),)
+        panels.append(Panel(curves, f'{SYMBOLS[i]}: frequency / Hz', 'vibration left / %', rules=rules, height=SMALL))
+    return Chart('what is left of the vibration over the frequency, for each shaper', panels, beside=3)

@@ -9,8 +9,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from psd_deflection import __version__
 from psd_deflection.arms.shapers import Shaper, recommended
+from psd_deflection.base.pages import table
+from psd_deflection.base.tables import Column, Table, text_column
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import with_values
@@ -105,23 +109,54 @@ class Identified(StudyResult):
         for i, axis in enumerate(self.axes):
             if not axis.modes:
                 out.append(f'{SYMBOLS[i]}: no mode stands out of the noise. Knock on the link, or release a load.')
-                continue
-            how = f'{len(axis.stretches)} ring-downs' if axis.how == 'ring-down' else 'the spectrum in operation'
             for mode in axis.modes:
-                out.append(
-                    f'{SYMBOLS[i]}: {_pm(mode.frequency, mode.frequency_sd)} Hz, damping ratio '
-                    f'{_pm(mode.damping, mode.damping_sd)} (95 %), '
-                    f'{SHOWN[i] * mode.amplitude:.1f} {SHOWN_UNITS[i]}, from {how}'
-                )
-            best = self.shaper_of(i)
-            if best is not None:
-                pairs = ', '.join(f'{s:.4f} at {1e3 * t:.1f} ms' for t, s in zip(best.times, best.sizes, strict=True))
-                out.append(f'{SYMBOLS[i]}: input shaper {best.name.upper()}: {pairs}')
-        for name in KINDS:
-            why = self._withheld(name)
-            if why is not None:
-                out.append(f'Nothing for dynamics.{name}_*: {why}.')
+                frequency, damping, size, how = self._mode_words(i, mode)
+                out.append(f'{SYMBOLS[i]}: {frequency} Hz, damping ratio {damping} (95 %), {size}, from {how}')
+            if best := self._shaper_words(i):
+                out.append(f'{SYMBOLS[i]}: input shaper {best}')
+        return [*out, *self._nothing()]
+
+    def page_sentences(self) -> list[str]:
+        """How many modes there are; what they are stands in a table."""
+        found = [f'{len(axis.modes)} along {SYMBOLS[i]}' for i, axis in enumerate(self.axes) if axis.modes]
+        first = f'Modes: {", ".join(found)}.' if found else 'No mode stands out of the noise.'
+        return [first, *self._nothing()]
+
+    def rows(self) -> list[list[str]]:
+        """The modes as a table: axis, frequency, damping ratio, amplitude, what from, and the shaper."""
+        out = []
+        for i, axis in enumerate(self.axes):
+            if not axis.modes:
+                out.append([SYMBOLS[i], 'none: knock on the link, or release a load', '', '', '', ''])
+            for number, mode in enumerate(axis.modes):
+                shaper = self._shaper_words(i).partition(':')[0] if number == 0 else ''
+                out.append([SYMBOLS[i], *self._mode_words(i, mode), shaper])
         return out
+
+    def _mode_words(self, i: int, mode: Mode) -> tuple[str, str, str, str]:
+        """Frequency, damping ratio, amplitude of a mode of axis ``i``, and what it was found from."""
+        axis = self.axes[i]
+        count = len(axis.stretches)
+        rings = f'{count} ring-down{"" if count == 1 else "s"}'
+        return (
+            _pm(mode.frequency, mode.frequency_sd),
+            _pm(mode.damping, mode.damping_sd),
+            f'{SHOWN[i] * mode.amplitude:.1f} {SHOWN_UNITS[i]}',
+            rings if axis.how == 'ring-down' else 'the spectrum in operation',
+        )
+
+    def _shaper_words(self, i: int) -> str:
+        """The recommended shaper of axis ``i``; '' if there is none."""
+        best = self.shaper_of(i)
+        if best is None:
+            return ''
+        pairs = ', '.join(f'{s:.4f} at {1e3 * t:.1f} ms' for t, s in zip(best.times, best.sizes, strict=True))
+        return f'{best.name.upper()}: {pairs}'
+
+    def _nothing(self) -> list[str]:
+        """What the rig file does not get, and why."""
+        whys = [(name, self._withheld(name)) for name in KINDS]
+        return [f'Nothing for dynamics.{name}_*: {why}.' for name, why in whys if why is not None]
 
     def lines(self) -> list[str]:
         """The sentences, and the lines for the rig file."""
@@ -157,18 +192,40 @@ class Identified(StudyResult):
             'shaper': None if best is None else {'name': best.name, 'times': best.times, 'sizes': best.sizes},
         }
 
+    def table(self) -> Table:
+        """One row a mode: Hz and damping ratio with their standard deviations, amplitude in m or rad."""
+        modes = [(AXES[i], mode, UNITS[i], axis.how) for i, axis in enumerate(self.axes) for mode in axis.modes]
+
+        def column(name: str, values: list[float], unit: str, words: str) -> Column:
+            return Column(name, np.array(values, dtype=np.float64), unit, words)
+
+        return Table(
+            text_column('axis', [axis for axis, *_ in modes], 'along which it shows'),
+            [
+                column('frequency', [m.frequency for _, m, *_ in modes], 'Hz', 'of the mode'),
+                column('frequency_sd', [m.frequency_sd for _, m, *_ in modes], 'Hz', 'its standard deviation'),
+                column('damping_ratio', [m.damping for _, m, *_ in modes], '', 'of the mode'),
+                column('damping_ratio_sd', [m.damping_sd for _, m, *_ in modes], '', 'its standard deviation'),
+                column('amplitude', [m.amplitude for _, m, *_ in modes], '', 'in the unit of the row'),
+                text_column('unit', [unit for _, _, unit, _ in modes], 'of the amplitude'),
+                text_column('how', [how for *_, how in modes], 'it was found'),
+            ],
+        )
+
     def sections(self) -> Iterable[PageSection]:
-        """Spectra, ring-downs, shapers."""
+        """The table of modes, spectra, ring-downs, shapers."""
         from psd_deflection.studies.identify.pictures import DrawnModes, sections
 
         shapers = [self.shaper_of(i) for i in range(len(self.axes))]
-        return sections(DrawnModes(self.poses, self.rate, self.axes, shapers))
+        head = ('axis', 'frequency, Hz (95 %)', 'damping ratio (95 %)', 'amplitude', 'from', 'input shaper')
+        modes = PageSection('', (table(head, self.rows()),))
+        return [modes, *sections(DrawnModes(self.poses, self.rate, self.axes, shapers))]
 
     def rig_yaml(self) -> str:
         """The user's parameter file with the modes, comments kept; without one what describes the rig."""
         recording, rig, params_file, tell = self.problem.opened
         date = datetime.now(UTC).date().isoformat()
-        recorded = named(recording.path.name, recording.digest)
+        recorded = named(recording.name, recording.digest)
         source = f'Identified by psd-deflection {__version__}, {date}, from {recorded}'
 
         def edit(text: str, path: Path) -> str:

@@ -1,7 +1,7 @@
 """The errors of each method, by condition, and the origin of the thesis's Table 5.1.
 
 Exact readings of a rig with the thesis's geometry go through every method. The result is the
-method's own error, without noise. ``psd-deflection compare-methods`` prints it.
+method's own error, without noise. ``psd-deflection thesis compare-methods`` prints it.
 """
 
 from __future__ import annotations

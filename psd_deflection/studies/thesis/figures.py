@@ -1,4 +1,4 @@
-"""The figures of docs/methods.md that the methods draw: ``compare-methods --out DIR``."""
+"""The figures of docs/methods.md that the methods draw: ``thesis compare-methods --out DIR``."""
 
 from __future__ import annotations
 
@@ -31,6 +31,7 @@ from psd_deflection.studies.thesis.comparison import (
     methods,
     thesis_geometry,
 )
+from psd_deflection.studies.thesis.large_spots import DIAMETERS, FORCES, spot_run
 
 _STYLE: Any = {
     'figure.dpi': 110,
@@ -56,7 +57,7 @@ def drawn() -> Iterator[tuple[str, Figure]]:
 
 
 def comparison() -> Figure:
-    """The table of ``compare-methods`` as a picture."""
+    """The table of ``thesis compare-methods`` as a picture."""
     figure, axes = plt.subplots(1, 2, figsize=(9.6, 5.0), sharey=True, layout='constrained')
     shown = methods()[::-1]
     rows = np.arange(len(shown))
@@ -341,6 +342,31 @@ def sensors() -> Figure:
     return figure
 
 
+def large_spots() -> Figure:
+    """Figures 5.30 to 5.35: both methods with dots of 1 mm (lines) and of 2 mm (marks), and the truth."""
+    figure, axes = plt.subplots(3, 2, figsize=(9.0, 6.6), sharex=True, layout='constrained')
+    units = np.array([_MDEG / 1e3, 1e3, 1e3])
+    for column, force in zip(axes.T, FORCES, strict=True):
+        small, large = (spot_run(force, diameter) for diameter in DIAMETERS)
+        for ax, axis, label, unit in zip(column, (2, 0, 1), ('θ, deg', 'ΔX, mm', 'ΔY, mm'), units, strict=True):
+            ax.plot(small.t, unit * small.truth[:, axis], color='black', lw=0.8, label='truth')
+            for method, color in zip(small.found, (_ORANGE, _BLUE), strict=True):
+                ax.plot(small.t, unit * small.found[method][:, axis], color=color, lw=1.2, label=f'{method}, 1 mm')
+                shown = slice(0, None, 5)
+                ax.plot(
+                    *(large.t[shown], unit * large.found[method][shown, axis], '.'),
+                    color=color,
+                    ms=4,
+                    label=f'{method}, 2 mm',
+                )
+            ax.set(ylabel=label)
+        column[0].set(title=f'{force:g} N on the sidebar')
+        column[-1].set(xlabel='s')
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc='outside lower center', ncols=5, fontsize=8)
+    return figure
+
+
 FIGURES: dict[str, Callable[[], Figure]] = {
     'comparison': comparison,
     'sensors': sensors,
@@ -352,4 +378,5 @@ FIGURES: dict[str, Callable[[], Figure]] = {
     'beam': beam,
     'pose': pose,
     'base_pair': base_pair,
+    'large_spots': large_spots,
 }

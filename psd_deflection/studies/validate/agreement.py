@@ -15,6 +15,10 @@ import numpy as np
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.validate.clock import variance_of_sum
 
+MOVES, CERTAIN = 0.2, 0.1
+"""Slope of the reference on the estimate beyond which both move, and its largest standard deviation: without motion
+the slope is that of noise on noise."""
+
 
 @dataclass(frozen=True)
 class Agreement:
@@ -24,6 +28,7 @@ class Agreement:
     the estimate is larger, as a share. ``noise``: standard deviation of what bias and scale leave. ``rms``,
     ``largest``: of the differences. ``share``: ``rms`` as a share of the largest deflection of the reference. ``*_sd``:
     standard deviations of the figures. ``scale`` and ``share`` are NaN if the link did not move along this axis.
+    ``mirrored``: the reference moves the other way.
     """
 
     bias: float
@@ -35,6 +40,7 @@ class Agreement:
     rms: float
     largest: float
     share: float
+    mirrored: bool = False
 
 
 def agreement(estimate: FloatArray, reference: FloatArray) -> Agreement:
@@ -46,14 +52,14 @@ def agreement(estimate: FloatArray, reference: FloatArray) -> Agreement:
     sd = float(np.sqrt((spread * spread).sum() / (k - 1)))
     centred = estimate - estimate.mean()
     power = float(centred @ centred)
-    slope, slope_sd, noise = math.nan, math.nan, sd
+    slope, slope_sd, noise, mirrored = math.nan, math.nan, sd, False
     if power > 0.0:
         slope = float(centred @ reference) / power
         left = reference - reference.mean() - slope * centred
         noise = float(np.sqrt((left * left).sum() / (k - 2)))
         slope_sd = math.sqrt(max(variance_of_sum(centred * left), noise**2 * power)) / power
-        # Without motion the slope is that of noise on noise.
-        if not (slope > 0.2 and slope_sd < 0.1):
+        mirrored = slope < -MOVES and slope_sd < CERTAIN
+        if not (slope > MOVES and slope_sd < CERTAIN):
             slope, slope_sd = math.nan, math.nan
             noise = sd
     rms = float(np.sqrt((difference * difference).mean()))
@@ -68,4 +74,5 @@ def agreement(estimate: FloatArray, reference: FloatArray) -> Agreement:
         rms=rms,
         largest=float(np.abs(difference).max()),
         share=rms / deflection if math.isfinite(slope) else math.nan,
+        mirrored=mirrored,
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,10 +18,12 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.studies.study import Opened
 from psd_deflection.studies.validate.motion import Motion, Solve
 
+ALL = 'all'
+
 
 @dataclass(frozen=True)
 class ValidateProblem:
-    """``motion``: what the detectors saw. ``solvers``: those that can solve the rig, the rig's first.
+    """``motion``: what the detectors saw. ``solvers``: those that are compared, the rig's first.
 
     ``t`` (k,), s, by the reference's clock, increasing. ``reference`` (k, 3), m, m, rad; ``sd`` (k, 3) of it if it is
     known; ``refused``: measurements without an answer, by reason. ``estimate_sd`` (3,): of the published estimates.
@@ -54,22 +56,24 @@ def read_validate(
     align: bool = False,
     largest: float = 1.0,
     exposure: float = 0.0,
+    solvers: Sequence[str] = (),
     counted: Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]] = iter,
 ) -> ValidateProblem:
     """Read the recording and its reference, or the one of a file. Raises RecordingError if one lacks what is needed.
 
-    ``counted`` hands blocks on and counts them.
+    ``solvers``: those that are compared beside the rig's; ``ALL``: every one that can solve the rig. ``counted`` hands
+    blocks on and counts them.
     """
     recording, rig = opened.recording, opened.rig
     references = references_of(recording) if reference is None else read_references(reference)
     seen = read_run(recording, Pipeline(rig), counted(recording.blocks()))
-    solvers = _solvers(rig)
+    compared = _solvers(rig, solvers)
     start = int(seen.t_ns[0])
     return ValidateProblem(
         motion=Motion(
-            _seconds(seen.t_ns, start), seen.dots, 1.0 / rig.converter.sample_rate_hz, solvers[rig.estimator.solver]
+            _seconds(seen.t_ns, start), seen.dots, 1.0 / rig.converter.sample_rate_hz, compared[rig.estimator.solver]
         ),
-        solvers=solvers,
+        solvers=compared,
         t=_seconds(references.t_ns, start),
         reference=references.poses,
         sd=references.sd,
@@ -87,15 +91,17 @@ def _seconds(t_ns: IntArray, start_ns: int) -> FloatArray:
     return seconds
 
 
-def _solvers(rig: Rig) -> dict[str, Solve]:
-    """Every solver that can solve the rig, the rig's first."""
+def _solvers(rig: Rig, beside: Sequence[str]) -> dict[str, Solve]:
+    """The rig's, then those ``beside`` it."""
     variances = dot_noise_variances(rig) / rig.estimator.block_size
+    named = [rig.estimator.solver, *(name for name in beside if name != ALL)]
     out: dict[str, Solve] = {}
-    for name in dict.fromkeys([rig.estimator.solver, *SOLVERS]):
+    for name in dict.fromkeys([*named, *(SOLVERS if ALL in beside else ())]):
         try:
             out[name] = _solve(name, rig, variances)
         except (SolverError, ConfigError):
-            if name == rig.estimator.solver:
+            # Of all, those that cannot solve the rig are left out.
+            if name in named:
                 raise
     return out
 

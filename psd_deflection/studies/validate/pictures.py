@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from psd_deflection.base.pages import picture, table
+from psd_deflection.base.charts import SMALL, Chart, Panel, Rule, Series
+from psd_deflection.base.pages import table
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.studies.study import PageSection
 from psd_deflection.studies.validate.agreement import Agreement
-
-MEASURED, REFERENCE, DIFFERENCE, LIMIT = '#4c72b0', '#c44e52', '#333333', '#8c8c8c'
-DRAWN = 4000
-"""Points of a picture at most."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +27,7 @@ class DrawnAgreement:
 
 
 def sections(found: DrawnAgreement, rows: Sequence[Sequence[str]]) -> list[PageSection]:
-    """The page below the sentences; ``rows``: the table of all solvers, its head first."""
+    """The page below the sentences; ``rows``: the table of solvers, its head first."""
     head, *cells = rows
     shares = (
         '<p class=quiet>Estimate minus reference. The last column is the rms in percent of the largest deflection.</p>'
@@ -42,63 +36,51 @@ def sections(found: DrawnAgreement, rows: Sequence[Sequence[str]]) -> list[PageS
         '<p class=quiet>Differences over means (Bland and Altman 1986): the lines are the bias and the limits '
         'within which 95 % of the differences lie.</p>'
     )
-    over_time = picture(_over_time(found), 'estimate and reference over time, and differences')
     return [
-        PageSection('Every solver', (shares, table(head, cells))),
-        PageSection('Over time', (over_time,)),
-        PageSection('Agreement', (altman, picture(_bland_altman(found), 'differences over means'))),
-        PageSection('One against the other', (picture(_scatter(found), 'estimate over reference'),)),
+        PageSection('Agreement by solver', (shares, table(head, cells))),
+        PageSection('Over time', (_over_time(found),)),
+        PageSection('Agreement', (altman, _bland_altman(found))),
+        PageSection('One against the other', (_scatter(found),)),
     ]
 
 
-def _thinned(found: DrawnAgreement) -> tuple[Any, Any, Any]:
-    every = max(1, math.ceil(len(found.t) / DRAWN))
-    return found.t[::every], found.estimate[::every], found.reference[::every]
+def _over_time(found: DrawnAgreement) -> Chart:
+    panels = []
+    along = 'time / s, by the clock of the samples'
+    for i, (symbol, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
+        estimate, reference = SHOWN[i] * found.estimate[:, i], SHOWN[i] * found.reference[:, i]
+        both = (
+            Series('reference', found.t, reference, 'red', 'rings'),
+            Series(f'estimate ({found.solver})', found.t, estimate, 'blue'),
+        )
+        difference = (Series('', found.t, estimate - reference, 'text', 'points'),)
+        panels.append(Panel(both, along, f'{symbol} / {unit}'))
+        panels.append(Panel(difference, along, f'{symbol}: difference / {unit}', height=90))
+    return Chart('estimate and reference over time, and differences', panels)
 
 
-def _over_time(found: DrawnAgreement) -> Figure:
-    t, estimate, reference = _thinned(found)
-    figure = Figure(figsize=(10, 8), layout='constrained')
-    axes = figure.subplots(6, 1, sharex=True, height_ratios=[2, 1] * 3)
-    for i in range(3):
-        upper, lower = axes[2 * i], axes[2 * i + 1]
-        upper.plot(t, SHOWN[i] * estimate[:, i], color=MEASURED, lw=0.9, label=f'estimate ({found.solver})')
-        upper.plot(t, SHOWN[i] * reference[:, i], 'o', ms=2.5, mfc='none', color=REFERENCE, label='reference')
-        upper.set_ylabel(f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}')
-        lower.plot(t, SHOWN[i] * (estimate - reference)[:, i], '.', ms=2, color=DIFFERENCE)
-        lower.set_ylabel('difference')
-        for axis in (upper, lower):
-            axis.grid(alpha=0.25)
-    axes[0].legend(loc='upper right', ncols=2, frameon=False)
-    axes[-1].set_xlabel('time / s, by the clock of the samples')
-    return figure
+def _bland_altman(found: DrawnAgreement) -> Chart:
+    panels = []
+    for i, (symbol, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
+        agreement = found.agreements[i]
+        mean = SHOWN[i] * 0.5 * (found.estimate + found.reference)[:, i]
+        difference = Series('', mean, SHOWN[i] * (found.estimate - found.reference)[:, i], 'blue', 'points')
+        rules = [Rule(SHOWN[i] * agreement.bias, 'bias', across=True, colour='text')]
+        rules += [Rule(SHOWN[i] * limit, across=True) for limit in agreement.limits]
+        label = f'{symbol}: difference / {unit}'
+        panels.append(Panel((difference,), f'{symbol}: mean of both / {unit}', label, rules=rules, height=SMALL))
+    return Chart('differences over means', panels, beside=3)
 
 
-def _bland_altman(found: DrawnAgreement) -> Figure:
-    _, estimate, reference = _thinned(found)
-    figure = Figure(figsize=(10, 3.6), layout='constrained')
-    for i, axis in enumerate(figure.subplots(1, 3)):
-        a = found.agreements[i]
-        mean = SHOWN[i] * 0.5 * (estimate + reference)[:, i]
-        axis.plot(mean, SHOWN[i] * (estimate - reference)[:, i], '.', ms=3, color=MEASURED)
-        axis.axhline(SHOWN[i] * a.bias, color=DIFFERENCE, lw=1)
-        for limit in a.limits:
-            axis.axhline(SHOWN[i] * limit, color=LIMIT, lw=1, ls='--')
-        axis.set_xlabel(f'mean of both, {SYMBOLS[i]} / {SHOWN_UNITS[i]}')
-        axis.set_ylabel(f'difference / {SHOWN_UNITS[i]}')
-        axis.grid(alpha=0.25)
-    return figure
-
-
-def _scatter(found: DrawnAgreement) -> Figure:
-    _, estimate, reference = _thinned(found)
-    figure = Figure(figsize=(10, 3.6), layout='constrained')
-    for i, axis in enumerate(figure.subplots(1, 3)):
-        axis.plot(SHOWN[i] * reference[:, i], SHOWN[i] * estimate[:, i], '.', ms=3, color=MEASURED)
-        both = np.concatenate([reference[:, i], estimate[:, i]])
-        ends = SHOWN[i] * np.array([np.nanmin(both), np.nanmax(both)])
-        axis.plot(ends, ends, color=LIMIT, lw=1)
-        axis.set_xlabel(f'reference {SYMBOLS[i]} / {SHOWN_UNITS[i]}')
-        axis.set_ylabel(f'estimate / {SHOWN_UNITS[i]}')
-        axis.grid(alpha=0.25)
-    return figure
+def _scatter(found: DrawnAgreement) -> Chart:
+    panels = []
+    for i, (symbol, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
+        estimate, reference = SHOWN[i] * found.estimate[:, i], SHOWN[i] * found.reference[:, i]
+        both = np.concatenate([reference, estimate])
+        ends = np.array([np.nanmin(both), np.nanmax(both)])
+        curves = (
+            Series('equal', ends, ends, 'quiet'),
+            Series('', reference, estimate, 'blue', 'points'),
+        )
+        panels.append(Panel(curves, f'{symbol}: reference / {unit}', f'{symbol}: estimate / {unit}', height=SMALL))
+    return Chart('estimate over reference', panels, beside=3)

@@ -1,4 +1,4 @@
-"""The answer of validate: what estimate and reference differ by, for every solver."""
+"""The answer of validate: what estimate and reference differ by, for each solver."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from psd_deflection.base.tables import columns
+from psd_deflection.base.tables import Column, Table, columns, columns_of
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.studies.study import PageSection, StudyResult
@@ -63,6 +63,11 @@ class Validated(StudyResult):
                 f'{name}: the estimate is {_pm(a.bias, a.bias_sd, i)} off on average; 95 % of the differences lie '
                 f'between {SHOWN[i] * a.limits[0]:+.1f} and {SHOWN[i] * a.limits[1]:+.1f} {SHOWN_UNITS[i]}'
             )
+            if a.mirrored:
+                text += (
+                    '; the reference moves the other way: turn its sign (of a camera, camera.view), '
+                    'or that of the readings if `psd-deflection check` says so'
+                )
             if math.isfinite(a.scale):
                 text += f'; it is {100.0 * a.scale:+.3f} ± {196.0 * a.scale_sd:.3f} % larger'
             out.append(text + '.')
@@ -78,11 +83,11 @@ class Validated(StudyResult):
         return out
 
     def lines(self) -> list[str]:
-        """The sentences and the table of all solvers."""
+        """The sentences and the table of solvers."""
         return [*self.sentences(), '', *columns(self.rows(), left=3).splitlines()]
 
     def rows(self) -> list[list[str]]:
-        """The table of all solvers, its head first: errors as in Table 5.1 of the thesis, with bias, scale, noise."""
+        """The table of solvers, its head first: errors as in Table 5.1 of the thesis, with bias, scale, noise."""
         out = [['solver', 'axis', 'unit', 'bias', 'scale %', 'noise', 'rms', 'largest', '% of deflection']]
         for name, three in self.agreements.items():
             for i, a in enumerate(three):
@@ -117,8 +122,14 @@ class Validated(StudyResult):
             'covered': dict(zip(AXES, self.covered, strict=True)),
         }
 
+    def table(self) -> Table:
+        """One row a reference over ``t`` (s): the ``reference_`` pose, and that of each solver (m, m, rad)."""
+        parts = [('reference', self.reference), *self.estimates.items()]
+        out = [c for name, pose in parts for c in columns_of(pose, [f'{name}_{a}' for a in AXES], UNITS, [name] * 3)]
+        return Table(Column('t', self.t, 's', 'by the clock of the samples'), out, {'solver': self.solver})
+
     def sections(self) -> Iterable[PageSection]:
-        """Every solver, over time, agreement."""
+        """The solvers, over time, agreement."""
         from psd_deflection.studies.validate.pictures import DrawnAgreement, sections
 
         of = self.solver

@@ -34,9 +34,12 @@ def random_chain(rng: np.random.Generator, links: int, slopes: str) -> Chain:
 
 
 class Frame:
-    """A chain as a frame of beams under a force at its end. ``tips``: dX, dY, theta of each link; ``end`` (6,)."""
+    """A chain as a frame of beams. ``tips``: dX, dY, theta of each link; ``end`` (6,).
 
-    def __init__(self, chain: Chain, force: FloatArray) -> None:
+    ``force`` (3,) at its end, ``others`` (N, 3) at the tips, N in the base.
+    """
+
+    def __init__(self, chain: Chain, force: FloatArray, others: FloatArray | None = None) -> None:
         pynite = pytest.importorskip('Pynite', reason='the finite elements: pip install PyNiteFEA')
         self.model = pynite.FEModel3D()
         self.model.add_material('unit', 1.0, 1.0, 0.0, 0.0)
@@ -55,8 +58,10 @@ class Frame:
             ends.append((foot, root, base, link.length))
             at = tip
         end = self._beam(root, at.position, at @ chain.end, RIGID, RIGID)
-        for axis, value in zip('XYZ', force, strict=True):
-            self.model.add_node_load(end, f'F{axis}', float(value))
+        loads = [(end, force)] if others is None else [(end, force), *zip((e[1] for e in ends), others, strict=True)]
+        for node, vector in loads:
+            for axis, value in zip('XYZ', vector, strict=True):
+                self.model.add_node_load(node, f'F{axis}', float(value))
         self.model.analyze_linear()
         self.end = self._moved(end)
         self.tips = []
@@ -132,6 +137,38 @@ def test_the_slope_ratio_of_a_force_is_wrong_for_a_link_that_carries_another_one
     assert 0.03 < error < 0.3
 
 
+def test_a_chain_that_says_nothing_takes_the_load_to_hang_at_its_end() -> None:
+    rng = np.random.default_rng(3)
+    asked = random_chain(rng, 3, 'end_force')
+    chain = Chain(asked.links, asked.end)
+    frame = Frame(chain, np.array([3.0, -4.0, 5.0]))
+    assert_agrees(chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips]), frame.end, 0.007)
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize(
+    ('slopes', 'share'), [('end_force', 0.0), ('end_force', 0.3), ('end_force', 1.0), ('ratio', 0.0)]
+)
+def test_the_covariance_holds_what_the_assumption_about_the_load_leaves(slopes: str, share: float) -> None:
+    """Readings without noise, and other forces at the tips, ``share`` of that at the end."""
+    inside, error, stated = [], [], []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        chain = random_chain(rng, 3, slopes)
+        force, others = rng.uniform(-5.0, 5.0, 3), share * rng.uniform(-5.0, 5.0, (3, 3))
+        frame = Frame(chain, force, others)
+        found = chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips])
+        turned = np.kron(np.eye(2), found.rigid.rotation)
+        deviations = np.sqrt(np.diag(turned @ found.covariance @ turned.T))
+        miss = np.abs(in_base(found) - frame.end)
+        inside.extend(miss < 1.96 * deviations)
+        error.append(np.linalg.norm(miss[:3]))
+        stated.append(np.linalg.norm(deviations[:3]))
+    assert np.mean(inside) > 0.85
+    # Nor does it hold anything: it is of the size of the errors.
+    assert np.median(stated) < 6.0 * np.median(error)
+
+
 @pytest.mark.statistics
 @pytest.mark.parametrize('slopes', ['ratio', 'end_force'])
 def test_covariance_is_that_of_chance(slopes: str) -> None:
@@ -143,7 +180,8 @@ def test_covariance_is_that_of_chance(slopes: str) -> None:
         mixed = rng.normal(size=(3, 3)) * 1e-4
         covariances.append(mixed @ mixed.T)
     angles = [0.3, -0.8, 1.1]
-    said = chain.compose([TipDeflection(p, c) for p, c in zip(tips, covariances, strict=True)], angles).covariance
+    found = chain.compose([TipDeflection(p, c) for p, c in zip(tips, covariances, strict=True)], angles)
+    said = found.covariance - found.of_model
     # Draws of which mean and covariance are exact, so that few are enough.
     draws = rng.normal(size=(400, 9))
     draws -= draws.mean(axis=0)
@@ -165,10 +203,17 @@ def test_an_uncertain_slope_ratio_widens_by_its_lever() -> None:
     link = ChainLink('BC', IDENTITY, LinkStatics(0.5, 1500.0, 1000.0), slope_ratio_sd=0.1)
     chain = Chain([link], shift(0.0, 0.0, 0.4))
     found = chain.compose([TipDeflection(np.array([1e-3, 0.0, 0.0]), CERTAIN)])
+    deviations = np.sqrt(np.diag(found.covariance - found.of_model))
     # k dX/L turns the tip about Y, and the end effector is 0.4 m beyond it.
-    assert found.deviations[4] == pytest.approx(0.1 * 1e-3 / 0.5, rel=1e-5)
-    assert found.deviations[0] == pytest.approx(0.4 * found.deviations[4], rel=1e-4)
-    assert found.deviations[[1, 3, 5]] == pytest.approx(0.0, abs=1e-9)
+    assert deviations[4] == pytest.approx(0.1 * 1e-3 / 0.5, rel=1e-5)
+    assert deviations[0] == pytest.approx(0.4 * deviations[4], rel=1e-4)
+    assert deviations[[1, 3, 5]] == pytest.approx(0.0, abs=1e-9)
+    # Bent aslant: what is beyond goes further the same way, so x and y err together.
+    aslant = chain.compose([TipDeflection(np.array([1e-3, 2e-3, 0.0]), CERTAIN)])
+    covariance = aslant.covariance - aslant.of_model
+    sd = np.sqrt(np.diag(covariance))
+    assert sd[1] == pytest.approx(2.0 * sd[0], rel=1e-3)
+    assert covariance[0, 1] == pytest.approx(sd[0] * sd[1], rel=1e-3)
 
 
 def test_joints_turn_what_follows_them() -> None:
@@ -189,7 +234,7 @@ def test_what_is_no_chain_is_refused() -> None:
         Chain([])
     with pytest.raises(ConfigError, match='two links have the name BC'):
         Chain([link, link])
-    with pytest.raises(ConfigError, match='slopes = none: must be one of ratio, end_force'):
+    with pytest.raises(ConfigError, match='slopes = none: must be one of end_force, ratio'):
         Chain([link], slopes='none')
     with pytest.raises(ValueError, match='2 deflections for 1 links'):
         Chain([link]).compose([TipDeflection(np.zeros(3), CERTAIN)] * 2)

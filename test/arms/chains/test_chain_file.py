@@ -71,7 +71,7 @@ def test_each_link_has_its_own_rig(tmp_path: Path) -> None:
         ('links: [{name: a, joint: {name: 4}}]', 'a: joint: name = 4: must be text'),
         ('links: [{name: a, slope_ratio_sd: -1}]', 'link 1: slope_ratio_sd = -1: must be at least 0 and'),
         ('links: [{name: a, parameters: {lenght: 1}}]', 'a: lenght = 1: no parameter of that name'),
-        ('links: [{name: a}]\nslopes: none', "slopes = 'none': must be one of ratio, end_force"),
+        ('links: [{name: a}]\nslopes: none', "slopes = 'none': must be one of end_force, ratio"),
         ('links: [{name: a}]\nbase_frame: ""', "base_frame = '': must be the name of a frame"),
         ('links: [{name: a}]\nframe_prefix: "a b"', "frame_prefix = 'a b': must be"),
         ('links: [{name: a}]\nend_effector: {xyz: 1}', 'end_effector: xyz = 1 m: must be a list'),

@@ -27,6 +27,7 @@ PERIOD = 0.02
 ELBOW = np.array([1.2, 0.6])
 PAYLOAD = np.array([0.0, 0.0, -40.0])
 CERTAIN = np.eye(6) * 1e-12
+RIVAL = 'another node publishes'
 
 
 @pytest.fixture(scope='module')
@@ -37,13 +38,14 @@ def arm() -> Arm:
 class Loop:
     """A compensator that sees a simulated arm through estimates of noise; ``offsets`` are those the controller has.
 
-    ``tells``: the controller tells them. ``sent``: when what was sent.
+    ``tells``: the controller tells them. ``sent``: when what was sent. ``whys``: why it held, and ''.
     """
 
     def __init__(self, arm: Arm, dry: bool = False, **chosen: float) -> None:
         given: dict[str, Any] = {'takeover': False, **chosen}
         self.tells = bool(given['takeover'])
         self.sent: list[tuple[float, FloatArray]] = []
+        self.whys: set[str] = set()
         self.compensator = Compensator(arm, CompensatorSettings(axes=('x', 'z'), **given), dry)
         self.plant = SimulatedArm(read_chain(EXAMPLE).chain, ELBOW, damping=0.1)
         self.offsets = np.zeros(2)
@@ -51,18 +53,20 @@ class Loop:
         self.t = 0.0
         self.noise = np.random.default_rng(3)
 
-    def run(self, seconds: float, wanted: FloatArray = ELBOW) -> Command:
+    def run(self, seconds: float, wanted: FloatArray = ELBOW, told_every: int = 1) -> Command:
         """Let the arm be moved to ``wanted`` at once, and the compensator act."""
-        for _ in range(round(seconds / PERIOD)):
+        for n in range(round(seconds / PERIOD)):
             self.t += PERIOD
             self.plant.step(wanted + (0.0 if self.dry else self.offsets), PERIOD)
-            self.compensator.joints(self.t, self.plant.angles)
-            if self.tells:
+            if n % told_every == 0:
+                self.compensator.joints(self.t, self.plant.angles)
+            if self.tells and n % told_every == 0:
                 self.compensator.applied(self.t, self.offsets)
             at = self.plant.end().deflection
             noisy = Transform(at.rotation, at.position + self.noise.normal(size=3) * 1e-6)
             self.compensator.observe(self.t, Observed(self.t, noisy, CERTAIN))
             command = self.send(self.t)
+            self.whys.add(command.why)
         return command
 
     def send(self, now: float) -> Command:
@@ -138,8 +142,8 @@ def test_a_joint_is_not_sent_beyond_its_limit(arm: Arm) -> None:
     assert loop.plant.angles[0] > -2.0 - 1e-4
 
 
-def following(arm: Arm) -> Loop:
-    loop = Loop(arm)
+def following(arm: Arm, **chosen: Any) -> Loop:
+    loop = Loop(arm, **chosen)
     loop.plant.force = PAYLOAD
     loop.run(0.4)
     loop.compensator.enable(True)
@@ -379,6 +383,18 @@ def test_an_arm_that_stands_still_is_not_asked_for_more(arm: Arm) -> None:
     assert loop.run(1.0).state is State.FOLLOWING
 
 
+@pytest.mark.parametrize('how', [{}, {'takeover': True}, {'output': 'commands'}], ids=repr)
+def test_an_arm_that_tells_seldom_is_not_taken_for_one_that_does_not_follow(arm: Arm, how: dict[str, Any]) -> None:
+    loop = following(arm, stale=0.5, jump=1.0, **how)
+    before = loop.offsets
+    loop.plant.force = 4.0 * PAYLOAD
+    loop.whys.clear()
+    # Between two messages the offsets may move by 0.028; 0.01 from what the arm does is one that does not follow.
+    command = loop.run(3.0, told_every=14)
+    assert (command.state, loop.whys) == (State.FOLLOWING, {''})
+    assert np.abs(command.offsets - before).max() > 0.02
+
+
 def test_what_the_controller_applies_is_where_it_begins(arm: Arm) -> None:
     """After a kill and a restart the controller still has the offsets of before, and nobody enabled the new one."""
     loop = following(arm)
@@ -455,7 +471,7 @@ def test_switched_off_while_nothing_is_told_the_offsets_go_back_once_it_is(arm: 
     assert np.array_equal(loop.offsets, left)
     # Not while somebody else commands the robot.
     loop.tells = True
-    loop.compensator.stop('another node publishes')
+    loop.compensator.stop(RIVAL, rival=True)
     loop.run(0.2)
     assert len(loop.sent) == count
     loop.compensator.stop('')
@@ -466,6 +482,19 @@ def test_switched_off_while_nothing_is_told_the_offsets_go_back_once_it_is(arm: 
     count = len(loop.sent)
     loop.run(0.5)
     assert len(loop.sent) == count
+
+
+def test_switched_off_while_the_robot_stands_offsets_that_were_silent_go_back(arm: Arm) -> None:
+    loop = telling(arm)
+    loop.compensator.stop('the robot does not run')
+    loop.tells = False
+    loop.run(0.4)
+    loop.compensator.enable(False)
+    loop.tells = True
+    assert np.any(loop.offsets)
+    assert loop.run(float(np.abs(loop.offsets).max()) / 0.1 + 0.1).state is State.OFF
+    assert not loop.offsets.any()
+    assert loop.step() <= 1.0 + 1e-9
 
 
 def test_offsets_of_the_controller_that_cannot_be_ours_are_not_taken_over(arm: Arm) -> None:
@@ -538,7 +567,7 @@ EVENT = st.one_of(
     st.tuples(st.just('age'), NUMBERS),
     st.tuples(st.just('applied'), st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0))),
     st.tuples(st.just('enable'), st.booleans()),
-    st.tuples(st.just('stop'), st.sampled_from(['', 'the robot does not run'])),
+    st.tuples(st.just('stop'), st.sampled_from(['', 'the robot does not run', RIVAL])),
     st.tuples(st.just('pause'), st.floats(-1.0, 5.0)),
     st.tuples(st.just('clock'), st.floats(-1e5, 1e5)),
     st.tuples(st.just('late'), st.floats(0.0, 0.5)),
@@ -565,7 +594,7 @@ def test_whatever_comes_no_step_is_larger_than_the_rate_allows(
             if kind == 'enable':
                 compensator.enable(value)
             elif kind == 'stop':
-                compensator.stop(value)
+                compensator.stop(value, rival=value == RIVAL)
             elif kind == 'pause':
                 now += max(value, 0.0)
             elif kind == 'clock':

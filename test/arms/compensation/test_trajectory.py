@@ -57,6 +57,15 @@ def test_the_controller_follows_the_sum_exactly(kind: str, orders: int) -> None:
     np.testing.assert_allclose(shaped.at(at)[:, 0], summed(by, path, at), atol=2e-5)
 
 
+@pytest.mark.parametrize('orders', [1, 2])
+def test_a_smooth_trajectory_has_no_points_close_to_each_other(orders: int) -> None:
+    """Only a kink has one just before it: a controller follows few points better than many."""
+    by, path = ZVD, moved(orders)
+    shaped = TrajectoryShaper(by).shape(0, path, ZERO)
+    assert np.diff(shaped.times).min() > 1e-3
+    assert len(shaped.times) == len(path.times) * len(by.times)
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.tuples(st.floats(0.02, 1.0), st.floats(-2.0, 2.0)), min_size=2, max_size=6), st.sampled_from(KINDS))
 def test_positions_and_speeds_stay_within_those_that_were_given(legs: list[tuple[float, float]], kind: str) -> None:

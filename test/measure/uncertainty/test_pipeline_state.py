@@ -7,7 +7,7 @@ import pytest
 
 from blind import generator
 from psd_deflection.measure.estimation import HELD, ZERO_VARIANCES
-from psd_deflection.measure.health import FROZEN
+from psd_deflection.measure.health import FROZEN, LOUD
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.model.simulation.tip_load import TIP_LOADS
@@ -161,7 +161,13 @@ def test_what_was_changed_is_remembered() -> None:
 
 @pytest.mark.parametrize(
     ('name', 'value'),
-    [(HELD, (0.0, 1.0)), (FROZEN, (4.0,)), (ZERO_VARIANCES, (1e-12, 1e-12)), (KNOWN_LOAD, (0.0, 0.0, 1.0, 0.0))],
+    [
+        (HELD, (0.0, 1.0)),
+        (FROZEN, (4.0,)),
+        (LOUD, (1.0, 2.0)),
+        (ZERO_VARIANCES, (1e-12, 1e-12)),
+        (KNOWN_LOAD, (0.0, 0.0, 1.0, 0.0)),
+    ],
 )
 def test_a_memory_of_another_length_is_left_out_and_said(name: str, value: tuple[float, ...]) -> None:
     rig = load_rig(overrides={'filter': 'modal', 'degraded': 'hold'})

@@ -146,8 +146,48 @@ def test_errors_are_held_and_forgotten_by_a_fiftieth_a_block() -> None:
     assert got.possible == (0.0,) * (2 * PSDS)
 
 
-def test_another_one_goes_on_from_the_state() -> None:
-    one, other = Redundancy(PSDS, UNKNOWNS), Redundancy(PSDS, UNKNOWNS)
+def test_a_small_residual_that_lasts_is_widened_for_and_fades() -> None:
+    """One of 1.7 standard deviations is nothing in a block, and much if it stays."""
+    readings = with_error(2, (1.0, 0.5), 3.0)
+    of, without = Redundancy(PSDS, UNKNOWNS, lasting=True), Redundancy(PSDS, UNKNOWNS)
+    first = check(of, readings)
+    assert not np.any(first.possible)
+    mean = 1.0 / 8.0
+    for _ in range(200):
+        got = check(of, readings)
+        mean += (1.0 - mean) / 8.0
+        # The mean has the chi-square 3 mean^2.
+        if 3.0 * mean * mean > 2.5:
+            break
+        assert not np.any(got.possible)
+    assert not got.contradict
+    np.testing.assert_allclose(got.possible, 1.5 * 2.0**0.5 * mean * np.abs(got.errors), rtol=1e-6)
+    for _ in range(100):
+        got = check(of, readings)
+        assert not np.any(check(without, readings).possible)
+    np.testing.assert_allclose(got.possible, 1.5 * 2.0**0.5 * np.abs(got.errors), rtol=1e-4)
+    # Gone, it is forgotten within a second or two.
+    agreed = with_error(2, (0.0, 0.0))
+    kept = check(of, agreed).possible
+    assert np.any(kept)
+    for _ in range(150):
+        got = check(of, agreed)
+    assert not np.any(got.possible)
+
+
+def test_noise_alone_is_no_residual_that_lasts() -> None:
+    of = Redundancy(PSDS, UNKNOWNS, lasting=True)
+    root, rng = np.linalg.cholesky(COVARIANCE), np.random.default_rng(11)
+    shares = [np.any(check(of, root @ rng.normal(size=2 * PSDS)).possible) for _ in range(2000)]
+    # Those of one block, a per cent.
+    assert np.mean(shares) < 0.03
+
+
+@pytest.mark.parametrize('lasting', [False, True])
+def test_another_one_goes_on_from_the_state(lasting: bool) -> None:
+    one, other = Redundancy(PSDS, UNKNOWNS, lasting=lasting), Redundancy(PSDS, UNKNOWNS, lasting=lasting)
+    for _ in range(30 * lasting):
+        check(one, with_error(2, (1.0, 0.5), 3.0))
     for of in (one, other):
         check(of, with_error(1, (1.0, 0.5), 9.0 * LIMIT))
     check(one, with_error(4, (1.0, 0.5), 9.0 * LIMIT), {4})
@@ -155,8 +195,9 @@ def test_another_one_goes_on_from_the_state() -> None:
     readings = with_error(4, (0.0, 0.0))
     assert check(one, readings, {4}) == check(other, readings, {4})
     assert check(one, readings) == check(other, readings)
-    for values in ((0.0,) * 9, (5.0, 0.0, *(0.0,) * 8), (-1.0, 0.0, *(0.0,) * 8)):
-        with pytest.raises(ValueError, match='10 values'):
+    many = 26 if lasting else 10
+    for values in ((0.0,) * (many - 1), (5.0, *(0.0,) * (many - 1)), (-1.0, *(0.0,) * (many - 1))):
+        with pytest.raises(ValueError, match=f'{many} values'):
             other.set_state(values)
 
 

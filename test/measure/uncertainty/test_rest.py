@@ -21,11 +21,11 @@ def moves(um: list[float], noise_um: float = 0.01) -> str:
 def test_two_blocks_tell_nothing_three_do() -> None:
     assert moves([0.0, 50.0]) == ''
     # From the first block to the mean of the others.
-    assert moves([0.0, 2.01, 2.01]).startswith('the link moves: y1 varied by 1.2 um rms in the last 3 blocks, noise')
+    assert moves([0.0, 2.01, 2.01]).startswith('the link moves: y1 varied by 1.2 µm rms in the last 3 blocks, noise')
     assert moves([0.0, 1.99, 1.99]) == ''
     # Of two at 0 and two at 1 m: 1/sqrt 3 m.
     said = moves([0.0, 0.0, 1e6, 1e6], noise_um=1e5)
-    assert ' varied by 577350.3 um rms in the last 4 blocks, noise explains 100000.0 um; ' in said
+    assert ' varied by 577350.3 µm rms in the last 4 blocks, noise explains 100000.0 µm; ' in said
 
 
 @pytest.mark.parametrize(('noise_um', 'drifts', 'scatters'), [(0.01, 2.0, 10.0), (3.0, 15.0, 15.0)])
@@ -69,6 +69,6 @@ def test_the_check_of_three_psds_goes_on_from_its_memory() -> None:
     one, other = (StampedDots(load_rig(overrides={'psd_3.center': [0.08, -0.06]})) for _ in range(2))
     assert one._redundancy is not None
     assert other._redundancy is not None
-    one._redundancy.set_state((2.0, 7.0, *(1e-12 * k for k in range(6))))
+    one._redundancy.set_state((2.0, 7.0, *(1e-12 * k for k in range(18))))
     other.restore(one.memory())
     assert other._redundancy.state() == one._redundancy.state()

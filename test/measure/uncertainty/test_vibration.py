@@ -53,8 +53,8 @@ def test_two_tones_are_two_and_what_does_not_take_part_stays_out() -> None:
     second, first = sorted(found(moving, noise(2)), key=rms_of)
     assert [round(t.frequency * RATE) for t in (first, second)] == [180, 87]
     np.testing.assert_allclose(first.covariance, np.outer(TURN[1], TURN[1]) * 9e-6**2 / 2.0, rtol=0.05, atol=1e-20)
-    assert words_of((first, second), RATE) == '5.1 um rms near 180 Hz, 1.7 um rms near 87 Hz'
-    assert words_of((Tone(0.087, np.eye(4) * 200e-12),), RATE) == '14 um rms near 87 Hz'
+    assert words_of((first, second), RATE) == '5.1 µm rms near 180 Hz, 1.7 µm rms near 87 Hz'
+    assert words_of((Tone(0.087, np.eye(4) * 200e-12),), RATE) == '14 µm rms near 87 Hz'
 
 
 @pytest.mark.parametrize('share', [0.15, 1.0])
@@ -122,11 +122,11 @@ def test_a_vibration_is_counted_and_named(hz: float) -> None:
     # And by no more than it is: three times, where the polynomials begin to follow it.
     assert s.inside.rms[1] > s.sd[1] / 1.2
     assert s.named == 1.0
-    assert s.words == f'vibrates: 14 um rms near {hz:g} Hz'
+    assert s.words == f'vibrates: 14 µm rms near {hz:g} Hz'
 
 
 def test_without_it_nothing_is_as_before() -> None:
-    """The finding: 14 um off at +- 0.4 um, and nothing said."""
+    """The finding: 14 µm off at +- 0.4 um, and nothing said."""
     s = shaken(87.0, seconds=8, vibration='ignore')
     assert s.inside.three < 0.2
     assert s.named == 0.0
@@ -214,7 +214,7 @@ def test_info_says_what_vibrates(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert main(['simulate', '--out', str(path), '--loads', 'chirp:0,-4,0:87,87:4']) == 0
     capsys.readouterr()
     assert main(['info', str(path)]) == 0
-    assert 'um rms near 87 Hz, in 100 % of the seconds' in capsys.readouterr().out
+    assert 'µm rms near 87 Hz, in 100 % of the seconds' in capsys.readouterr().out
     assert main(['info', str(path), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['vibration']['hz'] == pytest.approx(87.0, abs=0.2)
     assert main(['simulate', '--out', str(tmp_path / 'quiet.csv'), '--loads', 'steps:0,0,0;0,-10,0:2']) == 0

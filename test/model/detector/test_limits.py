@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.measure.health import OpticsHealth, Verdict
+from psd_deflection.measure.health import Loudness, OpticsHealth, Verdict
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock
 from psd_deflection.rig.config import load_rig
 
@@ -178,13 +178,15 @@ def test_noise_is_told_whatever_the_link_does_slowly(order: int) -> None:
         for _ in range(200):
             volts = np.tile(np.array(GOOD, np.float32), (20, 1))
             volts[:, 4] += (3.0 * t**order + times * 2e-3 * rng.standard_normal(20)).astype(np.float32)
-            found = OpticsHealth(rig).late_findings(volts, Verdict(BlockStatus.OK, '', 0), (0, 0))
+            found = OpticsHealth(rig).late_findings(volts, Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness())
             assert len(found) <= 1
             assert all(f.startswith('psd_2 is noisy') for f in found)
             told[times] += len(found)
     assert told[4.0] < 30
     assert told[10.0] > 190
-    blamed = OpticsHealth(rig).late_findings(volts, Verdict(BlockStatus.OK, '', 0, faults=frozenset({2})), (0, 0))
+    blamed = OpticsHealth(rig).late_findings(
+        volts, Verdict(BlockStatus.OK, '', 0, faults=frozenset({2})), (0, 0), Loudness()
+    )
     assert blamed == ()
 
 
@@ -267,7 +269,9 @@ def test_noise_is_told_from_five_times_what_amplifier_and_converter_have(channel
     for share, told in ((0.99, 0), (1.01, 1)):
         volts = np.zeros((size, 6))
         volts[:, channel] = share * limit * np.sqrt(20.0) / 8.0 * (-1.0) ** np.arange(size)
-        found = OpticsHealth(rig).late_findings(volts.astype(np.float32), Verdict(BlockStatus.OK, '', 0), (0, 0))
+        found = OpticsHealth(rig).late_findings(
+            volts.astype(np.float32), Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness()
+        )
         assert found == (f'psd_{1 + channel // 3} is noisy: {share * limit * 1e3:.1f} mV a sample',) * told
 
 
@@ -275,7 +279,9 @@ def test_blocks_of_nine_samples_and_blocks_with_gaps_tell_no_noise() -> None:
     volts = np.tile((-1.0) ** np.arange(20, dtype=np.float32)[:, None], (1, 6)).astype(np.float32)
     for size, present in ((9, 9), (20, 19)):
         rig = load_rig(overrides={'block_size': size, 'min_samples': 4})
-        assert OpticsHealth(rig).late_findings(volts[:present], Verdict(BlockStatus.OK, '', 0), (0, 0)) == ()
+        assert (
+            OpticsHealth(rig).late_findings(volts[:present], Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness()) == ()
+        )
 
 
 def test_a_frozen_detector_is_a_finding_unless_it_is_a_fault() -> None:
@@ -283,11 +289,11 @@ def test_a_frozen_detector_is_a_finding_unless_it_is_a_fault() -> None:
     health, ok = OpticsHealth(load_rig()), Verdict(BlockStatus.OK, '', 0)
     blamed = Verdict(BlockStatus.LASER_LOST, '', 2, faults=frozenset({2}))
     said = ('psd_1 stands still: no bit has moved for 5 blocks', 'psd_2 stands still: no bit has moved for 7 blocks')
-    assert health.late_findings(volts, ok, (5, 7)) == said
-    assert health.late_findings(volts, ok, (4, 7)) == said[1:]
-    assert health.late_findings(volts, blamed, (5, 7)) == said[:1]
+    assert health.late_findings(volts, ok, (5, 7), Loudness()) == said
+    assert health.late_findings(volts, ok, (4, 7), Loudness()) == said[1:]
+    assert health.late_findings(volts, blamed, (5, 7), Loudness()) == said[:1]
     refuses = OpticsHealth(load_rig(overrides={'frozen': 'refuse'}))
-    assert refuses.late_findings(volts, ok, (5, 7)) == ()
+    assert refuses.late_findings(volts, ok, (5, 7), Loudness()) == ()
 
 
 def test_a_dot_outside_is_told_in_millimetres() -> None:

@@ -98,7 +98,7 @@ def test_a_new_method_is_budgeted_as_it_declares(tmp_path: Path, capsys: pytest.
 
 @pytest.mark.usefixtures('joined')
 def test_a_new_method_is_compared_or_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['compare-methods']) == 0
+    assert main(['thesis', 'compare-methods']) == 0
     lines = capsys.readouterr().out.splitlines()
     rows = [[line[30:] for line in lines if line.startswith(name + '  ')] for name in ('made_up', 'exact (default)')]
     assert len(rows[0]) == 2

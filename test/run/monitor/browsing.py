@@ -10,7 +10,7 @@ import pytest
 from selenium.webdriver.support.ui import WebDriverWait
 
 from test.heard import WAIT_S
-from tools.browser import WHAT_IS_NEEDED, find_browser, open_browser
+from tools.browser import WHAT_IS_NEEDED, find_browser, heap_bytes, open_browser
 
 
 def require_browser() -> None:
@@ -76,9 +76,7 @@ class Page:
 
     def heap_bytes(self) -> int:
         """JavaScript heap in use after the garbage is gone."""
-        for _ in range(2):
-            self.driver.execute_cdp_cmd('HeapProfiler.collectGarbage', {})
-        return int(self.driver.execute_cdp_cmd('Runtime.getHeapUsage', {})['usedSize'])
+        return heap_bytes(self.driver)
 
     def nodes(self) -> int:
         return int(self.js('document.querySelectorAll("*").length'))

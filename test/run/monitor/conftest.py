@@ -2,10 +2,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from .serving import Serving
+
+if TYPE_CHECKING:
+    from .browsing import Page
 
 
 @pytest.fixture(autouse=True)
@@ -28,3 +32,14 @@ def serve() -> Iterator[Callable[..., Serving]]:
     yield begin
     for serving in started:
         serving.server.close()
+
+
+@pytest.fixture(scope='module')
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    """A browser."""
+    # Imported here: only these tests need selenium.
+    from .browsing import Page
+
+    one = Page(tmp_path_factory.mktemp('profile'))
+    yield one
+    one.close()

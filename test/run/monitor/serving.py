@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from psd_deflection.base.log import texts
+from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -20,6 +23,7 @@ from psd_deflection.run.monitor.feed import Feed
 from psd_deflection.run.monitor.metrics import Family, counter
 from psd_deflection.run.monitor.server import MonitorServer
 from psd_deflection.run.monitor.shown import RefusedError
+from test.heard import until
 
 START_NS = 1_700_000_000_000_000_000
 BLOCK_NS = 20_000_000
@@ -38,7 +42,9 @@ class StillShown:
         self.played: list[tuple[bool | None, float | None]] = []
         self.recordings: list[str | None] = []
         self.refusal = ''
+        self.folder = 'recordings/test'
         self.reports = 0
+        self.alarmed: Alarm | None = None
         self.acted = threading.Event()
 
     def describe(self) -> dict[str, Any]:
@@ -63,7 +69,7 @@ class StillShown:
     async def record(self, wanted: bool) -> str:
         if self.refusal:
             raise RefusedError(self.refusal)
-        self.recordings.append('recordings/test' if wanted else None)
+        self.recordings.append(self.folder if wanted else None)
         return 'recording' if wanted else 'recording ended'
 
     def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
@@ -87,6 +93,12 @@ class StillShown:
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         self.played.append((paused, seek_s))
         return 'playing'
+
+    def alarm(self) -> Alarm | None:
+        return self.alarmed
+
+    def history_file(self) -> Path | None:
+        return None
 
 
 def spots_of(index: int, *, status: BlockStatus = BlockStatus.OK, lost: int = 0) -> SpotMeans:
@@ -136,8 +148,14 @@ class Serving:
         self.url = self.server.start()
         self.port = int(self.url.rstrip('/').rpartition(':')[2])
 
-    def give(self, first: int, count: int, *, spread: float = 1.0, **options: Any) -> None:
+    def give(self, first: int, count: int, *, spread: float = 1.0, every: int = 1, **options: Any) -> None:
+        """Blocks ``first`` and so on; ``every`` times as slowly as the rig would."""
         for index in range(first, first + count):
+            t_ns = START_NS + index * every * BLOCK_NS
             if options.get('status', BlockStatus.OK) is BlockStatus.OK:
-                self.feed.put(estimate_of(index, spread=spread))
-            self.feed.put(spots_of(index, **options))
+                self.feed.put(estimate_of(index, spread=spread)._replace(t_ns=t_ns))
+            self.feed.put(dataclasses.replace(spots_of(index, **options), t_ns=t_ns))
+
+    def settle(self) -> None:
+        """Wait until the server has taken what was given."""
+        until(lambda: not self.feed.waiting)

@@ -63,6 +63,15 @@ def test_the_live_page(page: Page, shown: Serving) -> None:
     audit(page, 'document.body.dataset.rows >= 105 && document.querySelectorAll("#entries details").length > 0')
 
 
+def test_the_hours_each_on_a_scale_of_its_own(page: Page, shown: Serving) -> None:
+    page.open(shown.url)
+    page.until('document.body.dataset.rows >= 105')
+    page.js('document.querySelector("[data-span=\'600\']").click()')
+    page.js('document.getElementById("each").click()')
+    # The browser remembers both when it opens the page anew.
+    audit(page, 'document.body.dataset.cells > 0 && document.querySelectorAll("#plot_shift .u-axis").length === 3')
+
+
 def test_the_live_page_when_no_samples_come(page: Page, shown: Serving) -> None:
     page.open(shown.url)
     audit(page, 'document.body.dataset.state === "stale" && document.querySelectorAll("#entries details").length > 0')
@@ -105,7 +114,7 @@ def test_the_report_of_discover(page: Page, tmp_path: Path) -> None:
     assert main(['simulate', '--out', str(recording), *loads, *hidden]) == 0
     assert main(['discover', str(recording), '--params-file', 'config/thesis_rig.yaml', '--out', str(out)]) == 0
     page.open((out / 'report.html').as_uri())
-    audit(page, 'document.querySelectorAll("img").length >= 4')
+    audit(page, 'document.querySelectorAll(".uplot").length >= 8')
     page.driver.execute_cdp_cmd(
         'Emulation.setDeviceMetricsOverride', {'width': 390, 'height': 844, 'deviceScaleFactor': 1, 'mobile': True}
     )
@@ -113,5 +122,6 @@ def test_the_report_of_discover(page: Page, tmp_path: Path) -> None:
         # Readable on a phone: as wide as it, and no wider.
         assert page.js('window.innerWidth') == 390
         assert page.js('document.documentElement.scrollWidth') <= 390
+        assert page.complaints() == []
     finally:
         page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})

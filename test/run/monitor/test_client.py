@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
+import signal
 import stat
 import subprocess
 import sys
@@ -14,11 +16,14 @@ from pathlib import Path
 
 import pytest
 
+from psd_deflection import simulate
 from psd_deflection.cli.main import main
+from psd_deflection.recordings.conversion import Beside, convert
 from psd_deflection.records import BlockStatus
 from psd_deflection.run.monitor import client
 from psd_deflection.run.monitor.served import Served, announce, served_pages
 from test.heard import WAIT_S
+from tools.program import ROOT
 
 from .serving import START_NS, Serving
 from .test_server import listen
@@ -67,7 +72,7 @@ def test_zero_waits_for_a_link_that_moves(
     serve: Serve, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     serving = serve()
-    serving.shown.refusal = 'not zeroed: the link moves: y1 varied by 80.0 um rms'
+    serving.shown.refusal = 'not zeroed: the link moves: y1 varied by 80.0 µm rms'
     assert main(['zero', '--wait', '0']) == 7
     assert 'the link moves: y1 varied' in capsys.readouterr().err
     waited: list[float] = []
@@ -81,6 +86,78 @@ def test_zero_waits_for_a_link_that_moves(
     assert main(['zero']) == 0
     assert len(waited) == 3
     assert capsys.readouterr() == ('unloaded dots taken\n', '')
+
+
+CALIBRATE = ['calibrate', '--live', '--params-file', str(ROOT / 'config' / 'thesis_rig.yaml'), '--out']
+
+
+def test_calibrate_records_and_ends_with_the_recording(
+    serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    made = simulate(None, [(0, 0, 0), (30, 0, 0), (0, -50, -29), (-40, 40, 20)], seconds=1, seed=4)
+    convert(made, bag, made.parameters, Beside.of(made), made.blocks())
+    serving = serve()
+    serving.shown.folder = str(bag)
+    # It asks whether something is recorded, asks for a recording, and where it is; then somebody ends it.
+    asked, told = itertools.count(1), client.recording_of
+
+    def recording_of(daemon: client.Daemon) -> str | None:
+        if next(asked) == 3:
+            serving.shown.recordings.append(None)
+        return told(daemon)
+
+    monkeypatch.setattr(client, 'recording_of', recording_of)
+    monkeypatch.setattr('os.nice', lambda more: more)
+    assert main([*CALIBRATE, str(out)]) == 0
+    assert serving.shown.recordings == [str(bag), None, None]
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f'recording to {bag}; Ctrl-C or `psd-deflection record stop` ends it'
+    assert sum(line.startswith('   4.0 s  ') for line in lines) > 10
+    assert any(line.startswith('next: ') for line in lines)
+    assert {path.name for path in out.iterdir()} == {'rig.yaml', 'report.html', 'calibration.json'}
+
+
+def test_a_stop_of_the_calibration_is_never_lost(
+    serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python drops an exception that a signal raises in a callback of the garbage collector."""
+    bag, out = tmp_path / 'bag', tmp_path / 'out'
+    made = simulate(None, [(0, 0, 0), (30, 0, 0), (0, -50, -29)], seconds=1, seed=4)
+    convert(made, bag, made.parameters, Beside.of(made), made.blocks())
+    serving = serve()
+    serving.shown.folder = str(bag)
+    asked, told = itertools.count(1), client.recording_of
+
+    class Leaving:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+            # The signal is taken between two steps of Python.
+            sum(range(10))
+
+    def recording_of(daemon: client.Daemon) -> str | None:
+        if next(asked) == 3:
+            Leaving()
+        return told(daemon)
+
+    monkeypatch.setattr(client, 'recording_of', recording_of)
+    monkeypatch.setattr('os.nice', lambda more: more)
+    before = signal.getsignal(signal.SIGTERM)
+    assert main([*CALIBRATE, str(out)]) == 0
+    assert signal.getsignal(signal.SIGTERM) == before
+    # Nobody but us has ended the recording.
+    assert serving.shown.recordings == [str(bag), None]
+    assert {path.name for path in out.iterdir()} == {'rig.yaml', 'report.html', 'calibration.json'}
+
+
+def test_calibrate_needs_the_recording_on_this_machine(
+    serve: Serve, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    serving = serve()
+    assert main([*CALIBRATE, str(tmp_path / 'out')]) == 4
+    assert 'recordings/test: is not on this machine' in capsys.readouterr().err
+    # Who began it ends it.
+    assert serving.shown.recordings == ['recordings/test', None]
 
 
 def test_echo_prints_new_blocks(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from psd_deflection.records import BlockStatus, SampleBlock, TipLoad
+from psd_deflection.records import RESTART, BlockStatus, ParameterChange, SampleBlock, TipLoad
 from psd_deflection.run.monitor.feed import COLUMNS, BlockResult, Feed, row_columns, row_json
 
 from .serving import START_NS, estimate_of, spots_of
@@ -26,6 +26,21 @@ def test_a_row_has_the_block_and_its_primary_estimate() -> None:
     assert math.isclose(row['dx'], 1e-3 * math.sin(0.7), rel_tol=1e-6)
     assert math.isclose(row['sd_theta'], 3e-6, rel_tol=1e-6)
     assert math.isclose(row['x1'], 1e-3 * math.cos(0.7), rel_tol=1e-6)
+
+
+def test_blocks_of_which_nothing_came_are_counted_with_the_next() -> None:
+    feed = Feed(limit=6)
+    for index in (5, 6, 9, 2, 3):
+        feed.put(spots_of(index))
+    feed.put(ParameterChange(START_NS, 4, ((RESTART, (70.0, 2000.0)),)))
+    feed.put(spots_of(100))
+    # Those that did not fit were seen: they are no loss.
+    feed.put(spots_of(101))
+    assert [r.gone for r in feed.take() if isinstance(r, BlockResult)] == [0, 0, 2, 0, 0, 0]
+    feed.put(spots_of(103))
+    feed.skip()
+    feed.put(spots_of(200))
+    assert [r.gone for r in feed.take() if isinstance(r, BlockResult)] == [1, 0]
 
 
 def test_a_block_without_an_estimate_does_not_borrow_one() -> None:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import json
+import re
 import socket
 from collections.abc import Callable
 from typing import Any
+from urllib.parse import urlencode
 
 import aiohttp
+import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import unsaid
-from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, ReferencePose
+from psd_deflection.measure.watch import Alarm
+from psd_deflection.records import RESTART, AppliedLoad, BlockStatus, Mark, ParameterChange, ReferencePose
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run.monitor import server
 from psd_deflection.run.monitor.feed import Feed
@@ -112,8 +117,10 @@ def test_the_page_is_whole_and_loads_nothing_from_elsewhere(serve: Serve) -> Non
     assert "default-src 'none'" in headers['Content-Security-Policy']
     assert headers['X-Frame-Options'] == 'DENY'
     names = [part.split('"')[0] for part in page.replace('src="', 'href="').split('href="')[1:]]
-    assert len(names) >= 4
-    names += ['/page/rows.js', '/page/plots.js', '/page/detector.js', '/page/vendor/uPlot.LICENSE']
+    # All modules are asked for at once, not each after the one that imports it.
+    imported = [re.findall(r"from '(/page/\S+)'", path.read_text()) for path in server.PAGE.glob('*.js')]
+    assert {name for found in imported for name in found} <= set(names)
+    names += ['/page/vendor/uPlot.LICENSE']
     for name in names:
         assert name.startswith('/page/')
         status, text, headers = ask(serving.url + name[1:], 'GET')
@@ -270,6 +277,64 @@ def test_loads_zeros_and_references_are_shown(serve: Serve) -> None:
     assert references == [
         [pytest.approx(t + 0.02 * k, abs=1e-6), 0.001, -0.002, pytest.approx(0.1 * k)] for k in range(4)
     ]
+
+
+def history_of(serving: Serving, seconds: float, **more: object) -> dict[str, Any]:
+    """The answer for so many seconds from the first block on."""
+    query = urlencode({'from': START_NS / 1e9, 'to': START_NS / 1e9 + seconds, **more})
+    status, text, headers = ask(f'{serving.url}api/history?{query}', 'GET')
+    assert (status, headers['Content-Type']) == (200, 'application/json; charset=utf-8')
+    return dict(json.loads(text))
+
+
+def column(answer: dict[str, Any], name: str) -> list[float]:
+    return [float(v) for v in np.frombuffer(base64.b64decode(answer['columns'][name]), '<f4')]
+
+
+def test_the_history_has_what_came_with_its_losses_and_marks(serve: Serve) -> None:
+    serving = serve()
+    serving.give(0, 100)
+    serving.feed.put(Mark(START_NS + BLOCK_NS, 'bumped it'))
+    serving.feed.put(ParameterChange(START_NS + BLOCK_NS, 1, (('psd_1.zero', (0.0, 0.0)),)))
+    # Two blocks of which nothing came, four of which some did, two without light.
+    serving.give(102, 4, lost=3)
+    serving.give(106, 2, status=BlockStatus.LASER_LOST)
+    # A number that no sample had, as the device began anew.
+    serving.feed.put(ParameterChange(START_NS, 108, ((RESTART, (2160.0, 3000.0)),)))
+    serving.give(150, 50)
+    listen(serving.url, lambda m: any(r[1] == 199 for r in m.get('rows', [])))
+    serving.shown.alarmed = Alarm(START_NS + 2 * BLOCK_NS, START_NS + 4 * BLOCK_NS, 'x1', 3e-6, 1e-7)
+    listen(serving.url, lambda m: any(mark[1] == 'alarm' for mark in m.get('marks', ())))
+    answer = history_of(serving, 4.0)
+    assert (answer['start'], answer['width'], answer['marks_left_out']) == (START_NS / 1e9, 1.0, 0)
+    assert column(answer, 'blocks') == [50, 50, 6, 50]
+    assert column(answer, 'estimates') == [50, 50, 4, 50]
+    assert column(answer, 'lost') == [0, 0, 2 * 20 + 4 * 3, 0]
+    # dX swings by 1 mm with a period of 1.26 s.
+    assert column(answer, 'dx_high')[0] == pytest.approx(1e-3, rel=1e-2)
+    assert column(answer, 'dx_low')[0] == pytest.approx(-1e-3, rel=1e-2)
+    assert column(answer, 'sum1') == [5.0] * 4
+    assert [mark[1] for mark in answer['marks']] == ['mark', 'zero', 'alarm']
+    assert answer['marks'][-1][2].startswith('x1 is +3.00 µm off')
+    # The same for a second browser, and in cells as wide as it wants them.
+    assert column(history_of(serving, 40.0, points=10), 'blocks') == [156]
+
+
+@pytest.mark.parametrize(
+    ('query', 'headers', 'status', 'words'),
+    [
+        ('from=1&to=noon', {}, 400, "refused: to = 'noon': must be a time in s since 1970"),
+        ('', {}, 400, 'refused: from is missing'),
+        ('from=1&to=2', {'Host': 'evil.example'}, 403, 'not the name of this machine'),
+        ('from=1&to=2', {'Origin': 'http://evil.example'}, 403, 'asked for by another site'),
+        ('from=1&to=2', {'Sec-Fetch-Site': 'cross-site'}, 403, 'asked for by another site'),
+    ],
+)
+def test_who_may_not_see_the_page_does_not_get_its_history(
+    serve: Serve, query: str, headers: dict[str, str], status: int, words: str
+) -> None:
+    found, text, _ = ask(f'{serve().url}api/history?{query}', 'GET', headers=headers)
+    assert (found, words in text) == (status, True)
 
 
 def test_a_client_that_wants_no_history_gets_new_rows_alone(serve: Serve) -> None:

@@ -14,7 +14,8 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, Record, ReferencePose, SpotMeans
 from psd_deflection.run.monitor.feed import BlockResult, Feed
-from psd_deflection.run.monitor.shown import RefusedError, ShownRecording
+from psd_deflection.run.monitor.shown import RefusedError
+from psd_deflection.run.monitor.shown_recording import ShownRecording
 
 BAGS = Path(__file__).parents[3] / 'bags'
 
@@ -37,7 +38,7 @@ def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, sp
 
 
 def test_rates_are_of_a_second_however_long_ago_the_last_report_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr('psd_deflection.run.monitor.shown.time.time_ns', lambda: 0)
+    monkeypatch.setattr('psd_deflection.run.monitor.shown_recording.time.time_ns', lambda: 0)
     ended = threading.Event()
     source = source_of('clean', Feed(), list[str](), ended)
     source.start()
@@ -100,12 +101,13 @@ class Played(Feed):
     def __init__(self) -> None:
         super().__init__()
         self.times: list[int] = []
+        self.gone = 0
         self.others: list[Record] = []
         self._new = threading.Condition()
 
     def put(self, record: Record) -> None:
         super().put(record)
-        self.take()
+        self.gone += sum(item.gone for item in self.take() if isinstance(item, BlockResult))
         with self._new:
             if isinstance(record, SpotMeans):
                 self.times.append(record.t_ns)
@@ -116,6 +118,19 @@ class Played(Feed):
     def until(self, condition: Callable[[], bool]) -> None:
         with self._new:
             assert self._new.wait_for(condition, 60.0)
+
+
+def test_what_is_passed_over_on_the_way_to_a_goal_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr('psd_deflection.run.monitor.shown_recording.BEFORE_GOAL_NS', 0)
+    feed = Played()
+    source = source_of('clean', feed, [], threading.Event(), speed=1e-3)
+    source.start()
+    feed.until(lambda: len(feed.times) >= 1)
+    source.play(None, 3.0)
+    feed.until(lambda: feed.times[-1] >= feed.times[0] + 2.9e9)
+    source.close()
+    assert len(feed.times) < 50
+    assert feed.gone == 0
 
 
 def test_a_recording_can_be_paused_and_sought() -> None:

@@ -1,14 +1,17 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from psd_deflection.records import SampleBlock
+from psd_deflection.recordings.replay.engine import open_for_replay
+from psd_deflection.records import DiagnosticEntry, SampleBlock
 from psd_deflection.rig.config import load_rig
-from psd_deflection.run.monitor.spectrum import SEGMENT, Spectrum, density_json
+from psd_deflection.run.monitor.spectrum import SEGMENT, Spectrum, density_json, line_entry
+from tools.program import ROOT
 
 RIG = load_rig()
 
@@ -108,3 +111,42 @@ def test_samples_without_light_are_no_dots() -> None:
         block.volts[:, 5] = 0.01
         spectrum.add(block)
     assert spectrum.density() is None
+
+
+def entry_of(volts: npt.NDArray[np.float64]) -> DiagnosticEntry:
+    spectrum = Spectrum(RIG)
+    for block in blocks(volts):
+        spectrum.add(block)
+    return line_entry(RIG, spectrum.frequencies, spectrum.density())
+
+
+@pytest.mark.parametrize('hz', [40.0, 1040.0, 960.0])
+def test_a_line_without_a_mode_is_said_with_all_that_it_may_be(hz: float) -> None:
+    """The samples of 40, 960 and 1040 Hz are the same."""
+    noise = np.random.default_rng(1).normal(0.0, 2e-3, 4000)
+    entry = entry_of(noise + 0.04 * np.sin(2.0 * np.pi * hz * np.arange(4000) * 1e-3))
+    assert entry.level == 1
+    assert re.match(r'a line of 14\.[12] µm rms at 40 Hz on x1, where the rig file has no mode: ', entry.message)
+    assert 'something at 960 or 1040 Hz is folded' in entry.message
+    assert dict(entry.values) == {'line (Hz)': '40.0'}
+
+
+def test_noise_and_the_modes_of_the_rig_are_no_line() -> None:
+    t = np.arange(4000) * 1e-3
+    rng = np.random.default_rng(2)
+    for hz in (14.0, 21.0):
+        ringing = 4.0 * np.exp(-0.02 * 2.0 * np.pi * hz * (t % 2.0)) * np.sin(2.0 * np.pi * hz * (t % 2.0))
+        assert entry_of(ringing + rng.normal(0.0, 2e-3, 4000)).level == 0
+    for _ in range(50):
+        assert entry_of(rng.normal(0.0, 2e-3, 4000)).level == 0
+    assert entry_of(np.zeros(4000)).level == 0
+    assert line_entry(RIG, Spectrum(RIG).frequencies, None).level == 0
+
+
+def test_loads_that_come_and_go_are_no_line() -> None:
+    recording, rig = open_for_replay(ROOT / 'bags' / 'clean')
+    spectrum = Spectrum(rig)
+    for number, block in enumerate(recording.blocks()):
+        spectrum.add(block)
+        if number % 25 == 24:
+            assert line_entry(rig, spectrum.frequencies, spectrum.density()).level == 0

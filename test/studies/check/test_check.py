@@ -276,6 +276,26 @@ def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
     assert not quiet.notes
 
 
+def test_a_sum_beyond_the_limits_is_wrong() -> None:
+    loads = pushes(50.0)
+    for more, word in ((-3.5, 'too little: sum 1.50 V, below sum_min 2.5 V'), (3.0, 'too much: sum 8.00 V')):
+        volts = recorded(loads, 5)
+        volts[:, 5] += more
+        found = checked(volts, loads)
+        assert (found.verdict, found.findings, list(found.light)) == (WRONG, (), ['psd_2'])
+        assert found.light['psd_2'].startswith(word)
+        assert found.tree()['light'] == found.light
+        assert found.notes == ()
+        assert found.sentences()[0] == 'WRONG, but not in the wiring: that of the rig file fits.'
+
+
+def test_a_sum_that_does_not_answer_is_said_once() -> None:
+    loads = pushes(50.0)
+    volts = recorded(loads, 5)
+    volts[:, 5] = 0.0
+    assert [(f.name, f.where) for f in checked(volts, loads).findings] == [('stuck_channel', 'sum2')]
+
+
 def test_noise_that_the_rig_file_says_for_each_channel_is_held_against_each() -> None:
     loads = pushes(50.0)
     volts = recorded(loads, 5, sigmas=(1e-3, 2e-3, 2e-3, 1e-2, 2e-3, 2e-3))

@@ -98,7 +98,7 @@ def test_lost_values_cost_precision_and_nothing_else() -> None:
     (cubic,) = found.effects
     assert abs(cubic.active.values['c'] - 0.3) < 4.0 * cubic.sd['c']
     assert sum(r['lost'] for r in found.tree()['provenance']['recordings']) == pytest.approx(90, abs=30)
-    assert '<img' in found.report()
+    assert '<figure class="chart"' in found.report()
 
 
 def test_what_remains_is_unknown_if_it_follows_something() -> None:

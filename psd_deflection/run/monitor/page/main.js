@@ -1,17 +1,21 @@
-// Connects, keeps the last minute, draws. Nothing here grows with time: the rows are a ring, the
-// messages a list of fifty, and whatever is drawn is drawn into what is there.
+// Connects, keeps the last minute, draws. Nothing here grows with time: the rows are a ring, the messages a list of
+// fifty, of the hours the last answer, and whatever is drawn is drawn into what is there.
 
+import { History } from '/page/cells.js';
 import { clock, loadText } from '/page/charts.js';
 import { Detector, signed } from '/page/detector.js';
+import { showReport, tell } from '/page/health.js';
 import { Plots } from '/page/plots.js';
 import { Rows } from '/page/rows.js';
+import { enlargeable } from '/page/enlarge.js';
+import { calibrating, showCalibration } from '/page/calibrate.js';
+import { weighing } from '/page/weigh.js';
 
 const TRACES_MS = 80;
 const NUMBERS_MS = 150;
 const STALE_MS = 1500;
 const SILENT_MS = 4000;
 const RETRY_MS = [300, 600, 1200, 2500];
-const MESSAGES = 50;
 const GAP_BLOCKS = 3.5;
 const MARKS = 200;
 
@@ -43,6 +47,9 @@ let refusal = '';
 let received = 0;
 let lastRowAt = 0;
 let token = takeToken();
+// Of the traces, s. Beyond what the page has itself, the daemon is asked.
+let span = 30;
+const past = new History((cells) => plots.history(cells), (why) => notice(why, true));
 
 function takeToken() {
   const given = new URLSearchParams(location.hash.slice(1)).get('token');
@@ -103,8 +110,9 @@ function greet(found) {
     if (plots) {
       plots.hello = found;
       plots.references = references;
+      plots.cells = null;
       plots.build();
-    } else plots = new Plots(found, color, references, hold);
+    } else plots = new Plots(found, color, references, zoomed, recall('scale each') === 'on');
   }
   startOver();
   $('spectrum_s').textContent = String(Number(found.spectrum_s.toPrecision(2)));
@@ -148,12 +156,13 @@ function further(psds) {
 function startOver() {
   rows.clear();
   references.clear();
-  plots.state.marks = [];
+  plots.marks.length = 0;
+  past.renew();
   showReferences();
 }
 
 function takeMark(mark) {
-  const { marks } = plots.state;
+  const { marks } = plots;
   marks.push(mark);
   if (marks.length > MARKS) marks.shift();
   fresh = true;
@@ -203,6 +212,8 @@ function takeRow(values) {
 
 // To the eye.
 
+// When the first traces were drawn, for whoever measures the first load.
+let drawn = null;
 let tracesAt = 0;
 let numbersAt = 0;
 
@@ -213,11 +224,13 @@ function frame(now) {
     if (now - tracesAt >= TRACES_MS) {
       tracesAt = now;
       fresh = false;
-      if (!rows.empty) plots.traces(rows, Number($('span').value));
+      if (!rows.empty && !past.span) plots.traces(rows, span);
+      if (!rows.empty && !drawn) drawn = performance.mark('drawn');
     }
     const seen = rows.last('status') === 0;
     for (const detector of detectors) detector.draw(rows, hello, seen);
   }
+  past.tick(now, rows.last('t'), held(), plots.width);
   if (newDensity && !held()) {
     newDensity = false;
     plots.spectrum(density);
@@ -232,7 +245,15 @@ function frame(now) {
 function hold(wanted) {
   $('hold').setAttribute('aria-pressed', String(wanted));
   $('hold').textContent = wanted ? 'Held' : 'Hold';
-  if (!wanted) fresh = true;
+  if (wanted) return;
+  fresh = true;
+  past.zoom(null);
+}
+
+// A stretch of the traces was chosen, or left (null).
+function zoomed(range) {
+  hold(range !== null);
+  if (range) past.zoom(range);
 }
 
 const held = () => $('hold').getAttribute('aria-pressed') === 'true';
@@ -281,65 +302,13 @@ function showState() {
   if (document.title !== title) document.title = title;
 }
 
-const TILES = [
-  ['samples/s', 'rate (samples/s)'], ['estimates/s', 'rate (estimates/s)'], ['lost samples', 'lost'], ['bad frames', 'bad frames'],
-  ['dropped, queue', 'dropped by a full queue'], ['dropped, device', 'dropped by the device'], ['disconnects', 'disconnects'],
-  ['latency, median (ms)', 'latency, median (ms)'], ['latency, worst (ms)', 'latency, worst of a second (ms)'],
-  ['clock skew (ppm)', 'skew (ppm)'], ['clock residual (µs)', 'residual (us)'],
-  ['χ² of the readings', 'chi-square of the readings'], ['contradicting blocks', 'blocks whose readings contradict each other'],
-];
-const LOSSES = new Set(['blocks whose readings contradict each other', 'lost', 'bad frames', 'dropped by a full queue', 'dropped by the device', 'disconnects']);
-
 function showHealth(found) {
   health = found;
   hello.kind = found.kind;
   hello.name = found.name;
   hello.sum_min = found.sum_min;
-  const values = new Map(found.entries.filter((e) => e.name !== 'recording').flatMap((e) => e.values));
-  const tiles = TILES.filter(([, key]) => values.has(key)).map(([label, key]) => [label, values.get(key), LOSSES.has(key) && values.get(key) !== '0']);
-  if (found.load) tiles.push(['known load', loadText(...found.load), false]);
-  tiles.push(['not shown (page too slow)', String(found.dropped), found.dropped > 0]);
-  list($('tiles'), tiles);
-  const there = new Set();
-  for (const entry of found.entries) {
-    there.add(entry.name);
-    let details = $('entries').querySelector(`[data-name="${CSS.escape(entry.name)}"]`);
-    if (!details) {
-      details = document.createElement('details');
-      details.dataset.name = entry.name;
-      details.append(document.createElement('summary'), document.createElement('dl'));
-      details.firstChild.append(document.createElement('b'), document.createElement('span'));
-      $('entries').append(details);
-    }
-    details.className = `level-${entry.level}`;
-    details.querySelector('b').textContent = `${entry.name} `;
-    details.querySelector('span').textContent = entry.message;
-    list(details.querySelector('dl'), entry.values);
-  }
-  for (const details of [...$('entries').children]) if (!there.has(details.dataset.name)) details.remove();
+  showReport(found);
   buttons();
-}
-
-// Writes into the elements that are there: a list made anew every second would shed garbage.
-function list(element, pairs) {
-  while (element.children.length > 2 * pairs.length) element.lastChild.remove();
-  while (element.children.length < 2 * pairs.length) element.append(document.createElement(element.children.length % 2 ? 'dd' : 'dt'));
-  pairs.forEach(([label, value, bad], i) => {
-    const [dt, dd] = [element.children[2 * i], element.children[2 * i + 1]];
-    if (dt.textContent !== label) dt.textContent = label;
-    if (dd.textContent !== value) dd.textContent = value;
-    dd.classList.toggle('bad', Boolean(bad));
-  });
-}
-
-function tell(t, text) {
-  const messages = $('messages');
-  const item = document.createElement('li');
-  const time = document.createElement('time');
-  time.textContent = new Date(t * 1000).toLocaleTimeString([], { hour12: false });
-  item.append(time, text);
-  messages.prepend(item);
-  while (messages.children.length > MESSAGES) messages.lastChild.remove();
 }
 
 // From the hand.
@@ -349,12 +318,13 @@ function refused(id) {
   if (!hello || body.dataset.state === 'offline') return 'there is no connection to the daemon';
   if (!hello.control) return hello.why_no_control;
   if (hello.kind === 'replay' && id === 'record') return 'a recording is played; it is not recorded again';
+  if (hello.kind === 'replay' && id === 'calibrate') return 'a recording is played; psd-deflection calibrate takes it';
   if (hello.kind === 'replay' && id === 'mark') return 'a recording is played; its marks are those that were recorded';
   if (hello.kind === 'replay' && id === 'load') return 'a recording is played; its loads are those that were recorded';
   return '';
 }
 
-const TITLES = new Map(['mark', 'load', 'zero', 'record'].map((id) => [id, $(id).title]));
+const TITLES = new Map(['mark', 'load', 'zero', 'record', 'calibrate'].map((id) => [id, $(id).title]));
 
 function buttons() {
   const recording = Boolean(health && health.recording);
@@ -367,6 +337,7 @@ function buttons() {
   $('record').setAttribute('aria-pressed', String(recording));
   $('record').textContent = recording ? '● Recording' : 'Record';
   if (recording) $('record').title = health.recording;
+  showCalibration(health && health.calibration);
   $('held').textContent = health && health.load ? loadText(...health.load) : 'nothing';
   showPlayer();
 }
@@ -451,7 +422,7 @@ function askToken() {
 
 // A moment is marked at once; without a text it gets the next number.
 press('mark', () => {
-  const texts = new Set(plots.state.marks.filter(([, kind]) => kind === 'mark').map(([, , text]) => text));
+  const texts = new Set(plots.marks.filter(([, kind]) => kind === 'mark').map(([, , text]) => text));
   let number = 1;
   while (texts.has(`mark ${number}`)) number += 1;
   act('/api/mark', { text: $('mark_text').value.trim() || `mark ${number}` });
@@ -460,43 +431,51 @@ press('mark', () => {
 $('mark_text').onkeydown = (event) => { if (event.key === 'Enter') $('mark').click(); };
 press('zero', () => act('/api/zero', {}));
 press('record', () => act('/api/record', { record: !(health && health.recording) }));
-// When the link moved last, on the clock of this page; null if that is not known, or not chosen.
-let stepAt = null;
-let since = null;
-const secondsSince = (at) => (performance.now() - at) / 1000;
+enlargeable(document.querySelectorAll('figure.plot'));
+weighing(press, act);
+calibrating(press, act);
+$('cancel').onclick = () => $('ask').close('');
 
-function showStep() {
-  $('since_step').hidden = stepAt === null;
-  if (stepAt !== null) $('since_step').textContent = `since the last step (${secondsSince(stepAt).toFixed(1)} s ago)`;
-  if (since !== null) $('ago').value = secondsSince(since).toFixed(2);
+// What this browser remembers for the next visit.
+
+function recall(name) {
+  try {
+    return localStorage.getItem(name);
+  } catch {
+    return null;
+  }
 }
 
-press('load', async () => {
-  $('weigh').returnValue = '';
-  [stepAt, since] = [null, null];
-  $('ago').value = '0';
-  showStep();
-  $('weigh').showModal();
-  const found = await act('/api/step', {}, true);
-  if (found && found.ok && found.message) stepAt = performance.now() - 1000 * Number(found.message);
-  showStep();
-});
-setInterval(() => { if ($('weigh').open) showStep(); }, 250);
-$('since_step').onclick = () => {
-  since = stepAt;
-  showStep();
+function remember(name, value) {
+  try {
+    localStorage.setItem(name, value);
+  } catch {
+    // A browser that keeps nothing.
+  }
+}
+
+const windows = [...document.querySelectorAll('.windows [data-span]')];
+
+function look(seconds) {
+  span = seconds;
+  remember('window', String(seconds));
+  for (const button of windows) button.setAttribute('aria-pressed', String(Number(button.dataset.span) === seconds));
+  past.look(seconds > 60 ? seconds : 0);
+  if (plots && !past.span) plots.live();
+  hold(false);
+}
+
+for (const button of windows) button.onclick = () => look(Number(button.dataset.span));
+look(windows.map((b) => Number(b.dataset.span)).find((s) => String(s) === recall('window')) ?? 30);
+$('each').setAttribute('aria-pressed', String(recall('scale each') === 'on'));
+$('each').onclick = () => {
+  const wanted = $('each').getAttribute('aria-pressed') !== 'true';
+  $('each').setAttribute('aria-pressed', String(wanted));
+  remember('scale each', wanted ? 'on' : 'off');
+  if (!plots) return;
+  plots.each = wanted;
+  redraw();
 };
-$('ago').oninput = () => { since = null; };
-$('weigh').onclose = () => {
-  const how = $('weigh').returnValue;
-  if (!how) return;
-  const [fx, fy, tz] = ['fx', 'fy', 'tz'].map((id) => $(id).valueAsNumber);
-  const ago = since === null ? $('ago').valueAsNumber : secondsSince(since);
-  act('/api/load', { fx, fy, tz, add: how === 'add', ago });
-};
-$('weigh_cancel').onclick = () => $('weigh').close('');
-$('cancel').onclick = () => $('ask').close('');
-$('span').onchange = () => hold(false);
 $('hold').onclick = () => hold(!held());
 $('pause').onclick = () => {
   const why = refused('zero');
@@ -513,13 +492,12 @@ $('seek').onchange = async () => {
   else await act('/api/play', { seek: Number($('seek').value) }, true);
   seeking = false;
 };
-matchMedia('(prefers-color-scheme: dark)').onchange = () => {
-  if (plots) {
-    plots.build();
-    if (!rows.empty) plots.traces(rows, Number($('span').value));
-  }
+function redraw() {
+  plots.build(true);
   newDensity = true;
-};
+}
+
+matchMedia('(prefers-color-scheme: dark)').onchange = () => { if (plots) redraw(); };
 
 connect();
 requestAnimationFrame(frame);

@@ -1,7 +1,7 @@
 // The page of a recording (`psd-deflection plot --out X.html`): the whole of it, drawn once, in a file that
 // needs no server. The plot command puts charts.js before this text.
 
-import { calm, clock, cursor, decades, dragged, edge, eventMarks, Legend, line, lossMarks, modeMarks, number, options, power, referenceMarks } from '/page/charts.js';
+import { calm, clock, cursor, dragged, edge, eventMarks, Legend, line, logarithmic, logarithms, lossMarks, modeMarks, options, referenceMarks } from '/page/charts.js';
 
 const read = JSON.parse(document.getElementById('recording').textContent);
 const styles = getComputedStyle(document.documentElement);
@@ -91,8 +91,8 @@ function build() {
       scales: { x: { time: false, distr: 3, range: () => limits.frequencies ?? [data.spectrum[0][0], data.spectrum[0].at(-1)] }, y: { distr: 3 } },
       cursor: cursor(spectral),
       hooks: { drawAxes: [modeMarks(color, read.modes, data.spectrum[0].at(-1))], setCursor: [legend.follow('spectrum', 3)], setSelect: [dragged(spectral)] },
-      x: { splits: decades, values: (u, ticks) => ticks.map((v) => number(v)) },
-      y: { splits: decades, values: (u, ticks) => ticks.map(power) },
+      x: { splits: logarithmic, values: logarithms },
+      y: { splits: logarithmic, values: logarithms },
     }),
   };
   for (const name of Object.keys(data)) plots[name] = new uPlot(made[name](), data[name], element(name));

@@ -1,11 +1,14 @@
 // The last rows, column by column, in arrays that never grow: each is twice as long as what it
-// keeps, and its newer half moves to the front when it is full.
+// keeps, and its newer half moves to the front when it is full. The arrays are of bare numbers, so
+// that the heap is as large when they are full as when they are empty; NaN stands for null.
+
+const present = (value) => (Number.isNaN(value) ? null : value);
 
 export class Rows {
   constructor(names, capacity) {
     this.capacity = capacity;
     this.index = new Map(names.map((name, i) => [name, i]));
-    this.columns = names.map(() => new Array(2 * capacity).fill(null));
+    this.columns = names.map(() => new Float64Array(2 * capacity));
     this.clear();
   }
 
@@ -26,14 +29,14 @@ export class Rows {
       for (const column of this.columns) column.copyWithin(0, this.capacity);
       this.end = this.capacity;
     }
-    for (let i = 0; i < this.columns.length; i++) this.columns[i][this.end] = values[i];
+    for (let i = 0; i < this.columns.length; i++) this.columns[i][this.end] = values[i] ?? NaN;
     this.end += 1;
   }
 
   // The value `back` rows before the newest.
   last(name, back = 0) {
     const i = this.end - 1 - back;
-    return i < this.start ? null : this.columns[this.index.get(name)][i];
+    return i < this.start ? null : present(this.columns[this.index.get(name)][i]);
   }
 
   // Index of the first row with t >= `t`; t rises.
@@ -50,6 +53,11 @@ export class Rows {
   }
 
   slices(names, first) {
-    return names.map((name) => this.columns[this.index.get(name)].slice(first, this.end));
+    return names.map((name) => {
+      // An array of bare numbers too, unless a value is missing.
+      const slice = Array.from(this.columns[this.index.get(name)].subarray(first, this.end));
+      for (let i = 0; i < slice.length; i++) if (Number.isNaN(slice[i])) slice[i] = null;
+      return slice;
+    });
   }
 }

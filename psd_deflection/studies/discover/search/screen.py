@@ -78,8 +78,11 @@ class Screen:
 
     def columns_of(self, candidate: Candidate) -> list[FloatArray]:
         """The whitened signatures (D,) of one of its candidates."""
-        at = next(i for i, c in enumerate(self.candidates) if c is candidate)
-        return list(self.rows[self.slices[at]].astype(np.float64))
+        return list(self.rows[self.slice_of(candidate)].astype(np.float64))
+
+    def slice_of(self, candidate: Candidate) -> slice:
+        """The rows of one of its candidates."""
+        return next(s for c, s in zip(self.candidates, self.slices, strict=True) if c is candidate)
 
     def _projected(self, residual: FloatArray, known: FloatArray | None) -> tuple[FloatArray, FloatArray]:
         g = (self.rows @ residual.astype(np.float32)).astype(np.float64)

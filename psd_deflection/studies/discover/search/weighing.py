@@ -63,6 +63,16 @@ class NamedEffect:
     alternatives: tuple[tuple[str, float, float], ...]
     suggestion: Suggestion | None
 
+    @property
+    def name(self) -> str:
+        """As the catalogue has it."""
+        return self.active.effect.name
+
+    @property
+    def values(self) -> Mapping[str, float]:
+        """Of its parameters, by name, SI units; ``sd`` has the standard deviations of those that were fitted."""
+        return self.active.values
+
 
 @dataclass(frozen=True, slots=True)
 class Unknown:

@@ -27,16 +27,39 @@ export function number(value, digits = 5) {
   return String(Number(value.toPrecision(digits))).replace('-', '\u2212');
 }
 
-export function decades(u, axis, low, high) {
-  const from = Math.ceil(Math.log10(low) - 1e-9);
-  const to = Math.floor(Math.log10(high) + 1e-9);
-  return Array.from({ length: Math.max(0, to - from + 1) }, (_, i) => 10 ** (from + i));
+// As many decimals as two digits of its standard deviation have; `low` and `high` are two of them off.
+export function certain(value, low, high, digits) {
+  const sd = (high - low) / 4;
+  if (!(sd > 0)) return number(value, digits);
+  return value.toFixed(Math.min(9, Math.max(0, 1 - Math.floor(Math.log10(sd))))).replace('-', '\u2212');
 }
 
 export function power(value) {
   if (value === null || value === undefined) return '';
   const digits = String(Math.round(Math.log10(value)));
   return '10' + [...digits].map((c) => (c === '-' ? '\u207b' : '\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079'[c])).join('');
+}
+
+// 1, 2, 5 of each decade if there are few, else decades; within one decade even steps.
+export function logarithmic(u, axis, low, high) {
+  const decades = Math.log10(high / low);
+  const steps = decades > 3 ? [1] : [1, 2, 5];
+  const found = [];
+  for (let k = Math.floor(Math.log10(low)); k <= Math.log10(high); k++) {
+    for (const step of steps) if (step * 10 ** k >= low * 0.999 && step * 10 ** k <= high * 1.001) found.push(step * 10 ** k);
+  }
+  if (found.length >= 3) return found;
+  const step = 10 ** Math.floor(Math.log10((high - low) / 2));
+  const even = [];
+  for (let v = Math.ceil(low / step) * step; v <= high; v += step) even.push(v);
+  return even;
+}
+
+// Far from 1 a power says more than its digits.
+export function logarithms(u, ticks) {
+  // uPlot leaves null for those that have no room.
+  const far = ticks.some((v) => v !== null && (v > 1e4 || v < 1e-3));
+  return ticks.map((v) => (far && Math.abs(Math.log10(v) % 1) < 1e-9 ? power(v) : number(v, 3)));
 }
 
 export function options(color, element, series, extra) {
@@ -109,7 +132,7 @@ export function loadText(fx, fy, tz) {
 const LONGEST_WORDS = 40;
 const short = (text) => (text.length > LONGEST_WORDS ? `${text.slice(0, LONGEST_WORDS - 1)}\u2026` : text);
 
-// A dashed line where a load began or the zero was taken, a whole one at a mark, with its words where there is room.
+// A dashed line where a load began or the zero was taken, a whole one at a mark or an alarm, with words where there is room.
 export function eventMarks(color, state) {
   return (u) => {
     const g = u.ctx;
@@ -127,8 +150,8 @@ export function eventMarks(color, state) {
     for (const [t, kind, ...load] of state.marks) {
       const x = Math.round(u.valToPos(t, 'x', true));
       if (x < u.bbox.left || x > right) continue;
-      const marked = kind === 'mark';
-      g.strokeStyle = g.fillStyle = color(marked ? '--mark' : '--quiet');
+      const marked = kind === 'mark' || kind === 'alarm';
+      g.strokeStyle = g.fillStyle = color(kind === 'alarm' ? '--bad' : marked ? '--mark' : '--quiet');
       g.setLineDash(marked ? [] : [5 * ratio, 4 * ratio]);
       g.beginPath();
       g.moveTo(x, u.bbox.top);
@@ -168,7 +191,7 @@ export function referenceMarks(color, columns) {
       for (let i = 0; i < ts.length; i += step) {
         if (column[i] === null) continue;
         g.beginPath();
-        g.arc(u.valToPos(ts[i], 'x', true), u.valToPos(column[i], 'y', true), 3 * ratio, 0, 2 * Math.PI);
+        g.arc(u.valToPos(ts[i], 'x', true), u.valToPos(column[i], u.series[series].scale, true), 3 * ratio, 0, 2 * Math.PI);
         g.stroke();
       }
     }
@@ -242,8 +265,11 @@ export class Legend {
       const there = i !== null && i !== undefined && u.cursor.left >= 0;
       for (const key of this.keys) {
         if (key.dataset.plot !== name) continue;
-        const value = there ? u.data[Number(key.dataset.series)][i] : null;
-        write(key.querySelector('output'), value === null || value === undefined ? '' : number(value, digits));
+        const series = Number(key.dataset.series);
+        const at = u.cursor.idxs[series];
+        const [value, low, high] = [0, 1, 2].map((k) => (there ? u.data[series + k]?.[at] ?? null : null));
+        const banded = 'band' in key.dataset && low !== null && high !== null;
+        write(key.querySelector('output'), value === null ? '' : banded ? certain(value, low, high, digits) : number(value, digits));
       }
       for (const at of this.times) {
         if (at.dataset.plot === name) write(at, there ? (at.dataset.unit ? `${number(u.data[0][i], 4)} ${at.dataset.unit}` : clock(u.data[0][i], 3)) : '');

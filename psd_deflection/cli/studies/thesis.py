@@ -1,13 +1,17 @@
-"""Compare the errors of all methods, and explain Table 5.1 of the thesis.
+"""What concerns the thesis alone: compare the errors of all methods, and explain its Table 5.1.
 
-Every method gets exact readings of the thesis's rig, without noise. The first table has the rms and
+A rig needs none of this. docs/audit.md has what is wrong in the thesis; `make demo-thesis` in a checkout repeats its
+experiment on a simulated rig, from the camera to the page.
+
+compare-methods: every method gets exact readings of the thesis's rig, without noise. The first table has the rms and
 the largest error over a grid of poses (flat plate, independent tilts, tilts of a cantilever). The
 others have noise, condition number and error bound of the linear methods, and what each possible
-cause adds to Table 5.1. --out also draws the figures of docs/methods.md.
+cause adds to Table 5.1. The last has dots of 2 mm beside those of 1 mm. --out also draws the figures of
+docs/methods.md.
 
-  psd-deflection compare-methods
-  psd-deflection compare-methods --out figures
-  psd-deflection compare-methods --json
+  psd-deflection thesis compare-methods
+  psd-deflection thesis compare-methods --out figures
+  psd-deflection thesis compare-methods --json
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from psd_deflection.cli._report import print_json, save_figure, show
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.plate.linear import condition_number, design_matrix, error_bound
 from psd_deflection.model.solvers import make_solver
+from psd_deflection.records import FloatArray
 from psd_deflection.studies.thesis.comparison import (
     CAUSES,
     CONDITIONS,
@@ -43,6 +48,7 @@ from psd_deflection.studies.thesis.comparison import (
     table_5_1,
     thesis_geometry,
 )
+from psd_deflection.studies.thesis.large_spots import spot_changes
 
 _MDEG_PER_RAD = 1e3 * 180.0 / math.pi
 _UNITS = (1e6, 1e6, _MDEG_PER_RAD)
@@ -50,6 +56,7 @@ _UNITS = (1e6, 1e6, _MDEG_PER_RAD)
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
+    parser.add_argument('what', choices=('compare-methods',), help='the tables of all methods')
     parser.add_argument('--out', metavar='DIR', help='draw the figures into this folder')
     parser.add_argument('--json', action='store_true', help='print the errors of all methods as JSON in SI units')
 
@@ -61,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(errors_json())
     else:
-        show(*error_table(), '', *linear_table(), '', *cause_table())
+        show(*error_table(), '', *linear_table(), '', *cause_table(), '', *spot_table())
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
         from psd_deflection.studies.thesis.figures import drawn
@@ -72,6 +79,24 @@ def run(args: argparse.Namespace) -> int:
             save_figure(figure, path, metadata={'Software': None})
             show(f'wrote {path}', aside=args.json)
     return 0
+
+
+def spot_table() -> list[str]:
+    """Lines that compare dots of 1 mm with dots of 2 mm (figures 5.30 to 5.35)."""
+    lines = [
+        'Dots of 2 mm instead of 1 mm (Figs 5.30-5.35), ΔX µm / ΔY µm / θ mdeg: largest change of a block while the',
+        'link rings, then the mean error while the weight is held, with 1 mm and with 2 mm',
+    ]
+    width = max(len(c.method) for c in spot_changes())
+    for c in spot_changes():
+        cells = ''.join(f'{_signed(v):28}' for v in (c.largest, *c.error))
+        lines.append(f'{c.force:g} N, {c.method:{width}}  {cells}'.rstrip())
+    return lines
+
+
+def _signed(values: FloatArray) -> str:
+    """Three decimals; the -0 of a small number is 0."""
+    return ' / '.join(f'{np.round(v * u, 3) + 0.0:.3f}' for v, u in zip(values.tolist(), _UNITS, strict=True))
 
 
 def errors_json() -> dict[str, dict[str, dict[str, object]]]:

@@ -1,4 +1,4 @@
-"""``psd-deflection compare-methods``: the tables, the figures, and that the page on methods has them all."""
+"""``psd-deflection thesis compare-methods``: the tables, the figures, and that the page on methods has them all."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ DOCS = Path(__file__).parents[2] / 'docs'
 
 
 def test_tables_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['compare-methods', '--out', str(tmp_path / 'new' / 'figures')]) == 0
+    assert main(['thesis', 'compare-methods', '--out', str(tmp_path / 'new' / 'figures')]) == 0
     said = capsys.readouterr().out
     written = sorted((tmp_path / 'new' / 'figures').iterdir())
     assert [p.name for p in written] == sorted(f'{name}.png' for name in FIGURES)
@@ -52,7 +52,7 @@ def test_tables_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
 
 
 def test_programs_get_the_errors_in_si_units(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['compare-methods', '--json']) == 0
+    assert main(['thesis', 'compare-methods', '--json']) == 0
     found = json.loads(capsys.readouterr().out)
     assert list(found) == [m.label for m in methods()]
     cantilever = found['exact (default)']['cantilever tilts']
@@ -64,13 +64,13 @@ def test_programs_get_the_errors_in_si_units(capsys: pytest.CaptureFixture[str])
 
 def test_a_folder_that_cannot_be_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'taken').write_text('')
-    assert main(['compare-methods', '--out', str(tmp_path / 'taken')]) == 4
+    assert main(['thesis', 'compare-methods', '--out', str(tmp_path / 'taken')]) == 4
     assert 'taken: cannot be made a folder' in capsys.readouterr().err
 
 
 def test_a_figure_that_cannot_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / 'comparison.png').mkdir()
-    assert main(['compare-methods', '--out', str(tmp_path)]) == 4
+    assert main(['thesis', 'compare-methods', '--out', str(tmp_path)]) == 4
     assert f'--out {tmp_path / "comparison.png"}: cannot be written' in capsys.readouterr().err
 
 

@@ -1,0 +1,210 @@
+"""Charts of a report: curves over an axis are declared here, and the page's own script draws them with uPlot.
+
+A chart says values under the cursor, is looked at closer by dragging, and switches its curves on and off. Its
+arrays are inside the page. :mod:`psd_deflection.base.figures` draws the same declaration with matplotlib.
+"""
+
+from __future__ import annotations
+
+import html
+import itertools
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.base.page_files import packed, safe
+from psd_deflection.records import FloatArray
+
+Colour = Literal['blue', 'red', 'green', 'violet', 'orange', 'quiet', 'text']
+"""A tone for light pages and one for dark ones: ``STYLE`` in pages.py."""
+Style = Literal['line', 'points', 'rings']
+
+SMALL = 200
+"""px: the height of a panel that has others beside it."""
+BUCKETS = 1000
+"""Of a curve with more points the page has the least and the largest value of each of so many stretches."""
+MOST_POINTS = 4000
+"""Of a cloud of points the page has so many at most."""
+CELLS = (600, 200)
+"""Points of a cloud that share one of so many cells (across, up) lie on each other: one is kept."""
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """One curve: ``x`` and ``y`` (k,) in the units of its panel, NaN: no value.
+
+    ``name``: in the legend; curves of one name are switched together. ``spread`` (k,): ± of each value.
+    """
+
+    name: str
+    x: FloatArray
+    y: FloatArray
+    colour: Colour
+    style: Style = 'line'
+    spread: FloatArray | None = None
+    bold: bool = False
+
+
+class Rule(NamedTuple):
+    """A straight line through the panel at ``at``, upright, or level if ``across``; ``words`` beside it."""
+
+    at: float
+    words: str = ''
+    across: bool = False
+    colour: Colour = 'quiet'
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Curves over one axis. Labels end with `` / unit``. Panels of a chart with one ``x_label`` share cursor and zoom.
+
+    ``log``: the axes that are logarithmic. ``y_range``: what is shown at first, if not all.
+    ``height``: px.
+    """
+
+    series: Sequence[Series]
+    x_label: str
+    y_label: str
+    log: Literal['', 'x', 'y', 'x, y'] = ''
+    rules: Sequence[Rule] = ()
+    y_range: tuple[float, float] | None = None
+    height: int = 140
+
+
+@dataclass(frozen=True, eq=False)
+class Chart:
+    """``panels`` below each other, or so many ``beside`` each other where there is room. ``words``: what it shows."""
+
+    words: str
+    panels: Sequence[Panel]
+    beside: int = 1
+
+
+MARK = '<figure class="chart"'
+"""How a chart begins in a page: a page without it needs no script."""
+
+
+def drawn(chart: Chart) -> str:
+    """The chart as a part of a page."""
+    columns: dict[str, int] = {}
+    notes: dict[str, None] = {}
+    panels = []
+    for panel in chart.panels:
+        series, said = thinned(panel.series)
+        notes |= dict.fromkeys(said)
+        panels.append(
+            {
+                'series': [_told(one, columns) for one in series],
+                'x': panel.x_label,
+                'y': panel.y_label,
+                'log': panel.log,
+                'rules': list(panel.rules),
+                'range': panel.y_range,
+                'height': panel.height,
+            }
+        )
+    content = {
+        'words': chart.words,
+        'note': '; '.join(notes),
+        'beside': chart.beside,
+        'panels': panels,
+        'columns': list(columns),
+    }
+    words = html.escape(chart.words)
+    return (
+        f'{MARK} role="group" aria-label="{words}"><noscript><p>A chart, {words}: it is drawn with JavaScript.</p>'
+        f'</noscript><script type="application/json">{safe(json.dumps(content, ensure_ascii=False))}</script></figure>'
+    )
+
+
+def _told(series: Series, columns: dict[str, int]) -> dict[str, Any]:
+    """For the page's script; ``columns``: the place of each array, by its text. The same one is there once."""
+
+    def place(values: FloatArray) -> int:
+        # Pixels are coarser than floats of 32 bits, except for times of a day or of an epoch.
+        with np.errstate(over='ignore'):
+            single = np.asarray(values, np.float32)
+        reach = np.ptp(values[np.isfinite(values)]) if np.isfinite(values).any() else 0.0
+        fine = bool(np.all(np.abs(single - values)[np.isfinite(values)] <= 1e-5 * reach)) or reach == 0.0
+        text = 'f' + packed(values) if fine else 'd' + packed(values, np.float64)
+        return columns.setdefault(text, len(columns))
+
+    return {
+        'name': series.name,
+        'colour': series.colour,
+        'style': series.style,
+        'bold': series.bold,
+        'x': place(series.x),
+        'y': place(series.y),
+        'spread': None if series.spread is None else place(series.spread),
+    }
+
+
+def thinned(series: Sequence[Series]) -> tuple[list[Series], Iterable[str]]:
+    """What of ``series`` can be seen, and what was done, in words. Curves over the same x stay so."""
+    kept: dict[bytes, npt.NDArray[np.intp]] = {}
+    said: dict[str, None] = {}
+    for key, group in _by_x(series).items():
+        x, rows = group[0].x, [one.y for one in group]
+        if len(x) <= 2 * BUCKETS:
+            kept[key] = np.arange(len(x))
+        elif np.all(np.diff(x) >= 0.0) and len(np.unique(x)) > len(x) // 2:
+            kept[key] = _extremes(rows)
+            said[f'of every {len(x) / BUCKETS:.3g} points the least and the largest are drawn'] = None
+        else:
+            kept[key] = _apart(x, rows)
+            said[f'{len(kept[key])} of {len(x)} points are drawn'] = None
+    return [_of(one, kept[_key(one)]) for one in series], said
+
+
+def _key(one: Series) -> bytes:
+    return one.x.tobytes()
+
+
+def _by_x(series: Sequence[Series]) -> dict[bytes, list[Series]]:
+    out: dict[bytes, list[Series]] = {}
+    for one in series:
+        out.setdefault(_key(one), []).append(one)
+    return out
+
+
+def _extremes(rows: Sequence[FloatArray]) -> npt.NDArray[np.intp]:
+    """Indices of the least and the largest value of each row in each of ``BUCKETS`` stretches."""
+    n = len(rows[0])
+    edges = np.linspace(0, n, BUCKETS + 1).astype(np.intp)
+    keep = np.zeros(n, dtype=bool)
+    keep[[0, -1]] = True
+    for row in rows:
+        # Where a gap begins.
+        keep[1:] |= np.isnan(row[1:]) & np.isfinite(row[:-1])
+        low, high = np.where(np.isfinite(row), row, np.inf), np.where(np.isfinite(row), row, -np.inf)
+        for a, b in itertools.pairwise(edges):
+            keep[a + np.argmin(low[a:b])] = keep[a + np.argmax(high[a:b])] = True
+    return np.flatnonzero(keep)
+
+
+def _apart(x: FloatArray, rows: Sequence[FloatArray]) -> npt.NDArray[np.intp]:
+    """Indices of points that do not lie on each other, evenly thinned to ``MOST_POINTS``."""
+    keep = np.zeros(len(x), dtype=bool)
+    across = _cells(x, CELLS[0])
+    for row in rows:
+        _, first = np.unique(across * CELLS[1] + _cells(row, CELLS[1]), return_index=True)
+        keep[first[np.isfinite(row[first])]] = True
+    at = np.flatnonzero(keep & np.isfinite(x))
+    return at if len(at) <= MOST_POINTS else at[np.linspace(0, len(at) - 1, MOST_POINTS).astype(np.intp)]
+
+
+def _cells(values: FloatArray, count: int) -> FloatArray:
+    """The number of the cell of each value; that of NaN is 0."""
+    good = values[np.isfinite(values)]
+    low, reach = (good.min(), np.ptp(good) or 1.0) if len(good) else (0.0, 1.0)
+    return np.nan_to_num(np.floor((values - low) / reach * (count - 1)))
+
+
+def _of(one: Series, at: npt.NDArray[np.intp]) -> Series:
+    spread = None if one.spread is None else one.spread[at]
+    return Series(one.name, one.x[at], one.y[at], one.colour, one.style, spread, one.bold)

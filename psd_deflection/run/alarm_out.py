@@ -1,0 +1,220 @@
+"""Hands each alarm of the watch on: to a command of the user's, and to a web address (webhook).
+
+Both get the same JSON object. A thread of its own does it, so that neither a command that hangs nor a network
+that is down holds up a sample. Each has bounded time, and a bounded number of alarms may wait. What fails is said
+once, until it works again, and counted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import shlex
+import shutil
+import signal
+import subprocess
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from http.client import HTTPException
+from pathlib import Path
+from typing import IO
+from urllib.parse import urlsplit
+
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.json_text import json_text
+from psd_deflection.base.log import WARNING, Say
+from psd_deflection.measure.watch import Alarm
+
+COMMAND_S = 10.0
+"""Seconds after which a command is ended, with what it started."""
+ANSWER_S = 5.0
+"""Seconds that a web server may take for each step of its answer."""
+PAUSES_S = (1.0, 4.0)
+"""Seconds before the second and the third try of a web address."""
+MOST_WAITING = 100
+"""Alarms that may wait; further ones are counted as not handed on."""
+LONGEST_FILE = 4096
+"""Characters that are read of a file with an address."""
+
+
+def finding(alarm: Alarm, about: Mapping[str, object]) -> dict[str, object]:
+    """What is handed on: times in UTC, the shift and its standard deviation in m, or in rad for ``theta``.
+
+    ``about``: where it was seen.
+    """
+    return {
+        'text': f'since {_utc(alarm.since_ns)}: {alarm.words}',
+        'since': _utc(alarm.since_ns),
+        'sure_since': _utc(alarm.seen_ns),
+        'channel': alarm.channel,
+        'shift': alarm.shift,
+        'sd': alarm.sd,
+        'unit': 'rad' if alarm.channel == 'theta' else 'm',
+        'also': list(alarm.also),
+        **about,
+    }
+
+
+class AlarmOut:
+    """``command``: a program and its arguments, as a shell splits them; no shell runs it. It gets the JSON, one
+    line, on its standard input. ``webhook``: an ``http`` or ``https`` address, to which it is posted, or a file that
+    holds one. '' for neither. ``about``: joins each finding. ``say`` gets a line of what fails.
+
+    Raises ConfigError for a command that is not there and for an address that is none. ``sent``, ``failed``: counts;
+    ``failure``: why the last one failed, '' if it did not.
+    """
+
+    def __init__(self, command: str, webhook: str, say: Say, about: Mapping[str, object] | None = None) -> None:
+        self.sent = self.failed = 0
+        self.failure = ''
+        self._say, self._about = say, dict(about or {})
+        self._ways: list[tuple[str, Callable[[bytes], None]]] = []
+        self._said: set[str] = set()
+        if command:
+            argv = _argv(command)
+            self._ways.append((f'command {argv[0]}', lambda text: _run(argv, text)))
+        if webhook:
+            address = _address(webhook)
+            host = urlsplit(address).hostname
+            self._ways.append((f'webhook at {host}', lambda text: _post(address, text, self._ending)))
+        self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def put(self, alarm: Alarm) -> None:
+        """Hand on an alarm; returns at once."""
+        if not self._ways:
+            return
+        if self._waiting.qsize() >= MOST_WAITING:
+            self._fail('alarms', f'{MOST_WAITING} wait already')
+            return
+        self._waiting.put(f'{json_text(finding(alarm, self._about))}\n'.encode())
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._hand_on, name='alarms', daemon=True)
+            self._thread.start()
+
+    def values(self) -> list[tuple[str, str]]:
+        """For ``/diagnostics``; empty if nothing is to be handed on."""
+        if not self._ways:
+            return []
+        return [('alarms handed on', str(self.sent)), ('alarms not handed on', f'{self.failed} {self.failure}'.strip())]
+
+    def close(self, patience_s: float) -> bool:
+        """Hand on what waits, without further tries; whether that was done within ``patience_s``."""
+        if self._thread is None:
+            return True
+        self._waiting.put(None)
+        self._thread.join(patience_s / 2.0)
+        self._ending.set()
+        self._thread.join(patience_s / 2.0)
+        return not self._thread.is_alive()
+
+    def _hand_on(self) -> None:
+        while (text := self._waiting.get()) is not None:
+            for name, way in self._ways:
+                try:
+                    way(text)
+                except _NotHandedOnError as error:
+                    self._fail(name, str(error))
+                else:
+                    self.sent += 1
+                    self._said.discard(name)
+
+    def _fail(self, name: str, why: str) -> None:
+        self.failed += 1
+        self.failure = f'{name}: {why}'
+        if name not in self._said:
+            self._said.add(name)
+            self._say(f'watch: {name}: {why}; an alarm was not handed on, and further ones are counted', WARNING)
+
+
+class _NotHandedOnError(Exception):
+    """Why one alarm was not handed on."""
+
+
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    """A redirected POST would become a GET without the alarm: it fails instead."""
+
+    def redirect_request(
+        self, req: urllib.request.Request, fp: IO[bytes], code: int, msg: str, headers: object, newurl: str
+    ) -> None:
+        """None: no redirection."""
+
+
+_OPENER = urllib.request.build_opener(_NoRedirect)
+
+
+def _argv(command: str) -> list[str]:
+    try:
+        argv = shlex.split(command)
+    except ValueError as error:
+        raise ConfigError(f'watch_command = {command!r}: is no command line ({error})') from None
+    if not argv or shutil.which(argv[0]) is None:
+        raise ConfigError(f'watch_command = {command!r}: no program of that name can be run')
+    return argv
+
+
+def _address(given: str) -> str:
+    text = given
+    if '://' not in given:
+        try:
+            with Path(given).expanduser().open(encoding='utf-8') as file:
+                text = file.read(LONGEST_FILE).strip()
+        except (OSError, ValueError) as error:
+            raise ConfigError(
+                f'watch_webhook = {given!r}: is no address, and no file that can be read ({error})'
+            ) from None
+    try:
+        parts = urlsplit(text)
+        sound = parts.scheme in ('http', 'https') and bool(parts.hostname) and parts.port != 0
+    except ValueError:
+        sound = False
+    if not sound or not text.isascii() or not text.isprintable() or ' ' in text:
+        # What a file holds may be a secret: it is not shown.
+        raise ConfigError(f'watch_webhook = {given!r}: must be an address http://… or https://…, or a file with one')
+    return text
+
+
+def _run(argv: list[str], text: bytes) -> None:
+    try:
+        process = subprocess.Popen(argv, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True)
+    except OSError as error:
+        raise _NotHandedOnError(f'cannot be started ({error.strerror or error})') from None
+    try:
+        # A command that reads nothing is no failure.
+        process.communicate(text, timeout=COMMAND_S)
+    except subprocess.TimeoutExpired:
+        raise _NotHandedOnError(f'did not end within {COMMAND_S:g} s, and was killed') from None
+    finally:
+        # Also what it left behind.
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+    if process.returncode:
+        raise _NotHandedOnError(f'ended with status {process.returncode}')
+
+
+def _post(address: str, text: bytes, ending: threading.Event) -> None:
+    request = urllib.request.Request(address, text, {'Content-Type': 'application/json'}, method='POST')
+    for pause in (*PAUSES_S, None):
+        try:
+            with _OPENER.open(request, timeout=ANSWER_S):
+                return
+        except urllib.error.HTTPError as error:
+            error.close()
+            why, again = f'answers {error.code}', error.code >= 500 or error.code == 429
+        except (OSError, HTTPException, ValueError) as error:
+            reason = getattr(error, 'reason', error)
+            why, again = f'cannot be reached ({getattr(reason, "strerror", None) or reason})', True
+        if not again or pause is None or ending.wait(pause):
+            raise _NotHandedOnError(why)
+
+
+def _utc(t_ns: int) -> str:
+    """Time in UTC as ISO 8601 has it, to ms."""
+    whole, rest = divmod(t_ns, 1_000_000_000)
+    return datetime.fromtimestamp(whole, UTC).strftime('%Y-%m-%dT%H:%M:%S') + f'.{rest // 1_000_000:03d}Z'

@@ -1,0 +1,276 @@
+"""Which effects of the catalogue could be told apart, from the rig alone, before anything is recorded.
+
+The signature of each effect is simulated under loads that are planned, beside the noise of the rig. The chi-square of
+a signature grows with the square of the effect's size. An effect is seen from the size at which a search would accept
+it. It is named from the size at which the part that no other single effect can imitate reaches ``TELLS_APART``; that
+part is sin² of the angle between the two signatures. As in a search, an effect with more free parameters is no rival
+of one that does with fewer. All of it is to first order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from psd_deflection.base.drawings import Matrix
+from psd_deflection.base.pages import table, wide
+from psd_deflection.base.tables import Column, Table, columns, text_column
+from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.discover.discover import RecordedRig
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.planning import TELLS_APART
+from psd_deflection.studies.discover.problem import Problem, Progress
+from psd_deflection.studies.discover.search.screen import Screen, solve_seen
+from psd_deflection.studies.discover.search.search import BIC_ACCEPT, Search
+from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.study import PageSection, StudyResult
+
+ALIKE = 1e-5
+"""sin² below which two signatures are one: what is left of 32-bit signatures is rounding."""
+FROM_READINGS = ('spectral', 'line', 'lattice')
+"""Proposals that only readings can make."""
+
+
+@dataclass(frozen=True, slots=True)
+class Isolable:
+    """One effect, with its choices, under the loads. ``parameter``: that of the sizes, in ``unit``.
+
+    ``seen``, ``named``: the least sizes, None if no size that the parameter may have is enough. ``alike``: the effect
+    that imitates it best; ``apart``: sin² of the angle between the two, 0 to 1.
+    """
+
+    label: str
+    parameter: str
+    unit: str
+    seen: float | None
+    named: float | None
+    alike: str
+    apart: float
+
+    def tree(self) -> dict[str, Any]:
+        """As isolable.json has it."""
+        names = ('label', 'parameter', 'unit', 'seen', 'named', 'alike', 'apart')
+        return {name: getattr(self, name) for name in names}
+
+    @property
+    def row(self) -> tuple[str, ...]:
+        """For a table."""
+        sizes = [f'{size:.2g} {self.unit}'.strip() if size is not None else 'never' for size in (self.seen, self.named)]
+        return (self.label, self.parameter, *sizes, self.alike)
+
+
+HEAD = ('effect', 'size', 'seen from', 'named from', 'most like')
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Isolability(StudyResult):
+    """``found``: each effect that shows under ``loads``, in words. ``hidden``: the others, and what each needs.
+
+    ``matrix`` (n, n): how much of the signature of each the other imitates, 0 to 1.
+    """
+
+    study, json_name = 'discover', 'isolable.json'
+    title = 'What these loads can tell apart'
+
+    loads: str
+    seconds: float
+    found: tuple[Isolable, ...]
+    hidden: Mapping[str, str]
+    matrix: FloatArray
+    params_file: str
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """The rig and the loads."""
+        return {'loads': self.loads, 'rig': self.params_file}
+
+    def sentences(self) -> list[str]:
+        """How many can be named, which imitate each other, which do not show."""
+        named = [f for f in self.found if f.named is not None]
+        count = len(self.found) + len(self.hidden)
+        out = [
+            f'Under {self.loads}, {self.seconds:.0f} s, {len(named)} of {count} effects can be named, '
+            f'each from its own size on.'
+        ]
+        lost = [f for f in self.found if f.named is None]
+        if lost:
+            out.append('Seen, but not told apart: ' + '; '.join(f'{f.label} from {f.alike}' for f in lost) + '.')
+        if self.hidden:
+            out.append('Not seen: ' + '; '.join(f'{label} (needs {why})' for label, why in self.hidden.items()) + '.')
+        return out
+
+    def lines(self) -> list[str]:
+        """The table, then the sentences."""
+        return [*columns([HEAD, *(f.row for f in self.found)], left=5).split('\n'), '', *self.sentences()]
+
+    def tree(self) -> dict[str, Any]:
+        """The answer for programs; sizes in SI units."""
+        return {
+            'loads': self.loads,
+            'seconds': self.seconds,
+            'effects': [f.tree() for f in self.found],
+            'hidden': dict(self.hidden),
+        }
+
+    def table(self) -> Table:
+        """One row an effect: the least sizes at which it is ``seen`` and ``named``, NaN: never, and its ``unit``."""
+        found = self.found
+        sizes = np.array([(f.seen, f.named) for f in found], dtype=np.float64)
+        sizes = sizes.reshape(-1, 2)
+        return Table(
+            text_column('effect', [f.label for f in found], 'that may be there'),
+            [
+                Column('seen', sizes[:, 0], '', 'from this size on'),
+                Column('named', sizes[:, 1], '', 'from this size on'),
+                text_column('unit', [f.unit for f in found], 'of the sizes'),
+                text_column('alike', [f.alike for f in found], 'what it is mistaken for'),
+            ],
+            {'loads': self.loads, 'seconds': self.seconds},
+        )
+
+    def sections(self) -> Iterable[PageSection]:
+        """The table, and the picture of all pairs."""
+        rows = table(HEAD, [f.row for f in self.found])
+        yield PageSection('From which size', (wide(rows, 'the least sizes'),))
+        labels = [f.label for f in self.found]
+        words = 'how much of the signature of each effect another one imitates'
+        shown = Matrix(words, self.matrix, labels, labels, most=1.0)
+        note = '<p class=quiet>Each row an effect; dark: the effect of the column imitates it.</p>'
+        yield PageSection('Which imitates which', (note, shown))
+
+
+def isolable(
+    rig: Rig,
+    loads: FloatArray,
+    words: str = 'these loads',
+    *,
+    without: Sequence[str] = (),
+    params_file: str = 'the thesis rig',
+    progress: Progress = lambda _: None,
+) -> Isolability:
+    """What a recording of ``rig`` under ``loads`` (n, 3) N, N, N m, one row a sample, could tell apart.
+
+    ``words`` for the loads, ``params_file`` for the rig; ``without``: effects to leave out. Raises RecordingError
+    if the loads are too short for a search.
+    """
+    counts = RigSimulator(rig).step(loads).counts
+    planned = Observation('planned', rig, counts.astype(np.float64) * rig.converter.volts_per_count, loads)
+    machine = RecordedRig.of([planned], rig, without, None, progress)
+    problem = Problem.of(machine, 0, progress, np.random.default_rng(0))
+    screen = problem.search.screen
+    accepts = partial(_accepted, problem.search)
+    variants: dict[str, list[Candidate]] = {}
+    for candidate in screen.candidates:
+        variants.setdefault(_label(candidate), []).append(candidate)
+    found, matrix = [], []
+    for label, shapes in variants.items():
+        one, shares = min((_one(screen, label, c, variants, accepts) for c in shapes), key=_easiest)
+        if shapes[0].effect.finite:
+            one = _of_probes(screen, one, shapes, accepts(1))
+        found.append(one)
+        matrix.append(shares)
+    hidden = {}
+    for effect in catalogue().values():
+        for choice in effect.variants():
+            label = ActiveEffect(effect, choice).label
+            # Lines of a spectrum and coarse steps are looked for where readings have them; none are there yet.
+            by_itself = any(p.proposed_by(choice) in FROM_READINGS for p in effect.parameters)
+            if label not in variants and effect.name not in without and not by_itself:
+                hidden[label] = effect.needs
+    return Isolability(
+        loads=words,
+        seconds=len(loads) / rig.converter.sample_rate_hz,
+        found=tuple(found),
+        hidden=hidden,
+        matrix=np.array(matrix).reshape(len(found), -1),
+        params_file=params_file,
+    )
+
+
+def _accepted(search: Search, parameters: int) -> float:
+    """Chi-square from which a search accepts an effect of so many free parameters."""
+    by_chance = -math.expm1(math.log1p(-search.workspace.p_accept) / len(search.screen.candidates))
+    return max(float(chi2.isf(by_chance, parameters)), search.penalty * parameters + BIC_ACCEPT)
+
+
+def _label(candidate: Candidate) -> str:
+    return ActiveEffect(candidate.effect, candidate.start).label
+
+
+def _easiest(one: tuple[Isolable, list[float]]) -> float:
+    return math.inf if one[0].named is None else one[0].named
+
+
+def _one(
+    screen: Screen,
+    label: str,
+    candidate: Candidate,
+    variants: Mapping[str, Sequence[Candidate]],
+    accepts: Callable[[int], float],
+) -> tuple[Isolable, list[float]]:
+    """One candidate, and the share of its signature that each of ``variants`` imitates at best."""
+    own = screen.slice_of(candidate).start
+    length = float(screen.fisher[own, own])
+    shares = [max(_imitated(screen, own, screen.slice_of(c)) for c in others) for others in variants.values()]
+    rivals = [
+        (share, name)
+        for (name, others), share in zip(variants.items(), shares, strict=True)
+        if others[0].effect is not candidate.effect and len(others[0].free) <= len(candidate.free)
+    ]
+    share, alike = max(rivals, default=(0.0, ''))
+    apart = 1.0 - share if 1.0 - share > ALIKE else 0.0
+    accepted = accepts(len(candidate.free))
+    p = candidate.effect.parameter(candidate.free[0])
+    out = Isolable(
+        label=label,
+        parameter=p.name,
+        unit=p.unit,
+        seen=_size(candidate, length, accepted),
+        named=None if apart == 0.0 else _size(candidate, length, max(accepted, TELLS_APART / apart)),
+        alike=alike,
+        apart=apart,
+    )
+    return out, shares
+
+
+def _imitated(screen: Screen, own: int, other: slice) -> float:
+    """The share, 0 to 1, of the squared length of a column that those of another candidate make up."""
+    gain = solve_seen(screen.fisher[other, other], screen.fisher[other, own], screen.lengths[other])[0]
+    return min(gain / float(screen.fisher[own, own]), 1.0)
+
+
+def _size(candidate: Candidate, length: float, wanted: float) -> float | None:
+    """The size with a chi-square of ``wanted``, if its probe has ``length``; None if it may not be so large."""
+    p, off, times = candidate.effect.parameter(candidate.free[0]), candidate.off, math.sqrt(wanted / length)
+    if not candidate.effect.finite:
+        size, room = p.scale * times, max(p.maximum - off[p.name], off[p.name] - p.minimum)
+        return size if size <= room else None
+    if p.power:
+        size = candidate.start[p.name] * times ** (1.0 / p.power)
+        return size if p.minimum <= size <= p.maximum else None
+    return candidate.start[p.name] if times <= 1.0 else None
+
+
+def _of_probes(screen: Screen, one: Isolable, probes: Sequence[Candidate], accepted: float) -> Isolable:
+    """``one`` with the weakest of several probes that still shows, if the effect does not grow in proportion."""
+    p = probes[0].effect.parameter(probes[0].free[0])
+    if p.power:
+        return one
+    lengths = {c: float(screen.lengths[screen.slice_of(c).start]) for c in probes}
+
+    def weakest(wanted: float) -> float | None:
+        enough = [c for c in probes if lengths[c] >= wanted]
+        return min(enough, key=lambda c: lengths[c]).start[p.name] if enough else None
+
+    named = None if one.apart == 0.0 else weakest(max(accepted, TELLS_APART / one.apart))
+    return replace(one, seen=weakest(accepted), named=named)

@@ -1,0 +1,23 @@
+"""Runs the watch over a recording, by the records that its replay gives: the same as ``replay --watch``."""
+
+from __future__ import annotations
+
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.recordings.recording import Recording
+from psd_deflection.recordings.replay.engine import replayed
+from psd_deflection.recordings.replay.watched import WatchedReplay
+from psd_deflection.records import SampleBlock
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.watch.result import WatchedRun
+
+
+def watch(recording: Recording, rig: Rig, sources: dict[str, str]) -> WatchedRun:
+    """The alarms of ``recording`` with ``rig``, as it was at the start. Raises RecordingError and SolverError."""
+    watched = WatchedReplay(rig, recording)
+    start_ns: int | None = None
+    for records in replayed(recording, Pipeline(rig)):
+        for record in records:
+            if start_ns is None and isinstance(record, SampleBlock):
+                start_ns = int(record.t_ns[0])
+            watched.put(record)
+    return WatchedRun(tuple(watched.alarms), str(watched.watch.state), start_ns or 0, sources)

@@ -1,0 +1,102 @@
+"""The answer of the watch over a recording: its alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from psd_deflection.base.charts import Chart, Panel, Rule, Series
+from psd_deflection.base.pages import table
+from psd_deflection.base.tables import Column, Table, text_column
+from psd_deflection.measure.watch import Alarm
+from psd_deflection.studies.study import PageSection, StudyResult
+
+
+@dataclass(frozen=True)
+class WatchedRun(StudyResult):
+    """The alarms of a recording, the first first. ``start_ns``: of its first sample.
+
+    ``watched``: what was watched, in words. ``made_from``: see :attr:`StudyResult.sources`.
+    """
+
+    alarms: tuple[Alarm, ...]
+    watched: str
+    start_ns: int
+    made_from: Mapping[str, str]
+
+    study = 'watch'
+    title = 'Is the rig still its model?'
+    json_name = 'watch.json'
+
+    def since_s(self, alarm: Alarm) -> float:
+        """When an alarm began, s from the first sample."""
+        return (alarm.since_ns - self.start_ns) / 1e9
+
+    def sentences(self) -> list[str]:
+        """Each alarm with its time; or that there was none, and what was watched."""
+        lines = [f'since {self.since_s(a):.1f} s: {a.words}' for a in self.alarms]
+        return lines or [f'the rig is its model; watched: {self.watched}']
+
+    def tree(self) -> dict[str, Any]:
+        """The alarms: times in s from the first sample, shifts in m (of theta in rad)."""
+        return {
+            'same': not self.alarms,
+            'watched': self.watched,
+            'alarms': [
+                {
+                    'since_s': self.since_s(a),
+                    'seen_s': (a.seen_ns - self.start_ns) / 1e9,
+                    'channel': a.channel,
+                    'shift': a.shift,
+                    'sd': a.sd,
+                    'also': list(a.also),
+                }
+                for a in self.alarms
+            ],
+        }
+
+    def sections(self) -> Iterable[PageSection]:
+        """The alarms as a table."""
+        rows = [
+            (f'{self.since_s(a):.1f}', a.channel, f'{a.shift * 1e6:z.2f} ± {a.sd * 1e6:.2f}', ', '.join(a.also))
+            for a in self.alarms
+        ]
+        if rows:
+            words = table(('since, s', 'what', 'shift, µm (theta: µrad)', 'also'), rows)
+            yield PageSection('Alarms', (words, self._chart()))
+
+    def _chart(self) -> Chart:
+        panels = []
+        for channel in dict.fromkeys(a.channel for a in self.alarms):
+            own = [a for a in self.alarms if a.channel == channel]
+            t, shift, sd = np.array([(self.since_s(a), 1e6 * a.shift, 1e6 * a.sd) for a in own]).T
+            one = Series('', t, shift, 'red', 'points', 1.96 * sd)
+            label = f'{channel} / {"µrad" if channel == "theta" else "µm"}'
+            along = 'time / s from the first sample'
+            panels.append(Panel((one,), along, label, rules=[Rule(0.0, across=True)]))
+        return Chart('what shifted, since when and by how much (95 %)', panels)
+
+    @property
+    def sources(self) -> Mapping[str, str]:
+        """Recording and rig."""
+        return self.made_from
+
+    def table(self) -> Table:
+        """One row an alarm over ``since`` (s from the first sample): ``seen`` s, ``channel``, ``shift`` and ``sd``.
+
+        Shifts are in m, of ``theta`` in rad.
+        """
+        found = self.alarms
+        return Table(
+            Column('since', np.array([self.since_s(a) for a in found], dtype=np.float64), 's', 'when it began'),
+            [
+                Column('seen', np.array([(a.seen_ns - self.start_ns) / 1e9 for a in found]), 's', 'when it was sure'),
+                text_column('channel', [a.channel for a in found], 'what shifted'),
+                Column('shift', np.array([a.shift for a in found], dtype=np.float64), 'm, rad', 'by how much'),
+                Column('sd', np.array([a.sd for a in found], dtype=np.float64), 'm, rad', 'its standard deviation'),
+            ],
+            {'watched': self.watched},
+        )

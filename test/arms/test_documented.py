@@ -1,0 +1,57 @@
+"""What the pages say of settings is what is declared, and bounds are round numbers."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.arms.chains import chain_file
+from psd_deflection.arms.compensation import settings, shaping
+from psd_deflection.arms.compensation.damper import DamperSettings
+from psd_deflection.rig.parameters import Section
+
+DOCS = Path(__file__).parents[2] / 'docs'
+ROW = re.compile(r'^\| (`[^|]*`) \| ([^|]+) \|', re.MULTILINE)
+SECTIONS = (settings.SETTINGS, shaping.SHAPING, chain_file.SETTINGS, chain_file._JOINT, chain_file._LINK)
+
+
+def stated(page: str) -> dict[str, str]:
+    """Of each name in the first column of a page's tables, the first word of the second."""
+    found: dict[str, str] = {}
+    for names, values in ROW.findall((DOCS / page).read_text()):
+        words = [value.split()[0] for value in values.split(', ') if value.split()]
+        found |= dict(zip(re.findall('`([^`]*)`', names), words, strict=False))
+    return found
+
+
+def test_the_page_has_the_defaults_of_the_compensator() -> None:
+    said, declared = stated('compensation.md'), settings.SETTINGS.parameters
+    numbers = {p.name: p.default for p in declared.values() if p.live}
+    assert {name: float(said[name]) for name in numbers} == numbers
+    assert (said['takeover'], declared['takeover'].default) == ('true', True)
+
+
+def test_the_page_has_the_defaults_of_the_damper() -> None:
+    said = stated('shaping.md')
+    shown = {f.name: f.default for f in fields(DamperSettings) if f.name in said and f.name != 'lag'}
+    assert set(shown) == {'added', 'max_offset', 'max_rate', 'stale', 'max_sd', 'max_speed'}
+    assert {name: float(said[name]) for name in shown} == shown
+
+
+def test_what_may_be_set_while_a_node_runs_is_what_the_pages_say() -> None:
+    assert {p.name for p in shaping.SHAPING.parameters.values() if p.live} == {'max_step', 'lead'}
+    at_start = {p.name for p in settings.SETTINGS.parameters.values() if not p.live}
+    assert at_start == {'axes', 'output', 'joints', 'takeover', 'controller_state', 'frame_prefix'}
+
+
+@pytest.mark.parametrize('section', SECTIONS, ids=lambda s: next(iter(s.parameters)))
+def test_bounds_are_round(section: Section[object]) -> None:
+    """One, two or five times a power of ten, or 0.9 of a ratio below 1: what a person chose."""
+    for p in section.parameters.values():
+        for bound in (p.minimum, p.maximum, p.above):
+            if bound:
+                digits = f'{abs(bound):e}'.split('e')[0].rstrip('0').rstrip('.')
+                assert digits in ('1', '2', '5') or bound == 0.9, f'{p.name}: {bound}'

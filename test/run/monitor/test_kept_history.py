@@ -1,0 +1,325 @@
+"""What the page's hours are after a restart, and what a bad file or disk does to them."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from psd_deflection.base.log import texts
+from psd_deflection.records import Mark
+from psd_deflection.rig.config import load_rig
+from psd_deflection.run.monitor import kept_history
+from psd_deflection.run.monitor.history import LEVELS, Asked, History, Kept
+from psd_deflection.run.monitor.kept_history import HistoryFile, HistoryKeeper
+from psd_deflection.run.state import device_file
+from test.heard import until
+
+from .serving import BLOCK_NS, START_NS, Serving, StillShown
+from .test_history import SECOND, SIZE, SMALL, blocks, filled, row
+from .test_server import column, history_of
+
+IN_MEMORY = Path(':memory:')
+LATER = START_NS + 10**9 * SECOND
+Serve = Callable[..., Serving]
+
+
+Open = Callable[..., HistoryFile]
+
+
+@pytest.fixture
+def file_of() -> Iterator[Open]:
+    """Opens the file of a history; closed at the end."""
+    made: list[HistoryFile] = []
+
+    def opened(history: History, path: Path = IN_MEMORY) -> HistoryFile:
+        made.append(HistoryFile(path, history.kind, history.names, history.kept_length))
+        return made[-1]
+
+    yield opened
+    for file in made:
+        file.close()
+
+
+def cells(history: History, since: int, points: int = 2000, span: int = 2000) -> dict[str, np.ndarray]:
+    """By column, in cells of at least ten seconds."""
+    begin = START_NS + since * SECOND
+    return history.window(Asked(begin, begin + span * 10 * SECOND, points)).columns
+
+
+@settings(max_examples=60)
+@given(blocks, st.data())
+def test_what_is_kept_at_any_time_is_what_there_was(
+    rows: list[tuple[int, float | None, float, int, int]], data: st.DataObject
+) -> None:
+    """However often it is saved, and whatever the clock does in between."""
+    made, t_ns = History(2, SIZE, SMALL), START_NS
+    file = HistoryFile(IN_MEMORY, made.kind, made.names, made.kept_length)
+    for step, dx, total, lost, gone in rows:
+        t_ns += step
+        made.add(row(t_ns, dx, total, lost, gone))
+        if data.draw(st.booleans()):
+            file.save(made.unsaved())
+    file.save(made.unsaved())
+    kept = file.load(LATER, LATER)
+    whole = made._rings[1].between(0, made._rings[1].newest + 1)
+    assert kept.cells[-len(whole) :].tobytes() == whole.tobytes()
+    file.close()
+
+
+def test_two_runs_are_as_one(file_of: Open) -> None:
+    rows = [row(START_NS + k * SECOND // 2, 1e-6 * k, lost=k % 3) for k in range(900)]
+    first = filled(rows[:437])
+    first.mark(START_NS, '[1]')
+    file = file_of(first)
+    file.save(first.unsaved())
+    second = filled(rows[437:460])
+    # The first blocks came before the disk had answered, and in the cell in which the first run ended.
+    second.mark(START_NS + 230 * SECOND, '[2]')
+    second.restore(file.load(LATER, LATER))
+    for one in rows[460:]:
+        second.add(one)
+    whole = filled(rows)
+    for points in (2000, 300):
+        got, want = cells(second, 0, points), cells(whole, 0, points)
+        assert got.keys() == want.keys()
+        for name, values in want.items():
+            np.testing.assert_allclose(got[name], values, rtol=1e-12)
+    assert [text for _, text in second._marks] == ['[1]', '[2]']
+    # The cell under way is replaced, not kept twice.
+    file.save(second.unsaved())
+    assert len(file.load(LATER, LATER).cells) == len(whole._rings[1].between(0, whole._rings[1].newest + 1))
+
+
+def test_only_the_last_week_is_kept(file_of: Open) -> None:
+    made = filled([row(START_NS, 0.0)])
+    file = file_of(made)
+    assert made.kept_length * LEVELS[1][0] == LEVELS[2][0] * LEVELS[2][1]
+    file.save(made.unsaved())
+    made.add(row(START_NS + 10 * SECOND * (made.kept_length - 1), 0.0))
+    file.save(made.unsaved())
+    assert len(file.load(LATER, LATER).cells) == 2
+    made.add(row(START_NS + 10 * SECOND * made.kept_length, 0.0))
+    file.save(made.unsaved())
+    assert len(file.load(LATER, LATER).cells) == 2
+
+
+def test_what_lies_after_now_is_passed_over_and_goes(file_of: Open) -> None:
+    made = filled([row(START_NS, 0.0), row(START_NS + 100 * SECOND, 0.0)])
+    made.mark(START_NS + 100 * SECOND, '[1]')
+    file = file_of(made)
+    file.save(made.unsaved())
+    now = START_NS + 50 * SECOND
+    kept = file.load(now // (10 * SECOND), now)
+    assert [int(key) for key in kept.cells['key']] == [START_NS // (10 * SECOND)]
+    assert kept.marks == []
+    back = History(2, SIZE)
+    back.restore(kept)
+    file.save(back.unsaved())
+    assert len(file.load(LATER, LATER).cells) == 1
+
+
+def test_a_file_of_other_channels_is_begun_anew(file_of: Open, tmp_path: Path) -> None:
+    three, two = History(3, SIZE), filled([row(START_NS, 0.0)])
+    file = file_of(two, tmp_path / 'a')
+    file.save(two.unsaved())
+    assert len(file_of(two, tmp_path / 'a').load(LATER, LATER).cells) == 1
+    assert len(file_of(three, tmp_path / 'a').load(LATER, LATER).cells) == 0
+    assert len(file_of(two, tmp_path / 'a').load(LATER, LATER).cells) == 0
+
+
+def test_cells_and_marks_that_are_none_are_passed_over(file_of: Open, tmp_path: Path) -> None:
+    made = filled([row(START_NS + k * 10 * SECOND, 0.0) for k in range(4)])
+    made.mark(START_NS, '[1]')
+    file = file_of(made, tmp_path / 'a')
+    file.save(made.unsaved())
+    key = START_NS // (10 * SECOND)
+    with contextlib.closing(sqlite3.connect(tmp_path / 'a')) as own, own:
+        own.execute('UPDATE cells SET cell = ? WHERE key = ?', (b'short', key))
+        own.execute('UPDATE cells SET key = -5 WHERE key = ?', (key + 1,))
+        own.execute("INSERT INTO marks VALUES (0, 'no JSON'), (1, '{}'), ('noon', '[1]')")
+    kept = file.load(LATER, LATER)
+    assert [int(k) for k in kept.cells['key']] == [key + 2, key + 3]
+    assert kept.marks == [(START_NS, '[1]')]
+
+
+class Keeping:
+    """A keeper with its history."""
+
+    def __init__(self, path: Path) -> None:
+        self.said: list[str] = []
+        self.history = History(2, SIZE)
+        self.keeper = HistoryKeeper(path, self.history, texts(self.said.append))
+        self.keeper.start()
+
+    def restored(self) -> None:
+        until(self.keeper.restore)
+
+    def saved(self) -> None:
+        self.keeper.save()
+        until(self.keeper._idle.is_set)
+
+    def count(self) -> int:
+        return len(self.history._rings[1].between(0, LATER))
+
+
+@pytest.fixture
+def keep(tmp_path: Path) -> Iterator[Callable[[], Keeping]]:
+    made: list[Keeping] = []
+
+    def begin() -> Keeping:
+        made.append(Keeping(tmp_path / 'state' / 'history.sqlite'))
+        return made[-1]
+
+    yield begin
+    for one in made:
+        one.keeper.end()
+
+
+def test_nothing_is_saved_before_what_was_kept_is_read(keep: Callable[[], Keeping]) -> None:
+    one = keep()
+    one.history.add(row(START_NS, 0.0))
+    one.keeper.save()
+    one.restored()
+    one.saved()
+    one.keeper.end()
+    two = keep()
+    two.restored()
+    assert two.count() == 1
+    assert one.said == two.said == []
+
+
+def test_a_damaged_file_is_put_aside(keep: Callable[[], Keeping], tmp_path: Path) -> None:
+    (tmp_path / 'state').mkdir()
+    (tmp_path / 'state' / 'history.sqlite').write_bytes(b'no database at all' * 100)
+    one = keep()
+    one.restored()
+    assert one.said == [
+        f'{tmp_path}/state/history.sqlite: the kept history cannot be read (file is not a database); '
+        'it is history.sqlite.damaged now'
+    ]
+    assert (tmp_path / 'state' / 'history.sqlite.damaged').read_bytes()[:18] == b'no database at all'
+    one.history.add(row(START_NS, 0.0))
+    one.keeper.end()
+    two = keep()
+    two.restored()
+    assert two.count() == 1
+
+
+def test_a_file_that_is_damaged_inside_is_put_aside(keep: Callable[[], Keeping], tmp_path: Path) -> None:
+    one = keep()
+    one.restored()
+    for k in range(500):
+        one.history.add(row(START_NS + k * 10 * SECOND, 0.0))
+    one.keeper.end()
+    path = tmp_path / 'state' / 'history.sqlite'
+    content = bytearray(path.read_bytes())
+    content[3 * 4096 : -4096] = bytes(len(content) - 4 * 4096)
+    path.write_bytes(content)
+    two = keep()
+    two.restored()
+    assert two.count() == 0
+    assert 'the kept history cannot be read (database disk image is malformed)' in two.said[0]
+    assert path.with_name('history.sqlite.damaged').read_bytes() == content
+
+
+def test_marks_are_written_again_only_if_there_are_new_ones() -> None:
+    made = filled([row(START_NS, 0.0)])
+    made.mark(START_NS, '[1]')
+    assert made.unsaved().marks == [(START_NS, '[1]')]
+    assert made.unsaved().marks is None
+    # What could not be kept is kept the next time.
+    assert made.unsaved(0).marks == [(START_NS, '[1]')]
+    made.mark(START_NS + 1, '[2]')
+    assert made.unsaved().marks == [(START_NS, '[1]'), (START_NS + 1, '[2]')]
+
+
+def test_a_folder_that_cannot_be_written_costs_the_history_alone(keep: Callable[[], Keeping], tmp_path: Path) -> None:
+    (tmp_path / 'state').write_text('a file')
+    one = keep()
+    until(lambda: bool(one.said))
+    one.history.add(row(START_NS, 0.0))
+    one.keeper.save()
+    one.keeper.end()
+    (said,) = one.said
+    assert said.startswith(f'{tmp_path}/state/history.sqlite: the history of the page cannot be kept (')
+
+
+def test_what_the_disk_refused_is_written_the_next_time(
+    keep: Callable[[], Keeping], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one = keep()
+    one.restored()
+
+    def full(self: HistoryFile, kept: Kept) -> None:
+        raise sqlite3.OperationalError('database or disk is full')
+
+    with monkeypatch.context() as patched:
+        patched.setattr(HistoryFile, 'save', full)
+        for k in range(3):
+            one.history.add(row(START_NS + k * 10 * SECOND, 0.0))
+            one.saved()
+    assert len(one.said) == 1
+    assert 'disk is full' in one.said[0]
+    one.history.add(row(START_NS + 50 * SECOND, 0.0))
+    one.keeper.end()
+    two = keep()
+    two.restored()
+    assert two.count() == 4
+
+
+def test_a_disk_that_hangs_holds_nobody(keep: Callable[[], Keeping], monkeypatch: pytest.MonkeyPatch) -> None:
+    one = keep()
+    one.restored()
+    gate = threading.Event()
+    monkeypatch.setattr(HistoryFile, 'save', lambda self, kept: gate.wait())
+    monkeypatch.setattr(kept_history, 'END_S', 0.05)
+    one.history.add(row(START_NS, 0.0))
+    for _ in range(3):
+        one.keeper.save()
+    begun = time.monotonic()
+    one.keeper.end()
+    # Not for the minutes that the disk may hang.
+    assert time.monotonic() - begun < 60.0
+    assert one.keeper._thread.is_alive()
+    gate.set()
+
+
+def test_the_hours_of_a_page_outlive_it(serve: Serve, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(StillShown, 'history_file', lambda _: tmp_path / 'kept.sqlite')
+    first = serve()
+    first.give(0, 1500)
+    first.feed.put(Mark(START_NS + BLOCK_NS, 'bumped it'))
+    first.settle()
+    before = history_of(first, 400.0, points=40)
+    first.server.close()
+
+    second = serve()
+    until(lambda: bool(history_of(second, 400.0, points=40)['marks']))
+    after = history_of(second, 400.0, points=40)
+    assert after['columns'] == before['columns']
+    assert column(after, 'blocks') == [500, 500, 500]
+    assert [mark[1] for mark in after['marks']] == ['mark']
+    # The seconds went with the run; ten of them are the finest that is kept.
+    assert history_of(second, 40.0)['columns']['blocks'] == ''
+    second.server.close()
+
+    third = serve(monitor_history=False)
+    assert third.server._keeper is None
+    assert history_of(third, 400.0, points=40)['marks'] == []
+
+
+def test_two_devices_never_share_a_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv('XDG_STATE_HOME', str(tmp_path))
+    names = {device_file('history', serial, '.sqlite') for serial in ('A', 'A.', '../A', '', 'unknown', 'a' * 70)}
+    assert len(names) == 6
+    assert {path.parent for path in names} == {tmp_path / 'psd_deflection'}
+    assert load_rig().monitor.history is True

@@ -1,0 +1,240 @@
+"""Alarms handed on: a real program and a real web server on this machine."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import socket
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.base.log import texts
+from psd_deflection.cli.main import main
+from psd_deflection.measure.watch import Alarm
+from psd_deflection.recordings.read.readers import open_recording
+from psd_deflection.recordings.replay.engine import rig_at_start
+from psd_deflection.run import alarm_out as module
+from psd_deflection.run.alarm_out import AlarmOut, finding
+from test.heard import WAIT_S
+
+ALARM = Alarm(1_700_000_000_250_000_000, 1_700_000_004_000_000_000, 'x1', 5e-6, 0.2e-6, ('y1',))
+
+
+class Server:
+    """Answers each POST with the next of ``answers``, then 200; ``got``: the bodies."""
+
+    def __init__(self) -> None:
+        self.answers: list[int] = []
+        self.got: list[bytes] = []
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                server.got.append(self.rfile.read(int(self.headers['Content-Length'])))
+                self.send_response(server.answers.pop(0) if server.answers else 200)
+                self.send_header('Location', '/elsewhere')
+                self.send_header('Content-Length', '0')
+                self.end_headers()
+
+            def do_GET(self) -> None:
+                server.got.append(b'GET')
+                self.send_response(200)
+                self.end_headers()
+
+            def log_message(self, format: str, *args: object) -> None:
+                pass
+
+        self._http = HTTPServer(('127.0.0.1', 0), Handler)
+        self.url = f'http://127.0.0.1:{self._http.server_port}/hook'
+        self._thread = threading.Thread(target=self._http.serve_forever, args=(0.01,))
+        self._thread.start()
+
+    def close(self) -> None:
+        self._http.shutdown()
+        self._thread.join()
+        self._http.server_close()
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    made = Server()
+    yield made
+    made.close()
+
+
+@pytest.fixture(autouse=True)
+def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, 'PAUSES_S', (0.0, 0.0))
+    monkeypatch.setenv('no_proxy', '127.0.0.1')
+
+
+def python(program: str, *arguments: str) -> str:
+    """A command line that runs a line of Python."""
+    return shlex.join([sys.executable, '-c', program, *arguments])
+
+
+KEEP = 'import sys, pathlib; pathlib.Path(sys.argv[1]).open("a").write(sys.stdin.read())'
+
+
+def handed_on(command: str = '', webhook: str = '', times: int = 1) -> tuple[AlarmOut, list[str]]:
+    said: list[str] = []
+    out = AlarmOut(command, webhook, texts(said.append), {'device': 'abc'})
+    for _ in range(times):
+        out.put(ALARM)
+    assert out.close(2.0 * WAIT_S)
+    return out, said
+
+
+def test_command_and_web_address_get_the_same_finding(tmp_path: Path, server: Server) -> None:
+    kept = tmp_path / 'it is; $(kept)'
+    out, said = handed_on(python(KEEP, str(kept)), server.url)
+    expected = finding(ALARM, {'device': 'abc'})
+    assert json.loads(kept.read_text()) == expected
+    assert [json.loads(body) for body in server.got] == [expected]
+    assert said == []
+    assert (out.sent, out.failed) == (2, 0)
+    assert expected['since'] == '2023-11-14T22:13:20.250Z'
+    assert (expected['channel'], expected['shift'], expected['unit']) == ('x1', 5e-6, 'm')
+    assert expected['text'] == f'since 2023-11-14T22:13:20.250Z: {ALARM.words}'
+
+
+def test_no_shell_reads_the_command(tmp_path: Path) -> None:
+    kept = tmp_path / 'kept'
+    handed_on(python(KEEP, str(kept)) + f' ; touch {tmp_path}/made $(touch {tmp_path}/made)')
+    assert [path.name for path in tmp_path.iterdir()] == ['kept']
+
+
+def test_a_command_that_fails_is_said_once_and_counted() -> None:
+    out, said = handed_on(python('import sys; sys.exit(3)'), times=3)
+    assert (out.sent, out.failed) == (0, 3)
+    assert said == [
+        f'watch: command {sys.executable}: ended with status 3; an alarm was not handed on, '
+        'and further ones are counted'
+    ]
+    assert out.values() == [
+        ('alarms handed on', '0'),
+        ('alarms not handed on', f'3 command {sys.executable}: ended with status 3'),
+    ]
+
+
+def test_a_command_that_hangs_is_killed_with_what_it_started(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(module, 'COMMAND_S', 0.2)
+    # What it started keeps the pipe open: the end is read only if that is killed too.
+    pipe = tmp_path / 'pipe'
+    os.mkfifo(pipe)
+    hang = f'exec 3>{shlex.quote(str(pipe))}; {python("import signal; signal.pause()")} & wait'
+    out = AlarmOut(shlex.join(['sh', '-c', hang]), '', texts(lambda text: None))
+    out.put(ALARM)
+    with pipe.open() as end:
+        assert end.read() == ''
+    assert out.close(2.0 * WAIT_S)
+    assert out.failure.endswith('did not end within 0.2 s, and was killed')
+
+
+def test_a_command_that_reads_nothing_is_no_failure() -> None:
+    out, said = handed_on('true', times=2)
+    assert (out.sent, said) == (2, [])
+
+
+def test_a_web_address_is_tried_three_times_and_again_at_the_next_alarm(server: Server) -> None:
+    server.answers = [503, 500, 429, 503, 200]
+    out, said = handed_on('', server.url, times=2)
+    assert len(server.got) == 5
+    assert (out.sent, out.failed) == (1, 1)
+    assert said == [
+        'watch: webhook at 127.0.0.1: answers 429; an alarm was not handed on, and further ones are counted'
+    ]
+
+
+@pytest.mark.parametrize('answer', [302, 404])
+def test_what_no_repetition_mends_is_tried_once_and_no_redirection_is_followed(server: Server, answer: int) -> None:
+    server.answers = [answer]
+    out, _ = handed_on('', server.url)
+    assert len(server.got) == 1
+    assert (out.failed, out.failure) == (1, f'webhook at 127.0.0.1: answers {answer}')
+
+
+def test_a_server_that_is_away_is_said() -> None:
+    with socket.create_server(('127.0.0.1', 0)) as taken:
+        port = taken.getsockname()[1]
+    out, said = handed_on('', f'http://127.0.0.1:{port}/')
+    assert out.failed == 1
+    assert said[0].startswith('watch: webhook at 127.0.0.1: cannot be reached (Connection refused)')
+
+
+def test_alarms_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, 'MOST_WAITING', 0)
+    out, said = handed_on('true', times=2)
+    assert out.failed == 2
+    assert said == ['watch: alarms: 0 wait already; an alarm was not handed on, and further ones are counted']
+
+
+def test_an_address_that_is_a_secret_stays_in_its_file(server: Server, tmp_path: Path) -> None:
+    (tmp_path / 'address').write_text(f'{server.url}/secret\n')
+    out, _ = handed_on('', str(tmp_path / 'address'))
+    assert (len(server.got), out.sent) == (1, 1)
+    (tmp_path / 'address').write_text('file:///secret')
+    with pytest.raises(ConfigError) as refused:
+        AlarmOut('', str(tmp_path / 'address'), texts(lambda text: None))
+    assert 'secret' not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ('command', 'webhook', 'words'),
+    [
+        ('"', '', 'is no command line'),
+        (' ', '', 'no program of that name'),
+        ('/nowhere/notify', '', 'no program of that name'),
+        ('', 'file:///etc/passwd', 'must be an address http'),
+        ('', 'http://', 'must be an address http'),
+        ('', 'http://a b', 'must be an address http'),
+        ('', 'http://a:0', 'must be an address http'),
+        ('', 'http://a:b', 'must be an address http'),
+        ('', '/nowhere/address', 'no file that can be read'),
+    ],
+)
+def test_what_cannot_be_used_is_refused_at_the_start(command: str, webhook: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        AlarmOut(command, webhook, texts(lambda text: None))
+
+
+def drifting(path: Path) -> Path:
+    """A recording in which a laser wanders."""
+    effect = 'laser_pointing_drift,psd=1,rate_x=3e-7'
+    assert main(['simulate', '--out', str(path), '--loads', 'constant:0,0,0:20', '--effect', effect]) == 0
+    return path
+
+
+def test_a_replay_hands_on_its_alarms(server: Server, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, kept = drifting(tmp_path / 'drift.csv'), tmp_path / 'kept'
+    argv = ['replay', str(path), '--watch', '--watch-command', python(KEEP, str(kept)), '--watch-webhook', server.url]
+    assert main(argv) == 0
+    told = json.loads(kept.read_text())
+    assert told == json.loads(server.got[0])
+    assert told['recording'] == str(path)
+    assert told['text'].partition(': ')[2] in capsys.readouterr().out
+    assert main(['replay', str(path), '--watch-command', 'true']) == 2
+    assert main(['replay', str(path), '--watch', '--watch-command', '/nowhere/notify']) == 2
+    assert '--watch-command = ' in capsys.readouterr().err
+
+
+def test_no_recording_makes_a_replay_run_anything(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Parameters of a stranger's recording are no commands of the user's."""
+    made = tmp_path / 'made'
+    rig = f'/**:\n  ros__parameters:\n    watch: "on"\n    watch_command: touch {made}\n'
+    (tmp_path / 'rig.yaml').write_text(rig)
+    argv = ['simulate', '--out', str(tmp_path / 'rec'), '--loads', 'constant:0,0,0:20']
+    argv += ['--effect', 'laser_pointing_drift,psd=1,rate_x=3e-7', '--params-file', str(tmp_path / 'rig.yaml')]
+    assert main(argv) == 0
+    recorded = rig_at_start(open_recording(tmp_path / 'rec'))
+    assert recorded.acquisition.watch_command == f'touch {made}'
+    assert main(['replay', str(tmp_path / 'rec'), '--watch']) == 0
+    assert 'is no longer its model' in capsys.readouterr().out
+    assert not made.exists()

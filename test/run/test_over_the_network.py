@@ -1,0 +1,323 @@
+"""The reader on ports of the network: what it does on a serial line, it does over TCP; and over UDP with its faults."""
+
+from __future__ import annotations
+
+import select
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.base.errors import DeviceError
+from psd_deflection.base.log import texts
+from psd_deflection.cli.main import main
+from psd_deflection.devices.contract_frames import SimulatedFrames
+from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, HelloRequestFrame, PingFrame, encode
+from psd_deflection.devices.rig_feed import RigFeed
+from psd_deflection.devices.serve import serve
+from psd_deflection.devices.served_sockets import open_sockets
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.run.reading.acquisition import Acquisition
+from psd_deflection.run.reading.arrivals import Arrival
+from psd_deflection.run.session import Session
+from test.heard import WAIT_S
+from test.run.conftest import HELLO, Estimates, ScriptedDevice
+from test.run.test_acquisition import (  # noqa: F401 - they run here once more, on this module's device
+    HELLO_INFO,
+    Run,
+    numbers,
+    short_wait,
+    take,
+    test_a_device_restart_continues_with_a_new_block,
+    test_a_silent_device_is_named,
+    test_a_silent_device_is_woken,
+    test_another_device_on_the_same_port_is_not_taken,
+    test_every_lost_sample_has_a_cause,
+    test_garbage_gaps_repeats_and_flags_are_counted_and_cost_nothing_else,
+    test_reader_waits_for_an_unplugged_device_and_resumes,
+    test_samples_come_as_blocks_with_their_own_times,
+    test_stop_hands_over_what_was_read,
+)
+
+
+class ScriptedHost(ScriptedDevice):
+    """The same device behind a TCP port, which keeps its number while the host comes and goes."""
+
+    def __init__(self) -> None:
+        with socket.create_server(('127.0.0.1', 0)) as free:
+            self._place = free.getsockname()
+        super().__init__(Path())
+        self.port = f'socket://127.0.0.1:{self._place[1]}'
+
+    def plug(self) -> None:
+        self.greeted.clear()
+        self._listener = socket.create_server(self._place)
+        self._host: socket.socket | None = None
+        self._gone = threading.Event()
+        self._thread = threading.Thread(target=self._answer, args=(self._listener, self._gone), daemon=True)
+        self._thread.start()
+
+    def _answer(self, listener: socket.socket, gone: threading.Event) -> None:
+        decoder = FrameDecoder()
+        while not gone.is_set():
+            ready, _, _ = select.select([s for s in (listener, self._host) if s is not None], (), (), 0.01)
+            if listener in ready:
+                if self._host is not None:
+                    self._host.close()
+                self._host, _ = listener.accept()
+            elif ready and self._host is not None:
+                received = self._host.recv(4096)
+                if not received:
+                    self._host.close()
+                    self._host = None
+                for frame in decoder.feed(b'\x00' + received):
+                    if isinstance(frame, HelloRequestFrame):
+                        self.send(self.answer)
+                        self.greeted.set()
+
+    def send(self, stream: bytes) -> None:
+        assert self._host is not None
+        self._host.sendall(stream)
+
+    def unplug(self) -> None:
+        self._gone.set()
+        self._thread.join()
+        self._listener.close()
+        if self._host is not None:
+            self._host.close()
+
+
+@pytest.fixture
+def device() -> Iterator[ScriptedHost]:
+    scripted = ScriptedHost()
+    yield scripted
+    if not scripted._gone.is_set():
+        scripted.unplug()
+
+
+@pytest.fixture
+def rig(device: ScriptedHost) -> Rig:
+    return load_rig(overrides={'port': device.port})
+
+
+@pytest.fixture
+def run(device: ScriptedHost, rig: Rig) -> Iterator[Run]:
+    started = Run(rig)
+    yield started
+    started.acquisition.stop()
+
+
+def test_what_answers_in_another_language_is_asked_for_its_line_speed_at_the_other_end(
+    device: ScriptedHost,
+    rig: Rig,
+    short_wait: Any,  # noqa: F811
+) -> None:
+    device.answer = b'$GPGGA,123519,4807.038,N\r\n'
+    with pytest.raises(DeviceError, match=r'26 bytes but no frame .* is the line speed at the other end right'):
+        Acquisition(rig, texts(print)).open()
+
+
+def test_the_diagnostics_name_the_port_and_no_line_speed(run: Run, device: ScriptedHost) -> None:
+    assert run.acquisition.source.describe()['source'] == f'contract frames on {device.port}'
+
+
+class Sender:
+    """A device that sends datagrams to the port of ``rig``; it answers HELLO? and keeps the pings."""
+
+    def __init__(self, answer: bytes = encode(HELLO)) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+            free.bind(('127.0.0.1', 0))
+            place = free.getsockname()
+        self.answer = answer
+        self.rig = load_rig(overrides={'port': f'udp://127.0.0.1:{place[1]}'})
+        self.pinged = threading.Event()
+        self._place = place
+        self._ended = threading.Event()
+        self.sockets: list[socket.socket] = []
+        self._threads: list[threading.Thread] = []
+        self.start()
+
+    def start(self) -> None:
+        """From a socket of its own, as after a power-up."""
+        made = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        made.bind(('127.0.0.1', 0))
+        self.sockets.append(made)
+        self._threads.append(threading.Thread(target=self._answer, args=(made,), daemon=True))
+        self._threads[-1].start()
+
+    def _answer(self, made: socket.socket) -> None:
+        decoder = FrameDecoder()
+        while not self._ended.wait(0.01) and made is self.sockets[-1]:
+            # As a device does once a second.
+            made.sendto(self.answer, self._place)
+            while select.select((made,), (), (), 0.0)[0]:
+                for frame in decoder.feed(made.recv(4096)):
+                    if isinstance(frame, PingFrame):
+                        self.pinged.set()
+
+    def send(self, *datagrams: bytes) -> None:
+        for datagram in datagrams:
+            self.sockets[-1].sendto(datagram, self._place)
+
+    def hush(self) -> None:
+        """From now on it sends what the test sends."""
+        self._ended.set()
+        for thread in self._threads:
+            thread.join()
+
+    def end(self) -> None:
+        self.hush()
+        for made in self.sockets:
+            made.close()
+
+
+@pytest.fixture
+def sender() -> Iterator[Sender]:
+    made = Sender()
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def over_udp(sender: Sender) -> Iterator[Run]:
+    started = Run(sender.rig)
+    yield started
+    started.acquisition.stop()
+
+
+def frames(sample: Any, *seqs: int) -> bytes:
+    return b''.join(encode(sample(s)) for s in seqs)
+
+
+def test_a_lost_a_doubled_and_an_exchanged_datagram_are_counted_and_nothing_is_invented(
+    sender: Sender, over_udp: Run, sample: Any
+) -> None:
+    sent = [frames(sample, *range(n, n + 5)) for n in range(0, 60, 5)]
+    # The third is lost, the fifth comes twice, of the seventh and the eighth the second comes first.
+    sender.send(*sent[:2], *sent[3:5], sent[4], sent[5], sent[7], sent[6], *sent[8:])
+    got = numbers(take(over_udp.acquisition, 50))
+    assert got == [*range(10), *range(15, 30), *range(35, 60)]
+    counters = over_udp.acquisition.counters
+    assert counters.lost == 10
+    assert dict(counters.lost_by) == {'on the wire, without a trace': 10}
+    assert counters.repeated == 10
+    assert counters.bad == 0
+    assert sender.pinged.wait(WAIT_S)
+
+
+def test_frames_in_pieces_are_put_together_and_a_lost_piece_is_a_damaged_frame(
+    sender: Sender, over_udp: Run, sample: Any
+) -> None:
+    # HELLO between two pieces would end a frame.
+    sender.hush()
+    stream = frames(sample, *range(20))
+    pieces = [stream[at : at + 50] for at in range(0, len(stream), 50)]
+    sender.send(*pieces)
+    assert numbers(take(over_udp.acquisition, 20)) == list(range(20))
+    stream = frames(sample, *range(20, 60))
+    pieces = [stream[at : at + 50] for at in range(0, len(stream), 50)]
+    sender.send(*pieces[:5], *pieces[6:])
+    # The sixth has bytes 250 to 299 of frames of 32.
+    assert numbers(take(over_udp.acquisition, 37)) == [*range(20, 27), *range(30, 60)]
+    counters = over_udp.acquisition.counters
+    assert dict(counters.lost_by) == {'damaged on the wire': 3}
+    assert counters.bad == 1
+
+
+def test_a_device_that_sends_from_another_place_introduces_itself(
+    sender: Sender, over_udp: Run, sample: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from psd_deflection.devices import udp_port
+
+    sender.send(frames(sample, *range(20)))
+    take(over_udp.acquisition, 20)
+    monkeypatch.setattr(udp_port, 'SILENT_S', 0.0)
+    sender.start()
+    said = over_udp.heard('sends now')
+    assert 'is silent, and 127.0.0.1:' in said
+    assert said.endswith('waiting for it to come back')
+    over_udp.heard('the device is back')
+    sender.send(frames(sample, *range(40, 60)))
+    assert numbers(take(over_udp.acquisition, 20)) == list(range(40, 60))
+    assert over_udp.acquisition.counters.lost == 20
+
+
+def test_strangers_are_told_and_nothing_of_theirs_is_taken(sender: Sender, over_udp: Run, sample: Any) -> None:
+    stranger = Sender(encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'OTHER'})))
+    stranger._place = sender._place
+    try:
+        said = over_udp.heard('are not taken')
+        assert said.startswith(f'{sender.rig.acquisition.port}: datagrams of 127.0.0.1:')
+        stranger.send(frames(sample, *range(500, 520)))
+        sender.send(frames(sample, *range(20)))
+        assert numbers(take(over_udp.acquisition, 20)) == list(range(20))
+        assert over_udp.acquisition.hello is not None
+        assert over_udp.acquisition.hello.info['serial'] == 'T-1'
+    finally:
+        stranger.end()
+
+
+def test_text_lines_are_never_put_together_of_two_datagrams() -> None:
+    """Half of one line and half of the next make a line, but no sample."""
+    about = b'# {"serial": "W-1", "sample_rate_hz": 1000}\n'
+    sender = Sender(about)
+    rig = load_rig(overrides={'port': sender.rig.acquisition.port, 'source': 'lines'})
+    run = Run(rig)
+    try:
+        lines = [b'%d,%d,0.1,0.2,5.0,0.3,0.4,5.0' % (n, 1000 * n) for n in range(40)]
+        # A line without its end is one all the same.
+        sender.send(*lines[:5], lines[5][:12], lines[6][12:], *lines[7:])
+        assert numbers(take(run.acquisition, 38)) == [*range(5), *range(7, 40)]
+        assert run.acquisition.counters.lost == 2
+        assert run.acquisition.counters.bad == 2
+        assert run.acquisition.source.describe()['sender'].startswith('127.0.0.1:')
+    finally:
+        run.acquisition.stop()
+        sender.end()
+
+
+@pytest.fixture(params=['socket', 'udp'])
+def served(request: pytest.FixtureRequest) -> Iterator[str]:
+    """The port of the simulated rig behind a port of the network, in real time."""
+    kind = socket.SOCK_STREAM if request.param == 'socket' else socket.SOCK_DGRAM
+    with socket.socket(socket.AF_INET, kind) as free:
+        free.bind(('127.0.0.1', 0))
+        place = f'{request.param}://127.0.0.1:{free.getsockname()[1]}'
+    stop = threading.Event()
+    known = load_rig()
+    twin = SimulatedFrames(RigFeed(known, lambda first, n: np.tile([0.0, -10.0, 0.0], (n, 1)), seed=1))
+    with open_sockets(place, 1) as (port,):
+        thread = threading.Thread(target=serve, args=(twin, port, stop.is_set), daemon=True)
+        thread.start()
+        yield port.name
+        stop.set()
+        thread.join()
+
+
+def test_a_run_over_the_network_is_recorded_and_replayed_bit_by_bit(
+    served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said: list[str] = []
+    rig = load_rig(overrides={'port': served, 'record': True, 'bag_dir': str(tmp_path), 'keep_zero': False})
+    session = Session(rig, texts(said.append))
+    estimates = Estimates(40)
+    session.processing.sinks.append(estimates)
+    try:
+        session.start()
+        assert estimates.enough.wait(WAIT_S), said
+    finally:
+        folder = session.close()
+    assert session.failed is None
+    assert session.acquisition.counters.bad == 0
+    assert main(['replay', str(folder), '--compare', '--strict']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+    # The device is there for the next one.
+    again = Acquisition(load_rig(overrides={'port': served}), texts(said.append))
+    again.open()
+    again.start()
+    assert isinstance(again.queue.get(timeout=WAIT_S), Arrival)
+    again.stop()

@@ -1,0 +1,90 @@
+"""Two lasers over one beam splitter: the rules of the thesis by hand, and what the pipeline does when one fails."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.cli.main import main
+from psd_deflection.records import BlockStatus
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.splitter import Lasers, rules, simulated
+
+RIG = load_rig()
+FILE = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
+
+
+@pytest.mark.parametrize(
+    ('powers', 'allowed', 'kept'),
+    [
+        # Both together; each alone is enough (a quarter of 5 V is the least); one out is told; as spares; alike.
+        ((1e-3, 1e-3), 1e-3, [True, True, True, True, True, True, True]),
+        ((1.1e-3, 1e-3), 1e-3, [False, True, True, True, True, True, True]),
+        ((2.1e-3, 2e-3), 1e-3, [False, True, True, True, False, True, True]),
+        ((1e-3, 2.1e-3), 1e-3, [False, True, True, False, True, False, False]),
+        ((1e-3, 0.3e-3), 1e-3, [True, True, False, False, True, True, False]),
+        ((0.3e-3, 1e-3), 1e-3, [True, False, True, False, True, True, False]),
+    ],
+)
+def test_the_three_rules(powers: tuple[float, float], allowed: float, kept: list[bool]) -> None:
+    assert [rule.kept for rule in rules(RIG, Lasers(powers, allowed))] == kept
+
+
+def test_the_numbers_of_the_rules() -> None:
+    both, one, two, share, _, _, spare = rules(RIG, Lasers((0.6e-3, 0.4e-3), 1e-3))
+    assert (both.value, both.limit) == pytest.approx((1e-3, 2e-3))
+    assert (one.value, two.value, one.limit) == pytest.approx((3.0, 2.0, 1.25))
+    assert share.value == pytest.approx(0.4)
+    assert spare.value == pytest.approx(5.0 / 1.5)
+
+
+@pytest.mark.statistics
+def test_one_that_fails_costs_certainty_and_a_cold_spare_its_warm_up() -> None:
+    both, out, alone, cold, spare = simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.5))
+    assert [p.estimates for p in (both, out, alone, cold, spare)] == [1.0, 1.0, 1.0, 0.0, 1.0]
+    assert cold.status is BlockStatus.LASER_LOST
+    assert out.said == 'one of the two lasers is out: half the light on both detectors'
+    assert 'laser 1 lost' in cold.said
+    # Half the light has twice the noise, at least; the spare has what the first one had.
+    assert np.all(out.deviations > 1.9 * both.deviations)
+    assert spare.deviations == pytest.approx(alone.deviations, rel=0.3)
+    assert max(p.largest for p in (both, out, alone, spare)) < 5.0
+    # A spare that is on at once loses nothing.
+    assert [p.name for p in simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.0))][-2:] == ['laser 1 alone', 'its spare']
+
+
+def test_the_command_says_which_rule_is_broken(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ['design', '--params-file', FILE, '--splitter', '1e-3', '1e-3']
+    assert main([*words, '--allowed', '1e-3']) == 0
+    out = capsys.readouterr().out
+    assert 'NO' not in out
+    assert 'laser 1 out: one of the two lasers is out' in out
+    assert main([*words, '--allowed', '0.9e-3', '--json']) == 1
+    found = json.loads(capsys.readouterr().out)
+    assert [rule['words'] for rule in found['rules'] if not rule['kept']] == ['both together']
+    assert found['phases'][3]['status'] == 'LASER_LOST'
+
+
+@pytest.mark.parametrize(
+    ('words', 'message'),
+    [
+        (['--splitter', '1e-3', '1e-3'], 'give --allowed W too'),
+        (['--allowed', '1e-3'], 'is of two lasers: give --splitter W W'),
+        (['--splitter', '0', '1e-3', '--allowed', '1e-3'], 'must be above 0'),
+        (['--splitter', '1e-3', '1e6', '--allowed', '1e-3'], 'splitter = 1000000.0 W: must be above 0 and below 1000'),
+        (['--splitter', '1e-3', '1e-3', '--allowed', '1e-3', '--warm-up', '-1'], 'must be at least 0'),
+        (['--splitter', '1e-3', '1e-3', '--allowed', '1e-3', '--radius', '0.1'], 'not for --splitter'),
+    ],
+)
+def test_what_cannot_be_is_refused(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['design', '--params-file', FILE, *words]) != 0
+    assert message in capsys.readouterr().err
+
+
+def test_lasers_are_checked() -> None:
+    with pytest.raises(ConfigError, match='allowed = nan'):
+        Lasers((1e-3, 1e-3), float('nan'))

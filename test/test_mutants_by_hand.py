@@ -1,0 +1,32 @@
+"""Each of the mutants made by hand is a change of one line that is there, and Python after it."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+from tools.mutant_rooms import ROOMS
+from tools.mutants_by_hand import KINDS, hand_made
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_each_lies_in_a_room_whose_tests_should_notice() -> None:
+    rooms = [path for room in ROOMS.values() for path in room.code]
+    for m in hand_made():
+        assert any(m.file == path or m.file.startswith(f'{path}/') for path in rooms), m.file
+    for room in ROOMS.values():
+        for path in (*room.code, *room.leave, *(words.partition(' ')[0] for words in (*room.tests, *room.slow))):
+            assert (ROOT / path).exists(), path
+
+
+def test_each_mutant_made_by_hand_changes_one_line_and_can_run() -> None:
+    every = hand_made()
+    assert {m.kind for m in every} == set(KINDS)
+    assert len(set(every)) == len(every)
+    for m in every:
+        text = (ROOT / m.file).read_text()
+        changed = m.code(text)
+        ast.parse(changed)
+        lines = [(a, b) for a, b in zip(text.splitlines(), changed.splitlines(), strict=True) if a != b]
+        assert [(a.strip(), b.strip()) for a, b in lines] == [(m.was, m.made)]

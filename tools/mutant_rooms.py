@@ -1,0 +1,257 @@
+"""What ``make mutants`` breaks, and which tests should notice: a room each.
+
+Without cosmic-ray, so that the tests can ask whether each mutant made by hand lies in a room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+
+class Room(NamedTuple):
+    """``code``: files and folders that are broken. ``tests``: what should notice, in seconds.
+
+    ``leave``: files that only draw or word what others computed. ``slow``: what else CI runs; it takes minutes, and
+    tries what the ``tests`` do not notice.
+    """
+
+    code: tuple[str, ...]
+    tests: tuple[str, ...]
+    leave: tuple[str, ...] = ()
+    slow: tuple[str, ...] = ()
+
+
+_PIPELINE = (
+    'test/measure/test_pipeline.py -k not(drift or rms_errors or rotation or crosstalk or nonlinearity or iterative)'
+)
+_GOLDEN = 'test/test_golden.py'
+_SOLVERS = (
+    *('sensitivity', 'truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd'),
+)
+_UNCERTAINTY = (
+    *('formulas', 'consistency', 'combinations', 'stamped', 'redundancy', 'rest', 'block_fit', 'noise', 'converter'),
+)
+_RUNS = ('test/measure/test_pipeline.py', 'test/test_layouts.py')
+
+ROOMS: Mapping[str, Room] = {
+    'solvers': Room(
+        ('psd_deflection/model/solvers',),
+        (*(f'test/model/solvers/test_{n}.py' for n in _SOLVERS), _GOLDEN),
+        slow=('test/model/solvers/test_audit.py', 'test/studies/budget', *_RUNS),
+    ),
+    'plate': Room(
+        ('psd_deflection/model/plate',),
+        ('test/model/plate',),
+        slow=(
+            *(f'test/model/solvers/test_{n}.py' for n in ('sensitivity', 'truth', 'golden')),
+            'test/model/simulation/test_simulator.py',
+        ),
+    ),
+    'averaging': Room(('psd_deflection/measure/averaging.py',), ('test/measure/test_averaging.py', _GOLDEN)),
+    'timing': Room(
+        ('psd_deflection/measure/timing.py',),
+        ('test/measure/test_timing.py', 'test/run/test_clock_watch.py'),
+        slow=('test/run/test_acquisition.py', 'test/run/test_pinger.py'),
+    ),
+    'pipeline': Room(
+        (
+            'psd_deflection/measure/pipeline.py',
+            'psd_deflection/measure/estimation.py',
+            'psd_deflection/measure/correction.py',
+        ),
+        (
+            _PIPELINE,
+            'test/measure/test_estimation.py',
+            'test/measure/test_correction.py',
+            'test/model/misalignment/test_spread.py',
+            'test/measure/uncertainty/test_pipeline_state.py',
+            'test/measure/test_health.py',
+            'test/model/simulation/test_added_effect.py -k refused or heights',
+            'test/test_more_psds.py -k psd_left or without_one or contradicts or on_itself or all_psds or the_last',
+            'test/measure/motion/test_motion.py -k anew or begun_at or noted or is_refused',
+            _GOLDEN,
+        ),
+        slow=(
+            'test/measure/test_pipeline.py -k drift or an_effect_in or iterative',
+            'test/test_more_psds.py',
+            'test/measure/motion/test_motion.py -k recorded or coast or ahead or foretold or stated',
+            'test/measure/motion/test_inertia.py',
+            'test/model/simulation/test_base_pair.py',
+            'test/model/simulation/test_effects.py -k correction or together or the_wrench',
+        ),
+    ),
+    'detector': Room(
+        ('psd_deflection/model/detector', 'psd_deflection/measure/health.py', 'psd_deflection/rig/wiring.py'),
+        ('test/model/detector', 'test/measure/test_health.py', 'test/rig/test_wiring.py', _GOLDEN),
+        slow=_RUNS,
+    ),
+    'uncertainty': Room(
+        ('psd_deflection/measure/uncertainty',),
+        (
+            *(f'test/measure/uncertainty/test_{n}.py' for n in _UNCERTAINTY),
+            'test/measure/uncertainty/test_vibration.py -k tone or hum or regular or fit_states or counted',
+            'test/measure/test_pipeline.py -k zero or contradict',
+            'test/test_more_psds.py -k contradicts or degree or tells_on_itself or one_after or from_the_memory',
+            'test/measure/uncertainty/test_pipeline_state.py',
+        ),
+        slow=_RUNS,
+    ),
+    'adapters': Room(
+        ('msg_adapters',),
+        (
+            'test/recordings/test_adapters.py',
+            'test/recordings/test_contract.py',
+            'test/test_more_psds.py -k cloud_of_two',
+        ),
+        slow=(
+            *(f'test/recordings/test_{n}.py' for n in ('bag_writer', 'bag_reader', 'cdr', 'references')),
+            'test/arms/chains/test_chain.py',
+        ),
+    ),
+    'protocol': Room(
+        ('psd_deflection/devices/protocol', 'psd_deflection/base/sequence.py'),
+        (
+            'test/devices/protocol',
+            'test/base/test_sequence.py',
+            *(f'test/devices/test_{n}.py' for n in ('dataq', 'text_lines', 'thorlabs')),
+            'test/recordings/test_bag_reader.py -k restart or wrap or again',
+        ),
+        slow=(
+            *(f'test/devices/test_{n}.py' for n in ('source', 'survey')),
+            *(f'test/run/test_{n}.py' for n in ('acquisition', 'hello', 'restarts')),
+        ),
+    ),
+    'effects': Room(
+        ('psd_deflection/model/simulation/effects',),
+        (
+            'test/model/simulation/test_catalogue.py',
+            'test/model/simulation/test_effect_terms.py',
+            'test/model/simulation/test_effect_formulas.py',
+            'test/model/simulation/test_effects.py -k back or play or pieces or (wrench and (creep or '
+            'friction or load))',
+        ),
+        slow=('test/model/simulation/test_effects.py', 'test/model/simulation/test_simulator.py'),
+    ),
+    'discover': Room(
+        ('psd_deflection/studies/discover',),
+        (
+            *(
+                f'test/studies/discover/test_{n}.py'
+                for n in (
+                    *('formulas', 'law_formulas', 'plant_formulas', 'answers', 'rules', 'steps', 'parts'),
+                    *('problem', 'limits', 'ties'),
+                )
+            ),
+            # Their pieces: a whole discovery of the catalogue takes seconds.
+            'test/studies/discover/test_discover.py -k stripped or refined or coarse or imagined',
+            'test/studies/discover/test_planning.py -k loop or words or every_proposal or pieces',
+            'test/studies/discover/test_setup.py -k put_right or other_unit or at_its or outliers or stuck',
+        ),
+        leave=('psd_deflection/studies/discover/report.py',),
+        slow=tuple(
+            f'test/studies/discover/test_{n}.py'
+            for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
+        ),
+    ),
+    'link': Room(
+        ('psd_deflection/model/link',),
+        ('test/model/link',),
+        slow=('test/model/simulation/test_simulator.py', 'test/studies/thesis'),
+    ),
+    'misalignment': Room(
+        ('psd_deflection/model/misalignment',),
+        ('test/model/misalignment',),
+        slow=('test/studies/calibrate', 'test/measure/test_estimation.py'),
+    ),
+    'motion': Room(
+        ('psd_deflection/measure/motion',),
+        (
+            'test/measure/motion/test_modal.py',
+            'test/measure/motion/test_unseen.py',
+            'test/measure/motion/test_inertia.py',
+        ),
+        slow=('test/measure/motion/test_motion.py',),
+    ),
+    'watch': Room(
+        ('psd_deflection/measure/watch.py',),
+        ('test/measure/test_watch.py',),
+        slow=('test/run/test_watcher.py',),
+    ),
+    'chains': Room(
+        ('psd_deflection/arms/chains',),
+        ('test/arms/chains',),
+        slow=('test/run/test_chain.py', 'test/cli/test_chain.py'),
+    ),
+    'compensation': Room(
+        ('psd_deflection/arms/compensation', 'psd_deflection/arms/shapers.py', 'psd_deflection/arms/inputs.py'),
+        ('test/arms/compensation', 'test/arms/test_shapers.py', 'test/arms/test_inputs.py'),
+        slow=('test/cli/test_shaper.py',),
+    ),
+    'camera': Room(
+        ('psd_deflection/camera',),
+        ('test/camera',),
+        leave=('psd_deflection/camera/preview.py', 'psd_deflection/camera/print_target.py'),
+        slow=('test/cli/test_camera.py',),
+    ),
+    'calibrate': Room(
+        ('psd_deflection/studies/calibrate',),
+        ('test/studies/calibrate/test_dark.py', 'test/studies/calibrate/test_fit.py'),
+        leave=('psd_deflection/studies/calibrate/pictures.py',),
+        slow=('test/studies/calibrate/test_calibrate.py', 'test/cli/test_calibrate.py'),
+    ),
+    'check': Room(
+        ('psd_deflection/studies/check', 'psd_deflection/studies/noted_loads.py'),
+        ('test/studies/check', 'test/studies/test_noted_loads.py'),
+        slow=('test/run/test_guided.py',),
+    ),
+    'identify': Room(
+        ('psd_deflection/studies/identify',),
+        ('test/studies/identify',),
+        leave=('psd_deflection/studies/identify/pictures.py',),
+        slow=('test/cli/test_identify.py',),
+    ),
+    'validate': Room(
+        ('psd_deflection/studies/validate',),
+        ('test/studies/validate',),
+        leave=('psd_deflection/studies/validate/pictures.py',),
+        slow=('test/cli/test_validate.py',),
+    ),
+    'budget': Room(
+        ('psd_deflection/studies/budget',),
+        ('test/studies/budget',),
+        leave=('psd_deflection/studies/budget/pictures.py',),
+        slow=('test/cli/test_budget.py',),
+    ),
+    'thesis': Room(
+        ('psd_deflection/studies/thesis',),
+        ('test/studies/thesis',),
+        leave=('psd_deflection/studies/thesis/figures.py',),
+        slow=('test/cli/test_thesis.py',),
+    ),
+    'simulation': Room(
+        ('psd_deflection/model/simulation/simulator.py',),
+        ('test/model/simulation/test_simulator.py',),
+        slow=('test/model/simulation/test_effects.py',),
+    ),
+    'tables': Room(
+        (
+            *(f'psd_deflection/recordings/{n}.py' for n in ('charts', 'estimates', 'sample_table', 'spans')),
+            'psd_deflection/studies/axes.py',
+        ),
+        ('test/recordings/test_charts.py', 'test/recordings/test_recording_window.py', 'test/test_api.py'),
+        slow=('test/cli/test_validate.py', 'test/cli/test_identify.py'),
+    ),
+    'history': Room(
+        (
+            'psd_deflection/run/last_step.py',
+            'psd_deflection/run/monitor/history.py',
+            'psd_deflection/run/monitor/kept_history.py',
+        ),
+        (
+            'test/run/test_last_step.py',
+            'test/run/monitor/test_history.py',
+            'test/run/monitor/test_kept_history.py',
+        ),
+    ),
+}
