@@ -17,9 +17,9 @@ from blind.boom import Boom
 from blind.campaign import options
 from blind.emps import Emps
 from blind.measured import DATA
-from psd_deflection.studies.discover.conclusion import size_of
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
 from psd_deflection.studies.discover.plants import Plant
+from psd_deflection.studies.discover.trees import size_of
 
 MACHINES: Mapping[str, tuple[Callable[[Path], Plant], Callable[[Path], Plant] | None]] = {
     'boom': (lambda folder: Boom(folder), lambda folder: Boom(folder, weighed=True)),

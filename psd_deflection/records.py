@@ -222,6 +222,13 @@ class Mark(NamedTuple):
     text: str
 
 
+class Moment(NamedTuple):
+    """A mark on the axis of an answer: ``t`` s from where the axis is 0, for recordings after one another too."""
+
+    t: float
+    text: str
+
+
 class BaseAcceleration(NamedTuple):
     """A known acceleration of the link's base in ``link_base``, without gravity, held until the next one.
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.page_files import packed, safe
-from psd_deflection.records import FloatArray
+from psd_deflection.records import FloatArray, Moment
 
 Colour = Literal['blue', 'red', 'green', 'violet', 'orange', 'quiet', 'text']
 """A tone for light pages and one for dark ones: ``STYLE`` in pages.py."""
@@ -29,6 +29,9 @@ BUCKETS = 1000
 """Of a curve with more points the page has the least and the largest value of each of so many stretches."""
 MOST_POINTS = 4000
 """Of a cloud of points the page has so many at most."""
+ONE_AFTER_ANOTHER = '(recordings one after another)'
+MOST_WORDS = 20
+"""So many marks have their words beside them, the first; the others are lines only."""
 CELLS = (600, 200)
 """Points of a cloud that share one of so many cells (across, up) lie on each other: one is kept."""
 
@@ -59,20 +62,51 @@ class Rule(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class TimeAxis:
+    """An axis of time, s. ``since``: where it is 0, in words. ``marks``: drawn in every panel over it.
+
+    The only way to an axis of time, so no chart can leave out what somebody marked. ``name``: stands before the label
+    of a panel whose axis is its own.
+    """
+
+    since: str
+    marks: Sequence[Moment]
+    name: str = ''
+
+    def __str__(self) -> str:
+        return f'{self.name}{": " if self.name else ""}time / s {self.since}'.rstrip()
+
+
+@dataclass(frozen=True, eq=False)
 class Panel:
-    """Curves over one axis. Labels end with `` / unit``. Panels of a chart with one ``x_label`` share cursor and zoom.
+    """Curves ``over`` an axis. Labels end with `` / unit``. Panels of a chart with one
+    ``x_label`` share cursor and zoom.
 
     ``log``: the axes that are logarithmic. ``y_range``: what is shown at first, if not all.
     ``height``: px.
     """
 
     series: Sequence[Series]
-    x_label: str
+    over: str | TimeAxis
     y_label: str
     log: Literal['', 'x', 'y', 'x, y'] = ''
     rules: Sequence[Rule] = ()
     y_range: tuple[float, float] | None = None
     height: int = 140
+
+    @property
+    def x_label(self) -> str:
+        """That of the axis."""
+        return str(self.over)
+
+    def marked(self, words: bool) -> list[Rule]:
+        """``rules``, and the marks of the axis of time among the points; with their ``words``, if these are wanted."""
+        if not isinstance(self.over, TimeAxis) or not self.over.marks:
+            return list(self.rules)
+        x = np.concatenate([one.x for one in self.series])
+        low, high = np.nanmin(x, initial=np.inf), np.nanmax(x, initial=-np.inf)
+        shown = [mark for mark in self.over.marks if low <= mark.t <= high]
+        return [*self.rules, *(Rule(m.t, m.text if words and i < MOST_WORDS else '') for i, m in enumerate(shown))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +116,11 @@ class Chart:
     words: str
     panels: Sequence[Panel]
     beside: int = 1
+
+    def rules(self) -> list[list[Rule]]:
+        """The straight lines of each panel; panels over one axis say the words of a mark once."""
+        labels = [panel.x_label for panel in self.panels]
+        return [panel.marked(words=panel.x_label not in labels[:i]) for i, panel in enumerate(self.panels)]
 
 
 MARK = '<figure class="chart"'
@@ -93,7 +132,7 @@ def drawn(chart: Chart) -> str:
     columns: dict[str, int] = {}
     notes: dict[str, None] = {}
     panels = []
-    for panel in chart.panels:
+    for panel, rules in zip(chart.panels, chart.rules(), strict=True):
         series, said = thinned(panel.series)
         notes |= dict.fromkeys(said)
         panels.append(
@@ -102,7 +141,7 @@ def drawn(chart: Chart) -> str:
                 'x': panel.x_label,
                 'y': panel.y_label,
                 'log': panel.log,
-                'rules': list(panel.rules),
+                'rules': rules,
                 'range': panel.y_range,
                 'height': panel.height,
             }

@@ -10,7 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from psd_deflection.base.charts import Chart, Panel, Series, thinned
+from psd_deflection.base.charts import Chart, Panel, Rule, Series, thinned
 from psd_deflection.base.drawings import BarColumn, Bars, Drawing, Matrix
 
 TONES = {
@@ -24,6 +24,8 @@ TONES = {
 }
 WIDTH = 10.0
 """Inches."""
+LINE_PX = 12.0
+"""px of a panel's height from the words beside one upright rule to those beside the next."""
 PX = 100.0
 """Of a panel's height, an inch."""
 
@@ -100,8 +102,8 @@ def _chart(chart: Chart) -> ShownFigure:
     figure = ShownFigure(figsize=(WIDTH, 0.6 + 1.4 * sum(heights) / PX), layout='constrained')
     grid: Any = figure.subplots(rows, columns, squeeze=False, height_ratios=heights)
     axes = grid.ravel()
-    for i, (axis, panel) in enumerate(zip(axes, chart.panels, strict=False)):
-        _draw(axis, panel)
+    for i, (axis, panel, rules) in enumerate(zip(axes, chart.panels, chart.rules(), strict=False)):
+        _draw(axis, panel, rules)
         below = i + 1 < len(chart.panels) and columns == 1 and chart.panels[i + 1].x_label == panel.x_label
         if below:
             axis.set_xlabel('')
@@ -111,16 +113,19 @@ def _chart(chart: Chart) -> ShownFigure:
     return figure
 
 
-def _draw(axis: Any, panel: Panel) -> None:
+def _draw(axis: Any, panel: Panel, rules: list[Rule]) -> None:
     series, _ = thinned(panel.series)
     for one in series:
         _curve(axis, one)
-    for rule in panel.rules:
+    for i, rule in enumerate(rules):
         line = axis.axhline if rule.across else axis.axvline
         line(rule.at, color=TONES[rule.colour], lw=0.8, ls='--')
-        where = ((1.0, rule.at), axis.get_yaxis_transform(), 'right') if rule.across else None
-        place, how, side = where or ((rule.at, 0.97), axis.get_xaxis_transform(), 'left')
-        axis.text(*place, f' {rule.words} ', transform=how, ha=side, va='bottom' if rule.across else 'top', fontsize=8)
+        if rule.across:
+            place, how, side, edge = (1.0, rule.at), axis.get_yaxis_transform(), 'right', 'bottom'
+        else:
+            below = i % 3 * LINE_PX / panel.height
+            place, how, side, edge = (rule.at, 0.97 - below), axis.get_xaxis_transform(), 'left', 'top'
+        axis.text(*place, f' {rule.words} ', transform=how, ha=side, va=edge, fontsize=8)
     if 'x' in panel.log:
         axis.set_xscale('log')
     if 'y' in panel.log:

@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.devices.port_names import SCHEMES
 
 SHELLS = ('bash', 'zsh', 'tcsh')
 
@@ -33,11 +34,27 @@ FILES = (
     'FILE.png',
     'FILE.png|svg|pdf',
     'DIR|FILE.png|svg|pdf',
-    'PORT',
     'PATH',
 )
 FOLDERS = ('DIR', 'FOLDER', 'CALIBRATION')
 """Names of values in the help that are to be completed as paths; a bag is a folder, and completed as a file is."""
+
+_PORTS = ' '.join(f'{scheme}://' for scheme in SCHEMES)
+_PORT_FUNCTION = {
+    'bash': f"""
+_psd_deflection_port() {{
+  compgen -W '{_PORTS}' -- "$1"
+  _shtab_compgen_files "$1"
+}}
+""",
+    'zsh': f"""
+_psd_deflection_port() {{
+  _alternative 'network:network port:({_PORTS.replace(':', chr(92) + ':')})' 'file:file:_files'
+}}
+""",
+}
+_PORT_COMPLETED = dict.fromkeys(_PORT_FUNCTION, '_psd_deflection_port')
+"""A port is a file, or an address of the network by its scheme."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,7 +71,8 @@ def run(args: argparse.Namespace) -> int:
     # Only here: the parser of all commands, which imports all of them.
     from psd_deflection.cli.main import COMMANDS, make_parser
 
-    print(shtab.complete(make_parser(COMMANDS, _Completed), shell=args.shell))
+    parser, functions = make_parser(COMMANDS, _Completed), _PORT_FUNCTION.get(args.shell, '')
+    print(shtab.complete(parser, shell=args.shell, preamble=functions))
     return 0
 
 
@@ -66,7 +84,9 @@ class _Completed(argparse.Action):
         import shtab
 
         name = self.metavar or dest.upper()
-        if name in FOLDERS:
+        if name == 'PORT':
+            self.complete = {**shtab.FILE, **_PORT_COMPLETED}
+        elif name in FOLDERS:
             self.complete = shtab.DIRECTORY
         elif name in FILES:
             self.complete = shtab.FILE

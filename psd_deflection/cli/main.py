@@ -17,6 +17,7 @@ import shutil
 import signal
 import sys
 import textwrap
+import threading
 from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -102,6 +103,9 @@ exit status:
 
 _NEGATIVE = re.compile(r'^-[\d.][\d.,eE+-]*$')
 _WIDEST = 100
+AGAIN_S = 0.05
+"""After so long, s, an interrupt that was dropped comes again."""
+
 _REFUSED_OUTPUT = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
 
 
@@ -187,7 +191,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(errors='replace')  # type: ignore[union-attr]
     try:
         try:
-            status = _run(list(sys.argv[1:] if argv is None else argv))
+            with _no_interrupt_lost():
+                status = _run(list(sys.argv[1:] if argv is None else argv))
         finally:
             # Flush here, where an error can still be reported, not at the interpreter's exit.
             if sys.stdout is not None:
@@ -283,6 +288,34 @@ def _renamed(argv: list[str]) -> list[str]:
     """``argv`` with today's name of its command."""
     at = next((n for n, a in enumerate(argv) if a and not a.startswith('-')), len(argv))
     return [*argv[:at], *OLDER_NAMES.get(argv[at], argv[at : at + 1]), *argv[at + 1 :]] if at < len(argv) else argv
+
+
+@contextlib.contextmanager
+def _no_interrupt_lost() -> Iterator[None]:
+    """Python drops an exception of a finaliser, also that of a signal that came during one: it comes again."""
+    before = sys.unraisablehook
+
+    def told(dropped: sys.UnraisableHookArgs) -> None:
+        if issubclass(dropped.exc_type, KeyboardInterrupt):
+            again = threading.Timer(AGAIN_S, _interrupt)
+            again.daemon = True
+            again.start()
+        else:
+            before(dropped)
+
+    sys.unraisablehook = told
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
+def _interrupt() -> None:
+    if hasattr(signal, 'pthread_kill'):
+        # This ends a wait too.
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:
+        signal.raise_signal(signal.SIGINT)
 
 
 @contextlib.contextmanager

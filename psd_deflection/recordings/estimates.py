@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.tables import Column, Table, columns_of, html_table
-from psd_deflection.recordings.charts import estimates_chart
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.recordings.charts import estimates_chart, moments
+from psd_deflection.records import FloatArray, IntArray, Mark
 
 if TYPE_CHECKING:
     import pandas
@@ -28,6 +28,7 @@ class EstimateSeries:
     (n, 3, 3) of the pose. ``wrench`` (n, 3): load at the tip that the link model needs, N, N, N m, NaN if there is
     none. ``chi_square`` (n,): of the one redundant reading, NaN if it was not checked. ``covariance``, ``wrench`` and
     ``chi_square`` are None if the source has none. ``start_ns``: where ``t`` is 0; the first estimate if None.
+    ``marks``: of the recording.
     """
 
     topic: str
@@ -38,6 +39,7 @@ class EstimateSeries:
     wrench: FloatArray | None = None
     chi_square: FloatArray | None = None
     start_ns: int | None = None
+    marks: tuple[Mark, ...] = ()
 
     def rows(self, chosen: npt.NDArray[np.bool_]) -> EstimateSeries:
         """The estimates at which ``chosen`` (n,) is True."""
@@ -53,6 +55,7 @@ class EstimateSeries:
             part(self.covariance),
             part(self.wrench),
             part(self.chi_square),
+            marks=self.marks,
         )
 
     def __len__(self) -> int:
@@ -65,14 +68,18 @@ class EstimateSeries:
         t = self.t
         first, last = (-np.inf if part.start is None else part.start), (np.inf if part.stop is None else part.stop)
         chosen = self.rows((t >= first) & (t < last))
-        return replace(chosen, start_ns=self.start_ns if self.start_ns is not None or not len(t) else int(self.t_ns[0]))
+        return replace(chosen, start_ns=self._start_ns)
 
     @property
     def t(self) -> FloatArray:
         """Time of each estimate (the middle of its block), s from ``start_ns``."""
-        start = self.start_ns if self.start_ns is not None else (self.t_ns[0] if len(self.t_ns) else 0)
-        seconds: FloatArray = (self.t_ns - start) * 1e-9
+        seconds: FloatArray = (self.t_ns - self._start_ns).astype(np.float64) * 1e-9
         return seconds
+
+    @property
+    def _start_ns(self) -> int:
+        first = int(self.t_ns[0]) if len(self.t_ns) else 0
+        return first if self.start_ns is None else self.start_ns
 
     @property
     def dx(self) -> FloatArray:
@@ -131,10 +138,11 @@ class EstimateSeries:
         return self.table().to_xarray()
 
     def plot(self) -> ShownFigure:
-        """dX, dY and theta over time with their 95 % intervals, as a matplotlib figure, which a notebook shows."""
+        """dX, dY and theta over time with their 95 % intervals and the marks, as a matplotlib figure."""
         from psd_deflection.base.figures import figure_of
 
-        return figure_of(estimates_chart(self.t, self.pose, self.sd, self.topic))
+        marks = moments(self.marks, self._start_ns)
+        return figure_of(estimates_chart(self.t, self.pose, self.sd, self.topic, marks))
 
     def _summary(self) -> list[tuple[str, str]]:
         rows = [('estimates', str(len(self)))]

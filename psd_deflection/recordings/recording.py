@@ -18,7 +18,7 @@ from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.printable import printable
 from psd_deflection.base.tables import Table, html_table
 from psd_deflection.measure.averaging import BlockCutter
-from psd_deflection.recordings.charts import samples_chart
+from psd_deflection.recordings.charts import moments, samples_chart
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.allowance import Warnings
 from psd_deflection.recordings.read.grid import digest_of
@@ -30,6 +30,7 @@ from psd_deflection.records import (
     AppliedLoad,
     BaseAcceleration,
     Mark,
+    Moment,
     ParameterChange,
     RawChunk,
     ReferencePose,
@@ -195,6 +196,10 @@ class Recording(abc.ABC):
         """The moments that somebody marked, in order of time."""
         return []
 
+    def moments(self) -> tuple[Moment, ...]:
+        """The marks, s from the first sample."""
+        return moments(self.marks(), int(self.samples['t_ns'][0]))
+
     def rows_with_load(self) -> tuple[int, int]:
         """Number of rows of a CSV that say their load, and the time of the last one, ns; (0, 0) for others."""
         return 0, 0
@@ -288,7 +293,7 @@ class Recording(abc.ABC):
         """
         from psd_deflection.base.figures import figure_of
 
-        return figure_of(samples_chart(self.samples, self.psds, self.marks()))
+        return figure_of(samples_chart(self.samples, self.psds, self.moments()))
 
     def _summary(self) -> list[tuple[str, object]]:
         """What is known without reading all of it."""

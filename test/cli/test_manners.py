@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -198,6 +199,36 @@ def test_ctrl_c_leaves_no_output_that_looks_whole(
     assert signal.getsignal(number) is before
     told = f'psd-deflection {argv[0]}: interrupted; out.csv.partial holds what came before\n'
     assert capsys.readouterr().err == told
+
+
+class Finalised:
+    """Python drops what a signal raises in here."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.usefixtures('signals')
+def test_ctrl_c_that_python_drops_comes_again(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    dropped: list[object] = []
+
+    def put(self: object, record: object) -> None:
+        if not dropped:
+            Finalised()
+            # Not reached if the signal was not dropped.
+            dropped.append(record)
+        until = time.monotonic() + 60.0
+        while time.monotonic() < until:
+            time.sleep(0.01)
+
+    monkeypatch.setattr('psd_deflection.recordings.write.csv_writer.CsvSampleSink.put', put)
+    before = sys.unraisablehook
+    assert main(['convert', CLEAN, '--out', 'out.csv']) == 130
+    assert dropped
+    assert sys.unraisablehook is before
+    assert capsys.readouterr().err.startswith('psd-deflection convert: interrupted; out.csv.partial')
     assert [p.name for p in folder.iterdir()] == ['out.csv.partial']
 
 

@@ -466,7 +466,8 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
         make_parser([name], Noted)
     assert main(['completion', 'bash']) == 0
     script = capsys.readouterr().out
-    as_path = set(re.findall(r'_shtab_psd_deflection_(\w+)_COMPGEN=_shtab_compgen_(?:files|dirs)', script))
+    completed = r'_shtab_psd_deflection_(\w+)_COMPGEN=_(?:shtab_compgen_(?:files|dirs)|psd_deflection_port)'
+    as_path = set(re.findall(completed, script))
     assert as_path <= set(values)
     # What is left is numbers and words: a new kind of value is to be put here or among the paths. Options that may be
     # repeated have an action of their own and are not completed.

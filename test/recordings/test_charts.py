@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import psd_deflection
-from psd_deflection.recordings.charts import estimates_chart, samples_chart
+from psd_deflection.recordings.charts import estimates_chart, moments, samples_chart
 from psd_deflection.recordings.sample_table import sample_dtype
 from psd_deflection.records import Mark
 from tools.program import ROOT
@@ -17,10 +17,11 @@ def test_every_channel_is_drawn_with_the_marks() -> None:
     samples['t_ns'] = [5_000_000_000, 5_500_000_000, 6_000_000_000]
     samples['t'] = [0.0, 0.5, 1.0]
     samples['y2'] = [1.0, 2.0, 3.0]
-    chart = samples_chart(samples, 2, [Mark(5_250_000_000, 'bump')])
+    chart = samples_chart(samples, 2, moments([Mark(5_250_000_000, 'bump')], 5_000_000_000))
     assert [panel.y_label for panel in chart.panels] == [f'{n} / V' for n in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')]
-    for panel in chart.panels:
-        assert [(rule.at, rule.words) for rule in panel.rules] == [(0.25, 'bump')]
+    # Its words are beside it once.
+    words = ['bump', *[''] * 5]
+    assert [[(rule.at, rule.words) for rule in rules] for rules in chart.rules()] == [[(0.25, w)] for w in words]
     (curve,) = chart.panels[4].series
     assert curve.x.tolist() == [0.0, 0.5, 1.0]
     assert curve.y.tolist() == [1.0, 2.0, 3.0]
@@ -29,10 +30,10 @@ def test_every_channel_is_drawn_with_the_marks() -> None:
 def test_estimates_are_drawn_with_their_interval() -> None:
     pose = np.array([[1e-6, 2e-6, np.radians(0.003)]])
     sd = np.array([[1e-7, 2e-7, np.radians(0.0001)]])
-    panels = estimates_chart(np.array([0.5]), pose, sd, '/link_tip/deflection').panels
+    panels = estimates_chart(np.array([0.5]), pose, sd, '/link_tip/deflection', ()).panels
     shown = [(float(s.y[0]), float(s.spread[0])) for p in panels for s in p.series if s.spread is not None]
     assert np.allclose(shown, [(1.0, 0.196), (2.0, 0.392), (3.0, 0.196)])
-    assert estimates_chart(np.array([0.5]), pose, None, 'a').panels[0].series[0].spread is None
+    assert estimates_chart(np.array([0.5]), pose, None, 'a', ()).panels[0].series[0].spread is None
 
 
 @pytest.mark.parametrize('part', ['samples', 'estimates'])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,11 @@ import pytest
 
 import psd_deflection
 from psd_deflection import studies
-from psd_deflection.base.charts import Chart
+from psd_deflection.base.charts import Chart, Panel, TimeAxis
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
+from psd_deflection.records import Mark
 from psd_deflection.studies.budget.certificate import CertificateProblem, certify
 from psd_deflection.studies.budget.certificate_page import Certified
 from psd_deflection.studies.budget.from_calibration import read_calibration
@@ -26,9 +27,12 @@ from psd_deflection.studies.discover.isolable import isolable
 from psd_deflection.studies.discover.loop import Settled
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.study import StudyResult
+from psd_deflection.studies.watch.from_recordings import watch
 from psd_deflection.studies.watch.result import WatchedRun
 from test.studies.discover.test_plants import Spring
 
+# About every 50 ms, so that every stretch that is shown has one.
+MARKS = [Mark(t_ns, f'bump {i}') for i, t_ns in enumerate(range(10_000_000, 3_600_000_000, 47_000_000))]
 Maker = Callable[[Path], StudyResult]
 PUSHES = [(0, 0, 0), (0, -40, -20), (40, 0, 15), (-40, 30, 0), (0, 40, 20), (0, 0, 0)]
 
@@ -36,7 +40,9 @@ PUSHES = [(0, 0, 0), (0, -40, -20), (40, 0, 15), (-40, 30, 0), (0, 40, 20), (0, 
 @cache
 def run() -> SimulatedRecording:
     gain = {'sensor_gain': {'psd': 1, 'y': 0.02}}
-    return psd_deflection.simulate(psd_deflection.load_rig(), PUSHES, seconds=0.6, effects=gain)
+    simulated = psd_deflection.simulate(psd_deflection.load_rig(), PUSHES, seconds=0.6, effects=gain)
+    vars(simulated)['marks'] = lambda: MARKS
+    return simulated
 
 
 def tracker(folder: Path) -> Path:
@@ -117,6 +123,45 @@ def test_a_result_draws_itself_and_is_a_table(kind: str, tmp_path: Path) -> None
     pytest.importorskip('pandas')
     frame = result.to_pandas()
     assert list(frame.attrs['units']) == [frame.index.name, *frame.columns]
+
+
+def test_only_an_axis_of_time_has_its_words() -> None:
+    files = Path(psd_deflection.__file__).parent.rglob('*.py')
+    said = [path.name for path in files if 'time / s' in path.read_text(encoding='utf-8')]
+    assert said == ['charts.py'], 'a chart over time takes a TimeAxis, which has the marks'
+
+
+@pytest.mark.parametrize('kind', ['Calibrated', 'Discovery', 'Identified', 'Settled', 'Validated'])
+@pytest.mark.filterwarnings('ignore:.*lacks its parameters')
+def test_every_chart_over_time_shows_the_marks(kind: str, tmp_path: Path) -> None:
+    make, _ = RESULTS[kind]
+    over = list(over_time(make(tmp_path)))
+    assert over
+    marks = {mark.text: mark.t_ns / 1e9 for mark in MARKS}
+    for panel in over:
+        rules = [rule for rule in panel.marked(words=True) if rule.words.startswith('bump')]
+        assert rules
+        assert [rule.at for rule in rules] == pytest.approx([marks[rule.words] for rule in rules], abs=0.002)
+
+
+def over_time(result: StudyResult) -> Iterator[Panel]:
+    for drawing in result.drawings():
+        if isinstance(drawing, Chart):
+            yield from (panel for panel in drawing.panels if isinstance(panel.over, TimeAxis))
+
+
+def test_the_watch_shows_a_mark_before_its_first_alarm() -> None:
+    recording = psd_deflection.simulate(
+        psd_deflection.load_rig(),
+        [(0, 0, 0)],
+        seconds=20.0,
+        effects={'laser_pointing_drift': {'psd': 1, 'rate_x': 3e-7}},
+    )
+    vars(recording)['marks'] = lambda: [Mark(500_000_000, 'bumped')]
+    result = watch(recording, recording.known, {})
+    panel, *_ = over_time(result)
+    assert [(rule.at, rule.words) for rule in panel.marked(words=True)] == [(0.5, 'bumped')]
+    assert result.seconds == pytest.approx(19.999)
 
 
 def test_a_drawing_that_is_not_there_is_refused() -> None:

@@ -404,7 +404,8 @@ class BagRecording(Recording):
                 rows.setdefault(topic, []).append(cdr.numbers(wanted, message))
             except ValueError as error:
                 raise RecordingError(f'{self.path}: {topic} at log time {log_time}: {error}') from None
-        return {topic: _series(topic, found) for topic, found in rows.items()}
+        marks = tuple(self.marks())
+        return {topic: _series(topic, found, marks) for topic, found in rows.items()}
 
 
 def _to_change(t_ns: int, block: int, tree: Mapping[str, object]) -> ParameterChange:
@@ -430,12 +431,12 @@ def _memory_in(state: RigState) -> ParameterChange | None:
     return _to_change(state.t_ns, state.block, {WHOLE: 1.0, **state.memory})
 
 
-def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]]) -> EstimateSeries:
+def _series(topic: str, rows: list[tuple[int, tuple[float, ...]]], marks: tuple[Mark, ...]) -> EstimateSeries:
     t_ns = np.array([t for t, _ in rows], dtype=np.int64)
     numbers = np.array([v for _, v in rows], dtype=np.float64)
     pose, tilt = pose_stamped.to_poses(numbers)
     covariance = pose_with_covariance_stamped.to_covariances(numbers) if topic == DEFLECTION_WITH_COVARIANCE else None
-    return EstimateSeries(topic, t_ns, pose, tilt, covariance)
+    return EstimateSeries(topic, t_ns, pose, tilt, covariance, marks=marks)
 
 
 def files_in(folder: Path) -> list[Path]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -204,7 +205,7 @@ def replayed_estimates(recording: Recording, rig: Rig) -> EstimateSeries:
     for records in replayed(recording, Pipeline(rig)):
         for record in records:
             gathered.add(record)
-    return gathered.series()
+    return replace(gathered.series(), marks=tuple(recording.marks()))
 
 
 class GatheredEstimates:

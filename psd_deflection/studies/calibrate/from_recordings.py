@@ -78,6 +78,7 @@ def read_run(
         exposure,
         '' if recording.hello is None else str(recording.hello.get('serial', '')),
         _ends([r.celsius for r in recording.temperatures()]),
+        recording.moments(),
     )
 
 

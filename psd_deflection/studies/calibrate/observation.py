@@ -17,7 +17,7 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.model.misalignment.model import readings
 from psd_deflection.model.misalignment.rig import vector_of_rig
-from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray, IntArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray, IntArray, Moment
 from psd_deflection.rig.config import Rig
 
 SAMPLES_A_SIDE = 10
@@ -43,7 +43,7 @@ class CalibrationRun:
 
     ``reference_t`` (m,) s, ``reference`` (m, 3) m, m, rad; ``loads`` (n, 3) N, N, N m, held, or None. ``digest``: of
     its source. ``reference_sd`` (m, 3): as the reference states them, None if it does not. ``exposure``: time over
-    which each reference is a mean, s.
+    which each reference is a mean, s. ``marks``: from the first sample.
     """
 
     name: str
@@ -57,6 +57,7 @@ class CalibrationRun:
     exposure: float = 0.0
     device: str = ''
     temperature: tuple[float, float] | None = None
+    marks: tuple[Moment, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

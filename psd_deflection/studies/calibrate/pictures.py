@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.base.charts import Chart, Panel, Series
+from psd_deflection.base.charts import ONE_AFTER_ANOTHER, Chart, Panel, Series, TimeAxis
 from psd_deflection.base.drawings import Matrix
 from psd_deflection.base.pages import table
 from psd_deflection.model.misalignment.model import COUNT, ZERO
+from psd_deflection.records import Moment
 from psd_deflection.studies.calibrate.calibrate import Calibration
 from psd_deflection.studies.calibrate.fit import CLOCK, NAMES, REPORTED, linearised
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
@@ -131,6 +132,8 @@ def _residuals(found: Calibration) -> Chart:
     after = found.fit.linear.residual
     starts = np.concatenate(([0.0], np.cumsum([run.t[-1] for run in found.runs])))
     t = found.rows.t + starts[found.rows.run]
+    marks = [Moment(float(s) + t, text) for run, s in zip(found.runs, starts, strict=False) for t, text in run.marks]
+    along = TimeAxis(ONE_AFTER_ANOTHER, marks)
     panels = []
     for row, name in enumerate(CHANNEL_NAMES):
         curves = (
@@ -139,9 +142,7 @@ def _residuals(found: Calibration) -> Chart:
         )
         low, high = np.percentile(np.concatenate([one.y for one in curves]), [0.5, 99.5])
         room = 0.2 * (high - low)
-        panels.append(
-            Panel(curves, 'time / s (recordings one after another)', f'{name} / µm', y_range=(low - room, high + room))
-        )
+        panels.append(Panel(curves, along, f'{name} / µm', y_range=(low - room, high + room)))
     return Chart('reading minus model over time, before and after', panels)
 
 

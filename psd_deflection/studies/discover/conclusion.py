@@ -30,8 +30,17 @@ from psd_deflection.studies.discover.search.localise import Localisation
 from psd_deflection.studies.discover.search.remainder import Remainder
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.ties import ties
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown, covariance_of
+from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.trees import (
+    covariance_tree,
+    effect_tree,
+    fitted,
+    law_tree,
+    number,
+    parameters_of,
+    size_of,
+)
 from psd_deflection.studies.study import StudyResult, Tell, described, edited_rig_file, named, warn_caller
 
 SHOWN = 1e-3
@@ -108,7 +117,7 @@ class Conclusion(StudyResult):
         return {
             'verdict': self.verdict,
             'where': self._where(),
-            'effects': [_effect_tree(e) for e in self.effects],
+            'effects': [effect_tree(e) for e in self.effects],
             'unknown': [
                 {
                     'signature': u.signature,
@@ -120,14 +129,14 @@ class Conclusion(StudyResult):
                 for u in self.unknown
             ],
             'ties': self._ties(),
-            'covariance': _covariance(self.fit, self.effects),
+            'covariance': covariance_tree(self.fit, self.effects),
             'limits': [asdict(x) for x in self.search.limits],
             'remainder': None if self.remainder is None else self.remainder.tree(),
             'setup': [],
             'moves': None,
             'remaining': {'rms': self.gap_after, 'floors': self.floors},
             'gap': self._gap(),
-            'nuisance': [{'name': a.effect.name, 'parameters': _fitted(a, sd)} for a, sd in self.nuisance],
+            'nuisance': [{'name': a.effect.name, 'parameters': fitted(a, sd)} for a, sd in self.nuisance],
             'provenance': {
                 'version': __version__,
                 'seed': self.seed,
@@ -161,7 +170,7 @@ class Conclusion(StudyResult):
                 'when': [c.when[0], c.when[1]],
                 'band_hz': [c.band[0], c.band[1]],
                 'depends_on': list(c.depends_on),
-                'statistic': _number(c.statistic),
+                'statistic': number(c.statistic),
                 'p': min(max(c.p, 0.0), 1.0),
             }
             for c in self.where.cells
@@ -257,8 +266,8 @@ class RigConclusion(Conclusion):
         """As for any machine, with set-up, moves and law."""
         out = super().tree()
         for unknown, law in zip(out['unknown'], [self.law] if self.law is not None else [], strict=False):
-            unknown['law'] = _law_tree(law)
-        out['setup'] = [{**finding_tree(f), 'evidence': _number(f.evidence)} for f in self.setup]
+            unknown['law'] = law_tree(law)
+        out['setup'] = [{**finding_tree(f), 'evidence': number(f.evidence)} for f in self.setup]
         out['moves'] = dict(zip(('dx_m', 'dy_m', 'theta_rad'), self.moves, strict=True))
         return out
 
@@ -337,95 +346,6 @@ def model_yaml(
         return with_values(text, values, f'Put right by psd-deflection {__version__}', path)
 
     return edited_rig_file(params_file, 'model.yaml', lambda: described(rig, given), edit, tell)
-
-
-def _number(value: float) -> float:
-    # JSON has no infinity; for a chi-square or standard deviation this is as good.
-    if math.isnan(value):
-        return 0.0
-    return float(min(max(value, -1e300), 1e300))
-
-
-def parameters_of(effect: NamedEffect | Rival) -> dict[str, Any]:
-    """Choices as numbers, the rest with standard deviation and unit."""
-    return _fitted(effect.active, effect.sd)
-
-
-def _fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
-    out: dict[str, Any] = {}
-    for p in active.effect.parameters:
-        value = active.values[p.name]
-        if p.kind == 'choice':
-            out[p.name] = int(value)
-        elif math.isfinite(value):
-            out[p.name] = {'value': _number(value), 'sd': _number(sds.get(p.name, 0.0)), 'unit': p.unit}
-    return out
-
-
-def _covariance(fit: Fit, effects: Iterable[NamedEffect]) -> dict[str, Any]:
-    names, matrix = covariance_of(fit, tuple(effects))
-    return {'names': list(names), 'matrix': [[_number(v) for v in row] for row in matrix.tolist()]}
-
-
-def _effect_tree(e: NamedEffect) -> dict[str, Any]:
-    return {
-        'name': e.active.effect.name,
-        'stage': e.active.effect.stage,
-        'parameters': parameters_of(e),
-        'equivalent': list(e.equivalent),
-        'evidence': {
-            'delta_bic': _number(e.delta_bic),
-            'p': _number(e.p),
-            'heldout_gain': _number(e.heldout.gain),
-            'heldout_gain_error': _number(e.heldout.error),
-        },
-        'suggested_experiment': None if e.suggestion is None else e.suggestion.text,
-        'rivals': [
-            {
-                'name': r.active.effect.name,
-                'parameters': parameters_of(r),
-                'delta_bic': _number(r.delta_bic),
-            }
-            for r in e.rivals
-        ],
-    }
-
-
-def _law_tree(found: FoundLaw) -> dict[str, Any]:
-    """The tree of ``law``."""
-    law = found.law
-    return {
-        'stage': law.stage,
-        'acts_on': law.acts_on,
-        'channels': list(found.channels),
-        'variables': list(law.variables),
-        'kind': law.kind,
-        'expression': law.expression,
-        'further': [e.expression for e in found.further],
-        'heldout_after': found.heldout_gap,
-        'beside': [a.label for a in found.beside],
-        'equivalent': [
-            {'stage': e.stage, 'acts_on': e.acts_on, 'variables': list(e.variables), 'expression': e.expression}
-            for e in found.equivalent
-        ],
-        'evidence': {
-            'delta_bic': _number(found.delta_bic),
-            'p': _number(found.p),
-            'heldout_gain': _number(found.heldout.gain),
-            'heldout_gain_error': _number(found.heldout.error),
-        },
-    }
-
-
-def size_of(effect: NamedEffect | Rival) -> str:
-    """The fitted amplitudes with their standard deviations, for a person: ``angle 0.00399 ± 2e-05 rad``."""
-    out = []
-    for p in effect.active.effect.parameters:
-        value, sd = effect.active.values[p.name], effect.sd.get(p.name, 0.0)
-        if p.kind == 'amplitude' and p.name in effect.sd and abs(value) > 2.0 * sd:
-            digits = 1 if sd <= 0.0 else 2 + math.floor(math.log10(abs(value) / sd))
-            out.append(f'{p.name} {value:.{min(digits, 6)}g} ± {sd:.1g} {p.unit}'.rstrip())
-    return ', '.join(out)
 
 
 def _left(discovery: Conclusion) -> str:

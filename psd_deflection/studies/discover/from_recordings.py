@@ -88,6 +88,7 @@ def read_observation(
         digest=recording.digest,
         unknown_load=unknown,
         stated_rate_hz=stated,
+        marks=recording.moments(),
     )
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import FloatArray, IntArray, Moment
 from psd_deflection.rig.config import Rig
 
 QUIET = 0.25
@@ -26,7 +26,8 @@ class Observation:
     ``temperature`` (n,) degrees Celsius or None. ``rig``: the rig with this recording's own
     overrides. ``digest``: of its source. ``unknown_load``: numbers of samples before the first known load and
     after the last; what ``loads`` holds there is only a placeholder. ``stated_rate_hz``: the rig
-    file's sample rate if the recording's times say another, which ``rig`` then has; else 0.
+    file's sample rate if the recording's times say another, which ``rig`` then has; else 0. ``marks``: from the
+    first sample.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Observation:
     digest: str = ''
     unknown_load: tuple[int, int] = (0, 0)
     stated_rate_hz: float = 0.0
+    marks: tuple[Moment, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.volts)

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 from scipy.stats import chi2 as chi2_law
 
+from psd_deflection.base.charts import TimeAxis
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray, IntArray
@@ -250,13 +251,16 @@ class PlantComparison(Comparison):
         """As they are."""
         return [np.where(t, x, np.nan) for x, t in zip(tables, self.there, strict=True)]
 
-    def against(self) -> dict[str, list[FloatArray]]:
-        """Time or number of the reading, the inputs, and what was measured."""
+    def along(self) -> tuple[str | TimeAxis, list[FloatArray]]:
+        """Time, cases one after another, or number of the reading."""
         period = self.plant.period
         ends = np.cumsum([0, *(m.shape[1] for m in self.measured)])
         along = [(a + np.arange(m.shape[1])) * (period or 1.0) for a, m in zip(ends[:-1], self.measured, strict=True)]
-        out = {'time / s (cases one after another)' if period > 0.0 else 'number of the reading': along}
-        out.update({name: [np.asarray(v) for v in values] for name, values in self.plant.inputs().items()})
+        return TimeAxis('(cases one after another)', ()) if period > 0.0 else 'number of the reading', along
+
+    def against(self) -> dict[str, list[FloatArray]]:
+        """The inputs, and what was measured."""
+        out = {name: [np.asarray(v) for v in values] for name, values in self.plant.inputs().items()}
         for c, (channel, unit) in enumerate(zip(self.channels, self.plant.units, strict=True)):
             out[f'{channel} / {unit}' if unit else channel] = [m[c] for m in self.measured]
         return out

@@ -9,13 +9,13 @@ from typing import Final
 
 import numpy as np
 
-from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Series
+from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Series, TimeAxis
 from psd_deflection.base.drawings import CELL, BarColumn, Bars, Drawing, Matrix
 from psd_deflection.base.pages import table
 from psd_deflection.model.simulation.laws import VARIABLES
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion, parameters_of, size_of
+from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
 from psd_deflection.studies.discover.laws.law_features import known_values
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.search.comparison import Comparison
@@ -24,6 +24,7 @@ from psd_deflection.studies.discover.search.screen import Score
 from psd_deflection.studies.discover.search.smooth import Smooth
 from psd_deflection.studies.discover.search.trust import BANDS
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
+from psd_deflection.studies.discover.trees import parameters_of, size_of
 from psd_deflection.studies.study import PageSection
 
 DOTS = ('x1', 'y1', 'x2', 'y2')
@@ -34,7 +35,7 @@ AFTER: Final = 'blue'
 def _residual_chart(discovery: Conclusion) -> Chart:
     ws = discovery.workspace
     before, after = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
-    along, times = next(iter(ws.against().items()))
+    along, times = ws.along()
     # A gap between recordings.
     t = np.concatenate([np.append(part, part[-1]) for part in times])
     panels = []
@@ -65,7 +66,7 @@ def _against_chart(discovery: Conclusion) -> Chart | None:
     row = max(range(len(gaps)), key=lambda c: (gaps[c][0] ** 2 - gaps[c][1] ** 2) / max(gaps[c][0], 1e-300) ** 2)
     before, after = (np.concatenate([t[row] for t in table]) for table in tables)
     panels = []
-    for name, values in list(ws.against().items())[1:]:
+    for name, values in ws.against().items():
         at = np.concatenate(values)
         if np.any(np.isfinite(at)) and np.nanmax(at) > np.nanmin(at):
             curves = (
@@ -80,9 +81,9 @@ def _against_chart(discovery: Conclusion) -> Chart | None:
 def _function_chart(discovery: Conclusion, function: Smooth) -> Chart:
     """What remains without a name, and the smooth function, against each input, by channel."""
     ws = discovery.workspace
-    against = list(ws.against().items())
+    against: list[tuple[str | TimeAxis, list[FloatArray]]] = list(ws.against().items())
     # The last ones are the readings.
-    inputs = against[1 : len(against) - len(ws.channels)] or against[:1]
+    inputs = against[: len(against) - len(ws.channels)] or [ws.along()]
     value, left = ws.shown(function.tables), ws.shown(discovery.fit.difference)
     panels = []
     for row, label in enumerate(_labels(ws)):

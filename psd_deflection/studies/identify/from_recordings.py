@@ -10,8 +10,9 @@ import numpy as np
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.solvers.registry import solver_from_rig
+from psd_deflection.recordings.charts import moments
 from psd_deflection.recordings.read.references import read_run
-from psd_deflection.records import FloatArray, SampleBlock
+from psd_deflection.records import FloatArray, Moment, SampleBlock
 from psd_deflection.studies.study import Opened
 
 Counted = Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]
@@ -20,11 +21,15 @@ Counted = Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]
 
 @dataclass(frozen=True)
 class IdentifyProblem:
-    """``poses`` (n, 3): dX m, dY m, theta rad of single samples on an even grid, NaN if lost; ``rate``, Hz."""
+    """``poses`` (n, 3): dX m, dY m, theta rad of single samples on an even grid, NaN if lost; ``rate``, Hz.
+
+    ``marks``: of the recording, from the first of them.
+    """
 
     opened: Opened
     poses: FloatArray
     rate: float
+    marks: tuple[Moment, ...] = ()
 
 
 def read_identify(opened: Opened, counted: Counted = iter) -> IdentifyProblem:
@@ -37,4 +42,4 @@ def read_identify(opened: Opened, counted: Counted = iter) -> IdentifyProblem:
     poses = np.full((int(place[-1]) + 1, 3), np.nan)
     good = solved.status == 0
     poses[place[good]] = solved.pose[good]
-    return IdentifyProblem(opened, poses, rate)
+    return IdentifyProblem(opened, poses, rate, moments(recording.marks(), int(seen.t_ns[0])))

@@ -10,9 +10,10 @@ import numpy as np
 from scipy.signal import welch
 
 from psd_deflection.arms.shapers import KINDS, Shaper, shaper
-from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Rule, Series
+from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Rule, Series, TimeAxis
 from psd_deflection.base.pages import table
-from psd_deflection.records import FloatArray
+from psd_deflection.recordings.charts import FROM_FIRST
+from psd_deflection.records import FloatArray, Moment
 from psd_deflection.studies.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.studies.identify.axis_modes import AxisModes
 from psd_deflection.studies.study import PageSection
@@ -24,10 +25,11 @@ TONES: tuple[Colour, ...] = ('blue', 'red', 'green', 'violet')
 
 @dataclass(frozen=True)
 class DrawnModes:
-    """What is drawn: ``poses`` (n, 3), their ``rate``, Hz, modes and recommended shapers of each axis."""
+    """What is drawn: ``poses`` (n, 3), their ``rate``, Hz, ``marks``, modes and recommended shapers of each axis."""
 
     poses: FloatArray
     rate: float
+    marks: Sequence[Moment]
     axes: Sequence[AxisModes]
     shapers: Sequence[Shaper | None]
 
@@ -89,7 +91,8 @@ def _ring_downs(found: DrawnModes) -> Chart:
             Series('samples', t, SHOWN[i] * found.poses[first:last, i], MEASURED, 'points'),
             Series('fit', t, SHOWN[i] * modes.fitted[first:last], FITTED),
         )
-        panels.append(Panel(curves, f'{SYMBOLS[i]}: time / s', f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}', height=180))
+        along = TimeAxis(FROM_FIRST, found.marks, SYMBOLS[i])
+        panels.append(Panel(curves, along, f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}', height=180))
     return Chart('the largest ring-down of each axis and its fit', panels)
 
 

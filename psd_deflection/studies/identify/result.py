@@ -219,7 +219,7 @@ class Identified(StudyResult):
         shapers = [self.shaper_of(i) for i in range(len(self.axes))]
         head = ('axis', 'frequency, Hz (95 %)', 'damping ratio (95 %)', 'amplitude', 'from', 'input shaper')
         modes = PageSection('', (table(head, self.rows()),))
-        return [modes, *sections(DrawnModes(self.poses, self.rate, self.axes, shapers))]
+        return [modes, *sections(DrawnModes(self.poses, self.rate, self.problem.marks, self.axes, shapers))]
 
     def rig_yaml(self) -> str:
         """The user's parameter file with the modes, comments kept; without one what describes the rig."""

@@ -12,8 +12,9 @@ from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.solvers.registry import SOLVERS, solver_from_rig
+from psd_deflection.recordings.charts import moments
 from psd_deflection.recordings.read.references import read_references, read_run, references_of
-from psd_deflection.records import FloatArray, IntArray, SampleBlock
+from psd_deflection.records import FloatArray, IntArray, Moment, SampleBlock
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.study import Opened
 from psd_deflection.studies.validate.motion import Motion, Solve
@@ -29,6 +30,7 @@ class ValidateProblem:
     known; ``refused``: measurements without an answer, by reason. ``estimate_sd`` (3,): of the published estimates.
     ``align``: remove the offset between the clocks if it is told. ``largest``: offset that is looked for, s.
     ``exposure``: time over which each reference is a mean, s. ``sources``: what is compared, by name.
+    ``marks``: of the recording, by the clock of the samples.
     """
 
     motion: Motion
@@ -42,6 +44,7 @@ class ValidateProblem:
     largest: float
     exposure: float
     sources: Mapping[str, str]
+    marks: tuple[Moment, ...] = ()
 
     @property
     def solver(self) -> str:
@@ -83,6 +86,7 @@ def read_validate(
         largest=largest,
         exposure=exposure,
         sources={**opened.sources, 'reference': str(reference or recording.path)},
+        marks=moments(recording.marks(), start),
     )
 
 

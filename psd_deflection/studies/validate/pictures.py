@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.base.charts import SMALL, Chart, Panel, Rule, Series
+from psd_deflection.base.charts import SMALL, Chart, Panel, Rule, Series, TimeAxis
 from psd_deflection.base.pages import table
-from psd_deflection.records import FloatArray
+from psd_deflection.records import FloatArray, Moment
 from psd_deflection.studies.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.studies.study import PageSection
 from psd_deflection.studies.validate.agreement import Agreement
@@ -17,13 +17,17 @@ from psd_deflection.studies.validate.agreement import Agreement
 
 @dataclass(frozen=True)
 class DrawnAgreement:
-    """What is drawn: ``t`` (k,), s; ``estimate`` and ``reference`` (k, 3), m, m, rad; how the axes agree."""
+    """What is drawn: ``t`` (k,), s; ``estimate`` and ``reference`` (k, 3), m, m, rad; how the axes agree.
+
+    ``marks``: by the clock of the samples, as ``t``.
+    """
 
     solver: str
     t: FloatArray
     estimate: FloatArray
     reference: FloatArray
     agreements: Sequence[Agreement]
+    marks: Sequence[Moment]
 
 
 def sections(found: DrawnAgreement, rows: Sequence[Sequence[str]]) -> list[PageSection]:
@@ -46,7 +50,7 @@ def sections(found: DrawnAgreement, rows: Sequence[Sequence[str]]) -> list[PageS
 
 def _over_time(found: DrawnAgreement) -> Chart:
     panels = []
-    along = 'time / s, by the clock of the samples'
+    along = TimeAxis('by the clock of the samples', found.marks)
     for i, (symbol, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
         estimate, reference = SHOWN[i] * found.estimate[:, i], SHOWN[i] * found.reference[:, i]
         both = (

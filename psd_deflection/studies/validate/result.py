@@ -133,7 +133,7 @@ class Validated(StudyResult):
         from psd_deflection.studies.validate.pictures import DrawnAgreement, sections
 
         of = self.solver
-        shown = DrawnAgreement(of, self.t, self.estimates[of], self.reference, self.agreements[of])
+        shown = DrawnAgreement(of, self.t, self.estimates[of], self.reference, self.agreements[of], self.problem.marks)
         return sections(shown, self.rows())
 
 

@@ -8,10 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.base.charts import Chart, Panel, Rule, Series
+from psd_deflection.base.charts import Chart, Panel, Series, TimeAxis
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, text_column
 from psd_deflection.measure.watch import Alarm
+from psd_deflection.recordings.charts import FROM_FIRST
+from psd_deflection.records import Moment
 from psd_deflection.studies.study import PageSection, StudyResult
 
 
@@ -19,13 +21,16 @@ from psd_deflection.studies.study import PageSection, StudyResult
 class WatchedRun(StudyResult):
     """The alarms of a recording, the first first. ``start_ns``: of its first sample.
 
-    ``watched``: what was watched, in words. ``made_from``: see :attr:`StudyResult.sources`.
+    ``watched``: what was watched, in words; ``marks``: of the recording, from its first sample.
+    ``seconds``: it took. ``made_from``: see :attr:`StudyResult.sources`.
     """
 
     alarms: tuple[Alarm, ...]
     watched: str
     start_ns: int
     made_from: Mapping[str, str]
+    marks: tuple[Moment, ...] = ()
+    seconds: float = 0.0
 
     study = 'watch'
     title = 'Is the rig still its model?'
@@ -69,14 +74,15 @@ class WatchedRun(StudyResult):
             yield PageSection('Alarms', (words, self._chart()))
 
     def _chart(self) -> Chart:
+        along = TimeAxis(FROM_FIRST, self.marks)
         panels = []
         for channel in dict.fromkeys(a.channel for a in self.alarms):
             own = [a for a in self.alarms if a.channel == channel]
             t, shift, sd = np.array([(self.since_s(a), 1e6 * a.shift, 1e6 * a.sd) for a in own]).T
             one = Series('', t, shift, 'red', 'points', 1.96 * sd)
             label = f'{channel} / {"µrad" if channel == "theta" else "µm"}'
-            along = 'time / s from the first sample'
-            panels.append(Panel((one,), along, label, rules=[Rule(0.0, across=True)]))
+            model = Series('', np.array([0.0, max(self.seconds, *t)]), np.zeros(2), 'quiet')
+            panels.append(Panel((model, one), along, label))
         return Chart('what shifted, since when and by how much (95 %)', panels)
 
     @property

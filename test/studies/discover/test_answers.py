@@ -20,8 +20,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import nested
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.discover import conclusion as told
-from psd_deflection.studies.discover import planning
+from psd_deflection.studies.discover import planning, trees
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Setting
 from psd_deflection.studies.discover.laws.laws import FoundLaw
@@ -636,17 +635,17 @@ def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
 def test_a_size_is_told_to_the_digits_that_its_deviation_leaves(value: float, sd: float, words: str) -> None:
     """Two digits more than the deviation's first, six at most; within two deviations of nothing it is none."""
     effect = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': value}, 't'), sd={'angle': sd})
-    assert told.size_of(effect) == words
-    assert told.size_of(dataclasses.replace(effect, sd={})) == ''
+    assert trees.size_of(effect) == words
+    assert trees.size_of(dataclasses.replace(effect, sd={})) == ''
 
 
 def test_numbers_of_json_are_finite() -> None:
-    assert [told._number(v) for v in (math.nan, math.inf, -math.inf, 1.5)] == [0.0, 1e300, -1e300, 1.5]
+    assert [trees.number(v) for v in (math.nan, math.inf, -math.inf, 1.5)] == [0.0, 1e300, -1e300, 1.5]
     active = make_active('damping', {'bending_ratio': 0.03}, 't')
-    tree = told.parameters_of(named_effect(active, sd={'bending_ratio': math.inf}))
+    tree = trees.parameters_of(named_effect(active, sd={'bending_ratio': math.inf}))
     assert tree == {'bending_ratio': {'value': 0.03, 'sd': 1e300, 'unit': ''}}
     turned = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': 0.1}, 't'))
-    assert told.parameters_of(turned) == {'psd': 2, 'angle': {'value': 0.1, 'sd': 0.0, 'unit': 'rad'}}
+    assert trees.parameters_of(turned) == {'psd': 2, 'angle': {'value': 0.1, 'sd': 0.0, 'unit': 'rad'}}
     assert nested({'a.b': (1, 2), 'a.c.d': 'x', 'e': 3}) == {'a': {'b': [1, 2], 'c': {'d': 'x'}}, 'e': 3}
 
 
@@ -760,7 +759,7 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
     assert recording['noise_v'] == found.workspace.noise[0].sigma.tolist()
     assert recording['coloured'] == [False] * 6
     before, left = 1e6 * found.gap_before, 1e6 * found.gap_after
-    size = told.size_of(named)
+    size = trees.size_of(named)
     dx, dy, theta = (1e6 * v for v in found.moves)
     off = f'ΔX {dx:.3g} µm, ΔY {dy:.3g} µm, θ {theta:.3g} µrad'
     assert found.sentence == (
@@ -837,7 +836,7 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     )
     assert sentence(verdict='unknown_effect', unknown=(Unknown('', (), 0.5),)) == (
         'sensor_rotation (psd 2) explains part, but an unknown effect remains: '
-        f'the gap goes from {before} µm to {left}. Fitted: sensor_rotation {told.size_of(named)}.'
+        f'the gap goes from {before} µm to {left}. Fitted: sensor_rotation {trees.size_of(named)}.'
     )
     two = (named, dataclasses.replace(named, equivalent=('a', 'b'), sd={}))
     said_of_two = sentence(effects=two)

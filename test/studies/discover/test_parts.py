@@ -247,11 +247,11 @@ def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> Non
     assert gappy.worded(1.2345e-6) == '1.23 µm'
     beside = gappy.against()
     assert list(beside) == [
-        'time / s (recordings one after another)',
         *('load_fx / N', 'load_fy / N', 'load_tz / N m'),
         *('x1 / mm', 'y1 / mm', 'x2 / mm', 'y2 / mm'),
     ]
-    first, second = beside['time / s (recordings one after another)']
+    axis, (first, second) = gappy.along()
+    assert str(axis) == 'time / s (recordings one after another)'
     np.testing.assert_allclose(first, 0.01 + 0.02 * np.arange(60))
     # The second begins where the first ended, and has 500 samples a second.
     np.testing.assert_allclose(second, 1.2 + 0.02 + 0.04 * np.arange(40))

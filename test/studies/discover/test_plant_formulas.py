@@ -391,16 +391,17 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
     plant = Pictures(seen, {'a': tables(4)}, period=period)
     plant.done = {'u': given}
     ws = PlantComparison(plant)
+    axis, alongs = ws.along()
     beside = ws.against()
     times = [(start + np.arange(n)) * (period or 1.0) for start, n in zip((0, 10, 17), LENGTHS, strict=True)]
-    first = 'time / s (cases one after another)' if period else 'number of the reading'
-    assert list(beside) == [first, 'u', 'force / N', 'turn / rad']
-    for got, along in zip(beside[first], times, strict=True):
+    assert str(axis) == ('time / s (cases one after another)' if period else 'number of the reading')
+    assert list(beside) == ['u', 'force / N', 'turn / rad']
+    for got, along in zip(alongs, times, strict=True):
         np.testing.assert_allclose(got, along)
     assert all(np.array_equal(a, b) for a, b in zip(beside['u'], given, strict=True))
     assert all(np.array_equal(a, b[1], equal_nan=True) for a, b in zip(beside['turn / rad'], seen, strict=True))
     plant.units = ('', '')
-    assert list(ws.against())[2:] == ['force', 'turn']
+    assert list(ws.against())[1:] == ['force', 'turn']
     fit = refit(ws, [on('a', 0.5)], iterations=0)
     named = plant_search.regressors(ws, fit)
     assert [channel for channel, _ in named] == ['force', 'turn']

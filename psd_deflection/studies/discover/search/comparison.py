@@ -14,6 +14,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from psd_deflection.base.charts import TimeAxis
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
@@ -147,8 +148,12 @@ class Comparison(ABC):
         """A residual by ``channels``, as the gap counts it, for pictures; NaN where nothing was measured."""
 
     @abstractmethod
+    def along(self) -> tuple[str | TimeAxis, list[FloatArray]]:
+        """The time of what is ``shown``, or the number of the reading."""
+
+    @abstractmethod
     def against(self) -> dict[str, list[FloatArray]]:
-        """What ``shown`` may be held against in a picture, by name with unit; the first is the time or the number."""
+        """What else ``shown`` may be held against in a picture, by name with unit."""
 
     @abstractmethod
     def provenance(self) -> list[dict[str, object]]:

@@ -15,11 +15,12 @@ from typing import Self
 
 import numpy as np
 
+from psd_deflection.base.charts import ONE_AFTER_ANOTHER, TimeAxis
 from psd_deflection.model.simulation.catalogue import sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
+from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray, Moment
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
@@ -342,16 +343,23 @@ class Workspace(Comparison):
         """Block means of the dots (4, blocks), µm."""
         return [1e6 * d for d in self.block_dots(tables)]
 
-    def against(self) -> dict[str, list[FloatArray]]:
-        """Time, loads and the dots as measured, block by block."""
-        out: dict[str, list[FloatArray]] = {'time / s (recordings one after another)': []}
+    def along(self) -> tuple[TimeAxis, list[FloatArray]]:
+        """Time, recordings one after another, block by block."""
+        times: list[FloatArray] = []
+        marks: list[Moment] = []
         start = 0.0
         for o, dots in zip(self.observations, self.block_dots(self.measured), strict=True):
-            size, n = o.rig.estimator.block_size, dots.shape[1]
-            out['time / s (recordings one after another)'].append(
-                np.asarray(start + (np.arange(n) + 0.5) * size * o.period)
-            )
+            middles = (np.arange(dots.shape[1]) + 0.5) * o.rig.estimator.block_size * o.period
+            times.append(np.asarray(start + middles, dtype=np.float64))
+            marks += [mark._replace(t=start + mark.t) for mark in o.marks]
             start += o.duration
+        return TimeAxis(ONE_AFTER_ANOTHER, marks), times
+
+    def against(self) -> dict[str, list[FloatArray]]:
+        """Loads and the dots as measured, block by block."""
+        out: dict[str, list[FloatArray]] = {}
+        for o, dots in zip(self.observations, self.block_dots(self.measured), strict=True):
+            size, n = o.rig.estimator.block_size, dots.shape[1]
             for name, row in zip(LOADS_SHOWN, fine_means(o.loads.T, size), strict=True):
                 out.setdefault(name, []).append(row[:n])
             for name, row in zip(self.channels, dots, strict=True):
