@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from blind import generator
+from blind import motion as moving
 from blind.campaign import options
 from blind.generator import Array
 from psd_deflection.measure.pipeline import Pipeline
@@ -30,6 +31,10 @@ SETTLED = 100
 """Blocks before the noise is measured; they are not counted at rest."""
 SHIFTS = ((0.31372e-3, -0.27182e-3), (0.16180e-3, 0.46692e-3))
 """Where the PSDs are off their places, so that no reading stands in the middle of a converter's step, m."""
+RISE = 10.0
+"""K."""
+DRIFT = ({'x': 0.4e-6, 'y': -0.3e-6}, {'x': -0.2e-6, 'y': 0.4e-6})
+"""Of the dots of each PSD, m/K: up to 40 ppm/K of its half width of 10 mm, as makers state it."""
 LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (0.0, 8)}
 
 
@@ -113,22 +118,28 @@ def rig(row: Row, **overrides: object) -> Rig:
 @cache
 def motion(rest_s: int, steps: int) -> tuple[Array, Array]:
     """Volts (n, 6) without noise and poses (n / 20, 3) at the blocks' middles."""
+    fine = _poses(rest_s, steps)
+    return _optics(fine), _middles(fine)
+
+
+def _poses(rest_s: int, steps: int) -> Array:
     n = rest_s * 1000
     loads = np.zeros((n + steps * 5000, 3))
     for step in range(0, steps, 2):
         # Off the blocks' grid, each at another place in its block.
         first = n + step * 5000 + 7 * step % SIZE
         loads[first : first + 5000] = (0.0, -50.0, -29.25)
-    fine = generator.motion(loads, 0.585, [])
-    return _optics(fine), _middles(fine)
+    return generator.motion(loads, 0.585, [])
 
 
-def _optics(fine: Array) -> Array:
+def _optics(fine: Array, warm: Array | None = None, effects: Sequence[generator.Spec] = ()) -> Array:
+    """Volts (n, 6) without noise; ``warm``: K above the first temperature, for ``effects`` of the sensors."""
     none = np.zeros(len(fine))
     shifted = [
         {'name': 'sensor_position', 'psd': i, 'x': x, 'y': y, 'aimed': False} for i, (x, y) in enumerate(SHIFTS, 1)
     ]
-    m, light = generator.sensors(generator.optics(fine, none, none, 0.585, shifted), none, none, [])
+    dots = generator.optics(fine, none, none, 0.585, shifted)
+    m, light = generator.sensors(dots, none, none if warm is None else warm, effects)
     return generator.electronics(m, light, none, [])
 
 
@@ -158,8 +169,7 @@ def estimates(
     for part in (seq[:cut], seq[cut:]):
         if zero_at and out:
             pipeline.zero()
-        chunk = RawChunk(part, part * 1_000_000, volts[part].astype(np.float32), np.zeros(len(part), np.uint8))
-        out += [r for r in pipeline.process(chunk) if isinstance(r, DeflectionEstimate) and r.primary]
+        out += _published(pipeline, part, volts)
     return out
 
 
@@ -170,9 +180,11 @@ def score(row: Row, loss: str, *, rest_s: int = 100, steps: int = 16, seed: int 
     here = generator.present(len(clean), seed + 1000, share, burst)
     pipeline = Pipeline(rig(row, **overrides))
     got = estimates(pipeline, volts_of(row, clean, seed), here, zero_at=SETTLED if row.offsets else 0)
-    block = np.array([e.block for e in got])
-    error = np.array([(e.dx, e.dy, e.theta) for e in got]) - truth[block]
-    covariance = np.array([e.covariance for e in got]).reshape(-1, 3, 3)
+    return _scored(got, truth, rest_s, pipeline)
+
+
+def _scored(got: Sequence[DeflectionEstimate], truth: Array, rest_s: int, pipeline: Pipeline) -> Scored:
+    error, covariance, block = _errors(got, truth)
     first = rest_s * 1000 // SIZE
     rest = (block >= 2 * SETTLED) & (block < first)
     ringing = block >= first
@@ -181,6 +193,54 @@ def score(row: Row, loss: str, *, rest_s: int = 100, steps: int = 16, seed: int 
         inside(error[ringing], covariance[ringing]),
         pipeline.stamped.contradictions / len(got),
     )
+
+
+def warming(told: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) -> Scored:
+    """Readings that drift with temperature by what makers of PSDs state, ``DRIFT``, while it rises by ``RISE``.
+
+    ``told``: the rig file has the drift, and the temperature is told once a second, to 0.1 K.
+    """
+    fine = _poses(rest_s, steps)
+    warm = np.linspace(0.0, RISE, len(fine))
+    names = [{'name': 'thermal_drift', 'psd': psd, **drift} for psd, drift in enumerate(DRIFT, 1)]
+    volts = volts_of(ROWS[0], _optics(fine, warm, names), seed)
+    known = {f'effects.drift_{one["psd"]}.{key}': value for one in names for key, value in one.items()}
+    pipeline = Pipeline(rig(ROWS[0], **(known if told else {})))
+    got: list[DeflectionEstimate] = []
+    for second, part in enumerate(np.split(np.arange(len(volts)), len(volts) // 1000)):
+        if told:
+            pipeline.temperature(20.0 + round(float(warm[second * 1000 * generator.FINER]), 1))
+        got += _published(pipeline, part, volts)
+    return _scored(got, _middles(fine), rest_s, pipeline)
+
+
+def on_a_moving_base(seconds: int = 60, seed: int = 1) -> Inside:
+    """A link without load whose base turns, as :func:`blind.motion.swung` moves it; its accelerations are told."""
+    run = moving.make('joint', float(seconds), seed)
+    pipeline = Pipeline(moving.rig_of())
+    told = list(run.told)
+    got: list[DeflectionEstimate] = []
+    for part in np.split(np.arange(len(run.volts)), len(run.volts) // SIZE):
+        while told and told[0].t_ns < int(part[-1] + 1) * 1_000_000:
+            pipeline.accelerate(told.pop(0))
+        got += _published(pipeline, part, run.volts)
+    p = run.pose[: len(run.volts) // SIZE * SIZE].reshape(-1, SIZE, 3)
+    truth = (9.0 * (p[:, 9] + p[:, 10]) - p[:, 8] - p[:, 11]) / 16.0
+    error, covariance, block = _errors(got, truth)
+    in_motion = block >= int(moving.REST * generator.RATE) // SIZE
+    return inside(error[in_motion], covariance[in_motion])
+
+
+def _published(pipeline: Pipeline, part: npt.NDArray[np.int_], volts: Array) -> list[DeflectionEstimate]:
+    chunk = RawChunk(part, part * 1_000_000, volts[part].astype(np.float32), np.zeros(len(part), np.uint8))
+    return [r for r in pipeline.process(chunk) if isinstance(r, DeflectionEstimate) and r.primary]
+
+
+def _errors(got: Sequence[DeflectionEstimate], truth: Array) -> tuple[Array, Array, npt.NDArray[np.int_]]:
+    """Errors (k, 3), covariances (k, 3, 3) and blocks (k,) of estimates; ``truth`` (n, 3) of each block."""
+    block = np.array([e.block for e in got])
+    error = np.array([(e.dx, e.dy, e.theta) for e in got]) - truth[block]
+    return error, np.array([e.covariance for e in got]).reshape(-1, 3, 3), block
 
 
 class Shaken(NamedTuple):
@@ -208,9 +268,7 @@ def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **ov
     got = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary and r.block >= 2 * SETTLED]
     spots = [r for r in records if isinstance(r, SpotMeans)]
     words = {s.index: next((f for f in s.findings if f.startswith('vibrates')), '') for s in spots}
-    block = np.array([e.block for e in got])
-    error = np.array([(e.dx, e.dy, e.theta) for e in got]) - _middles(fine)[block]
-    covariance = np.array([e.covariance for e in got]).reshape(-1, 3, 3)
+    error, covariance, block = _errors(got, _middles(fine))
     sd = np.sqrt(np.einsum('nii->ni', covariance))
     named = np.array([bool(words[b]) for b in block.tolist()])
     beyond = (np.abs(error) > 3.0 * sd).any(axis=1)
@@ -341,6 +399,8 @@ def over_the_bound(
     return {name: np.sqrt(np.square(found).mean(axis=0)) / bound(row) for name, found in poses.items()}
 
 
+VIBRATION_SEEDS = 8
+
 SHAKEN_HEAD = '| Hz | ΔX | ΔY | θ | joint | within 3 sd | ΔY: rms error, µm | sd, µm | named | named beyond 3 sd |'
 
 
@@ -412,6 +472,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             print(f'| {name} | {loss} | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |', flush=True)
             if cost is None:
                 cost = np.array(s.rest.rms) / bound(row)
+        if whole:
+            warm = {told: pool.submit(warming, told) for told in (True, False)}
+            base = pool.submit(on_a_moving_base).result()
+            print(f'| white, moving base | none | | | | | {_cells(base)} | {base.three:.4f} | |')
+            for told, ramp in warm.items():
+                s = ramp.result()
+                label = 'white, temperature ramp' + ('' if told else ' that the rig file does not know')
+                tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
+                print(f'| {label} | none | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |')
         for told, found in rough.items():
             r = found.result()
             label = '10 bit, no dither' if told else '10 bit, the rig file says 16'
@@ -422,6 +491,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         for fit in ('mean', 'poly'):
             for name, ratio in over_the_bound(UNEQUAL, ('wls', 'exact', 'ols'), block_fit=fit).items():
                 print(f'- unequal channels, block_fit: {fit}, {name}: {_three(ratio)}')
+        print()
+        vibrations(VIBRATION_SEEDS)
     return 0
 
 

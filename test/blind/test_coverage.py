@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from blind.coverage import ROWS, UNEQUAL, fault, over_the_bound, score
+from blind.coverage import ROWS, UNEQUAL, Inside, fault, on_a_moving_base, over_the_bound, score, warming
 
 LABELS = ('white', 'AR(1) 0.9', 'twice the noise', '1, 2, 4, 2 mV', 'unequal channels')
 
@@ -16,9 +16,23 @@ def test_the_truth_is_inside(label: str) -> None:
     for part in (s.rest, s.ringing):
         assert part.blocks >= 900
         # 0.95, give or take three standard deviations of a thousand blocks.
-        assert all(0.92 < share < 0.98 for share in (*part.axes, part.joint))
+        assert covers(part)
     assert s.ringing.three > 0.99
     assert s.alarms == 0.0
+
+
+def covers(part: Inside) -> bool:
+    return all(0.92 < share < 0.98 for share in (*part.axes, part.joint))
+
+
+def test_a_drift_with_temperature_that_the_rig_file_knows_is_covered() -> None:
+    assert covers(warming(rest_s=26, steps=2, seed=3).rest)
+    # The judge can say no.
+    assert warming(told=False, rest_s=26, steps=2, seed=3).rest.joint < 0.8
+
+
+def test_the_truth_is_inside_on_a_moving_base() -> None:
+    assert covers(on_a_moving_base(30, seed=3))
 
 
 @pytest.mark.statistics
