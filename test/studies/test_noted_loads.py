@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
@@ -13,7 +16,7 @@ from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.noted_loads import ALIKE_S, MendedLoads, mend_loads, ordinal
+from psd_deflection.studies.noted_loads import ALIKE_S, MendedLoads, MendedNote, mend_loads, ordinal, shifts
 
 RIG = load_rig()
 LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, 0, 0)], float)
@@ -186,3 +189,32 @@ def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
     assert not found.values
     assert '; load 3, 3.4 s late; load 4, ' in found.sentence
     assert found.gap_before > 100.0 * found.gap_after
+
+
+@pytest.mark.parametrize('moments', [0.0, 1.0, 2.0, 3.0, 4.0, 5.4, -1.0, -2.6])
+def test_a_load_between_two_samples_moves_the_link_as_one_at_that_time(moments: float) -> None:
+    frequency, ratio, first = 14.0, 0.02, 100
+    loads = np.zeros((1000, 3))
+    loads[first:, 1] = -50.0
+    note = MendedNote(1, (0.0, -50.0, 0.0), 0.1, 0.1, 0.0)
+    (later,) = shifts(note, loads, 1e-3)
+    moved = Filter(mode_coefficients(frequency, ratio, 1e-3))((loads + later(moments))[:, 1] / -50.0)
+    # The step response of an oscillator, from the time of the step on.
+    w = 2.0 * math.pi * frequency
+    damped = w * math.sqrt(1.0 - ratio**2)
+    since = np.maximum(np.arange(1000) * 1e-3 - 0.1 - moments * 0.25e-3, 0.0)
+    ringing = np.cos(damped * since) + ratio * w / damped * np.sin(damped * since)
+    exact = 1.0 - np.exp(-ratio * w * since) * ringing
+    away = np.abs(np.arange(1000) - first) > 4
+    # The mean of that sample alone is off by 1e-3.
+    assert np.abs(moved - exact)[away].max() < 5e-5
+
+
+def test_a_late_note_beside_channels_that_are_read_after_one_another() -> None:
+    read = volts(hung(), effects__e__name='channel_skew', effects__e__psd=2, effects__e__delay=2e-4)
+    found = discover([Observation('x', RIG, read, noted((0.0, 0.0, 3.4, 0.0, 0.0, 0.0)))])
+    assert [e.active.label for e in found.effects] == ['channel_skew (psd 2)']
+    assert found.effects[0].active.values['delay'] == pytest.approx(2e-4, abs=2e-6)
+    assert found.verdict == 'effects_found'
+    assert found.floors < 1.05
+    assert [(f.name, f.where) for f in found.setup] == [('load_time', 'load 3')]

@@ -230,9 +230,9 @@ def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
         if mended is None:
             continue
         o = workspace.observations[i]
-        for note in mended.notes:
-            shifted = shifts(note, o.loads, o.period)
-            free += [LoadDirection(i, change, FREE_MOMENTS, note, axis) for axis, change in enumerate(shifted)]
+        for note in mended.timed:
+            for axis, shifted in enumerate(shifts(note, o.loads, o.period)):
+                free.append(LoadDirection(i, shifted(1.0), FREE_MOMENTS, note, axis, exact=shifted))
         # In whatever unit they were measured.
         unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(mended.loads).max(axis=0), 1e-30)
         if len(mended.measured) <= MOST_MEASURED:

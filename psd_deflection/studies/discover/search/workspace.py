@@ -9,7 +9,7 @@ and counted here.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Self
 
@@ -63,7 +63,8 @@ class LoadDirection:
     """A change of the loads that nobody knows: ``change`` (n, 3) N, N, N m of ``recording``, times a number of standard
     deviation ``sd``.
 
-    ``of``: what it belongs to; ``axis``: which of its numbers it is.
+    ``of``: what it belongs to; ``axis``: which of its numbers it is. ``exact``: the change (n, 3) by a number, if it is
+    not in proportion; ``size``: the number that the loads have already.
     """
 
     recording: int
@@ -71,6 +72,14 @@ class LoadDirection:
     sd: float
     of: object
     axis: int
+    exact: Callable[[float], FloatArray] | None = None
+    size: float = 0.0
+
+    def more(self, size: float) -> FloatArray:
+        """(n, 3): what ``size`` more does to the loads."""
+        if self.exact is None:
+            return size * self.change
+        return np.asarray(self.exact(self.size + size) - self.exact(self.size), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,7 +241,7 @@ class Workspace(Comparison):
         for d, size in more:
             o = observations[d.recording]
             observations[d.recording] = dataclasses.replace(
-                o, loads=o.loads + size * d.change, digest=o.digest or o.hashed()
+                o, loads=o.loads + d.more(size), digest=o.digest or o.hashed()
             )
         return self.replaced(observations=tuple(observations))
 
@@ -242,7 +251,9 @@ class Workspace(Comparison):
             return self
         free = self.free
         sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * (free.rows @ self._white(difference)))
-        return self._loaded(list(zip(self.free.directions, sizes.tolist(), strict=True)))
+        more = list(zip(free.directions, sizes.tolist(), strict=True))
+        moved = tuple(dataclasses.replace(d, size=d.size + size) for d, size in more)
+        return self._loaded(more).replaced(free=dataclasses.replace(free, directions=moved))
 
     def direction_sd(self) -> dict[tuple[int, int], float]:
         """Standard deviations of the free numbers by the noise, by the id of what each belongs to, and its axis."""
