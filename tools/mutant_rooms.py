@@ -201,8 +201,8 @@ ROOMS: Mapping[str, Room] = {
         slow=('test/studies/calibrate/test_calibrate.py', 'test/cli/test_calibrate.py'),
     ),
     'check': Room(
-        ('psd_deflection/studies/check', 'psd_deflection/studies/noted_loads.py'),
-        ('test/studies/check', 'test/studies/test_noted_loads.py'),
+        ('psd_deflection/studies/check', 'psd_deflection/studies/loads'),
+        ('test/studies/check', 'test/studies/loads'),
         slow=('test/run/test_guided.py',),
     ),
     'identify': Room(

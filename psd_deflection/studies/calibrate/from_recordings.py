@@ -23,7 +23,8 @@ from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import DarkLevel, dark_levels, values_of_levels
 from psd_deflection.studies.calibrate.observation import CalibrationRun, usable_dots
 from psd_deflection.studies.calibrate.result import Calibrated
-from psd_deflection.studies.noted_loads import mend_loads
+from psd_deflection.studies.loads.noted_times import mend_loads
+from psd_deflection.studies.loads.plateaus import as_hung, wrong_notes
 from psd_deflection.studies.study import Tell, opened
 
 
@@ -103,16 +104,18 @@ def read_runs(
     ]
 
 
-def timed(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
-    """``run`` with its loads at the times at which they acted, by the motion; ``tell`` gets what was noted wrong."""
+def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
+    """``run`` with the loads that hung, at the times at which they acted; ``tell`` gets what was noted wrong."""
     if run.loads is None:
         return run
     mended = mend_loads(rig, usable_dots(run, rig), run.loads)
-    if mended is None:
+    loads, late = (run.loads, ()) if mended is None else (mended.loads, mended.notes)
+    wrong = wrong_notes(rig, run.volts, loads)
+    for words in (*(n.words(run.name) for n in late), *(n.words(run.name) for n in wrong)):
+        tell(words)
+    if mended is None and not wrong:
         return run
-    for note in mended.notes:
-        tell(note.words(run.name))
-    return replace(run, loads=mended.loads)
+    return replace(run, loads=as_hung(loads, wrong))
 
 
 def today() -> str:
@@ -171,7 +174,7 @@ class CalibrationOptions:
         tell: Tell,
     ) -> Calibrated:
         """The answer; ``tell`` gets a warning if a load was noted late, or if the rig file cannot be edited."""
-        runs = [timed(run, rig, tell) for run in runs]
+        runs = [as_acted(run, rig, tell) for run in runs]
         lit = replace_values(rig, values_of_levels(levels))
         found = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
         return Calibrated(found, lit, self.params_file, self.date, tell)

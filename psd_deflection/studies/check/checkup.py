@@ -11,7 +11,13 @@ import numpy as np
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
-from psd_deflection.studies.check.judges import noise_findings, step_findings, unit_findings, wiring_findings
+from psd_deflection.studies.check.judges import (
+    noise_findings,
+    note_finding,
+    step_findings,
+    unit_findings,
+    wiring_findings,
+)
 from psd_deflection.studies.check.levels import SUM_FACTOR, Levels, levels
 from psd_deflection.studies.check.responses import responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
@@ -25,7 +31,8 @@ from psd_deflection.studies.check.wirings import (
     fitting_wirings,
     misfit,
 )
-from psd_deflection.studies.noted_loads import MendedNote, mend_loads
+from psd_deflection.studies.loads.noted_times import MendedNote, mend_loads
+from psd_deflection.studies.loads.plateaus import WrongNote, as_hung, wrong_notes
 
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
@@ -41,7 +48,7 @@ _LOADS = tuple(ALONE)
 class CheckProblem:
     """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``,
     ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``source``: the recording, '' at
-    the bench. ``late``: loads whose noted time is not that of their motion.
+    the bench. ``notes``: of loads that hung at another time than noted, or that were others.
     """
 
     rig: Rig
@@ -50,7 +57,7 @@ class CheckProblem:
     drift: FloatArray
     drift_sd: FloatArray
     source: str = ''
-    late: Sequence[MendedNote] = ()
+    notes: Sequence[MendedNote | WrongNote] = ()
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
@@ -61,8 +68,10 @@ def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '
     if mended is not None:
         loads, late = mended.loads, mended.notes
         moved = np.where(mended.unused[:, None], np.nan, volts)
-    answered = responses(rig, moved, loads)
-    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, late)
+    wrong = wrong_notes(rig, Wiring.from_rig(rig).to_psds(moved), loads)
+    answered = responses(rig, moved, as_hung(loads, wrong))
+    told: list[MendedNote | WrongNote] = [*late, *wrong]
+    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, told)
 
 
 def check(problem: CheckProblem) -> Checkup:
@@ -72,7 +81,7 @@ def check(problem: CheckProblem) -> Checkup:
     seen = tuple(p for p in pushes if p.seen)
     dead = [*measured.stuck, *(c for c in _dead(seen) if c not in measured.stuck)]
     found = fitting_wirings(seen) if seen else []
-    findings = [Finding(n.name, n.where, n.value, n.words(problem.source), abs(n.late)) for n in problem.late]
+    findings = [note_finding(n, problem.source) for n in problem.notes]
     lines: dict[str, object] = {}
     for channel in dead:
         findings.append(Finding('stuck_channel', channel, None, f'{channel} does not answer: look at its cable'))

@@ -1,4 +1,4 @@
-"""What check and discover both judge, once: noise and the unit of the loads against what file and recording say."""
+"""What check and discover both judge, once: noise, and what was noted of the loads, against file and recording."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import differences, fix_of, line, parameters
+from psd_deflection.studies.loads.noted_times import MendedNote
+from psd_deflection.studies.loads.plateaus import WrongNote
 
 NOISE_FACTOR = 2.0
 """Report noise that differs from the rig file's by more than this factor.
@@ -94,6 +96,11 @@ def _of_each_channel(noise: FloatArray, stated: FloatArray) -> tuple[list[Findin
 
 def _far(factor: float) -> bool:
     return factor > 0.0 and not 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR
+
+
+def note_finding(note: MendedNote | WrongNote, name: str) -> Finding:
+    """A load that was noted at another time or as another one than it hung, of the recording ``name``."""
+    return Finding(note.name, note.where, note.value, note.words(name), note.size)
 
 
 def unit_findings(sizes: FloatArray, evidence: float = 0.0) -> tuple[list[Finding], FloatArray]:

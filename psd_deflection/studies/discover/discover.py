@@ -44,10 +44,11 @@ from psd_deflection.studies.discover.search.signatures import (
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, mistakes
-from psd_deflection.studies.discover.setup.hung import all_free, levels, plateaus, told
+from psd_deflection.studies.discover.setup.hung import levels, times, told
 from psd_deflection.studies.discover.setup.redundant import PART, STAGES, fourth_reading, visible
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
+from psd_deflection.studies.loads.plateaus import all_free
 
 FREED_FROM = 10.0
 """A gap of so many floors, beside what the search has found, is held against loads that were noted wrong."""
@@ -273,7 +274,7 @@ def _freed(problem: Problem) -> Problem | None:
     wrong, observations = [], []
     for i, (o, difference) in enumerate(zip(ws.observations, problem.fit.difference, strict=True)):
         noted = {p.first: p.noted for p in machine.recorded.wrong if p.recording == i}
-        listed = [replace(p, noted=noted.get(p.first, p.noted)) for p in plateaus(o, i)]
+        listed = [replace(p, noted=noted.get(p.first, p.noted)) for p in times(o, i)]
         asked = levels(ws, i, difference, listed)
         if not all_free(asked, o.loads):
             return None

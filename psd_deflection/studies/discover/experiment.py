@@ -24,8 +24,9 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.discover.search.fit import STEP, Fit
-from psd_deflection.studies.discover.search.workspace import FINE_SECONDS, Workspace, fine_means
+from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import only_in
+from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
 
 ROOM = 0.8
 """Share of the way from an unloaded dot to the edge of its sensor, or of the converter's range, that a load may use."""

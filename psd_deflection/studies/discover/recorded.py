@@ -17,6 +17,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values
+from psd_deflection.studies.check.judges import note_finding
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import refit
@@ -24,21 +25,12 @@ from psd_deflection.studies.discover.search.proposals import coarse_step
 from psd_deflection.studies.discover.search.workspace import LoadDirection, Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
-from psd_deflection.studies.discover.setup.hung import (
-    Plateau,
-    Swaying,
-    directions,
-    levels,
-    of_plateau,
-    plateaus,
-    stand_out,
-)
-from psd_deflection.studies.discover.setup.hung import (
-    swaying as swaying_of,
-)
+from psd_deflection.studies.discover.setup.hung import Swaying, directions, levels, of_plateau, times
+from psd_deflection.studies.discover.setup.hung import swaying as swaying_of
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
-from psd_deflection.studies.noted_loads import SETTLED_S, MendedLoads, shifts
+from psd_deflection.studies.loads.noted_times import SETTLED_S, MendedLoads, shifts
+from psd_deflection.studies.loads.plateaus import Plateau, instead, stand_out
 
 MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
@@ -92,12 +84,7 @@ def cleaned(recorded: Recorded) -> Recorded:
 def put_right(recorded: Recorded) -> Recorded:
     """With loads at the times at which they acted, and with wiring, signs and units as they are."""
     timed = [time_loads(o) for o in recorded.observations]
-    late = [
-        Finding(n.name, n.where, n.value, n.words(o.name), abs(n.late))
-        for o, mended in timed
-        if mended is not None
-        for n in mended.notes
-    ]
+    late = [note_finding(n, o.name) for o, mended in timed if mended is not None for n in mended.notes]
     observations, wrong, lines = wire([o for o, _ in timed], recorded.known)
     gap = 0.0
     if wrong or late:
@@ -199,9 +186,9 @@ def _not_as_noted(
 ) -> tuple[list[Swaying], list[tuple[Plateau, FloatArray]]]:
     sways, wrong = list[Swaying](), list[tuple[Plateau, FloatArray]]()
     for i, (o, part) in enumerate(zip(workspace.observations, difference, strict=True)):
-        found = levels(workspace, i, part, plateaus(o, i))
-        sways += swaying_of(workspace, i, found)
-        wrong += [(found.plateaus[k], more) for k, more in stand_out(found)]
+        found = levels(workspace, i, part, times(o, i))
+        sways += swaying_of(workspace, i, part, found)
+        wrong += [(found.plateaus[k], more) for k, more in instead(found, stand_out(found))]
     return sways, wrong
 
 

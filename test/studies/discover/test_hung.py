@@ -1,4 +1,4 @@
-"""What hung instead of what was noted, what the fourth reading says, and a load cell's noise."""
+"""What hung instead of what was noted, found by a search, and what the fourth reading says."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
 from psd_deflection.studies.discover.result import Discovery
-from psd_deflection.studies.discover.setup.hung import Plateau, PlateauLoads, all_free
-from psd_deflection.studies.noted_loads import mend_loads, unnoted_steps, without_cell_noise
 
 RIG = load_rig()
 LEVELS = np.array(
@@ -87,23 +85,6 @@ OFF = np.zeros((8, 3))
 OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
 
 
-def asked(off: FloatArray, noted: FloatArray = ROUNDED) -> bool:
-    """Whether ``noted`` loads are asked for, if the movement says that they are ``off``; all (8, 3)."""
-    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, noted[i]) for i in range(len(noted)))
-    moved = np.repeat(off.T * 1e-6, 10, axis=1)
-    found = PlateauLoads(listed, off, np.zeros_like(moved), moved, np.zeros(80))
-    return all_free(found, np.repeat(noted, DWELL, axis=0))
-
-
-def test_loads_are_asked_for_if_what_hung_rounds_to_the_notes_and_not_if_it_is_far_nearer_or_farther() -> None:
-    assert asked(OFF)
-    # What hung would be noted as another number, or the step is too coarse for so small an error.
-    assert not asked(ROUNDED * 0.06)
-    assert not asked(0.1 * OFF)
-    # Numbers of no step, however small the error.
-    assert not asked(0.3 * OFF, ROUNDED + 0.37 * (ROUNDED != 0.0))
-
-
 @pytest.mark.statistics
 def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search() -> None:
     found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0)), np.repeat(ROUNDED, DWELL, axis=0))
@@ -133,27 +114,6 @@ def test_the_noise_of_a_load_cell_is_no_effect() -> None:
     assert found.verdict == 'nothing_missing'
     assert not found.setup
     assert found.floors < 1.05
-
-
-def test_a_load_cell_is_averaged_between_steps_and_motion_is_not() -> None:
-    noise = np.random.default_rng(1).normal(size=HUNG.shape) * (0.05, 0.05, 0.0)
-    calm, measured = without_cell_noise(HUNG + noise)
-    assert np.abs(calm - HUNG).max() < 5.0 * 0.05 / np.sqrt(DWELL)
-    # The first two have no step between them that stands out of nothing.
-    assert [m.first for m in measured] == [i * DWELL for i in range(len(LEVELS))]
-    assert measured[0].sd == pytest.approx([0.05 / np.sqrt(DWELL)] * 2 + [0.0], rel=0.1)
-    swept = HUNG + np.sin(NUMBER / 30.0)[:, None]
-    still, none = without_cell_noise(swept)
-    assert np.array_equal(still, swept)
-    assert none == ()
-    assert without_cell_noise(HUNG)[1] == ()
-
-
-def test_a_step_without_a_note_has_its_time() -> None:
-    dots = read(HUNG)[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
-    assert unnoted_steps(RIG, dots, noted_as(2, (0, -20, 0))) == pytest.approx([8.0], abs=2e-3)
-    assert unnoted_steps(RIG, dots, HUNG) == []
-    assert mend_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
 
 
 def prepared(volts: FloatArray, noted: FloatArray) -> Recorded:

@@ -45,7 +45,7 @@ from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.weighing import tied, unknown_of
-from psd_deflection.studies.discover.search.workspace import Workspace, fine_means
+from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.noise import (
     NoiseModel,
     _ar_density,
@@ -54,6 +54,7 @@ from psd_deflection.studies.discover.setup.noise import (
     estimate_noise,
 )
 from psd_deflection.studies.discover.steps import accepted, alternatives, credible
+from psd_deflection.studies.loads.fine import fine_means
 
 RIG = load_rig()
 SIGMA = 1e-3

@@ -25,8 +25,9 @@ from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.workspace import Workspace, fine_means
+from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import only_in
+from psd_deflection.studies.loads.fine import fine_means
 
 LOADS, POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
 SOUGHT = (*(f'static_{n}' for n in POSE), *POSE, *DOTS, 'sum1', 'sum2')

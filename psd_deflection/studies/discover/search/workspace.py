@@ -25,37 +25,16 @@ from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
 from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
+from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
 
 LEAST_NOISE = 0.05
 """Share of the rig file's noise that is assumed at least."""
-FINE_SECONDS = 0.004
 FOLDS = 4
 PIECE_SECONDS = 0.5
 DOTS = list(DOT_CHANNELS)
 LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
 MAX_FINE = 60_000
 """Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
-
-
-def fine_means(rows: FloatArray, size: int, present: FloatArray | None = None) -> FloatArray:
-    """Means (k, n // size) over ``size`` samples of rows (k, n).
-
-    ``present`` (k, n): 1 for the samples that count, else 0; all of them by default. A mean of none is 0.
-    """
-    n = rows.shape[1] // size
-    cut = rows[:, : n * size].reshape(rows.shape[0], n, size)
-    if present is None:
-        return _sums(cut) / size
-    weights = present[:, : n * size].reshape(cut.shape)
-    return _sums(cut * weights) / np.maximum(_sums(weights), 1.0)
-
-
-def _sums(cut: FloatArray) -> FloatArray:
-    """Sums over the last axis of ``cut`` (k, n, size): numpy's own sum over so few is several times slower."""
-    total = cut[:, :, 0].copy()
-    for i in range(1, cut.shape[2]):
-        total += cut[:, :, i]
-    return total
 
 
 @dataclass(frozen=True, slots=True, eq=False)

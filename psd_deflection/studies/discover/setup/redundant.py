@@ -19,6 +19,7 @@ from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.loads.plateaus import moved_plate
 
 DOTS = list(DOT_CHANNELS)
 CLIP = 6.0
@@ -49,14 +50,6 @@ class FourthReading:
     def acquits(self) -> bool:
         """Whether no detector, beam or amplifier is at fault."""
         return self.chi_square - self.values < self.allowed
-
-
-def moved_plate(rig: Rig, volts: FloatArray, there: FloatArray) -> FloatArray:
-    """The plate's movement (3, m), m, m, rad, of readings (6, m), V; NaN where one is missing (``there`` 0)."""
-    dots = volts[DOTS] * rig.sensitivities.reshape(4, 1)
-    out = np.linalg.pinv(design_matrix(rig.centers + rig.zeros)) @ dots
-    out[:, (there[DOTS] <= 0.0).any(axis=0)] = np.nan
-    return np.asarray(out)
 
 
 def across_plate(rig: Rig, volts: FloatArray) -> FloatArray:

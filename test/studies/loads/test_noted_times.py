@@ -11,12 +11,12 @@ from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.calibrate.from_recordings import timed
+from psd_deflection.studies.calibrate.from_recordings import as_acted
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.noted_loads import ALIKE_S, MendedLoads, MendedNote, mend_loads, ordinal, shifts
+from psd_deflection.studies.loads.noted_times import ALIKE_S, MendedLoads, MendedNote, mend_loads, ordinal, shifts
 
 RIG = load_rig()
 LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, 0, 0)], float)
@@ -170,13 +170,13 @@ def test_check_and_calibrate_say_the_same() -> None:
     told: list[str] = []
     t = np.arange(COUNT) / 1000.0
     run = CalibrationRun('x', t, QUIET, np.zeros(0), np.zeros((0, 3)), noted(LATE))
-    again = timed(run, RIG, told.append)
+    again = as_acted(run, RIG, told.append)
     assert told == words
     assert again.loads is not None
     # The correction gives dots in 32 bits: a time differs by some microseconds.
     assert np.abs(again.loads - expected.loads).max() < 0.5
     right = CalibrationRun('x', t, QUIET, np.zeros(0), np.zeros((0, 3)), hung())
-    assert timed(right, RIG, told.append) is right
+    assert as_acted(right, RIG, told.append) is right
 
 
 def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:

@@ -22,6 +22,7 @@ from psd_deflection.model.plate.linear import design_matrix
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
+from psd_deflection.studies.loads.load_cell import MeasuredLoad, without_cell_noise
 
 PERIODS = 4
 """Bending periods that each mean on either side of a moment takes."""
@@ -45,15 +46,6 @@ SETTLED_S = 5.0
 """Time constants of the slower mode after which a link is at rest."""
 ROUGH = 3.0
 """Leave out the motion under a load applied slowly if its remaining ringing exceeds the noise by this factor."""
-
-CELL_SHARE = 0.02
-"""Loads that change at more than this share of the samples were measured, not noted by a person."""
-CELL_STEP = 8.0
-"""Standard deviations of a load cell's noise beyond which the load itself has changed."""
-CELL_VALUES = 20
-"""Between two steps there are at least so many values, or nothing tells noise from motion."""
-CELL_WHITE = 0.15
-"""Largest correlation of neighbouring values that is still noise."""
 
 _PER_SECOND = 1.0 / 5.0
 _SKIP_STEP, _SKIP_NOTE = 4.0, 9.0
@@ -96,6 +88,11 @@ class MendedNote:
         return self.late if self._is_late else self.took
 
     @property
+    def size(self) -> float:
+        """s by which it was noted late or early."""
+        return abs(self.late)
+
+    @property
     def wrong(self) -> bool:
         """Whether it was noted otherwise than it was hung."""
         return abs(self.late) > ALIKE_S or self.took > 0.0
@@ -122,15 +119,6 @@ class MendedNote:
         if self.took > 0.0:
             out.append(f'applied over {self.took:.2g} s')
         return out
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MeasuredLoad:
-    """The mean of what a load cell measured at samples ``first`` to ``last``; ``sd`` (3,) of the mean, N, N, N m."""
-
-    first: int
-    last: int
-    sd: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,40 +162,6 @@ def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | N
     if mended is None:
         return MendedLoads(calm, (), np.zeros(len(loads), dtype=bool), measured) if measured else None
     return replace(mended, measured=measured)
-
-
-def without_cell_noise(loads: FloatArray) -> tuple[FloatArray, tuple[MeasuredLoad, ...]]:
-    """``loads`` (n, 3) as measured by a load cell, with the mean from one step to the next, and how exact each is.
-
-    A load of 0.05 N more or less at every sample moves the simulated link as no hung weight does. What is not white
-    between two steps is motion, and stays.
-    """
-    changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
-    if len(changed) < max(CELL_SHARE * len(loads), 50):
-        return loads, ()
-    at = np.concatenate(([0], changed))
-    values = loads[at]
-    apart = np.diff(values, axis=0)
-    noise = 1.4826 * np.median(np.abs(apart), axis=0) / math.sqrt(2.0)
-    # A channel that measures nothing has no steps either.
-    steps = np.flatnonzero(np.any(np.abs(apart) > CELL_STEP * np.maximum(noise, 1e-9), axis=1)) + 1
-    edges = np.concatenate(([0], steps, [len(values)]))
-    out = loads.copy()
-    measured = []
-    for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        part = values[a:b]
-        last = at[b] if b < len(at) else len(loads)
-        if b - a < CELL_VALUES:
-            continue
-        centred = part - part.mean(axis=0)
-        memory = np.abs((centred[1:] * centred[:-1]).sum(axis=0)) / np.maximum((centred**2).sum(axis=0), 1e-300)
-        if np.any(memory[noise > 0.0] > max(CELL_WHITE, 4.0 / math.sqrt(b - a))):
-            continue
-        lengths = np.diff(np.append(at[a:b], last))
-        out[at[a] : last] = (part * lengths[:, None]).sum(axis=0) / lengths.sum()
-        sd = np.sqrt((centred**2).mean(axis=0) / (b - a))
-        measured.append(MeasuredLoad(int(at[a]), int(last), sd))
-    return out, tuple(measured)
 
 
 def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:

@@ -1,0 +1,358 @@
+"""What hung on the link, if it is not what was noted: three numbers for each time between two changes of the load.
+
+A movement of the plate that another constant load makes, from one change to the next, is a wrong note. An effect of the
+catalogue moves the plate in proportion to the loads, more or less: so a few wrong notes stand out beside it. If all
+notes are wrong (rounded), other loads leave next to nothing of the movement.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.model.plate.linear import design_matrix
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.model.simulation.simulator import ForwardModel
+from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
+from psd_deflection.studies.loads.noted_times import ordinal, unnoted_steps
+
+BoolArray = npt.NDArray[np.bool_]
+DOTS = list(DOT_CHANNELS)
+
+LONG_S = 1.0
+"""Between two changes of the load there is at least this time, or it is a sweep."""
+FEWEST = 4
+"""Times between changes that a judgement needs."""
+FEWEST_RIGHT = 6
+"""Of which so many must agree for another one to be wrong: what effects do to the loads takes four numbers an axis."""
+TOLERANCE, SHARE = 0.3, 0.01
+"""N and N m, and share of the load, by which effects other than in proportion to the load may seem to change it."""
+STANDS_OUT = 3.0
+"""A few wrong notes must exceed that so many times."""
+SOFTER, OFFSET = 0.1, 0.5
+"""Standard deviations of what effects do to a load: share, and N or N m."""
+ROUNDS = 4
+"""Simulations until what hung is exact."""
+STEPS = (1.0, 2.0, 5.0, 10.0)
+"""N and N m to which people round loads."""
+LEAST_STEP = 0.1
+"""Share of the step, rms, by which rounded forces are off at least: on average 0.29."""
+CLOSES = 0.2
+"""Free loads must leave less than this share of the movement."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plateau:
+    """One time between two changes of the load: samples ``first`` to ``last`` of recording ``recording``.
+
+    ``number``: of the noted change that began it, from 1; 0 before the first. ``unnoted``: nothing was noted when it
+    began. ``noted`` (3,): N, N, N m.
+    """
+
+    recording: int
+    first: int
+    last: int
+    number: int
+    unnoted: bool
+    noted: FloatArray
+
+    def of(self, loads: FloatArray) -> FloatArray:
+        """(3,): the load in its middle, of ``loads`` (n, 3)."""
+        return np.asarray(loads[(self.first + self.last) // 2])
+
+
+def plateaus(rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0) -> list[Plateau]:
+    """The times between changes of ``loads`` (n, 3), also between those that only the motion shows.
+
+    ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost. ``recording``: which one it is.
+    """
+    period = 1.0 / rig.converter.sample_rate_hz
+    changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
+    # A load that was applied slowly changes from sample to sample: what counts is its end.
+    ends = changed[np.append(np.diff(changed) > 1, True)].tolist() if len(changed) else []
+    dots = volts[:, DOTS] * rig.sensitivities.ravel()
+    unnoted = [round(t / period) for t in unnoted_steps(rig, dots, loads)]
+    starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unnoted)])
+    stops = np.append(np.union1d(changed, unnoted), len(loads))
+    out, number = [], 0
+    for first, alone in starts:
+        number += not alone and first > 0
+        last = int(stops[np.searchsorted(stops, first, side='right')])
+        if (last - first) * period >= LONG_S:
+            out.append(Plateau(recording, first, last, number, alone, loads[(first + last) // 2].copy()))
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlateauLoads:
+    """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the noted one, N, N, N m.
+
+    ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
+    """
+
+    plateaus: tuple[Plateau, ...]
+    more: FloatArray
+    rest: FloatArray
+    moved: FloatArray
+
+    @property
+    def noted(self) -> FloatArray:
+        """(k, 3) N, N, N m."""
+        return np.array([p.noted for p in self.plateaus])
+
+
+def moved_plate(rig: Rig, volts: FloatArray, there: FloatArray) -> FloatArray:
+    """The plate's movement (3, m), m, m, rad, of readings (6, m), V; NaN where one is missing (``there`` 0)."""
+    dots = volts[DOTS] * rig.sensitivities.reshape(4, 1)
+    out = np.linalg.pinv(design_matrix(rig.centers + rig.zeros)) @ dots
+    out[:, (there[DOTS] <= 0.0).any(axis=0)] = np.nan
+    return np.asarray(out)
+
+
+def asked_for(rig: Rig, moved: FloatArray, samples: int, size: int, listed: Sequence[Plateau]) -> PlateauLoads:
+    """The loads that a movement of the plate asks for: ``moved`` (3, m), m, m, rad, measured minus simulated.
+
+    Of a recording of so many ``samples``, in means of ``size``; NaN where a reading is missing.
+    """
+    compliance = np.diag(LinkStatics.from_rig(rig).compliance)
+    there: BoolArray = np.isfinite(moved).all(axis=0) & _held(listed, samples, size, moved.shape[1])
+    more, rest = np.zeros((len(listed), 3)), np.full_like(moved, np.nan)
+    for axis in range(3):
+        columns = np.array(
+            [np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in _pulses(rig, samples, listed, axis))]
+        )
+        found = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
+        more[:, axis] = found[1:] / compliance[axis]
+        rest[axis, there] = moved[axis, there] - found @ columns[:, there]
+    # What the first time has is an offset, which all have.
+    return PlateauLoads(tuple(listed), more, rest, np.where(there, moved, np.nan))
+
+
+def _held(listed: Sequence[Plateau], samples: int, size: int, blocks: int) -> BoolArray:
+    inside = np.zeros(samples, dtype=bool)
+    for p in listed:
+        inside[p.first : p.last] = True
+    return np.asarray(inside[: blocks * size].reshape(blocks, size).all(axis=1))
+
+
+def _pulses(rig: Rig, samples: int, listed: Sequence[Plateau], axis: int) -> list[FloatArray]:
+    """How the link moves, as a share, if a load acts in one of the plateaus after the first."""
+    d, period = rig.dynamics, 1.0 / rig.converter.sample_rate_hz
+    mode = (
+        (d.torsion_frequency, d.torsion_damping_ratio) if axis == 2 else (d.bending_frequency, d.bending_damping_ratio)
+    )
+    out = []
+    for p in listed:
+        acts = np.zeros(samples)
+        if p.first > 0:
+            acts[p.first : p.last] = 1.0
+        out.append(Filter(mode_coefficients(*mode, period))(acts))
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class StandingOut:
+    """``gone``: plateaus with another load than noted. ``softer``: the share by which effects may change the others."""
+
+    gone: tuple[int, ...] = ()
+    softer: float = 0.0
+
+
+def stand_out(found: PlateauLoads) -> StandingOut:
+    """The few plateaus with another load than noted; none if it is none or are many."""
+    count = len(found.plateaus)
+    if np.abs(found.more).max(initial=0.0) < STANDS_OUT * TOLERANCE or not _closes(found):
+        return StandingOut()
+    # Two wrong ones of seven leave too few to tell what effects do: only beside loads that are right as noted.
+    for size, softer in ((1, 0.0), (2, 0.0), (1, SOFTER)):
+        if count - size < FEWEST_RIGHT:
+            continue
+        tried = []
+        for gone in itertools.combinations(range(1, count), size):
+            apart = _apart(found, gone, softer)
+            rest = np.delete(apart, gone)
+            if rest.max() <= 1.0 and apart[list(gone)].min() > max(STANDS_OUT, 5.0 * rest.max()):
+                tried.append((float(rest.max()), gone))
+        if tried:
+            return StandingOut(min(tried)[1], softer)
+    return StandingOut()
+
+
+def instead(found: PlateauLoads, which: StandingOut) -> list[tuple[int, FloatArray]]:
+    """Those plateaus, and by what (3,) N, N, N m the load of each differs from the noted one."""
+    slopes, offset = _proportion(found, which.gone, which.softer)
+    out = []
+    for k in which.gone:
+        own = found.more[k] - found.noted[k] @ slopes - offset
+        out.append((k, np.linalg.solve((np.eye(3) + slopes).T, own)))
+    return out
+
+
+def _proportion(found: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
+    """What effects do to all loads but ``gone``: (3, 3) and (3,), the likeliest if it is a share of ``softer``."""
+    if softer == 0.0:
+        return np.zeros((3, 3)), np.zeros(3)
+    keep = np.setdiff1d(np.arange(len(found.plateaus)), gone)
+    x = np.column_stack((found.noted[keep], np.ones(len(keep))))
+    prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
+    both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ found.more[keep]), dtype=np.float64)
+    return both[:3], both[3]
+
+
+def _apart(found: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
+    """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
+    slopes, offset = _proportion(found, gone, softer)
+    off = np.abs(found.more - found.noted @ slopes - offset)
+    allowed = TOLERANCE + SHARE * np.abs(found.noted).max(axis=1, keepdims=True)
+    return np.asarray((off / allowed).max(axis=1))
+
+
+def all_free(found: PlateauLoads, loads: FloatArray) -> bool:
+    """Whether other loads than noted, at most of the times, leave next to nothing of the movement.
+
+    ``loads`` (n, 3): as the movement of ``found`` counts them; those that were already put right differ from the noted.
+    """
+    if len(found.plateaus) < FEWEST or not _closes(found):
+        return False
+    return int(np.count_nonzero(_apart(found, (), SOFTER) > 1.0)) >= 2 or _rounded(found, loads)
+
+
+def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
+    """Whether the noted loads are what hung, rounded to a whole step: off by up to half of it, and by no less.
+
+    An effect of the catalogue changes loads by little against such a step, or in proportion to them.
+    """
+    hung = np.array([p.of(loads) for p in found.plateaus]) + found.more
+    held = np.any(found.noted != 0.0, axis=1)
+    if np.count_nonzero(held) < FEWEST:
+        return False
+    off, noted = (hung - found.noted)[held], found.noted[held]
+    steps = np.array([_step(noted[:, :2]), _step(noted[:, :2]), _step(noted[:, 2:])])
+    if np.any(np.abs(off) > (0.5 + SHARE) * steps):
+        return False
+    return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > LEAST_STEP * float(steps[0])
+
+
+def _step(noted: FloatArray) -> float:
+    """The largest step of which all ``noted`` numbers are multiples; infinity if all are 0, 0 if there is none."""
+    if not np.any(noted):
+        return np.inf
+    return max((s for s in STEPS if np.allclose(noted, s * np.round(noted / s), atol=1e-6)), default=0.0)
+
+
+def _closes(found: PlateauLoads) -> bool:
+    """Whether other loads, constant between changes, leave next to nothing of the movement."""
+    return _rms(found.rest) < CLOSES * _rms(found.moved)
+
+
+def _rms(part: FloatArray) -> float:
+    there = np.isfinite(part).all(axis=0)
+    centred = part[:, there] - part[:, there].mean(axis=1, keepdims=True)
+    # An angle counts by what it moves at a tenth of a metre.
+    return float(np.sqrt(np.mean((centred * np.array([[1.0], [1.0], [0.1]])) ** 2)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WrongNote:
+    """A load that was noted wrong, or not at all: ``hung`` (3,) N, N, N m in ``plateau``. ``period``: s from one sample
+    to the next.
+    """
+
+    plateau: Plateau
+    hung: FloatArray
+    period: float
+
+    @property
+    def name(self) -> str:
+        """Of the finding."""
+        return 'missing_load' if self.plateau.unnoted else 'load_value'
+
+    @property
+    def where(self) -> str:
+        """``load 3``, or when it was hung."""
+        p = self.plateau
+        return f'{p.first * self.period:.3f} s' if p.unnoted else f'load {p.number}'
+
+    @property
+    def value(self) -> tuple[float, ...]:
+        """What hung: N, N, N m."""
+        return tuple(self.hung.tolist())
+
+    @property
+    def off(self) -> FloatArray:
+        """(3,): by what it differs from the noted load, N, N, N m."""
+        return np.asarray(np.abs(self.hung - self.plateau.noted))
+
+    @property
+    def size(self) -> float:
+        """The largest of these."""
+        return float(self.off.max())
+
+    def words(self, name: str) -> str:
+        """What was wrong, and what to do; ``name``: of the recording."""
+        p = self.plateau
+        return (
+            f'{_begun(p, name)}: from {p.first * self.period:.3f} s to {p.last * self.period:.3f} s '
+            f'({_worded(self.hung)}) hung, not ({_worded(p.noted)}): note that'
+        )
+
+
+def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNote]:
+    """The few loads of a recording that are not what hung, of a rig that is nearly as its file says.
+
+    ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, at the times at which
+    they acted. Effects of the catalogue are no reason: they change all loads in proportion, more or less.
+    """
+    period = 1.0 / rig.converter.sample_rate_hz
+    listed = plateaus(rig, volts, loads)
+    if len(listed) <= FEWEST_RIGHT:
+        return []
+    found = _simulated(rig, volts, loads, listed)
+    which = stand_out(found)
+    out = [WrongNote(p, p.noted, period) for p in listed]
+    # A load that is far off moves the dots to where the detectors are not linear.
+    for _ in range(ROUNDS if which.gone else 0):
+        for k, more in instead(found, which):
+            out[k] = replace(out[k], hung=out[k].hung + more)
+        acting = [replace(p, noted=note.hung) for p, note in zip(listed, out, strict=True)]
+        found = _simulated(rig, volts, as_hung(loads, out), acting)
+    return [out[k] for k in which.gone]
+
+
+def _simulated(rig: Rig, volts: FloatArray, loads: FloatArray, listed: Sequence[Plateau]) -> PlateauLoads:
+    """The loads that ``volts`` (n, 6) ask for, held against the simulation under ``loads``."""
+    size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
+    difference = (volts - ForwardModel(rig).expect(loads).volts.T).T
+    there = np.isfinite(difference).astype(np.float64)
+    means = fine_means(np.where(there > 0.0, difference, 0.0), size, there)
+    return asked_for(rig, moved_plate(rig, means, fine_means(there, size)), len(loads), size, listed)
+
+
+def as_hung(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:
+    """``loads`` (n, 3) with what hung in place of what was noted."""
+    out = loads.copy()
+    for note in wrong:
+        out[note.plateau.first : note.plateau.last] = note.hung
+    return out
+
+
+def _begun(p: Plateau, name: str) -> str:
+    if not p.unnoted:
+        return f'the {ordinal(p.number)} load of {name} was noted wrong'
+    after = f' after the {ordinal(p.number)} noted load' if p.number else ''
+    return f'something was hung or taken off{after} of {name} and not noted'
+
+
+def _worded(load: FloatArray) -> str:
+    # Without a minus before nothing.
+    return ', '.join(f'{round(v, 2) + 0.0:g} {unit}' for v, unit in zip(load.tolist(), UNITS, strict=True))
+
+
+UNITS = ('N', 'N', 'N m')
