@@ -9,6 +9,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from psd_deflection.studies.discover.setup.hung import swaying as swaying_of
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
 from psd_deflection.studies.loads.noted_times import SETTLED_S, MendedLoads, shifts
-from psd_deflection.studies.loads.plateaus import Plateau, instead, stand_out
+from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_hung, noted_wrong
 
 MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
@@ -155,18 +156,17 @@ def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Worksp
             cut = [_without_swaying(o, i, swaying) for i, o in enumerate(workspace.observations)]
             workspace = beside(workspace, cut, recorded.known)
         observations = list(workspace.observations)
-        for plateau, more in wrong:
-            o = observations[plateau.recording]
-            loads = o.loads.copy()
-            loads[plateau.first : plateau.last] += more
-            observations[plateau.recording] = dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed())
+        for i, o in enumerate(observations):
+            own = [n for n in wrong if n.plateau.recording == i]
+            if own:
+                observations[i] = dataclasses.replace(o, loads=as_hung(o.loads, own), digest=o.digest or o.hashed())
         if swaying or wrong:
             workspace = beside(workspace, observations, recorded.known)
             recorded = replace(
                 recorded,
                 observations=workspace.observations,
                 findings=(*findings, *recorded.findings),
-                wrong=tuple(p for p, _ in wrong),
+                wrong=tuple(n.plateau for n in wrong),
                 stated_gap=recorded.stated_gap or gap,
             )
     return recorded, freed(recorded, workspace)
@@ -181,15 +181,22 @@ def _stated_floor(workspace: Workspace) -> float:
     return float(np.sqrt(np.mean(np.square(dots))))
 
 
-def _not_as_noted(
-    workspace: Workspace, difference: Sequence[FloatArray]
-) -> tuple[list[Swaying], list[tuple[Plateau, FloatArray]]]:
-    sways, wrong = list[Swaying](), list[tuple[Plateau, FloatArray]]()
+def _not_as_noted(workspace: Workspace, difference: Sequence[FloatArray]) -> tuple[list[Swaying], list[WrongNote]]:
+    sways, wrong = list[Swaying](), list[WrongNote]()
     for i, (o, part) in enumerate(zip(workspace.observations, difference, strict=True)):
         found = levels(workspace, i, part, times(o, i))
         sways += swaying_of(workspace, i, part, found)
-        wrong += [(found.plateaus[k], more) for k, more in instead(found, stand_out(found))]
+        wrong += noted_wrong(o.loads, o.period, partial(_asked, workspace, i, found))
     return sways, wrong
+
+
+def _asked(workspace: Workspace, i: int, found: PlateauLoads, acting: FloatArray) -> PlateauLoads:
+    """The loads that recording ``i`` asks for under ``acting`` ones; ``found``: under those that it has."""
+    o = workspace.observations[i]
+    if acting is o.loads:
+        return found
+    moved = workspace.loaded(i, acting)
+    return levels(workspace, i, moved.residual(moved.base)[1][i], found.plateaus)
 
 
 def _without_swaying(o: Observation, recording: int, swaying: Sequence[Swaying]) -> Observation:

@@ -8,7 +8,7 @@ notes are wrong (rounded), other loads leave next to nothing of the movement.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,8 +38,10 @@ STANDS_OUT = 3.0
 """A few wrong notes must exceed that so many times."""
 SOFTER, OFFSET = 0.1, 0.5
 """Standard deviations of what effects do to a load: share, and N or N m."""
-ROUNDS = 4
-"""Simulations until what hung is exact."""
+FAR, FAR_SHARE = 2.0, 0.1
+"""N and N m, and share of the load: what is off by more is simulated as the readings say."""
+BENT = 0.1
+"""Share of a wrong load that the others seem to be off by before it is simulated."""
 STEPS = (1.0, 2.0, 5.0, 10.0)
 """N and N m to which people round loads."""
 LEAST_STEP = 0.1
@@ -165,34 +167,30 @@ class StandingOut:
     softer: float = 0.0
 
 
-def stand_out(found: PlateauLoads) -> StandingOut:
-    """The few plateaus with another load than noted; none if it is none or are many."""
+def stand_out(found: PlateauLoads, bent: float = 0.0) -> StandingOut:
+    """The few plateaus with another load than noted; none if it is none or are many.
+
+    ``bent``: share of what is wrong by which the others may seem to be, too.
+    """
     count = len(found.plateaus)
-    if np.abs(found.more).max(initial=0.0) < STANDS_OUT * TOLERANCE or not _closes(found):
+    if np.abs(found.more).max(initial=0.0) < STANDS_OUT * TOLERANCE or not _closes(found, CLOSES + bent):
         return StandingOut()
     # Two wrong ones of seven leave too few to tell what effects do: only beside loads that are right as noted.
     for size, softer in ((1, 0.0), (2, 0.0), (1, SOFTER)):
         if count - size < FEWEST_RIGHT:
             continue
-        tried = []
+        fitting, tried = 0, []
         for gone in itertools.combinations(range(1, count), size):
             apart = _apart(found, gone, softer)
-            rest = np.delete(apart, gone)
-            if rest.max() <= 1.0 and apart[list(gone)].min() > max(STANDS_OUT, 5.0 * rest.max()):
-                tried.append((float(rest.max()), gone))
-        if tried:
+            rest, least = float(np.delete(apart, gone).max()), float(apart[list(gone)].min())
+            if rest <= 1.0 + bent * least:
+                fitting += 1
+                if least > max(STANDS_OUT, 5.0 * rest):
+                    tried.append((rest, gone))
+        # If the others are in proportion whichever is left out, nobody knows which one is wrong.
+        if tried and (softer == 0.0 or fitting == 1):
             return StandingOut(min(tried)[1], softer)
     return StandingOut()
-
-
-def instead(found: PlateauLoads, which: StandingOut) -> list[tuple[int, FloatArray]]:
-    """Those plateaus, and by what (3,) N, N, N m the load of each differs from the noted one."""
-    slopes, offset = _proportion(found, which.gone, which.softer)
-    out = []
-    for k in which.gone:
-        own = found.more[k] - found.noted[k] @ slopes - offset
-        out.append((k, np.linalg.solve((np.eye(3) + slopes).T, own)))
-    return out
 
 
 def _proportion(found: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
@@ -247,9 +245,9 @@ def _step(noted: FloatArray) -> float:
     return max((s for s in STEPS if np.allclose(noted, s * np.round(noted / s), atol=1e-6)), default=0.0)
 
 
-def _closes(found: PlateauLoads) -> bool:
+def _closes(found: PlateauLoads, share: float = CLOSES) -> bool:
     """Whether other loads, constant between changes, leave next to nothing of the movement."""
-    return _rms(found.rest) < CLOSES * _rms(found.moved)
+    return _rms(found.rest) < share * _rms(found.moved)
 
 
 def _rms(part: FloatArray) -> float:
@@ -310,29 +308,46 @@ def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNot
     ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, at the times at which
     they acted. Effects of the catalogue are no reason: they change all loads in proportion, more or less.
     """
-    period = 1.0 / rig.converter.sample_rate_hz
     listed = plateaus(rig, volts, loads)
-    if len(listed) <= FEWEST_RIGHT:
-        return []
-    found = _simulated(rig, volts, loads, listed)
-    which = stand_out(found)
-    out = [WrongNote(p, p.noted, period) for p in listed]
-    # A load that is far off moves the dots to where the detectors are not linear.
-    for _ in range(ROUNDS if which.gone else 0):
-        for k, more in instead(found, which):
-            out[k] = replace(out[k], hung=out[k].hung + more)
-        acting = [replace(p, noted=note.hung) for p, note in zip(listed, out, strict=True)]
-        found = _simulated(rig, volts, as_hung(loads, out), acting)
-    return [out[k] for k in which.gone]
-
-
-def _simulated(rig: Rig, volts: FloatArray, loads: FloatArray, listed: Sequence[Plateau]) -> PlateauLoads:
-    """The loads that ``volts`` (n, 6) ask for, held against the simulation under ``loads``."""
     size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
-    difference = (volts - ForwardModel(rig).expect(loads).volts.T).T
-    there = np.isfinite(difference).astype(np.float64)
-    means = fine_means(np.where(there > 0.0, difference, 0.0), size, there)
-    return asked_for(rig, moved_plate(rig, means, fine_means(there, size)), len(loads), size, listed)
+
+    def asked(acting: FloatArray) -> PlateauLoads:
+        difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
+        there = np.isfinite(difference).astype(np.float64)
+        means = fine_means(np.where(there > 0.0, difference, 0.0), size, there)
+        return asked_for(rig, moved_plate(rig, means, fine_means(there, size)), len(loads), size, listed)
+
+    return noted_wrong(loads, 1.0 / rig.converter.sample_rate_hz, asked)
+
+
+def noted_wrong(loads: FloatArray, period: float, asked: Callable[[FloatArray], PlateauLoads]) -> list[WrongNote]:
+    """The same of any simulation: ``asked`` holds the recording against that under other loads (n, 3)."""
+    first = asked(loads)
+    if np.abs(first.more).max(initial=0.0) < STANDS_OUT * TOLERANCE:
+        return []
+    # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
+    # the readings themselves say hung is simulated, then judged.
+    noted = first.noted
+    said = asked(np.zeros_like(loads)).more
+    far = np.abs(said - noted).max(axis=1) > FAR + FAR_SHARE * np.abs(said).max(axis=1)
+    hung = np.where(far[:, None], said, noted)
+
+    def against() -> PlateauLoads:
+        off = np.flatnonzero((hung != noted).any(axis=1)).tolist()
+        found = asked(as_hung(loads, [WrongNote(first.plateaus[k], hung[k], period) for k in off]))
+        return replace(found, more=found.more + hung - noted, moved=first.moved)
+
+    found = against()
+    which = stand_out(found, BENT)
+    for bent in (0.2 * BENT, 0.0, 0.0, 0.0):
+        if not which.gone:
+            return []
+        slopes, offset = _proportion(found, which.gone, which.softer)
+        for k in which.gone:
+            hung[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + found.more[k] - offset)
+        found = against()
+        which = stand_out(found, bent)
+    return [WrongNote(first.plateaus[k], hung[k], period) for k in which.gone]
 
 
 def as_hung(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:

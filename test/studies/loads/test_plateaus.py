@@ -100,6 +100,50 @@ def test_two_wrong_notes_of_eight_are_found_beside_an_effect_only_if_enough_are_
     assert wrong_notes(RIG, QUIET[: 6 * DWELL], TWICE[: 6 * DWELL]) == []
 
 
+@pytest.mark.parametrize(
+    ('number', 'load'),
+    [
+        pytest.param(5, (40, -80, 20), id='one axis'),
+        pytest.param(5, (-40, -40, 20), id='a sign'),
+        pytest.param(7, (0, -50, 0), id='the last'),
+        pytest.param(1, (0, -200, 0), id='ten times as much, beyond the detectors'),
+        pytest.param(3, (0, -50, -290), id='a torque ten times as large'),
+        pytest.param(2, (0, -5.1, 0), id='kilograms'),
+    ],
+)
+def test_a_note_that_is_far_off_is_wrong_however_far(number: int, load: tuple[float, float, float]) -> None:
+    (note,) = wrong_notes(RIG, QUIET, noted_as(number, load))
+    assert note.where == f'load {number}'
+    assert note.hung == pytest.approx(LEVELS[number], abs=0.1)
+    assert note.size == pytest.approx(np.abs(LEVELS[number] - load).max(), abs=0.1)
+
+
+def test_of_loads_that_follow_each_other_both_are_found() -> None:
+    both = noted_as(5, (40, -80, 20))
+    both[4 * DWELL : 5 * DWELL] = (0, 0, 0)
+    assert [n.where for n in wrong_notes(RIG, QUIET, both)] == ['load 4', 'load 5']
+
+
+def test_nobody_is_accused_if_another_load_may_be_the_wrong_one() -> None:
+    # Without the third load a soft link would explain the fourth, which is 1.5 N off.
+    assert wrong_notes(RIG, QUIET, noted_as(4, (28.5, 0, 0))) == []
+    three = noted_as(5, (40, -80, 20))
+    three[4 * DWELL : 5 * DWELL] = (60, 0, 0)
+    three[6 * DWELL : 7 * DWELL] = (0, 0, 0)
+    assert wrong_notes(RIG, QUIET, three) == []
+
+
+def test_beside_an_effect_what_hung_is_told_as_if_there_were_none() -> None:
+    long = np.concatenate((LEVELS[:-1], LEVELS[1:]))
+    hung = np.repeat(long, DWELL, axis=0)
+    noted = hung.copy()
+    noted[5 * DWELL : 6 * DWELL] = (40, -80, 20)
+    soft = read(hung, link__youngs_modulus=0.95 * RIG.link.youngs_modulus)
+    (note,) = wrong_notes(RIG, soft, noted)
+    assert note.where == 'load 5'
+    assert note.hung == pytest.approx((40.0, -40.0, 20.0), abs=0.3)
+
+
 def test_lost_samples_are_no_load() -> None:
     lost = QUIET.copy()
     lost[5 * DWELL + 1000 : 5 * DWELL + 1500] = np.nan

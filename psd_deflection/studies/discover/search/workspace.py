@@ -216,12 +216,16 @@ class Workspace(Comparison):
 
     def _loaded(self, more: Sequence[tuple[LoadDirection, float]]) -> Self:
         """With the loads changed."""
-        observations = list(self.observations)
+        out = self
         for d, size in more:
-            o = observations[d.recording]
-            observations[d.recording] = dataclasses.replace(
-                o, loads=o.loads + d.more(size), digest=o.digest or o.hashed()
-            )
+            out = out.loaded(d.recording, out.observations[d.recording].loads + d.more(size))
+        return out
+
+    def loaded(self, recording: int, loads: FloatArray) -> Self:
+        """With other ``loads`` (n, 3) N, N, N m of one recording."""
+        observations = list(self.observations)
+        o = observations[recording]
+        observations[recording] = dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed())
         return self.replaced(observations=tuple(observations))
 
     def settled(self, difference: Sequence[FloatArray]) -> Self:
