@@ -474,8 +474,6 @@ def _transitions(families: tuple[int, ...]) -> FloatArray:
     ``families``: numbers of rates of each kind, K together.
     """
     levels = sum(families)
-    if levels == 1:
-        return np.ones((1, 1))
     out = np.full((levels, levels), JUMPS / levels)
     first = 0
     for count in families:

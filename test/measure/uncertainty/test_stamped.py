@@ -122,6 +122,15 @@ def test_the_mean_of_fewer_samples_is_less_sure_by_their_number() -> None:
     np.testing.assert_allclose(stamped.mean_variances(5), 4.0 * whole, rtol=1e-12)
 
 
+def test_some_of_the_psds_have_their_own_noise() -> None:
+    noise = {'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [9e-3, 9e-3], 'psd_3.noise': [3e-3, 5e-3]}
+    stamped = StampedDots(rig_of(3, noise, **{'converter.bits': 24}))
+    some = stamped.some((0, 2), 'tied')
+    fitted = stamped.fit_some(some, ALL, np.zeros((20, 6)))
+    variances = np.diagonal(fitted.covariance)
+    np.testing.assert_allclose(np.sqrt(variances / variances[0]), [1.0, 2.0, 3.0, 5.0], rtol=1e-3)
+
+
 @pytest.mark.parametrize(('covariance', 'times'), [('file', 1.0), ('measured', 16.0)])
 @pytest.mark.parametrize('psds', [2, 3])
 def test_while_noise_is_unknown_readings_may_contradict_each_other_more(

@@ -7,7 +7,7 @@ import pytest
 
 from psd_deflection.measure.estimation import SYSTEMATIC, ZERO_VARIANCES
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.model.misalignment.model import COUNT, INDEX, readings
+from psd_deflection.model.misalignment.model import COUNT, INDEX, readings, response_of
 from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
 from psd_deflection.model.misalignment.spread import ParameterSpread
 from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record, TipMotion
@@ -91,6 +91,40 @@ def test_the_polynomial_is_what_it_stands_for() -> None:
         wanted = slopes @ known_of_rig(rig).covariance @ slopes.T
         factor = spread.factor(dx, dy, theta)
         assert factor @ factor.T == pytest.approx(wanted, rel=2e-3, abs=1e-3 * float(np.diag(wanted).max()))
+
+
+def test_the_dots_move_as_those_that_are_corrected_by_detectors_that_bend_their_readings() -> None:
+    from psd_deflection.model.misalignment.spread import dots_by_parameters
+
+    p = vector_of_rig(calibrated()).as_used.copy()
+    for name, value in (('psd_1.nonlinearity', 300.0), ('psd_2.nonlinearity', -200.0), ('psd_1.rotation', 0.02)):
+        p[INDEX[name]] = value
+    poses = np.array([[3e-3, -2e-3], [1e-3, 3e-3], [0.03, -0.02]])
+    found = dots_by_parameters(p, poses, 0.585)
+    for name, step in (
+        ('psd_1.gain_x', 1e-5),
+        ('psd_2.gain_y', 1e-5),
+        ('psd_1.center_y', 1e-7),
+        ('psd_2.rotation', 1e-6),
+    ):
+        after, before = p.copy(), p.copy()
+        after[INDEX[name]] += step
+        before[INDEX[name]] -= step
+        ends = [readings(q, poses, 0.585) for q in (after, before)]
+        places = [
+            np.stack([axis for psd in (0, 1) for axis in response_of(p, psd).place(r[2 * psd], r[2 * psd + 1])])
+            for r in ends
+        ]
+        moved = (places[0] - places[1]) / (2.0 * step)
+        assert found[:, :, INDEX[name]] == pytest.approx(moved.T, rel=1e-5, abs=1e-7)
+
+
+def test_parameters_that_only_go_together_count_once() -> None:
+    p = vector_of_rig(calibrated()).as_used
+    together = np.random.default_rng(3).normal(size=(COUNT, 2)) * 1e-4
+    factor = ParameterSpread(p, together @ together.T, 0.585).factor(*POSE)
+    assert factor.shape == (4, 2)
+    assert np.isfinite(factor).all()
 
 
 def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
