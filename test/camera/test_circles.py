@@ -174,6 +174,7 @@ def test_a_small_thing_beside_a_disc_is_noticed_in_a_large_image() -> None:
         (Status.DOUBLED, Scene(discs=4, radius=0.006, spacing=0.018)),
         (Status.SMALL, Scene(distance=5.0)),
         (Status.DEFOCUSED, Scene(blur=9.0)),
+        (Status.OBLIQUE, Scene(tilt=(0.0, 1.1))),
     ],
 )
 def test_what_cannot_be_measured_is_refused_with_the_reason(status: Status, scene: Scene) -> None:

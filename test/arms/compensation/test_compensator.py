@@ -329,6 +329,14 @@ def test_positions_that_were_old_when_they_came_are_not_new(arm: Arm) -> None:
     assert loop.send(loop.t + PERIOD).why == 'no positions of the joints for 0.08 s'
 
 
+def test_a_deflection_that_was_old_when_it_came_is_not_new(arm: Arm) -> None:
+    loop = following(arm)
+    now = loop.t + PERIOD
+    loop.compensator.observe(now, seen(loop, t=now, age=0.07))
+    loop.compensator.joints(now + PERIOD, loop.plant.angles)
+    assert loop.send(now + PERIOD).why == 'no deflection for 0.08 s'
+
+
 def test_offsets_that_are_held_for_long_go_back_to_zero(arm: Arm) -> None:
     loop = following(arm)
     held = np.abs(loop.offsets).max()

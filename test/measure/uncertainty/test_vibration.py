@@ -221,3 +221,12 @@ def test_info_says_what_vibrates(tmp_path: Path, capsys: pytest.CaptureFixture[s
     capsys.readouterr()
     assert main(['info', str(tmp_path / 'quiet.csv'), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['vibration'] is None
+
+
+def test_the_floor_of_a_bin_is_that_of_its_own_frequency() -> None:
+    """Of power that grows in proportion to the frequency it is the power itself, between the middles of groups."""
+    search = ToneSearch(SIZE, SEGMENT_BLOCKS)
+    power = np.arange(N // 2 + 1, dtype=np.float64)[:, None]
+    floor = np.log(2.0) * search._floor(power)
+    inside = slice(search._start + 100, -200)
+    np.testing.assert_allclose(floor[inside], power[inside], atol=0.6)
