@@ -37,6 +37,8 @@ MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
 FREE_MOMENTS = 40.0
 """How far fitted times may be off: 10 samples, in the quarters of one by which they are shifted."""
+MOST_AN_EFFECT_DOES = 0.5
+"""Share by which an effect may change a load."""
 MOST_MEASURED = 40
 """Measured loads of a recording whose errors are considered; each takes three simulations."""
 
@@ -186,7 +188,7 @@ def _not_as_noted(workspace: Workspace, difference: Sequence[FloatArray]) -> tup
     for i, (o, part) in enumerate(zip(workspace.observations, difference, strict=True)):
         found = levels(workspace, i, part, times(o, i))
         sways += swaying_of(workspace, i, part, found)
-        wrong += noted_wrong(o.loads, o.period, partial(_asked, workspace, i, found))
+        wrong += noted_wrong(o.loads, o.period, partial(_asked, workspace, i, found), MOST_AN_EFFECT_DOES)
     return sways, wrong
 
 

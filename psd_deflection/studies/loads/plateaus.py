@@ -7,7 +7,6 @@ notes are wrong (rounded), other loads leave next to nothing of the movement.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -15,16 +14,16 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.model.link import LinkStatics
-from psd_deflection.model.plate.linear import design_matrix
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
 from psd_deflection.studies.loads.noted_times import ordinal, unnoted_steps
+from psd_deflection.studies.loads.plate_motion import DOTS, across_plate, moved_plate
 
 BoolArray = npt.NDArray[np.bool_]
-DOTS = list(DOT_CHANNELS)
+IntArray = npt.NDArray[np.intp]
 
 LONG_S = 1.0
 """Between two changes of the load there is at least this time, or it is a sweep."""
@@ -36,12 +35,24 @@ TOLERANCE, SHARE = 0.3, 0.01
 """N and N m, and share of the load, by which effects other than in proportion to the load may seem to change it."""
 STANDS_OUT = 3.0
 """A few wrong notes must exceed that so many times."""
+EXACT, FEWEST_EXACT = 0.15, 5
+"""If that many others are within this share of the tolerance, those that exceed it so many times are wrong, too."""
+PLATE, PLATE_M = 0.05, 2e-7
+"""Then the readings are those of a plate: within this share of how far that load moves it, and so many metres."""
+AXES = np.array([1.0, 1.0, 0.1])
+"""An angle counts by what it moves at a tenth of a metre, m/rad."""
 SOFTER, OFFSET = 0.1, 0.5
 """Standard deviations of what effects do to a load: share, and N or N m."""
+MOST = 3.0
+"""They do no more than so many of them."""
 FAR, FAR_SHARE = 2.0, 0.1
 """N and N m, and share of the load: what is off by more is simulated as the readings say."""
 BENT = 0.1
 """Share of a wrong load that the others seem to be off by before it is simulated."""
+ANY = 1e9
+"""Nobody says how much an effect, a sign or a unit changes a load."""
+ALONE = 0.05
+"""A load of which the others leave more than this share is like none of them."""
 STEPS = (1.0, 2.0, 5.0, 10.0)
 """N and N m to which people round loads."""
 LEAST_STEP = 0.1
@@ -97,32 +108,36 @@ class PlateauLoads:
     """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the noted one, N, N, N m.
 
     ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
+    ``across`` (k,): how far the dots are then from where any movement of the plate would have them, m.
+    ``compliance`` (3,): m/N, m/N, rad/(N m).
     """
 
     plateaus: tuple[Plateau, ...]
     more: FloatArray
     rest: FloatArray
     moved: FloatArray
+    across: FloatArray
+    compliance: FloatArray
 
     @property
     def noted(self) -> FloatArray:
         """(k, 3) N, N, N m."""
         return np.array([p.noted for p in self.plateaus])
 
-
-def moved_plate(rig: Rig, volts: FloatArray, there: FloatArray) -> FloatArray:
-    """The plate's movement (3, m), m, m, rad, of readings (6, m), V; NaN where one is missing (``there`` 0)."""
-    dots = volts[DOTS] * rig.sensitivities.reshape(4, 1)
-    out = np.linalg.pinv(design_matrix(rig.centers + rig.zeros)) @ dots
-    out[:, (there[DOTS] <= 0.0).any(axis=0)] = np.nan
-    return np.asarray(out)
+    @property
+    def sizes(self) -> FloatArray:
+        """(k,): how far ``more`` moves the plate, m."""
+        return np.asarray(np.linalg.norm(self.more * self.compliance * AXES, axis=1))
 
 
-def asked_for(rig: Rig, moved: FloatArray, samples: int, size: int, listed: Sequence[Plateau]) -> PlateauLoads:
-    """The loads that a movement of the plate asks for: ``moved`` (3, m), m, m, rad, measured minus simulated.
+def asked_for(
+    rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: Sequence[Plateau]
+) -> PlateauLoads:
+    """The loads that readings ask for: ``difference`` (6, m), V, measured minus simulated.
 
-    Of a recording of so many ``samples``, in means of ``size``; NaN where a reading is missing.
+    Of a recording of so many ``samples``, in means of ``size``, of which the share ``count`` (6, m) is there.
     """
+    moved = moved_plate(rig, difference, count)
     compliance = np.diag(LinkStatics.from_rig(rig).compliance)
     there: BoolArray = np.isfinite(moved).all(axis=0) & _held(listed, samples, size, moved.shape[1])
     more, rest = np.zeros((len(listed), 3)), np.full_like(moved, np.nan)
@@ -133,8 +148,15 @@ def asked_for(rig: Rig, moved: FloatArray, samples: int, size: int, listed: Sequ
         found = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
         more[:, axis] = found[1:] / compliance[axis]
         rest[axis, there] = moved[axis, there] - found @ columns[:, there]
+    beside = np.where(there, across_plate(rig, difference), np.nan)
+    across = np.array([_mean(beside[p.first // size : p.last // size]) for p in listed])
     # What the first time has is an offset, which all have.
-    return PlateauLoads(tuple(listed), more, rest, np.where(there, moved, np.nan))
+    return PlateauLoads(tuple(listed), more, rest, np.where(there, moved, np.nan), across - across[:1], compliance)
+
+
+def _mean(values: FloatArray) -> float:
+    there = values[np.isfinite(values)]
+    return float(there.mean()) if len(there) else 0.0
 
 
 def _held(listed: Sequence[Plateau], samples: int, size: int, blocks: int) -> BoolArray:
@@ -167,30 +189,54 @@ class StandingOut:
     softer: float = 0.0
 
 
-def stand_out(found: PlateauLoads, bent: float = 0.0) -> StandingOut:
+def stand_out(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
     """The few plateaus with another load than noted; none if it is none or are many.
 
-    ``bent``: share of what is wrong by which the others may seem to be, too.
+    ``bent``: share of what is wrong by which the others may seem to be, too. ``largest``: share by which an effect, a
+    sign or another unit may change a load that no other is like.
     """
     count = len(found.plateaus)
-    if np.abs(found.more).max(initial=0.0) < STANDS_OUT * TOLERANCE or not _closes(found, CLOSES + bent):
+    if np.abs(found.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not _closes(found, CLOSES + bent):
         return StandingOut()
-    # Two wrong ones of seven leave too few to tell what effects do: only beside loads that are right as noted.
-    for size, softer in ((1, 0.0), (2, 0.0), (1, SOFTER)):
-        if count - size < FEWEST_RIGHT:
+    # A detector at fault moves its dots as no plate does.
+    as_plate = np.abs(found.across) <= PLATE * found.sizes + PLATE_M
+    off = _apart(found, (), 0.0)
+    order = np.argsort(-off, kind='stable')
+    for share, right, most in ((EXACT, FEWEST_EXACT, count - FEWEST_EXACT), (1.0, FEWEST_RIGHT, 2)):
+        for wrong in range(1, min(most, count - right) + 1):
+            gone = order[:wrong]
+            stands = _stands(off[gone] / share, off[order[wrong:]] / share, bent)
+            if stands and (share == 1.0 or as_plate[gone].all()) and _known(found, gone, largest):
+                return StandingOut(tuple(sorted(gone.tolist())))
+    # Two wrong ones of seven leave too few to tell what effects do.
+    fitting, tried = 0, []
+    for k in range(1, count if count > FEWEST_RIGHT else 0):
+        slopes, offset = _proportion(found, (k,), SOFTER)
+        if np.abs(slopes).max() > MOST * SOFTER or np.abs(offset).max() > MOST * OFFSET:
             continue
-        fitting, tried = 0, []
-        for gone in itertools.combinations(range(1, count), size):
-            apart = _apart(found, gone, softer)
-            rest, least = float(np.delete(apart, gone).max()), float(apart[list(gone)].min())
-            if rest <= 1.0 + bent * least:
-                fitting += 1
-                if least > max(STANDS_OUT, 5.0 * rest):
-                    tried.append((rest, gone))
-        # If the others are in proportion whichever is left out, nobody knows which one is wrong.
-        if tried and (softer == 0.0 or fitting == 1):
-            return StandingOut(min(tried)[1], softer)
-    return StandingOut()
+        apart = _apart(found, (k,), SOFTER)
+        others = np.delete(apart, k)
+        fitting += bool(others.max() <= 1.0 + bent * apart[k])
+        if _stands(apart[k : k + 1], others, bent) and _known(found, np.array([k]), largest):
+            tried.append(k)
+    # If the others are in proportion whichever is left out, nobody knows which one is wrong.
+    return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
+
+
+def _known(found: PlateauLoads, gone: IntArray, largest: float) -> bool:
+    """Whether the other loads say what effects in proportion do to those of ``gone``, or no effect does so much."""
+    noted = found.noted
+    right = np.delete(noted, gone, axis=0)
+    own = noted[gone]
+    rest = own - own @ np.linalg.pinv(right, rcond=ALONE) @ right
+    alike = np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(own, axis=1)
+    far = np.linalg.norm(found.more[gone], axis=1) > largest * np.linalg.norm(own, axis=1)
+    return bool(np.all(alike | far))
+
+
+def _stands(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
+    rest, least = float(others.max()), float(wrong.min())
+    return rest <= 1.0 + bent * least and least > max(STANDS_OUT, 5.0 * rest)
 
 
 def _proportion(found: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
@@ -253,8 +299,7 @@ def _closes(found: PlateauLoads, share: float = CLOSES) -> bool:
 def _rms(part: FloatArray) -> float:
     there = np.isfinite(part).all(axis=0)
     centred = part[:, there] - part[:, there].mean(axis=1, keepdims=True)
-    # An angle counts by what it moves at a tenth of a metre.
-    return float(np.sqrt(np.mean((centred * np.array([[1.0], [1.0], [0.1]])) ** 2)))
+    return float(np.sqrt(np.mean((centred * AXES[:, None]) ** 2)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -315,15 +360,20 @@ def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNot
         difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
         there = np.isfinite(difference).astype(np.float64)
         means = fine_means(np.where(there > 0.0, difference, 0.0), size, there)
-        return asked_for(rig, moved_plate(rig, means, fine_means(there, size)), len(loads), size, listed)
+        return asked_for(rig, means, fine_means(there, size), len(loads), size, listed)
 
     return noted_wrong(loads, 1.0 / rig.converter.sample_rate_hz, asked)
 
 
-def noted_wrong(loads: FloatArray, period: float, asked: Callable[[FloatArray], PlateauLoads]) -> list[WrongNote]:
-    """The same of any simulation: ``asked`` holds the recording against that under other loads (n, 3)."""
+def noted_wrong(
+    loads: FloatArray, period: float, asked: Callable[[FloatArray], PlateauLoads], largest: float = ANY
+) -> list[WrongNote]:
+    """The same of any simulation: ``asked`` holds the recording against that under other loads (n, 3).
+
+    ``largest``: share by which effects may change a load; signs and units are right then.
+    """
     first = asked(loads)
-    if np.abs(first.more).max(initial=0.0) < STANDS_OUT * TOLERANCE:
+    if not len(first.plateaus) or np.abs(first.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE:
         return []
     # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
     # the readings themselves say hung is simulated, then judged.
@@ -338,7 +388,7 @@ def noted_wrong(loads: FloatArray, period: float, asked: Callable[[FloatArray], 
         return replace(found, more=found.more + hung - noted, moved=first.moved)
 
     found = against()
-    which = stand_out(found, BENT)
+    which = stand_out(found, BENT, largest)
     for bent in (0.2 * BENT, 0.0, 0.0, 0.0):
         if not which.gone:
             return []
@@ -346,7 +396,7 @@ def noted_wrong(loads: FloatArray, period: float, asked: Callable[[FloatArray], 
         for k in which.gone:
             hung[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + found.more[k] - offset)
         found = against()
-        which = stand_out(found, bent)
+        which = stand_out(found, bent, largest)
     return [WrongNote(first.plateaus[k], hung[k], period) for k in which.gone]
 
 

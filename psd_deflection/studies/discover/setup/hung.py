@@ -18,15 +18,14 @@ from psd_deflection.studies.check.judges import note_finding
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.workspace import LoadDirection, Workspace
-from psd_deflection.studies.discover.setup.redundant import across_plate
 from psd_deflection.studies.loads.load_cell import MeasuredLoad
+from psd_deflection.studies.loads.plate_motion import across_plate
 from psd_deflection.studies.loads.plateaus import (
     FEWEST,
     Plateau,
     PlateauLoads,
     WrongNote,
     asked_for,
-    moved_plate,
     plateaus,
 )
 
@@ -71,8 +70,7 @@ def times(o: Observation, recording: int) -> list[Plateau]:
 def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Plateau]) -> PlateauLoads:
     """The loads that ``difference`` (6, m), V, measured minus simulated, asks for."""
     o = ws.observations[recording]
-    moved = moved_plate(o.rig, difference, ws.count[recording])
-    return asked_for(o.rig, moved, len(o.loads), ws.fine[recording], listed)
+    return asked_for(o.rig, difference, ws.count[recording], len(o.loads), ws.fine[recording], listed)
 
 
 def swaying(ws: Workspace, recording: int, difference: FloatArray, found: PlateauLoads) -> list[Swaying]:

@@ -11,17 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import eigh, null_space
+from scipy.linalg import eigh
 
-from psd_deflection.model.plate.linear import design_matrix
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, State, Values
 from psd_deflection.model.simulation.samples import SimulatedSamples
-from psd_deflection.records import DOT_CHANNELS, FloatArray
-from psd_deflection.rig.config import Rig
+from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.loads.plateaus import moved_plate
+from psd_deflection.studies.loads.plate_motion import DOTS, across_of, moved_plate
 
-DOTS = list(DOT_CHANNELS)
 CLIP = 6.0
 """Outliers of heavy-tailed noise count no more than so many standard deviations."""
 LIMIT = 5.0
@@ -52,20 +49,11 @@ class FourthReading:
         return self.chi_square - self.values < self.allowed
 
 
-def across_plate(rig: Rig, volts: FloatArray) -> FloatArray:
-    """What no movement of the plate makes (m,), m, of readings (6, m), V."""
-    return np.asarray(_across(rig) @ (volts[DOTS] * rig.sensitivities.reshape(4, 1)))
-
-
-def _across(rig: Rig) -> FloatArray:
-    return np.asarray(null_space(design_matrix(rig.centers + rig.zeros).T)[:, 0])
-
-
 def fourth(ws: Workspace, vectors: FloatArray) -> FloatArray:
     """What no movement of the plate makes of whitened ``vectors`` (k, D): (k, m), of unit variance if it is noise."""
     out = []
     for i, (o, noise) in enumerate(zip(ws.observations, ws.noise, strict=True)):
-        across = _across(o.rig) * o.rig.sensitivities.ravel() * noise.innovation[DOTS]
+        across = across_of(o.rig) * o.rig.sensitivities.ravel() * noise.innovation[DOTS]
         across = across / np.linalg.norm(across)
         rows = np.array([ws.split(v)[i][DOTS] for v in vectors])
         there = (ws.count[i][DOTS] > 0.0).all(axis=0)
