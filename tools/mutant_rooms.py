@@ -237,7 +237,7 @@ ROOMS: Mapping[str, Room] = {
     'tables': Room(
         (
             *(f'psd_deflection/recordings/{n}.py' for n in ('charts', 'estimates', 'sample_table', 'spans')),
-            'psd_deflection/studies/axes.py',
+            'psd_deflection/base/axes.py',
         ),
         ('test/recordings/test_charts.py', 'test/recordings/test_recording_window.py', 'test/test_api.py'),
         slow=('test/cli/test_validate.py', 'test/cli/test_identify.py'),

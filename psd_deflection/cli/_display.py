@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.errors import SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING
 from psd_deflection.cli._program import program
@@ -109,13 +110,9 @@ def live_line(session: Session, rate: float) -> str:
         # While the device sends nothing, an old estimate would look like a new one.
         body = 'no samples: the device is away' if session.acquisition.away else 'no samples come'
     elif estimate is not None:
-        sd = [math.sqrt(v) for v in estimate.variances]
-        mdeg = 1e3 * 180.0 / math.pi
-        body = (
-            f'ΔX {estimate.dx * 1e6:+9.2f} ± {sd[0] * 1e6:.2f} µm  '
-            f'ΔY {estimate.dy * 1e6:+9.2f} ± {sd[1] * 1e6:.2f} µm  '
-            f'θ {estimate.theta * mdeg:+9.2f} ± {sd[2] * mdeg:.2f} mdeg'
-        )
+        pose = estimate.dx, estimate.dy, estimate.theta
+        shown = zip(SYMBOLS, pose, estimate.variances, SHOWN, SHOWN_UNITS, strict=True)
+        body = '  '.join(f'{a} {v * by:+9.2f} ± {math.sqrt(var) * by:.2f} {unit}' for a, v, var, by, unit in shown)
     else:
         body = f'no estimate: {spots.reason}' if spots is not None and spots.reason else 'no estimate yet'
     return f'{head}  {body}  {tail}'

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.charts import Chart, Colour, Panel, Series, TimeAxis
 from psd_deflection.records import FloatArray, Mark, Moment, channel_names
 
@@ -34,9 +35,8 @@ def estimates_chart(
 ) -> Chart:
     """Deflections with their 95 % intervals. ``t`` (n,), s; ``pose`` and ``sd`` (n, 3), m, m, rad."""
     along = TimeAxis(FROM_FIRST, marks)
-    shown = (('ΔX / µm', 1e6), ('ΔY / µm', 1e6), ('θ / mdeg', float(np.degrees(1e3))))
     panels = []
-    for i, ((label, scale), tone) in enumerate(zip(shown, TONES, strict=True)):
+    for i, (symbol, unit, scale, tone) in enumerate(zip(SYMBOLS, SHOWN_UNITS, SHOWN, TONES, strict=True)):
         spread = None if sd is None else 1.96 * scale * sd[:, i]
-        panels.append(Panel((Series('', t, scale * pose[:, i], tone, spread=spread),), along, label))
+        panels.append(Panel((Series('', t, scale * pose[:, i], tone, spread=spread),), along, f'{symbol} / {unit}'))
     return Chart(topic, panels)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from psd_deflection.base.axes import ranges
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.tables import Column, Table, columns_of, html_table
 from psd_deflection.recordings.charts import estimates_chart, moments
@@ -148,12 +149,7 @@ class EstimateSeries:
         rows = [('estimates', str(len(self)))]
         if len(self):
             rows.append(('duration', f'{(self.t_ns[-1] - self.t_ns[0]) * 1e-9:.2f} s'))
-            for name, values, unit in (
-                ('ΔX', self.dx * 1e6, 'µm'),
-                ('ΔY', self.dy * 1e6, 'µm'),
-                ('θ', np.rad2deg(self.theta) * 1e3, 'mdeg'),
-            ):
-                rows.append((name, f'{np.nanmin(values):+.2f} … {np.nanmax(values):+.2f} {unit}'))
+            rows += ranges(self.pose)
         return rows
 
     def __repr__(self) -> str:

@@ -41,5 +41,6 @@ class RecentDots:
             if first <= index <= last:
                 dots[index - first] = values
         found = last_step(self._rig, dots, self._period)
-        ago_s = None if found is None else (last - first) * self._period - found
+        # Times are those of the middles of blocks; a step lies between two.
+        ago_s = None if found is None else (last - first + 0.5) * self._period - found
         return None if ago_s is None else last_ns - round(ago_s * 1e9)

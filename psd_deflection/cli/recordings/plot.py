@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.errors import RecordingError, UsageError
 from psd_deflection.base.printable import printable
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name, span_options
@@ -292,8 +293,7 @@ def summarise(drawn: Drawn, rig: Rig) -> list[tuple[str, str]]:
     return rows
 
 
-_MDEG = 180e3 / np.pi
-_POSE = (('dx', 'ΔX', 1e6, 'µm'), ('dy', 'ΔY', 1e6, 'µm'), ('theta', 'θ', _MDEG, 'mdeg'))
+_POSE = tuple(zip(AXES, SYMBOLS, SHOWN, SHOWN_UNITS, strict=True))
 
 
 def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any:

@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.axes import ranges
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import texts
 from psd_deflection.base.tables import Column
@@ -379,11 +380,7 @@ def _print_summary(args: argparse.Namespace, done: ReplayTask) -> None:
     for cause, count in sorted(totals.refused.items()):
         show(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
     if len(poses):
-        low, high = poses.min(axis=0), poses.max(axis=0)
-        show(
-            f'  ΔX {low[0] * 1e6:+.2f} … {high[0] * 1e6:+.2f} µm, ΔY {low[1] * 1e6:+.2f} … {high[1] * 1e6:+.2f} µm, '
-            f'θ {np.rad2deg(low[2]) * 1e3:+.2f} … {np.rad2deg(high[2]) * 1e3:+.2f} mdeg'
-        )
+        show('  ' + ', '.join(' '.join(row) for row in ranges(poses)))
     show(f'  {totals.seconds:.1f} s of data in {done.seconds:.2f} s')
     if args.out is not None:
         show(f'  written to {Path(args.out)}')

@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib.util
-import math
 import queue
 import sys
 from collections.abc import Iterator
@@ -25,6 +24,7 @@ from typing import TextIO
 
 from psd_deflection.arms.chains.chain import SLOPES
 from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.base.axes import SHOWN, SHOWN_UNITS
 from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.files import creating
 from psd_deflection.cli._display import Display
@@ -37,8 +37,8 @@ AXES = ('x', 'y', 'z', 'rx', 'ry', 'rz')
 COLUMNS = ('t', *AXES, *(f'sd_{axis}' for axis in AXES), 'missing')
 """Of the CSV: s; m and rad; why a line has no numbers."""
 
-_MDEG = 180e3 / math.pi
-_SHOWN = tuple((axis, *unit) for axis, unit in zip(AXES, 3 * [(1e6, 'µm')] + 3 * [(_MDEG, 'mdeg')], strict=True))
+_ALONG, _ABOUT = (SHOWN[0], SHOWN_UNITS[0]), (SHOWN[2], SHOWN_UNITS[2])
+_SHOWN = tuple((axis, *shown) for axis, shown in zip(AXES, 3 * [_ALONG] + 3 * [_ABOUT], strict=True))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

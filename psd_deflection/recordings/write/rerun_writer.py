@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import creating
 from psd_deflection.model.plate.scene import bend, tip_boxes
@@ -22,11 +23,7 @@ from psd_deflection.rig.config import Rig
 
 APPLICATION = 'psd_deflection'
 TIMELINE = 'time'
-POSE = (
-    ('dx', 'ΔX', 'µm', 1e6, (75, 156, 240)),
-    ('dy', 'ΔY', 'µm', 1e6, (242, 142, 60)),
-    ('theta', 'θ', 'mdeg', 180e3 / math.pi, (64, 192, 130)),
-)
+POSE = tuple(zip(AXES, SYMBOLS, SHOWN_UNITS, SHOWN, ((75, 156, 240), (242, 142, 60), (64, 192, 130)), strict=True))
 """Entity, name, unit, how many of it make an SI unit, colour."""
 
 _LOAD = (('fx', 'Fx (N)', POSE[0][4]), ('fy', 'Fy (N)', POSE[1][4]), ('tz', 'Tz (N m)', POSE[2][4]))

@@ -19,14 +19,15 @@ from typing import Any
 import numpy as np
 
 from psd_deflection import __version__
+from psd_deflection.base.axes import AXES as POSE
+from psd_deflection.base.axes import SHOWN_UNITS, SYMBOLS
+from psd_deflection.base.axes import UNITS as POSE_UNITS
 from psd_deflection.base.charts import SMALL, Chart, Panel, Rule, Series
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, columns, columns_of
-from psd_deflection.studies.axes import AXES as POSE
-from psd_deflection.studies.axes import UNITS as POSE_UNITS
 from psd_deflection.studies.budget.certificate import Certificate, CertificateProblem, Conformity, verdict_of
 from psd_deflection.studies.budget.expanded import PROBABILITY
-from psd_deflection.studies.budget.result import AXES, SHOWN, UNITS, freedom_words, in_words, shown
+from psd_deflection.studies.budget.result import SHOWN, UNITS, freedom_words, in_words, shown
 from psd_deflection.studies.study import PageSection, StudyResult
 
 OBJECT = {
@@ -176,7 +177,7 @@ class Certified(StudyResult):
         """The head first."""
         judged = self.verdicts
         head = ['pose', *UNITS, *(f'as found {u}' for u in UNITS), *(f'u_c {u}' for u in UNITS)]
-        head += [f'ν_eff {a}' for a in AXES] + [f'k {a}' for a in AXES] + [f'U {u}' for u in UNITS]
+        head += [f'ν_eff {a}' for a in SYMBOLS] + [f'k {a}' for a in SYMBOLS] + [f'U {u}' for u in UNITS]
         rows = [head + (['as found', 'as left'] if judged else [])]
         for n, (pose, error, said) in enumerate(
             zip(self.found.poses, self.found.found, self.found.stated, strict=True)
@@ -192,7 +193,7 @@ class Certified(StudyResult):
         number = np.arange(1.0, len(self.found.poses) + 1.0)
         limits = self.problem.limits
         panels = []
-        for i, (axis, unit) in enumerate(zip(AXES, ('µm', 'µm', 'mdeg'), strict=True)):
+        for i, (axis, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
             errors = SHOWN[i] * np.array([error[i] for error in self.found.found])
             spread = SHOWN[i] * np.array([said.uncertainty[i] for said in self.found.stated])
             curve = Series('as found ± U', number, errors, 'blue', 'points', spread=spread)

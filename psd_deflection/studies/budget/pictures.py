@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
+from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.charts import Colour
 from psd_deflection.base.drawings import BarColumn, Bars
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.budget.evaluate import Budget
 from psd_deflection.studies.budget.term import Kind
 
-TITLES = ('ΔX, µm', 'ΔY, µm', 'θ, mdeg')
+TITLES = tuple(f'{symbol}, {unit}' for symbol, unit in zip(SYMBOLS, SHOWN_UNITS, strict=True))
 LEAST = 1e-3
 """Share of the total at which a bar begins."""
 
@@ -30,7 +30,7 @@ class DrawnCause(NamedTuple):
 
 def shown(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
     """Every cause that does something, the largest first, and the total (3,)."""
-    factors = np.array([1e6, 1e6, math.degrees(1e3)])
+    factors = np.array(SHOWN)
     total = budget.total().rms * factors
     # What does nothing, or only rounds, has no place on a logarithmic axis.
     least = 1e-9 * budget.total().rms

@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.axes import AXES as POSE
+from psd_deflection.base.axes import SHOWN as FACTORS
+from psd_deflection.base.axes import SHOWN_UNITS, SYMBOLS
+from psd_deflection.base.axes import UNITS as POSE_UNITS
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, columns, columns_of, text_column
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.axes import AXES as POSE
-from psd_deflection.studies.axes import UNITS as POSE_UNITS
 from psd_deflection.studies.budget.evaluate import Budget
 from psd_deflection.studies.budget.expanded import PROBABILITY, Interval, difference
 from psd_deflection.studies.budget.pictures import LEAST, bars_of
 from psd_deflection.studies.budget.term import Cause, Contribution, Kind
 from psd_deflection.studies.study import PageSection, StudyResult
 
-SHOWN = np.array([1e6, 1e6, math.degrees(1e3)])
-"""µm, µm and mdeg of m, m and rad."""
-UNITS = ('ΔX µm', 'ΔY µm', 'θ mdeg')
-AXES = ('ΔX', 'ΔY', 'θ')
+SHOWN = np.array(FACTORS)
+UNITS = tuple(f'{symbol} {unit}' for symbol, unit in zip(SYMBOLS, SHOWN_UNITS, strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,7 +186,7 @@ class Budgeted(StudyResult):
     def _compared(self, interval: Interval) -> str:
         """The GUM's interval beside that of the draws."""
         off = difference(self.budget.expanded(), interval).tolist()
-        each = ', '.join(f'{name} {100.0 * v:+.1f} %' for name, v in zip(AXES, off, strict=True))
+        each = ', '.join(f'{name} {100.0 * v:+.1f} %' for name, v in zip(SYMBOLS, off, strict=True))
         return (
             f'{self.draws} draws of the declared distributions (GUM Supplement 1) have 95 % of the errors within '
             f'{in_words(interval.half)}; k u_c differs by {each}.'
@@ -226,7 +226,7 @@ def freedom_words(freedom: float) -> str:
 
 def parameter_rows(budget: Budget) -> list[list[str]]:
     """Of every error parameter what a sum by hand needs, the head first; contributions in µm, µm, mdeg."""
-    rows = [['cause', 'parameter', 'type', 'distribution', 'u', 'unit', 'ν', *(f'c {a}' for a in AXES), *UNITS]]
+    rows = [['cause', 'parameter', 'type', 'distribution', 'u', 'unit', 'ν', *(f'c {a}' for a in SYMBOLS), *UNITS]]
     for (cause, _), sensitivities in zip(budget.lines, budget.sensitivities, strict=True):
         freedom = freedom_words(cause.freedom(budget.at))
         for s in sensitivities:

@@ -10,11 +10,11 @@ import numpy as np
 from scipy.signal import welch
 
 from psd_deflection.arms.shapers import KINDS, Shaper, shaper
+from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Rule, Series, TimeAxis
 from psd_deflection.base.pages import table
 from psd_deflection.recordings.charts import FROM_FIRST
 from psd_deflection.records import FloatArray, Moment
-from psd_deflection.studies.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.studies.identify.axis_modes import AxisModes
 from psd_deflection.studies.study import PageSection
 

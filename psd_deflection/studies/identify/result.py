@@ -13,12 +13,12 @@ import numpy as np
 
 from psd_deflection import __version__
 from psd_deflection.arms.shapers import Shaper, recommended
+from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, text_column
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.parameter_files import with_values
-from psd_deflection.studies.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
 from psd_deflection.studies.study import PageSection, StudyResult, described, edited_rig_file, named

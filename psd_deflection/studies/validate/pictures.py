@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.charts import SMALL, Chart, Panel, Rule, Series, TimeAxis
 from psd_deflection.base.pages import table
 from psd_deflection.records import FloatArray, Moment
-from psd_deflection.studies.axes import SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.studies.study import PageSection
 from psd_deflection.studies.validate.agreement import Agreement
 

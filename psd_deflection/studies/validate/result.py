@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.base.tables import Column, Table, columns, columns_of
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS, UNITS
 from psd_deflection.studies.study import PageSection, StudyResult
 from psd_deflection.studies.validate.agreement import Agreement
 from psd_deflection.studies.validate.clock import Offset

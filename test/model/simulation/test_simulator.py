@@ -267,3 +267,12 @@ def test_a_long_history_is_simulated_in_pieces(monkeypatch: pytest.MonkeyPatch) 
         whole = ForwardModel(load_rig(), effects).expect(steps, warm).volts
         assert np.array_equal(np.concatenate([volts for _, volts in pieces], axis=1), whole)
     assert list(ForwardModel(load_rig(), []).expect_in_pieces(steps[:0], None)) == []
+
+
+def test_each_psd_has_its_own_sum() -> None:
+    rig = load_rig(
+        overrides={'effects.light.name': 'ambient_light', 'effects.light.psd': 1, 'effects.light.level': 0.1}
+    )
+    sums = ForwardModel(rig).expect(np.zeros((5, 3))).volts[[2, 5]]
+    assert sums[0] == pytest.approx(rig.amplifier.sum_nominal + 0.1, rel=1e-3)
+    assert sums[1] == pytest.approx(rig.amplifier.sum_nominal, rel=1e-3)

@@ -261,3 +261,16 @@ def test_all_time_may_be_asked_for() -> None:
     made = filled(row(START_NS + s * SECOND, 1e-3) for s in range(200))
     found = made.window(asked({'from': '-9e9', 'to': '9e9', 'points': '2000'}))
     assert (found.columns['blocks'].tolist(), found.width_ns) == ([200], 9_000_000 * SECOND)
+
+
+def test_a_cell_that_is_too_old_for_its_place_does_not_take_it_back() -> None:
+    """Cells 1 and 4 of a ring of three share a place, in which an old one still lies."""
+    ring = history._Ring(1, 3, history._kind(3))
+    cells = np.full(2, history._empty(history._kind(3)), history._kind(3))
+    cells['key'] = (1, 4)
+    cells['blocks'] = (1, 2)
+    ring.put(cells[:1].copy())
+    ring.put(cells.copy())
+    assert ring.cells['key'].tolist().count(4) == 1
+    assert 1 not in ring.cells['key']
+    assert int(ring.between(4, 5)['blocks'][0]) == 2

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import t as student
 
 from blind import calibration as campaign
 from blind import misaligned
@@ -16,12 +17,15 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
 from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import (
+    PIECES,
     DarkLevel,
+    _mean_and_drift,
     dark_levels,
     result_of_levels,
     values_of_levels,
     words_of_level,
 )
+from psd_deflection.studies.calibrate.fit import fewer
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 
 RATE = 1000
@@ -230,3 +234,13 @@ def test_a_level_is_a_record(nominal: Rig) -> None:
     rig = replace_values(nominal, values_of_levels([one, two]))
     assert rig.psds[0].dark == pytest.approx((3.0, -2.0, 0.12), abs=1e-3)
     assert rig.psds[1].dark == pytest.approx((-1.0, 0.5, 0.06), abs=1e-3)
+
+
+def test_few_pieces_widen_the_interval_to_that_of_student() -> None:
+    part = np.random.default_rng(6).normal(0.0, 2e-3, (4000, 3))
+    mean, sd, _, _ = _mean_and_drift(part, 1e-9)
+    pieces = np.array([piece.mean(axis=0) for piece in np.array_split(part, PIECES)])
+    plain = pieces.std(axis=0, ddof=1) / PIECES**0.5
+    worth = [fewer((pieces[:, [i]] - pieces[:, i].mean()), np.zeros(PIECES, dtype=np.int64)) ** 0.5 for i in range(3)]
+    assert mean == pytest.approx(part.mean(axis=0))
+    assert sd == pytest.approx(plain * worth * student.ppf(0.975, PIECES - 1) / 1.959964, rel=1e-6)

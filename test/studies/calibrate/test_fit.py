@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -10,7 +14,7 @@ from blind import misaligned
 from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
-from psd_deflection.studies.calibrate.fit import pose_of_readings
+from psd_deflection.studies.calibrate.fit import Linear, Noise, pose_of_readings, weight_matrices
 
 
 def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
@@ -35,3 +39,14 @@ def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
         best = minimize(of, np.zeros(3), method='Nelder-Mead', options={'xatol': 1e-4, 'fatol': 1e-9})
         np.testing.assert_allclose(best.x, 0.0, atol=0.02)
         assert misfit(pose, row) == pytest.approx(best.fun, abs=1e-3)
+
+
+def test_rows_that_are_worth_fewer_weigh_less() -> None:
+    rng = np.random.default_rng(4)
+    rows = cast(Any, SimpleNamespace(sd=np.ones((5, 3)), variances=rng.uniform(1.0, 2.0, (5, 4)) * 1e-12))
+    linear = Linear(np.zeros((5, 4)), np.zeros((5, 4, 2)), rng.normal(size=(5, 4, 3)))
+    noise = Noise(np.array([1e-6, 2e-6, 3e-6]), 1.5)
+    each = weight_matrices(linear, rows, noise)
+    spread = linear.by_pose[2] @ np.diag(noise.reference**2) @ linear.by_pose[2].T
+    np.testing.assert_allclose(each[2], np.linalg.inv(spread + np.diag(1.5**2 * rows.variances[2])), rtol=1e-9)
+    np.testing.assert_allclose(weight_matrices(linear, rows, replace(noise, fewer=4.0)), each / 4.0, rtol=1e-12)

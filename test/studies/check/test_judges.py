@@ -15,7 +15,7 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check import judges
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.levels import levels
-from psd_deflection.studies.check.wirings import WIRINGS
+from psd_deflection.studies.check.wirings import SEEN, WIRINGS, PushResponse
 
 RIG = load_rig()
 
@@ -173,3 +173,21 @@ def test_a_step_that_is_no_power_of_two_has_no_line() -> None:
     assert [(f.where, f.fix) for f in findings] == [('x1', 'x1 steps by 300 mV, the rig file says 0.305 mV')]
     assert lines == {}
     assert judges.step_findings(RIG, np.zeros(6)) == ([], {})
+
+
+def test_a_turn_stands_out_of_the_noise_of_a_difference_which_is_twice_as_large() -> None:
+    sd = np.full(4, 1e-7)
+    for factor, seen in ((1.5, False), (2.5, True)):
+        size = SEEN * 1e-7 * factor**0.5
+        dots = np.array([size / 2.0, 0.0, -size / 2.0, 0.0])
+        assert PushResponse(('tz',), dots, sd, dots, only_twist=True).seen is seen
+    # Of a push all four count.
+    alone = np.array([SEEN * 1.2e-7, 0.0, 0.0, 0.0])
+    assert PushResponse(('fx',), alone, sd, alone).seen
+
+
+def test_glitches_are_no_noise() -> None:
+    rng = np.random.default_rng(7)
+    volts = np.array([1.0, 2.0, 5.0, -1.0, 0.5, 5.0]) + rng.normal(0.0, 2e-3, (4000, 6))
+    volts[::250] += 0.5
+    assert levels(RIG, volts).noise == pytest.approx(np.full(6, 2e-3), rel=0.15)

@@ -218,3 +218,13 @@ def test_a_late_note_beside_channels_that_are_read_after_one_another() -> None:
     assert found.verdict == 'effects_found'
     assert found.floors < 1.05
     assert [(f.name, f.where) for f in found.setup] == [('load_time', 'load 3')]
+
+
+def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
+    loads = np.tile([0.0, -20.0, 0.0], (100, 1))
+    loads[0] = 0.0
+    note = MendedNote(1, (0.0, -20.0, 0.0), 0.001, 0.001, 0.0)
+    (later,) = shifts(note, loads, 0.001)
+    # Four quarters of a sample later nothing acts in the second sample.
+    assert later(4.0)[1] == pytest.approx([0.0, 20.0, 0.0])
+    assert later(4.0)[2:] == pytest.approx(0.0)

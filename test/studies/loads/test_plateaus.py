@@ -189,12 +189,15 @@ OFF = np.zeros((8, 3))
 OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
 
 
-def asked(off: FloatArray, noted: FloatArray = ROUNDED) -> bool:
-    """Whether ``noted`` loads are asked for, if the movement says that they are ``off``; all (8, 3)."""
+def asked(off: FloatArray, noted: FloatArray = ROUNDED, acting: FloatArray | None = None) -> bool:
+    """Whether ``noted`` loads are asked for, if the movement says that they are ``off``; all (8, 3).
+
+    ``acting`` (n, 3): with what is simulated, if it is something else.
+    """
     listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, noted[i]) for i in range(len(noted)))
     moved = np.repeat(off.T * 1e-6, 10, axis=1)
     found = PlateauLoads(listed, off, np.zeros_like(moved), moved, np.zeros(8), np.ones(3))
-    return all_free(found, np.repeat(noted, DWELL, axis=0))
+    return all_free(found, np.repeat(noted, DWELL, axis=0) if acting is None else acting)
 
 
 def test_loads_are_asked_for_if_what_hung_rounds_to_the_notes_and_not_if_it_is_far_nearer_or_farther() -> None:
@@ -202,6 +205,9 @@ def test_loads_are_asked_for_if_what_hung_rounds_to_the_notes_and_not_if_it_is_f
     # What hung would be noted as another number, or the step is too coarse for so small an error.
     assert not asked(ROUNDED * 0.06)
     assert not asked(0.1 * OFF)
+    # Half of it was put right before: what is left counts with that.
+    half = 0.5 * OFF
+    assert asked(half, ROUNDED, np.repeat(ROUNDED + half, DWELL, axis=0))
     # Numbers of no step, however small the error.
     assert not asked(0.3 * OFF, ROUNDED + 0.37 * (ROUNDED != 0.0))
 

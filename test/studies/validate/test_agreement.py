@@ -54,3 +54,18 @@ def test_a_reference_that_moves_the_other_way_is_mirrored() -> None:
     assert agreement(true, noise - true).mirrored
     assert not agreement(true, noise + true).mirrored
     assert not agreement(rng.normal(0.0, 1e-6, 3000), noise).mirrored
+
+
+def test_the_deviations_are_those_of_many_runs_of_noise_that_remembers() -> None:
+    rng = np.random.default_rng(4)
+    true = 2e-3 * np.sin(np.linspace(0.0, 40.0, 400))
+    plain, half = [], []
+    for _ in range(200):
+        noise = rng.normal(0.0, 10e-6, 400)
+        for i in range(1, 400):
+            noise[i] += 0.9 * noise[i - 1]
+        plain.append(agreement(true, true + noise))
+        half.append(agreement(true, 2.0 * true + noise))
+    assert np.std([f.bias for f in plain]) == pytest.approx(np.median([f.bias_sd for f in plain]), rel=0.35)
+    assert np.mean([f.scale for f in half]) == pytest.approx(-0.5, abs=1e-3)
+    assert np.std([f.scale for f in half]) == pytest.approx(np.median([f.scale_sd for f in half]), rel=0.35)

@@ -9,7 +9,7 @@ from blind.clock import Seen, dots, scored, seen, truth
 from blind.clock import motion_of as motion_of_samples
 from blind.generator import Array
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.studies.validate.clock import Offset, clock_offset
+from psd_deflection.studies.validate.clock import Offset, _coarse, clock_offset
 from psd_deflection.studies.validate.motion import Motion
 
 
@@ -125,3 +125,10 @@ def test_a_reference_of_another_run_is_refused() -> None:
 )
 def test_the_sentence_says_what_to_add(value: float, words: str) -> None:
     assert words in Offset(value, 1e-4, 0.0, 1e-6, True, (), 100).sentence
+
+
+def test_the_first_guess_is_not_half_a_sample_off() -> None:
+    runs = [seen(seed) for seed in range(8)]
+    errors = [_coarse(motion_of(run), run.stamps, run.poses, 0.5)[0] - run.offset for run in runs]
+    assert abs(np.mean(errors)) < 0.25e-3
+    assert max(map(abs, errors)) < 0.75e-3

@@ -1,0 +1,23 @@
+"""The three axes of the tip as people read them: symbols, units, and the factor from SI to what is shown."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+
+AXES = ('dx', 'dy', 'theta')
+SYMBOLS = ('ΔX', 'ΔY', 'θ')
+UNITS = ('m', 'm', 'rad')
+SHOWN = (1e6, 1e6, math.degrees(1e3))
+"""µm, µm, mdeg of an SI unit."""
+SHOWN_UNITS = ('µm', 'µm', 'mdeg')
+
+
+def ranges(poses: FloatArray) -> list[tuple[str, str]]:
+    """Symbol, and least and greatest in words, of ``poses`` (n, 3), m, m, rad; NaN is passed over."""
+    low, high = np.nanmin(poses, axis=0) * SHOWN, np.nanmax(poses, axis=0) * SHOWN
+    words = [f'{a:+.2f} … {b:+.2f} {unit}' for a, b, unit in zip(low, high, SHOWN_UNITS, strict=True)]
+    return list(zip(SYMBOLS, words, strict=True))
