@@ -348,7 +348,7 @@ def pose_bounds(scene: render.Scene, picture: Any, *nears: Any) -> Any:
         ends = [picture(scene, replace(render.Pose(), **{name: sign * step})) for sign in (1.0, -1.0)]
         slopes.append((ends[0] - ends[1]) / (2.0 * step))
     variance = scene.read_noise**2 + 1.0 / 12.0
-    rows = [np.array([slope[near] for slope in slopes]) for near in nears]
+    rows = [np.array([slope[near].ravel() for slope in slopes]) for near in nears]
     return np.array([np.sqrt(np.diag(np.linalg.inv(r @ r.T / variance))[:3]) for r in rows])
 
 
