@@ -223,7 +223,7 @@ def test_info_says_what_vibrates(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert json.loads(capsys.readouterr().out)['vibration'] is None
 
 
-def test_the_floor_of_a_bin_is_that_of_its_own_frequency() -> None:
+def test_the_floor_under_a_tone_is_that_of_its_own_frequency() -> None:
     """Of power that grows in proportion to the frequency it is the power itself, between the middles of groups."""
     search = ToneSearch(SIZE, SEGMENT_BLOCKS)
     power = np.arange(N // 2 + 1, dtype=np.float64)[:, None]
