@@ -196,7 +196,7 @@ ROOMS: Mapping[str, Room] = {
     ),
     'calibrate': Room(
         ('psd_deflection/studies/calibrate',),
-        ('test/studies/calibrate/test_dark.py', 'test/studies/calibrate/test_fit.py'),
+        tuple(f'test/studies/calibrate/test_{n}.py' for n in ('dark', 'fit', 'check', 'observation', 'progress')),
         leave=('psd_deflection/studies/calibrate/pictures.py',),
         slow=('test/studies/calibrate/test_calibrate.py', 'test/cli/test_calibrate.py'),
     ),
