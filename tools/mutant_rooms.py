@@ -170,6 +170,7 @@ ROOMS: Mapping[str, Room] = {
             'test/measure/motion/test_modal.py',
             'test/measure/motion/test_unseen.py',
             'test/measure/motion/test_inertia.py',
+            'test/measure/motion/test_filter.py',
         ),
         slow=('test/measure/motion/test_motion.py',),
     ),
@@ -239,7 +240,11 @@ ROOMS: Mapping[str, Room] = {
             *(f'psd_deflection/recordings/{n}.py' for n in ('charts', 'estimates', 'sample_table', 'spans')),
             'psd_deflection/base/axes.py',
         ),
-        ('test/recordings/test_charts.py', 'test/recordings/test_recording_window.py', 'test/test_api.py'),
+        (
+            'test/base/test_axes.py',
+            *(f'test/recordings/test_{n}.py' for n in ('charts', 'recording_window')),
+            'test/test_api.py',
+        ),
         slow=('test/cli/test_validate.py', 'test/cli/test_identify.py'),
     ),
     'history': Room(
