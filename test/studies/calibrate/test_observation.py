@@ -165,3 +165,10 @@ def test_half_of_the_deviations_tell_that_of_all() -> None:
     assert _deviation(values, True) == pytest.approx(2.0, rel=0.03)
     values[::10] += 1000.0
     assert _deviation(values, True) == pytest.approx(2.0, rel=0.2)
+
+
+def test_the_steps_of_the_converter_are_no_noise() -> None:
+    rig = rig_from_values({'converter.bits': 10})
+    step = 20.0 / 1024.0
+    volts = np.round(lit(40_000, (0.6 * step,) * 4) / step) * step
+    assert noise_of(run_of(volts), rig) == pytest.approx([0.6 * step] * 4, rel=0.03)
