@@ -6,7 +6,9 @@ import math
 
 import pytest
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.budget.budget import BudgetProblem, budget
 from psd_deflection.studies.budget.load import default_load
 
 RIG = load_rig()
@@ -85,3 +87,10 @@ def test_the_links_of_the_thesis_have_its_50_newtons() -> None:
 def test_without_room_there_is_no_load() -> None:
     rig = replace_values(RIG, {'psd_1.active_area': [0.004, 0.004], 'psd_1.zero': [0.0, 0.003]})
     assert [abs(v) for v in default_load(rig)] == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.xfail(raises=ValueError, strict=True, reason='a rig of three PSDs ends in a traceback, not in a message')
+def test_a_rig_of_three_detectors_is_refused_in_words() -> None:
+    three = replace_values(RIG, {'psd_3.center': [0.1, 0.0]})
+    with pytest.raises(ConfigError, match='two PSDs'):
+        budget(BudgetProblem(three))
