@@ -366,6 +366,17 @@ def test_the_sentences_say_the_largest(certificate: Certificate) -> None:
     assert lines[6].startswith(f'1     {POSES[0][0] * 1e6:.3f}')
 
 
+def test_the_pose_stands_flush_left_and_the_numbers_right(certificate: Certificate) -> None:
+    lines = _certified(certificate).lines()
+    head, row = lines[3], lines[5]
+    cells = _certified(certificate)._results()[1]
+    at = head.index('θ mdeg')
+    assert row[at - 2 :].startswith(f'  {cells[3]}')
+    end = head.index('as found ΔX µm') + len('as found ΔX µm')
+    assert row[:end].endswith(f'  {cells[4]}')
+    assert row[end : end + 2] == '  '
+
+
 def test_mixed_verdicts_are_all_named(certificate: Certificate) -> None:
     # One pose was a metre off, the others not at all.
     wrong = replace(certificate, found=np.diag([1.0, 0.0, 0.0]))

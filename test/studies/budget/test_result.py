@@ -91,6 +91,19 @@ def test_the_rows_of_the_causes_are_their_numbers(plain: Budgeted) -> None:
     assert text[4].startswith(f'{rows[0][0]:<{max(len(row[0]) for row in (head, *rows))}}  ')
 
 
+def test_words_stand_flush_left_and_numbers_right(plain: Budgeted) -> None:
+    lines = plain.lines()
+    head, first = lines[2], lines[4]
+    cells = plain._causes()[1]
+    at = head.index('type')
+    assert first[at - 2 :].startswith(f'  {cells[3]} ')
+    end = head.index('ν') + 1
+    # As wide as 999, so that one figure stands at the right of it.
+    assert cells[4] == '8'
+    assert head[end - 4 : end] == '   ν'
+    assert first[end - 4 : end] == '   8'
+
+
 def test_totals_are_sums_of_their_kind(plain: Budgeted) -> None:
     rows = {row[0]: row[1:] for row in plain._totals()[1:]}
     for kind in (*Kind, None):
