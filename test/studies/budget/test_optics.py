@@ -15,6 +15,7 @@ from psd_deflection.studies.budget.optics import (
     gradient_shift,
     index_per_kelvin,
     refracted_angle,
+    saturation_pressure,
 )
 
 
@@ -98,3 +99,75 @@ def test_what_averaging_leaves_of_hum() -> None:
     assert averaging_gain(20, 60.0, 1000.0) == pytest.approx(0.157, abs=1e-3)
     # An alias of a constant is not averaged at all.
     assert averaging_gain(20, 1000.0, 1000.0) == 1.0
+
+
+@pytest.mark.parametrize(('celsius', 'hectopascal'), [(0.0, 6.11), (10.0, 12.28), (20.0, 23.39), (30.0, 42.47)])
+def test_saturated_vapour_is_that_of_the_tables(celsius: float, hectopascal: float) -> None:
+    assert saturation_pressure(273.15 + celsius) == pytest.approx(100.0 * hectopascal, rel=4e-3)
+
+
+def _magnus(celsius: float) -> float:
+    """WMO-No. 8, annex 4.B: ln e = ln 6.112 + 17.62 t / (243.12 + t), hPa."""
+    return 100.0 * math.exp(math.log(6.112) + 17.62 * celsius / (243.12 + celsius))
+
+
+def _birch_and_downs(pascal: float, celsius: float, percent: float, co2: float, micrometres: float) -> float:
+    """Refractivity: Metrologia 30 (1993), equations 1 to 3; carbon dioxide by Edlen's factor."""
+    s2 = micrometres**-2
+    standard = 1e-8 * (8342.54 + 2406147.0 / (130.0 - s2) + 15998.0 / (38.9 - s2))
+    standard *= (1.0 + 0.540e-6 * (co2 - 300.0)) / (1.0 + 0.540e-6 * (450.0 - 300.0))
+    dry = (
+        pascal * standard / 96095.43 * (1.0 + 1e-8 * (0.601 - 0.00972 * celsius) * pascal) / (1.0 + 0.003661 * celsius)
+    )
+    vapour = _magnus(celsius) * percent / 100.0
+    return dry - vapour * (3.7345 - 0.0401 * s2) * 1e-10 * 292.75 / (celsius + 273.15)
+
+
+@pytest.mark.parametrize(
+    ('pascal', 'celsius', 'percent', 'co2', 'micrometres'),
+    [
+        (101_325.0, 20.0, 50.0, 450.0, 0.633),
+        (90_000.0, 35.0, 90.0, 900.0, 0.45),
+        (105_000.0, -10.0, 0.0, 300.0, 0.8),
+        (1_000_000.0, 45.0, 100.0, 0.0, 0.4),
+    ],
+)
+def test_the_index_of_any_air(pascal: float, celsius: float, percent: float, co2: float, micrometres: float) -> None:
+    wanted = _birch_and_downs(pascal, celsius, percent, co2, micrometres)
+    got = air_index(pascal, 273.15 + celsius, percent, co2, micrometres * 1e-6) - 1.0
+    assert got == pytest.approx(wanted, abs=1e-15 + 1e-12 * wanted)
+    assert saturation_pressure(273.15 + celsius) == pytest.approx(_magnus(celsius), rel=1e-12)
+
+
+def test_what_is_not_said_of_the_air() -> None:
+    """Half saturated, with 450 ppm of carbon dioxide, for the light of a helium-neon laser."""
+    got = air_index(95_000.0, 300.0) - 1.0
+    assert got == pytest.approx(_birch_and_downs(95_000.0, 26.85, 50.0, 450.0, 0.633), abs=1e-15)
+
+
+@pytest.mark.parametrize('micrometres', [0.45, 0.633, 0.9])
+def test_the_index_by_temperature(micrometres: float) -> None:
+    warm, cold = (_birch_and_downs(101_325.0, 26.85 + t, 0.0, 450.0, micrometres) for t in (0.01, -0.01))
+    assert index_per_kelvin(300.0, micrometres * 1e-6) == pytest.approx((warm - cold) / 0.02, rel=1e-5)
+    assert index_per_kelvin(300.0) == index_per_kelvin(300.0, 633e-9)
+    assert index_per_kelvin(293.15) == pytest.approx(-9.3e-7, rel=2e-3)
+
+
+def test_shifts_by_hand() -> None:
+    assert gradient_shift(3e-4, 4.0) == pytest.approx(3e-4 * 16.0 / 2.0)
+    inside = math.asin(1.5 * math.sin(0.4) / 1.2)
+    assert boundary_shift(0.4, 1.5, 1.2, 3.0) == pytest.approx(3.0 * (math.tan(inside) - math.tan(0.4)))
+    # Grazing: the sine of 1 is still an angle, both ways.
+    assert refracted_angle(math.pi / 2.0, 1.5, 1.5) == pytest.approx(math.pi / 2.0)
+    assert refracted_angle(-math.pi / 2.0, 1.5, 1.5) == pytest.approx(-math.pi / 2.0)
+    for angle in (0.8, -0.8):
+        with pytest.raises(ConfigError, match=rf'a beam at {angle:g} rad .* indices 1\.5 and 1$'):
+            refracted_angle(angle, 1.5, 1.0)
+
+
+@pytest.mark.parametrize(('samples', 'frequency', 'rate'), [(20, 57.0, 1000.0), (7, 130.0, 800.0), (3, 999.9, 1000.0)])
+def test_what_a_mean_leaves_of_a_sinusoid_is_that_of_its_sum(samples: int, frequency: float, rate: float) -> None:
+    turns = [2.0 * math.pi * frequency * i / rate for i in range(samples)]
+    left = math.hypot(math.fsum(map(math.cos, turns)), math.fsum(map(math.sin, turns))) / samples
+    assert averaging_gain(samples, frequency, rate) == pytest.approx(left, rel=1e-6)
+    assert averaging_gain(samples, 2.0 * rate, rate) == 1.0

@@ -1,0 +1,629 @@
+"""A certificate of a calibration written by hand: each input against the exact model, every sum written again."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from psd_deflection import __version__
+from psd_deflection.base.charts import Chart
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.model.misalignment.model import ALL, INDEX, readings
+from psd_deflection.model.misalignment.rig import vector_of_rig
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.studies.budget import from_calibration
+from psd_deflection.studies.budget.certificate import (
+    Certificate,
+    CertificateProblem,
+    certify,
+    default_poses,
+    verdict_of,
+)
+from psd_deflection.studies.budget.certificate_page import FIELDS, Certified
+from psd_deflection.studies.budget.evaluate import CAUSES
+from psd_deflection.studies.budget.from_calibration import read_calibration, read_fields
+from psd_deflection.studies.budget.inputs import INPUTS, REFERENCE_INPUTS, read_inputs
+from psd_deflection.studies.budget.term import Situation
+
+EVERY = (*INPUTS, *REFERENCE_INPUTS)
+AXES = ('dx', 'dy', 'theta')
+SCALES = (1e6, 1e6, math.degrees(1e3))
+# Standard deviations that a calibration found, and how three of them go together.
+FOUND = {'psd_1.rotation': 1e-3, 'psd_2.gain_y': 2e-3, 'beam_1.angle_x': 5e-4}
+JOINT = {('psd_1.rotation', 'psd_2.gain_y'): 0.5, ('psd_1.rotation', 'beam_1.angle_x'): -0.25}
+RIG = replace_values(
+    load_rig(),
+    {
+        'calibration.names': list(FOUND),
+        'calibration.sds': list(FOUND.values()),
+        # Each with those before it: 2 with 1, 3 with 1, 3 with 2.
+        'calibration.correlations': [0.5, -0.25, 0.0],
+        # One channel is worse, so that the solver trusts it less.
+        'psd_2.noise': [8e-3, 2e-3],
+        'psd_1.height': 0.02,
+    },
+)
+POSES = [(1e-3, -2e-3, 0.015), (0.0, 0.0, 0.0), (-1.5e-3, 5e-4, -0.01)]
+
+
+def _tree() -> dict[str, Any]:
+    """As calibrate writes it, the parts that a certificate reads."""
+    return {
+        'kind': 'reference',
+        'refused': '',
+        'parameters': {
+            'psd_1.rotation': {'value': 0.012, 'used': 0.0},
+            'psd_2.gain_y': {'value': 1e-3, 'used': 5e-3},
+        },
+        'reference': {'rows': 60, 'outliers': 7},
+        'range': {'low': [-2e-3, -2.5e-3, -0.02], 'high': [1e-3, 2e-3, 0.03]},
+        'provenance': {
+            'date': '2026-01-02',
+            'recordings': [
+                {'name': 'a.csv', 'sha256': 'aa', 'device': 'U6', 'temperature': [21.5, 20.25]},
+                {'name': 'b.csv', 'sha256': 'bb', 'device': 'U6', 'temperature': None},
+                {'name': 'c.csv', 'sha256': 'cc', 'device': 'T7', 'temperature': [22.75]},
+            ],
+        },
+    }
+
+
+def _problem(**changes: Any) -> CertificateProblem:
+    given = {'inputs': read_inputs(None, {'reference_scale': 2e-5}, declared=EVERY), 'poses': POSES}
+    return CertificateProblem(**{'rig': RIG, 'calibration': _tree(), 'rig_file': 'new/rig.yaml', **given, **changes})
+
+
+@pytest.fixture(scope='module')
+def certificate() -> Certificate:
+    return certify(_problem())
+
+
+# ---- What the calibration left open ----
+
+
+def _weighted_pose(rig: Rig, read: FloatArray, pose: tuple[float, float, float]) -> FloatArray:
+    """One step of weighted least squares from the true pose, the slopes by differences of the plate's exact model."""
+    p = vector_of_rig(rig).as_used
+    length = rig.link.length
+
+    def model(x: FloatArray) -> FloatArray:
+        return readings(p, x[:, None], length)[:, 0]
+
+    at = np.array(pose)
+    jacobian = np.stack([(model(at + d) - model(at - d)) / 2e-7 for d in 1e-7 * np.eye(3)], axis=1)
+    step = 2.0 * 10.0 / 2**16
+    variances = np.array([2e-3, 2e-3, 8e-3, 2e-3]) ** 2 + step**2 / 12.0
+    weighted = jacobian.T / variances
+    return np.asarray(np.linalg.solve(weighted @ jacobian, weighted @ (read - model(at))))
+
+
+@pytest.mark.parametrize('pose', range(len(POSES)))
+def test_an_error_of_the_rig_file_makes_the_pose_wrong_by_c(certificate: Certificate, pose: int) -> None:
+    """The true parameter is less by the error of what the rig file says of it; the exact readings are estimated."""
+    p = vector_of_rig(RIG).as_used
+    rows = [row for row in certificate.inputs if row.cause == 'calibration']
+    assert [row.parameter for row in rows] == [one.name for one in ALL if 'zero' not in one.name]
+    for row in rows:
+        error = np.zeros(len(ALL))
+        error[INDEX[row.parameter]] = 1e-2 * row.u
+        up, down = (
+            _weighted_pose(RIG, readings(p - sign * error, np.array(POSES[pose])[:, None], RIG.link.length)[:, 0], q)
+            for sign, q in ((1.0, POSES[pose]), (-1.0, POSES[pose]))
+        )
+        expected = (up - down) / (2.0 * error.max())
+        assert row.coefficients[pose] == pytest.approx(expected, rel=2e-5, abs=1e-9), row.parameter
+
+
+def test_what_the_calibration_says_of_its_parameters(certificate: Certificate) -> None:
+    rows = {row.parameter: row for row in certificate.inputs if row.cause == 'calibration'}
+    for name, sd in FOUND.items():
+        assert rows[name].u == pytest.approx(sd, rel=1e-9)
+    # Of what it did not find the tolerance is known.
+    assert rows['psd_2.rotation'].u == pytest.approx(0.010)
+    assert {(row.observed, row.distribution) for row in rows.values()} == {(True, 'normal')}
+    assert (rows['psd_1.rotation'].unit, rows['psd_1.gain_x'].unit, rows['psd_1.height'].unit) == ('rad', '', 'm')
+    # 60 frames without 7 outliers, less two parameters.
+    assert {row.freedom for row in rows.values()} == {51.0}
+    expected = np.eye(len(rows))
+    names = list(rows)
+    for (a, b), value in JOINT.items():
+        expected[names.index(a), names.index(b)] = expected[names.index(b), names.index(a)] = value
+    assert certificate.correlations == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_parameter_that_is_known_exactly_has_no_correlation() -> None:
+    exact = replace_values(RIG, {'calibration.sds': [0.0, 2e-3, 5e-4]})
+    found = certify(_problem(rig=exact))
+    assert found.inputs[0].u == 0.0
+    assert found.correlations[0].tolist() == [0.0] * len(found.correlations)
+    assert np.diag(found.correlations)[1:] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(('rows', 'outliers', 'freedom'), [(60, 0, 58.0), (10, 7, 1.0), (10, 8, 1.0), (10, 6, 2.0)])
+def test_a_fit_without_more_frames_than_parameters_has_one_degree_of_freedom(
+    rows: int, outliers: int, freedom: float
+) -> None:
+    tree = {**_tree(), 'reference': {'rows': rows, 'outliers': outliers}}
+    assert certify(_problem(calibration=tree)).inputs[0].freedom == freedom
+
+
+def test_as_found_is_what_the_old_values_would_have_done(certificate: Certificate) -> None:
+    rows = {row.parameter: row for row in certificate.inputs if row.cause == 'calibration'}
+    # The old rotation was 12 mrad too small, the old gain 0.004 too large.
+    expected = -0.012 * rows['psd_1.rotation'].coefficients + 0.004 * rows['psd_2.gain_y'].coefficients
+    assert certificate.found == pytest.approx(expected, rel=1e-12)
+    assert np.abs(certificate.found[0]).min() > 1e-7
+
+
+# ---- The reference and what acts since the zero ----
+
+
+def test_the_scale_of_the_reference_is_that_of_each_pose(certificate: Certificate) -> None:
+    lengths, angles = (row for row in certificate.inputs if row.cause == 'reference')
+    assert lengths.coefficients.tolist() == [[x, y, 0.0] for x, y, _ in POSES]
+    assert angles.coefficients.tolist() == [[0.0, 0.0, theta] for *_, theta in POSES]
+    assert (lengths.u, angles.u) == (2e-5, 1e-4)
+    assert (lengths.unit, angles.unit, lengths.observed, angles.observed) == ('', '', False, False)
+    # One was stated; the other is a guess, known to a quarter.
+    assert (lengths.freedom, angles.freedom) == (math.inf, 8.0)
+
+
+@pytest.mark.parametrize(('doubt', 'freedom'), [(0.5, 2.0), (1.0, 0.5), (0.0, math.inf), (1e-3, 5e5)])
+def test_a_doubt_about_the_reference_is_its_degrees_of_freedom(doubt: float, freedom: float) -> None:
+    inputs = read_inputs(None, {'assumption_doubt': doubt}, declared=EVERY)
+    rows = [row for row in certify(_problem(inputs=inputs)).inputs if row.cause == 'reference']
+    assert [row.freedom for row in rows] == pytest.approx([freedom, freedom])
+
+
+SINCE = (
+    *('light_profile', 'thermal_drift', 'amplifier_noise', 'quantisation', 'zeroing'),
+    *('refraction', 'interference', 'pointing_drift', 'bracket_expansion'),
+)
+
+
+def test_since_the_zero_acts_what_no_calibration_measures(certificate: Certificate) -> None:
+    """Drift, air, hum, noise and rounding; where parts sit and how they are turned the calibration found."""
+    own = [row for row in certificate.inputs if row.cause not in ('calibration', 'reference')]
+    assert tuple(dict.fromkeys(row.cause for row in own)) == SINCE
+    assert certificate.inputs[-len(own) :] == tuple(own)
+    measured = {c.name for c in CAUSES if c.calibrated}
+    assert measured == {c.name for c in CAUSES} - {*SINCE, 'computation'}
+    counts: dict[str, int] = defaultdict(int)
+    for row in own:
+        counts[row.cause] += 1
+    # A temperature of one bracket; air that bends both beams alike and each of them; else each reading by itself.
+    assert counts == {**dict.fromkeys(SINCE, 4), 'bracket_expansion': 1, 'refraction': 6}
+    assert {row.cause for row in own if row.observed} == {'amplifier_noise', 'zeroing'}
+    assert {row.cause: row.distribution for row in own if row.distribution != 'normal'} == {
+        'thermal_drift': 'uniform',
+        'interference': 'arcsine',
+    }
+    noise = [row for row in own if row.cause == 'amplifier_noise']
+    assert [row.parameter for row in noise] == ['x1', 'y1', 'x2', 'y2']
+    assert [row.u for row in noise] == pytest.approx(np.array([1e-6, 1e-6, 4e-6, 1e-6]) / math.sqrt(20.0))
+    freedom = {row.cause: row.freedom for row in own}
+    assert (freedom['amplifier_noise'], freedom['pointing_drift'], freedom['quantisation']) == (999.0, 8.0, math.inf)
+    assert {row.cause: row.unit for row in own if row.unit != 'm'} == {'bracket_expansion': ''}
+
+
+def test_a_shift_of_a_reading_moves_each_pose_as_least_squares_has_it(certificate: Certificate) -> None:
+    noise = [row for row in certificate.inputs if row.cause == 'amplifier_noise']
+    p = vector_of_rig(RIG).as_used
+    for n, pose in enumerate(POSES):
+        exact = readings(p, np.array(pose)[:, None], RIG.link.length)[:, 0]
+        for i, row in enumerate(noise):
+            moved = exact + 1e-6 * np.eye(4)[i]
+            assert row.coefficients[n] == pytest.approx(_weighted_pose(RIG, moved, pose) / 1e-6, rel=1e-5, abs=1e-6)
+
+
+# ---- The sums ----
+
+
+def test_every_u_is_the_sum_of_its_causes(certificate: Certificate) -> None:
+    for n, said in enumerate(certificate.stated):
+        for i in range(3):
+            variances: dict[str, float] = defaultdict(float)
+            freedom = {row.cause: row.freedom for row in certificate.inputs}
+            first = [row for row in certificate.inputs if row.cause == 'calibration']
+            for a, one in enumerate(first):
+                for b, other in enumerate(first):
+                    g = one.u * one.coefficients[n, i] * other.u * other.coefficients[n, i]
+                    variances['calibration'] += g * certificate.correlations[a, b]
+            for row in certificate.inputs:
+                if row.cause != 'calibration':
+                    variances[row.cause] += (row.u * row.coefficients[n, i]) ** 2
+            total = math.fsum(variances.values())
+            effective = math.floor(total**2 / math.fsum(v * v / freedom[c] for c, v in variances.items()))
+            assert said.standard[i] == pytest.approx(math.sqrt(total), rel=1e-9)
+            assert said.freedom[i] == effective
+            assert said.uncertainty[i] == pytest.approx(student.ppf(0.975, effective) * math.sqrt(total), rel=1e-9)
+            assert said.bias[i] == 0.0
+
+
+def test_without_poses_they_are_rest_and_the_ends_of_what_was_seen() -> None:
+    expected = [
+        (0.0, 0.0, 0.0),
+        (-2e-3, 0.0, 0.0),
+        (1e-3, 0.0, 0.0),
+        (0.0, -2.5e-3, 0.0),
+        (0.0, 2e-3, 0.0),
+        (0.0, 0.0, -0.02),
+        (0.0, 0.0, 0.03),
+    ]
+    assert default_poses(_tree()) == expected
+    assert certify(_problem(poses=())).poses.tolist() == [list(pose) for pose in expected]
+
+
+def test_what_cannot_be_certified_says_why() -> None:
+    with pytest.raises(ConfigError, match=r'new/rig\.yaml: calibration\.names: not there'):
+        certify(_problem(rig=load_rig()))
+    with pytest.raises(ConfigError, match=r'new/rig\.yaml: calibrated by loads, without a reference'):
+        certify(_problem(calibration={**_tree(), 'kind': 'loads'}))
+    # Each number of the pose in its place.
+    with pytest.raises(ConfigError, match=r'^pose 0\.001 -0\.25 0\.02: the dot of psd_1 .*: take a smaller one$'):
+        certify(_problem(poses=[(1e-3, -0.25, 0.02)]))
+
+
+def test_a_solver_that_is_linear_weighs_nothing() -> None:
+    """The direct method has one matrix, whatever the pose and the noise of a channel."""
+    found = certify(_problem(rig=replace_values(RIG, {'solver': 'wls'})))
+    noise = [row for row in found.inputs if row.cause == 'amplifier_noise']
+    for row in noise:
+        assert row.coefficients == pytest.approx(np.tile(row.coefficients[0], (3, 1)))
+    # Two dots that both move by -1 move the plate by 1.
+    assert noise[0].coefficients[0, 0] + noise[2].coefficients[0, 0] == pytest.approx(-1.0)
+
+
+# ---- The rule ----
+
+
+@pytest.mark.parametrize(
+    ('found', 'uncertainty', 'verdict'),
+    [
+        # On the limit is within it; the powers of two make it exact.
+        ((0.5, 0.0, 0.0), (0.5, 1.0, 1.0), ('conforms', 'conforms')),
+        ((-0.5, 0.0, 0.0), (0.5, 1.0, 1.0), ('conforms', 'conforms')),
+        ((0.5, 0.0, 0.0), (0.75, 1.0, 1.0), ('not decided', 'conforms')),
+        ((1.5, 0.0, 0.0), (0.5, 1.0, 1.0), ('not decided', 'conforms')),
+        ((1.75, 0.0, 0.0), (0.5, 1.0, 1.0), ('does not conform', 'conforms')),
+        ((0.0, -1.75, 0.0), (0.5, 0.5, 1.0), ('does not conform', 'conforms')),
+        # One axis is enough to fail, and all are needed to conform.
+        ((0.0, 0.0, 3.0), (0.5, 0.5, 1.25), ('does not conform', 'not decided')),
+        ((0.0, 0.0, 0.0), (2.0, 2.0, 2.0), ('not decided', 'not decided')),
+    ],
+)
+def test_the_rule_is_guarded_by_u(
+    found: tuple[float, ...], uncertainty: tuple[float, ...], verdict: tuple[str, str]
+) -> None:
+    got = verdict_of(np.array(found), np.array(uncertainty), np.ones(3))
+    assert (got.found, got.left) == verdict
+
+
+# ---- The page ----
+
+
+def _certified(certificate: Certificate, **changes: Any) -> Certified:
+    return Certified(certificate, replace(_problem(), **changes))
+
+
+LIMITS = (1e-4, 2e-4, 3e-3)
+
+
+def test_the_rows_of_the_results_are_the_numbers(certificate: Certificate) -> None:
+    rows = _certified(certificate, limits=LIMITS)._results()
+    head, *others = rows
+    assert len(head) == 1 + 6 * 3 + 2
+    assert head[1:4] == ['ΔX µm', 'ΔY µm', 'θ mdeg']
+    verdicts = _certified(certificate, limits=LIMITS).verdicts
+    for n, (row, said) in enumerate(zip(others, certificate.stated, strict=True)):
+        assert row[0] == str(n + 1)
+        assert len(row) == len(head)
+        parts = (certificate.poses[n], certificate.found[n], said.standard)
+        numbers = [scale * v for part in parts for scale, v in zip(SCALES, part.tolist(), strict=True)]
+        assert [float(v) for v in row[1:10]] == pytest.approx(numbers, abs=6e-4)
+        assert row[10:13] == [f'{v:.0f}' for v in said.freedom.tolist()]
+        assert [float(v) for v in row[13:16]] == pytest.approx(said.factor.tolist(), abs=6e-4)
+        expanded = [scale * v for scale, v in zip(SCALES, said.uncertainty.tolist(), strict=True)]
+        assert [float(v) for v in row[16:19]] == pytest.approx(expanded, abs=6e-4)
+        assert tuple(row[19:]) == tuple(verdicts[n])
+    # Nothing is judged without limits.
+    assert [row[: len(head) - 2] for row in rows] == _certified(certificate)._results()
+    assert _certified(certificate).verdicts == []
+
+
+def test_verdicts_are_those_of_each_pose(certificate: Certificate) -> None:
+    for limits in (LIMITS, (1e-9, 1e-9, 1e-9), (1.0, 1.0, 1.0)):
+        got = _certified(certificate, limits=limits).verdicts
+        for one, error, said in zip(got, certificate.found, certificate.stated, strict=True):
+            worst = np.abs(error) + said.uncertainty
+            assert (one.found == 'conforms') == all(w <= limit for w, limit in zip(worst, limits, strict=True))
+
+
+def test_the_sentences_say_the_largest(certificate: Certificate) -> None:
+    first, second = _certified(certificate).sentences()
+    largest = [max(s.uncertainty[i] for s in certificate.stated) * SCALES[i] for i in range(3)]
+    assert f'the largest of 3 poses: ΔX {largest[0]:.3g} µm, ΔY {largest[1]:.3g} µm, θ {largest[2]:.3g} mdeg.' in first
+    wrong = [max(abs(e[i]) for e in certificate.found) * SCALES[i] for i in range(3)]
+    assert f'wrong by up to ΔX {wrong[0]:.3g} µm, ΔY {wrong[1]:.3g} µm, θ {wrong[2]:.3g} mdeg.' in second
+    wide = _certified(certificate, limits=(1.0, 1.0, 1.0))
+    assert wide.sentences()[2] == 'As found: every pose conforms; as left: every pose conforms.'
+    lines = wide.lines()
+    assert lines[:4] == [*wide.sentences(), '']
+    # The number, ΔX, ΔY and θ of the pose stand flush left.
+    assert [line.split()[0] for line in lines[6:]] == ['1', '2', '3']
+    assert lines[6].startswith(f'1     {POSES[0][0] * 1e6:.3f}')
+
+
+def test_the_pose_stands_flush_left_and_the_numbers_right(certificate: Certificate) -> None:
+    lines = _certified(certificate).lines()
+    head, row = lines[3], lines[5]
+    cells = _certified(certificate)._results()[1]
+    at = head.index('θ mdeg')
+    assert row[at - 2 :].startswith(f'  {cells[3]}')
+    end = head.index('as found ΔX µm') + len('as found ΔX µm')
+    assert row[:end].endswith(f'  {cells[4]}')
+    assert row[end : end + 2] == '  '
+
+
+def test_mixed_verdicts_are_all_named(certificate: Certificate) -> None:
+    # One pose was a metre off, the others not at all.
+    wrong = replace(certificate, found=np.diag([1.0, 0.0, 0.0]))
+    said = _certified(wrong, limits=(0.5, 0.5, 0.5)).sentences()[2]
+    assert said == 'As found: conforms, does not conform; as left: every pose conforms.'
+    said = _certified(certificate, limits=(1e-12, 1.0, 1.0)).sentences()[2]
+    assert said.endswith('as left: every pose not decided.')
+
+
+def test_the_chart_has_every_error_and_both_limits(certificate: Certificate) -> None:
+    chart = _certified(certificate, limits=LIMITS)._chart()
+    assert chart.beside == 3
+    for i, (panel, axis) in enumerate(zip(chart.panels, ('ΔX / µm', 'ΔY / µm', 'θ / mdeg'), strict=True)):
+        (curve,) = panel.series
+        assert panel.y_label == axis
+        assert curve.x.tolist() == [1.0, 2.0, 3.0]
+        assert curve.y == pytest.approx(SCALES[i] * certificate.found[:, i])
+        assert curve.spread == pytest.approx([SCALES[i] * said.uncertainty[i] for said in certificate.stated])
+        assert [rule.at for rule in panel.rules] == pytest.approx([-SCALES[i] * LIMITS[i], SCALES[i] * LIMITS[i]])
+        assert all(rule.across for rule in panel.rules)
+    assert all(not panel.rules for panel in _certified(certificate)._chart().panels)
+    assert sum(isinstance(one, Chart) for one in _certified(certificate).drawings()) == 1
+
+
+def test_the_files_have_all_digits(certificate: Certificate) -> None:
+    files = _certified(certificate, limits=LIMITS).files()
+    assert list(files) == [*('certificate.html', 'certificate.json', 'inputs.csv', 'correlations.csv', 'results.csv')]
+    read = {name: list(csv.DictReader(io.StringIO(text))) for name, text in files.items() if name.endswith('csv')}
+    for row, one in zip(read['inputs.csv'], certificate.inputs, strict=True):
+        assert (row['cause'], row['parameter'], row['unit']) == (one.cause, one.parameter, one.unit)
+        assert row['type'] == {True: 'A', False: 'B'}[one.observed]
+        assert (float(row['u']), float(row['nu'])) == (one.u, one.freedom)
+        for n in range(3):
+            assert [float(row[f'c_{a}_{n + 1}']) for a in AXES] == one.coefficients[n].tolist()
+    names = [one.parameter for one in certificate.inputs if one.cause == 'calibration']
+    assert [row[''] for row in read['correlations.csv']] == names
+    for row, own in zip(read['correlations.csv'], certificate.correlations.tolist(), strict=True):
+        assert [float(row[name]) for name in names] == own
+    assert [row['pose'] for row in read['results.csv']] == ['1', '2', '3']
+    for n, row in enumerate(read['results.csv']):
+        said = certificate.stated[n]
+        parts: Mapping[str, FloatArray] = {
+            '': certificate.poses[n],
+            'as_found_': certificate.found[n],
+            'u_c_': said.standard,
+            'nu_eff_': said.freedom,
+            'k_': said.factor,
+            'U_': said.uncertainty,
+        }
+        for kind, values in parts.items():
+            assert [float(row[f'{kind}{axis}']) for axis in AXES] == values.tolist()
+
+
+def test_the_tree_and_the_table_have_the_same_numbers(certificate: Certificate) -> None:
+    answer = _certified(certificate, limits=LIMITS, fields={'number': 'A-17'})
+    tree = json.loads(answer.json())
+    assert tree['limits'] == list(LIMITS)
+    assert tree['probability'] == 0.95
+    assert tree['range'] == _tree()['range']
+    assert tree['provenance'] == {'version': __version__, 'calibration': _tree()['provenance']}
+    assert tree['fields']['number'] == 'A-17'
+    assert np.array(tree['correlations']) == pytest.approx(certificate.correlations, abs=0.0)
+    assert [one['coefficients'] for one in tree['inputs']] == [r.coefficients.tolist() for r in certificate.inputs]
+    table = answer.table()
+    assert table.index.values.tolist() == [1, 2, 3]
+    columns = {column.name: column for column in table.columns}
+    assert [columns[f'expanded_{axis}'].unit for axis in AXES] == ['m', 'm', 'rad']
+    for n, one in enumerate(tree['poses']):
+        assert one['pose'] == list(POSES[n]) == [columns[axis].values[n] for axis in AXES]
+        assert one['as_found'] == [columns[f'as_found_{axis}'].values[n] for axis in AXES]
+        assert one['standard'] == [columns[f'standard_{axis}'].values[n] for axis in AXES]
+        assert one['uncertainty'] == [columns[f'expanded_{axis}'].values[n] for axis in AXES]
+        assert one['uncertainty'] == certificate.stated[n].uncertainty.tolist()
+        assert one['conformity'] == answer.verdicts[n]._asdict()
+    plain = _certified(certificate).tree()
+    assert plain['limits'] is None
+    assert [one['conformity'] for one in plain['poses']] == [None] * 3
+
+
+def test_fields_are_those_given_and_else_what_the_recordings_say(certificate: Certificate) -> None:
+    fields = _certified(certificate, fields={'number': 'A-17'}).fields
+    assert list(fields) == list(FIELDS)
+    assert len(FIELDS) == 13 + 5 + 3
+    assert (fields['number'], fields['customer']) == ('A-17', '')
+    assert fields['device'] == 'U6, T7'
+    assert fields['temperature'] == '20.2 to 22.8'
+    given = _certified(certificate, fields={'device': 'mine', 'temperature': '19'}).fields
+    assert (given['device'], given['temperature']) == ('mine', '19')
+    tree = _tree()
+    tree['provenance']['recordings'] = [{'name': 'a.csv', 'sha256': 'aa'}]
+    assert _certified(certificate, calibration=tree).fields['temperature'] == ''
+
+
+def test_sources_are_numbered(certificate: Certificate) -> None:
+    assert _certified(certificate).sources == {
+        'version': __version__,
+        'calibrated rig file': 'new/rig.yaml',
+        'calibrated on': '2026-01-02',
+        'recording 1': 'a.csv (sha256 aa)',
+        'recording 2': 'b.csv (sha256 bb)',
+        'recording 3': 'c.csv (sha256 cc)',
+    }
+
+
+def test_the_page_has_every_section(certificate: Certificate) -> None:
+    answer = _certified(certificate, limits=LIMITS, fields={'number': 'A-17'})
+    page = answer.report()
+    for words in (
+        'reference, type and serial number',
+        'performed by',
+        '<td>A-17</td>',
+        '<td>. . . . ',
+        'Largest errors allowed: ΔX 100 µm, ΔY 200 µm, θ 172 mdeg.',
+        'Valid for poses of ΔX µm -2000.000 to 1000.000, ΔY µm -2500.000 to 2000.000, θ mdeg -1145.916 to 1718.873, ',
+        # 20 samples at 1 kHz are 50 estimates a second, and nine tenths of these are held.
+        'single estimates of 20 samples at 1000 Hz by the solver exact',
+        'motion slower than 45 Hz',
+        '<td>∞</td>',
+        f'<td>{certificate.inputs[0].coefficients[0, 0]:.6g}</td>',
+    ):
+        assert words in page, words
+    # A field is in the page once if it was filled in.
+    assert page.count('A-17') == 1
+    assert 'No limits were given: nothing is judged.' in _certified(certificate).report()
+    assert page.count('<td>. . .') == 13 + 5 + 3 - 3
+
+
+# ---- The folder of a calibration ----
+
+
+def _folder(path: Path, tree: object) -> Path:
+    (path / 'rig.yaml').write_text('/**:\n  ros__parameters:\n    psd_1: {height: 0.02}\n')
+    (path / 'calibration.json').write_text(tree if isinstance(tree, str) else json.dumps(tree))
+    return path
+
+
+def test_a_folder_is_read_whole(tmp_path: Path) -> None:
+    tree = _tree()
+    del tree['provenance']['date']
+    rig, found = read_calibration(_folder(tmp_path, tree))
+    assert rig.heights.tolist() == [0.02, 0.0]
+    # Older ones have no date.
+    assert found == {**_tree(), 'provenance': {**_tree()['provenance'], 'date': ''}}
+    assert read_calibration(_folder(tmp_path, _tree()))[1] == _tree()
+
+
+def _changed(*path: str | int, to: object) -> dict[str, Any]:
+    tree = _tree()
+    inner: Any = tree
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = to
+    return tree
+
+
+@pytest.mark.parametrize(
+    ('tree', 'words'),
+    [
+        ('{', 'no JSON; give'),
+        ('[' * 100_000, 'no JSON; give'),
+        ([], 'no map; give'),
+        (_changed('refused', to='worse than before'), 'refused: the calibration was refused'),
+        (_changed('kind', to='loads'), 'kind = loads: its scale is traceable to nothing'),
+        (_changed('parameters', to=[]), 'parameters: not there'),
+        (_changed('parameters', 'psd_2.gain_y', to=3.0), 'parameters.psd_2.gain_y: needs the numbers'),
+        (_changed('parameters', 'psd_2.gain_y', to={'value': 1.0}), 'parameters.psd_2.gain_y: needs the numbers'),
+        (_changed('parameters', 'psd_2.gain_y', to={'used': 1.0}), 'parameters.psd_2.gain_y: needs the numbers'),
+        (_changed('parameters', 'psd_2.gain_y', 'used', to=math.inf), 'parameters.psd_2.gain_y: needs the numbers'),
+        (_changed('parameters', 'psd_2.gain_y', 'used', to=True), 'parameters.psd_2.gain_y: needs the numbers'),
+        (_changed('parameters', 'psd_2.gain_y', 'used', to='1'), 'parameters.psd_2.gain_y: needs the numbers'),
+        (_changed('reference', to=None), 'reference: not there'),
+        (_changed('reference', 'rows', to=None), 'reference.rows: not a number'),
+        (_changed('reference', 'outliers', to='few'), 'reference.outliers: not a number'),
+        (_changed('range', to=None), 'range: not there'),
+        (_changed('range', 'low', to=[0.0, 0.0]), 'range.low: must be three'),
+        (_changed('range', 'low', to=[0.0] * 4), 'range.low: must be three'),
+        (_changed('range', 'high', to='abc'), 'range.high: must be three'),
+        (_changed('range', 'high', to=[0.0, 0.0, None]), 'range.high: must be three'),
+        (_changed('provenance', to='me'), 'provenance: not there'),
+        (_changed('provenance', 'recordings', to={}), 'provenance.recordings: must be maps'),
+        (_changed('provenance', 'recordings', 2, to='c.csv'), 'provenance.recordings: must be maps'),
+        (_changed('provenance', 'recordings', 2, to={'name': 'c.csv'}), 'provenance.recordings: must be maps'),
+        (_changed('provenance', 'recordings', 2, 'temperature', to=20.0), 'recordings.temperature: must be numbers'),
+        (_changed('provenance', 'recordings', 2, 'temperature', to=['w']), 'recordings.temperature: must be numbers'),
+    ],
+    ids=lambda v: v if isinstance(v, str) and len(v) < 60 else '',
+)
+def test_what_calibrate_does_not_write_is_refused(tree: object, words: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        read_calibration(_folder(tmp_path, tree))
+    assert f'calibration.json: {words}'.partition('calibration.json: ')[2] in str(error.value)
+    assert str(error.value).startswith(str(tmp_path / 'calibration.json'))
+
+
+def test_a_file_that_is_too_long_or_not_there_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = _folder(tmp_path, _tree())
+    size = (folder / 'calibration.json').stat().st_size
+    # One of thirty parameters has 40 kB.
+    assert 40_000 < from_calibration.LONGEST == 10**7
+    monkeypatch.setattr(from_calibration, 'LONGEST', size)
+    assert read_calibration(folder)[1] == _tree()
+    monkeypatch.setattr(from_calibration, 'LONGEST', size - 1)
+    with pytest.raises(ConfigError, match=f'more than {size - 1} bytes'):
+        read_calibration(folder)
+    (folder / 'calibration.json').unlink()
+    with pytest.raises(RecordingError, match=r'calibration\.json: cannot be read'):
+        read_calibration(folder)
+
+
+def test_words_of_a_stranger_are_cut(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as error:
+        read_calibration(_folder(tmp_path, _changed('kind', to='k' * 201)))
+    assert f'kind = {"k" * 199}…:' in str(error.value)
+    with pytest.raises(ConfigError) as error:
+        read_calibration(_folder(tmp_path, _changed('kind', to='k' * 200)))
+    assert f'kind = {"k" * 200}:' in str(error.value)
+
+
+def test_fields_are_read_as_words(tmp_path: Path) -> None:
+    path = tmp_path / 'fields.yaml'
+
+    def read(text: str) -> dict[str, str]:
+        path.write_text(text)
+        return read_fields(str(path))
+
+    assert read_fields(None) == {}
+    assert read('number: A-17\npressure: 1013\ncustomer:\n') == {'number': 'A-17', 'pressure': '1013', 'customer': ''}
+    for text, words in (
+        ('- number', 'fields are lines'),
+        ('nummer: 1', 'nummer: no such field; did you mean number'),
+        ('number: [1]', 'number: must be words'),
+        ('number: {a: 1}', 'number: must be words'),
+    ):
+        with pytest.raises(ConfigError, match=words) as error:
+            read(text)
+        assert str(error.value).startswith(str(path))
+
+
+def test_a_drift_of_a_beam_is_that_of_the_budget_at_each_pose() -> None:
+    """Where all channels count alike, as the budget takes them."""
+    inputs = read_inputs()
+    words = ('here', 'there')
+    cause = next(c for c in CAUSES if c.name == 'pointing_drift')
+    even = replace_values(RIG, {'psd_2.noise': [2e-3, 2e-3]})
+    rows = [row for row in certify(_problem(rig=even)).inputs if row.cause == 'pointing_drift']
+    for n, pose in enumerate(POSES):
+        own = cause.sensitivities(Situation.at_pose(even, inputs, np.array(pose), 'exact', words))
+        for row, one in zip(rows, own, strict=True):
+            assert row.u == one.deviation == pytest.approx(10e-6 * 0.585)
+            assert row.coefficients[n] == pytest.approx(one.coefficient, rel=1e-9, abs=1e-12)

@@ -1,0 +1,104 @@
+"""The inputs: defaults by the sources that they name, and bounds that hold on both sides."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.studies.budget.inputs import INPUTS, REFERENCE_INPUTS, is_assumed, read_inputs
+
+EVERY = (*INPUTS, *REFERENCE_INPUTS)
+NANO, MICRO, MILLI = 1e-9, 1e-6, 1e-3
+
+# By what the sources say: data sheets, the thesis, a rule. Default, unit, least (more than it: True), greatest.
+SAID: dict[str, tuple[float, str, float, bool, float]] = {
+    'laser_wavelength': (650 * NANO, 'm', 10 * NANO, True, 10 * MICRO),
+    'laser_diameter': (1 * MILLI, 'm', 1 * MICRO, True, 50 * MILLI),
+    'laser_power': (1 * MILLI / 2, 'W', 0.0, True, 1.0),
+    'profile_change': (1 * MILLI, '', 0.0, False, 1.0),
+    'pointing_drift': (10 * MICRO, 'rad', 0.0, False, 0.1),
+    'responsivity': (0.4, 'A/W', 0.0, True, 2.0),
+    'dark_current': (500 * NANO, 'A', 0.0, False, 1 * MILLI),
+    'nonlinearity': (0.1 / 100, '', 0.0, False, 0.1),
+    'drift_coefficient': (40 * MICRO, '1/K', 0.0, False, 0.01),
+    'temperature': (273.15 + 20.0, 'K', 273.15 - 50.0, True, 273.15 + 80.0),
+    'temperature_change': (5.0, 'K', 0.0, False, 100.0),
+    'air_gradient': (10.0, 'K/m', 0.0, False, 1000.0),
+    'air_step': (303.15 - 293.15, 'K', 0.0, False, 500.0),
+    'air_step_angle': (math.radians(5.0), 'rad', 0.0, False, 1.4),
+    'interference': (5 * MILLI, 'V', 0.0, False, 10.0),
+    'interference_frequency': (60.0, 'Hz', 0.0, True, 1e6),
+    'rotation_tolerance': (math.radians(0.5), 'rad', 0.0, False, 0.5),
+    'tilt_tolerance': (math.radians(0.5), 'rad', 0.0, False, 0.5),
+    'beam_tolerance': (2 * MILLI / 0.585, 'rad', 0.0, False, 0.5),
+    'center_tolerance': (1 * MILLI / 2, 'm', 0.0, False, 0.1),
+    'height_tolerance': (1 * MILLI, 'm', 0.0, False, 0.1),
+    'gain_tolerance': (2 * MILLI, '', 0.0, False, 0.5),
+    'expansion_coefficient': (23.6 * MICRO, '1/K', 0.0, False, 1 * MILLI),
+    'bracket_temperature': (1.0, 'K', 0.0, False, 100.0),
+    'slope_ratio_tolerance': ((2.0 - 1.0) / 2.0, '', 0.0, False, 5.0),
+    'zero_blocks': (1.0, 'blocks', 0.0, True, 1e6),
+    'noise_freedom': (1000.0 - 1.0, '', 0.0, True, 1e9),
+    # 25 % are 8 degrees of freedom.
+    'assumption_doubt': (math.sqrt(1.0 / (2.0 * 8.0)), '', 0.0, False, 10.0),
+    'iteration_tolerance': (0.1 * MILLI, 'm', 0.0, False, 10 * MILLI),
+    'iteration_step': (math.radians(0.01), 'rad', 0.0, False, 0.1),
+    'reference_scale': (1e-4, '', 0.0, False, 0.1),
+    'reference_angle_scale': (1e-4, '', 0.0, False, 0.1),
+}
+# A source that says degrees or millimetres is rounded to two or three digits.
+ROUNDED = {'beam_tolerance': 0.03, 'rotation_tolerance': 0.01, 'tilt_tolerance': 0.01, 'air_step_angle': 1e-3}
+
+
+def test_every_input_is_what_its_source_says() -> None:
+    assert [i.parameter.name for i in EVERY] == list(SAID)
+    for i in EVERY:
+        default, unit, *_ = SAID[i.parameter.name]
+        assert i.parameter.default == pytest.approx(default, rel=ROUNDED.get(i.parameter.name, 1e-6))
+        assert i.parameter.unit == unit
+
+
+@pytest.mark.parametrize('name', list(SAID))
+def test_bounds_hold_on_both_sides(name: str) -> None:
+    _, _, least, exclusive, greatest = SAID[name]
+
+    def read(value: float) -> float:
+        return read_inputs(None, {name: value}, declared=EVERY)[name]
+
+    inside = greatest * (1.0 - 1e-12)
+    assert read(inside) == inside
+    with pytest.raises(ConfigError, match=f'{name}.* at most'):
+        read(greatest * (1.0 + 1e-9))
+    low = least * (1.0 + 1e-9) if exclusive else least
+    low = low or (1e-300 if exclusive else 0.0)
+    assert read(low) == low
+    with pytest.raises(ConfigError, match=f'{name}.* {"above" if exclusive else "at least"}'):
+        read(least * (1.0 - 1e-9) if exclusive else -1e-300)
+
+
+def test_a_guess_is_what_nobody_has_replaced() -> None:
+    assert is_assumed('pointing_drift', 10e-6)
+    assert not is_assumed('pointing_drift', 11e-6)
+    # A data sheet is no guess, nor is the thesis.
+    assert not is_assumed('dark_current', 500e-9)
+    assert not is_assumed('laser_power', 0.5e-3)
+    assert is_assumed('reference_scale', 1e-4)
+    assert not is_assumed('reference_scale', 2e-5)
+
+
+def test_only_what_is_declared_is_read(tmp_path: Path) -> None:
+    assert list(read_inputs()) == [i.parameter.name for i in INPUTS]
+    assert list(read_inputs(declared=EVERY)) == list(SAID)
+    # The reference belongs to a certificate; no budget takes it.
+    with pytest.raises(ConfigError, match='settings: reference_scale = 1: no such input'):
+        read_inputs(None, {'reference_scale': 1})
+    path = tmp_path / 'inputs.yaml'
+    path.write_text('reference_scale: 2e-5\n')
+    assert read_inputs(path, declared=EVERY)['reference_scale'] == 2e-5
+    with pytest.raises(ConfigError, match=r'inputs\.yaml: reference_scale'):
+        read_inputs(path)
+    with pytest.raises(ConfigError, match=r'--set: gain_tolerance'):
+        read_inputs(path, {'gain_tolerance': -1.0}, '--set', EVERY)

@@ -1,0 +1,248 @@
+"""What a budget says, shows and writes, against the numbers of its causes and sums by hand."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.model.link import LinkStatics
+from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.studies.budget.budget import BudgetProblem, budget
+from psd_deflection.studies.budget.evaluate import CAUSES, draws, monte_carlo
+from psd_deflection.studies.budget.expanded import Interval, difference, expanded, interval_of
+from psd_deflection.studies.budget.inputs import read_inputs
+from psd_deflection.studies.budget.result import Budgeted, freedom_words, in_words, parameter_rows, shown, type_of
+from psd_deflection.studies.budget.term import Contribution, Kind
+
+RIG = replace_values(load_rig(), {'psd_2.noise': [4e-3, 2e-3]})
+LOAD = (8.0, -30.0, -12.0)
+AXES = ('dx', 'dy', 'theta')
+SCALES = np.array([1e6, 1e6, 180.0 / math.pi * 1e3])
+
+
+@pytest.fixture(scope='module')
+def answer() -> Budgeted:
+    return budget(BudgetProblem(RIG, load=LOAD, draws=400, seed=3, rig_file='rig.yaml'))
+
+
+@pytest.fixture(scope='module')
+def plain() -> Budgeted:
+    return budget(BudgetProblem(RIG, load=LOAD))
+
+
+def test_values_are_shown_in_micrometres_and_millidegrees() -> None:
+    assert shown(np.array([1.5e-6, -2e-3, math.radians(0.25)])) == ['1.500', '-2000.000', '250.000']
+    assert in_words(np.array([1.5e-6, 2.3456e-6, math.radians(0.25)])) == 'ΔX 1.5 µm, ΔY 2.35 µm, θ 250 mdeg'
+    assert (freedom_words(math.inf), freedom_words(8.0)) == ('∞', '8')
+
+
+def test_observed_causes_are_of_type_a() -> None:
+    assert {cause.name: type_of(cause) for cause in CAUSES} == {
+        **dict.fromkeys((cause.name for cause in CAUSES), 'B'),
+        'amplifier_noise': 'A',
+        'zeroing': 'A',
+    }
+
+
+def test_the_problem_says_what_is_computed(answer: Budgeted, plain: Budgeted) -> None:
+    assert (answer.draws, answer.seed, answer.load, answer.sources) == (400, 3, LOAD, {'rig': 'rig.yaml'})
+    assert answer.budget.at.method == 'exact'
+    assert (plain.sampled, plain.interval, plain.draws, plain.seed, plain.sources) == (None, None, 0, 1, {})
+    # Drawn once as normal, and once more as declared.
+    assert answer.sampled is not None
+    assert answer.sampled.covariance.tolist() == monte_carlo(answer.budget.at, 400, 3).covariance.tolist()
+    assert answer.interval is not None
+    assert answer.interval.half.tolist() == interval_of(draws(answer.budget.at, 400, 3, shaped=True)).half.tolist()
+    assert budget(BudgetProblem(RIG, load=LOAD, method='wls')).budget.at.method == 'wls'
+    sizes: list[int] = []
+    budget(BudgetProblem(RIG, load=LOAD, draws=10_003), sizes.append)
+    assert sizes == [10_000, 3, 10_000, 3]
+
+
+def test_the_situation_is_the_load_and_the_pose(plain: Budgeted) -> None:
+    dx, dy, theta = LinkStatics.from_rig(RIG).deflection(*LOAD)
+    expected = (
+        f'Load (8 N, -30 N, -12 N m): ΔX {1e3 * dx:.4f} mm, ΔY {1e3 * dy:.4f} mm, '
+        f'θ {180.0 / math.pi * theta:.4f} deg; method exact; mean of 20 samples'
+    )
+    assert plain.lines()[:2] == [expected, '']
+    assert f'<p class=quiet>{expected}</p>' in plain.report()
+
+
+def test_the_rows_of_the_causes_are_their_numbers(plain: Budgeted) -> None:
+    head, *rows = plain._causes()
+    assert head[5:] == ['ΔX µm', 'ΔY µm', 'θ mdeg', 'ΔX %', 'ΔY %', 'θ %']
+    whole = plain.budget.total().rms
+    for row, (cause, line) in zip(rows, plain.budget.lines, strict=True):
+        assert row[:4] == [cause.name, cause.row or '-', cause.kind.value, type_of(cause)]
+        freedom = cause.freedom(plain.budget.at)
+        assert row[4] == ('∞' if freedom == math.inf else str(int(freedom)))
+        size = np.sqrt(line.bias**2 + np.diag(line.covariance))
+        assert [float(v) for v in row[5:8]] == pytest.approx((size * SCALES).tolist(), abs=6e-4)
+        assert [float(v) for v in row[8:]] == pytest.approx((100.0 * (size / whole) ** 2).tolist(), abs=0.06)
+    # A line of dashes below the head, four columns flush left.
+    text = plain.lines()
+    assert text[2].split() == ' '.join(head).split()
+    assert text[4].startswith(f'{rows[0][0]:<{max(len(row[0]) for row in (head, *rows))}}  ')
+
+
+def test_words_stand_flush_left_and_numbers_right(plain: Budgeted) -> None:
+    lines = plain.lines()
+    head, first = lines[2], lines[4]
+    cells = plain._causes()[1]
+    at = head.index('type')
+    assert first[at - 2 :].startswith(f'  {cells[3]} ')
+    end = head.index('ν') + 1
+    # As wide as 999, so that one figure stands at the right of it.
+    assert cells[4] == '8'
+    assert head[end - 4 : end] == '   ν'
+    assert first[end - 4 : end] == '   8'
+
+
+def test_totals_are_sums_of_their_kind(plain: Budgeted) -> None:
+    rows = {row[0]: row[1:] for row in plain._totals()[1:]}
+    for kind in (*Kind, None):
+        own = [line for cause, line in plain.budget.lines if kind is None or cause.kind is kind]
+        bias = sum((line.bias for line in own), np.zeros(3))
+        variance = sum((np.diag(line.covariance) for line in own), np.zeros(3))
+        expected = np.sqrt(bias**2 + variance) * SCALES
+        name = 'total' if kind is None else f'all {kind.value} terms'
+        assert [float(v) for v in rows[name]] == pytest.approx(expected.tolist(), abs=6e-4)
+    assert len(rows) == 4
+
+
+def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain: Budgeted) -> None:
+    variances = np.array([np.diag(line.covariance) for _, line in plain.budget.lines])
+    bias = np.sum([line.bias for _, line in plain.budget.lines], axis=0)
+    said = expanded(variances, [cause.freedom(plain.budget.at) for cause in CAUSES], bias)
+    _, *rows = plain._expanded()
+    assert len(rows) == 5
+    assert [float(v) for v in rows[0][1:]] == pytest.approx((said.standard * SCALES).tolist(), abs=6e-4)
+    assert rows[1][1:] == [f'{v:.0f}' for v in said.freedom.tolist()]
+    assert rows[2][1:] == [f'{v:.3f}' for v in said.factor.tolist()]
+    assert [float(v) for v in rows[3][1:]] == pytest.approx((bias * SCALES).tolist(), abs=6e-4)
+    by_hand = said.factor * said.standard + np.abs(bias)
+    assert [float(v) for v in rows[4][1:]] == pytest.approx((by_hand * SCALES).tolist(), abs=6e-4)
+    assert answer.interval is not None
+    drawn = answer._expanded()[6:]
+    assert [float(v) for v in drawn[0][1:]] == pytest.approx((answer.interval.half * SCALES).tolist(), abs=6e-4)
+    off = 100.0 * (said.factor * said.standard / answer.interval.half - 1.0)
+    assert drawn[1][1:] == [f'{v:+.1f}' for v in off.tolist()]
+    sentence = answer.sentences()[-1]
+    assert f'ΔX {off[0]:+.1f} %, ΔY {off[1]:+.1f} %, θ {off[2]:+.1f} %.' in sentence
+    assert f'within {in_words(answer.interval.half)};' in sentence
+    assert sentence.startswith('400 draws of the declared distributions')
+
+
+def test_without_a_spread_there_is_no_difference() -> None:
+    said = expanded(np.array([[4.0, 4.0, 0.0]]), [math.inf], np.zeros(3))
+    got = difference(said, Interval(np.array([2.0 * 1.959964, 0.0, 0.0]), np.zeros(3)))
+    # The first is what was drawn; of the others nothing was drawn.
+    assert got == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
+    assert difference(said, Interval(np.array([1.959964] * 3), np.zeros(3)))[:2] == pytest.approx([1.0, 1.0], abs=1e-6)
+
+
+def test_the_sentences_name_the_largest_cause(answer: Budgeted, plain: Budgeted) -> None:
+    first, second, third = plain.sentences()
+    assert first == f'A single estimate is wrong by {in_words(plain.budget.total().rms)} (rms), method exact.'
+    shares = {cause.name: max(plain.budget.shares(line)) for cause, line in plain.budget.lines}
+    largest = max(shares, key=lambda name: float(shares[name]))
+    assert second == f'The largest cause is {largest}: up to {shares[largest]:.0%} of the mean square of an axis.'
+    assert third == f'Expanded uncertainty for 95 %: {in_words(plain.budget.expanded().uncertainty)}.'
+    assert answer.sampled is not None
+    size = np.sqrt(answer.sampled.bias**2 + np.diag(answer.sampled.covariance))
+    assert f'400 random draws of all causes at once give {in_words(size)}.' in answer.sentences()
+    dx, dy, theta = shown(size)
+    assert f'total     ΔX {dx} µm  ΔY {dy} µm  θ {theta} mdeg' in answer.lines()
+    assert 'Monte Carlo, 400 draws of everything at once (seed 3):' in answer.lines()
+
+
+def test_the_rows_of_the_parameters_are_what_a_sum_by_hand_needs(plain: Budgeted) -> None:
+    head, *rows = parameter_rows(plain.budget)
+    assert head[7:] == ['c ΔX', 'c ΔY', 'c θ', 'ΔX µm', 'ΔY µm', 'θ mdeg']
+    own = [(cause, s) for cause in CAUSES for s in cause.sensitivities(plain.budget.at)]
+    for row, (cause, s) in zip(rows, own, strict=True):
+        assert row[:4] == [cause.name, s.name, type_of(cause), cause.distribution.value]
+        assert float(row[4]) == pytest.approx(s.deviation, rel=1e-5)
+        assert row[5] == cause.unit
+        assert row[6] == freedom_words(cause.freedom(plain.budget.at))
+        assert [float(v) for v in row[7:10]] == pytest.approx(s.coefficient.tolist(), rel=1e-5, abs=1e-12)
+        by_hand = (np.abs(s.coefficient) * s.deviation * SCALES).tolist()
+        assert [float(v) for v in row[10:]] == pytest.approx(by_hand, abs=6e-4)
+
+
+def _same(tree: dict[str, Any], line: Contribution) -> None:
+    assert tree['bias'] == line.bias.tolist()
+    assert tree['covariance'] == line.covariance.tolist()
+    assert tree['rms'] == pytest.approx(np.sqrt(line.bias**2 + np.diag(line.covariance)).tolist())
+
+
+def test_the_tree_has_every_number(answer: Budgeted, plain: Budgeted) -> None:
+    tree = json.loads(answer.json())
+    at = answer.budget.at
+    assert (tree['unit'], tree['load'], tree['pose']) == (['m', 'm', 'rad'], list(LOAD), at.pose.tolist())
+    for one, (cause, line) in zip(tree['terms'], answer.budget.lines, strict=True):
+        _same(one, line)
+        assert one['kind'] == {'per estimate': 'per_estimate', 'known bias': 'known'}.get(
+            cause.kind.value, 'systematic'
+        )
+        assert one['inputs'] == {name: read_inputs()[name] for name in cause.inputs}
+        assert one['share'] == pytest.approx((line.rms**2 / answer.budget.total().rms ** 2).tolist())
+        freedom = cause.freedom(at)
+        assert one['freedom'] == (None if freedom == math.inf else freedom)
+        assert one['type'] == type_of(cause)
+        for parameter, s in zip(one['parameters'], cause.sensitivities(at), strict=True):
+            assert (parameter['name'], parameter['u'], parameter['unit']) == (s.name, s.deviation, cause.unit)
+            assert parameter['sensitivity'] == s.coefficient.tolist()
+    _same(tree['totals']['total'], answer.budget.total())
+    for kind in Kind:
+        _same(tree['totals'][kind.name.lower()], answer.budget.total(kind))
+    assert answer.sampled is not None
+    assert answer.interval is not None
+    _same(tree['totals']['monte_carlo'], answer.sampled)
+    stated = tree['expanded']
+    assert stated['probability'] == 0.95
+    assert stated['uncertainty'] == answer.budget.expanded().uncertainty.tolist()
+    assert stated['freedom'] == answer.budget.expanded().freedom.tolist()
+    assert stated['monte_carlo']['half'] == answer.interval.half.tolist()
+    assert stated['monte_carlo']['middle'] == answer.interval.middle.tolist()
+    assert 'monte_carlo' not in plain.tree()['expanded']
+    assert 'monte_carlo' not in plain.tree()['totals']
+    # Nothing is doubted: infinitely many degrees of freedom, which JSON does not have.
+    inputs = read_inputs(None, {'assumption_doubt': 0.0, 'noise_freedom': 1e9})
+    known = budget(BudgetProblem(RIG, inputs, LOAD))
+    quiet = replace(known, budget=replace(known.budget, lines=known.budget.lines[:1]))
+    assert quiet.tree()['expanded']['freedom'] == [None] * 3
+
+
+def test_the_table_has_a_row_for_every_cause(plain: Budgeted) -> None:
+    table = plain.table()
+    assert list(table.index.values) == [cause.name for cause in CAUSES]
+    columns = {column.name: column for column in table.columns}
+    assert list(columns) == ['kind', 'freedom', *(f'rms_{a}' for a in AXES), *(f'share_{a}' for a in AXES)]
+    assert [columns[f'rms_{a}'].unit for a in AXES] == ['m', 'm', 'rad']
+    assert [columns[f'share_{a}'].unit for a in AXES] == ['', '', '']
+    for i, (cause, line) in enumerate(plain.budget.lines):
+        assert columns['kind'].values[i] == cause.kind.value
+        assert columns['freedom'].values[i] == cause.freedom(plain.budget.at)
+        assert [columns[f'rms_{a}'].values[i] for a in AXES] == line.rms.tolist()
+        assert [columns[f'share_{a}'].values[i] for a in AXES] == plain.budget.shares(line).tolist()
+    assert table.attributes == {'method': 'exact', 'load': LOAD}
+
+
+def test_the_page_has_every_section(answer: Budgeted) -> None:
+    titles = [section.title for section in answer.sections()]
+    assert titles == [
+        *('', 'Every cause beside the total', 'Totals', 'Every cause'),
+        *('Expanded uncertainty (GUM)', 'Every error parameter'),
+    ]
+    page = answer.report()
+    for cells in (*answer._causes(), *answer._totals(), *answer._expanded(), *parameter_rows(answer.budget)):
+        assert all(f'>{cell}<' in page for cell in cells if cell)
+    # The bars begin at a thousandth.
+    assert 'from 0.001 of the total on' in page
