@@ -519,3 +519,28 @@ def test_the_noise_is_that_of_the_samples_without_any_rest(three: Rig, solver: s
     assert pipeline.stamped.noise_source() == 'measured in motion'
     assert pipeline.stamped.noise.sample_sd() == pytest.approx(1e-6, rel=0.1)
     assert pipeline.stamped.noise.mean_sd() == pytest.approx(1e-6 / 20**0.5, rel=0.3)
+
+
+STUDIES: dict[str, list[str]] = {
+    'budget': ['--params-file', str(THREE)],
+    'design': ['--params-file', str(THREE)],
+    **{name: ['{three}'] for name in ('calibrate', 'check', 'discover', 'identify', 'validate')},
+}
+"""What each study is asked of a rig of three PSDs."""
+OF_NO_RIG = {'certificate', 'effects', 'thesis'}
+
+
+def test_every_study_takes_a_rig_of_three_psds_or_says_why_not(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    commands = (Path(__file__).parents[1] / 'psd_deflection' / 'cli' / 'studies').glob('[a-z]*.py')
+    assert {c.stem for c in commands} == {*STUDIES, *OF_NO_RIG}
+    three = tmp_path / 'three'
+    run = ['simulate', '--params-file', str(THREE), '--out', str(three), '--loads', 'steps:0,0,0;0,-20,0;30,0,0:2']
+    assert main(run) == 0
+    for name, given in STUDIES.items():
+        out = [] if name in ('budget', 'design', 'check', 'validate') else ['--out', str(tmp_path / name)]
+        capsys.readouterr()
+        code = main([name, *(a.format(three=three) for a in given), *out])
+        said = capsys.readouterr().err
+        assert code == 0 or (code in (3, 4) and ('PSDs' in said or 'reference' in said)), (name, code, said)

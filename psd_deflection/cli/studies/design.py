@@ -32,7 +32,7 @@ from psd_deflection.model.link.section import TubeSection
 from psd_deflection.model.plate import placement
 from psd_deflection.model.plate.linear import condition_number, design_matrix
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.rig.config import Rig, check_two_psds, load_rig
 from psd_deflection.studies import splitter
 from psd_deflection.studies.budget.load import default_load
 from psd_deflection.studies.thesis import scaling
@@ -92,6 +92,7 @@ def run(args: argparse.Namespace) -> int:
         show_text(appendix_b())
         return 0
     rig = load_rig(args.params_file)
+    check_two_psds(rig, 'a placement')
     each = rig.noises[:, :2] * rig.sensitivities
     sigma = float(np.sqrt((each * each).mean() / rig.estimator.block_size))
     if args.sigma is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from psd_deflection.rig.config import Rig
+from psd_deflection.rig.config import Rig, check_two_psds
 from psd_deflection.studies.budget.estimate import method_of
 from psd_deflection.studies.budget.evaluate import draws, evaluate, monte_carlo
 from psd_deflection.studies.budget.expanded import Interval, interval_of
@@ -36,9 +36,10 @@ class BudgetProblem:
 def budget(problem: BudgetProblem, drawn: Callable[[int], object] = lambda size: None) -> Budgeted:
     """Every cause to first order, and the random draws that must agree; ``drawn`` gets the number of draws just done.
 
-    Raises ConfigError if the load leaves the active area or the method does not suit the rig.
+    Raises ConfigError for a load that leaves the active area, a method that does not suit the rig, more than two PSDs.
     """
     rig = problem.rig
+    check_two_psds(rig, 'a budget')
     load = default_load(rig) if problem.load is None else problem.load
     found = evaluate(Situation.at_load(rig, problem.inputs, load, problem.method or method_of(rig)))
     sampled: Contribution | None = None
