@@ -195,7 +195,8 @@ def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) ->
         return out
 
     valid = there.astype(np.float64)
-    overlap = correlated(count, valid)
+    # A count: the transform leaves 20 a last bit below 20.
+    overlap = np.rint(correlated(count, valid))
     cost = np.zeros(len(lags))
     with np.errstate(divide='ignore', invalid='ignore'):
         for axis in range(3):
@@ -206,7 +207,7 @@ def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) ->
             both = correlated(r, m) / overlap - sm * sr
             explained = np.where((vm > 0.0) & (vr > 0.0), both * both / (vm * vr), 0.0)
             cost += np.log1p(-np.clip(np.nan_to_num(explained), 0.0, 1.0 - 1e-12))
-    cost *= np.maximum(overlap, 0.0)
+    cost *= overlap
     # Half of the references that can overlap must; an offset at the edge with few of them explains anything.
     cost[overlap < max(FEWEST, 0.5 * overlap.max())] = np.inf
     lowest = minimum_filter1d(cost, 2 * APART + 1)
@@ -263,6 +264,7 @@ class _Used:
         causes = causes / scale
         left = np.empty((k, 3))
         own = np.empty((k, 3))
+        ramp = np.empty((k, 3))
         sizes = np.empty(3)
         for axis in range(3):
             root = np.sqrt(weights[:, axis])[:, None]
@@ -271,7 +273,10 @@ class _Used:
             sizes[axis] = max(1.4826 * float(np.median(np.abs(left[:, axis] - np.median(left[:, axis])))), 1e-12)
             # What the offset does to this axis, without what bias and scales could do as well.
             does = sum((terms[1 + c] / scale[1 + c] * self.rates[:, i] for c, i in enumerate(moving)), np.zeros(k))
-            own[:, axis] = does - causes @ np.linalg.lstsq(causes * root, does[:, None] * root, rcond=1e-10)[0][:, 0]
+            # Beside it what an offset that grows with time does.
+            both = np.column_stack([does, does * self.t])
+            both -= causes @ np.linalg.lstsq(causes * root, both * root, rcond=1e-10)[0]
+            own[:, axis], ramp[:, axis] = both.T
         next_weights = np.clip(1.0 - (left / (BIWEIGHT * sizes)) ** 2, 0.0, None) ** 2
         w = next_weights / sizes**2
         information = float((w * own * own).sum())
@@ -281,7 +286,6 @@ class _Used:
         scores = (w * own * left).sum(axis=1)
         spread = max(variance_of_sum(scores) / information**2, 1.0 / information)
         # The offset's growth with time, by what is left.
-        ramp = own * self.t[:, None]
         ramp = ramp - own * (float((w * own * ramp).sum()) / information)
         grows = float((w * ramp * ramp).sum())
         drift = float((w * ramp * left).sum()) / grows if grows > 0.0 else 0.0
