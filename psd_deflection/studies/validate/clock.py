@@ -170,9 +170,6 @@ def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) ->
     n, period = len(single), motion.period
     place = np.rint((t - motion.t[0]) / period).astype(np.int64)
     lags = np.arange(-math.ceil(largest / period), math.ceil(largest / period) + 1)
-    reach = place[:, None].min() + lags[0], place.max() + lags[-1]
-    if reach[1] < 0 or reach[0] >= n:
-        return []
     first = int(place.min())
     length = int(place.max()) - first + 1
     size = 1 << int(n + length + 1).bit_length()
@@ -224,7 +221,6 @@ def _refined(
     ``best``: another fit. One that stays far above its chi-square is not finished.
     """
     value = start
-    middle = float(t.mean())
     weights = np.ones((len(t), 3))
     fit: _Fit | None = None
     for passed in range(PASSES):
@@ -232,7 +228,7 @@ def _refined(
         good = np.isfinite(seen).all(axis=1)
         if good.sum() < FEWEST:
             return None
-        used = _Used(t[good] - middle, poses[good], seen[good], rates[good])
+        used = _Used(t[good], poses[good], seen[good], rates[good])
         step, fit, weights[good] = used.solved(weights[good])
         value += step
         fit.value = value
@@ -247,7 +243,7 @@ def _refined(
 
 @dataclass(frozen=True)
 class _Used:
-    """The references in the fit: times from their middle (k,), references, motion and its rates (k, 3)."""
+    """The references in the fit: times (k,), references, motion and its rates (k, 3)."""
 
     t: FloatArray
     poses: FloatArray
