@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
@@ -17,6 +20,8 @@ from psd_deflection.studies.validate import clock
 from psd_deflection.studies.validate.clock import Offset, _coarse, _Fit, _refined, _robust, _Used, clock_offset
 from psd_deflection.studies.validate.motion import Motion
 
+Array = npt.NDArray[Any]
+
 TOLD = Offset(0.01, 1e-3, 0.0, 1e-6, True, (), 100)
 
 
@@ -25,11 +30,11 @@ def first_three(dots: FloatArray) -> FloatArray:
     return poses
 
 
-def of(t: FloatArray, poses: FloatArray, period: float = 1e-3) -> Motion:
+def of(t: Array, poses: Array, period: float = 1e-3) -> Motion:
     return Motion(t, np.column_stack([poses, np.zeros(len(t))]), period, first_three)
 
 
-def dense(columns: FloatArray, values: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+def dense(columns: Array, values: Array, weights: Array) -> tuple[Array, Array]:
     """Weighted least squares: the terms, and their covariance for weights that are inverse variances."""
     normal = columns.T @ (weights[:, None] * columns)
     return np.linalg.solve(normal, columns.T @ (weights * values)), np.linalg.inv(normal)
@@ -39,8 +44,7 @@ def dense(columns: FloatArray, values: FloatArray, weights: FloatArray) -> tuple
 
 
 def test_the_interval_holds_95_percent() -> None:
-    low, high = Offset(0.5, 0.1, 0.0, 0.0, True, (), 100).interval
-    assert (low, high) == (pytest.approx(0.304), pytest.approx(0.696))
+    assert Offset(0.5, 0.1, 0.0, 0.0, True, (), 100).interval == pytest.approx((0.304, 0.696))
 
 
 @pytest.mark.parametrize(
@@ -144,7 +148,7 @@ def fit_with(value: float, left: float, sizes: tuple[float, ...] = (1.0, 1.0, 1.
 
 
 def found_of(
-    monkeypatch: pytest.MonkeyPatch, fits: list[_Fit | None], poses: FloatArray, largest: float = 0.5
+    monkeypatch: pytest.MonkeyPatch, fits: Sequence[_Fit | None], poses: Array, largest: float = 0.5
 ) -> tuple[Offset, list[float | None]]:
     """The offset if the refinement gives ``fits``, and the best fit that each was told of. 256 samples a second."""
     told: list[float | None] = []
@@ -220,9 +224,7 @@ def test_without_a_fit_there_is_no_offset(monkeypatch: pytest.MonkeyPatch) -> No
 # The first look, on the grid
 
 
-def coarse_by_hand(
-    poses: FloatArray, there: FloatArray, place: FloatArray, reference: FloatArray, reach: int
-) -> list[int]:
+def coarse_by_hand(poses: Array, there: Array, place: Array, reference: Array, reach: int) -> list[int]:
     """Lag by lag, reference by reference: the five lowest minima, five samples apart at least."""
     lags = list(range(-reach, reach + 1))
     inside = [[p + lag for p in place if 0 <= p + lag < len(poses) and there[p + lag]] for lag in lags]
@@ -265,11 +267,11 @@ def test_the_first_look_is_a_regression_at_every_lag(
     there = np.ones(samples, dtype=bool)
     if references > 20:
         there[1:-1] = rng.random(samples - 2) < 0.9
-    place = first + step * np.arange(references)
+    place: Array = first + step * np.arange(references)
     if samples == 150:
         place = np.sort(np.concatenate([place[::2], place[::2]]))
     reference = rng.normal([1e7, -5.0, 0.0], 1.0, (references, 3))
-    at = np.arange(samples)[there]
+    at: Array = np.arange(samples)[there]
     motion = of(5.0 + 1e-3 * at, poses[there])
     # Missing samples lie between their neighbours and do not count.
     wanted = coarse_by_hand(poses, there, place, reference, reach)
