@@ -256,7 +256,7 @@ class _Used:
         # Of an axis that does not move, the readings are noise and explain nothing.
         moving = [i for i in range(3) if np.ptp(self.seen[:, i]) > 0.0]
         causes = np.column_stack([np.ones(k), *(self.seen[:, i] - self.seen[:, i].mean() for i in moving)])
-        scale = np.maximum(np.sqrt((causes * causes).mean(axis=0)), 1e-300)
+        scale = np.sqrt((causes * causes).mean(axis=0))
         causes = causes / scale
         left = np.empty((k, 3))
         own = np.empty((k, 3))

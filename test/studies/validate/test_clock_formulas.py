@@ -350,6 +350,19 @@ def test_a_motion_at_rest_tells_no_step() -> None:
     assert weights.max() <= 1.0
 
 
+def test_an_axis_on_which_nothing_is_left_tells_nothing_more() -> None:
+    """A reference that states 0 there: its scatter is 1e-12, not 0, by which nobody can divide."""
+    rng = np.random.default_rng(0)
+    seen, rates = rng.normal(0.0, 1.0, (60, 3)), rng.normal(0.0, 1.0, (60, 3))
+    poses = seen + 0.01 * rates + rng.normal(0.0, 0.1, (60, 3))
+    poses[:, 2] = 0.0
+    step, fit, weights = _Used(np.arange(60.0), poses, seen, rates).solved(np.ones((60, 3)))
+    assert fit.sizes[2] == 1e-12
+    assert weights[:, 2].tolist() == [1.0] * 60
+    assert step == pytest.approx(0.01, abs=4.0 * fit.sd)
+    assert fit.sd < 0.02
+
+
 def test_references_at_one_time_tell_no_drift() -> None:
     rng = np.random.default_rng(0)
     seen, rates = rng.normal(0.0, 1.0, (60, 3)), rng.normal(0.0, 1.0, (60, 3))
