@@ -112,7 +112,14 @@ def test_the_biweight_is_the_integral_of_its_influence() -> None:
 
 @pytest.mark.parametrize(
     ('first', 'last', 'moved'),
-    [(11.5, 14.0, True), (10.5, 14.0, False), (-5.0, -1.5, True), (-5.0, -0.5, False), (11.5, 31.5, True)],
+    [
+        (11.02, 14.0, True),
+        (10.98, 14.0, False),
+        (-5.0, -1.02, True),
+        (-5.0, -0.95, False),
+        (11.5, 31.5, True),
+        (-0.5, 10.5, False),
+    ],
 )
 def test_stamps_of_another_day_are_laid_on_the_motion(
     monkeypatch: pytest.MonkeyPatch, first: float, last: float, moved: bool
@@ -262,7 +269,7 @@ def test_the_first_look_is_a_regression_at_every_lag(
     seed: int, samples: int, first: int, step: int, references: int, reach: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    poses = rng.normal(0.0, 1.0, (samples, 3)) + 50.0
+    poses = rng.normal([1e8, 0.0, 50.0], 1.0, (samples, 3))
     poses[:, 1] = 3.0
     there = np.ones(samples, dtype=bool)
     if references > 20:
@@ -278,6 +285,19 @@ def test_the_first_look_is_a_regression_at_every_lag(
     assert len(wanted) >= 1
     found = _coarse(motion, 5.0 + 1e-3 * (place + 0.3), reference, 1e-3 * (reach - 0.4))
     assert found == pytest.approx([1e-3 * lag for lag in wanted])
+
+
+@pytest.mark.parametrize('sign', [1, -1])
+def test_offsets_up_to_the_largest_are_tried_and_no_others(sign: int) -> None:
+    poses = np.random.default_rng(0).normal(0.0, 1.0, (400, 3))
+    motion = of(np.arange(400) * 1e-3, poses)
+    place = 150 + 3 * np.arange(30)
+
+    def first(lag: int) -> float:
+        return _coarse(motion, 1e-3 * place, poses[place + sign * lag], 0.04)[0]
+
+    assert first(40) == pytest.approx(0.04 * sign)
+    assert first(41) != pytest.approx(0.041 * sign)
 
 
 # The refinement
@@ -439,6 +459,42 @@ def test_what_is_ten_rivals_above_the_best_is_not_finished(
     monkeypatch.setattr(_Used, 'solved', counted)
     _refined(motion, at, poses, 0.03, 0.0, best)
     assert (len(passes) > 2) is finished
+    assert finished or len(passes) == 2
+
+
+def steps_of(monkeypatch: pytest.MonkeyPatch, start: float, noise: float) -> list[float]:
+    """The steps of a refinement of an offset of 12.3 ms from ``start``."""
+    rng = np.random.default_rng(1)
+    t = np.arange(1000.0) * 1e-3
+    motion = of(t, np.stack([np.sin(9.0 * t), np.cos(14.0 * t), t**2], axis=1))
+    at = np.linspace(0.1, 0.9, 60)
+    poses = np.stack([np.sin(9.0 * at), np.cos(14.0 * at), at**2], axis=1) + rng.normal(0.0, noise, (60, 3))
+    steps = []
+    solved = _Used.solved
+
+    def noted(used: _Used, weights: FloatArray) -> tuple[float, _Fit, FloatArray]:
+        found = solved(used, weights)
+        steps.append(abs(found[0]))
+        return found
+
+    with monkeypatch.context() as patched:
+        patched.setattr(_Used, 'solved', noted)
+        assert _refined(motion, at - 0.0123, poses, start, 0.0, None) is not None
+    return steps
+
+
+def test_a_refinement_ends_with_a_step_below_a_tenth_of_a_microsecond(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = steps_of(monkeypatch, 0.0, 0.02)
+    assert 3 < len(steps) < 12
+    assert steps[-1] < 1e-7
+    assert min(steps[2:-1]) >= 1e-7
+    # The weights of outliers are those of the second pass, so there are three.
+    assert len(steps_of(monkeypatch, 0.0123, 1e-9)) == 3
+
+
+def test_a_refinement_ends_after_twelve_passes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clock, 'SETTLED', 0.0)
+    assert len(steps_of(monkeypatch, 0.0, 0.02)) == 12
 
 
 # Scores that follow each other
