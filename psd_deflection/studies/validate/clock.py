@@ -301,6 +301,6 @@ def variance_of_sum(scores: FloatArray) -> float:
     new = scores[1:] - kept * scores[:-1] if kept > 0.0 else scores
     lags = math.floor(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0))
     total = float(new @ new)
-    for lag in range(1, min(lags, len(new) - 1) + 1):
+    for lag in range(1, lags + 1):
         total += 2.0 * (1.0 - lag / (lags + 1.0)) * float(new[lag:] @ new[:-lag])
     return max(total, 0.0) * len(scores) / max(len(new), 1) / (1.0 - kept) ** 2
