@@ -291,7 +291,7 @@ def test_the_first_look_is_a_regression_at_every_lag(
 def test_offsets_up_to_the_largest_are_tried_and_no_others(sign: int) -> None:
     poses = np.random.default_rng(0).normal(0.0, 1.0, (400, 3))
     motion = of(np.arange(400) * 1e-3, poses)
-    place = 150 + 3 * np.arange(30)
+    place: Array = 150 + 3 * np.arange(30)
 
     def first(lag: int) -> float:
         return _coarse(motion, 1e-3 * place, poses[place + sign * lag], 0.04)[0]
