@@ -170,9 +170,6 @@ def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) ->
     n, period = len(single), motion.period
     place = np.rint((t - motion.t[0]) / period).astype(np.int64)
     lags = np.arange(-math.ceil(largest / period), math.ceil(largest / period) + 1)
-    reach = place[:, None].min() + lags[0], place.max() + lags[-1]
-    if reach[1] < 0 or reach[0] >= n:
-        return []
     first = int(place.min())
     length = int(place.max()) - first + 1
     size = 1 << int(n + length + 1).bit_length()
@@ -195,7 +192,8 @@ def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) ->
         return out
 
     valid = there.astype(np.float64)
-    overlap = correlated(count, valid)
+    # A count: the transform leaves 20 a last bit below 20.
+    overlap = np.rint(correlated(count, valid))
     cost = np.zeros(len(lags))
     with np.errstate(divide='ignore', invalid='ignore'):
         for axis in range(3):
@@ -206,7 +204,7 @@ def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) ->
             both = correlated(r, m) / overlap - sm * sr
             explained = np.where((vm > 0.0) & (vr > 0.0), both * both / (vm * vr), 0.0)
             cost += np.log1p(-np.clip(np.nan_to_num(explained), 0.0, 1.0 - 1e-12))
-    cost *= np.maximum(overlap, 0.0)
+    cost *= overlap
     # Half of the references that can overlap must; an offset at the edge with few of them explains anything.
     cost[overlap < max(FEWEST, 0.5 * overlap.max())] = np.inf
     lowest = minimum_filter1d(cost, 2 * APART + 1)
@@ -223,7 +221,6 @@ def _refined(
     ``best``: another fit. One that stays far above its chi-square is not finished.
     """
     value = start
-    middle = float(t.mean())
     weights = np.ones((len(t), 3))
     fit: _Fit | None = None
     for passed in range(PASSES):
@@ -231,7 +228,7 @@ def _refined(
         good = np.isfinite(seen).all(axis=1)
         if good.sum() < FEWEST:
             return None
-        used = _Used(t[good] - middle, poses[good], seen[good], rates[good])
+        used = _Used(t[good], poses[good], seen[good], rates[good])
         step, fit, weights[good] = used.solved(weights[good])
         value += step
         fit.value = value
@@ -246,7 +243,7 @@ def _refined(
 
 @dataclass(frozen=True)
 class _Used:
-    """The references in the fit: times from their middle (k,), references, motion and its rates (k, 3)."""
+    """The references in the fit: times (k,), references, motion and its rates (k, 3)."""
 
     t: FloatArray
     poses: FloatArray
@@ -259,10 +256,11 @@ class _Used:
         # Of an axis that does not move, the readings are noise and explain nothing.
         moving = [i for i in range(3) if np.ptp(self.seen[:, i]) > 0.0]
         causes = np.column_stack([np.ones(k), *(self.seen[:, i] - self.seen[:, i].mean() for i in moving)])
-        scale = np.maximum(np.sqrt((causes * causes).mean(axis=0)), 1e-300)
+        scale = np.sqrt((causes * causes).mean(axis=0))
         causes = causes / scale
         left = np.empty((k, 3))
         own = np.empty((k, 3))
+        ramp = np.empty((k, 3))
         sizes = np.empty(3)
         for axis in range(3):
             root = np.sqrt(weights[:, axis])[:, None]
@@ -271,7 +269,10 @@ class _Used:
             sizes[axis] = max(1.4826 * float(np.median(np.abs(left[:, axis] - np.median(left[:, axis])))), 1e-12)
             # What the offset does to this axis, without what bias and scales could do as well.
             does = sum((terms[1 + c] / scale[1 + c] * self.rates[:, i] for c, i in enumerate(moving)), np.zeros(k))
-            own[:, axis] = does - causes @ np.linalg.lstsq(causes * root, does[:, None] * root, rcond=1e-10)[0][:, 0]
+            # Beside it what an offset that grows with time does.
+            both = np.column_stack([does, does * self.t])
+            both -= causes @ np.linalg.lstsq(causes * root, both * root, rcond=1e-10)[0]
+            own[:, axis], ramp[:, axis] = both.T
         next_weights = np.clip(1.0 - (left / (BIWEIGHT * sizes)) ** 2, 0.0, None) ** 2
         w = next_weights / sizes**2
         information = float((w * own * own).sum())
@@ -281,7 +282,6 @@ class _Used:
         scores = (w * own * left).sum(axis=1)
         spread = max(variance_of_sum(scores) / information**2, 1.0 / information)
         # The offset's growth with time, by what is left.
-        ramp = own * self.t[:, None]
         ramp = ramp - own * (float((w * own * ramp).sum()) / information)
         grows = float((w * ramp * ramp).sum())
         drift = float((w * ramp * left).sum()) / grows if grows > 0.0 else 0.0
@@ -301,6 +301,6 @@ def variance_of_sum(scores: FloatArray) -> float:
     new = scores[1:] - kept * scores[:-1] if kept > 0.0 else scores
     lags = math.floor(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0))
     total = float(new @ new)
-    for lag in range(1, min(lags, len(new) - 1) + 1):
+    for lag in range(1, lags + 1):
         total += 2.0 * (1.0 - lag / (lags + 1.0)) * float(new[lag:] @ new[:-lag])
     return max(total, 0.0) * len(scores) / max(len(new), 1) / (1.0 - kept) ** 2

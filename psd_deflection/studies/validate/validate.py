@@ -35,9 +35,10 @@ def validate(problem: ValidateProblem) -> Validated:
     agreements = {name: of for name, poses in estimates.items() if (of := _on_each_axis(poses, kept)) is not None}
     covered = (math.nan, math.nan, math.nan)
     if problem.sd is not None and problem.solver in agreements:
-        error = estimates[problem.solver] - kept
+        error = np.abs(estimates[problem.solver] - kept)
         both = np.sqrt(problem.sd[there] ** 2 + problem.estimate_sd**2)
-        x, y, twist = (float(v) for v in np.nanmean(np.abs(error) <= 1.96 * both, axis=0))
+        good = np.isfinite(error).all(axis=1)
+        x, y, twist = (float(v) for v in (error[good] <= 1.96 * both[good]).mean(axis=0))
         covered = (x, y, twist)
     return Validated(
         problem=problem,

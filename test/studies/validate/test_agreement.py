@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
+from scipy.stats import linregress
 
 from psd_deflection.studies.validate.agreement import agreement
 
@@ -69,3 +72,58 @@ def test_the_deviations_are_those_of_many_runs_of_noise_that_remembers() -> None
     assert np.std([f.bias for f in plain]) == pytest.approx(np.median([f.bias_sd for f in plain]), rel=0.35)
     assert np.mean([f.scale for f in half]) == pytest.approx(-0.5, abs=1e-3)
     assert np.std([f.scale for f in half]) == pytest.approx(np.median([f.scale_sd for f in half]), rel=0.35)
+
+
+def test_slope_and_deviations_are_those_of_a_regression() -> None:
+    """Errors that change sign each time have no memory: the deviations are those of least squares."""
+    estimate = np.array([0.0, 1.0, 2.0, 4.0, 5.0, 7.0, 8.0, 9.0, 11.0, 12.0]) + 100.0
+    error = 0.1 * np.resize([1.0, -1.0], 10) * [1.0, 2.0, 1.0, 3.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0]
+    reference = 0.8 * estimate - 3.0 + error
+    found = agreement(estimate, reference)
+    fit = linregress(estimate, reference)
+    left = reference - fit.slope * estimate - fit.intercept
+    assert found.scale == pytest.approx(1.0 / fit.slope - 1.0)
+    assert found.noise == pytest.approx(np.sqrt(left @ left / 8.0))
+    # Of one over the slope.
+    assert found.scale_sd == pytest.approx(fit.stderr / fit.slope**2)
+    assert found.share == pytest.approx(found.rms / reference[-1])
+    even = agreement(5.0 + error, np.full(10, 5.0))
+    assert even.bias_sd == pytest.approx(error.std(ddof=1) / math.sqrt(10.0))
+
+
+@pytest.mark.parametrize(
+    ('slope', 'noise', 'scale', 'mirrored'),
+    [
+        # The slope has a deviation of the noise over 10.
+        (0.21, 0.1, 1.0 / 0.21 - 1.0, False),
+        (0.19, 0.1, math.nan, False),
+        (1.0, 0.95, 0.0, False),
+        (1.0, 1.05, math.nan, False),
+        (-0.21, 0.1, math.nan, True),
+        (-0.19, 0.1, math.nan, False),
+        (-1.0, 0.95, math.nan, True),
+        (-1.0, 1.05, math.nan, False),
+    ],
+)
+def test_both_move_if_the_slope_is_above_a_fifth_and_known_to_a_tenth(
+    slope: float, noise: float, scale: float, mirrored: bool
+) -> None:
+    estimate = np.resize([1.0, 1.0, -1.0, -1.0], 100)
+    # No more in common with the estimate than with a constant.
+    error = noise * np.resize([1.0, -1.0], 100) * math.sqrt(0.98)
+    found = agreement(estimate, slope * estimate + error)
+    assert found.scale == pytest.approx(scale, nan_ok=True)
+    assert math.isfinite(found.share) == math.isfinite(scale)
+    assert found.mirrored is mirrored
+    together = np.sqrt(((1.0 - slope) ** 2 * 100.0 + 98.0 * noise**2) / 99.0)
+    assert found.noise == pytest.approx(noise if math.isfinite(scale) else together)
+
+
+def test_an_estimate_that_stands_still_has_no_scale() -> None:
+    found = agreement(np.full(20, 0.5), np.resize([0.0, 1.0, 0.2], 20))
+    assert math.isnan(found.scale)
+    assert math.isnan(found.scale_sd)
+    assert math.isnan(found.share)
+    assert not found.mirrored
+    assert found.noise == pytest.approx(np.resize([0.0, 1.0, 0.2], 20).std(ddof=1))
+    assert found.largest == 0.5

@@ -1,0 +1,157 @@
+"""The fitted motion, against polynomials that numpy fits to each instant alone, and counts by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.polynomial import Polynomial
+
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.validate import motion as module
+from psd_deflection.studies.validate.motion import Motion
+
+PERIOD = 2.0**-10
+"""s: sums of it are exact."""
+
+
+def first_three(dots: FloatArray) -> FloatArray:
+    poses: FloatArray = dots[:, :3].copy()
+    return poses
+
+
+def of(kept: FloatArray, seed: int = 0, period: float = PERIOD) -> Motion:
+    """Samples at the places ``kept``, a cubic with noise on each channel."""
+    rng = np.random.default_rng(seed)
+    t = kept * period
+    dots = np.stack([a + 40.0 * a * t - 900.0 * t**2 + 9e4 * a * t**3 for a in (1.0, -2.0, 0.5, 3.0)], axis=1)
+    return Motion(t, dots + rng.normal(0.0, 0.1, dots.shape), period, first_three)
+
+
+@pytest.mark.parametrize(('exposure', 'half'), [(0.0, 8), (7.8, 12), (10.0, 13), (0.5, 9)])
+def test_each_instant_has_the_polynomial_through_the_samples_about_it(exposure: float, half: int) -> None:
+    """``exposure`` in samples: eight samples on either side of it."""
+    places = np.delete(np.arange(120.0), [40, 41, 44, 77])
+    motion = of(places)
+    at = np.array([5.3, 20.0, 30.2, 30.45, 30.7, 43.4, 45.9, 76.6, 90.0, 115.8])
+    values, rates, variances = motion.dots_at(at * PERIOD, exposure * PERIOD)
+    inside, weights = np.polynomial.legendre.leggauss(8)
+    for i, instant in enumerate(at):
+        near = np.abs(places - instant) <= half + 0.5
+        for channel in range(4):
+            # From the instant, in samples.
+            u = places[near] - instant
+            fit = Polynomial.fit(u, motion.dots[near, channel], 4).convert()
+            spread = fit.integ()
+            mean = (spread(0.5 * exposure) - spread(-0.5 * exposure)) / exposure if exposure else fit(0.0)
+            ends = (fit(0.5 * exposure) - fit(-0.5 * exposure)) / exposure if exposure else fit.deriv()(0.0)
+            assert values[i, channel] == pytest.approx(mean, rel=1e-9)
+            assert rates[i, channel] == pytest.approx(ends / PERIOD, rel=1e-8)
+            left = motion.dots[near, channel] - fit(u)
+            design = np.vander(u / half, 5)
+            share = 0.5 * weights @ np.vander(0.5 * exposure * inside / half, 5)
+            factor = share @ np.linalg.solve(design.T @ design, share)
+            assert variances[i, channel] == pytest.approx(left @ left / (len(u) - 5) * factor, rel=1e-7)
+
+
+@pytest.mark.parametrize(
+    ('exposure', 'before', 'after', 'answer'),
+    [
+        (0.0, 8, 9, True),
+        (0.0, 5, 7, True),
+        (0.0, 5, 6, False),
+        (0.0, 3, 9, True),
+        (0.0, 2, 9, False),
+        # With an exposure of four samples the fit takes ten on either side.
+        (4.0, 3, 11, True),
+        (4.0, 2, 11, False),
+        (4.0, 10, 3, True),
+        (4.0, 10, 2, False),
+    ],
+)
+def test_twelve_samples_are_needed_and_three_on_either_side(
+    exposure: float, before: int, after: int, answer: bool
+) -> None:
+    """A sample at the instant counts as after it. ``exposure`` in samples."""
+    near = np.arange(50.0 - before, 50.0 + after)
+    motion = of(np.concatenate([np.arange(30.0), near, np.arange(70.0, 90.0)]))
+    for array in motion.dots_at(np.array([50.0 * PERIOD]), exposure * PERIOD):
+        assert np.isfinite(array).all() == answer
+        assert np.isnan(array).all() != answer
+
+
+def test_nothing_is_known_of_instants_outside_the_samples() -> None:
+    motion = of(np.arange(40.0))
+    values, _, _ = motion.dots_at(np.array([-5.0, 2.0, 2.5, 3.0, 36.0, 36.5, 37.5, 60.0]) * PERIOD)
+    assert np.isfinite(values[:, 0]).tolist() == [False, False, True, True, True, True, False, False]
+
+
+def test_many_instants_are_fitted_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    motion = of(np.arange(60.0))
+    at = np.linspace(10.0, 50.0, 22) * PERIOD
+    whole = motion.dots_at(at, 2e-3)
+    monkeypatch.setattr(module, 'ROWS', 7)
+    for a, b in zip(whole, motion.dots_at(at, 2e-3), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_no_instants_have_no_answers() -> None:
+    assert [a.shape for a in of(np.arange(60.0)).dots_at(np.empty(0))] == [(0, 4)] * 3
+
+
+def test_the_speed_is_that_of_the_pose_not_of_the_dots() -> None:
+    t = np.arange(100.0) * PERIOD
+    dots = np.stack([1.0 + 30.0 * t, 2.0 - 50.0 * t, 0.3 + t**2, 1000.0 * t], axis=1)
+
+    def solve(d: FloatArray) -> FloatArray:
+        return np.stack([d[:, 0] * d[:, 1], d[:, 2] - d[:, 0], np.sin(d[:, 3])], axis=1)
+
+    at = np.array([0.02, 0.05, 0.07])
+    poses, speeds = Motion(t, dots, PERIOD, solve).poses_at(at)
+    a, b = 1.0 + 30.0 * at, 2.0 - 50.0 * at
+    expected = np.stack([30.0 * b - 50.0 * a, 2.0 * at - 30.0, 1000.0 * np.cos(1000.0 * at)], axis=1)
+    np.testing.assert_allclose(poses, np.stack([a * b, 0.3 + at**2 - a, np.sin(1000.0 * at)], axis=1), rtol=1e-8)
+    # The sine turns by a tenth of a radian over a tenth of a sample.
+    np.testing.assert_allclose(speeds, expected, rtol=2e-3)
+
+
+def test_where_samples_are_missing_pose_and_speed_are_unknown() -> None:
+    motion = of(np.arange(60.0))
+    poses, speeds = motion.poses_at(np.array([-1.0, 0.02, 1.0]))
+    assert np.isnan(poses).all(axis=1).tolist() == [True, False, True]
+    assert np.isnan(speeds).all(axis=1).tolist() == [True, False, True]
+    assert np.isfinite(poses[1]).all()
+    assert np.isfinite(speeds[1]).all()
+
+
+def test_a_solver_is_not_asked_for_nothing() -> None:
+    def solve(dots: FloatArray) -> FloatArray:
+        raise AssertionError(len(dots))
+
+    motion = Motion(np.arange(60.0) * PERIOD, np.zeros((60, 4)), PERIOD, solve)
+    poses, speeds = motion.poses_at(np.array([7.0, 8.0]))
+    assert np.isnan(poses).all()
+    assert np.isnan(speeds).all()
+
+
+def test_single_samples_lie_on_an_even_grid() -> None:
+    # Samples 2 and 5 are lost, that of place 6 has no pose; the stamps tremble.
+    t = 7.0 + np.array([0.0, 1.2, 2.9, 4.1, 6.0, 7.2, 8.0]) * 1e-3
+    dots = np.array([[0.0, 5.0, 1.0], [2.0, 5.0, 1.0], [6.0, 5.0, 3.0], [4.0, 5.0, 4.0], [9.0, 9.0, 9.0]])
+    dots = np.concatenate([dots, [[10.0, 8.0, 7.0], [3.0, 5.0, 0.0]]])
+    asked = []
+
+    def solve(d: FloatArray) -> FloatArray:
+        asked.append(len(d))
+        poses = first_three(d)
+        poses[4, 1] = np.nan
+        return poses
+
+    motion = Motion(t, np.column_stack([dots, np.zeros(7)]), 1e-3, solve)
+    poses, there = motion.grid()
+    assert there.tolist() == [True, True, False, True, True, False, False, True, True]
+    np.testing.assert_allclose(poses[:, 0], [0.0, 2.0, 4.0, 6.0, 4.0, 6.0, 8.0, 10.0, 3.0])
+    np.testing.assert_allclose(poses[:, 1], [5.0, 5.0, 5.0, 5.0, 5.0, 6.0, 7.0, 8.0, 5.0])
+    np.testing.assert_allclose(poses[:, 2], [1.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 0.0])
+    assert motion.grid()[0] is poses
+    assert asked == [7]
+    assert '_grid=' not in repr(motion)

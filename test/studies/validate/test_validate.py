@@ -1,0 +1,174 @@
+"""The comparison as a whole, on a made-up motion whose every difference is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from psd_deflection.base.errors import RecordingError
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.validate.from_recordings import ValidateProblem
+from psd_deflection.studies.validate.motion import Motion
+from psd_deflection.studies.validate.validate import validate
+
+LATE = 0.0123
+"""s, by which the stamps of the reference are early."""
+
+
+def first_three(dots: FloatArray) -> FloatArray:
+    poses: FloatArray = dots[:, :3].copy()
+    return poses
+
+
+def pose(t: FloatArray) -> FloatArray:
+    return np.stack([np.sin(9.0 * t), np.cos(14.0 * t), np.sin(4.0 * t + t**2)], axis=1)
+
+
+T = np.arange(3000.0) * 1e-3
+STAMPS = np.linspace(0.1, 2.8, 90)
+NOISE = np.random.default_rng(0).normal(0.0, [1e-3, 2e-3, 3e-3], (90, 3))
+
+
+@pytest.fixture
+def problem() -> ValidateProblem:
+    """Late stamps; the bias is 0.1, -0.2, 0.3."""
+    return ValidateProblem(
+        motion=Motion(T, np.column_stack([pose(T), np.zeros(len(T))]), 1e-3, first_three),
+        solvers={'exact': first_three},
+        t=STAMPS - LATE,
+        reference=pose(STAMPS) - [0.1, -0.2, 0.3] + NOISE,
+        sd=None,
+        refused={},
+        estimate_sd=np.array([0.0, 0.0, 0.0]),
+        align=True,
+        largest=0.5,
+        exposure=0.0,
+        sources={},
+    )
+
+
+def test_the_offset_is_removed_if_asked(problem: ValidateProblem) -> None:
+    found = validate(problem)
+    assert found.applied
+    assert found.offset.value == pytest.approx(LATE, abs=4.0 * found.offset.sd)
+    assert found.t == pytest.approx(problem.t + found.offset.value)
+    np.testing.assert_allclose(found.estimates['exact'], pose(found.t), atol=1e-6)
+    assert found.reference.tolist() == problem.reference.tolist()
+    assert [a.bias for a in found.agreements['exact']] == pytest.approx([0.1, -0.2, 0.3], abs=2e-3)
+    assert [a.noise for a in found.agreements['exact']] == pytest.approx(NOISE.std(axis=0).tolist(), rel=0.1)
+    assert found.left_out == 0
+    assert np.isnan(found.covered).all()
+    assert found.problem is problem
+
+
+def test_the_offset_is_not_removed_unless_asked(problem: ValidateProblem) -> None:
+    found = validate(replace(problem, align=False))
+    assert not found.applied
+    assert found.offset.value == pytest.approx(LATE, abs=4.0 * found.offset.sd)
+    assert found.t.tolist() == problem.t.tolist()
+    np.testing.assert_allclose(found.estimates['exact'], pose(STAMPS - LATE), atol=1e-6)
+
+
+def test_an_offset_that_is_not_told_is_not_removed(problem: ValidateProblem) -> None:
+    noise = np.random.default_rng(1).normal(0.0, 1.0, (90, 3))
+    found = validate(replace(problem, reference=noise))
+    assert not found.offset.told
+    assert not found.applied
+    assert found.t.tolist() == problem.t.tolist()
+
+
+def test_only_offsets_up_to_the_largest_are_looked_for(problem: ValidateProblem) -> None:
+    far = replace(problem, t=STAMPS - 0.3, largest=0.1)
+    assert abs(validate(replace(far, align=False)).offset.value) <= 0.105
+    assert validate(replace(far, largest=0.4)).offset.value == pytest.approx(0.3, abs=1e-3)
+
+
+def test_each_reference_is_a_mean_over_its_exposure(problem: ValidateProblem) -> None:
+    within = (np.arange(100) - 49.5) * 0.4e-3
+    found = validate(replace(problem, align=False, exposure=0.04))
+    expected = np.mean([pose(problem.t + u) for u in within], axis=0)
+    middle = (problem.t > 0.1) & (problem.t < 2.7)
+    np.testing.assert_allclose(found.estimates['exact'][middle], expected[middle], atol=2e-5)
+    assert np.abs(pose(problem.t) - expected).max() > 0.01
+
+
+def test_references_without_samples_are_left_out(problem: ValidateProblem) -> None:
+    early = np.linspace(-0.4, -0.2, 7)
+    t = np.concatenate([early, problem.t])
+    reference = np.concatenate([np.zeros((7, 3)), problem.reference])
+    sd = np.concatenate([np.zeros((7, 3)), np.ones((90, 3))])
+    found = validate(replace(problem, t=t, reference=reference, sd=sd, align=False))
+    assert found.left_out == 7
+    assert found.t.tolist() == problem.t.tolist()
+    assert found.reference.tolist() == problem.reference.tolist()
+    assert found.estimates['exact'].shape == (90, 3)
+    assert found.covered == (1.0, 1.0, 1.0)
+
+
+def test_cover_counts_what_lies_within_both_deviations(problem: ValidateProblem) -> None:
+    """Differences of 1, and deviations of 0.3 of the estimate and 0.4 of the reference together are 0.5."""
+    exact = pose(STAMPS)
+    # Beyond 0.98 are 9, 18 and 27 of 90.
+    size = np.where(np.arange(90)[:, None] < [9, 18, 27], 0.985, 0.975) * np.resize([1.0, -1.0], (90, 1))
+    both = replace(
+        problem,
+        t=STAMPS,
+        align=False,
+        reference=exact + size,
+        sd=np.full((90, 3), 0.4),
+        estimate_sd=np.full(3, 0.3),
+    )
+    assert validate(both).covered == pytest.approx((0.9, 0.8, 0.7))
+
+
+def test_a_solver_that_answers_too_rarely_is_not_judged(problem: ValidateProblem) -> None:
+    def rarely(answers: int) -> ValidateProblem:
+        def solve(dots: FloatArray) -> FloatArray:
+            poses = first_three(dots)
+            poses[answers:, 1] = np.nan
+            return poses
+
+        sd = np.full((90, 3), 1.0)
+        return replace(problem, align=False, sd=sd, solvers={'exact': first_three, 'wls': solve})
+
+    found = validate(rarely(20))
+    assert list(found.agreements) == ['exact', 'wls']
+    kept = validate(replace(problem, align=False, t=problem.t[:20], reference=problem.reference[:20]))
+    assert [a.bias for a in found.agreements['wls']] == pytest.approx([a.bias for a in kept.agreements['exact']])
+    found = validate(rarely(19))
+    assert list(found.agreements) == ['exact']
+    assert list(found.estimates) == ['exact', 'wls']
+    # The solver of the rig itself: nothing is said about its cover.
+    own = rarely(19)
+    found = validate(replace(own, solvers={'wls': own.solvers['wls'], 'exact': first_three}))
+    assert list(found.agreements) == ['exact']
+    assert np.isnan(found.covered).all()
+
+
+def test_missing_answers_do_not_count_in_the_cover(problem: ValidateProblem) -> None:
+    def solve(dots: FloatArray) -> FloatArray:
+        poses = first_three(dots)
+        poses[:30] = np.nan
+        return poses
+
+    sd = np.full((90, 3), 0.4)
+    sd[60:] = 1e-6
+    found = validate(replace(problem, align=False, sd=sd, solvers={'exact': solve}))
+    # Of the sixty that have an answer thirty have a deviation that is far too small.
+    assert found.covered[1:] == pytest.approx((0.5, 0.5), abs=0.02)
+
+
+def test_fewer_than_twenty_references_within_the_recording_are_too_few(problem: ValidateProblem) -> None:
+    # By their stamps they are 0.4 s early, and 19 or 20 of 90 lie within the samples.
+    for inside in (20, 19):
+        t = np.concatenate([np.linspace(-0.49, -0.3, 90 - inside), np.linspace(0.05, 0.3, inside)])
+        early = replace(problem, t=t, reference=pose(t + 0.5) + NOISE, largest=0.6, align=False)
+        if inside == 20:
+            found = validate(early)
+            assert found.offset.value == pytest.approx(0.5, abs=1e-2)
+            assert (len(found.t), found.left_out) == (20, 70)
+        else:
+            with pytest.raises(RecordingError, match=r'^19 references lie within .*; at least 20 are needed .*--align'):
+                validate(early)
