@@ -54,9 +54,9 @@ def loudest_peak(samples: FloatArray, rate: float, noise: float, beside: Sequenc
     floor = 2.0 * noise**2 * rate * 2.0 * (1.0 - np.cos(2.0 * np.pi * f / rate))
     free = inside
     for taken in beside:
-        free = free & (np.abs(f - taken) >= max(0.15 * taken, 2.0 * (f[1] - f[0])))
+        free = free & (np.abs(f - taken) >= max(0.15 * taken, 2.0 * f[1]))
     at = int(np.argmax(p * free))
-    if not 0 < at < len(f) - 1 or not p[at] >= PEAK * floor[at] or p[at] < max(p[at - 1], p[at + 1]):
+    if not free[at] or not p[at] >= PEAK * floor[at] or p[at] < max(p[at - 1], p[at + 1]):
         return None
     about = inside & (np.abs(f - f[at]) < 0.5 * f[at]) & (np.abs(f - f[at]) > 0.2 * f[at])
     if about.any() and p[at] < (STANDS_OUT if beside else 4.0) * np.median(p[about]):
