@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -40,27 +39,31 @@ def lines(samples: FloatArray, frequency: float) -> tuple[FloatArray, FloatArray
     straight = samples - np.polyval(np.polyfit(k, samples, 1), k)
     window = hann(n, sym=False)
     p = 2.0 * np.abs(np.fft.rfft(straight * window)) ** 2 / (RATE * np.sum(window**2))
-    f = np.fft.rfftfreq(n, 1.0 / RATE)
+    f = np.asarray(np.fft.rfftfreq(n, 1.0 / RATE), dtype=np.float64)
     about = np.flatnonzero((f > 0.6 * frequency) & (f < 1.5 * frequency))[::2]
     return f[about], p[about]
 
 
-@pytest.mark.parametrize(('prior', 'guess'), [(1.0, 14.0), (0.2, 14.5)])
+@pytest.mark.parametrize(('prior', 'guess'), [(None, 14.0), (0.2, 14.5)])
 def test_it_is_the_likeliest_mode_with_the_scatter_of_its_likelihood(
-    prior: float, guess: float, monkeypatch: pytest.MonkeyPatch
+    prior: float | None, guess: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The likelihood of exponential lines, in other parameters and by another search."""
-    monkeypatch.setattr(operation, 'SLOPE_SD', prior)
+    if prior is None:
+        # What is said of it.
+        prior = 1.0
+    else:
+        monkeypatch.setattr(operation, 'SLOPE_SD', prior)
     samples = driven(noise=3e-5) + 1e-3 * np.arange(6000) / 6000.0 + 5e-3
     f, p = lines(samples, guess)
 
-    def density(x: Sequence[float]) -> FloatArray:
+    def density(x: FloatArray) -> FloatArray:
         peak, f0, zeta, slope, floor = x
         r = f / f0
         shape = 4.0 * zeta**2 / ((1.0 - r**2) ** 2 + 4.0 * zeta**2 * r**2)
         return np.asarray(1e-6 * peak * r**-slope * shape + 1e-10 * floor)
 
-    def loss(x: Sequence[float]) -> float:
+    def loss(x: FloatArray) -> float:
         s = density(x)
         return float(np.sum(np.log(1e8 * s) + p / s) + 0.5 * (x[3] / prior) ** 2)
 
@@ -142,6 +145,14 @@ def test_the_search_begins_at_the_peak_with_narrow_and_wide_modes(monkeypatch: p
     np.testing.assert_allclose([row[2] for row in found], [0.005, 0.02, 0.08])
     np.testing.assert_allclose([row[3] for row in found], 0.1 * np.median(p))
     assert [row[4] for row in found] == [0.0] * 3
+
+
+def test_a_steady_swing_is_no_driven_mode() -> None:
+    """Nor are two modes one."""
+    t = np.arange(6000) / RATE
+    noise = 3e-5 * np.random.default_rng(2).normal(size=6000)
+    assert mode_in_operation(1e-3 * np.sin(2.0 * np.pi * 14.0 * t) + noise, RATE, 14.0) is None
+    assert mode_in_operation(driven() + driven(17.0, 0.01, seed=2) + noise, RATE, 14.0) is None
 
 
 def swollen(n: int, first: int, count: int, total: float) -> FloatArray:
