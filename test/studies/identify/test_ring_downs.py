@@ -90,8 +90,11 @@ def test_what_a_stretch_leaves_is_that_of_dense_least_squares() -> None:
     np.testing.assert_allclose(found, terms, rtol=1e-7)
     np.testing.assert_allclose(left, s.y - a @ terms, atol=1e-12)
     assert s.loud(modes) == pytest.approx(max(math.hypot(*terms[2:4]), math.hypot(*terms[4:6])), rel=1e-7)
-    assert s.loud(modes[::-1]) == pytest.approx(s.loud(modes), rel=1e-7)
     assert s.loud(modes[:1]) > 0.0
+    t = times(600)
+    s = stretch(ring(t, size=1e-3) + ring(t, 40.0, 0.01, 9e-4) + ring(t, 90.0, 0.01, 8e-4))
+    for order in itertools.permutations([(16.0, 0.02), (40.0, 0.01), (90.0, 0.01)]):
+        assert s.loud(list(order)) == pytest.approx(1e-3, rel=1e-6)
 
 
 def test_the_root_of_the_mean_square() -> None:
@@ -392,6 +395,60 @@ def test_the_search_finds_the_ring_downs_and_their_mode() -> None:
     np.testing.assert_allclose(modes, [(16.0, 0.02)], rtol=2e-3)
     noise = 1e-6 * np.random.default_rng(8).normal(size=3000)
     assert _stretches(noise, noise, RATE, [(15.5, 0.01)], 1e-6) == ([], [(15.5, 0.01)])
+
+
+@pytest.mark.parametrize(('level', 'told'), [(1e-6, 3e-6), (4e-6, 4e-6)])
+def test_of_three_windows_that_grow_the_longest_tells_the_modes(
+    level: float, told: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what it leaves is noise, if it is more than was thought."""
+    samples = blows(6000, [100, 2000, 4000])
+    lengths = [500, 900, 700, 5000]
+    seen: list[Modes] = []
+    scanned: list[tuple[Modes, float, int, int]] = []
+
+    def grown(samples: FloatArray, seed: _Stretch, start: _Rung, window: int, level: float) -> tuple[_Stretch, _Rung]:
+        length = lengths[len(seen)]
+        seen.append(start.modes)
+        return _Stretch(samples, 100, 100 + length, RATE), _Rung([(float(length), 0.02)], np.full(4, 3e-6), np.eye(2))
+
+    def scan(samples: FloatArray, rate: float, modes: Modes, level: float, window: int, hop: int) -> list[_Stretch]:
+        scanned.append((modes, level, window, hop))
+        return []
+
+    monkeypatch.setattr(module, '_grown', grown)
+    monkeypatch.setattr(module, '_scanned', scan)
+    assert _stretches(samples, samples, RATE, [(16.0, 0.01)], level) == ([], [(900.0, 0.02)])
+    assert len(seen) == 3
+    np.testing.assert_allclose(np.reshape(seen, (3, 2)), [(16.0, 0.02)] * 3, rtol=0.02)
+    # Six periods, and half a one.
+    assert scanned == [([(900.0, 0.02)], pytest.approx(told), 384, 32)]
+
+
+@pytest.mark.parametrize(('fits', 'splits'), [(2, 5), (99, 10)])
+def test_if_no_window_fits_the_first_ten_are_split(fits: int, splits: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Until three of them fit as two modes."""
+    samples = blows(6000, [100, 2000, 4000])
+    count = 0
+
+    def split(stretches: Sequence[_Stretch], modes: Modes) -> _Rung:
+        nonlocal count
+        count += 1
+        assert modes == [(16.0, 0.01)]
+        return _Rung([(16.0, 0.02)], np.full(4, 1e-9 if count > fits else 1.0), np.eye(2))
+
+    def grown(samples: FloatArray, seed: _Stretch, start: _Rung, window: int, level: float) -> tuple[_Stretch, _Rung]:
+        return seed, start
+
+    monkeypatch.setattr(
+        module, '_fit', lambda stretches, start, steps=100: _Rung([(16.0, 0.02)], np.ones(4), np.eye(2))
+    )
+    monkeypatch.setattr(module, '_split', split)
+    monkeypatch.setattr(module, '_grown', grown)
+    found, modes = _stretches(samples, samples, RATE, [(16.0, 0.01)], 1e-6)
+    assert count == splits
+    assert bool(found) is (fits == 2)
+    assert modes == ([(16.0, 0.02)] if found else [(16.0, 0.01)])
 
 
 def test_the_largest_ringing_of_each_mode() -> None:
