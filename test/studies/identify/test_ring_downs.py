@@ -543,7 +543,12 @@ def test_a_further_mode_has_a_hundredth_of_the_loudest_and_saves_enough(
 
     monkeypatch.setattr(module, '_hints', hints)
     monkeypatch.setattr(module, '_split', lambda stretches, modes: two)
-    monkeypatch.setattr(module, '_variance_at', lambda fit, stretches, rate, frequency: variance)
+
+    def variance_at(fit: _Rung, stretches: Sequence[_Stretch], rate: float, frequency: float) -> float:
+        assert frequency == pytest.approx(16.0, rel=1e-3)
+        return variance
+
+    monkeypatch.setattr(module, '_variance_at', variance_at)
     assert len(_of_right_order([s], one, RATE).modes) == count
     np.testing.assert_allclose(asked, 0.3 * 34.0 * variance)
     assert len(asked) == count
@@ -563,14 +568,17 @@ def test_three_modes_are_the_most(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def trimmed(
-    scatter: Sequence[float], monkeypatch: pytest.MonkeyPatch, pattern: Sequence[float] = (1.0, -1.0)
+    scatter: Sequence[float],
+    monkeypatch: pytest.MonkeyPatch,
+    pattern: Sequence[float] = (1.0, -1.0),
+    piece: int = 16,
 ) -> tuple[int, int] | None:
-    """What is kept of pieces of 16 samples, a quarter of a period, that leave so much."""
-    samples = np.zeros(1000)
-    s = _Stretch(samples, 100, 100 + 16 * len(scatter), RATE)
-    left = np.repeat(scatter, 16) * np.resize(pattern, 16 * len(scatter))
+    """What is kept of pieces of so many samples, a quarter of a period, that leave so much."""
+    samples = np.zeros(3000)
+    s = _Stretch(samples, 100, 100 + piece * len(scatter), RATE)
+    left = np.repeat(scatter, piece) * np.resize(pattern, piece * len(scatter))
     monkeypatch.setattr(_Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
-    kept = _trimmed(s, samples, RATE, [(16.0, 0.02), (40.0, 0.02)])
+    kept = _trimmed(s, samples, RATE, [(RATE / (4.0 * piece), 0.02), (40.0, 0.02)])
     return None if kept is None else (kept.first, kept.last)
 
 
@@ -598,6 +606,40 @@ def test_errors_that_remember_are_worth_fewer(monkeypatch: pytest.MonkeyPatch) -
     limit = 1.0 + 4.0 / math.sqrt(2.0)
     assert trimmed([*[1.0] * 39, limit * 0.98], monkeypatch, (1.0,)) == (100, 740)
     assert trimmed([*[1.0] * 39, limit * 1.03], monkeypatch, (1.0,)) == (100, 724)
+
+
+def test_however_errors_remember_a_fortieth_of_the_samples_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a memory of 0.95 there are 0.05/1.95; of 64 samples that is 1.64."""
+    limit = 1.0 + 4.0 / math.sqrt(2.0 * 64.0 * 0.05 / 1.95)
+    assert trimmed([*[1.0] * 39, limit * 0.98], monkeypatch, (1.0,), 64) == (100, 2660)
+    assert trimmed([*[1.0] * 39, limit * 1.03], monkeypatch, (1.0,), 64) == (100, 2596)
+
+
+def test_of_fast_modes_a_piece_has_four_samples(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = np.zeros(200)
+    s = _Stretch(samples, 0, 200, RATE)
+    left = np.ones(200) * np.resize((1.0, -1.0), 200)
+    left[197] = 50.0
+    monkeypatch.setattr(_Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
+    kept = _trimmed(s, samples, RATE, [(128.0, 0.02)])
+    assert kept is not None
+    assert (kept.first, kept.last) == (0, 196)
+
+
+def test_the_ends_are_cut_three_times_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = blows(3000, [0])
+    both = [_Stretch(samples, 0, 1000, RATE), _Stretch(samples, 1000, 1500, RATE)]
+
+    def cut(s: _Stretch, samples: FloatArray, rate: float, modes: Modes) -> _Stretch | None:
+        return _Stretch(samples, s.first + 10, s.last, rate) if s.last == 1000 else None
+
+    monkeypatch.setattr(module, '_trimmed', cut)
+    kept, fit = _settled(samples, RATE, both, [(16.0, 0.02)])
+    assert [(s.first, s.last) for s in kept] == [(30, 1000)]
+    assert len(fit.left) == 970
+    # If nothing would be left, all is.
+    kept, fit = _settled(samples, RATE, both[1:], [(16.0, 0.02)])
+    assert [(s.first, s.last) for s in kept] == [(1000, 1500)]
 
 
 def test_four_periods_are_left_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
