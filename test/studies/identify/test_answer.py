@@ -40,10 +40,12 @@ def found(*axes: tuple[Mode, ...], stretches: int = 1) -> Identified:
         ((mode(damping_sd=0.0069),), (), 'not known well'),
         # The surer of the two counts.
         ((mode(sd=0.2),), (mode(sd=0.1),), None),
+        # As a share of its frequency: the higher of two that agree within their scatter.
+        ((mode(12.0, sd=0.1199, damping_sd=0.5),), (mode(12.3, sd=0.1228),), None),
         # Apart by half a percent...
         ((mode(),), (mode(14.069),), None),
         ((mode(14.0702),), (mode(14.0),), None),
-        ((mode(),), (mode(14.072),), 'different frequencies'),
+        ((mode(),), (mode(14.072),), 'ΔX and ΔY ring at different frequencies'),
         # ...or by three standard deviations of both, 0.03 and 0.04 Hz.
         ((mode(sd=0.03),), (mode(14.149, sd=0.04),), None),
         ((mode(sd=0.03),), (mode(14.151, sd=0.04),), 'different frequencies'),
@@ -90,7 +92,7 @@ def test_the_shaper_suits_all_close_modes_and_their_scatter(sd: float, name: str
 
     MZV leaves at most 5 % to 0.71 Hz from 14 Hz.
     """
-    modes = (mode(13.7), mode(13.4, sd=sd), mode(14.6))
+    modes = (mode(13.7), mode(13.4, sd=sd), mode(14.6, 0.05))
     answer = found((*modes, mode(50.0, sd=1.0)), (mode(sd=0.3),), ())
     both = answer.shaper_of(0)
     middle = shaper(name, 14.0, 0.02)
@@ -157,6 +159,14 @@ def test_a_mode_in_words() -> None:
     # The shaper stands beside the loudest mode only.
     assert [row[-1] == '' for row in rows] == [False, True, True, False]
     assert rows[2] == ['ΔY', 'none: knock on the link, or release a load', '', '', '', '']
+
+
+def test_a_shaper_in_words_has_sizes_and_milliseconds() -> None:
+    """MZV of 0.5 Hz without damping: impulses 3/8 of a turn apart, the middle one sqrt(2) times the others."""
+    words = found((mode(0.5, 1e-9, sd=1e-9, damping_sd=1e-12),), (), ())._shaper_words(0)
+    size = 1.0 / (2.0 + math.sqrt(2.0))
+    assert words == f'MZV: {size:.4f} at 0.0 ms, {math.sqrt(2.0) * size:.4f} at 750.0 ms, {size:.4f} at 1500.0 ms'
+    assert found((), (), ())._shaper_words(0) == ''
 
 
 def test_how_many_modes_there_are() -> None:

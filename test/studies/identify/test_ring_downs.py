@@ -319,6 +319,14 @@ def test_a_stretch_grows_by_half_a_window_or_a_third_until_a_blow() -> None:
         assert grown.last + low == expected[1]
 
 
+def test_a_stretch_ends_where_the_recording_ends() -> None:
+    samples = 1e-3 * np.exp(-0.02 * 100.0 * times(400)) * np.cos(100.0 * times(400))
+    samples += 1e-6 * np.random.default_rng(16).normal(size=400)
+    seed = _Stretch(samples, 8, 392, RATE)
+    grown, _ = _grown(samples, seed, _fit([seed], [(16.0, 0.02)]), 384, 1e-6)
+    assert (grown.first, grown.last) == (8, 392)
+
+
 @pytest.mark.parametrize('split', [True, False])
 def test_a_small_blow_that_is_lost_in_the_mean_ends_a_stretch(split: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A buzz of 5 um for 192 samples: 2.4 um in the mean of all, 4 um at the end. Two modes do not help."""
