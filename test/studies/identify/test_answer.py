@@ -162,10 +162,9 @@ def test_a_mode_in_words() -> None:
 
 
 def test_a_shaper_in_words_has_sizes_and_milliseconds() -> None:
-    """MZV of 0.5 Hz without damping: impulses 3/8 of a turn apart, the middle one sqrt(2) times the others."""
+    """ZVD of 0.5 Hz without damping: a quarter, a half and a quarter, half a turn apart."""
     words = found((mode(0.5, 1e-9, sd=1e-9, damping_sd=1e-12),), (), ())._shaper_words(0)
-    size = 1.0 / (2.0 + math.sqrt(2.0))
-    assert words == f'MZV: {size:.4f} at 0.0 ms, {math.sqrt(2.0) * size:.4f} at 750.0 ms, {size:.4f} at 1500.0 ms'
+    assert words == 'ZVD: 0.2500 at 0.0 ms, 0.5000 at 1000.0 ms, 0.2500 at 2000.0 ms'
     assert found((), (), ())._shaper_words(0) == ''
 
 
