@@ -133,7 +133,9 @@ def test_the_search_begins_at_the_peak_with_narrow_and_wide_modes(monkeypatch: p
 
     def watched(loss: Any, start: FloatArray, **options: Any) -> Any:
         starts.append(start)
-        return minimize(loss, start, **options)
+        found = minimize(loss, start, **options)
+        assert found.success
+        return found
 
     monkeypatch.setattr(operation, 'minimize', watched)
     assert mode_in_operation(samples, RATE, 14.3) is not None

@@ -634,6 +634,18 @@ def test_of_fast_modes_a_piece_has_four_samples(monkeypatch: pytest.MonkeyPatch)
     assert (kept.first, kept.last) == (0, 196)
 
 
+def test_a_piece_of_one_sample_counts_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples = np.zeros(400)
+    s = _Stretch(samples, 10, 10 + 16 * 20 + 1, RATE)
+    left = np.resize((1.0, -1.0), 321)
+    monkeypatch.setattr(_Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
+    for size, last in ((1.65, 331), (1.75, 330)):
+        left[-1] = size
+        kept = _trimmed(s, samples, RATE, [(16.0, 0.02)])
+        assert kept is not None
+        assert (kept.first, kept.last) == (10, last)
+
+
 def test_the_ends_are_cut_three_times_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = blows(3000, [0])
     both = [_Stretch(samples, 0, 1000, RATE), _Stretch(samples, 1000, 1500, RATE)]
