@@ -462,7 +462,10 @@ def test_of_three_windows_that_grow_the_longest_tells_the_modes(
     assert len(seen) == 3
     np.testing.assert_allclose(np.reshape(seen, (3, 2)), [(16.0, 0.02)] * 3, rtol=0.02)
     # Six periods, and half a one.
-    assert scanned == [([(900.0, 0.02)], pytest.approx(told), 384, 32)]
+    ((modes, noise, *sizes),) = scanned
+    assert modes == [(900.0, 0.02)]
+    assert noise == pytest.approx(told)
+    assert sizes == [384, 32]
 
 
 @pytest.mark.parametrize(('fits', 'splits'), [(2, 5), (99, 10)])
