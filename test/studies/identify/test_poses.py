@@ -98,6 +98,7 @@ def test_what_stands_above_the_noise_is_looked_for(
     """Three peaks at most; the search begins with a damping ratio of a hundredth and the noise above a third."""
     sought: list[Any] = []
     beside: list[list[float]] = []
+    driven: list[float] = []
 
     def loudest(filled: FloatArray, rate: float, white: float, taken: Sequence[float]) -> float | None:
         beside.append(list(taken))
@@ -112,12 +113,13 @@ def test_what_stands_above_the_noise_is_looked_for(
     monkeypatch.setattr(module, 'coloured_noise', lambda *a: noise)
     monkeypatch.setattr(module, 'stands_above', lambda filled, rate, f, noise: f in above)
     monkeypatch.setattr(module, '_stretches', stretches)
-    monkeypatch.setattr(module, 'mode_in_operation', lambda filled, rate, f: None)
+    monkeypatch.setattr(module, 'mode_in_operation', lambda filled, rate, f: driven.append(f))
     samples = 2e-6 * np.random.default_rng(4).normal(size=2000)
     found = modes_of(samples, RATE)
     assert (found.how, found.modes) == ('none', ())
     assert found.noise == pytest.approx(2e-6, rel=0.1)
     assert beside == [list(peaks[:k]) for k in range(min(len(peaks) + 1, 3))]
+    assert driven == list(above[:1])
     if above:
         ((modes, level),) = sought
         assert modes == [(f, 0.01) for f in above]

@@ -118,6 +118,12 @@ def test_two_modes_are_fitted_to_the_last_digits() -> None:
         assert fit.deviation < 1e-12
 
 
+def test_of_rest_nothing_is_left() -> None:
+    fit = _fit([stretch(np.zeros(100))], [(16.0, 0.02)])
+    assert fit.deviation == 0.0
+    assert np.all(np.isfinite(fit.modes))
+
+
 def test_the_scatter_of_a_fit_is_that_of_its_slopes() -> None:
     """Of all that is fitted, the linear terms of each stretch too, by differences of the motion."""
     rng = np.random.default_rng(2)
@@ -713,7 +719,7 @@ def test_the_variance_at_a_mode_is_that_of_white_noise_of_its_density(
     near = [v for k, v in zip(f, p, strict=True) if abs(k - frequency) < half_width]
     assert len(near) == count
     s = stretch(np.zeros(20))
-    for stretches in (1, 2, 3):
+    for stretches in (1, 2, 3, 4, 6):
         free = max(2 * count - 2 * close * (stretches + 1), 2)
         expected = sum(near) * rate / free
         # More than the mean, as this noise remembers.
