@@ -55,7 +55,7 @@ def mode_in_operation(samples: FloatArray, rate: float, frequency: float) -> Mod
             loss,
             start,
             method='Nelder-Mead',
-            options={'maxiter': 6000, 'maxfev': 6000, 'xatol': 1e-6, 'fatol': 1e-6},
+            options={'maxfev': 6000, 'xatol': 1e-6, 'fatol': 1e-6},
         )
         if best is None or tried.fun < best.fun:
             best = tried
@@ -76,13 +76,14 @@ def _scatters_as_it_should(ratios: FloatArray) -> bool:
     """Whether ``ratios`` (n,) of a periodogram to a density are as the right one leaves them: exponential, mean 1."""
     from scipy.stats import gamma
 
-    worst = 1.0
-    for length in (4, max(len(ratios) // 8, 5)):
-        parts = np.array_split(ratios, max(len(ratios) // length, 1))
-        for part in parts:
-            below = float(gamma.cdf(part.sum(), len(part)))
-            worst = min(worst, 2.0 * len(parts) * min(below, 1.0 - below))
-    return worst > 0.5 * ODDS
+    chances = [
+        2.0 * len(parts) * min(below, 1.0 - below)
+        for length in (4, max(len(ratios) // 8, 5))
+        for parts in [np.array_split(ratios, len(ratios) // length)]
+        for part in parts
+        for below in [float(gamma.cdf(part.sum(), len(part)))]
+    ]
+    return min(chances) > 0.5 * ODDS
 
 
 def _information(density: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:

@@ -52,11 +52,11 @@ def loudest_peak(samples: FloatArray, rate: float, noise: float, beside: Sequenc
     inside = (f >= LOWEST) & (f <= min(HIGHEST, rate / 4.0))
     # Of white noise of this size, differences taken.
     floor = 2.0 * noise**2 * rate * 2.0 * (1.0 - np.cos(2.0 * np.pi * f / rate))
-    contrast = np.where(inside, p / np.maximum(floor, 1e-300), 0.0)
+    free = inside
     for taken in beside:
-        contrast[np.abs(f - taken) < max(0.15 * taken, 2.0 * (f[1] - f[0]))] = 0.0
-    at = int(np.argmax(np.where(inside & (contrast > 0.0), p, 0.0)))
-    if contrast[at] < PEAK or not 0 < at < len(f) - 1 or p[at] < max(p[at - 1], p[at + 1]):
+        free = free & (np.abs(f - taken) >= max(0.15 * taken, 2.0 * f[1]))
+    at = int(np.argmax(p * free))
+    if not free[at] or not p[at] >= PEAK * floor[at] or p[at] < max(p[at - 1], p[at + 1]):
         return None
     about = inside & (np.abs(f - f[at]) < 0.5 * f[at]) & (np.abs(f - f[at]) > 0.2 * f[at])
     if about.any() and p[at] < (STANDS_OUT if beside else 4.0) * np.median(p[about]):

@@ -1,0 +1,213 @@
+"""What is said of modes that are given: limits, words, tables. Numbers by hand."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from psd_deflection.arms.shapers import recommended, shaper
+from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
+from psd_deflection.studies.identify.from_recordings import IdentifyProblem
+from psd_deflection.studies.identify.result import Identified, _close, _pm
+
+
+def mode(frequency: float = 14.0, damping: float = 0.02, *, sd: float = 1e-4, damping_sd: float = 1e-4) -> Mode:
+    return Mode(frequency, sd, damping, damping_sd, 1e-3)
+
+
+def found(*axes: tuple[Mode, ...], stretches: int = 1) -> Identified:
+    """Seen in ``stretches`` of half a second, one each second; 500 samples a second."""
+    places = tuple((500 * i + 50, 500 * i + 300) for i in range(stretches))
+    x, y, twist = (
+        AxisModes(
+            modes, 'ring-down' if modes and stretches else 'operation' if modes else 'none', places, np.zeros(3), 1e-6
+        )
+        for modes in axes
+    )
+    nowhere: Any = None
+    return Identified(IdentifyProblem(nowhere, np.zeros((3, 3)), 500.0), (x, y, twist))
+
+
+@pytest.mark.parametrize(
+    ('x', 'y', 'why'),
+    [
+        ((mode(sd=0.139),), (), None),
+        ((mode(sd=0.141),), (), 'not known well'),
+        ((mode(damping_sd=0.0067),), (), None),
+        ((mode(damping_sd=0.0069),), (), 'not known well'),
+        # The surer of the two counts.
+        ((mode(sd=0.2),), (mode(sd=0.1),), None),
+        # As a share of its frequency: the higher of two that agree within their scatter.
+        ((mode(12.0, sd=0.1199, damping_sd=0.5),), (mode(12.3, sd=0.1228),), None),
+        # Apart by half a percent...
+        ((mode(),), (mode(14.069),), None),
+        ((mode(14.0702),), (mode(14.0),), None),
+        ((mode(),), (mode(14.072),), 'ΔX and ΔY ring at different frequencies'),
+        # ...or by three standard deviations of both, 0.03 and 0.04 Hz.
+        ((mode(sd=0.03),), (mode(14.149, sd=0.04),), None),
+        ((mode(sd=0.03),), (mode(14.151, sd=0.04),), 'different frequencies'),
+        # Within 30 % of the loudest one.
+        ((mode(10.0), mode(13.1)), (), None),
+        ((mode(10.0), mode(12.9)), (), 'two modes close'),
+        ((mode(10.0),), (mode(10.0), mode(30.0), mode(7.1)), 'two modes close'),
+        ((mode(10.0), mode(6.9)), (mode(10.0),), None),
+        ((), (), None),
+    ],
+)
+def test_why_the_rig_file_does_not_get_a_mode(x: tuple[Mode, ...], y: tuple[Mode, ...], why: str | None) -> None:
+    answer = found(x, y, ())
+    said = answer._withheld('bending')
+    assert (said is None) is (why is None)
+    assert why is None or (said is not None and why in said)
+    assert bool(answer.values) is bool((x or y) and why is None)
+    assert answer._nothing() == ([f'Nothing for dynamics.bending_*: {said}.'] if why else [])
+    assert answer._withheld('torsion') is None
+
+
+def test_the_surer_axis_is_the_one_that_the_rig_file_gets() -> None:
+    less, more = mode(14.00000012, 0.0200000123, sd=2e-3), mode(14.01234567890, 0.0212345678, sd=1e-3)
+    rounded = {'dynamics.bending_frequency': 14.012346, 'dynamics.bending_damping_ratio': 0.0212346}
+    assert found((less,), (more,), ()).values == rounded
+    assert found((more,), (less,), ()).values == rounded
+    # Sure is the share of the frequency.
+    assert (
+        found((mode(14.0, sd=1.0e-3),), (mode(14.05, sd=1.002e-3),), ()).values['dynamics.bending_frequency'] == 14.05
+    )
+    twist = found((), (), (mode(21.0), mode(3.0))).values
+    assert twist == {'dynamics.torsion_frequency': 21.0, 'dynamics.torsion_damping_ratio': 0.02}
+
+
+def test_only_modes_near_the_loudest_are_close() -> None:
+    modes = [mode(10.0), mode(12.99), mode(13.01), mode(7.01), mode(6.99)]
+    assert _close(modes) == [modes[0], modes[1], modes[3]]
+    assert _close([]) == []
+
+
+@pytest.mark.parametrize(('sd', 'name'), [(0.03, 'mzv'), (0.05, 'zvd')])
+def test_the_shaper_suits_all_close_modes_and_their_scatter(sd: float, name: str) -> None:
+    """It works from three standard deviations below the lowest to as far above the highest: for 0.69 or 0.75 Hz.
+
+    MZV leaves at most 5 % to 0.71 Hz from 14 Hz.
+    """
+    modes = (mode(13.7), mode(13.4, sd=sd), mode(14.6, 0.05))
+    answer = found((*modes, mode(50.0, sd=1.0)), (mode(sd=0.3),), ())
+    both = answer.shaper_of(0)
+    middle = shaper(name, 14.0, 0.02)
+    assert both is not None
+    assert both.name == name
+    assert both.times == pytest.approx(middle.times)
+    assert both.sizes == pytest.approx(middle.sizes)
+    assert answer.shaper_of(1) == shaper('zvd', 14.0, 0.02)
+    assert answer.shaper_of(2) is None
+
+
+@pytest.mark.parametrize(
+    ('modes', 'known'),
+    [
+        ((mode(damping_sd=0.0067),), True),
+        ((mode(damping_sd=0.0069),), False),
+        ((mode(damping_sd=0.0),), False),
+        ((mode(damping_sd=0.001), mode(15.0, damping_sd=0.0069)), False),
+        ((mode(damping_sd=0.001), mode(30.0, damping_sd=0.0069)), True),
+    ],
+)
+def test_a_shaper_needs_a_damping_ratio_within_a_third(modes: tuple[Mode, ...], known: bool) -> None:
+    assert (found(modes, (), ()).shaper_of(0) is not None) is known
+
+
+@pytest.mark.parametrize(
+    ('value', 'sd', 'words'),
+    [
+        (14.0, 0.01, '14.000 ± 0.020'),
+        (14.0, 0.1, '14.00 ± 0.20'),
+        (14.0, 1.0, '14.0 ± 2.0'),
+        (140.0, 10.0, '140 ± 20'),
+        (1400.0, 100.0, '1400 ± 196'),
+        (0.02, 0.00123, '0.0200 ± 0.0024'),
+        (1.0, 1e-12, '1.000000000 ± 0.000000000'),
+        (14.0, 0.0, '14.000000 ± 0.000000'),
+        (14.0, math.inf, '14.000000 ± inf'),
+    ],
+)
+def test_an_interval_has_two_digits(value: float, sd: float, words: str) -> None:
+    assert _pm(value, sd) == words
+
+
+def test_a_mode_in_words() -> None:
+    x = Mode(14.0, 0.01, 0.02, 0.001, 12.34e-6)
+    twist = Mode(21.0, 0.02, 0.03, 0.001, math.radians(0.0125))
+    answer = found((x, mode(40.0)), (), (twist,))
+    words = ('14.000 ± 0.020', '0.0200 ± 0.0020', '12.3 µm', '1 ring-down')
+    assert answer._mode_words(0, x) == words
+    assert answer._mode_words(2, twist)[2:] == ('12.5 mdeg', '1 ring-down')
+    assert found((x,), (), (), stretches=2)._mode_words(0, x)[3] == '2 ring-downs'
+    assert found((x,), (), (), stretches=0)._mode_words(0, x)[3] == 'the spectrum in operation'
+    best = answer.shaper_of(0)
+    assert best is not None
+    impulses = ', '.join(f'{s:.4f} at {1000.0 * t:.1f} ms' for s, t in zip(best.sizes, best.times, strict=True))
+    lines = answer.sentences()
+    assert lines[0] == f'ΔX: {words[0]} Hz, damping ratio {words[1]} (95 %), {words[2]}, from {words[3]}'
+    assert lines[1].startswith('ΔX: 40.')
+    assert lines[2] == f'ΔX: input shaper {best.name.upper()}: {impulses}'
+    assert lines[3] == 'ΔY: no mode stands out of the noise. Knock on the link, or release a load.'
+    assert [line[:2] for line in lines[4:]] == ['θ:', 'θ:']
+    rows = answer.rows()
+    assert rows[0] == ['ΔX', *words, best.name.upper()]
+    # The shaper stands beside the loudest mode only.
+    assert [row[-1] == '' for row in rows] == [False, True, True, False]
+    assert rows[2] == ['ΔY', 'none: knock on the link, or release a load', '', '', '', '']
+
+
+def test_a_shaper_in_words_has_sizes_and_milliseconds() -> None:
+    """ZVD of 0.5 Hz without damping: a quarter, a half and a quarter, half a turn apart."""
+    words = found((mode(0.5, 1e-9, sd=1e-9, damping_sd=1e-12),), (), ())._shaper_words(0)
+    assert words == 'ZVD: 0.2500 at 0.0 ms, 0.5000 at 1000.0 ms, 0.2500 at 2000.0 ms'
+    assert found((), (), ())._shaper_words(0) == ''
+
+
+def test_how_many_modes_there_are() -> None:
+    assert found((mode(), mode(40.0)), (), (mode(),)).page_sentences() == ['Modes: 2 along ΔX, 1 along θ.']
+    assert found((), (), ()).page_sentences() == ['No mode stands out of the noise.']
+    assert len(found((mode(sd=1.0),), (), ()).page_sentences()) == 2
+
+
+def test_lines_for_the_rig_file_follow_the_sentences() -> None:
+    answer = found((mode(14.25),), (), ())
+    tail = ['    dynamics.bending_frequency: 14.25', '    dynamics.bending_damping_ratio: 0.02']
+    assert answer.lines() == [*answer.sentences(), '', 'Lines for the rig file, below ros__parameters:', '', *tail]
+    nothing = found((), (), ())
+    assert nothing.lines() == nothing.sentences()
+
+
+def test_numbers_for_machines_are_in_si_units() -> None:
+    x = Mode(14.0, 0.01, 0.02, 0.001, 12e-6)
+    tree = found((x,), (), (mode(21.0), mode(30.0)), stretches=2).tree()
+    assert list(tree['axes']) == ['dx', 'dy', 'theta']
+    dx = tree['axes']['dx']
+    assert (dx['unit'], dx['how'], dx['noise'], tree['axes']['theta']['unit']) == ('m', 'ring-down', 1e-6, 'rad')
+    np.testing.assert_allclose(dx['stretches'], [[0.1, 0.6], [1.1, 1.6]])
+    best = recommended(14.0, 0.01, 0.02)
+    assert dx['shaper'] == {'name': best.name, 'times': best.times, 'sizes': best.sizes}
+    assert tree['axes']['dy']['shaper'] is None
+    expected = {
+        'frequency': 14.0,
+        'frequency_sd': 0.01,
+        'damping_ratio': 0.02,
+        'damping_ratio_sd': 0.001,
+        'amplitude': 12e-6,
+    }
+    assert dx['modes'] == [expected]
+    assert len(tree['axes']['theta']['modes']) == 2
+
+
+def test_the_table_has_a_row_for_each_mode() -> None:
+    x = Mode(14.0, 0.01, 0.02, 0.001, 12e-6)
+    columns = {c.name: list(c.values) for c in found((x,), (), (mode(21.0), mode(30.0))).table().columns}
+    assert columns['frequency'] == [14.0, 21.0, 30.0]
+    assert columns['frequency_sd'] == [0.01, 1e-4, 1e-4]
+    assert columns['damping_ratio'] == [0.02, 0.02, 0.02]
+    assert columns['damping_ratio_sd'] == [0.001, 1e-4, 1e-4]
+    assert columns['amplitude'] == [12e-6, 1e-3, 1e-3]

@@ -1,0 +1,199 @@
+"""The mode of a driven link: its likelihood written again, and spectra that no driven mode has."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+from scipy.signal.windows import hann
+from scipy.stats import gamma
+
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.identify import operation
+from psd_deflection.studies.identify.operation import _information, _scatters_as_it_should, mode_in_operation
+
+RATE = 200.0
+
+
+def driven(
+    frequency: float = 14.0, zeta: float = 0.02, seconds: float = 30.0, seed: int = 1, noise: float = 0.0
+) -> FloatArray:
+    """About 1 mm of a resonator of one pole pair that noise drives."""
+    rng = np.random.default_rng(seed)
+    w = 2.0 * np.pi * frequency / RATE
+    pole = np.exp(-zeta * w + 1j * w * math.sqrt(1.0 - zeta**2))
+    n = round(seconds * RATE)
+    moved = lfilter([1.0], [1.0, -2.0 * pole.real, abs(pole) ** 2], rng.normal(size=n + 2000))[2000:]
+    return np.asarray(1e-3 * moved / moved.std() + noise * rng.normal(size=n))
+
+
+def lines(samples: FloatArray, frequency: float) -> tuple[FloatArray, FloatArray]:
+    """Every second line of the density of the samples about ``frequency``, a Hann window before the transform."""
+    n = len(samples)
+    k = np.arange(n)
+    straight = samples - np.polyval(np.polyfit(k, samples, 1), k)
+    window = hann(n, sym=False)
+    p = 2.0 * np.abs(np.fft.rfft(straight * window)) ** 2 / (RATE * np.sum(window**2))
+    f = np.asarray(np.fft.rfftfreq(n, 1.0 / RATE), dtype=np.float64)
+    about = np.flatnonzero((f > 0.6 * frequency) & (f < 1.5 * frequency))[::2]
+    return f[about], p[about]
+
+
+@pytest.mark.parametrize(('prior', 'guess'), [(None, 14.0), (0.2, 14.5)])
+def test_it_is_the_likeliest_mode_with_the_scatter_of_its_likelihood(
+    prior: float | None, guess: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The likelihood of exponential lines, in other parameters and by another search."""
+    if prior is None:
+        # What is said of it.
+        prior = 1.0
+    else:
+        monkeypatch.setattr(operation, 'SLOPE_SD', prior)
+    samples = driven(noise=3e-5) + 1e-3 * np.arange(6000) / 6000.0 + 5e-3
+    f, p = lines(samples, guess)
+
+    def density(x: FloatArray) -> FloatArray:
+        peak, f0, zeta, slope, floor = x
+        r = f / f0
+        shape = 4.0 * zeta**2 / ((1.0 - r**2) ** 2 + 4.0 * zeta**2 * r**2)
+        return np.asarray(1e-6 * peak * r**-slope * shape + 1e-10 * floor)
+
+    def loss(x: FloatArray) -> float:
+        s = density(x)
+        return float(np.sum(np.log(1e8 * s) + p / s) + 0.5 * (x[3] / prior) ** 2)
+
+    best = minimize(
+        loss,
+        [1.0, 14.0, 0.02, 0.0, 0.1],
+        method='L-BFGS-B',
+        bounds=[(1e-3, 1e3), (13, 15), (5e-3, 0.1), (-5, 5), (1e-6, 1e3)],
+    )
+    best = minimize(loss, best.x, method='Nelder-Mead', options={'xatol': 1e-9, 'fatol': 1e-12, 'maxfev': 4000})
+    found = mode_in_operation(samples, RATE, guess)
+    assert found is not None
+    assert found.frequency == pytest.approx(best.x[1], rel=3e-6)
+    assert found.damping == pytest.approx(best.x[2], rel=3e-4)
+    slopes = []
+    for i, step in enumerate(1e-5 * np.maximum(np.abs(best.x), 1e-2)):
+        more = np.array(best.x)
+        more[i] += step
+        slopes.append((np.log(density(more)) - np.log(density(best.x))) / step)
+    information = np.array(slopes) @ np.array(slopes).T
+    information[3, 3] += 1.0 / prior**2
+    deviations = np.sqrt(np.linalg.inv(information).diagonal())
+    assert found.frequency_sd == pytest.approx(deviations[1], rel=2e-3)
+    assert found.damping_sd == pytest.approx(deviations[2], rel=2e-3)
+    # The area under what the mode adds, without the slope of what drives it.
+    peak, f0, zeta = best.x[:3]
+    area, _ = quad(
+        lambda r: 4.0 * zeta**2 / ((1.0 - r**2) ** 2 + 4.0 * zeta**2 * r**2),
+        0.0,
+        50.0,
+        points=[0.9, 1.0, 1.1],
+        limit=500,
+    )
+    assert found.amplitude == pytest.approx(math.sqrt(1e-6 * peak * f0 * area), rel=1e-3)
+
+
+@pytest.mark.parametrize(('guess', 'seen'), [(14.0 / 0.72, True), (14.0 / 0.68, False), (10.15, True), (9.7, False)])
+def test_a_mode_far_from_the_peak_is_not_the_one_that_was_asked_for(guess: float, seen: bool) -> None:
+    """Below 0.7 of it or above 1.4."""
+    assert (mode_in_operation(driven(noise=3e-5), RATE, guess) is not None) is seen
+
+
+@pytest.mark.parametrize(('zeta', 'seen'), [(0.3, True), (0.9, False)])
+def test_what_hardly_swings_is_no_mode(zeta: float, seen: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Above a damping ratio of a half; the colour of what drives it is known. One blow in the middle, without noise."""
+    monkeypatch.setattr(operation, 'SLOPE_SD', 0.01)
+    n = 6000
+    f = np.fft.rfftfreq(n, 1.0 / RATE)
+    shape = 1.0 / np.sqrt((14.0**2 - f**2) ** 2 + (2.0 * zeta * 14.0 * f) ** 2)
+    found = mode_in_operation(np.fft.irfft(shape * np.exp(-1j * np.pi * f * n / RATE), n), RATE, 14.0)
+    assert (found is not None) is seen
+
+
+@pytest.mark.parametrize(('seconds', 'seen'), [(4.6, False), (4.8, True)])
+def test_a_spectrum_of_thirty_lines_is_enough(seconds: float, seen: bool) -> None:
+    samples = driven(seconds=seconds, zeta=0.05, noise=3e-5)
+    assert (len(lines(samples, 14.0)[0]) == 30) is seen
+    assert len(lines(samples, 14.0)[0]) in (29, 30)
+    assert (mode_in_operation(samples, RATE, 14.0) is not None) is seen
+
+
+def test_the_search_begins_at_the_peak_with_narrow_and_wide_modes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three tenths of the highest line at the peak of a mode alone, and a tenth of the median below it."""
+    samples = driven(noise=3e-5)
+    p = lines(samples, 14.3)[1]
+    starts: list[FloatArray] = []
+
+    def watched(loss: Any, start: FloatArray, **options: Any) -> Any:
+        starts.append(start)
+        found = minimize(loss, start, **options)
+        assert found.success
+        return found
+
+    monkeypatch.setattr(operation, 'minimize', watched)
+    assert mode_in_operation(samples, RATE, 14.3) is not None
+    found = [(*np.exp(start[:4]), start[4]) for start in starts]
+    # A mode alone has the height a / (2 zeta f0^2)^2.
+    heights = [a / (2.0 * zeta * f0**2) ** 2 / p.max() for a, f0, zeta, *_ in found]
+    np.testing.assert_allclose(heights, 0.3, rtol=1e-9)
+    np.testing.assert_allclose([row[1] for row in found], 14.3)
+    np.testing.assert_allclose([row[2] for row in found], [0.005, 0.02, 0.08])
+    np.testing.assert_allclose([row[3] for row in found], 0.1 * np.median(p))
+    assert [row[4] for row in found] == [0.0] * 3
+
+
+def test_a_steady_swing_is_no_driven_mode() -> None:
+    """Nor are two modes one."""
+    t = np.arange(6000) / RATE
+    noise = 3e-5 * np.random.default_rng(2).normal(size=6000)
+    assert mode_in_operation(1e-3 * np.sin(2.0 * np.pi * 14.0 * t) + noise, RATE, 14.0) is None
+    assert mode_in_operation(driven() + driven(17.0, 0.01, seed=2) + noise, RATE, 14.0) is None
+
+
+def swollen(n: int, first: int, count: int, total: float) -> FloatArray:
+    """Ratios of 1, but ``count`` of them from ``first`` have the sum ``total``."""
+    out = np.ones(n)
+    out[first : first + count] = total / count
+    return out
+
+
+@pytest.mark.parametrize(
+    ('n', 'first', 'count', 'parts'),
+    [
+        # Fours of thirty-two; two of them lie in either neighbour of the larger parts.
+        (32, 4, 4, 8),
+        # Thirty have six fives, and sevenths that begin elsewhere.
+        (30, 15, 5, 6),
+        # Eighths of eighty.
+        (80, 30, 10, 8),
+    ],
+)
+def test_a_spectrum_leaves_the_line_once_in_two_thousand_parts(n: int, first: int, count: int, parts: int) -> None:
+    """A sum of exponential ratios has a gamma distribution; too much and too little count, in each of the parts."""
+    for factor, expected in ((0.98, False), (1.02, True)):
+        chance = factor * 0.0005 / (2.0 * parts)
+        for total in (gamma.isf(chance, count), gamma.ppf(chance, count)):
+            assert _scatters_as_it_should(swollen(n, first, count, total)) is expected
+
+
+def test_ratios_as_they_should_be_pass() -> None:
+    rng = np.random.default_rng(6)
+    assert sum(_scatters_as_it_should(rng.exponential(size=200)) for _ in range(40)) >= 39
+    assert not _scatters_as_it_should(1.5 * rng.exponential(size=1000))
+    assert not _scatters_as_it_should(np.ones(1000) + 1e-3 * rng.normal(size=1000) + 0.8)
+
+
+def test_the_information_is_of_the_slopes_of_the_logarithm() -> None:
+    """Of exp(a^3 f + sin(b) f^2): slopes 3 a^2 f and cos(b) f^2."""
+    f = np.linspace(1.0, 2.0, 7)
+    a, b = 0.7, 0.4
+    slopes = np.stack((3.0 * a**2 * f, math.cos(b) * f**2))
+    found = _information(lambda x: np.asarray(np.exp(x[0] ** 3 * f + math.sin(x[1]) * f**2)), np.array([a, b]))
+    np.testing.assert_allclose(found, slopes @ slopes.T, rtol=1e-7)

@@ -1,0 +1,239 @@
+"""Peaks and noise of spectra that are known by hand or computed again with scipy."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+from scipy.optimize import brentq, nnls
+from scipy.signal import lfilter, welch
+from scipy.signal.windows import blackmanharris
+
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.identify.spectra import (
+    ColouredNoise,
+    coloured_noise,
+    filled_up,
+    loudest_peak,
+    stands_above,
+    white_noise,
+)
+
+RATE = 1000.0
+
+
+def sine(frequency: float, seconds: float = 20.0, rate: float = RATE) -> FloatArray:
+    return np.asarray(1e-3 * np.sin(2.0 * np.pi * frequency * np.arange(round(seconds * rate)) / rate + 0.4))
+
+
+def of_differences(samples: FloatArray, rate: float = RATE) -> tuple[FloatArray, FloatArray]:
+    """The spectrum of the speed, in pieces of eight seconds."""
+    f, p = welch(rate * (samples[1:] - samples[:-1]), rate, nperseg=min(len(samples) - 1, round(8.0 * rate)))
+    return np.asarray(f), np.asarray(p)
+
+
+def speed_of_white(deviation: float, f: float, rate: float = RATE) -> float:
+    """Density of the speed that white noise seems to have, one-sided."""
+    return float(2.0 * deviation**2 / rate * abs(rate * (1.0 - np.exp(-2j * np.pi * f / rate))) ** 2)
+
+
+def test_lost_samples_lie_on_a_line_between_their_neighbours() -> None:
+    nan = math.nan
+    np.testing.assert_allclose(filled_up(np.array([nan, 1.0, nan, nan, 4.0, 2.0, nan])), [1, 1, 2, 3, 4, 2, 2])
+
+
+@pytest.mark.parametrize(('count', 'pieces', 'quiet'), [(6000, 12, 3), (5989, 11, 2), (1000, 2, 1), (300, 1, 1)])
+def test_the_noise_is_that_of_the_quietest_quarter(count: int, pieces: int, quiet: int) -> None:
+    """Of fourth differences, in pieces of five hundred."""
+    rng = np.random.default_rng(count)
+    loudness = np.repeat(rng.permutation(np.arange(1.0, 21.0)), math.ceil((count + 4) / 20))[: count + 4]
+    samples = 1e-6 * loudness * rng.normal(size=count + 4)
+    difference = np.convolve(samples, [1.0, -4.0, 6.0, -4.0, 1.0], 'valid')
+    each = sorted(float(np.mean(piece**2)) for piece in np.array_split(difference, pieces))
+    assert white_noise(samples) == pytest.approx(math.sqrt(sum(each[:quiet]) / quiet / 70.0), rel=1e-9)
+
+
+def test_white_noise_has_its_deviation_in_spite_of_slow_motion_and_lost_samples() -> None:
+    rng = np.random.default_rng(3)
+    samples = 1e-3 * np.sin(np.arange(20_000) / 300.0) + rng.normal(0.0, 2e-6, 20_000)
+    samples[rng.random(20_000) < 0.02] = math.nan
+    assert white_noise(samples) == pytest.approx(2e-6, rel=0.08)
+
+
+@pytest.mark.parametrize('frequency', [0.5, 1.0, 20.125, 133.625, 200.0])
+def test_a_peak_is_found_where_it_is(frequency: float) -> None:
+    assert loudest_peak(sine(frequency), RATE, 1e-9) == frequency
+
+
+@pytest.mark.parametrize('frequency', [0.25, 0.375, 200.125, 240.0])
+def test_what_is_slower_or_faster_than_a_link_is_no_peak(frequency: float) -> None:
+    assert loudest_peak(sine(frequency), RATE, 1e-9) is None
+
+
+def test_a_peak_lies_below_a_quarter_of_the_sample_rate() -> None:
+    assert loudest_peak(sine(100.0, rate=400.0), 400.0, 1e-9) == 100.0
+    assert loudest_peak(sine(100.5, rate=400.0), 400.0, 1e-9) is None
+
+
+def test_of_a_short_record_the_spectrum_is_that_of_all_differences() -> None:
+    """A thousand of them: a line each hertz."""
+    assert loudest_peak(sine(20.0, 1.001), RATE, 1e-9) == 20.0
+    assert loudest_peak(sine(33.0, 1.001), RATE, 1e-9) == 33.0
+
+
+@pytest.mark.parametrize(('frequency', 'rate'), [(20.0, RATE), (150.0, RATE), (60.0, 300.0)])
+def test_a_peak_is_25_times_the_noise(frequency: float, rate: float) -> None:
+    samples = sine(frequency, rate=rate)
+    f, p = of_differences(samples, rate)
+    top = float(p[np.argmin(np.abs(f - frequency))])
+    for factor, expected in ((24.9, None), (25.1, frequency)):
+        noise = math.sqrt(top / factor / speed_of_white(1.0, frequency, rate))
+        assert loudest_peak(samples, rate, noise) == expected
+
+
+@pytest.mark.parametrize(('beside', 'least'), [((), 4.0), ((30.0,), 30.0), ((90.0, 30.0), 30.0)])
+def test_a_peak_stands_out_of_what_is_around_it(beside: tuple[float, ...], least: float) -> None:
+    """The median between a fifth and a half of its frequency away; a blunt step has more below it than above."""
+    around = np.asarray(lfilter([0.3], [1.0, -0.7], np.repeat([0.0, 1.0], 10_000)))
+
+    def stands_out(size: float) -> float:
+        f, p = of_differences(sine(60.0) + size * around)
+        away = np.abs(f / 60.0 - 1.0)
+        return float(p[f == 60.0][0] / np.median(p[(away > 0.2) & (away < 0.5)]))
+
+    def missing(log_size: float, wanted: float) -> float:
+        return math.log(stands_out(math.exp(log_size)) / wanted)
+
+    for factor, expected in ((0.99, None), (1.01, 60.0)):
+        size = math.exp(brentq(missing, math.log(1e-5), math.log(10.0), args=(factor * least,)))
+        assert loudest_peak(sine(60.0) + size * around, RATE, 1e-9, beside) == expected
+
+
+def test_a_further_peak_is_not_at_one_that_is_taken() -> None:
+    """Not within 15 % of its frequency, nor within two lines of the spectrum, an eighth of a hertz each."""
+    assert loudest_peak(sine(22.875), RATE, 1e-9, [20.0]) is None
+    assert loudest_peak(sine(17.125), RATE, 1e-9, [20.0]) is None
+    assert loudest_peak(sine(23.125), RATE, 1e-9, [20.0]) == 23.125
+    assert loudest_peak(sine(16.875), RATE, 1e-9, [40.0, 20.0]) == 16.875
+    assert loudest_peak(sine(1.0), RATE, 1e-9, [0.75]) == 1.0
+    assert loudest_peak(sine(0.875), RATE, 1e-9, [0.75]) is None
+
+
+def test_of_two_peaks_the_loudest_is_first() -> None:
+    samples = sine(20.0) + 0.2 * sine(50.0)
+    assert loudest_peak(samples, RATE, 1e-9) == 20.0
+    assert loudest_peak(samples, RATE, 1e-9, [20.0]) == 50.0
+
+
+@pytest.mark.parametrize(('off', 'taken'), [(0.03, 16.0), (-0.03, 27.5)])
+def test_the_flank_of_a_taken_peak_is_no_peak(off: float, taken: float) -> None:
+    """The peak itself is the last line that counts as taken."""
+    frequency = 18.375 if off > 0.0 else 23.5
+    assert loudest_peak(sine(frequency + off), RATE, 1e-9) == frequency
+    assert loudest_peak(sine(frequency + off), RATE, 1e-9, [taken]) is None
+
+
+def test_the_density_of_noise_that_remembers_is_that_of_a_random_walk() -> None:
+    f = np.array([1.0, 30.0, 250.0, 400.0, 500.0])
+    turned = np.abs(1.0 - np.exp(-2j * np.pi * f / RATE)) ** 2
+    np.testing.assert_allclose(ColouredNoise(3e-12, 5e-13).density(f, RATE), 3e-12 + 5e-13 / turned, rtol=1e-12)
+    assert ColouredNoise(0.0, 5e-13).density(np.zeros(1), RATE) == pytest.approx(5e-4)
+
+
+def test_the_deviation_is_the_area_under_the_density() -> None:
+    assert ColouredNoise(4.0, 0.0).deviation(100.0, RATE) == pytest.approx(40.0)
+    area, _ = quad(lambda f: 4.0 + 5.0 / abs(1.0 - np.exp(-2j * np.pi * f / RATE)) ** 2, 50.0, 500.0)
+    assert ColouredNoise(4.0, 5.0).deviation(50.0, RATE) == pytest.approx(math.sqrt(area), rel=2e-3)
+
+
+@pytest.mark.parametrize('peaks', [[14.0], [14.0, 46.0]])
+def test_white_noise_below_a_link_that_is_driven_keeps_its_size(peaks: list[float]) -> None:
+    """The flanks of the modes are no noise that remembers."""
+    rng = np.random.default_rng(7)
+    samples = rng.normal(0.0, 2e-6, 20_000)
+    for peak in peaks:
+        w = 2.0 * np.pi * peak / RATE
+        pole = np.exp(-0.02 * w + 1j * w)
+        samples += lfilter([2e-6], [1.0, -2.0 * pole.real, abs(pole) ** 2], rng.normal(size=20_000))
+    found = coloured_noise(samples, RATE, peaks)
+    density = found.density(np.array([120.0, 300.0, 450.0]), RATE)
+    np.testing.assert_allclose(density, 2.0 * 2e-6**2 / RATE, rtol=0.12)
+
+
+def test_noise_that_remembers_has_the_density_of_its_autoregression() -> None:
+    rng = np.random.default_rng(8)
+    samples = sine(14.0) + lfilter([1e-6], [1.0, -0.9], rng.normal(size=20_000))
+    f = np.array([60.0, 120.0, 300.0])
+    expected = 2e-12 / RATE / np.abs(1.0 - 0.9 * np.exp(-2j * np.pi * f / RATE)) ** 2
+    np.testing.assert_allclose(coloured_noise(samples, RATE, [14.0]).density(f, RATE), expected, rtol=0.15)
+
+
+def test_above_a_fast_mode_there_is_too_little_to_tell_what_remembers() -> None:
+    """The whole spectrum then stands for the noise."""
+    samples = np.random.default_rng(9).normal(0.0, 2e-6, 20_000)
+    found = coloured_noise(samples, RATE, [185.0])
+    assert found.walk == 0.0
+    assert found.white == pytest.approx(2.0 * 2e-6**2 / RATE, rel=0.05)
+
+
+@pytest.mark.parametrize('frequency', [14.0, 14.05, 0.125])
+def test_a_mode_exceeds_the_noise_at_its_frequency_25_times(frequency: float) -> None:
+    samples = sine(frequency)
+    f, p = of_differences(samples)
+    top = float(np.interp(frequency, f, p))
+    for factor, expected in ((24.9, False), (25.1, True)):
+        # Half of it is white, half remembers.
+        half = 0.5 * top / factor / (RATE**2 * abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2)
+        noise = ColouredNoise(half, half * float(abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2))
+        assert stands_above(samples, RATE, frequency, noise) is expected
+
+
+def fitted_bands(samples: FloatArray, peaks: list[float], monkeypatch: pytest.MonkeyPatch) -> list[FloatArray]:
+    """What is given to the fit of the noise, if there is a fit: shapes over the power of each band."""
+    seen: list[FloatArray] = []
+
+    def watched(matrix: FloatArray, ones: FloatArray) -> Any:
+        np.testing.assert_array_equal(ones, 1.0)
+        seen.append(matrix)
+        return nnls(matrix, ones)
+
+    monkeypatch.setattr('scipy.optimize.nnls', watched)
+    found = coloured_noise(samples, RATE, peaks)
+    assert found.white > 0.0 or not samples.any()
+    return seen
+
+
+@pytest.mark.parametrize('peaks', [[14.0], [46.0, 14.0], [60.0]])
+def test_the_noise_is_fitted_in_24_bands_above_the_loudest_mode(
+    peaks: list[float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From 2.5 times its frequency to 0.48 of the sample rate, not within 40 % of a mode; in quiet times."""
+    samples = np.random.default_rng(11).normal(0.0, 2e-6, 7_123)
+    length = max(64, round(4.0 * RATE / min(peaks)))
+    window = blackmanharris(length, sym=False)
+    pieces = np.lib.stride_tricks.sliding_window_view(samples, length)[:: length - length // 2]
+    turned = np.abs(np.fft.rfft(pieces * window, axis=1)) ** 2 * 2.0 / (RATE * np.sum(window**2))
+    # A quarter of the squares of noise lie below -log(0.75) of their mean.
+    p = np.quantile(turned, 0.25, axis=0) / math.log(4.0 / 3.0)
+    f = np.arange(len(p)) * RATE / length
+    shapes = [np.ones(len(f)), 1.0 / np.maximum(np.abs(1.0 - np.exp(-2j * np.pi * f / RATE)) ** 2, 1e-9)]
+    # A mode of quality 10.
+    shapes += [1.0 / ((1.0 - (f / k) ** 2) ** 2 + 0.01) for k in peaks]
+    lowest, highest = 2.5 * peaks[0], 0.48 * RATE
+    band = np.floor(24.0 * np.log(np.maximum(f, 1e-9) / lowest) / math.log(highest / lowest))
+    band[np.any([np.abs(f / k - 1.0) <= 0.4 for k in peaks], axis=0)] = -1
+    rows = [[shape[band == b].mean() / p[band == b].mean() for shape in shapes] for b in range(24) if (band == b).any()]
+    (seen,) = fitted_bands(samples, peaks, monkeypatch)
+    expected = np.array(rows) / np.linalg.norm(rows, axis=0)
+    np.testing.assert_allclose(seen, expected, rtol=1e-9)
+
+
+def test_a_fit_of_the_noise_needs_four_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows of 64 samples have a line each 15.6 Hz; four of them lie above 415 Hz, three above 430 Hz."""
+    samples = np.random.default_rng(12).normal(0.0, 2e-6, 5_000)
+    assert len(fitted_bands(samples, [166.0], monkeypatch)) == 1
+    assert fitted_bands(samples, [172.0], monkeypatch) == []
+    assert fitted_bands(np.zeros(5_000), [14.0], monkeypatch) == []
