@@ -199,7 +199,7 @@ def test_the_tree_has_every_number(answer: Budgeted, plain: Budgeted) -> None:
         assert one['type'] == type_of(cause)
         for parameter, s in zip(one['parameters'], cause.sensitivities(at), strict=True):
             assert (parameter['name'], parameter['u'], parameter['unit']) == (s.name, s.deviation, cause.unit)
-            assert parameter['sensitivity'] == pytest.approx(s.coefficient.tolist(), rel=1e-9)
+            assert parameter['sensitivity'] == pytest.approx(s.coefficient.tolist(), rel=1e-9, abs=1e-9)
     _same(tree['totals']['total'], answer.budget.total())
     for kind in Kind:
         _same(tree['totals'][kind.name.lower()], answer.budget.total(kind))
