@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.studies.thesis.comparison import CAUSES, CONDITIONS, Method, errors, methods, table_5_1
+from psd_deflection.model.solvers.registry import SOLVERS
+from psd_deflection.studies.thesis.comparison import (
+    CAUSES,
+    CONDITIONS,
+    Method,
+    errors,
+    methods,
+    refused,
+    table_5_1,
+)
 
 Cell = tuple[float, float, float]
 
@@ -86,3 +95,10 @@ def test_table_5_1_by_cause(label: str) -> None:
     cause = next(c for c in CAUSES if c.label == label)
     got = table_5_1(cause)
     np.testing.assert_allclose(100.0 * np.array(got), TABLE_5_1[label], atol=0.06)
+
+
+def test_every_method_is_a_row_or_is_refused_with_a_reason() -> None:
+    rows, without = [m.name for m in methods()], refused()
+    assert {*rows, *without} >= set(SOLVERS)
+    assert not {*rows} & {*without}
+    assert all(without.values())
