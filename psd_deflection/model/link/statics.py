@@ -33,9 +33,9 @@ class LinkStatics:
     torsional_stiffness: float
     clamp_bending: float = 0.0
     clamp_torsion: float = 0.0
-    by: Arithmetic = field(default=LIBRARY, repr=False)
-    _force: float = field(init=False, repr=False)
-    _twist: float = field(init=False, repr=False)
+    by: Arithmetic = LIBRARY
+    _force: float = field(init=False)
+    _twist: float = field(init=False)
 
     def __post_init__(self) -> None:
         # A force F turns the clamp by its moment F L, which moves the tip by L times that.
