@@ -9,7 +9,7 @@ import pytest
 
 from blind.watch import SIZES, WITHIN_S, one, quiet, table
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.measure.watch import Watch
+from psd_deflection.measure.watch import Watch, _Channel, _Window
 from psd_deflection.model.solvers.registry import solver_from_rig
 from psd_deflection.records import (
     AppliedLoad,
@@ -335,3 +335,74 @@ def test_quiet_minutes_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     assert hours >= 0.05
     assert (alarms, said) == (0, [])
     assert not table([], hours, 1, ['x1'], 0.0)[1]
+
+
+def learnt(*means: float) -> _Channel:
+    """A channel that has learned its level from windows of scatters 0 to 11 µm."""
+    channel = _Channel('x1')
+    for scatter in range(12):
+        channel.still(_Window(0.0, 1e-6 * scatter))
+    for mean in means:
+        channel.learn(mean)
+    return channel
+
+
+def test_a_channel_knows_its_noise_from_the_calmer_windows() -> None:
+    channel = learnt(1e-6, 1e-6, 3e-6)
+    assert channel.level is None
+    assert channel.count(0.0, 0, 4, 0.0) == 0.0
+    assert channel.learn(1e-6)
+    assert channel.level == pytest.approx(1e-6)
+    # A quarter of them scatter by less than 3 µm; four blocks a window.
+    assert channel.sigma(4) == pytest.approx(1.5e-6)
+    assert channel.shift()[0] == 0.0
+    assert channel.shift()[1] == pytest.approx(1.5e-6)
+
+
+def test_what_exceeds_two_deviations_is_counted_from_the_first_window_on() -> None:
+    channel = learnt(0.0, 0.0, 0.0, 0.0)
+    sigma = 1.5e-6
+    assert channel.count(3.0 * sigma, 7, 4, 0.0) == pytest.approx(1.0)
+    assert channel.since_ns == 7
+    assert channel.count(4.0 * sigma, 8, 4, 0.0) == pytest.approx(3.0)
+    assert channel.since_ns == 7
+    # No window counts more than eight; a shift that the rig allows is not counted.
+    assert channel.count(100.0 * sigma, 9, 4, 0.0) == pytest.approx(11.0)
+    assert channel.beyond
+    shift, sd = channel.shift()
+    assert shift == pytest.approx(4.0 * sigma)
+    assert sd == pytest.approx(sigma * np.sqrt(1.0 / 3.0 + 1.0 / 4.0))
+    wandering_rig = learnt(0.0, 0.0, 0.0, 0.0)
+    assert wandering_rig.count(3.0 * sigma, 7, 4, 2.5 * sigma) == pytest.approx(0.5)
+    other_way = learnt(0.0, 0.0, 0.0, 0.0)
+    assert other_way.count(-3.0 * sigma, 7, 4, 0.0) == pytest.approx(1.0)
+    assert other_way.since_ns == 7
+
+
+def test_windows_under_a_load_have_the_pose_and_the_time_of_their_blocks() -> None:
+    fed = Fed()
+    fed.load(0.0, -10.0)
+    fed.run(2.25, under(0.0, -10.0))
+    # The window begins anew after a lost laser.
+    fed.run(0.02, REST, BlockStatus.LASER_LOST)
+    first = fed.block
+    fed.run(1.0, under(0.0, -10.0))
+    windows = list(fed.watch._recent)
+    # Of the first four only the last: until then nobody knows what is usual.
+    assert len(windows) == 3
+    for _, pose, off in windows:
+        assert pose == pytest.approx([0.0, -10.0 * COMPLIANCE[1], 0.0], abs=1e-6)
+        assert off == pytest.approx([0.0, 0.0, 0.0], abs=2e-6)
+    # At the last block of each, which is that of its end.
+    assert [ended for ended, _, _ in windows[-2:]] == [(first + 24) * 20_000_000, (first + 49) * 20_000_000]
+
+
+def test_a_base_line_may_be_wrong_in_proportion_to_shift_and_twist(monkeypatch: pytest.MonkeyPatch) -> None:
+    watch = Fed().watch
+    least: list[float] = []
+    monkeypatch.setattr(_Channel, 'count', lambda self, mean, began_ns, blocks, allowed: least.append(allowed))
+    for _ in range(4):
+        watch._base_lines([_Window(0.0, 1e-7)], [1e-3, 2e-3, 0.01], 0, 25)
+    watch._base_lines([_Window(0.0, 1e-7)], [4e-3, 6e-3, 0.03], 0, 25)
+    reach = float(np.hypot(*RIG.centers.T).max())
+    assert least == [pytest.approx(RIG.acquisition.watch_wander + 0.002 * (5e-3 + reach * 0.02))]

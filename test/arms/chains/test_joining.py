@@ -96,3 +96,9 @@ def test_a_clock_that_goes_back_begins_anew() -> None:
     assert [j.t_ns // BLOCK_NS for j in got if j.tips] == [1, 2, 3, 4]
     assert joiner.missing == [0, 0]
     assert joiner.joined == 8
+
+
+def test_two_estimates_closer_than_a_block_miss_none() -> None:
+    joiner = Joiner([BLOCK_NS] * 2)
+    run(joiner, {0: every(0, 5) + [4 * BLOCK_NS + 6_000_000], 1: every(7_000_000, 6)})
+    assert joiner.missing == [0, 0]
