@@ -100,5 +100,5 @@ def test_a_clock_that_goes_back_begins_anew() -> None:
 
 def test_two_estimates_closer_than_a_block_miss_none() -> None:
     joiner = Joiner([BLOCK_NS] * 2)
-    run(joiner, {0: every(0, 5) + [4 * BLOCK_NS + 6_000_000], 1: every(7_000_000, 6)})
+    run(joiner, {0: [*every(0, 5), 4 * BLOCK_NS + 6_000_000], 1: every(7_000_000, 6)})
     assert joiner.missing == [0, 0]
