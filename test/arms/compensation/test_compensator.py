@@ -270,6 +270,14 @@ def test_settings_are_checked(chosen: dict[str, object], message: str) -> None:
         CompensatorSettings(**chosen)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    'name', ['max_offset', 'max_rate', 'damping', 'max_sd', 'jump', 'max_deflection', 'max_joint_speed', 'follow_error']
+)
+def test_no_limit_is_nothing(name: str) -> None:
+    with pytest.raises(ConfigError, match=f'{name} = 0.0 .*must be above 0'):
+        CompensatorSettings(**{name: 0.0})  # type: ignore[arg-type]
+
+
 def test_before_the_first_deflection_there_is_no_offset(arm: Arm) -> None:
     compensator = Compensator(arm, CompensatorSettings())
     compensator.enable(True)
