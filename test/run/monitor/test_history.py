@@ -274,3 +274,23 @@ def test_a_cell_that_is_too_old_for_its_place_does_not_take_it_back() -> None:
     assert ring.cells['key'].tolist().count(4) == 1
     assert 1 not in ring.cells['key']
     assert int(ring.between(4, 5)['blocks'][0]) == 2
+
+
+def test_marks_are_to_be_kept_at_first_and_when_there_are_new_ones() -> None:
+    made = History(2, SIZE, SMALL)
+    # None yet: the file may have some of a run before.
+    assert made.unsaved().marks == []
+    assert made.unsaved().marks is None
+    made.mark(START_NS, '"bumped"')
+    assert made.unsaved().marks == [(START_NS, '"bumped"')]
+    assert made.unsaved().marks is None
+    assert made.unsaved(0).marks == [(START_NS, '"bumped"')]
+
+
+def test_the_newest_two_thousand_marks_are_kept() -> None:
+    made = History(2, SIZE, SMALL)
+    for n in range(2100):
+        made.mark(START_NS + n, f'{n}')
+    marks = made.unsaved().marks
+    assert marks is not None
+    assert [text for _, text in marks] == [f'{n}' for n in range(100, 2100)]
