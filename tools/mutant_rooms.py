@@ -242,7 +242,7 @@ ROOMS: Mapping[str, Room] = {
         ),
         (
             'test/base/test_axes.py',
-            *(f'test/recordings/test_{n}.py' for n in ('charts', 'recording_window')),
+            *(f'test/recordings/test_{n}.py' for n in ('charts', 'recording_window', 'tables')),
             'test/test_api.py',
         ),
         slow=('test/cli/test_validate.py', 'test/cli/test_identify.py'),
