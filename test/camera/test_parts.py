@@ -1,0 +1,131 @@
+"""Parts of the camera by themselves: headers, pixel formats, sectors of a rim, bounds of a fit, words."""
+
+from __future__ import annotations
+
+import math
+import struct
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera.discs.rim_judge import _sectors
+from psd_deflection.camera.discs.rim_model import Shape, moved
+from psd_deflection.camera.footage import of_ros_image
+from psd_deflection.camera.image_size import declared_size
+from psd_deflection.camera.intrinsics import Intrinsics, calibrated
+from psd_deflection.camera.settings import CameraSettings
+
+
+def segment(marker: int, body: bytes) -> bytes:
+    return bytes((0xFF, marker)) + struct.pack('>H', len(body) + 2) + body
+
+
+FRAME = struct.pack('>BHH', 8, 37, 53) + b'\x01\x01\x11\x00'
+
+
+@pytest.mark.parametrize('frame', [*range(0xC0, 0xC4), *range(0xC5, 0xC8), *range(0xC9, 0xCC), *range(0xCD, 0xD0)])
+def test_a_jpeg_has_the_size_of_its_frame_whatever_stands_before(frame: int) -> None:
+    before = segment(0xE0, b'JFIF\0' + bytes(9)) + segment(0xC4, bytes(20)) + b'\xff' + segment(0xFE, b'\xff\xc0words')
+    assert declared_size(b'\xff\xd8' + before + b'\xff\xd0' + segment(frame, FRAME)) == (53, 37)
+
+
+@pytest.mark.parametrize('end', [0xD9, 0xDA])
+def test_behind_its_data_a_jpeg_has_no_frame(end: int) -> None:
+    assert declared_size(b'\xff\xd8' + segment(end, bytes(4)) + segment(0xC0, FRAME)) is None
+
+
+ROWS, COLUMNS = 6, 8
+
+
+@pytest.mark.parametrize(
+    ('encoding', 'pixel', 'grey'),
+    [
+        ('mono8', (200,), 200),
+        ('8UC1', (200,), 200),
+        ('bgr8', (0, 0, 200), 60),
+        ('8UC3', (0, 0, 200), 60),
+        ('rgb8', (200, 0, 0), 60),
+        ('bgra8', (0, 200, 0, 9), 117),
+        ('rgba8', (0, 0, 200, 9), 23),
+    ],
+)
+@pytest.mark.parametrize('padding', [0, 5])
+def test_a_ros_image_is_grey_by_its_encoding(encoding: str, pixel: tuple[int, ...], grey: int, padding: int) -> None:
+    row = bytes(pixel) * COLUMNS + bytes(padding)
+    found = of_ros_image(ROWS, COLUMNS, encoding, False, len(row), row * ROWS)
+    assert found.shape == (ROWS, COLUMNS)
+    assert np.abs(found.astype(int) - grey).max() <= 1
+    # A row less than it says, or rows that are too short.
+    assert of_ros_image(ROWS, COLUMNS, encoding, False, len(row), row * (ROWS - 1)) is None
+    assert of_ros_image(ROWS, COLUMNS + 6, encoding, False, len(row), row * ROWS) is None
+
+
+@pytest.mark.parametrize(
+    ('encoding', 'first', 'second'),
+    [
+        ('bayer_rggb8', 'RG', 'GB'),
+        ('bayer_bggr8', 'BG', 'GR'),
+        ('bayer_gbrg8', 'GB', 'RG'),
+        ('bayer_grbg8', 'GR', 'BG'),
+    ],
+)
+def test_a_mosaic_has_its_colours_where_its_name_says(encoding: str, first: str, second: str) -> None:
+    image = np.zeros((ROWS, COLUMNS), dtype=np.uint8)
+    for row, letters in enumerate((first, second)):
+        for column, letter in enumerate(letters):
+            image[row::2, column::2] = 200 if letter == 'R' else 0
+    found = of_ros_image(ROWS, COLUMNS, encoding, False, COLUMNS, image.tobytes())
+    # A red that is the same everywhere: three tenths of it, in the middle.
+    assert np.abs(found[2:4, 2:6].astype(int) - 60).max() <= 2
+
+
+def test_sixteen_bits_are_in_the_order_that_is_said() -> None:
+    image = np.array([[1, 2], [256, 65535]], dtype=np.uint16)
+    assert np.array_equal(of_ros_image(2, 2, 'mono16', False, 4, image.astype('<u2').tobytes()), image)
+    assert np.array_equal(of_ros_image(2, 2, '16UC1', True, 4, image.astype('>u2').tobytes()), image)
+    assert of_ros_image(2, 2, 'yuv422', False, 4, bytes(8)) is None
+
+
+def test_a_rim_has_sixteen_parts_of_equal_angle() -> None:
+    angle = (np.arange(1600) + 0.5) * 2.0 * math.pi / 1600
+    side = (np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32))
+    rims = cast(Any, SimpleNamespace(begin=np.array([0, 1600])))
+    _, counts = np.unique(_sectors(side, rims), return_counts=True)
+    assert counts.tolist() == [100] * 16
+    # Each part is of one piece.
+    changes = np.count_nonzero(np.diff(_sectors(side, rims)))
+    assert changes == 15
+
+
+def test_a_fit_stays_within_its_bounds() -> None:
+    shape = Shape(np.eye(3), np.array([0.0, 0.0, 1.0]), 1.0, np.eye(2), np.zeros(0), np.zeros((3, 6)), np.zeros(0))
+    light = np.ones((3, 6))
+    step = np.zeros(10)
+    step[3:6] = 0.1, 0.2, 0.3
+    step[6:] = 0.9, 2000.0, 0.0, -5.0
+    found = moved(shape, step, light)
+    assert found.place == pytest.approx([0.1, 0.2, 1.3])
+    assert found.swell == 1.4
+    large, small = np.diag(found.blur)
+    assert large == 900.0
+    assert 0.0 < small < 0.1
+    assert moved(shape, -0.01 * np.ones(10), light).blur == pytest.approx(np.eye(2) - 0.01)
+
+
+def test_a_lens_is_told_with_the_deviation_of_each_number() -> None:
+    matrix = np.array([[1000.0, 0.0, 320.0], [0.0, 1001.0, 240.0], [0.0, 0.0, 1.0]])
+    made = Intrinsics((640, 480), matrix, np.array([1.0, 2.0, 3.0, 4.0]), np.zeros(5), 0.1, 12, [])
+    assert made.lines() == ['focal length 1000.0 ± 1.0, 1001.0 ± 2.0 px', 'centre 320.0 ± 3.0, 240.0 ± 4.0 px']
+
+
+def test_each_image_that_does_not_show_the_board_is_told_with_the_reason() -> None:
+    images = [('a', None), ('b', np.zeros((48, 64), np.uint8)), ('c', np.zeros((50, 60), np.uint8))]
+    with pytest.raises(ConfigError, match=r'0 images show the board') as caught:
+        calibrated(CameraSettings(target='charuco'), images)
+    said = str(caught.value)
+    assert '; a: ' in said
+    assert '; b: ' in said
+    assert '; c: has 60 x 50 pixels, the first has 64 x 48' in said
