@@ -276,3 +276,22 @@ def test_each_psd_has_its_own_sum() -> None:
     sums = ForwardModel(rig).expect(np.zeros((5, 3))).volts[[2, 5]]
     assert sums[0] == pytest.approx(rig.amplifier.sum_nominal + 0.1, rel=1e-3)
     assert sums[1] == pytest.approx(rig.amplifier.sum_nominal, rel=1e-3)
+
+
+def test_a_link_under_a_constant_force_begins_at_rest_where_that_has_it() -> None:
+    rig = load_rig(overrides={'effects.f.name': 'tip_force', 'effects.f.x': 3.0, 'effects.f.y': -7.0})
+    pose = ForwardModel(rig).run(np.zeros((50, 3))).pose
+    per = ForwardModel(rig).physics.force_compliance
+    np.testing.assert_allclose(pose[:2], np.array([[3.0 * per], [-7.0 * per]]) * np.ones(50), rtol=1e-9)
+
+
+def test_what_is_taken_between_the_samples_has_that_time() -> None:
+    rig = load_rig()
+    assert ForwardModel(rig, phase=0.0004).run(np.zeros((3, 3))).t == pytest.approx([0.0004, 0.0014, 0.0024])
+    assert ForwardModel(rig).run(np.zeros((3, 3))).t == pytest.approx([0.0, 0.001, 0.002])
+
+
+def test_without_a_seed_it_is_that_of_zero() -> None:
+    same, zero, other = (RigSimulator(load_rig(), *seed).step(np.zeros((20, 3))).counts for seed in ((), (0,), (1,)))
+    assert np.array_equal(same, zero)
+    assert not np.array_equal(same, other)
