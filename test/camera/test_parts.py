@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera.boards import Board
 from psd_deflection.camera.discs.rim_judge import _sectors
-from psd_deflection.camera.discs.rim_model import Shape, moved
+from psd_deflection.camera.discs.rim_model import Shape, moved, turned
 from psd_deflection.camera.footage import of_ros_image
 from psd_deflection.camera.image_size import declared_size
 from psd_deflection.camera.intrinsics import Intrinsics, calibrated
-from psd_deflection.camera.settings import CameraSettings
+from psd_deflection.camera.settings import CameraSettings, settings_from
+from psd_deflection.camera.targets import target_of
 
 
 def segment(marker: int, body: bytes) -> bytes:
@@ -113,6 +115,9 @@ def test_a_fit_stays_within_its_bounds() -> None:
     assert large == 900.0
     assert 0.0 < small < 0.1
     assert moved(shape, -0.01 * np.ones(10), light).blur == pytest.approx(np.eye(2) - 0.01)
+    # A quarter of a pixel is as sharp as it gets.
+    step[7:] = 0.0, 0.0, -0.97
+    assert np.diag(moved(shape, step, light).blur) == pytest.approx([1.0, 0.0625])
 
 
 def test_a_lens_is_told_with_the_deviation_of_each_number() -> None:
@@ -129,3 +134,26 @@ def test_each_image_that_does_not_show_the_board_is_told_with_the_reason() -> No
     assert '; a: ' in said
     assert '; b: ' in said
     assert '; c: has 60 x 50 pixels, the first has 64 x 48' in said
+
+
+@pytest.mark.parametrize(('columns', 'right'), [(0, True), (1000, True), (1001, False), (-1, False)])
+def test_a_board_has_up_to_a_thousand_columns(columns: int, right: bool) -> None:
+    if right:
+        assert settings_from({'target.columns': columns}, 'x').columns == columns
+    else:
+        with pytest.raises(ConfigError, match=f'target.columns = {columns}'):
+            settings_from({'target.columns': columns}, 'x')
+
+
+@pytest.mark.parametrize('view', ['outside', 'base'])
+def test_exact_corners_give_the_pose_of_a_board_at_once(view: str) -> None:
+    board = target_of(CameraSettings(target='charuco', view=view))
+    assert isinstance(board, Board)
+    plane = np.stack(np.meshgrid(np.linspace(-0.03, 0.03, 6), np.linspace(-0.04, 0.04, 8)), axis=-1).reshape(-1, 2)
+    facing = np.diag([1.0, -1.0, -1.0]) if view == 'outside' else np.eye(3)
+    true = facing @ turned(np.array([0.2, -0.3, 0.4]))
+    at = np.array([0.01, -0.02, 0.5])
+    seen = np.column_stack([plane, np.zeros(len(plane))]) @ true.T + at
+    rotation, place = board._guess(plane, seen[:, :2] / seen[:, 2:])
+    assert rotation == pytest.approx(true, abs=1e-9)
+    assert place == pytest.approx(at, abs=1e-9)
