@@ -8,11 +8,13 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.misalignment.model import INDEX, PARAMETERS, ZERO
 from psd_deflection.rig.config import rig_from_values
-from psd_deflection.studies.calibrate.calibrate import undetermined
+from psd_deflection.studies.calibrate.calibrate import _with_clamp, undetermined
 from psd_deflection.studies.calibrate.check import _moved
-from psd_deflection.studies.calibrate.fit import posterior, prior_of_rig
+from psd_deflection.studies.calibrate.fit import CLAMP_AT, CalibrationFit, Linear, Noise, posterior, prior_of_rig
+from psd_deflection.studies.calibrate.observation import Rows
 
 
 @pytest.mark.parametrize('seed', range(3))
@@ -54,3 +56,26 @@ def test_what_no_row_tells_is_undetermined_alone_or_as_a_combination() -> None:
     assert set(found) == {('psd_2.height',), ('psd_1.gain_x', 'psd_2.gain_x')}
     one, other = found['psd_1.gain_x', 'psd_2.gain_x'].values()
     assert (abs(one), one + other) == pytest.approx((0.5**0.5, 0.0), abs=2e-4)
+
+
+def test_a_clamp_that_gives_way_is_found_beside_a_pose_that_is_an_outlier() -> None:
+    rig = rig_from_values({})
+    prior = prior_of_rig(rig)
+    n, size = 40, len(prior.mean)
+    rng = np.random.default_rng(7)
+    loads = np.column_stack([rng.uniform(-50.0, 50.0, (n, 2)), rng.uniform(-20.0, 20.0, n)])
+    bends, twists = 2e-5, 3e-4
+    own = np.diag(LinkStatics.from_rig(rig).compliance)
+    pose = loads * (own + np.array([bends, bends, twists]) * [rig.link.length**2, rig.link.length**2, 1.0])
+    pose[3] += (5e-3, 5e-3, 0.1)
+    weights, zeros = np.ones(n), np.zeros((n, 3))
+    weights[3] = 0.0
+    rest, run = np.ones(n, dtype=bool), np.zeros(n, dtype=np.int64)
+    seconds = np.asarray(0.02 * np.arange(n), dtype=np.float64)
+    rows = Rows(seconds, run, pose, np.zeros((n, 4)), np.ones((n, 4)), zeros, loads, rest, zeros + 1.0)
+    linear = Linear(np.zeros((n, 4)), np.zeros((n, 4, size)), np.zeros((n, 4, 3)))
+    free = np.zeros(size, dtype=bool)
+    noise = Noise(np.array([1e-7, 1e-7, 1e-7]))
+    whole = CalibrationFit(np.zeros(size), np.zeros((size, size)), np.zeros((size, size)), linear, weights, noise, free)
+    found = _with_clamp(whole, rows, rig, prior)
+    assert found.values[CLAMP_AT : CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)
