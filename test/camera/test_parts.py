@@ -127,13 +127,12 @@ def test_a_lens_is_told_with_the_deviation_of_each_number() -> None:
 
 
 def test_each_image_that_does_not_show_the_board_is_told_with_the_reason() -> None:
-    images = [('a', None), ('b', np.zeros((48, 64), np.uint8)), ('c', np.zeros((50, 60), np.uint8))]
+    images = [('a', np.zeros((48, 64), np.uint8)), ('b', np.zeros((50, 60), np.uint8)), ('c', None)]
     with pytest.raises(ConfigError, match=r'0 images show the board') as caught:
         calibrated(CameraSettings(target='charuco'), images)
     said = str(caught.value)
     assert '; a: ' in said
-    assert '; b: ' in said
-    assert '; c: has 60 x 50 pixels, the first has 64 x 48' in said
+    assert '; b: has 60 x 50 pixels, the first has 64 x 48; c: ' in said
 
 
 @pytest.mark.parametrize(('columns', 'right'), [(0, True), (1000, True), (1001, False), (-1, False)])
