@@ -11,7 +11,9 @@ from psd_deflection.records import FloatArray
 AXES = ('dx', 'dy', 'theta')
 SYMBOLS = ('ΔX', 'ΔY', 'θ')
 UNITS = ('m', 'm', 'rad')
-SHOWN = (1e6, 1e6, math.degrees(1e3))
+MDEG = math.degrees(1e3)
+"""Thousandths of a degree in a radian."""
+SHOWN = (1e6, 1e6, MDEG)
 """µm, µm, mdeg of an SI unit."""
 SHOWN_UNITS = ('µm', 'µm', 'mdeg')
 

@@ -16,12 +16,12 @@ from __future__ import annotations
 import argparse
 import asyncio
 import contextlib
-import math
 import sys
 from collections.abc import Mapping
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
+from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import DaemonError
 from psd_deflection.cli._daemon import daemon_of, url_option
 from psd_deflection.cli._options import whole
@@ -31,7 +31,6 @@ from psd_deflection.run.monitor.start import need_server
 if TYPE_CHECKING:
     from psd_deflection.run.monitor.client import Daemon
 
-MDEG = 180e3 / math.pi
 SHOWN = (('dx', 'ΔX', 1e6, 'µm'), ('dy', 'ΔY', 1e6, 'µm'), ('theta', 'θ', MDEG, 'mdeg'))
 
 

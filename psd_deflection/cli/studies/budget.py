@@ -21,6 +21,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._options import (
@@ -168,7 +169,7 @@ def _derived(rig: Rig, inputs: dict[str, float]) -> list[str]:
         f'  noise of a dot: {_each(noise, 3)} µm a sample, {_each(noise / math.sqrt(block), 3)} µm a mean of {block}',
         f'  step of the converter: {_each(rig.converter.volts_per_count * rig.sensitivities, 4)} µm',
         f'  hum that a mean of {block} leaves at {inputs["interference_frequency"]:g} Hz: {hum:.3f}',
-        f'  stop window of thesis_iteration: {math.degrees(window) * 1e3:.2f} mdeg',
+        f'  stop window of thesis_iteration: {window * MDEG:.2f} mdeg',
     ]
 
 

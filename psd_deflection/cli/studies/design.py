@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.tables import columns
@@ -159,7 +160,7 @@ def phases_text(phases: Sequence[splitter.LightPhase]) -> str:
     """A row for each phase of the simulation, and what is said in it."""
     rows = [['simulated', 'blocks with an estimate', 'ΔX ± µm', 'ΔY ± µm', 'θ ± mdeg', 'largest error, in ±']]
     for p in phases:
-        sds = (p.deviations * np.array([1e6, 1e6, math.degrees(1e3)])).tolist()
+        sds = (p.deviations * np.array([1e6, 1e6, MDEG])).tolist()
         numbers = [f'{v:.3f}' for v in sds] if p.estimates else ['–'] * 3
         rows.append([p.name, f'{p.estimates:.0%}', *numbers, f'{p.largest:.1f}' if p.estimates else '–'])
     said = [f'{p.name}: {p.said}' for p in phases if p.said]
@@ -246,7 +247,7 @@ def link_text(rig: Rig) -> str:
         f'Link: L {rig.link.length:g} m, I {section.second_moment:.4e} m^4, J {section.polar_moment:.4e} m^4, '
         f'area {section.area * 1e6:.1f} mm^2\n'
         f'EI {statics.bending_stiffness:.1f} N m^2, GJ {statics.torsional_stiffness:.1f} N m^2; '
-        f'tip {bend * 1e6:.2f} µm/N, {math.degrees(twist) * 1e3:.2f} mdeg/(N m); torsion-to-bending ratio {ratio:.3f}'
+        f'tip {bend * 1e6:.2f} µm/N, {twist * MDEG:.2f} mdeg/(N m); torsion-to-bending ratio {ratio:.3f}'
     )
 
 
@@ -295,7 +296,7 @@ def placement_text(candidates: list[PlacementRow], sigma: float) -> str:
             continue
         design = design_matrix(centers)
         in_metres, scaled = (condition_number(design, length).two for length in (1.0, placement.SCALE))
-        theta = f'{math.degrees(s.theta) * 1e3:.3f}'
+        theta = f'{s.theta * MDEG:.3f}'
         deviations = [f'{s.dx * 1e6:.3f}', f'{s.dy * 1e6:.3f}', theta]
         rows.append([name, *_places(centers), *deviations, f'{scaled:.3f}', f'{in_metres:.3f}'])
     own, best = spreads[0], spreads[-1]
@@ -323,7 +324,7 @@ def tilt_text(rig: Rig, radius: float, sigma: float) -> str:
         (f'three on a ring of {radius * 1e3:g} mm, one plane', three, np.zeros(3)),
         (f'the same, heights {", ".join(f"{h * 1e3:+g}" for h in stagger)} mm', three, stagger),
     ):
-        s = placement.pose_spread(TILTED, centers, heights, sigma) * np.array([1e6, 1e6, *[math.degrees(1e3)] * 3])
+        s = placement.pose_spread(TILTED, centers, heights, sigma) * np.array([1e6, 1e6, *[MDEG] * 3])
         rows.append([name, *(f'{v:.3f}' if math.isfinite(v) else 'unseen' for v in s.tolist())])
     return (
         columns(rows)
@@ -346,7 +347,7 @@ def tied_text(rig: Rig, best: FloatArray, sigma: float) -> str:
         ('opposite along Y, heights +50, -50 mm', turned, stagger),
     ):
         s = placement.slope_ratio_spread(pose, link.slope_ratio, link.length, centers, heights, sigma)
-        dx, dy, theta, ratio = (s * np.array([1e6, 1e6, math.degrees(1e3), 1.0])).tolist()
+        dx, dy, theta, ratio = (s * np.array([1e6, 1e6, MDEG, 1.0])).tolist()
         rows.append([name, f'{dx:.3f}', f'{dy:.3f}', f'{theta:.3f}', f'{ratio:.4f}'])
     return columns(rows)
 

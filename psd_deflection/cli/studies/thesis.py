@@ -17,13 +17,13 @@ docs/methods.md.
 from __future__ import annotations
 
 import argparse
-import math
 import textwrap
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.axes import MDEG
 from psd_deflection.cli._options import make_folder
 from psd_deflection.cli._report import print_json, save_figure, show
 from psd_deflection.model.plate import Geometry
@@ -50,8 +50,7 @@ from psd_deflection.studies.thesis.comparison import (
 )
 from psd_deflection.studies.thesis.large_spots import spot_changes
 
-_MDEG_PER_RAD = 1e3 * 180.0 / math.pi
-_UNITS = (1e6, 1e6, _MDEG_PER_RAD)
+_UNITS = (1e6, 1e6, MDEG)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -162,11 +161,11 @@ def linear_table() -> list[str]:
         deviations = np.sqrt(np.diag(covariance)) * _UNITS
         lines.append(f'{label:38} ' + ' / '.join(f'{v:.2f}' for v in deviations))
     lines += ['', 'What the least squares of Appendix D make of a twist of 1 mdeg, both counter-clockwise']
-    dots = dots_of(geometry, np.array([[0.0, 0.0, 1.0 / _MDEG_PER_RAD, 0.0, 0.0]]))
+    dots = dots_of(geometry, np.array([[0.0, 0.0, 1.0 / MDEG, 0.0, 0.0]]))
     for method in methods():
         if method.name in ('appendix_d_ols', 'appendix_d_wls'):
             solver = make_solver(method.name, geometry, **method.options)
-            found = float(solver.solve_many(dots, VARIANCES).pose[0, 2]) * _MDEG_PER_RAD
+            found = float(solver.solve_many(dots, VARIANCES).pose[0, 2]) * MDEG
             lines.append(f'{method.label:38} {found:.3f} mdeg')
     design = design_matrix(geometry.beams)
     lines += ['', 'Condition number of A (4.28), Frobenius (2-norm)']

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from psd_deflection.base.axes import MDEG
 from psd_deflection.base.charts import ONE_AFTER_ANOTHER, Chart, Panel, Series, TimeAxis
 from psd_deflection.base.drawings import Matrix
 from psd_deflection.base.pages import table
@@ -95,7 +96,7 @@ def _noise(found: Calibration) -> str:
     rows = [(name, f'{v * 1e3:.3f} mV a sample') for name, v in zip(CHANNEL_NAMES, found.noise, strict=True)]
     if found.kind == 'reference':
         x, y, theta = found.fit.noise.reference
-        rows.append(('reference', f'{x * 1e6:.2f} µm, {y * 1e6:.2f} µm, {np.degrees(theta) * 1e3:.2f} mdeg a frame'))
+        rows.append(('reference', f'{x * 1e6:.2f} µm, {y * 1e6:.2f} µm, {theta * MDEG:.2f} mdeg a frame'))
         clock = found.clock + float(found.values[CLOCK])
         rows.append(('clock of the reference', f'add {clock * 1e3:.3f} ± {found.sd[CLOCK] * 1e3:.2g} ms to its times'))
         rows.append(('outliers of the reference', f'{int(np.sum(found.fit.weights == 0.0))} of {len(found.rows)}'))

@@ -14,6 +14,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
+from psd_deflection.base.axes import MDEG
 from psd_deflection.model.detector.sensors import Duolateral, Quadrant
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.plate.landing import landing
@@ -44,7 +45,6 @@ _STYLE: Any = {
     'svg.hashsalt': 'psd_deflection',
 }
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = '#1f6fb4', '#e07b1a', '#2f9455', '#c23b3b', '#777777'
-_MDEG = 1e3 * 180.0 / np.pi
 
 
 def drawn() -> Iterator[tuple[str, Figure]]:
@@ -64,7 +64,7 @@ def comparison() -> Figure:
     for k, (condition, color) in enumerate(zip(CONDITIONS, (_BLUE, _ORANGE, _GREEN), strict=True)):
         cells = [errors(m, condition) for m in shown]
         translation = [1e6 * float(np.hypot(c.rms[0], c.rms[1])) for c in cells]
-        twist = [_MDEG * float(c.rms[2]) for c in cells]
+        twist = [MDEG * float(c.rms[2]) for c in cells]
         for ax, values in zip(axes, (translation, twist), strict=True):
             ax.plot(np.maximum(values, 1e-2), rows + 0.22 * (1 - k), 'o', color=color, ms=5, label=condition)
     for ax, label in zip(axes, ('tip deflection, rms µm', 'twist, rms mdeg'), strict=True):
@@ -147,8 +147,8 @@ def exact() -> Figure:
     rng = np.random.default_rng(1)
     dots = dots_of(geometry, pose) + 2e-6 * rng.standard_normal((3000, 4))
     found = make_solver('exact', geometry).solve_many(dots, VARIANCES)
-    off = (found.pose - pose[0, :3]) * (1e6, 1e6, _MDEG)
-    claimed = found.covariance[0] * np.outer((1e6, 1e6, _MDEG), (1e6, 1e6, _MDEG))
+    off = (found.pose - pose[0, :3]) * (1e6, 1e6, MDEG)
+    claimed = found.covariance[0] * np.outer((1e6, 1e6, MDEG), (1e6, 1e6, MDEG))
     figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.6), layout='constrained')
     labels = ('error of ΔX, µm', 'error of ΔY, µm', 'error of θ, mdeg')
     for ax, (i, j) in zip(axes, ((0, 2), (1, 2)), strict=True):
@@ -172,7 +172,7 @@ def appendix_d() -> Figure:
     poses = np.zeros((dy.size, 5))
     poses[:, 0], poses[:, 1], poses[:, 2] = 1e-4, dy.ravel(), theta.ravel()
     found = make_solver('appendix_d', geometry).solve_many(dots_of(geometry, poses), VARIANCES)
-    off = np.abs(found.pose[:, 2] - poses[:, 2]) * _MDEG
+    off = np.abs(found.pose[:, 2] - poses[:, 2]) * MDEG
     off[found.status != 0] = np.nan
     figure, ax = plt.subplots(figsize=(6.4, 3.8), layout='constrained')
     ax.grid(visible=False)
@@ -274,7 +274,7 @@ def pose() -> Figure:
     deviations = []
     for step in steps:
         spread = pose_spread(at, centers, np.array([step, -step / 2, -step / 2]), 2e-6)
-        deviations.append(_MDEG * spread[[3, 4, 2]])
+        deviations.append(MDEG * spread[[3, 4, 2]])
     figure, ax = plt.subplots(figsize=(5.8, 3.6), layout='constrained')
     for values, label, color in zip(
         np.transpose(deviations), ('phi', 'omega', 'theta'), (_BLUE, _ORANGE, _GREEN), strict=True
@@ -345,7 +345,7 @@ def sensors() -> Figure:
 def large_spots() -> Figure:
     """Figures 5.30 to 5.35: both methods with dots of 1 mm (lines) and of 2 mm (marks), and the truth."""
     figure, axes = plt.subplots(3, 2, figsize=(9.0, 6.6), sharex=True, layout='constrained')
-    units = np.array([_MDEG / 1e3, 1e3, 1e3])
+    units = np.array([MDEG / 1e3, 1e3, 1e3])
     for column, force in zip(axes.T, FORCES, strict=True):
         small, large = (spot_run(force, diameter) for diameter in DIAMETERS)
         for ax, axis, label, unit in zip(column, (2, 0, 1), ('θ, deg', 'ΔX, mm', 'ΔY, mm'), units, strict=True):
