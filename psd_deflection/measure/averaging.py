@@ -8,6 +8,7 @@ not filled in.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -79,12 +80,12 @@ class BlockCutter:
         )
 
 
-def covariance(values: FloatArray, by: Arithmetic = FIXED) -> FloatArray:
-    """Unbiased sample covariance (c, c) of ``values`` (n, c); zeros if n < 2."""
+def covariance(values: FloatArray, means: Sequence[float], by: Arithmetic = FIXED) -> FloatArray:
+    """Unbiased sample covariance (c, c) of ``values`` (n, c) about their ``means`` (c,); zeros if n < 2."""
     n, c = values.shape
     if n < 2:
         return np.zeros((c, c))
-    centred = values - by.sum(values, 0) / n
+    centred = values - np.array(means)
     return np.asarray(by.product(centred.T, centred) / (n - 1))
 
 
@@ -96,7 +97,11 @@ def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> in
     another time: :mod:`psd_deflection.measure.uncertainty.block_fit` gives the value at the stamp.
     """
     first = int(block.t_ns[0])
-    slots = block.seq - block.index * block_size
-    offsets = (block.t_ns - first).sum() / len(slots)
-    to_middle = (0.5 * (block_size - 1) - slots.sum() / len(slots)) * period_ns
+    count = len(block.seq)
+    offsets = (block.t_ns - first).sum() / count
+    # Of a whole block the mean slot is the middle.
+    to_middle = 0.0
+    if count < block_size:
+        slots = block.seq - block.index * block_size
+        to_middle = (0.5 * (block_size - 1) - slots.sum() / count) * period_ns
     return first + round(float(offsets) + float(to_middle))

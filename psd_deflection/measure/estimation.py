@@ -417,7 +417,7 @@ class Estimation:
         dx, dy, cov = self._one_psd.solve(psd, (x, y), (vx, vy), theta, variance)
         if self.spread is not None:
             gain = np.zeros((3, 2 * len(self._rig.psds)))
-            c, s = by.cos(theta), by.sin(theta)
+            c, s = by.cos_sin(theta)
             gain[:2, 2 * psd : 2 * psd + 2] = [[-c, s], [-s, -c]]
             own = np.array(cov).reshape(3, 3) + _through(gain, self.spread.factor(dx, dy, theta), by)
             cov = tuple(own.ravel().tolist())

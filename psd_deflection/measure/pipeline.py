@@ -333,7 +333,7 @@ class Pipeline:
             index=seen.index,
             dots=answer.dots,
             sums=tuple((self._by.sum(seen.sums, 0) / len(seen.slots)).tolist()),
-            covariance=covariance(seen.samples, self._by),
+            covariance=covariance(seen.samples, seen.means, self._by),
             present=len(seen.slots),
             lost=self._cutter.block_size - len(seen.slots),
             status=status,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import math
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from psd_deflection.base.arithmetic import ARITHMETICS, FIXED, LIBRARY, Arithmetic, FixedArithmetic, in_pairs
 from psd_deflection.base.arithmetic.elementary import FixedFunctions
+from psd_deflection.base.arithmetic.matrices import pivots, surely_positive
 from psd_deflection.records import FloatArray
 
 PACKAGE = Path(__file__).parents[2] / 'psd_deflection'
@@ -133,22 +135,64 @@ def test_an_index_twice_in_one_operand_is_refused() -> None:
         FIXED.einsum('ii->i', np.eye(2))
 
 
-@pytest.mark.parametrize('count', range(10))
-def test_rows_are_added_in_pairs(count: int) -> None:
-    rows = np.random.default_rng(count).normal(size=(count, 3))
+@pytest.mark.parametrize('shape', [(3,), (), (2, 1500)])
+@pytest.mark.parametrize('count', [*range(10), 20, 27])
+def test_rows_are_added_in_pairs(count: int, shape: tuple[int, ...]) -> None:
+    rows = np.random.default_rng(count).normal(size=(count, *shape))
 
     def added(some: list[FloatArray]) -> FloatArray:
         if len(some) < 2:
-            return some[0] if some else np.zeros(3)
+            return some[0] if some else np.zeros(shape)
         half = len(some) // 2
         pairs = [some[i] + some[half + i] for i in range(half)]
         if len(some) % 2:
             pairs[0] = pairs[0] + some[-1]
         return added(pairs)
 
-    np.testing.assert_array_equal(in_pairs(rows), added(list(rows)))
-    for axis in (0, 1):
+    wanted = added(list(rows))
+    first = in_pairs(rows)
+    np.testing.assert_array_equal(first, wanted)
+    # Another sum of that shape leaves the first alone; the rows need not lie one after the other.
+    np.testing.assert_array_equal(in_pairs(-np.asfortranarray(rows)), -wanted)
+    np.testing.assert_array_equal(first, wanted)
+    for axis in range(rows.ndim):
         assert FIXED.sum(rows, axis) == pytest.approx(rows.sum(axis=axis))
+
+
+def test_sums_of_many_shapes_stay_right() -> None:
+    for count in (*range(1, 400), 3):
+        assert in_pairs(np.ones((count, 2))).tolist() == [count, count]
+
+
+def test_sums_in_threads_do_not_meet() -> None:
+    rows = np.random.default_rng(0).normal(size=(8, 300, 20, 3))
+    wanted = [[in_pairs(block).tolist() for block in own] for own in rows]
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(lambda own: [in_pairs(block).tolist() for block in own], rows)) == wanted
+
+
+def test_cosine_and_sine_together_are_those_of_each() -> None:
+    for by in (LIBRARY, FIXED):
+        for x in (*ANGLES[::7].tolist(), 0.0, -0.0, 1e12, math.inf if by is FIXED else 1.0):
+            assert str(by.cos_sin(x)) == str((by.cos(x), by.sin(x)))
+
+
+@pytest.mark.parametrize('part', [1e-9, -1e-9, 1e-15, -1e-15, 0.0])
+def test_whether_a_matrix_is_positive_is_told_by_its_pivots_where_rounding_decides(part: float) -> None:
+    rng = np.random.default_rng(5)
+    vectors = np.linalg.qr(rng.normal(size=(12, 12)))[0]
+    a = (vectors * [part, *np.linspace(0.1, 1.0, 11)]) @ vectors.T
+    a = 0.5 * (a + a.T)
+    assert FIXED.is_positive(a) is all(float(p) > 0.0 for p in pivots(a))
+    assert (surely_positive(a) is None) is (abs(part) < 1e-12)
+    if abs(part) > 1e-12:
+        assert FIXED.is_positive(a) is (part > 0.0)
+
+
+def test_a_matrix_of_nothing_or_of_no_numbers_is_not_sure() -> None:
+    assert surely_positive(np.zeros((3, 3))) is None
+    assert not FIXED.is_positive(np.zeros((3, 3)))
+    assert not FIXED.is_positive(np.full((3, 3), np.nan))
 
 
 @pytest.mark.parametrize('size', [1, 2, 3, 5, 12, 27])

@@ -88,8 +88,9 @@ def test_the_middle_of_a_block_does_not_depend_on_which_samples_are_there(slots:
 def test_the_covariance_is_numpys() -> None:
     values = np.random.default_rng(0).normal(size=(20, 4))
     for n in (2, 3, 20):
-        np.testing.assert_allclose(covariance(values[:n]), np.cov(values[:n].T), rtol=1e-12)
-    assert not covariance(values[:1]).any()
+        means = values[:n].mean(axis=0).tolist()
+        np.testing.assert_allclose(covariance(values[:n], means), np.cov(values[:n].T), rtol=1e-12)
+    assert not covariance(values[:1], values[0].tolist()).any()
 
 
 def test_a_repeat_in_the_first_chunk_is_passed_over_too() -> None:

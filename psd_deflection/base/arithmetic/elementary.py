@@ -142,6 +142,17 @@ class FixedFunctions(Arithmetic):
         """See :class:`Arithmetic`; NaN if ``x`` is not finite."""
         return _by_quarter(x, 1)
 
+    def cos_sin(self, x: float) -> tuple[float, float]:
+        """See :class:`Arithmetic`. The bits of :meth:`cos` and :meth:`sin`, for little more than one of them."""
+        if not -_FAR_ANGLE < x < _FAR_ANGLE:
+            return self.cos(x), self.sin(x)
+        k, r = _reduced(x)
+        c, s = _cos_near(r), _sin_near(r)
+        quarter = int(k) & 3
+        if quarter & 1:
+            c, s = -s, c
+        return (-c, -s) if quarter & 2 else (c, s)
+
     def atan2(self, y: float, x: float) -> float:
         """See :class:`Arithmetic`; NaN if one is not finite."""
         across, along = abs(y), abs(x)

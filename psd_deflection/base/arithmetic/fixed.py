@@ -15,6 +15,7 @@ from psd_deflection.base.arithmetic.matrices import (
     plan,
     product_of,
     rotate,
+    surely_positive,
 )
 from psd_deflection.records import FloatArray
 
@@ -115,8 +116,9 @@ class FixedArithmetic(FixedFunctions):
         return self.log_det(a)
 
     def is_positive(self, a: FloatArray) -> bool:
-        """See :class:`Arithmetic`."""
-        return all(bool(pivot > 0.0) for pivot in pivots(a))
+        """See :class:`Arithmetic`. By the pivots, unless the answer is the same however one rounds."""
+        sure = surely_positive(a)
+        return all(bool(pivot > 0.0) for pivot in pivots(a)) if sure is None else sure
 
     def legendre(self, count: int) -> tuple[FloatArray, FloatArray]:
         """See :class:`Arithmetic`. By Newton's method on the polynomial."""

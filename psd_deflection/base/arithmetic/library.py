@@ -25,6 +25,10 @@ class Arithmetic:
         """Cosine of ``x`` rad."""
         return math.cos(x)
 
+    def cos_sin(self, x: float) -> tuple[float, float]:
+        """Cosine and sine of ``x`` rad."""
+        return math.cos(x), math.sin(x)
+
     def atan2(self, y: float, x: float) -> float:
         """Angle of the vector (x, y), rad."""
         return math.atan2(y, x)

@@ -138,7 +138,8 @@ def _terms(q: FloatArray, precision: FloatArray, middle: FloatArray, whole: bool
     share = mixed / own[:, None]
     rest = (information[:, used, used] - share[:, :, None] * mixed[:, None, :]).tolist()
     right = (middle[used] - share * middle[0]).tolist()
-    every = np.concatenate((u, estimate, precision), axis=2)
+    # In memory sample by sample: that is how they are summed.
+    every = np.concatenate((u, estimate, precision), axis=2).transpose(1, 0, 2).copy().transpose(1, 0, 2)
     return _Terms(q, u, information, v, every, used, rest, right, (middle[0] / own).tolist(), share.tolist())
 
 

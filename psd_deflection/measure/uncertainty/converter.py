@@ -50,6 +50,8 @@ class ConverterSteps:
         self._divisor = np.zeros(channels)
         self._off = np.zeros(channels)
         self.steps = np.zeros(channels)
+        # What is fine stays so.
+        self._all_fine = False
 
     @classmethod
     def of_rig(cls, rig: Rig) -> ConverterSteps:
@@ -63,9 +65,9 @@ class ConverterSteps:
 
     def add(self, volts: Volts) -> bool:
         """``volts`` (n, C), none of them NaN; True if :attr:`steps` changed."""
-        fine = self._fine
-        if fine.all():
+        if self._all_fine:
             return False
+        fine = self._fine
         levels: FloatArray = np.asarray(volts, dtype=np.float64)
         self._first = np.where(np.isnan(self._first), levels[0], self._first)
         apart = np.abs(levels - self._first)
@@ -83,6 +85,7 @@ class ConverterSteps:
             self._divisor[channel] = own if own == 0.0 or own > least else self._step
         before = self.steps
         self.steps = self._found()
+        self._all_fine = bool(self._fine.all())
         return not np.array_equal(before, self.steps)
 
     def state(self) -> tuple[float, ...]:
@@ -97,6 +100,7 @@ class ConverterSteps:
             raise ValueError(f'steps of {len(self.steps)} channels have {3 * len(self.steps)} values')
         self._first, self._divisor, self._off = np.reshape(values, (3, -1)).copy()
         self.steps = self._found()
+        self._all_fine = bool(self._fine.all())
 
     def _tolerance(self, volts: FloatArray) -> FloatArray:
         return np.asarray(np.maximum(_OFF * self._step, _ROUNDING * np.abs(volts).max(axis=0)))

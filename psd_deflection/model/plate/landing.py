@@ -30,8 +30,8 @@ def landing(beam: Beam[float], pose: Pose[float], arithmetic: Arithmetic = LIBRA
     """(x, y, dx, dy) of one laser's dot: m; m/m for dX, dY and m/rad for the angles."""
     dx, dy, theta, phi, omega = pose
     height = beam[2]
-    sin, cos = arithmetic.sin, arithmetic.cos
-    turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
+    turn = arithmetic.cos_sin
+    turns = *turn(theta), *turn(phi), *turn(omega)
     _, _, cp, sp, co, so = turns
     ax, ay, x, y = _place(beam, dx, dy, turns)
     return (

@@ -71,8 +71,8 @@ def _rows(
 def crossing(beam: Beam[float], pose: Pose[float], arithmetic: Arithmetic = LIBRARY) -> tuple[float, float, Row, Row]:
     """(q_x, q_y, dq_x, dq_y) of one beam: m; m/m for dX, dY and m/rad for the angles."""
     dx, dy, theta, phi, omega = pose
-    sin, cos = arithmetic.sin, arithmetic.cos
-    turns = cos(theta), sin(theta), cos(phi), sin(phi), cos(omega), sin(omega)
+    turn = arithmetic.cos_sin
+    turns = *turn(theta), *turn(phi), *turn(omega)
     x, y, qx, qy = _point(beam, dx, dy, turns)
     row_x, row_y = _rows(x, y, qx, qy, beam[2], turns)
     return qx, qy, row_x, row_y
@@ -177,8 +177,7 @@ def flat_pose(
         along += qx * (lx - nx) + qy * (ly - ny)
         across += qx * (ly - ny) - qy * (lx - nx)
     theta = arithmetic.atan2(across, along)
-    c = arithmetic.cos(theta)
-    s = arithmetic.sin(theta)
+    c, s = arithmetic.cos_sin(theta)
     return nx - c * mx + s * my, ny - s * mx - c * my, theta
 
 

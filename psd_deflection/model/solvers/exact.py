@@ -81,8 +81,7 @@ class ExactSolver(Solver):
         lx = l1x - self._l2x
         ly = l1y - self._l2y
         theta = by.atan2(qx * ly - qy * lx, qx * lx + qy * ly)
-        c = by.cos(theta)
-        s = by.sin(theta)
+        c, s = by.cos_sin(theta)
         steps = 0
         status = SolverStatus.OK
         if mx != my:
@@ -237,9 +236,7 @@ def _newton(
     theta: float, difference: float, mixed: float, along: float, across: float, by: Arithmetic
 ) -> tuple[float, float, float, int]:
     """Minimise F from ``theta``: difference R - P, mixed Q, along A, across B of the module's text."""
-    sin, cos = by.sin, by.cos
-    c = cos(theta)
-    s = sin(theta)
+    c, s = by.cos_sin(theta)
     steps = 0
     while steps < _MAX_STEPS:
         steps += 1
@@ -249,8 +246,7 @@ def _newton(
         # The magnitude of the curvature makes every step go downhill.
         step = slope / abs(curvature)
         theta -= step
-        c = cos(theta)
-        s = sin(theta)
+        c, s = by.cos_sin(theta)
         if abs(step) < _LAST_STEP:
             break
     return theta, c, s, steps

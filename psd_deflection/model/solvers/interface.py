@@ -166,7 +166,7 @@ def weighted_gain(
 
     ``points``: q = (x1, y1, ...), m. The readings of a dot at q go with the pose as -R(-theta) and (q_y, -q_x).
     """
-    c, s = arithmetic.cos(theta), arithmetic.sin(theta)
+    c, s = arithmetic.cos_sin(theta)
     xx, xy, xt, _, yy, yt, _, _, tt = solution.covariance
     rows: tuple[list[float], list[float], list[float]] = ([], [], [])
     for i in range(0, len(points), 2):

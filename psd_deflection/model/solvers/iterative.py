@@ -54,7 +54,7 @@ class IterativeSolver(Solver):
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
         """One block, pure floats. See :class:`Solver`."""
         count = self._count
-        sin, cos = self._arithmetic.sin, self._arithmetic.cos
+        cos_sin = self._arithmetic.cos_sin
         plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
         mx = my = 0.0
         for qx, qy, _, _ in plate:
@@ -67,23 +67,20 @@ class IterativeSolver(Solver):
         for qx, qy, lx, ly in plate:
             along += (qx - mx) * lx + (qy - my) * ly
             across += (qx - mx) * ly - (qy - my) * lx
-        theta = 0.0
+        theta, c, s = 0.0, 1.0, 0.0
         status = SolverStatus.NOT_CONVERGED
         trials = 0
         while trials < _MAX_TRIALS:
             trials += 1
-            c = cos(theta)
-            s = sin(theta)
             disagreement = across * c - along * s
             agreement = along * c + across * s
             step = disagreement / abs(agreement) if agreement else 1.0
             step = max(-_LARGEST_STEP, min(_LARGEST_STEP, step))
             theta += step
+            c, s = cos_sin(theta)
             if abs(step) < _LAST_STEP:
                 status = SolverStatus.OK
                 break
-        c = cos(theta)
-        s = sin(theta)
         dx = self._lx - c * mx + s * my
         dy = self._ly - s * mx - c * my
         residual: list[float] = []
@@ -97,7 +94,7 @@ class IterativeSolver(Solver):
         """In closed form: the disagreement stays 0 if a dot moves. See :class:`Solver`."""
         count = self._count
         by = self._arithmetic
-        c, s = by.cos(solution.theta), by.sin(solution.theta)
+        c, s = by.cos_sin(solution.theta)
         plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
         mx = by.total(p[0] for p in plate) / count
         my = by.total(p[1] for p in plate) / count

@@ -98,8 +98,7 @@ class MinimumTiltSolver(Solver):
                 return flat._replace(status=SolverStatus.INADMISSIBLE)
             return flat
         theta = by.atan2(qx * ey - qy * ex, qx * ex + qy * ey)
-        c = by.cos(theta)
-        s = by.sin(theta)
+        c, s = by.cos_sin(theta)
         cos_beta = self._length / long
         sin_beta = sqrt((1.0 - cos_beta) * (1.0 + cos_beta))
         # Plate point 1 in the base's axes, along and across the base line.
@@ -125,7 +124,7 @@ class MinimumTiltSolver(Solver):
 
     def _too_short(self, long: float, theta: float, variances: tuple[float, ...]) -> bool:
         """Whether noise along the base line cannot explain that it is too short for any tilt."""
-        c, s = self._arithmetic.cos(theta), self._arithmetic.sin(theta)
+        c, s = self._arithmetic.cos_sin(theta)
         ax = c * self._ex + s * self._ey
         ay = c * self._ey - s * self._ex
         vx1, vy1, vx2, vy2 = variances

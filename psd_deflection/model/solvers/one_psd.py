@@ -34,7 +34,7 @@ class OnePsd:
         qx = self._centers[psd][0] + dot[0]
         qy = self._centers[psd][1] + dot[1]
         lx, ly = self._beams[psd]
-        c, s = self._arithmetic.cos(theta), self._arithmetic.sin(theta)
+        c, s = self._arithmetic.cos_sin(theta)
         vx, vy = variances
         # d(d)/d(theta) = -R'(theta) q
         gx = s * qx + c * qy

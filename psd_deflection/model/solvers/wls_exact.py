@@ -83,8 +83,7 @@ class WlsExactSolver(Solver):
             status = SolverStatus.INADMISSIBLE if sine == sine else SolverStatus.NOT_CONVERGED
             return linear._replace(status=status)
         theta = by.asin(sine) - by.atan(kappa)
-        c = by.cos(theta)
-        s = by.sin(theta)
+        c, s = by.cos_sin(theta)
         # (1 - cos) by the half angle: no digits are lost at small angles.
         versine = 2.0 * by.square(by.sin(0.5 * theta))
         fx = linear.dx + xy * (s - linear.theta) - xx * versine
