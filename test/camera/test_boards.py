@@ -54,6 +54,27 @@ def test_a_board_is_found_again(settings: CameraSettings, view: str) -> None:
     assert np.all(np.abs(off) < 5.0 * np.sqrt(np.diag(answer.covariance)))
 
 
+def test_the_noise_of_a_board_is_what_its_pose_leaves_of_the_corners() -> None:
+    """A pose takes six of the independent values; the residuals are those of OpenCV's projection."""
+    board = target_of(BOARD)
+    assert isinstance(board, Board)
+    image = shot(SMALL, BOARD, Pose(0.0, 0.0, 0.1, 0.02, -0.01), np.random.default_rng(3))
+    matrix, distortion = np.array(SMALL.matrix).reshape(3, 3), np.array(BOARD.distortion)
+    found = board.locate(image, image, Lens(matrix, distortion), 255.0)
+    # All of the corners of 5 x 5 squares.
+    assert len(found.points) == 16
+    assert found.residuals == 32
+    apart = BOARD.square * (np.arange(4) - 1.5)
+    corners = np.array([[x, y, 0.0] for x in apart for y in apart])
+    turn, _ = cv2.Rodrigues(found.rotation)
+    seen, _ = cv2.projectPoints(corners, turn, found.place, matrix, distortion)
+    away = np.linalg.norm(seen - found.points, axis=2)
+    # Each corner has its own, much nearer than the next.
+    assert sorted(away.argmin(axis=0).tolist()) == list(range(16))
+    left = float(np.sum(away.min(axis=0) ** 2))
+    assert found.noise**2 == pytest.approx(left / (32 - 6), rel=0.005)
+
+
 def test_an_edge_along_the_rows_of_the_image_is_drawn_where_it_is() -> None:
     scene = Scene(width=60, height=80, focal=1000.0, centre=(30.0, 40.0), distance=0.25, black=0.0, white=1.0)
 

@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.boards import Board
+from psd_deflection.camera.discs.find_discs import find_discs
 from psd_deflection.camera.discs.rim_judge import _sectors
 from psd_deflection.camera.discs.rim_model import Shape, moved, turned
 from psd_deflection.camera.footage import of_ros_image
 from psd_deflection.camera.image_size import declared_size
 from psd_deflection.camera.intrinsics import Intrinsics, calibrated
+from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings, settings_from
 from psd_deflection.camera.targets import target_of
 
@@ -156,3 +159,28 @@ def test_exact_corners_give_the_pose_of_a_board_at_once(view: str) -> None:
     rotation, place = board._guess(plane, seen[:, :2] / seen[:, 2:])
     assert rotation == pytest.approx(true, abs=1e-9)
     assert place == pytest.approx(at, abs=1e-9)
+
+
+@pytest.mark.parametrize(('thick', 'why'), [(1, Status.MISSING), (2, Status.OBLIQUE)])
+def test_three_scratches_a_pixel_wide_are_no_target_seen_obliquely(thick: int, why: Status) -> None:
+    """They have its spacing: 36 px, of half-widths of 10 to 12 px."""
+    grey = np.full((40, 130), 20, dtype=np.uint8)
+    for middle in (24, 60, 96):
+        grey[20 : 20 + thick, middle - 7 : middle + 8] = 220
+    with pytest.raises(NoPoseError) as caught:
+        find_discs(grey, 25.0 / 8.0)
+    assert caught.value.status is why
+
+
+def test_a_rest_that_does_not_come_is_given_up_behind_four_hundred_frames() -> None:
+    """One good frame alone is no rest, as long as the next good one may say that it moved."""
+    still = TargetPose(np.eye(3), np.array([0.0, 0.0, 1.0]), 1e-12 * np.eye(6), 0.0, 10, np.zeros((3, 2)))
+    target = SimpleNamespace(locate=lambda *_: still, set_rest=lambda _: None)
+    reference = CameraReference(CameraSettings(), lambda _: cast(Any, target))
+    assert reference.take(0, np.zeros((20, 20), dtype=np.uint8)) == []
+    hidden = NoPoseError(Status.HIDDEN)
+    assert [reference.take(i, hidden) for i in range(1, 400)] == [[]] * 399
+    assert reference.rest is None
+    answers = reference.take(400, hidden)
+    assert [a.t_ns for a in answers] == list(range(401))
+    assert [a.status for a in answers] == [Status.OK] + [Status.HIDDEN] * 400

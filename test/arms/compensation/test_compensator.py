@@ -200,6 +200,17 @@ def test_a_bad_deflection_is_not_followed_and_good_ones_are_again(
     assert loop.run(PERIOD * 10).state is State.FOLLOWING
 
 
+def test_a_deflection_is_followed_up_to_the_deviation_that_is_allowed(arm: Arm) -> None:
+    # A power of two has an exact square.
+    bound = 2.0**-10
+    loop = following(arm, max_sd=bound)
+    for sd, state in ((bound, State.FOLLOWING), (math.nextafter(bound, 1.0), State.HOLDING)):
+        loop.t += PERIOD
+        loop.compensator.joints(loop.t, loop.plant.angles)
+        covariance = np.eye(6) * sd**2
+        assert loop.compensator.observe(loop.t, seen(loop, t=loop.t, covariance=covariance)).state is state
+
+
 @pytest.mark.parametrize('lost', ['deflection', 'joints'])
 def test_it_holds_within_a_tenth_of_a_second_of_the_last_word(arm: Arm, lost: str) -> None:
     loop = following(arm)

@@ -100,6 +100,34 @@ def test_one_that_replaces_another_goes_on_from_it(orders: int) -> None:
     assert np.array_equal(second.states[-1, 0], [0.0, 0.0])
 
 
+def test_what_was_replaced_before_the_last_one_still_has_its_points() -> None:
+    """Lines with a kink: without a point there the controller would cut the corner."""
+    by = shaper('zvd', 3.0, 0.02)
+    starts = [0.0, 0.2, 0.3]
+    # From where the one before is: 0.3 after 0.1 s, then back.
+    paths = [([0.0, 0.1, 1.0], [0.0, 0.3, 0.0]), ([0.0, 0.5], [0.0, -0.1]), ([0.0, 0.4], [0.0, 0.2])]
+    shapes = TrajectoryShaper(by, max_step=1.0)
+    knots: list[tuple[list[float], list[float]]] = []
+    for start, (times, places) in zip(starts, paths, strict=True):
+        if knots:
+            places = [float(np.interp(start, *knots[-1])), *places[1:]]
+        knots.append(([start + t for t in times], places))
+        path = checked(['a'], times, [[[p], [], []] for p in places])
+        shaped = shapes.shape(round(start * S), path, standing({'a': 0.0}))
+
+    def commanded(t: FloatArray) -> FloatArray:
+        which = np.clip(np.searchsorted(starts, t, side='right') - 1, 0, None)
+        return np.choose(which, [np.interp(t, *k) for k in knots])
+
+    at = np.linspace(0.0, shaped.duration, 1501)
+    wanted = sum(a * commanded(starts[-1] + at - t) for t, a in zip(by.times, by.sizes, strict=True))
+    np.testing.assert_allclose(shaped.at(at)[:, 0, 0], wanted, atol=1e-6)
+    # The kink of the first, 0.1 s after it began, comes back as the last of the shaper's times says.
+    kink = 0.1 + by.times[-1] - starts[-1]
+    assert kink > 0.1
+    assert np.abs(shaped.times - kink).min() < 1e-6
+
+
 def test_a_stream_of_set_points_is_shaped() -> None:
     by = TrajectoryShaper(ZV, max_step=0.05)
     period, heard = 0.02, []
@@ -208,6 +236,18 @@ def test_what_cannot_be_followed_is_refused(
 ) -> None:
     with pytest.raises(ConfigError, match=why):
         checked(names, times, points)
+
+
+@pytest.mark.parametrize('sign', [1.0, -1.0])
+@pytest.mark.parametrize('of', [0, 1, 2])
+def test_a_number_of_a_trajectory_is_at_most_a_million(of: int, sign: float) -> None:
+    def to(value: float) -> Trajectory:
+        first = [[value if k == of else 0.0] for k in range(3)]
+        return checked(['a'], [0.0, 1.0], [first, [[0.0], [0.0], [0.0]]])
+
+    assert to(sign * 1e6).states[0, of, 0] == sign * 1e6
+    with pytest.raises(ConfigError, match=r'point 0 is not finite, or beyond 1e\+06'):
+        to(sign * math.nextafter(1e6, math.inf))
 
 
 def test_shapers_in_series_end_both_modes() -> None:

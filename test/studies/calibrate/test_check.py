@@ -10,10 +10,20 @@ import pytest
 
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.misalignment.model import INDEX, PARAMETERS, ZERO
+from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
+from psd_deflection.studies.calibrate import check as checking
 from psd_deflection.studies.calibrate.calibrate import _with_clamp, undetermined
-from psd_deflection.studies.calibrate.check import _moved
-from psd_deflection.studies.calibrate.fit import CLAMP_AT, CalibrationFit, Linear, Noise, posterior, prior_of_rig
+from psd_deflection.studies.calibrate.check import MovedGroup, _fitted, _moved
+from psd_deflection.studies.calibrate.fit import (
+    CLAMP_AT,
+    CalibrationFit,
+    Linear,
+    Noise,
+    Prior,
+    posterior,
+    prior_of_rig,
+)
 from psd_deflection.studies.calibrate.observation import Rows
 
 
@@ -33,6 +43,32 @@ def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None
     sd = scale[own] * np.sqrt(np.diag(covariance))
     assert [v for v, _ in found.shifts.values()] == pytest.approx(shift.tolist())
     assert [s for _, s in found.shifts.values()] == pytest.approx(sd.tolist())
+
+
+def test_a_group_is_fitted_as_if_it_may_have_moved_by_three_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
+    told = prior_of_rig(rig_from_values({}))
+    names = [p.name for p in PARAMETERS if p.group == 'psd_1.gain']
+    given: list[Prior] = []
+
+    def explained(rows: object, rig: object, prior: Prior, *_: object) -> tuple[float, FloatArray]:
+        given.append(prior)
+        return 7.0, prior.mean + 0.5
+
+    monkeypatch.setattr(checking, 'explained', explained)
+    group = MovedGroup('psd_1.gain', 0.01, 1.0, 2, dict.fromkeys(names, (0.0, 0.1)))
+    nothing = cast(Any, None)
+    found = _fitted(group, nothing, nothing, told, 'reference', nothing, nothing, 3.0)
+    wider = np.zeros(len(told.mean))
+    for p in PARAMETERS:
+        if p.name in names:
+            wider[INDEX[p.name]] = 9.0 * p.tolerance**2
+    (prior,) = given
+    assert np.all(wider[[INDEX[n] for n in names]] > 0.0)
+    np.testing.assert_allclose(prior.covariance, told.covariance + np.diag(wider), rtol=1e-12)
+    assert np.array_equal(prior.mean, told.mean)
+    # Against nothing moved; and what it moved by.
+    assert found.evidence == pytest.approx(4.0)
+    assert [v for v, _ in found.shifts.values()] == pytest.approx([0.5] * len(names))
 
 
 def test_what_no_row_tells_is_undetermined_alone_or_as_a_combination() -> None:

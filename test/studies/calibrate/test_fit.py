@@ -14,7 +14,16 @@ from blind import misaligned
 from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
-from psd_deflection.studies.calibrate.fit import Linear, Noise, pose_of_readings, weight_matrices
+from psd_deflection.studies.calibrate.fit import (
+    SIZE,
+    Kind,
+    Linear,
+    Noise,
+    _components,
+    pose_of_readings,
+    prior_of_rig,
+    weight_matrices,
+)
 
 
 def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
@@ -50,3 +59,25 @@ def test_rows_that_are_worth_fewer_weigh_less() -> None:
     spread = linear.by_pose[2] @ np.diag(noise.reference**2) @ linear.by_pose[2].T
     np.testing.assert_allclose(each[2], np.linalg.inv(spread + np.diag(1.5**2 * rows.variances[2])), rtol=1e-9)
     np.testing.assert_allclose(weight_matrices(linear, rows, replace(noise, fewer=4.0)), each / 4.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
+@pytest.mark.parametrize(('share', 'told'), [(0.0, 0.3), (0.2, 0.3), (0.4, 0.4), (2.0, 2.0)])
+def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: float, told: float) -> None:
+    """The redundant reading has ``share`` of the noise that is stated, of either sign; nothing was fitted."""
+    rng = np.random.default_rng(6)
+    n, sd = 200, 3e-6
+    by_pose = rng.normal(size=(n, 4, 3))
+    # The direction that no pose reaches, by cofactors.
+    across = np.array([[(-1) ** i * np.linalg.det(np.delete(m, i, axis=0)) for i in range(4)] for m in by_pose])
+    across /= np.linalg.norm(across, axis=1)[:, None]
+    moved = np.einsum('nij,nj->ni', by_pose, rng.normal(size=(n, 3)) * 1e-4)
+    residual = moved + share * sd * rng.choice([-1.0, 1.0], n)[:, None] * across
+    rows = cast(
+        Any,
+        SimpleNamespace(sd=np.ones((n, 3)), variances=np.full((n, 4), sd**2), run=np.zeros(n, dtype=np.int64)),
+    )
+    linear = Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
+    prior = prior_of_rig(rig_from_values({}))
+    found = _components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
+    assert found.dots == pytest.approx(told)
