@@ -172,15 +172,25 @@ def test_three_scratches_a_pixel_wide_are_no_target_seen_obliquely(thick: int, w
     assert caught.value.status is why
 
 
-def test_a_rest_that_does_not_come_is_given_up_behind_four_hundred_frames() -> None:
-    """One good frame alone is no rest, as long as the next good one may say that it moved."""
+@pytest.mark.parametrize(('rest_frames', 'last'), [(0, 400), (30, 600)])
+def test_a_rest_that_does_not_come_is_given_up_behind_twenty_times_as_many_frames(rest_frames: int, last: int) -> None:
+    """Frames of which one is good, and twenty or as many as are asked for would be a rest."""
     still = TargetPose(np.eye(3), np.array([0.0, 0.0, 1.0]), 1e-12 * np.eye(6), 0.0, 10, np.zeros((3, 2)))
     target = SimpleNamespace(locate=lambda *_: still, set_rest=lambda _: None)
-    reference = CameraReference(CameraSettings(), lambda _: cast(Any, target))
+    reference = CameraReference(CameraSettings(rest_frames=rest_frames), lambda _: cast(Any, target))
     assert reference.take(0, np.zeros((20, 20), dtype=np.uint8)) == []
     hidden = NoPoseError(Status.HIDDEN)
-    assert [reference.take(i, hidden) for i in range(1, 400)] == [[]] * 399
+    assert [reference.take(i, hidden) for i in range(1, last)] == [[]] * (last - 1)
     assert reference.rest is None
-    answers = reference.take(400, hidden)
-    assert [a.t_ns for a in answers] == list(range(401))
-    assert [a.status for a in answers] == [Status.OK] + [Status.HIDDEN] * 400
+    answers = reference.take(last, hidden)
+    assert [a.t_ns for a in answers] == list(range(last + 1))
+    assert [a.status for a in answers] == [Status.OK] + [Status.HIDDEN] * last
+
+
+def test_as_many_frames_are_the_rest_as_are_asked_for() -> None:
+    still = TargetPose(np.eye(3), np.array([0.0, 0.0, 1.0]), 1e-12 * np.eye(6), 0.0, 10, np.zeros((3, 2)))
+    target = SimpleNamespace(locate=lambda *_: still, set_rest=lambda _: None)
+    reference = CameraReference(CameraSettings(rest_frames=500), lambda _: cast(Any, target))
+    image = np.zeros((20, 20), dtype=np.uint8)
+    assert [reference.take(i, image) for i in range(499)] == [[]] * 499
+    assert len(reference.take(499, image)) == 500

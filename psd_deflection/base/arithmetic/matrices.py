@@ -20,9 +20,9 @@ AT_ONCE = 1 << 15
 _MARGIN = 1e-13
 """Of the largest element, times the square of the number of unknowns: 500 times the rounding of one operation."""
 _SMALL = 1 << 12
-"""Numbers up to which a sum keeps its places: at most 32 kB a shape."""
+"""Numbers of rows up to which the partial sums have places that are kept: at most 32 kB a shape."""
 _MOST_SHAPES = 256
-"""Shapes of which they are kept; blocks with gaps have as many as they have samples."""
+"""Shapes of which they are kept. Blocks with gaps have as many lengths as they have samples."""
 
 
 @cache
@@ -57,28 +57,21 @@ def in_pairs(rows: AnyFloats) -> FloatArray:
     calls.
     """
     rest = np.asarray(rows, dtype=np.float64)
-    count = len(rest)
-    if 1 < count and rest.size <= _SMALL:
-        places = _HERE.places
-        way = places.get(rest.shape)
-        if way is None:
-            if len(places) >= _MOST_SHAPES:
-                places.clear()
-            way = places[rest.shape] = _Way(rest.shape)
-        return way.sum(rest)
-    if not count:
-        return np.zeros(rest.shape[1:])
-    while (count := len(rest)) > 1:
-        half = count // 2
-        pairs = rest[:half] + rest[half : 2 * half]
-        if count & 1:
-            pairs[0] += rest[-1]
-        rest = pairs
-    return np.asarray(rest[0])
+    if len(rest) < 2:
+        return np.asarray(rest[0]) if len(rest) else np.zeros(rest.shape[1:])
+    kept = _KEPT.by_shape
+    scratch = kept.get(rest.shape)
+    if scratch is None:
+        scratch = _Scratch(rest.shape)
+        if rest.size <= _SMALL:
+            if len(kept) >= _MOST_SHAPES:
+                kept.clear()
+            kept[rest.shape] = scratch
+    return scratch.sum(rest)
 
 
-class _Way:
-    """The places of the sums of :func:`in_pairs` for one shape of rows: a few numbers cost less than making them anew."""
+class _Scratch:
+    """The partial sums of :func:`in_pairs` for one shape of rows. Of few numbers, making them anew costs most."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         """``shape``: two rows or more."""
@@ -108,14 +101,14 @@ class _Way:
         return self._last.copy()
 
 
-class _Places(threading.local):
-    """``places``: by shape, of this thread alone."""
+class _Kept(threading.local):
+    """``by_shape``: what this thread has; another one would write into it."""
 
     def __init__(self) -> None:
-        self.places: dict[tuple[int, ...], _Way] = {}
+        self.by_shape: dict[tuple[int, ...], _Scratch] = {}
 
 
-_HERE = _Places()
+_KEPT = _Kept()
 
 
 def orthogonal(a: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -154,7 +147,7 @@ def pivots(a: FloatArray) -> list[FloatArray]:
 def surely_positive(a: FloatArray) -> bool | None:
     """Whether symmetric ``a`` (n, n) is positive definite; None if that hangs on rounding.
 
-    Elimination of a matrix gives the pivots of one that differs from it by some n rounding errors of its largest element
+    Elimination gives the pivots of a matrix that differs from ``a`` by some n rounding errors of its largest element
     (Rump, Verification of positive definiteness, BIT 46, 2006). So if Cholesky's factors exist with much more than
     that taken off the diagonal, or do not with as much added, every order of the sums says so.
     """

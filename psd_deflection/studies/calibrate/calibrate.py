@@ -263,22 +263,22 @@ def roughly_late(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) ->
 def _believed(
     first: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask
 ) -> tuple[CalibrationFit, Prior, list[str]]:
-    """Widen what the rows contradict, the worst at a time."""
-    widened: list[str] = []
+    """Widen what the rows contradict, the worst at a time, each once; the third are the names of these."""
+    widened: list[int] = []
     while len(widened) < 6:
         sd = np.sqrt(np.diag(first.covariance))
         off = np.where(free & (sd < 0.7 * prior.sd), np.abs(first.values - prior.mean) / prior.sd, 0.0)
-        off[[INDEX[n] for n in widened if n in INDEX]] = 0.0
+        off[widened] = 0.0
         worst = int(np.argmax(off))
         if off[worst] < CONTRADICTED:
             break
-        widened.append(NAMES[worst])
+        widened.append(worst)
         covariance = prior.covariance.copy()
         covariance[worst] *= WIDER
         covariance[:, worst] *= WIDER
         prior = Prior(prior.mean, covariance)
         first = fit(rows, rig, prior, kind, free=free, start=first)
-    return first, prior, widened
+    return first, prior, [NAMES[i] for i in widened]
 
 
 def _determined(first: CalibrationFit, prior: Prior, free: Mask) -> Mask:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from blind import misaligned
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
+from psd_deflection.studies.calibrate import calibrate as module
 from psd_deflection.studies.calibrate.calibrate import Calibration, calibrate
 from psd_deflection.studies.calibrate.check import check
-from psd_deflection.studies.calibrate.fit import NAMES
-from psd_deflection.studies.calibrate.observation import CalibrationRun, smoothed
+from psd_deflection.studies.calibrate.fit import NAMES, CalibrationFit, prior_of_rig
+from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows, smoothed
 from psd_deflection.studies.calibrate.result import values_of
 
 AT = {name: i for i, name in enumerate(NAMES)}
@@ -225,3 +227,23 @@ def test_a_short_campaign_covers_the_truth() -> None:
     assert found.poses > 0.5
     assert found.worse == 0
     assert found.named == 1.0
+
+
+def test_what_the_rows_contradict_is_widened_once_each_the_worst_first(
+    nominal: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A clamp, too: it has no parameter in the rig file that the other numbers are counted by."""
+    prior = prior_of_rig(nominal)
+    worst, next_one = AT['clamp.bending_compliance'], AT['psd_1.rotation']
+    values = prior.mean.copy()
+    values[worst] += 400.0 * prior.sd[worst]
+    values[next_one] += 300.0 * prior.sd[next_one]
+    first = cast(CalibrationFit, SimpleNamespace(values=values, covariance=1e-6 * prior.covariance))
+    # A fit that stays where it is.
+    monkeypatch.setattr(module, 'fit', lambda *_, start, **__: start)
+    free = np.ones(len(NAMES), dtype=bool)
+    _, wider, widened = module._believed(first, cast(Rows, None), nominal, prior, 'loads', free)
+    assert widened == ['clamp.bending_compliance', 'psd_1.rotation']
+    sd = prior.sd.copy()
+    sd[[worst, next_one]] *= module.WIDER
+    assert wider.sd == pytest.approx(sd)
