@@ -34,7 +34,7 @@ GROWS = {'append', 'appendleft', 'add', 'setdefault', 'extend', 'update', 'put',
 BOUNDED_BY = {
     'arms/inputs.py:_told': 'LONGEST_LIST',
     'camera/lens.py:_grids': 'one size of image a camera',
-    'camera/reference.py:_waiting': 'decides after 400 frames',
+    'camera/reference.py:_waiting': '20 MOST_REST, or twice rest.frames',
     'devices/contract_frames.py:_early': 'what comes before START is answered, in 2 s',
     'devices/dataq.py:_list': 'the simulated device: its 11 channels',
     'devices/thorlabs.py:_ports': 'two ports',

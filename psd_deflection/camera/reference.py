@@ -78,7 +78,7 @@ class CameraReference:
             complete = len(good) >= MOST_REST or (len(good) > 1 and not _still(good[:-1], good[-1]))
             if complete and len(good) < MOST_REST:
                 good = good[:-1]
-        if complete or len(self._waiting) > 20 * max(MOST_REST, self._settings.rest_frames):
+        if complete or len(self._waiting) > max(20 * MOST_REST, 2 * self._settings.rest_frames):
             return self._decide(good)
         return []
 
