@@ -119,13 +119,16 @@ def _of_primary(name: str, estimate: DeflectionEstimate) -> Iterator[Item]:
 
 def _of_solver(name: str, estimate: DeflectionEstimate) -> Iterator[Item]:
     """Of each estimate, on its solver's topic."""
-    yield name.format(solver=estimate.solver), estimate.t_ns, estimate
+    if estimate.on_own_topic:
+        yield name.format(solver=estimate.solver), estimate.t_ns, estimate
 
 
 def _of_psd(psd: int) -> Callable[[str, SpotMeans], Iterator[Item]]:
     """Of one PSD, if its dot was seen. With a fault of one the dots of the others are good if they were used."""
 
     def items(name: str, spots: SpotMeans) -> Iterator[Item]:
+        if not spots.published:
+            return
         measured = spots.status in _MEASURED
         lost = not measured and (not spots.left_out or psd in spots.left_out)
         if psd <= len(spots.sums) and not lost and all(map(math.isfinite, spots.dots)):

@@ -111,7 +111,8 @@ class SpotMeans:
     ``sums``: (sum1, sum2, ...), V. ``covariance`` (2P, 2P): sample covariance of the dots, m^2 (zeros if
     fewer than two samples are present). ``present`` + ``lost`` = block size. ``reason`` is empty
     when ``status`` is OK. ``findings``: warnings that do not prevent an estimate. ``left_out``: PSDs (from 1) that
-    the estimate was made without, if the others were enough for it.
+    the estimate was made without, if the others were enough for it. ``published``: whether the dots are; of most blocks
+    they are not, if the parameter ``decimation`` says so.
     """
 
     t_ns: int
@@ -125,6 +126,7 @@ class SpotMeans:
     reason: str
     findings: tuple[str, ...] = ()
     left_out: tuple[int, ...] = ()
+    published: bool = True
 
 
 class DeflectionEstimate(NamedTuple):
@@ -134,7 +136,9 @@ class DeflectionEstimate(NamedTuple):
     ``covariance``: 3 x 3 of (dx, dy, theta), row by row, m^2, m rad, rad^2.
     ``residual_rms``: rms of the dot residuals, m. ``primary``: True for the estimate that is
     published as ``/link_tip/deflection``. ``chi_square``: of the redundant readings, one degree of
-    freedom each (one with two PSDs); NaN if they were not checked.
+    freedom each (one with two PSDs); NaN if they were not checked. ``on_own_topic``: whether it is
+    published on its solver's topic; the primary one of most blocks is not, if the parameter
+    ``decimation`` says so.
     """
 
     t_ns: int
@@ -149,6 +153,7 @@ class DeflectionEstimate(NamedTuple):
     residual_rms: float
     primary: bool
     chi_square: float = math.nan
+    on_own_topic: bool = True
 
     @property
     def pose(self) -> tuple[float, float, float]:

@@ -45,7 +45,7 @@ class SeenBlock:
 
     ``t_ns``: middle of the block, stream time. ``slots`` (n,): places of the samples in the block. ``samples`` (n, 2P):
     their dots, m; ``means`` (2P,): of all. ``sums`` (n, P): sum signals, V. ``frozen`` (P,): for how many blocks each
-    detector's values have not changed.
+    detector's values have not changed. ``due``: whether it has more than its estimate and its samples.
     """
 
     t_ns: int
@@ -56,6 +56,7 @@ class SeenBlock:
     sums: FloatArray
     verdict: Verdict
     frozen: tuple[int, ...]
+    due: bool
 
 
 class HeldTwist(NamedTuple):
@@ -349,6 +350,7 @@ class Estimation:
             residual_rms=self._by.root(self._by.total(r * r for r in s.residual) / len(s.residual)),
             primary=primary,
             chi_square=checked.chi_square if primary and checked is not None and checked.freedom else nan,
+            on_own_topic=block.due,
         )
 
     def _covariance(
@@ -433,6 +435,7 @@ class Estimation:
             covariance=cov,
             residual_rms=0.0,
             primary=True,
+            on_own_topic=block.due,
         )
 
 

@@ -141,7 +141,7 @@ class OpticsHealth:
         self._by = ARITHMETICS[config.arithmetic]
         self._psds = len(rig.psds)
         self._size = config.block_size
-        self._min_samples = config.min_samples
+        self._min_samples = min(config.min_samples, config.block_size)
         self._splitter = config.splitter
         self._nominal = rig.amplifier.sum_nominal
         # If two lasers share all detectors, half the light does not mean a lost laser.

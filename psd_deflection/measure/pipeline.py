@@ -340,6 +340,7 @@ class Pipeline:
             reason=reason,
             findings=findings,
             left_out=self.stamped.left_out,
+            published=seen.due,
         )
         yield self.last_spots
         yield block
@@ -363,6 +364,7 @@ class Pipeline:
             sums=sums,
             verdict=self._optics.judge(block, volts, means, sums, frozen),
             frozen=frozen,
+            due=block.index % self.rig.estimator.decimation == 0,
         )
 
     def _count(self, status: BlockStatus, verdict: Verdict, answer: BlockSolution) -> None:
@@ -382,7 +384,8 @@ class Pipeline:
             yield best
             if used is not None:
                 load = self.tip_loads.tip_load(seen.index, best.dx, best.dy, best.theta)
-                yield TipLoad(seen.t_ns, *load)
+                if seen.due:
+                    yield TipLoad(seen.t_ns, *load)
         if self.motion_filter is not None:
             # Poses of some PSDs have another noise than the filter knows: it coasts.
             usable = status is BlockStatus.TOO_FEW_SAMPLES or (status is BlockStatus.OK and answer.complete)
@@ -390,7 +393,7 @@ class Pipeline:
             if moved is not None:
                 yield moved
         self._keep_for_zero(seen, answer)
-        if best is not None and used is not None:
+        if seen.due and best is not None and used is not None:
             yield from self.estimation.others(seen, used)
 
     def _keep_for_zero(self, seen: SeenBlock, answer: BlockSolution) -> None:

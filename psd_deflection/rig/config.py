@@ -54,7 +54,6 @@ from psd_deflection.rig.running import AcquisitionConfig, MonitorConfig
 
 _ORDERED = (
     ('link.inner_radius', 'less than', 'link.outer_radius'),
-    ('min_samples', 'at most', 'block_size'),
     ('sum_min', 'less than', 'sum_max'),
 )
 BASE_SOLVER = 'base_pair'

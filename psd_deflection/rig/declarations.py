@@ -182,7 +182,21 @@ class EstimatorConfig:
     """How samples become estimates."""
 
     block_size: int = parameter(20, 'samples', 'samples averaged for one estimate', minimum=1, maximum=1000)
-    min_samples: int = parameter(10, 'samples', 'a block with fewer samples has no estimate', minimum=1, maximum=1000)
+    min_samples: int = parameter(
+        10,
+        'samples',
+        'a block with fewer samples has no estimate; one of a smaller block_size needs all of them',
+        minimum=1,
+        maximum=1000,
+    )
+    decimation: int = parameter(
+        1,
+        'blocks',
+        'of so many blocks one has a wrench, dots and the answers of the other solvers; the estimate of solver and the '
+        'samples are of every block, so that small blocks cost less',
+        minimum=1,
+        maximum=1000,
+    )
     sum_min: float = parameter(
         2.5, 'V', 'a sum signal below this means that the laser is lost', minimum=0.0, maximum=100.0, live=True
     )

@@ -45,6 +45,10 @@ PATIENCE_S = 3.0
 """How long it waits for recordings that are still being written."""
 
 IDLE_S = 0.5
+GATHER_S = 0.02
+"""Pause of the recorder when it has written what there was: waking up for each message costs more than writing it, and
+takes Python's lock from the thread that publishes the next one.
+"""
 LOOK_EVERY = 250
 """Messages between two checks of the file and of the room on its disk: half a second's worth."""
 
@@ -369,16 +373,20 @@ class Recorder:
     def _write(self, bag: BagWriter, take: Take) -> None:
         items, config = take.queue, take.config
         since_look = 0
-        unwritten = False
+        unwritten = gathered = False
         while True:
             take.beat = time.monotonic()
             try:
-                item = items.get(timeout=IDLE_S)
+                item = items.get_nowait() if gathered else items.get(timeout=IDLE_S)
             except queue.Empty:
-                if unwritten:
+                if gathered:
+                    time.sleep(GATHER_S)
+                elif unwritten:
                     bag.flush()
                     unwritten = False
+                gathered = False
                 continue
+            gathered = True
             if item is None:
                 return
             if isinstance(item, ParameterChange):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from msg_adapters import DEFLECTION, DEFLECTION_WITH_COVARIANCE, SAMPLES, WRENCH, to_messages
 from psd_deflection.cli.main import main
 from psd_deflection.measure.health import FROZEN
 from psd_deflection.measure.pipeline import Pipeline
@@ -507,3 +509,49 @@ def test_what_is_told_of_a_block(rig: Rig) -> None:
     assert isinstance(records[-1], SampleBlock)
     assert pipeline.last_spots is spots
     assert pipeline.last_estimate is records[0]
+
+
+@pytest.mark.parametrize(('size', 'every'), [(1, 20), (5, 4), (20, 3)])
+def test_with_decimation_each_block_has_its_estimate_and_one_of_so_many_the_rest(size: int, every: int) -> None:
+    counts = still((1e-4, -2e-4, 1e-3), 240 * size, 1)
+    names = [DEFLECTION, DEFLECTION_WITH_COVARIANCE, SAMPLES, WRENCH, '/psd_1/spot', '/psd_2/spot']
+    names += ['/link_tip/exact/deflection', '/link_tip/wls/deflection', '/link_tip/iterative/deflection']
+    published: dict[int, Counter[str]] = {}
+    poses: dict[int, list[tuple[float, ...]]] = {}
+    for told in (1, every):
+        pipeline = Pipeline(load_rig(overrides={'block_size': size, 'decimation': told}))
+        records = list(pipeline.process(chunk_of(counts)))
+        published[told] = Counter(m.topic for record in records for m in to_messages(record))
+        primary = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary]
+        poses[told] = [(*r.pose, *r.covariance) for r in primary]
+        # What runs beside the topics knows of each block.
+        assert [r.index for r in records if isinstance(r, SpotMeans)] == list(range(240))
+        due = [r.index for r in records if isinstance(r, SpotMeans) and r.published]
+        assert due == list(range(0, 240, told))
+        assert {r.block for r in records if isinstance(r, DeflectionEstimate) and not r.primary} == set(due)
+    assert published[1] == dict.fromkeys(names, 240)
+    assert published[every] == dict.fromkeys(names[:3], 240) | dict.fromkeys(names[3:], 240 // every)
+    # The estimates have the same bits, whatever is beside them.
+    assert poses[every] == poses[1]
+
+
+def test_a_recording_with_decimation_is_replayed_bit_for_bit_with_as_many_messages(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = tmp_path / 'rig.yaml'
+    model.write_text('/**:\n  ros__parameters:\n    block_size: 5\n    decimation: 4\n')
+    bag = tmp_path / 'each_fifth'
+    argv = ['simulate', '--params-file', str(model), '--loads', 'steps:0,0,0;0,-10,5:1', '--out', str(bag)]
+    assert main(argv) == 0
+    counts = Counter(m.channel.topic for m in open_recording(bag).messages())
+    assert (counts[DEFLECTION], counts[WRENCH], counts['/psd_1/spot']) == (400, 100, 100)
+    assert main(['replay', str(bag), '--compare', '--strict']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(('size', 'lost', 'status'), [(1, 0, 'OK'), (4, 1, 'TOO_FEW_SAMPLES'), (20, 10, 'OK')])
+def test_a_block_smaller_than_the_least_number_of_samples_needs_all_of_them(size: int, lost: int, status: str) -> None:
+    pipeline = Pipeline(load_rig(overrides={'block_size': size}))
+    chunk = chunk_of(still((0.0, 0.0, 0.0), size - lost, 2))
+    records = [*pipeline.process(chunk), *pipeline.flush()]
+    assert [r.status.name for r in records if isinstance(r, SpotMeans)] == [status]

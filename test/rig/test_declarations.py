@@ -45,7 +45,7 @@ def another(p: Parameter) -> Value:
         case bool():
             return not p.default
         case int():
-            return p.default - 1 if p.default else 1
+            return p.default - 1 if p.default > (p.minimum or 0) else p.default + 1
         case float():
             return 0.99 * p.default if p.default else 0.01
         case list() if p.kind == 'double_array':

@@ -127,6 +127,7 @@ class McapFile(_RecordSink):
         self._channels: dict[str, int] = {}
         self._chunk_first: int | None = None
         self._chunk_last = 0
+        self._begun = False
         self.changes: list[ParameterChange] = []
         self.custom = dict(CUSTOM)
         self._present = dict(rig_values)
@@ -179,14 +180,20 @@ class McapFile(_RecordSink):
     @contextlib.contextmanager
     def _guard(self) -> Any:
         if self._stream is None:
-            raise RecordingError(f'{self.path}: the recording is closed')
+            raise self._closed()
         try:
             yield
         except OSError as error:
-            self._abandon()
-            raise RecordingError(
-                f'{self.path}: cannot be written ({error.strerror or error}); it ends with the last complete chunk'
-            ) from None
+            raise self._failed(error) from None
+
+    def _closed(self) -> RecordingError:
+        return RecordingError(f'{self.path}: the recording is closed')
+
+    def _failed(self, error: OSError) -> RecordingError:
+        self._abandon()
+        return RecordingError(
+            f'{self.path}: cannot be written ({error.strerror or error}); it ends with the last complete chunk'
+        )
 
     def _abandon(self) -> None:
         stream, self._stream = self._stream, None
@@ -226,7 +233,10 @@ class McapFile(_RecordSink):
         self._write(topic, type_name, message, t_ns)
 
     def _write(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
-        with self._guard():
+        if self._stream is None:
+            raise self._closed()
+        # As _guard, which costs as much as the rest.
+        try:
             channel = self._channels.get(topic)
             if channel is None:
                 channel = self._register(topic, type_name)
@@ -238,10 +248,14 @@ class McapFile(_RecordSink):
             self._chunk_last = t_ns if first is None else max(self._chunk_last, t_ns)
             entry = self.topics[topic]
             self._writer.add_message(channel, t_ns, message, t_ns, entry.messages)
-        if not any(t.messages for t in self.topics.values()):
+        except OSError as error:
+            raise self._failed(error) from None
+        if self._begun:
+            self.start_ns = min(self.start_ns, t_ns)
+            self.end_ns = max(self.end_ns, t_ns)
+        else:
+            self._begun = True
             self.start_ns = self.end_ns = t_ns
-        self.start_ns = min(self.start_ns, t_ns)
-        self.end_ns = max(self.end_ns, t_ns)
         entry.messages += 1
 
     def _register(self, topic: str, type_name: str) -> int:
