@@ -351,15 +351,16 @@ def _matched(changes: IntArray, sizes: FloatArray, steps: list[_Step], period: f
 def _profile(t: FloatArray, start: float, took: float, period: float) -> FloatArray:
     """Share (n,) of a load that acts from ``t`` to the next sample, if applied from ``start`` on in ``took`` s.
 
-    A step between two samples is the mean of the one, and as much more in the next as gives it the right time: the mean
-    alone makes a link of 14 Hz ring by up to a thousandth of its movement that is not there.
+    A step between two samples is the mean of the one, more of it, and as much less in the sample before as gives it
+    the right time: the mean alone makes a link of 14 Hz ring by up to a thousandth of its movement that is not there.
+    Behind the step nothing turns back: a clamp that sticks would keep that.
     """
     # Rounded, so that a step at a sample is one in floating point, too.
     share = np.clip(np.round((t + period - start) / max(took, period), 6), 0.0, 1.0)
     if took <= period:
         more = 0.5 * share * (1.0 - share)
-        share -= more
-        share[1:] += more[:-1]
+        share += more
+        share[:-1] -= more[1:]
     return np.asarray(share)
 
 

@@ -81,17 +81,20 @@ class Plateau:
         return np.asarray(loads[(self.first + self.last) // 2])
 
 
-def plateaus(rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0) -> list[Plateau]:
+def plateaus(
+    rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0, *, noted: bool = False
+) -> list[Plateau]:
     """The times between changes of ``loads`` (n, 3), also between those that only the motion shows.
 
-    ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost. ``recording``: which one it is.
+    ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost. ``recording``: which one it is. ``noted``: only between
+    changes that were noted.
     """
     period = 1.0 / rig.converter.sample_rate_hz
     changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
     # A load that was applied slowly changes from sample to sample: what counts is its end.
     ends = changed[np.append(np.diff(changed) > 1, True)].tolist() if len(changed) else []
     dots = volts[:, DOTS] * rig.sensitivities.ravel()
-    unnoted = [round(t / period) for t in unnoted_steps(rig, dots, loads)]
+    unnoted = [] if noted else [round(t / period) for t in unnoted_steps(rig, dots, loads)]
     starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unnoted)])
     stops = np.append(np.union1d(changed, unnoted), len(loads))
     out, number = [], 0

@@ -95,16 +95,33 @@ def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search
 
 
 @pytest.mark.statistics
-def test_a_weight_that_sways_is_told_and_its_time_left_out() -> None:
+@pytest.mark.parametrize(('force', 'frequency'), [(1.0, 1.3), (2.0, 1.6)])
+def test_a_weight_that_sways_is_told_and_its_time_left_out(force: float, frequency: float) -> None:
+    """So much that its swings are taken for steps of a load that nobody noted, too."""
     acting = HUNG.copy()
     at = (NUMBER - 3 * DWELL) / 1000.0
-    acting[:, 0] += np.where((at > 0.0) & (at < 4.0), np.sin(2.0 * np.pi * 1.3 * at), 0.0)
+    acting[:, 0] += np.where((at > 0.0) & (at < 4.0), force * np.sin(2.0 * np.pi * frequency * at), 0.0)
     found = searched(read(acting), HUNG)
     assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 3')]
-    assert 'swayed at 1.3' in found.setup[0].fix
+    assert f'from 12.000 s to 16.000 s swayed at {frequency}' in found.setup[0].fix
     assert found.setup[0].value is None
-    assert found.setup[0].evidence == pytest.approx(1.0, rel=0.1)
+    assert found.setup[0].evidence == pytest.approx(force, rel=0.1)
     assert found.verdict == 'nothing_missing'
+
+
+@pytest.mark.statistics
+def test_a_clamp_that_sticks_is_found_beside_loads_that_were_noted_late() -> None:
+    """It keeps where the load was, so that a mended load must not turn back by a thousandth behind its step."""
+    sticks = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
+    noted = np.tile(LEVELS[0], (len(HUNG), 1))
+    for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
+        noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
+    found = searched(read(HUNG, **sticks), noted)
+    assert [f.name for f in found.setup] == ['load_time'] * 7
+    assert [(e.active.effect.name, e.active.values['axis']) for e in found.effects] == [('clamp_friction', 3)]
+    assert found.effects[0].active.values['width'] == pytest.approx(1.4e-5, rel=5e-3)
+    assert (found.verdict, found.unknown) == ('effects_found', ())
+    assert found.floors < 1.05
 
 
 @pytest.mark.statistics

@@ -110,6 +110,16 @@ def test_the_nearest_of_two_units_that_are_alike_is_named(factor: float, unit: s
     assert f'it is noted in {unit} instead' in findings[0].fix
 
 
+def test_units_that_are_alike_are_told_apart_where_the_movement_is_not_in_proportion() -> None:
+    """50 N at the end of a bar: what moves in proportion to the load is 1 % off, and the units are 2 % apart."""
+    loads = np.repeat([(0, 0, 0), (0, -50, -29.25), (0, 0, 0)], 2000, axis=0).astype(np.float64)
+    volts = np.asarray(RigSimulator(RIG, 1).step(loads).counts * RIG.converter.volts_per_count, dtype=np.float64)
+    for factor in (9.80665e-3, 1e-2):
+        noted = np.asarray(loads / (1.0, 1.0, factor), dtype=np.float64)
+        _, findings, _ = wire([Observation('x', RIG, volts, noted)], ())
+        assert [(f.where, f.value) for f in findings] == [('tz', factor)]
+
+
 def test_loads_in_grams_have_one_factor_for_forces_and_torque() -> None:
     _, findings, _ = wire([loaded(recorded(), *[1.0 / 9.80665e-3] * 3)], ())
     assert [(f.where, f.value) for f in findings] == [('fx fy', 9.80665e-3), ('tz', 9.80665e-3)]

@@ -228,3 +228,16 @@ def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
     # Four quarters of a sample later nothing acts in the second sample.
     assert later(4.0)[1] == pytest.approx([0.0, 20.0, 0.0])
     assert later(4.0)[2:] == pytest.approx(0.0)
+
+
+def test_a_step_between_two_samples_has_its_time_and_turns_back_before_it_not_behind() -> None:
+    """Half a sample later than sample 10: the sum over the samples is -1/2, the moment about sample 10 is 1/8."""
+    loads = np.where(np.arange(20)[:, None] < 10, 0.0, [[4.0, -8.0, 2.0]])
+    (later,) = shifts(MendedNote(1, (4.0, -8.0, 2.0), 0.01, 0.01, 0.0), loads, 1e-3)
+    for more in (2.0, -2.0):
+        changed = later(more) / [4.0, -8.0, 2.0]
+        assert changed.sum(axis=0) == pytest.approx(-0.25 * more)
+        about = np.arange(20) - 10.0 if more > 0.0 else np.arange(20) - 9.0
+        assert about @ changed == pytest.approx(0.125)
+        assert not changed[11:].any()
+        assert (loads + later(more))[11:] == pytest.approx(np.tile([4.0, -8.0, 2.0], (9, 1)))

@@ -35,6 +35,8 @@ PLATE = 10.0
 """And moves the plate: what no movement of the plate makes has so many times less energy."""
 SWAYS_M = 2e-6
 """And at least this, rms."""
+TONE = 0.25
+"""Half of that movement is as near as this to its strongest frequency."""
 FREE = 100.0
 """N or N m: standard deviation of a load that nobody knows."""
 TELLING = 4.0
@@ -76,6 +78,7 @@ def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequen
 def swaying(ws: Workspace, recording: int, difference: FloatArray, found: PlateauLoads) -> list[Swaying]:
     """Plateaus in which the link swings slowly, and only there; ``found``: the loads that ``difference`` asks for."""
     o = ws.observations[recording]
+    found = _not_cut(ws, recording, difference, found)
     beyond = across_plate(o.rig, difference)
     period = o.period * ws.fine[recording]
     per = np.diag(LinkStatics.from_rig(o.rig).compliance)
@@ -92,16 +95,44 @@ def swaying(ws: Workspace, recording: int, difference: FloatArray, found: Platea
         part = np.vstack((part, beyond[a:b]))
         part = np.where(there, part - part[:, there].mean(axis=1, keepdims=True), 0.0)
         power = np.abs(np.fft.rfft(part * np.hanning(b - a), axis=1)) ** 2 / (0.375 * (b - a) ** 2) * 2.0
-        f = np.fft.rfftfreq(b - a, period)
+        f: FloatArray = np.fft.rfftfreq(b - a, period).astype(np.float64)
         band = (f >= SLOWEST_HZ) & (f <= FASTEST_HZ)
         *moves, across = power[:, band].sum(axis=1).tolist()
         each = np.array(moves) if sum(moves) > PLATE * across else np.zeros(2)
         axis = int(np.argmax(each))
-        peak = float(f[band][np.argmax(power[axis, band])]) if band.any() else 0.0
+        peak = _strongest(f[band], power[axis, band])
+        # A step that nobody noted has no tone.
+        tone = float(power[axis, band & (np.abs(f - peak) <= TONE * peak)].sum())
+        if peak * (b - a) * period < 2.0 or tone < 0.5 * float(power[axis, band].sum()):
+            each = np.zeros(2)
         rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / per[axis]), peak))
     sizes = np.array([r[0] for r in rows])
     limit = max(SWAYS * float(np.median(sizes)), SWAYS_M) if len(sizes) >= FEWEST else np.inf
     return [Swaying(p, r[1], r[2]) for p, r in zip(found.plateaus, rows, strict=True) if r[0] > limit]
+
+
+def _strongest(f: FloatArray, power: FloatArray) -> float:
+    """Frequency at which ``power`` is largest, between those of ``f``: the top of a parabola through its logarithm."""
+    if not len(f) or not power.any():
+        return 0.0
+    k = min(max(int(np.argmax(power)), 1), len(f) - 2)
+    if k < 1:
+        return float(f[np.argmax(power)])
+    a, b, c = np.log(np.maximum(power[k - 1 : k + 2], 1e-300)).tolist()
+    bend = a - 2.0 * b + c
+    shift = 0.5 * (a - c) / bend if bend < 0.0 else 0.0
+    return float(f[k] + min(max(shift, -1.0), 1.0) * (f[1] - f[0]))
+
+
+def _not_cut(ws: Workspace, recording: int, difference: FloatArray, found: PlateauLoads) -> PlateauLoads:
+    """What swings seems to step, too: the time of a noted load is whole if steps cut it into too short pieces."""
+    o = ws.observations[recording]
+    listed = list[Plateau]()
+    for whole in plateaus(o.rig, o.volts, o.loads, recording, noted=True):
+        pieces = [p for p in found.plateaus if p.number == whole.number]
+        all_there = sum(p.last - p.first for p in pieces) >= whole.last - whole.first
+        listed += pieces if all_there else [whole]
+    return found if listed == [*found.plateaus] else levels(ws, recording, difference, listed)
 
 
 def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
