@@ -127,6 +127,7 @@ BENCH_BEGIN = mkdir -p build/bench
 BENCH_PAGE = @echo 'make bench BENCH=--full: longer and more often, into docs/performance.md'
 BENCH_LIVE ?= --seconds 12 --settle 2 --starts 2
 BENCH_LIMITS ?= --minutes 2 --seconds 20 --times 3
+BENCH_EACH ?= --seconds 10
 BENCH_RIGS ?= --most 32 --seconds 4
 BENCH_CPU ?= --no-native --seconds 8 --results build/bench/cpu.json
 BENCH_SOLVERS ?= --blocks 200000
@@ -136,6 +137,7 @@ bench: $(READY)
 	$(BENCH_BEGIN)
 	$(BIN)/python -m bench.live $(BENCH_LIVE) $(INTO)
 	$(BIN)/python -m bench.limits $(BENCH_LIMITS) $(INTO)
+	$(BIN)/python -m bench.each_sample $(BENCH_EACH) $(INTO)
 	$(BIN)/python -m bench.rigs $(BENCH_RIGS) $(INTO)
 	$(BIN)/python -m bench.cpu $(BENCH_CPU)
 	$(BIN)/python bench/solvers.py $(BENCH_SOLVERS)

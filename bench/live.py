@@ -215,9 +215,9 @@ def parts(seconds: float, times: int) -> list[float]:
 
 
 class Device:
-    """Writes samples to a port by the clock; notes when the last byte of each block was written."""
+    """Writes samples to a port by the clock; ``written``: when it began to write the last byte of each block, ns."""
 
-    def __init__(self) -> None:
+    def __init__(self, block: int = 20) -> None:
         from psd_deflection.devices.contract_frames import SimulatedFrames
         from psd_deflection.devices.pseudo_terminal import PseudoTerminal
         from psd_deflection.devices.rig_feed import RigFeed
@@ -225,6 +225,7 @@ class Device:
 
         self.port = PseudoTerminal()
         self.device = SimulatedFrames(RigFeed(load_rig(), lambda _, n: np.zeros((n, 3))))
+        self._block = block
         self.written: list[int] = []
         self.stop = threading.Event()
         self.thread = threading.Thread(target=self._run, daemon=True)
@@ -239,12 +240,13 @@ class Device:
                 asked = os.read(self.port.master, 4096)
             except OSError:
                 asked = b''
+            now = time.monotonic_ns()
             try:
                 os.write(self.port.master, self.device.receive(asked, 0) + stream)
             except OSError:
                 continue
-            if before // 20 != self.device.taken // 20:
-                self.written.append(time.monotonic_ns())
+            ended = self.device.taken // self._block - before // self._block
+            self.written += [now] * ended
 
 
 def child(role: str, what: str = '', seconds: float = 0.0) -> subprocess.Popen[str]:
