@@ -45,7 +45,7 @@ from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect,
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, mistakes
 from psd_deflection.studies.discover.setup.hung import levels, times, told
-from psd_deflection.studies.discover.setup.redundant import PART, STAGES, fourth_reading, visible
+from psd_deflection.studies.discover.setup.redundant import PART, STAGES, excess, fourth_reading, visible
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
 from psd_deflection.studies.loads.plateaus import all_free
@@ -165,11 +165,11 @@ class RecordedRig(Machine):
         self, ws: Workspace, found: list[tuple[Candidate, Columns]], residual: FloatArray, fit: Fit | None
     ) -> list[tuple[Candidate, Columns]]:
         """Without detectors and beams that would show in the fourth reading if they made much of ``residual`` (D,)."""
-        excess = ws.loss(residual) - ws.size
         reading = self.recorded.fourth if fit is None else fourth_reading(ws, residual)
-        if reading is None or not reading.acquits or excess < (FAR - 1.0) * ws.size:
+        beyond, throughout = excess(ws, residual)
+        if reading is None or not reading.acquits or throughout < FAR - 1.0:
             return found
-        least = 2.0 * reading.allowed / (PART * excess)
+        least = 2.0 * reading.allowed / (PART * beyond)
         # Mistakes of the set-up touch every channel; those of a detector are steps that the readings themselves show.
         return [
             (c, columns)

@@ -39,6 +39,8 @@ STANDS_IN = 0.2
 """An effect beside others explains this share of what they leave at least, in chi-square beyond noise."""
 NEAR = 0.1
 """Unless it leaves less than this share of the noise itself."""
+MOST_CLOSED = 0.5
+"""After a swap that leaves less than this share of chi-square beyond noise, effects are added once more."""
 ROUNDS = 3
 """How often effects are added: again only if the noise beside those found is another than before."""
 TRIALS = 7
@@ -237,7 +239,21 @@ class Search:
         """What :meth:`run` gives beside itself; it changes this search."""
         scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
-        current = self.mistake(null, scores)
+        null, grown = self._settled(null, self.mistake(null, scores))
+        current, others = self.swap(null, grown)
+        if self._much_closer(grown, current):
+            # Beside the wrong effect nothing held that holds beside the right one; what that cost is not counted.
+            self._begun = self.workspace.simulations
+            self.screen = self._make_screen(self.workspace, current)
+            null, more = self._settled(null, current)
+            if len(more.effects) > len(current.effects):
+                current, others = self.swap(null, more)
+        p, delta_bic, delta_chi2 = self.weigh(null, current)
+        limits = self._limits(current)
+        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace, limits)
+
+    def _settled(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
+        """The fit of no effect, and ``current`` with all that passes, beside the noise that is estimated then."""
         for _ in range(ROUNDS):
             null, current = self._grown(null, current)
             current = self._drop(null, current)
@@ -249,10 +265,13 @@ class Search:
                 break
             # Noise that was estimated beside a large discrepancy may have hidden what is small.
             current = calmer
-        current, others = self.swap(null, current)
-        p, delta_bic, delta_chi2 = self.weigh(null, current)
-        limits = self._limits(current)
-        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace, limits)
+        return null, current
+
+    def _much_closer(self, before: Fit, current: Fit) -> bool:
+        """Whether a swap closed most of what was open, and left something."""
+        size = self.workspace.size
+        left = current.chi2 - size
+        return left < MOST_CLOSED * (before.chi2 - size) and left > NEAR * size
 
     def _limits(self, current: Fit) -> tuple[Limit, ...]:
         """The limit that kept further effects out, with what lies beyond it."""

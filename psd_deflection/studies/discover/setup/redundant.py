@@ -67,6 +67,17 @@ def fourth_reading(ws: Workspace, residual: FloatArray) -> FourthReading:
     return FourthReading(float(rest @ rest), len(rest))
 
 
+def excess(ws: Workspace, residual: FloatArray) -> tuple[float, float]:
+    """Chi-square beyond noise of the dots of a whitened ``residual`` (D,), and that of each value, as ``CLIP`` has it.
+
+    The second is what the fourth reading could see: a dot that is far off for some moments has much of the first alone.
+    """
+    there = [count[DOTS] > 0.0 for count in ws.count]
+    dots = np.concatenate([part[DOTS][here] for part, here in zip(ws.split(residual), there, strict=True)])
+    clipped = np.clip(dots, -CLIP, CLIP)
+    return float(dots @ dots) - len(dots), float(clipped @ clipped) / len(dots) - 1.0
+
+
 def solved(ws: Workspace, difference: Sequence[FloatArray]) -> FloatArray:
     """The whitened residual (D,) of the poses that the readings say; ``difference``: of the simulated ones."""
     moves = [np.zeros((3, d.shape[1])) for d in difference]
