@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import itertools
 import math
+from typing import cast
 
 import numpy as np
 import pytest
 
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import RigSimulator
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.calibrate.from_recordings import as_acted
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.loads.noted_times import ALIKE_S, MendedLoads, MendedNote, mend_loads, ordinal, shifts
+from psd_deflection.studies.loads import noted_times
+from psd_deflection.studies.loads.noted_times import (
+    ALIKE_S,
+    LEAST_SHARE,
+    MendedLoads,
+    MendedNote,
+    mend_loads,
+    ordinal,
+    shifts,
+    unnoted_steps,
+)
 
 RIG = load_rig()
 LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, 0, 0)], float)
@@ -228,3 +240,504 @@ def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
     # Four quarters of a sample later nothing acts in the second sample.
     assert later(4.0)[1] == pytest.approx([0.0, 20.0, 0.0])
     assert later(4.0)[2:] == pytest.approx(0.0)
+
+
+# ---- the pieces, by hand
+
+
+def note(noted: float, hung: float, took: float = 0.0, *, settled_only: bool = False, number: int = 3) -> MendedNote:
+    return MendedNote(number, (1.5, -2.0, 0.25), noted, hung, took, settled_only)
+
+
+@pytest.mark.parametrize(
+    ('one', 'name', 'value', 'size', 'wrong'),
+    [
+        (note(3.0, 1.0), 'load_time', 2.0, 2.0, True),
+        (note(1.0, 3.0), 'load_time', -2.0, 2.0, True),
+        (note(3.0, 1.0, 1.75), 'load_time', 2.0, 2.0, True),
+        # As late as it took: noted when it was done.
+        (note(3.0, 1.0, 2.0), 'load_ramp', 2.0, 2.0, True),
+        (note(1.0, 3.0, 2.0), 'load_ramp', 2.0, 2.0, True),
+        (note(1.0, 3.0, 2.5), 'load_ramp', 2.5, 2.0, True),
+        (note(1.0, 1.0, 0.5), 'load_ramp', 0.5, 0.0, True),
+        # Two milliseconds are no delay.
+        (note(ALIKE_S, 0.0), 'load_ramp', 0.0, ALIKE_S, False),
+        (note(0.0, ALIKE_S), 'load_ramp', 0.0, ALIKE_S, False),
+        (note(0.0021, 0.0), 'load_time', 0.0021, 0.0021, True),
+    ],
+)
+def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_took(
+    one: MendedNote, name: str, value: float, size: float, wrong: bool
+) -> None:
+    assert (one.name, one.value, one.size, one.wrong) == (name, value, size, wrong)
+    assert one.where == 'load 3'
+
+
+@pytest.mark.parametrize(
+    ('one', 'words'),
+    [
+        (
+            note(3.0, 1.0, 1.75),
+            'was noted 2.000 s late and applied over 1.8 s: note it 1.000 s after the first sample, '
+            'as a ramp until 2.750 s, not 3.000 s',
+        ),
+        (note(1.0, 1.125), 'was noted 0.125 s early: note it 1.125 s after the first sample, not 1.000 s'),
+        (
+            note(1.0, 1.0, 0.5, settled_only=True),
+            'was applied over 0.5 s: note it 1.000 s after the first sample, as a ramp until 1.500 s, not 1.000 s; '
+            'here only the link at rest under it is used',
+        ),
+    ],
+)
+def test_a_wrong_time_is_told_in_words_and_so_is_what_to_do(one: MendedNote, words: str) -> None:
+    assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
+
+
+def test_numbers_up_to_a_thousand_have_the_ending_of_their_last_word() -> None:
+    def ending(number: int) -> str:
+        # eleventh, twelfth, thirteenth ... nineteenth
+        teens = 10 < number % 100 < 20
+        return 'th' if teens else ['th', 'st', 'nd', 'rd', *['th'] * 6][int(str(number)[-1])]
+
+    assert [ordinal(n) for n in range(1, 1001)] == [f'{n}{ending(n)}' for n in range(1, 1001)]
+
+
+@pytest.mark.parametrize(
+    ('late', 'alike'),
+    [
+        ([0.25, 0.25, 0.25], True),
+        ([0.25, 0.375, 0.125], True),
+        ([0.25, 0.376, 0.125], False),
+        ([0.25, 0.374, 0.124], False),
+        ([-0.25, -0.375, -0.125], True),
+        ([0.9, 0.9, 0.9], True),
+        ([0.901, 0.901, 0.9], False),
+        ([-0.901, -0.901, -0.9], False),
+        # The middle one counts, not the mean.
+        ([0.25, 0.25, 0.0, 0.25], False),
+    ],
+)
+def test_delays_are_alike_within_so_much_of_the_middle_one_and_up_to_0_9_seconds(
+    late: list[float], alike: bool
+) -> None:
+    assert noted_times._alike(np.array(late), 0.125) is alike
+
+
+def test_the_dots_move_by_what_a_cantilever_and_a_shaft_do() -> None:
+    rig = load_rig(overrides={'psd_1.zero': [0.002, -0.01], 'psd_2.zero': [0.01, 0.004]})
+    link = rig.link
+    fourth = link.outer_radius**4 - link.inner_radius**4
+    bend = link.length**3 / (3.0 * link.youngs_modulus * math.pi / 4.0 * fourth)
+    twist = link.length / (link.shear_modulus * math.pi / 2.0 * fourth)
+    beams = ((0.002, 0.06), (-0.09, 0.004))
+    loads = [(2.0, 0.0, 0.0), (0.0, -3.0, 0.0), (1.0, 2.0, -4.0)]
+    wanted = []
+    for fx, fy, tz in loads:
+        x, y, turn = bend * fx, bend * fy, twist * tz
+        moved = [(-x + turn * ly, -y - turn * lx) for lx, ly in beams]
+        wanted.append(math.sqrt(sum(a * a + b * b for a, b in moved)))
+    assert noted_times._expected(rig, np.array(loads)) == pytest.approx(wanted, rel=1e-9)
+
+
+# ---- steps of the dots
+
+
+def stepped(n: int, steps: dict[int, float], noise: float = 0.0, seed: int = 0) -> FloatArray:
+    """Dots (n, 4) whose x1 steps by so much at so many samples."""
+    dots = noise * np.random.default_rng(seed).normal(size=(n, 4))
+    for at, size in steps.items():
+        dots[at:, 0] += size
+    return dots
+
+
+def sizes_of(dots: FloatArray, width: int) -> dict[int, float]:
+    """By how much the mean of ``width`` samples from each on differs from that before, with more than a quarter there."""
+    out = {}
+    for at in range(width, len(dots) - width):
+        before, after = (part[np.isfinite(part).all(axis=1)] for part in (dots[at - width : at], dots[at : at + width]))
+        enough = min(len(before), len(after)) > width // 4
+        out[at] = float(np.linalg.norm(after.mean(axis=0) - before.mean(axis=0))) if enough else 0.0
+    return out
+
+
+def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
+    # The difference is a triangle from 90 to 110: above 3 % of it from 91 to 109.
+    (step,) = noted_times._steps(stepped(200, {100: 2.0}), 10)
+    assert (step.at, step.size, step.first, step.last) == (pytest.approx(100.0), pytest.approx(2.0), 91, 110)
+    # Of two rows of three the middle is between them.
+    (slow,) = noted_times._steps(stepped(200, {100: 1.0, 101: 1.0}), 10)
+    assert slow.at == pytest.approx(100.5)
+    # Four widths are the least, even if most of them is lost: more than two of ten must be there.
+    for n, told in ((40, 1), (39, 0)):
+        short = stepped(n, {20: 1.0})
+        short[:15] = short[26:] = np.nan
+        assert len(noted_times._steps(short, 10)) == told
+    assert noted_times._steps(np.zeros((200, 4)), 10) == []
+
+
+def test_a_step_stands_out_ten_times_of_what_is_there_without_one() -> None:
+    noise = stepped(1000, {}, 1.0)
+    usual = float(np.median([*sizes_of(noise, 20).values()]))
+    assert len(noted_times._steps(stepped(1000, {500: 14.0 * usual}, 1.0), 20)) == 1
+    assert noted_times._steps(stepped(1000, {500: 9.0 * usual}, 1.0), 20) == []
+
+
+@pytest.mark.parametrize(('share', 'seen'), [(0.0395, 1), (0.0400, 2)])
+def test_a_stretch_above_three_per_cent_of_the_largest_is_half_a_width_long(share: float, seen: int) -> None:
+    # A triangle of 102 to either side: 25 on either side of the middle one are half of it, 51, and 24 are less.
+    assert len(noted_times._steps(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
+
+
+def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample() -> None:
+    width = 16
+    dots = stepped(600, {100: 1.0, 110: 0.5, 300: -2.0, 470: 0.3}, 0.01, 3)
+    dots[np.random.default_rng(4).random(600) < 0.3] = np.nan
+    dots[296:304] = np.nan
+    dots[470 - 2 * width : 470, 1] = np.nan
+    sizes = sizes_of(dots, width)
+    least = max(10.0 * float(np.median([*sizes.values()])), 0.03 * max(sizes.values()))
+    stretches: list[list[int]] = []
+    for at, size in sizes.items():
+        if size > least:
+            if not stretches or stretches[-1][-1] != at - 1:
+                stretches.append([])
+            stretches[-1].append(at)
+    wanted = []
+    for stretch in stretches:
+        if len(stretch) < width // 2:
+            continue
+        half = 0.5 * max(sizes[at] for at in stretch)
+        over = {at: sizes[at] - half for at in stretch if sizes[at] > half}
+        first, last = stretch[0], stretch[-1] + 1
+        parts = dots[last : last + width], dots[max(first - width, 0) : first]
+        after, before = (p[np.isfinite(p).all(axis=1)].mean(axis=0) for p in parts)
+        middle = sum(at * w for at, w in over.items()) / sum(over.values())
+        wanted.append((middle, float(np.linalg.norm(after - before)), first, last))
+    found = [(s.at, s.size, s.first, s.last) for s in noted_times._steps(dots, width)]
+    assert len(found) >= 2
+    assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-9)
+
+
+def test_half_a_window_that_is_lost_still_has_a_mean_and_three_quarters_have_none() -> None:
+    # Of sixteen before the step more than four must be there.
+    for lost, seen in ((11, 100), (12, None)):
+        dots = stepped(200, {100: 1.0})
+        dots[100 - lost : 100] = np.nan
+        dots[100 + 16 - 11 : 140] = np.nan
+        found = noted_times._steps(dots, 16)
+        sizes = sizes_of(dots, 16)
+        assert (sizes[100] > 0.0) == (seen is not None)
+        assert bool(found) == any(size > 0.03 for size in sizes.values())
+
+
+def test_a_difference_is_of_the_means_of_whole_samples_and_nothing_has_the_mean_0() -> None:
+    dots = np.arange(24.0).reshape(6, 4)
+    dots[4, 2] = np.nan
+    assert noted_times._difference(dots, slice(3, 6), slice(0, 2)) == pytest.approx([14.0] * 4)
+    assert noted_times._difference(dots, slice(4, 5), slice(0, 2)) == pytest.approx([-2.0, -3.0, -4.0, -5.0])
+
+
+# ---- which note belongs to which step
+
+
+def as_steps(*places: tuple[float, float]) -> list[noted_times._Step]:
+    return [noted_times._Step(at, size, round(at) - 5, round(at) + 5) for at, size in places]
+
+
+def cheapest(changes: IntArray, sizes: FloatArray, steps: list[noted_times._Step], period: float) -> list[tuple[int, int]]:
+    """Of all ways to pair notes and steps in their order that of the least cost, one by one."""
+    seen = [i for i in range(len(changes)) if sizes[i] > 0.03 * max(sizes)]
+    factor = sum(s.size for s in steps) / sum(sizes[i] for i in seen)
+    best: tuple[float, list[tuple[int, int]]] = (math.inf, [])
+    for count in range(min(len(seen), len(steps)) + 1):
+        for some in itertools.combinations(seen, count):
+            for others in itertools.combinations(range(len(steps)), count):
+                pairs = list(zip(some, others, strict=True))
+                cost = 9.0 * (len(seen) - count) + 4.0 * (len(steps) - count)
+                for i, j in pairs:
+                    away = abs(steps[j].at - changes[i]) * period
+                    unlike = 2.0 * math.log(max(steps[j].size, 1e-12) / factor / sizes[i])
+                    cost += away / 5.0 + min(unlike**2, 8.0) if away <= 30.0 else math.inf
+                if cost < best[0]:
+                    best = cost, pairs
+    return best[1]
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_notes_and_steps_are_paired_at_the_least_cost_of_all_ways(seed: int) -> None:
+    chance = np.random.default_rng(seed)
+    changes = np.sort(chance.choice(6000, 5, replace=False))
+    sizes = 1e-4 * np.exp(chance.normal(size=5))
+    sizes[chance.integers(5)] *= 0.01
+    places = np.sort(changes[:4] + chance.normal(size=4) * chance.choice([20.0, 300.0, 1500.0]))
+    steps = as_steps(*zip(places.tolist(), (2e-4 * np.exp(chance.normal(size=4))).tolist(), strict=True))
+    assert noted_times._matched(changes, sizes, steps, 0.01) == cheapest(changes, sizes, steps, 0.01)
+
+
+def test_a_note_without_a_step_near_it_has_none() -> None:
+    changes = np.array([1000, 9000])
+    # Thirty seconds away is the farthest.
+    for away, pairs in ((2999.0, [(0, 0)]), (3000.0, [(0, 0)]), (3001.0, [])):
+        assert noted_times._matched(changes[:1], np.array([1e-4]), as_steps((1000.0 + away, 1e-4)), 0.01) == pairs
+    # What moves the dots by no more than 3 % of the largest does not count.
+    sizes = np.array([1.0, LEAST_SHARE])
+    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.04)), 0.01) == [(0, 0)]
+    sizes[1] = 0.04
+    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.04)), 0.01) == [(0, 0), (1, 1)]
+    assert noted_times._matched(changes, np.zeros(2), as_steps((1000.0, 1.0)), 0.01) == []
+    assert noted_times._matched(changes, sizes, [], 0.01) == []
+    # A step of no size is paired with the one that it is nearest to.
+    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.0)), 0.01) == [(0, 0), (1, 1)]
+
+
+# ---- loads between samples
+
+
+def test_a_step_between_samples_keeps_its_time_and_a_ramp_its_share() -> None:
+    t = np.arange(8.0)
+    assert noted_times._profile(t, 3.0, 0.0, 1.0) == pytest.approx([0, 0, 0, 1, 1, 1, 1, 1])
+    # A quarter after 3: three quarters of that sample, of which 0.5 * 3/4 * 1/4 come one later.
+    more = 0.5 * 0.75 * 0.25
+    assert noted_times._profile(t, 3.25, 0.0, 1.0) == pytest.approx([0, 0, 0, 0.75 - more, 1 + more, 1, 1, 1])
+    assert noted_times._profile(t, 3.25, 1.0, 1.0) == pytest.approx([0, 0, 0, 0.75 - more, 1 + more, 1, 1, 1])
+    # A ramp from 2 to 4.5, at the end of each sample.
+    assert noted_times._profile(t, 2.0, 2.5, 1.0) == pytest.approx([0, 0, 0.4, 0.8, 1, 1, 1, 1])
+    # A millionth of a sample is none.
+    assert noted_times._profile(t, 3.0000004, 0.0, 1.0).tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
+    assert noted_times._profile(t, 3.000001, 0.0, 1.0)[3] < 1.0
+    assert noted_times._profile(t, 3.00001, 0.0, 1.0)[3] == pytest.approx(1 - 1.5e-5, abs=1e-8)
+
+
+def test_later_and_slower_shift_what_the_load_changed_by() -> None:
+    t = np.arange(40.0)
+    loads = np.column_stack((t, -2.0 * t, t**2))
+    # Applied from 10 to 14: before is the sample before 9, after is the second one beyond 14.
+    step = loads[16] - loads[8]
+    ramp = note(12.0, 10.0, 4.0)
+    later, slower = shifts(ramp, loads, 1.0)
+    share = np.clip((t + 1.0 - 10.0) / 4.0, 0.0, 1.0)
+    assert later(2.0) == pytest.approx(np.outer(np.clip((t + 1.0 - 10.5) / 4.0, 0.0, 1.0) - share, step), abs=1e-3)
+    assert slower(4.0) == pytest.approx(np.outer(np.clip((t + 1.0 - 10.0) / 5.0, 0.0, 1.0) - share, step), abs=1e-3)
+    # Faster than at once it cannot be.
+    assert slower(-100.0) == pytest.approx(np.outer((t >= 10.0) - share, step), abs=1e-3)
+    assert later(0.0) == pytest.approx(0.0)
+    assert len(shifts(note(12.0, 10.0), loads, 1.0)) == 1
+    # At the begin and at the end of a recording there is no more.
+    first, _ = shifts(note(0.0, 0.0, 1.5), loads, 1.0)
+    assert first(4.0)[0] == pytest.approx(-(loads[4] - loads[0]) / 1.5, rel=1e-5)
+    last, _ = shifts(note(38.0, 38.0, 1.5), loads, 1.0)
+    assert last(4.0)[38] == pytest.approx(-(loads[39] - loads[36]) / 1.5, rel=1e-5)
+
+
+def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_are_told() -> None:
+    loads = np.zeros((30, 3))
+    loads[5:] = (1.0, 0.0, 0.0)
+    loads[12:] = (1.0, -2.0, 0.0)
+    loads[20:] = (0.0, 0.0, 3.0)
+    acted, notes = noted_times._as_acted(loads, np.array([5, 12, 20]), {0: (0.3, 0.0), 2: (1.8, 0.2)}, 0.1)
+    wanted = np.zeros((30, 3))
+    wanted[3:] += (1.0, 0.0, 0.0)
+    wanted[12:] += (0.0, -2.0, 0.0)
+    wanted[18:] += 0.5 * np.array((-1.0, 2.0, 3.0))
+    wanted[19:] += 0.5 * np.array((-1.0, 2.0, 3.0))
+    assert acted == pytest.approx(wanted, abs=1e-5)
+    assert [(n.number, n.load, n.noted, n.hung, n.took) for n in notes] == [
+        (1, (1.0, 0.0, 0.0), pytest.approx(0.5), 0.3, 0.0),
+        (3, (0.0, 0.0, 3.0), pytest.approx(2.0), 1.8, 0.2),
+    ]
+    # What took a tenth of a second was no ramp.
+    (one,) = noted_times._as_acted(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
+    assert one.took == 0.0
+    begun = loads + (7.0, 8.0, 9.0)
+    assert noted_times._as_acted(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)
+
+
+# ---- the fit of one time
+
+
+def ringing(t: FloatArray) -> FloatArray:
+    """Both modes, ringing since long before."""
+    out = np.zeros_like(t)
+    for frequency, size in ((14.0, 1.0), (21.0, 0.7)):
+        w = 2.0 * math.pi * frequency
+        out += size * np.exp(-0.02 * w * t) * np.cos(w * math.sqrt(1.0 - 0.02**2) * t + 0.3)
+    return out
+
+
+def moved_by(start: float, took: float, n: int = 6000) -> FloatArray:
+    """Dots (n, 4), m, that a load from ``start`` on moves, beside drift and the ringing of an older one."""
+    t = np.arange(n) * 1e-3
+    share = np.clip((t + 1e-3 - start) / max(took, 1e-3), 0.0, 1.0)
+    bend, twist = (Filter(mode_coefficients(f, 0.02, 1e-3))(share) for f in (14.0, 21.0))
+    moved = np.column_stack((bend, 0.1 * bend + 0.2 * twist, bend + 0.3 * twist, -0.2 * bend))
+    beside = ringing(t)[:, None] * (3.0, 2.0, -1.0, 2.0) + t[:, None] * (0.1, -0.2, 0.0, 0.3) + (1.0, 2.0, 3.0, 4.0)
+    return np.asarray(1e-4 * (moved + beside))
+
+
+class Looked:
+    """Dots that note which of them are looked at."""
+
+    def __init__(self, dots: FloatArray) -> None:
+        self.dots, self.parts = dots, list[slice]()
+
+    def __len__(self) -> int:
+        return len(self.dots)
+
+    def __getitem__(self, part: slice) -> FloatArray:
+        self.parts.append(part)
+        return self.dots[part]
+
+
+@pytest.mark.parametrize(
+    ('start', 'took', 'middle'),
+    [(3.0, 0.0, 3.0), (3.0, 0.0, 3.14), (3.0, 0.0, 2.86), (3.0, 0.2, 3.1), (3.0, 2.0, 4.0)],
+)
+def test_one_time_is_fitted_beside_drift_and_the_ringing_of_before(start: float, took: float, middle: float) -> None:
+    step = noted_times._Step(1000.0 * middle, 1e-4, round(1000.0 * start) - 200, round(1000.0 * (start + took)) + 200)
+    found = noted_times._fitted(RIG, moved_by(start, took), step, (2000.0, 6000.0), 1e-3)
+    assert found == pytest.approx((start, took), abs=1e-3 if took else 2e-5)
+
+
+@pytest.mark.parametrize(
+    ('between', 'window'),
+    [
+        # A second before the step and two after it,
+        ((0.0, 9000.0), (3900, 7100)),
+        # but not nearer than a tenth of a second to the steps before and after,
+        ((4000.4, 6000.6), (4101, 5900)),
+        # and the stretch of the step itself in any case.
+        ((4950.0, 5050.0), (4900, 5100)),
+    ],
+)
+def test_a_time_is_fitted_to_a_second_before_and_two_after_without_the_neighbours(
+    between: tuple[float, float], window: tuple[int, int]
+) -> None:
+    looked = Looked(moved_by(5.0, 0.0, 9000))
+    step = noted_times._Step(5000.0, 1e-4, 4900, 5100)
+    noted_times._fitted(RIG, cast(FloatArray, looked), step, between, 1e-3)
+    assert {(part.start, part.stop) for part in looked.parts} == {window}
+
+
+def test_a_time_is_fitted_to_no_more_than_there_is() -> None:
+    looked = Looked(moved_by(0.5, 0.0, 1500))
+    step = noted_times._Step(500.0, 1e-4, 400, 600)
+    found = noted_times._fitted(RIG, cast(FloatArray, looked), step, (-2000.0, 9000.0), 1e-3)
+    assert {(part.start, part.stop) for part in looked.parts} == {(0, 1500)}
+    assert found[0] == pytest.approx(0.5, abs=1e-4)
+
+
+def test_the_least_of_a_valley_is_found_from_the_best_start() -> None:
+    def valley(x: FloatArray) -> float:
+        return float((x[0] - 1.23) ** 2 + 4.0 * (x[1] - 0.61) ** 2 + 2.0)
+
+    least, (at, took) = noted_times._least(valley, [(0.0, 0.3), (1.2, 0.6), (5.0, 1.0)], 0.05)
+    assert (least, at, took) == pytest.approx((2.0, 1.23, 0.61), abs=1e-3)
+    # Without a duration it keeps none, and looks six reaches about.
+    least, (at, took) = noted_times._least(valley, [(0.0, 0.0), (1.2, 0.0), (5.0, 0.0)], 0.01)
+    assert (at, took) == (pytest.approx(1.23, abs=2e-5), 0.0)
+    assert least == pytest.approx(2.0 + 4.0 * 0.61**2)
+    for begun, end in ((1.1, 1.16), (1.4, 1.34)):
+        assert noted_times._least(valley, [(begun, 0.0)], 0.01)[1][0] == pytest.approx(end, abs=5e-5)
+
+
+# ---- what is left
+
+
+def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
+    chance = np.random.default_rng(5)
+    loads = np.zeros((1010, 3))
+    loads[200:, 0], loads[500:, 1], loads[700:, 2] = 3.0, -20.0, 8.0
+    link = RIG.link
+    columns = [np.ones(1010), np.arange(1010.0)]
+    for k, frequency in enumerate((14.0, 14.0, 21.0)):
+        columns.append(Filter(mode_coefficients(frequency, 0.02, 1e-3))(loads[:, k]))
+    design = np.column_stack(columns)
+    dots = 1e-4 * design @ chance.normal(size=(5, 4)) * (1.0, 1e-3, 1.0, 1.0) + 1e-6 * chance.normal(size=(1010, 4))
+    dots[chance.random(1010) < 0.1] = np.nan
+    dots[400:420] = np.nan
+    there = np.isfinite(dots).all(axis=1)
+    rest = np.where(there[:, None], dots - design @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0], np.nan)
+    left, means = noted_times._left(RIG, dots, loads)
+    assert link.length == 0.585
+    assert left == pytest.approx(float(np.nansum(rest**2)), rel=1e-6)
+    assert means.shape == dots.shape
+    for first in range(0, 1010, 20):
+        part = rest[first : first + 20]
+        wanted = np.nanmean(part, axis=0) if np.isfinite(part).any() else np.full(4, np.nan)
+        assert means[first : first + 20] == pytest.approx(np.tile(wanted, (len(part), 1)), rel=1e-4, nan_ok=True)
+
+
+def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
+    t = np.arange(8000) * 1e-3
+    rig = load_rig(overrides={'dynamics.torsion_frequency': 10.0, 'dynamics.torsion_damping_ratio': 0.05})
+    # 1 / (2 pi f ratio): 0.568 s of 14 Hz at 0.02, 0.318 s of 10 Hz at 0.05.
+    wanted = 5.0 / (2.0 * math.pi * 14.0 * 0.02)
+    for took in (0.0, 0.7):
+        moving = np.flatnonzero(noted_times._moving(rig, note(3.0, 2.0, took), t))
+        assert moving[0] == 1980
+        assert moving[-1] == math.floor(1000.0 * (2.0 + took + wanted))
+        assert len(moving) == moving[-1] - moving[0] + 1
+    # Without damping of a thousandth or more it would never end.
+    free = load_rig(overrides={'dynamics.torsion_frequency': 200.0, 'dynamics.torsion_damping_ratio': 0.0})
+    assert np.flatnonzero(noted_times._moving(free, note(3.0, 2.0), t))[-1] == math.floor(2000.0 + 5e6 / (400.0 * math.pi))
+
+
+def rest_of(sizes: list[float], block: int = 4) -> FloatArray:
+    """Blocks whose four dots are each of these sizes."""
+    return np.repeat(np.outer(sizes, np.ones(4)), block, axis=0)
+
+
+def test_ringing_is_rough_beyond_three_times_the_noise() -> None:
+    # Neighbours of quiet blocks differ by 1 of each of four dots: half of the square, of four, is the noise, 2.
+    quiet = [0.0, 1.0] * 20
+    rings = np.zeros(4 * 46, dtype=bool)
+    rings[-24:] = True
+    # Six that are s off their mean, of four dots: 4 s^2, above 9 * 2 if s is above 2.1.
+    for size, rough in ((2.1, False), (2.14, True)):
+        rest = rest_of([*quiet, *[size, -size] * 3])
+        assert noted_times._rough(rest, rings, 4) is rough
+        # About their own mean.
+        rest[-24:] += 50.0
+        assert noted_times._rough(rest, rings, 4) is rough
+    # A lost block counts as none, and of three nothing is told.
+    rest = rest_of([*quiet, *[5.0, -5.0] * 3])
+    rest[-8:] = np.nan
+    assert noted_times._rough(rest, rings, 4)
+    rest[-12:, 2] = np.nan
+    assert not noted_times._rough(rest, rings, 4)
+
+
+def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_rough() -> None:
+    loads, count = np.zeros((6000, 3)), 6000
+    quiet = np.repeat(np.random.default_rng(1).normal(size=(300, 4)), 20, axis=0)
+    rest = quiet.copy()
+    rest[2500:4000] += 20.0 * np.sin(np.arange(1500) / 40.0)[:, None]
+    slow, sudden = note(2.0, 2.0, 0.5), note(2.5, 2.5)
+    found = noted_times._without_rough_motion(RIG, loads, [slow, sudden], rest)
+    assert found.loads is loads
+    assert found.notes == (note(2.0, 2.0, 0.5, settled_only=True), sudden)
+    ends = 2.5 + 5.0 / (2.0 * math.pi * 14.0 * 0.02)
+    assert np.flatnonzero(found.unused).tolist() == list(range(1980, math.floor(1000.0 * ends) + 1))
+    # While it was applied it counts as nothing.
+    rest = quiet.copy()
+    rest[1000:2500] += 100.0 * np.sin(np.arange(1500) / 40.0)[:, None]
+    found = noted_times._without_rough_motion(RIG, loads, [slow], rest)
+    assert (found.notes, found.unused.sum(), len(found.unused)) == ((slow,), 0, count)
+
+
+# ---- when nothing is looked for
+
+
+def test_changes_within_a_quarter_of_a_second_are_a_sweep() -> None:
+    dots = QUIET[: 3 * DWELL, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity
+    for apart, told in ((249, 0), (250, 1)):
+        loads = np.zeros((3 * DWELL, 3))
+        loads[2 * DWELL :] = (0.0, -50.0, 0.0)
+        loads[2 * DWELL + apart :] = (0.0, -51.0, 0.0)
+        # The step at 5 s has no note.
+        assert len(unnoted_steps(RIG, dots, loads)) == told
+    # A ramp is one change: it ends once.
+    ramp = np.zeros((3 * DWELL, 3))
+    ramp[2 * DWELL :, 1] = -50.0 * np.clip((np.arange(DWELL) + 1.0) / 30.0, 0.0, 1.0)
+    assert unnoted_steps(RIG, dots, ramp) == pytest.approx([5.0], abs=2e-3)
+    assert unnoted_steps(RIG, dots, np.zeros((3 * DWELL, 3))) == pytest.approx([5.0, 10.0], abs=2e-3)
