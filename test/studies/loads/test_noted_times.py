@@ -24,6 +24,7 @@ from psd_deflection.studies.loads.noted_times import (
     LEAST_SHARE,
     MendedLoads,
     MendedNote,
+    last_step,
     mend_loads,
     ordinal,
     shifts,
@@ -271,6 +272,7 @@ def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_
 ) -> None:
     assert (one.name, one.value, one.size, one.wrong) == (name, value, size, wrong)
     assert one.where == 'load 3'
+    assert MendedNote(3, one.load, one.noted, one.hung, one.took) == one
 
 
 @pytest.mark.parametrize(
@@ -281,6 +283,7 @@ def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_
             'was noted 2.000 s late and applied over 1.8 s: note it 1.000 s after the first sample, '
             'as a ramp until 2.750 s, not 3.000 s',
         ),
+        (note(1.125, 1.0), 'was noted 0.125 s late: note it 1.000 s after the first sample, not 1.125 s'),
         (note(1.0, 1.125), 'was noted 0.125 s early: note it 1.125 s after the first sample, not 1.000 s'),
         (
             note(1.0, 1.0, 0.5, settled_only=True),
@@ -375,23 +378,37 @@ def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
     assert noted_times._steps(np.zeros((200, 4)), 10) == []
 
 
-def test_a_step_stands_out_ten_times_of_what_is_there_without_one() -> None:
-    noise = stepped(1000, {}, 1.0)
-    usual = float(np.median([*sizes_of(noise, 20).values()]))
-    assert len(noted_times._steps(stepped(1000, {500: 14.0 * usual}, 1.0), 20)) == 1
-    assert noted_times._steps(stepped(1000, {500: 9.0 * usual}, 1.0), 20) == []
+@pytest.mark.parametrize(('times', 'seen'), [(13.5, 1), (13.0, 0)])
+def test_a_step_stands_out_ten_times_of_what_is_there_without_one(times: float, seen: int) -> None:
+    # A drift of 0.01 a sample is 1 between two means of 100, everywhere. Half of the stretch, 51 samples, must be above
+    # 10: three quarters of the step, and the drift across it.
+    dots = stepped(2000, {900: times})
+    dots[:, 3] = 0.01 * np.arange(2000.0)
+    assert (0.75 * times) ** 2 + 1.0 != pytest.approx(100.0, abs=2.0)
+    assert len(noted_times._steps(dots, 100)) == seen
+
+
+def test_a_step_is_more_than_three_per_cent_of_the_largest() -> None:
+    for size, seen in ((3.0, 1), (4.0, 2)):
+        assert len(noted_times._steps(stepped(100, {30: 100.0, 70: size}), 2)) == seen
 
 
 @pytest.mark.parametrize(('share', 'seen'), [(0.0395, 1), (0.0400, 2)])
 def test_a_stretch_above_three_per_cent_of_the_largest_is_half_a_width_long(share: float, seen: int) -> None:
     # A triangle of 102 to either side: 25 on either side of the middle one are half of it, 51, and 24 are less.
     assert len(noted_times._steps(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
+    assert len(noted_times._steps(stepped(2000, {500: share, 1200: 1.0}), 102)) == seen
 
 
-def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample() -> None:
-    width = 16
-    dots = stepped(600, {100: 1.0, 110: 0.5, 300: -2.0, 470: 0.3}, 0.01, 3)
-    dots[np.random.default_rng(4).random(600) < 0.3] = np.nan
+@pytest.mark.parametrize(
+    ('width', 'lost', 'unit'), [(16, 0.3, 1.0), (16, 0.6, 1e-4), (16, 0.7, 1e-4), (16, 0.75, 1.0), (3, 0.4, 1e-4)]
+)
+@pytest.mark.parametrize('seed', range(4))
+def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample(
+    width: int, lost: float, unit: float, seed: int
+) -> None:
+    dots = unit * stepped(600, {100: 1.0, 110: 0.5, 300: -2.0, 470: 0.3}, 0.01, 3)
+    dots[np.random.default_rng(seed).random(600) < lost] = np.nan
     dots[296:304] = np.nan
     dots[470 - 2 * width : 470, 1] = np.nan
     sizes = sizes_of(dots, width)
@@ -409,25 +426,15 @@ def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample()
         half = 0.5 * max(sizes[at] for at in stretch)
         over = {at: sizes[at] - half for at in stretch if sizes[at] > half}
         first, last = stretch[0], stretch[-1] + 1
-        parts = dots[last : last + width], dots[max(first - width, 0) : first]
-        after, before = (p[np.isfinite(p).all(axis=1)].mean(axis=0) for p in parts)
+        parts = [dots[last : last + width], dots[first - width : first]]
+        there = [p[np.isfinite(p).all(axis=1)] for p in parts]
+        after, before = (p.mean(axis=0) if len(p) else np.zeros(4) for p in there)
         middle = sum(at * w for at, w in over.items()) / sum(over.values())
         wanted.append((middle, float(np.linalg.norm(after - before)), first, last))
-    found = [(s.at, s.size, s.first, s.last) for s in noted_times._steps(dots, width)]
-    assert len(found) >= 2
-    assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-9)
-
-
-def test_half_a_window_that_is_lost_still_has_a_mean_and_three_quarters_have_none() -> None:
-    # Of sixteen before the step more than four must be there.
-    for lost, seen in ((11, 100), (12, None)):
-        dots = stepped(200, {100: 1.0})
-        dots[100 - lost : 100] = np.nan
-        dots[100 + 16 - 11 : 140] = np.nan
-        found = noted_times._steps(dots, 16)
-        sizes = sizes_of(dots, 16)
-        assert (sizes[100] > 0.0) == (seen is not None)
-        assert bool(found) == any(size > 0.03 for size in sizes.values())
+    with np.errstate(invalid='raise', divide='raise'):
+        found = [(s.at, s.size, s.first, s.last) for s in noted_times._steps(dots, width)]
+    assert len(found) == len(wanted)
+    assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-7)
 
 
 def test_a_difference_is_of_the_means_of_whole_samples_and_nothing_has_the_mean_0() -> None:
@@ -509,24 +516,29 @@ def test_a_step_between_samples_keeps_its_time_and_a_ramp_its_share() -> None:
 
 
 def test_later_and_slower_shift_what_the_load_changed_by() -> None:
-    t = np.arange(40.0)
+    t = 0.5 * np.arange(40.0)
     loads = np.column_stack((t, -2.0 * t, t**2))
-    # Applied from 10 to 14: before is the sample before 9, after is the second one beyond 14.
-    step = loads[16] - loads[8]
+    # Applied from sample 20 to 28: before is the sample before 19, after is the second one beyond 28.
+    step = loads[30] - loads[18]
     ramp = note(12.0, 10.0, 4.0)
-    later, slower = shifts(ramp, loads, 1.0)
-    share = np.clip((t + 1.0 - 10.0) / 4.0, 0.0, 1.0)
-    assert later(2.0) == pytest.approx(np.outer(np.clip((t + 1.0 - 10.5) / 4.0, 0.0, 1.0) - share, step), abs=1e-3)
-    assert slower(4.0) == pytest.approx(np.outer(np.clip((t + 1.0 - 10.0) / 5.0, 0.0, 1.0) - share, step), abs=1e-3)
+    later, slower = shifts(ramp, loads, 0.5)
+
+    def share(start: float, took: float) -> FloatArray:
+        return np.asarray(np.clip((t + 0.5 - start) / took, 0.0, 1.0))
+
+    # A moment is an eighth of a second here.
+    assert later(4.0) == pytest.approx(np.outer(share(10.5, 4.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert slower(8.0) == pytest.approx(np.outer(share(10.0, 5.0) - share(10.0, 4.0), step), abs=1e-3)
     # Faster than at once it cannot be.
-    assert slower(-100.0) == pytest.approx(np.outer((t >= 10.0) - share, step), abs=1e-3)
+    assert slower(-100.0) == pytest.approx(np.outer((t >= 10.0) - share(10.0, 4.0), step), abs=1e-3)
     assert later(0.0) == pytest.approx(0.0)
-    assert len(shifts(note(12.0, 10.0), loads, 1.0)) == 1
+    assert len(shifts(note(12.0, 10.0, 0.9), loads, 0.5)) == 2
+    assert len(shifts(note(12.0, 10.0), loads, 0.5)) == 1
     # At the begin and at the end of a recording there is no more.
-    first, _ = shifts(note(0.0, 0.0, 1.5), loads, 1.0)
-    assert first(4.0)[0] == pytest.approx(-(loads[4] - loads[0]) / 1.5, rel=1e-5)
-    last, _ = shifts(note(38.0, 38.0, 1.5), loads, 1.0)
-    assert last(4.0)[38] == pytest.approx(-(loads[39] - loads[36]) / 1.5, rel=1e-5)
+    first, _ = shifts(note(0.0, 0.0, 1.0), loads, 0.5)
+    assert first(4.0)[0] == pytest.approx(-(loads[4] - loads[0]) / 2.0, rel=1e-5)
+    last, _ = shifts(note(19.0, 19.0, 1.0), loads, 0.5)
+    assert last(4.0)[38] == pytest.approx(-(loads[39] - loads[36]) / 2.0, rel=1e-5)
 
 
 def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_are_told() -> None:
@@ -548,6 +560,12 @@ def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_a
     # What took a tenth of a second was no ramp.
     (one,) = noted_times._as_acted(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
     assert one.took == 0.0
+    # From the second sample on, and one right after the other.
+    loads = np.zeros((6, 3))
+    loads[1:], loads[2:] = (1.0, 0.0, 0.0), (5.0, 2.0, 0.0)
+    assert noted_times._as_acted(loads, np.array([1, 2]), {}, 0.1)[0] == pytest.approx(loads)
+    loads = np.zeros((30, 3))
+    loads[5:], loads[12:], loads[20:] = (1.0, 0.0, 0.0), (1.0, -2.0, 0.0), (0.0, 0.0, 3.0)
     begun = loads + (7.0, 8.0, 9.0)
     assert noted_times._as_acted(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)
 
@@ -626,6 +644,53 @@ def test_a_time_is_fitted_to_no_more_than_there_is() -> None:
     assert found[0] == pytest.approx(0.5, abs=1e-4)
 
 
+def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
+    class Later(Looked):
+        def __len__(self) -> int:
+            return 1_006_000
+
+        def __getitem__(self, part: slice) -> FloatArray:
+            return self.dots[part.start - 1_000_000 : part.stop - 1_000_000]
+
+    step = noted_times._Step(1_003_000.0, 1e-4, 1_002_800, 1_003_200)
+    found = noted_times._fitted(RIG, cast(FloatArray, Later(moved_by(3.0, 0.0))), step, (0.0, 2e6), 1e-3)
+    assert found == pytest.approx((1003.0, 0.0), abs=2e-5)
+
+
+def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_it_leaves_less_than_half(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[tuple[list[tuple[float, float]], float]] = []
+
+    def least(left: object, starts: list[tuple[float, float]], reach: float) -> tuple[float, tuple[float, float]]:
+        asked.append((starts, reach))
+        return (1.0, (3.01, 0.0)) if len(asked) % 2 else (slow, (2.5, -1.1))
+
+    monkeypatch.setattr(noted_times, '_least', least)
+    step = noted_times._Step(3000.0, 1e-4, 2800, 3200)
+    for slow, found in ((0.49, (2.5, 1.1)), (0.5, (3.01, 0.0)), (1.2, (3.01, 0.0))):
+        assert noted_times._fitted(RIG, moved_by(3.0, 0.0), step, (0.0, 6000.0), 1e-3) == found
+    (sudden, by), (ramps, seconds) = asked[:2]
+    assert [at for at, _ in sudden] == pytest.approx([2.85 + 0.006 * i for i in range(51)])
+    assert {took for _, took in sudden} == {0.0}
+    # About the middle, of a tenth of a second and more up to some seconds.
+    assert [at + 0.5 * took for at, took in ramps] == pytest.approx([3.0] * 6)
+    assert [took for _, took in ramps] == [0.15, 0.3, 0.6, 1.0, 1.5, 2.5]
+    assert (by, seconds) == (1e-3, 0.05)
+
+
+def test_the_search_begins_with_a_reach_to_either_side_and_ends_after_120_looks() -> None:
+    looks: list[tuple[float, float]] = []
+
+    def down(x: FloatArray) -> float:
+        looks.append((float(x[0]), float(x[1])))
+        return float(-x[0] - 2.0 * x[1])
+
+    noted_times._least(down, [(1.0, 0.5), (2.0, 1.0)], 0.25)
+    assert looks[2:5] == [(2.0, 1.0), (2.25, 1.0), (2.0, 1.25)]
+    assert len(looks) == 2 + 120
+
+
 def test_the_least_of_a_valley_is_found_from_the_best_start() -> None:
     def valley(x: FloatArray) -> float:
         return float((x[0] - 1.23) ** 2 + 4.0 * (x[1] - 0.61) ** 2 + 2.0)
@@ -647,7 +712,6 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
     chance = np.random.default_rng(5)
     loads = np.zeros((1010, 3))
     loads[200:, 0], loads[500:, 1], loads[700:, 2] = 3.0, -20.0, 8.0
-    link = RIG.link
     columns = [np.ones(1010), np.arange(1010.0)]
     for k, frequency in enumerate((14.0, 14.0, 21.0)):
         columns.append(Filter(mode_coefficients(frequency, 0.02, 1e-3))(loads[:, k]))
@@ -655,16 +719,25 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
     dots = 1e-4 * design @ chance.normal(size=(5, 4)) * (1.0, 1e-3, 1.0, 1.0) + 1e-6 * chance.normal(size=(1010, 4))
     dots[chance.random(1010) < 0.1] = np.nan
     dots[400:420] = np.nan
+    # One of a block.
+    dots[600:619] = np.nan
     there = np.isfinite(dots).all(axis=1)
     rest = np.where(there[:, None], dots - design @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0], np.nan)
-    left, means = noted_times._left(RIG, dots, loads)
-    assert link.length == 0.585
+    with np.errstate(invalid='raise', divide='raise'):
+        left, means = noted_times._left(RIG, dots, loads)
     assert left == pytest.approx(float(np.nansum(rest**2)), rel=1e-6)
     assert means.shape == dots.shape
     for first in range(0, 1010, 20):
         part = rest[first : first + 20]
         wanted = np.nanmean(part, axis=0) if np.isfinite(part).any() else np.full(4, np.nan)
         assert means[first : first + 20] == pytest.approx(np.tile(wanted, (len(part), 1)), rel=1e-4, nan_ok=True)
+    # A millionth of the loads moves the dots alike.
+    assert noted_times._left(RIG, dots, 1e-6 * loads)[0] == pytest.approx(left, rel=1e-6)
+    # And one axis that is never loaded does nothing.
+    loads[:, 1] = 0.0
+    design[:, 3] = 0.0
+    rest = dots[there] - design[there] @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0]
+    assert noted_times._left(RIG, dots, loads)[0] == pytest.approx(float((rest**2).sum()), rel=1e-6)
 
 
 def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
@@ -699,6 +772,11 @@ def test_ringing_is_rough_beyond_three_times_the_noise() -> None:
         # About their own mean.
         rest[-24:] += 50.0
         assert noted_times._rough(rest, rings, 4) is rough
+    # Exactly three times is not beyond: 1.5 of two dots, beside quiet ones of which one differs by 1.
+    rest = rest_of([*quiet, *[1.5, -1.5] * 3]) * (1.0, 0.0, 0.0, 0.0)
+    rest[-24:, 1] = rest[-24:, 0]
+    assert not noted_times._rough(rest, rings, 4)
+    assert noted_times._rough(1.01 * rest - 0.01 * rest * ~rings[:, None], rings, 4)
     # A lost block counts as none, and of three nothing is told.
     rest = rest_of([*quiet, *[5.0, -5.0] * 3])
     rest[-8:] = np.nan
@@ -713,31 +791,187 @@ def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_r
     rest = quiet.copy()
     rest[2500:4000] += 20.0 * np.sin(np.arange(1500) / 40.0)[:, None]
     slow, sudden = note(2.0, 2.0, 0.5), note(2.5, 2.5)
-    found = noted_times._without_rough_motion(RIG, loads, [slow, sudden], rest)
+    rough = note(2.0, 2.0, 0.5, settled_only=True)
+    assert noted_times._without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
+    found = noted_times._without_rough_motion(RIG, loads, [sudden, slow], rest)
     assert found.loads is loads
-    assert found.notes == (note(2.0, 2.0, 0.5, settled_only=True), sudden)
+    assert found.notes == (sudden, rough)
     ends = 2.5 + 5.0 / (2.0 * math.pi * 14.0 * 0.02)
     assert np.flatnonzero(found.unused).tolist() == list(range(1980, math.floor(1000.0 * ends) + 1))
     # While it was applied it counts as nothing.
     rest = quiet.copy()
-    rest[1000:2500] += 100.0 * np.sin(np.arange(1500) / 40.0)[:, None]
+    rest[1000:2520] += 100.0 * np.sin(np.arange(1520) / 40.0)[:, None]
     found = noted_times._without_rough_motion(RIG, loads, [slow], rest)
     assert (found.notes, found.unused.sum(), len(found.unused)) == ((slow,), 0, count)
 
 
-# ---- when nothing is looked for
+# ---- all of it, with what it is made of told
 
 
-def test_changes_within_a_quarter_of_a_second_are_a_sweep() -> None:
-    dots = QUIET[: 3 * DWELL, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity
-    for apart, told in ((249, 0), (250, 1)):
-        loads = np.zeros((3 * DWELL, 3))
-        loads[2 * DWELL :] = (0.0, -50.0, 0.0)
-        loads[2 * DWELL + apart :] = (0.0, -51.0, 0.0)
-        # The step at 5 s has no note.
-        assert len(unnoted_steps(RIG, dots, loads)) == told
-    # A ramp is one change: it ends once.
-    ramp = np.zeros((3 * DWELL, 3))
-    ramp[2 * DWELL :, 1] = -50.0 * np.clip((np.arange(DWELL) + 1.0) / 30.0, 0.0, 1.0)
-    assert unnoted_steps(RIG, dots, ramp) == pytest.approx([5.0], abs=2e-3)
-    assert unnoted_steps(RIG, dots, np.zeros((3 * DWELL, 3))) == pytest.approx([5.0, 10.0], abs=2e-3)
+@pytest.mark.parametrize(('rate', 'width'), [(1000.0, 286), (200.0, 57), (10.0, 3), (5.0, 2)])
+def test_means_take_four_periods_of_bending_and_two_samples_at_least(
+    rate: float, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    widths: list[int] = []
+
+    def none(dots: FloatArray, width: int) -> list[noted_times._Step]:
+        widths.append(width)
+        return []
+
+    monkeypatch.setattr(noted_times, '_steps', none)
+    rig = load_rig(overrides={'converter.sample_rate_hz': rate, 'dynamics.bending_frequency': 14.0})
+    loads = np.zeros((100, 3))
+    loads[50:] = 1.0
+    assert unnoted_steps(rig, np.zeros((100, 4)), loads) == []
+    assert last_step(rig, np.zeros((100, 4)), 1.0 / rate) is None
+    assert mend_loads(rig, np.zeros((100, 4)), loads) is None
+    assert widths == [width] * 3
+
+
+def with_pieces(
+    monkeypatch: pytest.MonkeyPatch,
+    steps: list[noted_times._Step],
+    fitted: dict[float, tuple[float, float]],
+    left: tuple[float, float] = (1.0, 100.0),
+) -> list[tuple[float, float]]:
+    """Steps, their fitted times and what mended and noted loads leave; between which samples a time was fitted."""
+    between: list[tuple[float, float]] = []
+
+    def fit(
+        rig: Rig, dots: FloatArray, step: noted_times._Step, edges: tuple[float, float], period: float
+    ) -> tuple[float, float]:
+        between.append(edges)
+        return fitted[step.at]
+
+    leaves = iter([left[0], left[1]] * 9)
+    monkeypatch.setattr(noted_times, '_steps', lambda dots, width: steps)
+    monkeypatch.setattr(noted_times, '_fitted', fit)
+    monkeypatch.setattr(noted_times, '_left', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4))))
+    return between
+
+
+def noted_at(*places: int, count: int = 20_000) -> FloatArray:
+    """Loads (n, 3) that change along X, along Y and by a torque in turn."""
+    loads = np.zeros((count, 3))
+    for k, at in enumerate(places):
+        loads[at:, k % 3] += (10.0, 10.0, 3.0)[k % 3]
+    return loads
+
+
+def test_last_step_is_the_last_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_pieces(monkeypatch, as_steps((100.0, 1.0), (250.0, 1.0), (900.5, 1.0)), {})
+    assert last_step(RIG, np.zeros((1000, 4)), 0.02) == pytest.approx(18.01)
+
+
+def test_steps_without_a_note_near_them_are_told_by_their_fitted_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = [noted_times._Step(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0, 15000.0)]
+    fitted = {3000.0: (3.01, 0.5), 8000.0: (8.02, 0.7), 15000.0: (15.03, 0.9)}
+    between = with_pieces(monkeypatch, steps, fitted)
+    dots = np.zeros((20_000, 4))
+    assert unnoted_steps(RIG, dots, np.zeros((20_000, 3))) == [3.01, 8.02, 15.03]
+    assert between == [(0.0, 8000.0), (3000.0, 15000.0), (8000.0, 20000.0)]
+    # Near: two widths of 286 before the step's first sample, or after its last.
+    for at, near in ((7228, True), (7227, False), (8772, True), (8773, False)):
+        told = unnoted_steps(RIG, dots, noted_at(3000, at, 15000))
+        assert told == ([] if near else [8.02])
+    # One axis is enough for a note, and two samples may be one change after the other.
+    for axis in range(3):
+        loads = np.zeros((20_000, 3))
+        for at in (3000, 8000, 15000):
+            loads[at:, axis] += 1.0
+        assert unnoted_steps(RIG, dots, loads) == []
+        assert unnoted_steps(RIG, dots, loads[:, [axis, axis, axis]]) == []
+
+
+def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = [noted_times._Step(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0)]
+    with_pieces(monkeypatch, steps, {3000.0: (3.01, 0.0), 8000.0: (8.0, 0.0)})
+    dots = np.zeros((20_000, 4))
+    for apart, told in ((249, []), (250, [3.01])):
+        assert unnoted_steps(RIG, dots, noted_at(8000, 8000 + apart)) == told
+        assert (mend_loads(RIG, dots, noted_at(3000, 9000, 9000 + apart)) is None) == (not told)
+    # A ramp is one change, which ends once; one that comes two samples later is another.
+    ramp = noted_at(*range(8000, 8100))
+    assert unnoted_steps(RIG, dots, ramp) == [3.01]
+    assert unnoted_steps(RIG, dots, noted_at(8000, 8002)) == []
+    # Its end may come with a note of the next one within a quarter of a second.
+    assert unnoted_steps(RIG, dots, noted_at(*range(8000, 8100), 8200)) == []
+    assert unnoted_steps(RIG, dots, noted_at(*range(8000, 8100), 8400)) == [3.01]
+
+
+def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(monkeypatch: pytest.MonkeyPatch) -> None:
+    places = (3000.0, 8000.0, 15000.0)
+    sizes = noted_times._expected(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
+    steps = [
+        noted_times._Step(at, size, int(at) - 200, int(at) + 200) for at, size in zip(places, sizes, strict=True)
+    ]
+    fitted = {3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0), 15000.0: (15.0, 0.0)}
+    dots = np.zeros((20_000, 4))
+    between = with_pieces(monkeypatch, steps, fitted)
+    late = noted_at(3000, 9500, 15000)
+    found = mend_loads(RIG, dots, late)
+    assert found is not None
+    assert [(n.number, n.noted, n.hung, n.took) for n in found.notes] == [(2, 9.5, 8.0, 0.0)]
+    assert [n.number for n in found.timed] == [1, 2, 3]
+    assert found.loads == pytest.approx(noted_at(3000, 8000, 15000))
+    assert between == [(0.0, 8000.0), (3000.0, 15000.0), (8000.0, 20000.0)]
+    assert not found.unused.any()
+    assert found.measured == ()
+    # Right as noted, all late alike, or two milliseconds off: nothing is fitted.
+    for noted_so in (noted_at(3000, 8000, 15000), noted_at(3500, 8500, 15500), noted_at(3002, 8000, 14998)):
+        between.clear()
+        assert mend_loads(RIG, dots, noted_so) is None
+        assert between == []
+    # A step that is longer than two widths and a tenth of a second is looked at: 2 * 286 + 100 samples.
+    for long, looks in ((672, 0), (673, 3)):
+        between.clear()
+        some = [steps[0], noted_times._Step(8000.0, sizes[1], 7700, 7700 + long), steps[2]]
+        monkeypatch.setattr(noted_times, '_steps', lambda dots, width, some=some: some)
+        assert mend_loads(RIG, dots, noted_at(3000, 8000, 15000)) is None
+        assert len(between) == looks
+    # Applied over a tenth of a second is a step.
+    for took, told in ((0.1, None), (0.101, [0.101])):
+        fitted[8000.0] = (8.0, took)
+        ramp = mend_loads(RIG, dots, noted_at(3000, 8000, 15000))
+        assert (None if ramp is None else [n.took for n in ramp.notes]) == told
+    fitted[8000.0] = (8.0, 0.0)
+    monkeypatch.setattr(noted_times, '_steps', lambda dots, width: steps)
+    # Alike by the fitted times, though not by the middles of the steps.
+    fitted.update({3000.0: (2.999, 0.0), 8000.0: (9.498, 0.0), 15000.0: (15.0, 0.0)})
+    assert mend_loads(RIG, dots, late) is None
+    fitted.update({3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0)})
+    for left, told_late in (((1.0, 3.9), False), ((1.0, 4.0), True), ((1.0, 4.1), True), ((0.1, 0.41), True)):
+        with_pieces(monkeypatch, steps, fitted, left)
+        assert (mend_loads(RIG, dots, late) is not None) == told_late
+
+
+def test_the_size_of_a_change_is_what_came_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[FloatArray] = []
+
+    def expected(rig: Rig, changes: FloatArray) -> FloatArray:
+        asked.append(changes)
+        return np.zeros(len(changes))
+
+    monkeypatch.setattr(noted_times, '_expected', expected)
+    with_pieces(monkeypatch, as_steps((3000.0, 1.0)), {})
+    # From the second sample on, and the last with the last.
+    loads = np.zeros((1000, 3))
+    loads[1:], loads[500:], loads[999:] = (1.0, 0.0, 0.0), (1.0, 2.0, 0.0), (0.0, 2.0, -5.0)
+    assert mend_loads(RIG, np.zeros((1000, 4)), loads) is None
+    assert asked[0].tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-1.0, 0.0, -5.0]]
+
+
+def test_loads_of_a_cell_lose_their_noise_whether_times_are_mended_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    dots, chance = np.zeros((2000, 4)), np.random.default_rng(1)
+    noisy = np.where(np.arange(2000)[:, None] < 1500, 0.0, 50.0) + chance.normal(size=(2000, 3))
+    with_pieces(monkeypatch, [], {})
+    found = mend_loads(RIG, dots, noisy)
+    assert found is not None
+    assert [m.first for m in found.measured] == [0, 1500]
+    assert (found.notes, found.timed, found.unused.sum(), found.unused.shape) == ((), (), 0, (2000,))
+    assert np.ptp(found.loads[:1500], axis=0).tolist() == [0.0] * 3
+    with_pieces(monkeypatch, as_steps((400.0, 1e-4)), {400.0: (0.4, 0.0)})
+    found = mend_loads(RIG, dots, noisy)
+    assert found is not None
+    assert [m.first for m in found.measured] == [0, 1500]
+    assert [n.hung for n in found.notes] == [0.4]
