@@ -14,13 +14,15 @@ from psd_deflection.studies.check.responses import responses
 
 RIG = load_rig()
 GAINS = load_rig(overrides={'psd_1.sensitivity': [4e-4, 6e-4], 'psd_2.sensitivity': [5e-4, 8e-4]})
+ZEROS = load_rig(overrides={'psd_1.zero': [0.001, -0.002], 'psd_2.zero': [0.002, 0.0015]})
 
 
 def test_means_are_of_the_samples_that_are_there() -> None:
-    samples = np.arange(18.0).reshape(9, 2)[:8]
-    samples[1, 0] = samples[4:8, 1] = np.nan
-    wanted = np.array([[(0 + 4 + 6) / 3, 4.0], [11.0, np.nan]])
-    assert module._block_means(samples, 2) == pytest.approx(wanted, nan_ok=True)
+    samples = np.arange(16.0).reshape(8, 2)
+    samples[1, 0] = samples[1:4, 1] = samples[4:8, 1] = np.nan
+    wanted = np.array([[(0 + 4 + 6) / 3, 1.0], [11.0, np.nan]])
+    with np.errstate(invalid='raise', divide='raise'):
+        assert module._block_means(samples, 2) == pytest.approx(wanted, nan_ok=True)
 
 
 def test_loads_that_always_came_together_are_one() -> None:
@@ -69,13 +71,12 @@ def test_slopes_and_their_spread_are_those_of_least_squares_and_memory_widens_th
     memory = [float(r[1:] @ r[:-1] / (r @ r)) for r in left.T]
     widened = [(1.0 + max(m, 0.0)) / (1.0 - max(m, 0.0)) for m in memory]
     assert variance == pytest.approx(squares / (200 - 6) * widened, rel=1e-6)
-    # Memory counts up to 0.98: that of a straight line's square is more.
-    line = np.column_stack((design, np.arange(200.0) ** 3))[:, -1:]
-    _, _, slow = module._regression(design[:, :5], line)
-    r = line[:, 0] - design[:, :5] @ np.linalg.lstsq(design[:, :5], line[:, 0], rcond=None)[0]
-    assert (r[1:] @ r[:-1]) / (r @ r) > 0.9
-    colour = min(float(r[1:] @ r[:-1] / (r @ r)), 0.98)
-    assert slow == pytest.approx((r @ r) / 195 * (1 + colour) / (1 - colour), rel=1e-6)
+    # Memory counts up to 0.98: that of a slow wave is more.
+    wave = np.sin(np.arange(2000.0) / 300.0)[:, None]
+    about = wave[:, 0] - wave.mean()
+    assert (about[1:] @ about[:-1]) / (about @ about) > 0.99
+    _, _, slow = module._regression(np.column_stack((np.zeros((2000, 4)), np.ones(2000))), wave)
+    assert slow == pytest.approx(about @ about / 1995 * 1.98 / 0.02, rel=1e-6)
     # What explains all leaves nothing, and no more numbers than values have a variance still.
     _, _, exact = module._regression(np.eye(3)[:, :2], np.array([[1.0], [2.0], [0.0]]))
     assert exact.tolist() == [0.0]
@@ -83,15 +84,26 @@ def test_slopes_and_their_spread_are_those_of_least_squares_and_memory_widens_th
     assert module._regression(few, np.ones((2, 1)))[2].tolist() == [0.0]
 
 
-def test_combinations_that_hardly_move_say_nothing() -> None:
+@pytest.mark.parametrize('other', [1, 2, 3])
+@pytest.mark.parametrize('unit', [1e4, 1.0, 1e-4, 1e-8])
+@pytest.mark.parametrize(('share', 'told'), [(1e-5, True), (1e-7, False)])
+def test_combinations_that_hardly_move_say_nothing_in_whatever_unit(
+    other: int, unit: float, share: float, told: bool
+) -> None:
     chance = np.random.default_rng(2)
-    along = chance.normal(size=100)
-    for share, told in ((1e-5, True), (1e-7, False)):
-        beside = share * chance.normal(size=100)
-        design = np.column_stack((along, along + beside, np.zeros((100, 2)), np.ones(100), np.arange(100.0)))
-        slopes, _, _ = module._regression(design, (3.0 * along + beside)[:, None])
-        # Of the difference alone that is 1; if it says nothing both have the same share.
-        assert bool(abs(slopes[1, 0] - slopes[0, 0]) > 0.5) is told
+    along, beside = chance.normal(size=100), share * chance.normal(size=100)
+    design = np.column_stack((np.zeros((100, 4)), np.ones(100), np.arange(100.0)))
+    design[:, 0] = unit * along
+    design[:, other] = unit * (along + beside)
+    slopes, _, _ = module._regression(design, unit * (3.0 * along + beside + 7.0)[:, None])
+    # Of the difference alone that is 1; if it says nothing both have the same share.
+    assert bool(abs(slopes[other, 0] - slopes[0, 0]) > 0.5) is told
+    assert slopes[4, 0] == pytest.approx(7.0 * unit, rel=1e-3)
+    # Where only one dot moves a lot, the others are small beside it.
+    design[:, :4] = 0.0
+    design[:, 0], design[:, other] = 1e-3 * unit * share * along, unit * np.cos(np.arange(100.0))
+    slopes, _, _ = module._regression(design, design[:, :1])
+    assert slopes[0, 0] == pytest.approx(0.0, abs=1e-3)
 
 
 def of_loads(rig: Rig, loads: FloatArray) -> FloatArray:
@@ -109,7 +121,7 @@ def at_rest(rig: Rig, load: tuple[float, float, float]) -> FloatArray:
     return np.asarray(after - before)
 
 
-@pytest.mark.parametrize('rig', [RIG, GAINS], ids=['alike', 'other sensitivities'])
+@pytest.mark.parametrize('rig', [RIG, GAINS, ZEROS], ids=['alike', 'other sensitivities', 'dots beside the centre'])
 def test_each_push_moves_the_channels_by_what_its_load_moves_at_rest(rig: Rig) -> None:
     loads = held((0, 0, 0), (5, 0, 0), (0, 0, 0), (0, 8, 0), (0, -10, 0), (0, 0, 3), (0, 0, 0))
     volts = of_loads(rig, loads)
@@ -137,12 +149,14 @@ def test_each_push_moves_the_channels_by_what_its_load_moves_at_rest(rig: Rig) -
 
 
 def test_loads_that_came_together_are_told_at_their_largest() -> None:
-    loads = held((0, 0, 0), (0, -2, -1), (0, -4, -2), (0, 0, 0))
-    (push,) = responses(RIG, of_loads(RIG, loads), loads).pushes
-    assert push.loads == ('fy', 'tz')
-    assert push.name == '+Y with +θ'
-    assert push.expected == pytest.approx(-at_rest(RIG, (0.0, -4.0, -2.0)), abs=1e-9)
-    assert push.channels == pytest.approx(push.expected, abs=1e-7)
+    for most, more, way in (((0, -4, -2), (0, -3.9, -2.2), -1.0), ((0, -4, 2), (0, -3.9, 2.2), -1.0)):
+        loads = held((0, 0, 0), more, most, (0, -2, 0.5 * most[2]), (0, 0, 0))
+        (push,) = responses(RIG, of_loads(RIG, loads), loads).pushes
+        assert push.loads == ('fy', 'tz')
+        assert push.name == '+Y with +θ'
+        # The first that is named says where it is largest, and its way.
+        assert push.expected == pytest.approx(way * at_rest(RIG, most), abs=1e-9)
+        assert push.channels == pytest.approx(push.expected, abs=1e-7)
 
 
 def test_eight_blocks_are_the_fewest() -> None:
