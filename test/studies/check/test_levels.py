@@ -155,9 +155,7 @@ def test_hum_below_a_quarter_of_the_noise_is_none(noise: float, seen: bool) -> N
 @pytest.mark.parametrize(
     ('n', 'rate', 'seen'), [(1000, 1000.0, True), (999, 1000.0, False), (600, 150.0, True), (600, 149.0, False)]
 )
-def test_hum_is_looked_for_in_a_second_and_at_two_and_a_half_samples_a_period(
-    n: int, rate: float, seen: bool
-) -> None:
+def test_hum_is_looked_for_in_a_second_and_at_two_and_a_half_samples_a_period(n: int, rate: float, seen: bool) -> None:
     hz, hum = module._hum(waves(n, rate, {50.0: 0.1}), rate, np.full(6, 1e-3))
     assert hz == 50.0
     assert bool(hum[1] > 0.0) is seen

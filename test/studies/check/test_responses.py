@@ -165,7 +165,7 @@ def test_eight_blocks_are_the_fewest() -> None:
     assert responses(RIG, volts, loads).pushes == ()
     lost = volts.copy()
     lost[:20, 1] = np.nan
-    with pytest.raises(RecordingError, match='^7 blocks of samples: at least 8 are needed'):
+    with pytest.raises(RecordingError, match=r'^7 blocks of samples: at least 8 are needed'):
         responses(RIG, lost, loads)
     with pytest.raises(RecordingError, match='7 blocks'):
         responses(RIG, volts[:159], loads[:159])

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import (
@@ -185,8 +184,8 @@ def test_each_difference_has_the_line_that_puts_it_right() -> None:
     right = parameters(TURNED, PLAIN)
     assert [fix_of(d, TURNED, right) for d in differences(TURNED, PLAIN)] == [
         'psds_exchanged: true',
-        "psd_1.axes: [-y, x]",
-        "psd_1.axes: [-y, x]",
+        'psd_1.axes: [-y, x]',
+        'psd_1.axes: [-y, x]',
     ]
     # The file has x1 turned for PSD 1, and PSDs are exchanged: PSD 2, which is on input 1, is right as it is.
     now, file = Wiring(exchanged=True), Wiring(False, (('-x', 'y'), ('x', 'y')))
@@ -203,5 +202,3 @@ def test_each_difference_has_the_line_that_puts_it_right() -> None:
 def test_a_fit_has_no_load_turned_unless_it_is_said() -> None:
     assert WiringFit(PLAIN, 0.0).reversed_loads == ()
     assert math.isclose(push([1.0, 0.0, 0.0, 0.0]).misfit(PLAIN)[1], 1.0)
-
-

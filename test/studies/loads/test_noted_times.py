@@ -354,7 +354,7 @@ def stepped(n: int, steps: dict[int, float], noise: float = 0.0, seed: int = 0) 
 
 
 def sizes_of(dots: FloatArray, width: int) -> dict[int, float]:
-    """By how much the mean of ``width`` samples from each on differs from that before, with more than a quarter there."""
+    """By how much the mean of ``width`` samples differs from that before, with more than a quarter of both there."""
     out = {}
     for at in range(width, len(dots) - width):
         before, after = (part[np.isfinite(part).all(axis=1)] for part in (dots[at - width : at], dots[at : at + width]))
@@ -366,7 +366,8 @@ def sizes_of(dots: FloatArray, width: int) -> dict[int, float]:
 def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
     # The difference is a triangle from 90 to 110: above 3 % of it from 91 to 109.
     (step,) = noted_times._steps(stepped(200, {100: 2.0}), 10)
-    assert (step.at, step.size, step.first, step.last) == (pytest.approx(100.0), pytest.approx(2.0), 91, 110)
+    assert (step.at, step.size) == pytest.approx((100.0, 2.0))
+    assert (step.first, step.last) == (91, 110)
     # Of two rows of three the middle is between them.
     (slow,) = noted_times._steps(stepped(200, {100: 1.0, 101: 1.0}), 10)
     assert slow.at == pytest.approx(100.5)
@@ -451,7 +452,9 @@ def as_steps(*places: tuple[float, float]) -> list[noted_times._Step]:
     return [noted_times._Step(at, size, round(at) - 5, round(at) + 5) for at, size in places]
 
 
-def cheapest(changes: IntArray, sizes: FloatArray, steps: list[noted_times._Step], period: float) -> list[tuple[int, int]]:
+def cheapest(
+    changes: IntArray, sizes: FloatArray, steps: list[noted_times._Step], period: float
+) -> list[tuple[int, int]]:
     """Of all ways to pair notes and steps in their order that of the least cost, one by one."""
     seen = [i for i in range(len(changes)) if sizes[i] > 0.03 * max(sizes)]
     factor = sum(s.size for s in steps) / sum(sizes[i] for i in seen)
@@ -553,9 +556,10 @@ def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_a
     wanted[18:] += 0.5 * np.array((-1.0, 2.0, 3.0))
     wanted[19:] += 0.5 * np.array((-1.0, 2.0, 3.0))
     assert acted == pytest.approx(wanted, abs=1e-5)
-    assert [(n.number, n.load, n.noted, n.hung, n.took) for n in notes] == [
-        (1, (1.0, 0.0, 0.0), pytest.approx(0.5), 0.3, 0.0),
-        (3, (0.0, 0.0, 3.0), pytest.approx(2.0), 1.8, 0.2),
+    assert [(n.number, n.load) for n in notes] == [(1, (1.0, 0.0, 0.0)), (3, (0.0, 0.0, 3.0))]
+    assert [(n.noted, n.hung, n.took) for n in notes] == [
+        pytest.approx((0.5, 0.3, 0.0)),
+        pytest.approx((2.0, 1.8, 0.2)),
     ]
     # What took a tenth of a second was no ramp.
     (one,) = noted_times._as_acted(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
@@ -566,11 +570,15 @@ def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_a
     assert noted_times._as_acted(loads, np.array([1, 2]), {}, 0.1)[0] == pytest.approx(loads)
     loads = np.zeros((30, 3))
     loads[5:], loads[12:], loads[20:] = (1.0, 0.0, 0.0), (1.0, -2.0, 0.0), (0.0, 0.0, 3.0)
-    begun = loads + (7.0, 8.0, 9.0)
+    begun = np.add(loads, (7.0, 8.0, 9.0))
     assert noted_times._as_acted(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)
 
 
 # ---- the fit of one time
+
+
+def times(n: int) -> FloatArray:
+    return np.asarray(np.arange(n, dtype=np.float64) * 1e-3)
 
 
 def ringing(t: FloatArray) -> FloatArray:
@@ -584,7 +592,7 @@ def ringing(t: FloatArray) -> FloatArray:
 
 def moved_by(start: float, took: float, n: int = 6000) -> FloatArray:
     """Dots (n, 4), m, that a load from ``start`` on moves, beside drift and the ringing of an older one."""
-    t = np.arange(n) * 1e-3
+    t = times(n)
     share = np.clip((t + 1e-3 - start) / max(took, 1e-3), 0.0, 1.0)
     bend, twist = (Filter(mode_coefficients(f, 0.02, 1e-3))(share) for f in (14.0, 21.0))
     moved = np.column_stack((bend, 0.1 * bend + 0.2 * twist, bend + 0.3 * twist, -0.2 * bend))
@@ -661,14 +669,16 @@ def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_i
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[list[tuple[float, float]], float]] = []
+    slowly = [0.49]
 
     def least(left: object, starts: list[tuple[float, float]], reach: float) -> tuple[float, tuple[float, float]]:
         asked.append((starts, reach))
-        return (1.0, (3.01, 0.0)) if len(asked) % 2 else (slow, (2.5, -1.1))
+        return (1.0, (3.01, 0.0)) if len(asked) % 2 else (slowly[0], (2.5, -1.1))
 
     monkeypatch.setattr(noted_times, '_least', least)
     step = noted_times._Step(3000.0, 1e-4, 2800, 3200)
-    for slow, found in ((0.49, (2.5, 1.1)), (0.5, (3.01, 0.0)), (1.2, (3.01, 0.0))):
+    for left, found in ((0.49, (2.5, 1.1)), (0.5, (3.01, 0.0)), (1.2, (3.01, 0.0))):
+        slowly[0] = left
         assert noted_times._fitted(RIG, moved_by(3.0, 0.0), step, (0.0, 6000.0), 1e-3) == found
     (sudden, by), (ramps, seconds) = asked[:2]
     assert [at for at, _ in sudden] == pytest.approx([2.85 + 0.006 * i for i in range(51)])
@@ -699,7 +709,8 @@ def test_the_least_of_a_valley_is_found_from_the_best_start() -> None:
     assert (least, at, took) == pytest.approx((2.0, 1.23, 0.61), abs=1e-3)
     # Without a duration it keeps none, and looks six reaches about.
     least, (at, took) = noted_times._least(valley, [(0.0, 0.0), (1.2, 0.0), (5.0, 0.0)], 0.01)
-    assert (at, took) == (pytest.approx(1.23, abs=2e-5), 0.0)
+    assert at == pytest.approx(1.23, abs=2e-5)
+    assert took == 0.0
     assert least == pytest.approx(2.0 + 4.0 * 0.61**2)
     for begun, end in ((1.1, 1.16), (1.4, 1.34)):
         assert noted_times._least(valley, [(begun, 0.0)], 0.01)[1][0] == pytest.approx(end, abs=5e-5)
@@ -721,7 +732,7 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
     dots[400:420] = np.nan
     # One of a block.
     dots[600:619] = np.nan
-    there = np.isfinite(dots).all(axis=1)
+    there = np.asarray(np.isfinite(dots).all(axis=1))
     rest = np.where(there[:, None], dots - design @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0], np.nan)
     with np.errstate(invalid='raise', divide='raise'):
         left, means = noted_times._left(RIG, dots, loads)
@@ -741,7 +752,7 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
 
 
 def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
-    t = np.arange(8000) * 1e-3
+    t = times(8000)
     rig = load_rig(overrides={'dynamics.torsion_frequency': 10.0, 'dynamics.torsion_damping_ratio': 0.05})
     # 1 / (2 pi f ratio): 0.568 s of 14 Hz at 0.02, 0.318 s of 10 Hz at 0.05.
     wanted = 5.0 / (2.0 * math.pi * 14.0 * 0.02)
@@ -752,7 +763,9 @@ def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
         assert len(moving) == moving[-1] - moving[0] + 1
     # Without damping of a thousandth or more it would never end.
     free = load_rig(overrides={'dynamics.torsion_frequency': 200.0, 'dynamics.torsion_damping_ratio': 0.0})
-    assert np.flatnonzero(noted_times._moving(free, note(3.0, 2.0), t))[-1] == math.floor(2000.0 + 5e6 / (400.0 * math.pi))
+    assert np.flatnonzero(noted_times._moving(free, note(3.0, 2.0), t))[-1] == math.floor(
+        2000.0 + 5e6 / (400.0 * math.pi)
+    )
 
 
 def rest_of(sizes: list[float], block: int = 4) -> FloatArray:
@@ -902,9 +915,7 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
 def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(monkeypatch: pytest.MonkeyPatch) -> None:
     places = (3000.0, 8000.0, 15000.0)
     sizes = noted_times._expected(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
-    steps = [
-        noted_times._Step(at, size, int(at) - 200, int(at) + 200) for at, size in zip(places, sizes, strict=True)
-    ]
+    steps = [noted_times._Step(at, size, int(at) - 200, int(at) + 200) for at, size in zip(places, sizes, strict=True)]
     fitted = {3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0), 15000.0: (15.0, 0.0)}
     dots = np.zeros((20_000, 4))
     between = with_pieces(monkeypatch, steps, fitted)

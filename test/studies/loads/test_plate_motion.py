@@ -11,8 +11,10 @@ from psd_deflection.studies.loads.plate_motion import across_of, across_plate, m
 
 RIG = load_rig(
     overrides={
-        **{'psd_1.sensitivity': [4e-4, 6e-4], 'psd_2.sensitivity': [5e-4, 8e-4]},
-        **{'psd_1.zero': [0.002, -0.01], 'psd_2.zero': [0.01, 0.004]},
+        'psd_1.sensitivity': [4e-4, 6e-4],
+        'psd_2.sensitivity': [5e-4, 8e-4],
+        'psd_1.zero': [0.002, -0.01],
+        'psd_2.zero': [0.01, 0.004],
     }
 )
 GAINS = np.array([4e-4, 6e-4, 5e-4, 8e-4])

@@ -295,8 +295,10 @@ def test_steps_without_a_note_are_looked_for_in_the_dots_in_metres(monkeypatch: 
 
 GIVEN = load_rig(
     overrides={
-        **{'psd_1.sensitivity': [4e-4, 6e-4], 'psd_2.sensitivity': [5e-4, 8e-4]},
-        **{'dynamics.bending_damping_ratio': 0.1, 'dynamics.torsion_damping_ratio': 0.2},
+        'psd_1.sensitivity': [4e-4, 6e-4],
+        'psd_2.sensitivity': [5e-4, 8e-4],
+        'dynamics.bending_damping_ratio': 0.1,
+        'dynamics.torsion_damping_ratio': 0.2,
     }
 )
 PLATE = np.array([[-1.0, 0.0, 0.07], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.1]])
@@ -467,7 +469,7 @@ def test_one_wrong_load_is_found_beside_what_effects_do_in_proportion() -> None:
     assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=4.0 * softened)).gone == ()
     assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=2.6 * softened)).gone == (5,)
     for more, gone in ((2.0, ()), (1.6, (5,))):
-        offset = softened + (0.0, more, 0.0)
+        offset = np.add(softened, (0.0, more, 0.0))
         assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=offset)).gone == gone
     # The first after a change may be wrong, the time before all of them may not.
     assert plateaus.stand_out(seen({1: (2.0, 0.0, 0.0)}, everywhere=softened)).gone == (1,)
@@ -494,7 +496,9 @@ def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fi
 
 def test_what_is_off_by_less_than_a_seventh_of_a_newton_is_right_whatever_the_others_suggest() -> None:
     # Small loads are a tenth too small, so the large one would be off by 5 N.
-    small = np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (-1, 1, 0), (0, -1, 1), (1, -1, 1), (50, 0, 0), (1, 1, -1)], float)
+    small = np.array(
+        [(0, 0, 0), (1, 0, 0), (0, 1, 0), (-1, 1, 0), (0, -1, 1), (1, -1, 1), (50, 0, 0), (1, 1, -1)], float
+    )
     share = 0.1 * small
     share[6] = 0.0
     assert plateaus._apart(seen({}, small, everywhere=share), (6,), 0.1)[6] > 5.5
@@ -522,7 +526,7 @@ def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much()
     def known(k: list[int], more: tuple[float, float, float] = (0.0, 0.0, 1.0), largest: float = 1e9) -> bool:
         rows = [i for i in range(5) if i < 3 or i in k]
         here = [rows.index(i) for i in k]
-        return plateaus._known(seen({i: more for i in here}, noted[rows]), np.array(here), largest)
+        return plateaus._known(seen(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
 
     # A torque of 5 % of (3, 4) is as good as none.
     assert known([3])
@@ -709,7 +713,9 @@ def test_a_load_that_is_off_by_two_newtons_and_a_tenth_is_simulated_as_the_readi
     assert asked_with[2] == pytest.approx(truth[5] if far else [40.0, -40.0, 20.0])
 
 
-def test_readings_are_held_against_the_simulation_in_fine_means_of_what_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_readings_are_held_against_the_simulation_in_fine_means_of_what_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     held: list[tuple[FloatArray, FloatArray, int, int]] = []
 
     def asked_for(
@@ -764,15 +770,18 @@ def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -> None:
-    loads, asked_with = np.repeat(SPREAD, DWELL, axis=0), []
+    loads, asked_with = np.repeat(SPREAD, DWELL, axis=0), list[FloatArray]()
 
-    def small(acting: FloatArray) -> PlateauLoads:
-        asked_with.append(acting)
-        return seen({6: (0.0, size, 0.0)})
+    def of_size(size: float) -> Callable[[FloatArray], PlateauLoads]:
+        def asked(acting: FloatArray) -> PlateauLoads:
+            asked_with.append(acting)
+            return seen({6: (0.0, size, 0.0)})
+
+        return asked
 
     # A seventh of a newton: 0.15 of three times 0.3.
     for size, asks in ((0.134, 1), (EXACT * STANDS_OUT * TOLERANCE, 3), (0.136, 3)):
         asked_with.clear()
-        assert plateaus.noted_wrong(loads, 1e-3, small) == []
+        assert plateaus.noted_wrong(loads, 1e-3, of_size(size)) == []
         assert len(asked_with) == asks
     assert plateaus.noted_wrong(loads, 1e-3, lambda acting: seen({}, SPREAD[:0])) == []
