@@ -12,10 +12,11 @@ import pytest
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check import checkup
 from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.levels import Levels
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
-from psd_deflection.studies.check.wirings import PushResponse, on_channels
+from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFit, on_channels
 from psd_deflection.studies.loads.noted_times import MendedNote
 
 RIG = load_rig()
@@ -93,6 +94,9 @@ def test_a_channel_is_dead_that_moves_less_than_a_tenth_of_every_push() -> None:
     assert of(with_share(0.099)) == [('stuck_channel', 'x1')]
     assert with_share(0.099).findings[0].fix == 'x1 does not answer: look at its cable'
     assert ('stuck_channel', 'x1') not in of(with_share(0.101))
+    # Of 1, 3, 9 and 3 the first is a tenth of the whole: that is an answer.
+    tenth = replace(push('fx'), channels=np.array([1.0, 3.0, 9.0, 3.0]) * -1e-4)
+    assert ('stuck_channel', 'x1') not in of(checked([tenth, push('fy')]))
     # A turn by hand says nothing of it, and without pushes along both axes nobody knows.
     turned = replace(push('tz'), only_twist=True)
     dead = replace(push('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
@@ -106,6 +110,9 @@ def test_a_channel_that_is_stuck_is_told_once_and_no_wiring_then() -> None:
     found = checked([dead, push('fy')], of_levels(stuck=('x1', 'sum2')))
     assert of(found) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]
     assert found.verdict == WRONG
+    turned = Wiring(False, (('-x', 'y'), ('x', 'y')))
+    three = [push(load, 9.80665, turned) for load in ('fx', 'fy', 'tz')]
+    assert of(checked(three, of_levels(stuck=('sum2',)))) == [('stuck_channel', 'sum2')]
 
 
 # ---- wirings
@@ -132,12 +139,39 @@ def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
     assert one.findings[0].equivalent == (f'{others} other wirings, which these pushes cannot tell apart',)
 
 
+@pytest.mark.parametrize(('count', 'words'), [(2, '1 other wiring,'), (3, '2 other wirings,'), (4, '3 other wirings,')])
+def test_other_wirings_are_counted(count: int, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    some = [WiringFit(wiring, 0.0) for wiring in WIRINGS[7 : 7 + count]]
+    monkeypatch.setattr(checkup, 'fitting_wirings', lambda seen: some)
+    assert {f.equivalent[-1] for f in checked().findings if f.equivalent} == {
+        f'{words} which these pushes cannot tell apart'
+    }
+
+
+def test_a_wiring_that_leaves_some_of_each_push_is_no_other_explanation() -> None:
+    # A push along (c, s) leaves 1 - (c^2 - s^2)^2 with its y turned: 0.3 of one, 0.6 of two, more than of the best.
+    c = math.sqrt(0.5 + 0.5 * math.sqrt(0.7))
+    s = math.sqrt(1.0 - c * c)
+    one = replace(push('fx'), channels=np.array([c, -s, 0.0, 0.0]) * 1e-4, expected=np.array([c, s, 0.0, 0.0]) * 1e-4)
+    found = checked([one, one])
+    assert ('channel_sign', 'y1') in of(found)
+    assert not any('load_sign' in text for f in found.findings for text in f.equivalent)
+    assert next(f.evidence for f in found.findings if f.where == 'y1') == pytest.approx(0.6)
+
+
 def test_all_signs_turned_may_be_the_loads_as_well() -> None:
     wiring = Wiring(False, (('-x', '-y'), ('-x', '-y')))
     found = checked([push(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')])
     assert {f.equivalent for f in found.findings} == {('load_sign of fx fy tz',)}
     # By the file each push goes the other way and leaves nothing of its own: three that are not explained at all.
     assert [f.evidence for f in found.findings] == pytest.approx([3.0] * 4)
+    # If one of the loads went the other way too, only the others are turned: half as far as expected.
+    other = checked([push('fx', 1.0, wiring), push('fy', 1.0, wiring), push('tz', -0.5, wiring)])
+    assert ('load_sign of fx fy',) in {f.equivalent for f in other.findings}
+    # A push that leans leaves 0.04 of 1.04 of the best one as well.
+    lean = replace(push('fx', 1.0, wiring), channels=np.array([1.0, 0.2, 1.0, 0.2]) * 1e-4)
+    found = checked([lean, *(push(load, 1.0, wiring) for load in ('fy', 'tz'))])
+    assert [f.evidence for f in found.findings] == pytest.approx([3.0 - 0.04 / 1.04] * 4)
     # A push that leans leaves 0.36 of it, beyond the limit: then the loads are no other explanation.
     lean = replace(push('fx', 1.0, wiring), channels=np.array([1.0, 0.75, 1.0, 0.75]) * 1e-4)
     found = checked([lean, *(push(load, 1.0, wiring) for load in ('fy', 'tz'))])
@@ -323,6 +357,9 @@ def test_hum_is_worth_a_look_where_it_is_largest() -> None:
     hum = (0.0, 1e-3, 0.0, 4e-3, 0.0, 2e-3)
     words = 'hum: 4.0 mV at 60 Hz on x2; look at shielding and ground'
     assert checked(levels=of_levels(hum=hum, hum_hz=60.0)).notes == (words,)
+    for volt, told in ((4.9495e-3, '4.9'), (4.9505e-3, '5.0')):
+        hum = (0.0, volt, 0.0, 0.0, 0.0, 0.0)
+        assert checked(levels=of_levels(hum=hum)).notes[0].startswith(f'hum: {told} mV at 50 Hz on y1')
     for channel, name in enumerate(('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')):
         small = [1e-9 * (i == channel) for i in range(6)]
         assert checked(levels=of_levels(hum=small)).notes[0].endswith(f'on {name}; look at shielding and ground')
@@ -335,6 +372,11 @@ def test_drift_is_worth_a_look_beyond_five_micrometres_a_minute_and_five_deviati
         ((0.0, 5.1 * minute, 0.0, 0.0), 1e-9, '+5.1 µm a minute on y1'),
         ((0.0, 4.9 * minute, 0.0, 0.0), 1e-9, ''),
         ((-5.1 * minute, 0.0, 0.0, 0.0), 1e-9, '-5.1 µm a minute on x1'),
+        ((5.0 / 60e6, 0.0, 0.0, 0.0), 1e-9, ''),
+        ((4.99999995 * minute, 0.0, 0.0, 0.0), 1e-9, ''),
+        ((5.00000005 * minute, 0.0, 0.0, 0.0), 1e-9, '+5.0 µm a minute on x1'),
+        ((6.04999995 * minute, 0.0, 0.0, 0.0), 1e-9, '+6.0 µm a minute on x1'),
+        ((6.05000005 * minute, 0.0, 0.0, 0.0), 1e-9, '+6.1 µm a minute on x1'),
         # The farthest of those that stand out.
         ((6.0 * minute, 0.0, -7.0 * minute, 0.0), 1e-9, '-7.0 µm a minute on x2'),
         ((0.0, 0.0, 0.0, 5.0 * sd), sd, ''),

@@ -100,10 +100,12 @@ def test_combinations_that_hardly_move_say_nothing_in_whatever_unit(
     assert bool(abs(slopes[other, 0] - slopes[0, 0]) > 0.5) is told
     assert slopes[4, 0] == pytest.approx(7.0 * unit, rel=1e-3)
     # Where only one dot moves a lot, the others are small beside it.
-    design[:, :4] = 0.0
-    design[:, 0], design[:, other] = 1e-3 * unit * share * along, unit * np.cos(np.arange(100.0))
-    slopes, _, _ = module._regression(design, design[:, :1])
-    assert slopes[0, 0] == pytest.approx(0.0, abs=1e-3)
+    for small, large in ((0, other), (other, 0)):
+        design[:, :4] = 0.0
+        design[:, small], design[:, large] = 1e-3 * unit * share * along, unit * np.cos(np.arange(100.0))
+        slopes, _, _ = module._regression(design, design[:, [small]] + 7.0 * unit)
+        assert slopes[small, 0] == pytest.approx(0.0, abs=1e-3)
+        assert slopes[4, 0] == pytest.approx(7.0 * unit, rel=1e-3)
 
 
 def of_loads(rig: Rig, loads: FloatArray) -> FloatArray:

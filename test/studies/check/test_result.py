@@ -151,6 +151,11 @@ def test_each_push_has_a_row_with_what_the_file_expects_on_each_channel() -> Non
     # The file has x1 turned; a hundredth of the whole is next to nothing. By hand there is no size.
     assert along == ['+X', '+1.0', '-2.0', '+0.0', '+4.0', '  rig file:', '+', '0', '+', '0', '']
     assert beside == ['+Y with +θ', '+0.0', '+0.0', '+0.0', '+1000.0', '  rig file:', '0', '+', '0', '-', '0.50']
+    # Rounded to a tenth of a micrometre.
+    near = replace(PUSHES[0], channels=np.array([1.0499995e-6, 1.0500005e-6, 0.0, 0.0]))
+    assert _pushes(replace(CHECKUP, pushes=(near,), sizes=(1.0,)))[1][1:3] == ['+1.0', '+1.1']
+    # One push that has a size is enough for a column.
+    assert [row[-1] for row in _pushes(replace(CHECKUP, pushes=PUSHES[::-1]))] == ['size', '1.50', '']
     # A push that was not seen has none either, and then there is no column.
     assert [len(row) for row in _pushes(replace(CHECKUP, sizes=(1.5, math.nan)))] == [10, 10, 10]
     assert CHECKUP.lines()[0] == ''
@@ -209,9 +214,21 @@ def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:
         'hum',
         'x1 0.0  y1 1.0  sum1 0.0  x2 2.5  y2 0.0  sum2 0.0  mV at 60 Hz',
     )
-    for sd, told in ((TELLING_DRIFT, True), (1.001 * TELLING_DRIFT, False)):
+    minute = 1e-6 / 60.0
+    near = replace(
+        CHECKUP,
+        drift=minute * np.array([1.04999999, 1.05000001, 0.0, 0.0]),
+        drift_sd=minute * np.array([2.24999998, 2.25000002, 0.0, 0.0]),
+        levels=replace(LEVELS, hum=np.array([1.0495e-3, 1.0505e-3, 0.0, 0.0, 0.0, 0.0]), stated=2.2245e-3),
+    )
+    told = dict(_levels(near))
+    assert told['drift'].startswith('x1 +1.0 ± 2.2  y1 +1.1 ± 2.3  ')
+    assert told['hum'].startswith('x1 1.0  y1 1.1  ')
+    assert told['noise'].endswith('(rig file 2.22)')
+    assert _levels(replace(CHECKUP, levels=replace(LEVELS, stated=2.2255e-3)))[0][1].endswith('(rig file 2.23)')
+    for sd, known in ((TELLING_DRIFT, True), (1.001 * TELLING_DRIFT, False)):
         short = replace(CHECKUP, drift_sd=np.array([0.0, 0.0, sd, 0.0]))
-        assert (_levels(short)[3][1] != 'cannot be told: the recording is too short') is told
+        assert (_levels(short)[3][1] != 'cannot be told: the recording is too short') is known
 
 
 def test_the_tree_and_the_table_have_all_numbers() -> None:

@@ -491,6 +491,7 @@ def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fi
     assert left(found, 4) == pytest.approx(1.13, abs=0.01)
     assert plateaus._apart(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
     assert plateaus.stand_out(found).gone == (3,)
+    assert plateaus.stand_out(found, 0.025).gone == (3,)
     assert plateaus.stand_out(found, 0.1).gone == ()
 
 
