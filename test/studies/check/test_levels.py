@@ -71,6 +71,12 @@ def test_a_channel_on_which_no_bit_moves_is_stuck_if_noise_would_move_one() -> N
         assert levels(quiet, volts).stuck == stuck
 
 
+def test_one_sample_has_no_noise() -> None:
+    found = levels(RIG, noisy(1))
+    assert found.noise.tolist() == [0.0] * 6
+    assert found.sums == pytest.approx(noisy(1)[0, [2, 5]])
+
+
 def test_steps_are_seen_wherever_they_are() -> None:
     volts = np.zeros((2500, 6))
     volts[2000:] = 0.05 * np.random.default_rng(2).integers(-3, 4, (500, 6))

@@ -77,6 +77,14 @@ def test_slopes_and_their_spread_are_those_of_least_squares_and_memory_widens_th
     assert (about[1:] @ about[:-1]) / (about @ about) > 0.99
     _, _, slow = module._regression(np.column_stack((np.zeros((2000, 4)), np.ones(2000))), wave)
     assert slow == pytest.approx(about @ about / 1995 * 1.98 / 0.02, rel=1e-6)
+    # One value more than numbers, and as many of which some count for nothing.
+    for rows in (7, 4):
+        some = design[:rows].copy()
+        some[:, :4] *= rows > 6
+        own = chance.normal(size=(rows, 1))
+        r = own[:, 0] - some @ np.linalg.lstsq(some, own[:, 0], rcond=None)[0]
+        colour = min(max(float(r[1:] @ r[:-1] / (r @ r)), 0.0), 0.98)
+        assert module._regression(some, own)[2] == pytest.approx(r @ r * (1 + colour) / (1 - colour), rel=1e-5)
     # What explains all leaves nothing, and no more numbers than values have a variance still.
     _, _, exact = module._regression(np.eye(3)[:, :2], np.array([[1.0], [2.0], [0.0]]))
     assert exact.tolist() == [0.0]

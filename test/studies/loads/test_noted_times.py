@@ -371,6 +371,11 @@ def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
     # Of two rows of three the middle is between them.
     (slow,) = noted_times._steps(stepped(200, {100: 1.0, 101: 1.0}), 10)
     assert slow.at == pytest.approx(100.5)
+    # So it is wherever the dots are, from the first width of them on.
+    early = stepped(200, {14: 1.0})
+    (first,), (shifted,) = noted_times._steps(early, 10), noted_times._steps(early + 5.0, 10)
+    assert (shifted.at, shifted.size) == pytest.approx((first.at, first.size))
+    assert (shifted.first, shifted.last) == (first.first, first.last) == (10, 24)
     # Four widths are the least, even if most of them is lost: more than two of ten must be there.
     for n, told in ((40, 1), (39, 0)):
         short = stepped(n, {20: 1.0})
@@ -387,6 +392,17 @@ def test_a_step_stands_out_ten_times_of_what_is_there_without_one(times: float, 
     dots[:, 3] = 0.01 * np.arange(2000.0)
     assert (0.75 * times) ** 2 + 1.0 != pytest.approx(100.0, abs=2.0)
     assert len(noted_times._steps(dots, 100)) == seen
+
+
+def test_places_without_a_mean_have_no_step() -> None:
+    # Fifty of a hundred places have none: their middle one is half of the least that the drift makes of the others,
+    # 0.55, as three samples after the last are left. Ten times of that are more than the step.
+    dots = stepped(120, {30: 2.0})
+    dots[:, 3] = 0.1 * np.arange(120.0)
+    dots[62:] = np.nan
+    assert list(sizes_of(dots, 10).values()).count(0.0) == 50
+    assert noted_times._steps(dots, 10) == []
+    assert len(noted_times._steps(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
 
 
 def test_a_step_is_more_than_three_per_cent_of_the_largest() -> None:
