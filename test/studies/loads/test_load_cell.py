@@ -74,6 +74,9 @@ def test_noise_is_what_has_next_to_no_memory_of_few_values_up_to_four_over_the_r
         assert loads[:, 1] == pytest.approx(np.full(2 * count, values.mean()))
     # Whatever its unit.
     assert len(measured_along_y(1e-3 * values)[1]) == noise
+    # And so it is of the part after a step.
+    first = with_memory(count, 0.0)
+    assert len(measured_along_y(np.concatenate((first, 1000.0 + values)))[1]) == 1 + noise
     # That along Y says all, whatever the others do.
     both = np.zeros((2 * count, 3))
     both[:, 1] = np.repeat(values, 2)
@@ -132,7 +135,8 @@ def test_the_mean_is_over_the_time_that_each_value_held_and_its_deviation_over_t
     values[150:] += (100.0, 0.0, 0.0)
     loads = np.repeat(values, held, axis=0)
     edge = int(held[:150].sum())
-    calm, (first, second) = without_cell_noise(loads)
+    with np.errstate(invalid='raise', divide='raise'):
+        calm, (first, second) = without_cell_noise(loads)
     assert (first.first, first.last, second.first, second.last) == (0, edge, edge, len(loads))
     assert calm[:edge] == pytest.approx(np.tile(loads[:edge].mean(axis=0), (edge, 1)))
     assert calm[edge:] == pytest.approx(np.tile(loads[edge:].mean(axis=0), (len(loads) - edge, 1)))
