@@ -204,7 +204,10 @@ ROOMS: Mapping[str, Room] = {
     'check': Room(
         ('psd_deflection/studies/check', 'psd_deflection/studies/loads'),
         ('test/studies/check', 'test/studies/loads'),
-        slow=('test/run/test_guided.py',),
+        slow=(
+            *('test/run/test_guided.py', 'test/run/test_last_step.py'),
+            *(f'test/studies/discover/test_{n}.py' for n in ('setup', 'hung')),
+        ),
     ),
     'identify': Room(
         ('psd_deflection/studies/identify',),

@@ -48,7 +48,7 @@ def noise_findings(
     there = np.isfinite(dots)
     if not there.any():
         return [], {}
-    factor = math.sqrt(float(np.mean(dots[there] ** 2)) / float(np.mean(stated**2)))
+    factor = math.sqrt(float(np.mean(dots[there] ** 2)) / float(np.mean(stated[there] ** 2)))
     if not _far(factor):
         return [], {}
     level = float(f'{factor * rig.amplifier.noise:.2g}')

@@ -303,12 +303,11 @@ def _steps(dots: FloatArray, width: int) -> list[_Step]:
     for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         # Two steps close together make one stretch with two peaks.
         weights = np.maximum(size[a:b] - 0.5 * size[a:b].max(), 0.0)
-        if weights.sum() <= 0.0 or b - a < width // 2:
+        if b - a < width // 2:
             continue
         first, last = a + width, b + width
-        beyond = slice(last, min(last + width, n)), slice(max(first - width, 0), first)
-        moved = [float(x) for x in np.linalg.norm(_difference(dots, *beyond), axis=0, keepdims=True)]
-        out.append(_Step(float(at[a:b] @ weights / weights.sum()), moved[0], first, last))
+        moved = _difference(dots, slice(last, last + width), slice(a, first))
+        out.append(_Step(float(at[a:b] @ weights / weights.sum()), float(np.linalg.norm(moved, axis=0)), first, last))
     return out
 
 

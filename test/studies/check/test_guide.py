@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -136,3 +137,330 @@ def test_a_dot_at_its_end_is_said() -> None:
         yield from [push] * 700
 
     assert 'A dot is at the end of its PSD: push less.' in [guide.feed(bench.block(load)) for load in loads()]
+
+
+# ---- the phases, sample by sample
+
+MICRO = 1e-6
+WAIT = 500
+"""Blocks of ten seconds."""
+
+
+class Fed:
+    """A guide that gets blocks whose dots are told, m; ``said``: what it answered to each."""
+
+    def __init__(self, known: Rig | None = None) -> None:
+        self.known = known or load_rig()
+        self.guide = Guide(self.known)
+        self.said: list[str] = []
+
+    def feed(self, dots: tuple[float, float, float, float], blocks: int = 1, shaking: float = 0.0) -> list[str]:
+        """``blocks`` at these ``dots``; ``shaking``: one after the other to either side of it on y1, m."""
+        volts = np.full((BLOCK, 6), 5.0)
+        answers = []
+        for _ in range(blocks):
+            side = shaking if len(self.said) % 2 else -shaking
+            moved = np.add(dots, (0.0, side, 0.0, 0.0))
+            volts[:, [0, 1, 3, 4]] = moved / self.known.amplifier.sensitivity
+            answers.append(self.guide.feed(volts.copy()))
+            self.said.append(answers[-1])
+        return answers
+
+    def at(self, phase: Phase, progress: float | None = None) -> bool:
+        """Whether that is waited for, and so far."""
+        far = self.guide.progress
+        return self.guide.phase is phase and (progress is None or math.isclose(far, progress, abs_tol=1e-9))
+
+    def rested(self, shaking: float = 0.0) -> Fed:
+        """After the first rest, two seconds of it."""
+        self.feed(NOTHING, 100, shaking)
+        assert self.at(Phase.PUSH)
+        return self
+
+
+NOTHING = (0.0, 0.0, 0.0, 0.0)
+FAR = (0.0, 300 * MICRO, 0.0, -400 * MICRO)
+"""Half a millimetre away."""
+
+
+def test_rest_takes_two_seconds_and_a_push_and_letting_go_six_tenths_each() -> None:
+    fed = Fed()
+    guide = fed.guide
+    assert fed.at(Phase.REST, 0.0)
+    assert (guide.number, guide.pushes) == (0, [])
+    assert guide.moved.tolist() == [0.0] * 4
+    assert guide.prompt() == 'Leave the link alone.'
+    for number in range(1, 100):
+        fed.feed(NOTHING)
+        assert fed.at(Phase.REST, number / 100)
+    fed.feed(NOTHING)
+    assert fed.at(Phase.PUSH, 0.0)
+    for number, name in enumerate(('Push the tip along +X', 'Push the tip along +Y', 'Turn the tip'), start=1):
+        assert guide.number == number - 1
+        assert guide.prompt().startswith(f'{number} of 3: {name}')
+        for held in range(1, 30):
+            fed.feed(FAR)
+            assert fed.at(Phase.PUSH, held / 30)
+        assert guide.moved == pytest.approx(np.array(FAR))
+        assert fed.feed(FAR) == ['Got it: x1 +0, y1 +300, x2 +0, y2 -400 µm.']
+        assert fed.at(Phase.RELEASE, 0.0)
+        assert guide.prompt() == 'Let go.'
+        for back in range(1, 30):
+            fed.feed(NOTHING)
+            assert fed.at(Phase.RELEASE, back / 30)
+        fed.feed(NOTHING)
+        assert len(guide.pushes) == number
+    assert fed.at(Phase.DONE)
+    assert (guide.number, guide.prompt()) == (3, 'Done.')
+    assert fed.feed(FAR) == ['']
+    assert [p.loads for p in guide.pushes] == [('fx',), ('fy',), ('tz',)]
+    assert [p.only_twist for p in guide.pushes] == [False, False, True]
+    assert not any(p.sized for p in guide.pushes)
+    assert [p.expected.tolist() for p in guide.pushes] == [[-1, 0, -1, 0], [0, -1, 0, -1], [0.07, 0, 0, 0.1]]
+
+
+def test_pieces_of_any_length_count_by_their_samples() -> None:
+    fed = Fed()
+    volts = np.full((1990, 6), 5.0)
+    fed.guide.feed(volts)
+    assert fed.at(Phase.REST, 0.995)
+    fed.guide.feed(volts[:10])
+    assert fed.at(Phase.PUSH)
+    assert len(fed.guide.rest()) == 2000
+    # The oldest pieces go as soon as the others are enough.
+    moving = Fed()
+    moving.feed((0.0, 0.0, 0.0, 50 * MICRO), 30)
+    moving.feed(NOTHING, 99)
+    assert moving.at(Phase.REST)
+    moving.feed(NOTHING)
+    assert moving.at(Phase.PUSH)
+    assert len(moving.guide.rest()) == 2000
+
+
+def test_what_is_moved_is_against_the_last_rest_or_what_was_just_seen() -> None:
+    fed = Fed()
+    fed.feed(NOTHING)
+    fed.feed((8 * MICRO, 0.0, 0.0, 0.0))
+    assert fed.guide.moved == pytest.approx([4 * MICRO, 0.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize(('shaking', 'rests'), [(1.10 * MICRO, True), (1.14 * MICRO, False)])
+def test_rest_wanders_by_no_more_than_five_times_the_noise_of_a_block(shaking: float, rests: bool) -> None:
+    # 2 mV are 1 um a sample; of a block of 20 five deviations are 1.118 um.
+    fed = Fed()
+    said = fed.feed(NOTHING, WAIT - 1, shaking)
+    assert fed.at(Phase.REST) is not rests
+    if not rests:
+        assert fed.guide.progress == 0.0
+        assert not any(said)
+        assert fed.feed(NOTHING, 2, shaking).count('It still moves by 1.1 µm rms: leave it alone.') == 1
+        # Once in ten seconds, and after half a minute it is taken as it is.
+        assert fed.feed(NOTHING, WAIT - 2, shaking) == [''] * (WAIT - 2)
+        assert fed.feed(NOTHING, 4, shaking).count('It still moves by 1.1 µm rms: leave it alone.') == 1
+        fed.feed(NOTHING, WAIT - 4, shaking)
+        assert fed.at(Phase.REST)
+        fed.feed(NOTHING, 3, shaking)
+        assert fed.at(Phase.PUSH)
+
+
+def test_rest_of_a_quiet_rig_may_still_wander_by_a_tenth_of_the_least_push() -> None:
+    quiet = load_rig(overrides={'amplifier.noise': 1e-5})
+    for shaking, rests in ((0.99 * MICRO, True), (1.01 * MICRO, False)):
+        fed = Fed(quiet)
+        fed.feed(NOTHING, 110, shaking)
+        assert fed.at(Phase.PUSH) is rests
+
+
+@pytest.mark.parametrize(
+    ('shaking', 'size', 'taken'),
+    [
+        # Ten micrometres at least,
+        (0.0, 9.9, False),
+        (0.0, 10.1, True),
+        # or ten times as far as the dots wander at rest: 1 um on y1, the noise of two seconds, 0.224 um, on the others.
+        (1.0, 10.7, False),
+        (1.0, 10.8, True),
+    ],
+)
+def test_a_push_stands_out_of_the_rest(shaking: float, size: float, taken: bool) -> None:
+    assert 10.0 * math.sqrt(1.0 + 3.0 * 0.2236**2) == pytest.approx(10.724, abs=1e-3)
+    fed = Fed().rested(shaking * MICRO)
+    said = fed.feed((size * MICRO, 0.0, 0.0, 0.0), WAIT + 1)
+    assert fed.at(Phase.RELEASE) is taken
+    if not taken:
+        assert fed.guide.progress == 0.0
+        assert [text for text in said if text] == [f'No push yet: the dots have moved by {size:.1f} µm.']
+        assert said[WAIT - 2] == ''
+
+
+@pytest.mark.parametrize(('shaking', 'taken'), [(149.0, True), (151.0, False)])
+def test_a_push_is_held_if_it_wanders_by_less_than_three_tenths_of_it(shaking: float, taken: bool) -> None:
+    fed = Fed().rested()
+    said = fed.feed(FAR, WAIT + 1, shaking * MICRO)
+    assert any(text.startswith('Got it') for text in said) is taken
+    assert ('Hold it steadier.' in said) is not taken
+
+
+def test_a_dot_at_the_end_of_its_range_is_said_though_it_is_held() -> None:
+    # Two counts below 10 V are the end; half a millimetre is a volt.
+    step = 20.0 / 2**16
+    for volt, ends in ((10.0 - 2.0 * step, True), (10.0 - 2.5 * step, False)):
+        fed = Fed().rested()
+        said = fed.feed((0.0, 0.0, -volt * 5e-4, 0.0), WAIT + 1)
+        assert ('A dot is at the end of its PSD: push less.' in said) is ends
+        assert any(text.startswith('Got it') for text in said) is not ends
+
+
+def test_how_far_the_dots_were_pushed_is_told_in_whole_micrometres() -> None:
+    fed = Fed().rested()
+    assert fed.feed((1234.5006 * MICRO, -0.6 * MICRO, -999.4998 * MICRO, 0.0), 30)[-1] == (
+        'Got it: x1 +1235, y1 -1, x2 -999, y2 +0 µm.'
+    )
+
+
+@pytest.mark.parametrize(
+    ('size', 'shaking', 'free'), [(74.0, 0.0, True), (76.0, 0.0, False), (0.0, 74.0, True), (0.0, 76.0, False)]
+)
+def test_a_push_is_let_go_within_a_seventh_of_it(size: float, shaking: float, free: bool) -> None:
+    # Half a millimetre: 0.15 of it are 75 um.
+    fed = Fed().rested()
+    fed.feed(FAR, 30)
+    said = fed.feed((0.0, 0.0, size * MICRO, 0.0), 30, shaking * MICRO)
+    assert len(fed.guide.pushes) == free
+    if not free:
+        assert fed.guide.progress == 0.0
+        said += fed.feed((0.0, 0.0, size * MICRO, 0.0), WAIT - 28, shaking * MICRO)
+        assert [text for text in said if text] == ['Let go of the link.']
+
+
+def test_a_push_is_against_the_rests_before_and_after_and_as_sure_as_these_were() -> None:
+    fed = Fed().rested(MICRO)
+    fed.feed(FAR, 30, 20 * MICRO)
+    fed.feed((4 * MICRO, 0.0, 0.0, -6 * MICRO), 30)
+    (taken,) = fed.guide.pushes
+    assert taken.channels == pytest.approx([-2e-6, 300e-6, 0.0, -397e-6])
+    # At rest y1 wandered by 1 um, the others by the noise, 1 um a sample, of 2000; y1 was held by 20 um, of 30 blocks.
+    rest = 1e-6 * math.sqrt(100 * 1e-3 / 2.0)
+    held = 20e-6 / math.sqrt(30.0)
+    wanted = [math.hypot(rest, 2e-6), math.hypot(1e-6, held), rest, math.hypot(rest, 3e-6)]
+    assert taken.sd == pytest.approx(wanted)
+    # The next one is against that rest.
+    fed.feed((4 * MICRO, 100 * MICRO, 0.0, -6 * MICRO), 30)
+    fed.feed((4 * MICRO, 0.0, 0.0, -6 * MICRO), 30)
+    assert fed.guide.pushes[1].channels == pytest.approx([0.0, 1e-4, 0.0, 0.0], abs=1e-12)
+    # From the first rest, at 2 s, to the last, at 4.4 s, with what handling may shift: 2 um.
+    drift, sd = fed.guide.drift()
+    assert drift == pytest.approx(np.array([4e-6, 0.0, 0.0, -6e-6]) / 2.4)
+    assert sd == pytest.approx((np.array([rest, 1e-6, rest, rest]) + 2e-6) / 2.4)
+    assert fed.guide.rest().shape == (2000, 6)
+    assert fed.guide.rest()[:, 2].tolist() == [5.0] * 2000
+
+
+def test_all_is_told_against_the_last_rest_wherever_that_is() -> None:
+    def at(x1: float, y1: float, x2: float, y2: float) -> tuple[float, float, float, float]:
+        """Micrometres beside the first rest."""
+        return (200e-6 + x1 * MICRO, -100e-6 + y1 * MICRO, 50e-6 + x2 * MICRO, y2 * MICRO)
+
+    fed = Fed()
+    fed.feed(at(0, 0, 0, 0), 100)
+    assert fed.feed(at(0, 300, 0, -400), 30)[-1] == 'Got it: x1 +0, y1 +300, x2 +0, y2 -400 µm.'
+    fed.feed(at(0, 0, 0, -60), 30)
+    (first,) = fed.guide.pushes
+    assert first.channels == pytest.approx([0.0, 300e-6, 0.0, -370e-6], abs=1e-12)
+    rest = 1e-6 * math.sqrt(100 * 1e-3 / 2.0)
+    assert first.sd == pytest.approx([rest, rest, rest, math.hypot(rest, 30e-6)])
+    assert fed.guide.drift()[0] == pytest.approx([0.0, 0.0, 0.0, -60e-6 / 1.2], abs=1e-12)
+    fed.feed(at(0, 300, 0, -460))
+    assert fed.guide.moved == pytest.approx([0.0, 300e-6, 0.0, -400e-6], abs=1e-12)
+    assert fed.feed(at(0, 300, 0, -460), 29)[-1] == 'Got it: x1 +0, y1 +300, x2 +0, y2 -400 µm.'
+    # 76 um from the last rest is not let go of half a millimetre, 74 is, though both are farther from the first.
+    fed.feed(at(0, 0, 76, -60), 30)
+    assert fed.at(Phase.RELEASE, 0.0)
+    fed.feed(at(0, 0, 74, -60), 30)
+    assert len(fed.guide.pushes) == 2
+
+
+def test_a_piece_goes_when_the_pieces_after_it_are_enough() -> None:
+    fed = Fed()
+    for samples, place in ((1500, 10.0), (900, 20.0), (10, 60.0)):
+        volts = np.zeros((samples, 6))
+        volts[:, 0] = place * MICRO / 5e-4
+        fed.guide.feed(volts)
+    assert fed.guide.moved == pytest.approx([(60.0 - 30.0) * MICRO, 0.0, 0.0, 0.0])
+    volts = np.zeros((1095, 6))
+    fed.guide.feed(volts)
+    # 900, 10 and 1095 samples are enough for two seconds.
+    assert fed.guide.moved == pytest.approx([(0.0 - 80.0 / 3.0) * MICRO, 0.0, 0.0, 0.0])
+
+
+def test_a_push_at_the_end_of_the_range_is_filled_and_no_more() -> None:
+    fed = Fed().rested()
+    volts = np.full((35, 6), 9.9999)
+    for _ in range(30):
+        assert fed.guide.feed(volts) == ''
+    assert fed.at(Phase.PUSH, 1.0)
+
+
+def test_the_steadiness_of_a_hand_counts_by_the_pieces_in_which_it_let_go() -> None:
+    fed = Fed().rested()
+    fed.feed(FAR, 30, 20 * MICRO)
+    fed.guide.feed(np.zeros((600, 6)))
+    (taken,) = fed.guide.pushes
+    rest = 1e-6 * math.sqrt(100 * 1e-3 / 2.0)
+    assert taken.sd == pytest.approx([rest, math.hypot(rest, 20e-6), rest, rest])
+
+
+def test_ten_seconds_are_enough_and_thirty_are_all() -> None:
+    # 1024 samples a second: each second is one in floating point, too.
+    known = load_rig(overrides={'converter.sample_rate_hz': 1024.0})
+    guide = Guide(known)
+    said = []
+    for second in range(1, 31):
+        volts = np.zeros((1024, 6))
+        volts[:, 1] = 0.1 * (second % 2)
+        assert guide.phase is Phase.REST
+        said += [second] if guide.feed(volts) else []
+    assert said == [10, 20]
+    assert guide.phase is Phase.PUSH
+
+
+def test_a_push_is_more_than_ten_micrometres_and_let_go_at_less_than_a_seventh_of_it() -> None:
+    # At 1 Hz and 2^-11 m/V each number is one in floating point, too: two seconds are two samples, 0.6 s one.
+    slow = {'converter.sample_rate_hz': 1.0, 'amplifier.sensitivity': 2.0**-11, 'amplifier.noise': 1e-5}
+    guide = Guide(load_rig(overrides=slow))
+
+    def fed(volt: float) -> str:
+        return guide.feed(np.array([[volt, 0.0, 5.0, 0.0, 0.0, 5.0]]))
+
+    assert (fed(0.0), fed(0.0)) == ('', '')
+    assert fed(10e-6 * 2.0**11) == ''
+    assert fed(10.01e-6 * 2.0**11) == 'Got it: x1 +10, y1 +0, x2 +0, y2 +0 µm.'
+    assert fed(0.0) == ''
+    assert fed(1.0).startswith('Got it: x1 +488, ')
+    assert fed(0.15) == ''
+    assert len(guide.pushes) == 1
+    assert fed(0.1499) == ''
+    assert len(guide.pushes) == 2
+
+
+@pytest.mark.parametrize(('shaking', 'told'), [(1.2499995, '1.2'), (1.2500005, '1.3')])
+def test_how_much_it_moves_is_told_to_a_tenth_of_a_micrometre(shaking: float, told: str) -> None:
+    assert f'It still moves by {told} µm rms: leave it alone.' in Fed().feed(NOTHING, WAIT + 2, shaking * MICRO)
+    fed = Fed().rested()
+    far = 5.0 + (shaking - 1.25) * 4.0 + 0.25
+    said = fed.feed((far * MICRO, 0.0, 0.0, 0.0), WAIT + 2)
+    assert f'No push yet: the dots have moved by {4.0 + float(told):.1f} µm.' in said
+
+
+def test_one_rest_alone_has_no_drift() -> None:
+    drift, sd = Fed().rested().guide.drift()
+    assert drift.tolist() == [0.0] * 4
+    # In the time of one sample.
+    assert (sd > 1e-3).all()
+
+
+def test_the_landmark_is_the_psd_that_lies_farthest_out_along_the_axis() -> None:
+    rig = load_rig(overrides={'psd_1.center': [0.03, -0.08], 'psd_2.center': [-0.02, 0.05]})
+    first, second, _ = directions(rig)
+    assert first == 'Push the tip along +X (towards the PSD at x 30 mm, y -80 mm) and hold it.'
+    assert second == 'Push the tip along +Y (away from the PSD at x 30 mm, y -80 mm) and hold it.'

@@ -11,6 +11,7 @@ import pytest
 
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check import judges
 from psd_deflection.studies.check.checkup import check, of_recording
@@ -191,3 +192,76 @@ def test_glitches_are_no_noise() -> None:
     volts = np.array([1.0, 2.0, 5.0, -1.0, 0.5, 5.0]) + rng.normal(0.0, 2e-3, (4000, 6))
     volts[::250] += 0.5
     assert levels(RIG, volts).noise == pytest.approx(np.full(6, 2e-3), rel=0.15)
+
+
+def test_the_noise_of_steps_is_their_size_over_the_root_of_twelve() -> None:
+    stated = math.hypot(2e-3, 0.05 / math.sqrt(12.0))
+    steps = np.full((2, 2), 0.05)
+    (found,), lines = judges.noise_findings(RIG, np.full(4, 3.45678 * stated), steps)
+    assert (found.name, found.where, found.value) == ('noise_level', 'x1 y1 x2 y2', 3.457)
+    assert found.evidence == pytest.approx(math.log(3.45678))
+    assert lines == {'amplifier.noise': 6.9e-3}
+    assert found.fix == 'amplifier.noise: 0.0069'
+    # Steps that are finer than the file's make no less.
+    alone = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))
+    (same,), _ = judges.noise_findings(RIG, np.full(4, 3.0 * alone), np.zeros((2, 2)))
+    assert same.value == 3.0
+    # Channels that nobody sees have no say, however coarse they are.
+    steps[0, 1] = 5.0
+    (some,), _ = judges.noise_findings(RIG, np.array([1.0, math.nan, 1.0, 1.0]) * 3.45678 * stated, steps)
+    assert some.value == 3.457
+    assert judges.noise_findings(RIG, np.zeros(4)) == ([], {})
+
+
+def test_the_noise_of_one_channel_is_told_with_its_factor_and_both_of_its_psd() -> None:
+    rig = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]})
+    step = 20.0 / 2**16 / math.sqrt(12.0)
+    noise = np.array([2.34567 * math.hypot(1e-3, step), 2e-3, 4e-3, math.hypot(2e-3, step) / 3.21])
+    findings, lines = judges.noise_findings(rig, noise)
+    assert [(f.name, f.where, f.value) for f in findings] == [
+        ('noise_level', 'x1', 2.346),
+        ('noise_level', 'y2', 0.312),
+    ]
+    assert [f.evidence for f in findings] == pytest.approx([math.log(2.34567), math.log(3.21)])
+    assert lines == {'psd_1.noise': [2.4e-3, 2e-3], 'psd_2.noise': [4e-3, 6.2e-4]}
+    noise[1] = math.nan
+    assert [f.where for f in judges.noise_findings(rig, noise)[0]] == ['y2']
+
+
+@pytest.mark.parametrize(
+    ('bits', 'step', 'right', 'words'),
+    [
+        (16, 0.02, 10, '20 mV, the rig file says 0.305 mV'),
+        (12, 0.0101, 11, '10.1 mV, the rig file says 4.88 mV'),
+        (11, 0.04006, 9, '40.1 mV, the rig file says 9.77 mV'),
+        (11, 0.04004, 9, '40 mV, the rig file says 9.77 mV'),
+        # A third more is no bit, and fewer than eight no converter has.
+        (16, 0.0004, None, '0.4 mV, the rig file says 0.305 mV'),
+        (16, 20.0 / 2**LEAST_BITS, LEAST_BITS, ''),
+        (16, 40.0 / 2**LEAST_BITS, None, ''),
+    ],
+)
+def test_each_doubling_of_the_step_is_a_bit_less(bits: int, step: float, right: int | None, words: str) -> None:
+    rig = load_rig(overrides={'converter.bits': bits})
+    (found,), lines = judges.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]))
+    assert lines == ({} if right is None else {'converter.bits': right})
+    assert (found.where, found.value) == ('sum1', step)
+    assert found.evidence == pytest.approx(math.log(step / (20.0 / 2**bits)))
+    told = f'sum1 steps by {words}'
+    if words:
+        assert found.fix == (told if right is None else f'converter.bits: {right} ({told})')
+
+
+def test_a_unit_has_the_evidence_that_is_told_or_none() -> None:
+    sizes = np.array([9.80665, math.nan, math.nan])
+    assert judges.unit_findings(sizes)[0][0].evidence == 0.0
+    (found,), factors = judges.unit_findings(sizes, 7.0)
+    assert (found.name, found.where, found.value, found.evidence) == ('load_unit', 'fx', 9.80665, 7.0)
+    assert found.fix == 'multiply load_fx in the recording by 9.80665: it is noted in kg instead of N'
+    assert factors.tolist() == [9.80665, 1.0, 1.0]
+
+
+def test_a_turned_sign_has_the_value_minus_one_and_an_exchange_none() -> None:
+    wiring = Wiring(True, (('y', 'x'), ('x', '-y')))
+    findings, _ = judges.wiring_findings(wiring, Wiring.from_rig(RIG), 0.0)
+    assert [(f.name, f.value) for f in findings] == [('psd_swap', None), ('axis_swap', None), ('channel_sign', -1.0)]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
-from psd_deflection.studies.loads.load_cell import without_cell_noise
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.loads.load_cell import MeasuredLoad, without_cell_noise
 
 DWELL = 4000
 LEVELS = np.array(
@@ -27,3 +29,123 @@ def test_a_load_cell_is_averaged_between_steps_and_motion_is_not() -> None:
     assert np.array_equal(still, swept)
     assert none == ()
     assert without_cell_noise(HUNG)[1] == ()
+
+
+def measured_along_y(values: FloatArray, *, held: int = 2) -> tuple[FloatArray, tuple[MeasuredLoad, ...]]:
+    """What becomes of ``values`` (k,) of a cell along Y, each held for so many samples."""
+    loads = np.zeros((held * len(values), 3))
+    loads[:, 1] = np.repeat(values, held)
+    return without_cell_noise(loads)
+
+
+def with_memory(count: int, wanted: float) -> FloatArray:
+    """Values whose correlation with the next one is as ``wanted``."""
+    white = np.random.default_rng(2).normal(size=count + 1)
+
+    def mixed(share: float) -> FloatArray:
+        return np.asarray(white[1:] + share * white[:-1])
+
+    def memory(share: float) -> float:
+        about = mixed(share) - mixed(share).mean()
+        return float(about[1:] @ about[:-1] / (about @ about))
+
+    return mixed(brentq(lambda share: memory(share) - wanted, -0.99, 0.99))
+
+
+@pytest.mark.parametrize(
+    ('count', 'memory', 'noise'),
+    [
+        (400, 0.19, True),
+        (400, -0.19, True),
+        (400, 0.21, False),
+        (400, -0.21, False),
+        (10_000, 0.145, True),
+        (10_000, 0.155, False),
+        (10_000, -0.155, False),
+    ],
+)
+def test_noise_is_what_has_next_to_no_memory_of_few_values_up_to_four_over_the_root_of_their_number(
+    count: int, memory: float, noise: bool
+) -> None:
+    values = with_memory(count, memory)
+    loads, measured = measured_along_y(values)
+    assert len(measured) == noise
+    if noise:
+        assert loads[:, 1] == pytest.approx(np.full(2 * count, values.mean()))
+    # Whatever its unit.
+    assert len(measured_along_y(1e-3 * values)[1]) == noise
+    # And so it is of the part after a step.
+    first = with_memory(count, 0.0)
+    assert len(measured_along_y(np.concatenate((first, 1000.0 + values)))[1]) == 1 + noise
+    # That along Y says all, whatever the others do.
+    both = np.zeros((2 * count, 3))
+    both[:, 1] = np.repeat(values, 2)
+    both[:, 0] = np.repeat(np.random.default_rng(3).normal(size=count), 2)
+    assert len(without_cell_noise(both)[1]) == noise
+
+
+@pytest.mark.parametrize(('changes', 'samples', 'told'), [(49, 400, 0), (50, 400, 1), (99, 5000, 0), (100, 5000, 1)])
+def test_loads_that_change_at_fifty_samples_and_at_a_fiftieth_of_them_were_measured(
+    changes: int, samples: int, told: int
+) -> None:
+    loads = np.zeros((samples, 3))
+    at = np.arange(changes + 1) * (samples // (changes + 1))
+    for first, value in zip(at.tolist(), np.random.default_rng(4).normal(size=changes + 1).tolist(), strict=True):
+        loads[first:, 0] = value
+    assert len(without_cell_noise(loads)[1]) == told
+
+
+@pytest.mark.parametrize(('times', 'parts'), [(7.9, 1), (8.1, 2), (-7.9, 1), (-8.1, 2)])
+def test_a_step_is_a_change_by_more_than_eight_deviations_of_the_noise(times: float, parts: int) -> None:
+    values = np.random.default_rng(5).normal(size=2001)
+    steps = np.abs(np.diff(values))
+    # The median of a normal law's absolute values is 0.6745 deviations; of a difference the deviation is root 2 larger.
+    noise = float(np.median(steps)) / 0.67449 / 2.0**0.5
+    assert steps.max() < 7.0 * noise
+    # Back in two smaller ones.
+    values[1000:1002] = values[999] + np.array([1.0, 0.5]) * times * noise
+    assert len(measured_along_y(values)[1]) == parts
+
+
+def test_a_channel_without_noise_has_steps_and_a_billionth_of_a_newton_is_none() -> None:
+    noise = np.random.default_rng(6).normal(size=600)
+    for step, parts in ((0.5, 2), (2e-8, 2), (8.0 * 1e-9, 1), (5e-9, 1)):
+        loads = np.zeros((600, 3))
+        loads[:, 1] = noise
+        loads[300:, 2] = step
+        assert [m.first for m in without_cell_noise(loads)[1]] == [0, 300][:parts]
+
+
+@pytest.mark.parametrize(('short', 'told'), [(19, False), (20, True)])
+def test_less_than_twenty_values_between_steps_stay_as_they_are(short: int, told: bool) -> None:
+    values = np.random.default_rng(7).normal(size=200)
+    values[100 : 100 + short] += 1000.0
+    loads, measured = measured_along_y(values, held=3)
+    edges = [(0, 300), (300, 300 + 3 * short), (300 + 3 * short, 600)]
+    assert [(m.first, m.last) for m in measured] == [e for e in edges if told or e[0] != 300]
+    middle = loads[300 : 300 + 3 * short, 1]
+    kept = values[100 : 100 + short]
+    assert middle == pytest.approx(np.full(3 * short, kept.mean()) if told else np.repeat(kept, 3))
+
+
+def test_the_mean_is_over_the_time_that_each_value_held_and_its_deviation_over_the_values() -> None:
+    chance = np.random.default_rng(8)
+    held = chance.integers(1, 9, 300)
+    values = chance.normal(size=(300, 3)) * (1.0, 0.0, 0.1) + (5.0, 0.0, 1.0)
+    values[150:] += (100.0, 0.0, 0.0)
+    loads = np.repeat(values, held, axis=0)
+    edge = int(held[:150].sum())
+    with np.errstate(invalid='raise', divide='raise'):
+        calm, (first, second) = without_cell_noise(loads)
+    assert (first.first, first.last, second.first, second.last) == (0, edge, edge, len(loads))
+    assert calm[:edge] == pytest.approx(np.tile(loads[:edge].mean(axis=0), (edge, 1)))
+    assert calm[edge:] == pytest.approx(np.tile(loads[edge:].mean(axis=0), (len(loads) - edge, 1)))
+    assert first.sd == pytest.approx(values[:150].std(axis=0) / 150.0**0.5, abs=1e-12)
+    assert second.sd == pytest.approx(values[150:].std(axis=0) / 150.0**0.5, abs=1e-12)
+
+
+def test_motion_in_one_part_leaves_the_noise_of_the_next() -> None:
+    values = np.concatenate((with_memory(400, 0.4), 1000.0 + with_memory(400, 0.0)))
+    loads, (found,) = measured_along_y(values)
+    assert (found.first, found.last) == (800, 1600)
+    assert loads[:800, 1] == pytest.approx(np.repeat(values[:400], 2))

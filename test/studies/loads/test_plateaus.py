@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.model.simulation.modes import Filter, mode_coefficients
+from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.calibrate.from_recordings import as_acted
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.loads import plateaus
+from psd_deflection.studies.loads.fine import fine_means
 from psd_deflection.studies.loads.noted_times import mend_loads, unnoted_steps
-from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, all_free, as_hung, wrong_notes
+from psd_deflection.studies.loads.plate_motion import across_of
+from psd_deflection.studies.loads.plateaus import (
+    EXACT,
+    STANDS_OUT,
+    TOLERANCE,
+    Plateau,
+    PlateauLoads,
+    WrongNote,
+    all_free,
+    as_hung,
+    wrong_notes,
+)
 
 RIG = load_rig()
 DWELL = 4000
@@ -217,3 +233,556 @@ def test_a_step_without_a_note_has_its_time() -> None:
     assert unnoted_steps(RIG, dots, noted_as(2, (0, -20, 0))) == pytest.approx([8.0], abs=2e-3)
     assert unnoted_steps(RIG, dots, HUNG) == []
     assert mend_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
+
+
+# ---- the pieces, by hand
+
+
+def told(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
+    return [(p.first, p.last, p.number, p.unnoted) for p in listed]
+
+
+def test_times_of_a_second_or_more_between_changes_are_listed_with_the_number_of_their_note() -> None:
+    loads = np.zeros((9000, 3))
+    loads[1500:] = (1.0, 0.0, 0.0)
+    # A second is enough, a sample less is not, and a ramp ends once.
+    loads[2500:] = (1.0, 2.0, 0.0)
+    loads[3499:] = (1.0, 2.0, 3.0)
+    loads[5000:5049] = np.linspace((1.0, 2.0, 3.0), (1.0, 2.0, 0.0), 51)[1:-1][:49]
+    loads[5049:] = (1.0, 2.0, 0.0)
+    listed = plateaus.plateaus(RIG, np.zeros((9000, 6)), loads, 7)
+    assert told(listed) == [(0, 1500, 0, False), (1500, 2500, 1, False), (3499, 5000, 3, False), (5049, 9000, 4, False)]
+    assert [tuple(p.noted) for p in listed] == [(0, 0, 0), (1, 0, 0), (1, 2, 3), (1, 2, 0)]
+    assert {p.recording for p in listed} == {7}
+    # From the second sample on, and two that follow each other in two samples.
+    loads[1:] += (5.0, 0.0, 0.0)
+    loads[6000:6002] = (0.0, 0.0, 1.0)
+    loads[6002:] = (0.0, 0.0, 2.0)
+    again = plateaus.plateaus(RIG, np.zeros((9000, 6)), loads)
+    assert told(again)[0] == (1, 1500, 1, False)
+    assert told(again)[-1] == (6002, 9000, 7, False)
+    assert {p.recording for p in again} == {0}
+    assert told(plateaus.plateaus(RIG, np.zeros((9000, 6)), np.ones((9000, 3)))) == [(0, 9000, 0, False)]
+    assert told(plateaus.plateaus(RIG, np.zeros((999, 6)), np.ones((999, 3)))) == []
+    # Its load is the one in its middle.
+    assert Plateau(0, 10, 21, 1, False, np.zeros(3)).of(np.arange(90.0).reshape(30, 3)).tolist() == [45.0, 46.0, 47.0]
+
+
+def test_a_time_that_only_the_motion_shows_has_the_number_of_the_note_before_it() -> None:
+    acting = np.repeat([(0.0, 0.0, 0.0), (0.0, -20.0, 0.0), (0.0, -50.0, 0.0), (0.0, 0.0, 0.0)], 2000, axis=0)
+    noted = acting.copy()
+    noted[4000:6000] = (0.0, -20.0, 0.0)
+    listed = plateaus.plateaus(RIG, read(acting), noted)
+    assert [(p.number, p.unnoted) for p in listed] == [(0, False), (1, False), (1, True), (2, False)]
+    assert [p.first for p in listed] == pytest.approx([0, 2000, 4000, 6000], abs=2)
+    assert [p.last for p in listed] == pytest.approx([2000, 4000, 6000, 8000], abs=2)
+
+
+def test_steps_without_a_note_are_looked_for_in_the_dots_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[FloatArray] = []
+
+    def unnoted(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
+        looked.append(dots)
+        return [2.0, 5.5]
+
+    monkeypatch.setattr(plateaus, 'unnoted_steps', unnoted)
+    volts, loads = np.random.default_rng(1).normal(size=(9000, 6)), np.zeros((9000, 3))
+    loads[4000:] = 1.0
+    listed = plateaus.plateaus(GIVEN, volts, loads)
+    assert told(listed) == [(0, 2000, 0, False), (2000, 4000, 0, True), (4000, 5500, 1, False), (5500, 9000, 1, True)]
+    assert looked[0] == pytest.approx(volts[:, [0, 1, 3, 4]] * (4e-4, 6e-4, 5e-4, 8e-4))
+
+
+GIVEN = load_rig(
+    overrides={
+        'psd_1.sensitivity': [4e-4, 6e-4],
+        'psd_2.sensitivity': [5e-4, 8e-4],
+        'dynamics.bending_damping_ratio': 0.1,
+        'dynamics.torsion_damping_ratio': 0.2,
+    }
+)
+PLATE = np.array([[-1.0, 0.0, 0.07], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.1]])
+"""Rows x1 y1 x2 y2 of PSDs at (0, 70) and (-100, 0) mm: x_i = -X + ly θ, y_i = -Y - lx θ."""
+ACROSS = np.linalg.svd(PLATE)[0][:, 3]
+
+
+def compliance() -> FloatArray:
+    """m/N, m/N, rad/(N m) of a cantilever and a shaft."""
+    link = RIG.link
+    fourth = link.outer_radius**4 - link.inner_radius**4
+    bend = link.length**3 / (3.0 * link.youngs_modulus * np.pi / 4.0 * fourth)
+    return np.array([bend, bend, link.length / (link.shear_modulus * np.pi / 2.0 * fourth)])
+
+
+def test_loads_are_asked_for_by_how_the_plate_moves_and_what_no_plate_does_is_told_apart() -> None:
+    size, samples = 4, 6002
+    ends = [(0, 1500), (1500, 3000), (3302, 4504), (4504, samples)]
+    listed = [Plateau(0, a, b, k, False, np.zeros(3)) for k, (a, b) in enumerate(ends)]
+    more = np.array([(0.0, 0.0, 0.0), (1.0, -2.0, 3.0), (0.5, 0.0, -1.0), (-4.0, 1.0, 0.5)])
+    poses = np.tile([[1e-5], [-2e-5], [3e-5]], samples)
+    for (a, b), load in zip(ends[1:], more[1:], strict=True):
+        acts = np.zeros(samples)
+        acts[a:b] = 1.0
+        for axis, (frequency, ratio) in enumerate(((14.0, 0.1), (14.0, 0.1), (21.0, 0.2))):
+            moved = Filter(mode_coefficients(frequency, ratio, 1e-3))(acts)
+            poses[axis] += load[axis] * compliance()[axis] * moved
+    beside = np.zeros(samples)
+    for (a, b), far in zip(ends, (2e-6, 5e-6, -1e-6, 2e-6), strict=True):
+        beside[a:b] = far
+    dots = PLATE @ poses + np.outer(ACROSS, beside)
+    # What is in no time of the list counts for nothing.
+    dots[:, 3000:3302] += 1e-3
+    volts = np.zeros((6, samples))
+    volts[[0, 1, 3, 4]] = dots / np.array([[4e-4], [6e-4], [5e-4], [8e-4]])
+    there = np.ones((6, samples))
+    there[3, 2000:2100] = 0.0
+    count = fine_means(there, size)
+    found = plateaus.asked_for(GIVEN, fine_means(volts, size), count, samples, size, listed)
+    assert found.more == pytest.approx(more, abs=1e-6)
+    assert found.plateaus == tuple(listed)
+    assert found.compliance == pytest.approx(compliance())
+    blocks = np.arange(samples // size) * size
+    known = ((blocks < 3000) | (blocks >= 3302)) & ((blocks < 2000) | (blocks >= 2100))
+    assert np.isfinite(found.moved).all(axis=0).tolist() == known.tolist()
+    assert found.moved[:, known] == pytest.approx(fine_means(poses, size)[:, known], abs=1e-12)
+    assert found.rest[:, known] == pytest.approx(0.0, abs=1e-9)
+    assert np.isnan(found.rest[:, ~known]).all()
+    # Against the first time; its sign is that of a direction that may be turned around.
+    way = np.sign(across_of(GIVEN) @ ACROSS)
+    assert way * found.across == pytest.approx([0.0, 3e-6, -3e-6, 0.0], abs=1e-12)
+
+
+def test_the_link_moves_with_its_modes_under_what_is_hung_after_the_first_time() -> None:
+    listed = [Plateau(0, a, b, 0, False, np.zeros(3)) for a, b in ((0, 100), (1, 100), (100, 200))]
+    for axis, (frequency, ratio) in enumerate(((14.0, 0.1), (14.0, 0.1), (21.0, 0.2))):
+        first, second, third = plateaus._pulses(GIVEN, 300, listed, axis)
+        assert not first.any()
+        for pulse, (a, b) in ((second, (1, 100)), (third, (100, 200))):
+            acts = np.zeros(300)
+            acts[a:b] = 1.0
+            assert pulse == pytest.approx(Filter(mode_coefficients(frequency, ratio, 1e-3))(acts))
+
+
+def test_a_mean_of_nothing_is_0() -> None:
+    assert plateaus._mean(np.array([1.0, np.nan, 4.0])) == 2.5
+    assert plateaus._mean(np.array([np.nan])) == 0.0
+    assert plateaus._mean(np.array([])) == 0.0
+
+
+SPREAD = np.array(
+    [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (20, 10, 5)], float
+)
+"""Noted loads; each is like the others."""
+
+
+def seen(
+    more: dict[int, tuple[float, float, float]],
+    noted: FloatArray = SPREAD,
+    *,
+    across: dict[int, float] | None = None,
+    left: float = 0.0,
+    everywhere: FloatArray | float = 0.0,
+) -> PlateauLoads:
+    """What readings say if loads are off by ``more``; ``left``: share of the movement that no load explains."""
+    off = np.zeros(noted.shape) + everywhere
+    for k, load in more.items():
+        off[k] += load
+    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, noted[i]) for i in range(len(noted)))
+    moved = np.repeat((off * (1e-5, 1e-5, 1e-4)).T, 10, axis=1)
+    beside = np.zeros(len(noted))
+    for k, far in (across or {}).items():
+        beside[k] = far
+    return PlateauLoads(listed, off, left * moved, moved, beside, np.array([1e-5, 1e-5, 1e-4]))
+
+
+def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> None:
+    found = seen({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
+    assert found.sizes[:4] == pytest.approx([0.0, 5e-5, 5e-5, 1e-4])
+    assert found.noted.tolist() == SPREAD.tolist()
+
+
+@pytest.mark.parametrize(
+    ('count', 'more', 'gone'),
+    [
+        # The others are exact: 0.45 of the tolerance, 0.3 N and a hundredth of the load, are enough.
+        (8, {6: (0.0, 0.28, 0.0)}, (6,)),
+        (8, {6: (0.0, 0.26, 0.0)}, ()),
+        (8, {6: (0.0, 0.0, 0.28)}, (6,)),
+        (8, {4: (-0.28, 0.0, 0.0), 2: (0.0, 0.4, 0.0), 6: (0.0, 1.0, 0.0)}, (2, 4, 6)),
+        # Five must be right.
+        (6, {2: (0.0, 1.0, 0.0)}, (2,)),
+        (5, {2: (0.0, 1.0, 0.0)}, ()),
+        (7, {2: (0.0, 1.0, 0.0), 1: (0.0, -2.0, 0.0)}, (1, 2)),
+        (6, {2: (0.0, 1.0, 0.0), 1: (0.0, -2.0, 0.0)}, ()),
+        (8, {2: (0.0, 1.0, 0.0), 1: (0.0, -2.0, 0.0), 6: (0.0, 1.0, 0.0), 4: (1.0, 0.0, 0.0)}, ()),
+    ],
+)
+def test_loads_that_are_off_beside_exact_ones_are_wrong_if_five_are_right(
+    count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
+) -> None:
+    found = plateaus.stand_out(seen(more, SPREAD[:count]))
+    assert (found.gone, found.softer) == (gone, 0.0)
+
+
+def test_a_detector_at_fault_and_a_movement_that_no_load_makes_are_no_wrong_note() -> None:
+    wrong = {6: (0.0, 1.0, 0.0)}
+    # A load of 1 N moves the plate by 10 um: a twentieth of that and 0.2 um are 0.7 um.
+    for far, gone in ((6.9e-7, (6,)), (-6.9e-7, (6,)), (7.1e-7, ()), (-7.1e-7, ())):
+        assert plateaus.stand_out(seen(wrong, across={6: far})).gone == gone
+    assert plateaus.stand_out(seen(wrong, across={1: 1e-3})).gone == (6,)
+    # Far beyond the tolerance no plate is asked for.
+    far_off = plateaus.stand_out(seen({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
+    assert (far_off.gone, far_off.softer) == ((6,), 0.0)
+    # Nothing that moves is nothing to explain.
+    assert not plateaus._closes(seen({}))
+    for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
+        assert plateaus.stand_out(seen(wrong, left=left), bent).gone == gone
+
+
+@pytest.mark.parametrize(
+    ('count', 'more', 'gone'),
+    [
+        # Others are off by a quarter of a newton: no more than the tolerance, 0.3 N, and a fifth of the wrong ones.
+        (8, {6: (0.0, 2.0, 0.0)}, (6,)),
+        (8, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0)}, (4, 6)),
+        (8, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0), 2: (0.0, 4.0, 0.0)}, ()),
+        (12, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0), 2: (0.0, 4.0, 0.0)}, ()),
+        (7, {6: (0.0, 2.0, 0.0)}, (6,)),
+        (7, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0)}, ()),
+    ],
+)
+def test_beside_loads_that_are_off_by_less_than_the_tolerance_two_may_be_wrong_if_six_are_right(
+    count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
+) -> None:
+    twelve = np.vstack((SPREAD, SPREAD[1:5]))
+    slightly = np.where(np.arange(count)[:, None] % 2, 0.1, -0.1) * (1.0, 0.0, 0.0)
+    assert plateaus.stand_out(seen(more, twelve[:count], everywhere=slightly)).gone == gone
+
+
+def test_one_wrong_load_is_found_beside_what_effects_do_in_proportion() -> None:
+    softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
+    found = plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=softened))
+    assert (found.gone, found.softer) == ((5,), 0.1)
+    assert plateaus.stand_out(seen({}, everywhere=softened)).gone == ()
+    # Of six, and if effects would have to do more than three times what they do, nobody is accused.
+    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, SPREAD[:6], everywhere=softened[:6])).gone == ()
+    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=4.0 * softened)).gone == ()
+    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=2.6 * softened)).gone == (5,)
+    for more, gone in ((2.0, ()), (1.6, (5,))):
+        offset = np.add(softened, (0.0, more, 0.0))
+        assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=offset)).gone == gone
+    # The first after a change may be wrong, the time before all of them may not.
+    assert plateaus.stand_out(seen({1: (2.0, 0.0, 0.0)}, everywhere=softened)).gone == (1,)
+    assert plateaus.stand_out(seen({0: (2.0, 0.0, 0.0)}, everywhere=softened)).gone == ()
+
+
+def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fits() -> None:
+    softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
+
+    def left(found: PlateauLoads, without: int) -> float:
+        return float(np.delete(plateaus._apart(found, (without,), 0.1), without).max())
+
+    # Without any other one, the worst that is left is one and a half times the tolerance.
+    found = seen({2: (0.0, 2.5, 0.0)}, everywhere=softened)
+    assert all(1.3 < left(found, k) < 1.8 for k in (1, 3, 4, 5, 6, 7))
+    assert plateaus.stand_out(found).gone == (2,)
+    # Without the fourth it is 1.13 times, which may come from that one if a tenth of its 3.9 is allowed.
+    found = seen({3: (0.0, 6.0, 0.0)}, everywhere=softened)
+    assert left(found, 4) == pytest.approx(1.13, abs=0.01)
+    assert plateaus._apart(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
+    assert plateaus.stand_out(found).gone == (3,)
+    assert plateaus.stand_out(found, 0.025).gone == (3,)
+    assert plateaus.stand_out(found, 0.1).gone == ()
+
+
+def test_what_is_off_by_less_than_a_seventh_of_a_newton_is_right_whatever_the_others_suggest() -> None:
+    # Small loads are a tenth too small, so the large one would be off by 5 N.
+    small = np.array(
+        [(0, 0, 0), (1, 0, 0), (0, 1, 0), (-1, 1, 0), (0, -1, 1), (1, -1, 1), (50, 0, 0), (1, 1, -1)], float
+    )
+    share = 0.1 * small
+    share[6] = 0.0
+    assert plateaus._apart(seen({}, small, everywhere=share), (6,), 0.1)[6] > 5.5
+    assert plateaus.stand_out(seen({}, small, everywhere=share)).gone == ()
+
+
+def test_what_stands_out_is_three_times_the_tolerance_and_five_times_the_others() -> None:
+    def stands(wrong: list[float], others: list[float], bent: float = 0.0) -> bool:
+        return plateaus._stands(np.array(wrong), np.array(others), bent)
+
+    assert stands([3.01], [0.5])
+    assert not stands([3.0], [0.5])
+    assert not stands([4.0], [0.8])
+    assert stands([4.01], [0.8])
+    assert stands([5.1, 9.0], [0.2, 1.0])
+    assert not stands([5.1, 3.0], [0.2, 0.5])
+    assert not stands([9.0], [1.01])
+    assert stands([9.0], [1.01], 0.01)
+    assert not stands([9.0], [1.1], 0.01)
+
+
+def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much() -> None:
+    noted = np.array([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 20.0, 0.0), (3.0, 4.0, 0.24), (3.0, 4.0, 0.26)])
+
+    def known(k: list[int], more: tuple[float, float, float] = (0.0, 0.0, 1.0), largest: float = 1e9) -> bool:
+        rows = [i for i in range(5) if i < 3 or i in k]
+        here = [rows.index(i) for i in k]
+        return plateaus._known(seen(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
+
+    # A torque of 5 % of (3, 4) is as good as none.
+    assert known([3])
+    assert not known([4])
+    assert not known([3, 4])
+    # More than twice the load, which is 5 long.
+    assert known([4], (0.0, 6.1, 8.1), 2.0)
+    assert not known([4], (0.0, 5.9, 7.9), 2.0)
+    assert known([3, 4], (0.0, 6.1, 8.1), 2.0)
+    # Exactly so much is not beyond.
+    noted[4] = (0.0, 3.0, 4.0)
+    assert not known([4], (0.0, 6.0, 8.0), 2.0)
+
+
+def test_what_effects_do_is_the_likeliest_share_and_offset_of_all_other_loads() -> None:
+    chance = np.random.default_rng(1)
+    found = seen({}, everywhere=chance.normal(size=SPREAD.shape))
+    for gone, softer in (((), 0.1), ((2,), 0.1), ((1, 5), 0.2)):
+        keep = [k for k in range(8) if k not in gone]
+        x = np.column_stack((SPREAD, np.ones(8)))[keep]
+        # A tenth of the tolerance, 0.03, is the deviation of a load; those of a share and of an offset are the prior's.
+        pull = np.diag(0.03 / np.array([softer, softer, softer, 0.5]))
+        rows, values = np.vstack((x, pull)), np.vstack((found.more[keep], np.zeros((4, 3))))
+        wanted = np.linalg.lstsq(rows, values, rcond=None)[0]
+        slopes, offset = plateaus._proportion(found, gone, softer)
+        assert slopes == pytest.approx(wanted[:3], abs=1e-9)
+        assert offset == pytest.approx(wanted[3], abs=1e-9)
+        # Off by the largest of the three, in units of 0.3 and a hundredth of the load.
+        off = np.abs(found.more - np.column_stack((SPREAD, np.ones(8))) @ wanted).max(axis=1)
+        allowed = [0.3 + 0.01 * max(abs(v) for v in load) for load in SPREAD.tolist()]
+        assert plateaus._apart(found, gone, softer) == pytest.approx(off / allowed)
+    slopes, offset = plateaus._proportion(found, (), 0.0)
+    assert (slopes.tolist(), offset.tolist()) == (np.zeros((3, 3)).tolist(), [0.0] * 3)
+
+
+def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> None:
+    off = {4: (9.0, 0.0, 0.0), 5: (-9.0, 9.0, 4.0), 6: (7.0, -8.0, 0.0)}
+    loads = np.repeat(SPREAD, DWELL, axis=0)
+    for left, free in ((0.19, True), (0.21, False)):
+        assert plateaus.all_free(seen(off, left=left), loads) is free
+    assert plateaus.all_free(seen({2: (9.0, 5.0, 0.0), 3: (-9.0, 9.0, 4.0)}, SPREAD[:4]), loads)
+    assert not plateaus.all_free(seen({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, SPREAD[:3]), loads)
+    # Two that are off by more than the tolerance are enough.
+    two = seen({5: (0.0, 0.0, 0.9), 1: (0.0, 0.0, -0.9)})
+    apart = plateaus._apart(two, (), 0.1)
+    assert sorted(apart)[-3] < 1.0 < sorted(apart)[-2]
+    assert max(apart) < 2.0
+    assert plateaus.all_free(two, loads)
+    # One alone is a wrong note, and others are needed to say so.
+    found = seen({0: (0.0, 0.0, 0.6)})
+    assert int((plateaus._apart(found, (), 0.1) > 1.0).sum()) == 1
+    assert not plateaus.all_free(found, loads)
+
+
+def test_loads_are_rounded_if_each_is_off_by_half_a_step_at_most_and_by_a_tenth_on_average() -> None:
+    noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
+    loads = np.repeat(noted, DWELL, axis=0)
+
+    def rounded(*off: tuple[float, float, float], count: int = 5) -> bool:
+        more = np.zeros((5, 3))
+        more[: len(off)] = off
+        return plateaus._rounded(seen({}, noted[:count], everywhere=more[:count]), loads)
+
+    # Forces in steps of 5 N, torques in steps of 2 N m.
+    assert rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0, 0.0, 1.0))
+    assert not rounded((2.5, 0.0, 0.0), (0.0, -2.6, 0.0), (0.0, 0.0, 1.0))
+    assert not rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0, 0.0, -1.1))
+    assert not rounded((2.6, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0, 0.0, 1.0))
+    # Half a step and a hundredth.
+    assert rounded((2.54, 0.0, 0.0), (0.0, -2.54, 0.0), (0.0, 0.0, 1.01))
+    # What has no load is not rounded, and four must have one.
+    assert rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0,) * 3, (0.0,) * 3, (0.0, 9.0, 0.0))
+    assert rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), count=4)
+    assert not rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), count=3)
+    # Off by 0.5 N rms, a tenth of the step, counted by the larger of two forces: two of four by the root of a half.
+    assert rounded((0.72, 0.5, 0.0), (0.5, -0.72, 0.0))
+    assert not rounded((0.70, 0.5, 0.9), (0.5, -0.70, 0.9))
+
+
+@pytest.mark.parametrize(
+    ('noted', 'step'),
+    [
+        ([10.0, -30.0], 10.0),
+        ([10.0, -35.0], 5.0),
+        ([4.0, -6.0], 2.0),
+        ([4.0, 7.0], 1.0),
+        ([4.0, 7.5], 0.0),
+        ([4.0, 7.0 + 5e-7], 1.0),
+        ([4.0, 0.0001], 0.0),
+        ([0.0, 0.0], np.inf),
+    ],
+)
+def test_the_step_of_noted_numbers_is_the_largest_of_which_all_are_multiples(noted: list[float], step: float) -> None:
+    assert plateaus._step(np.array(noted)) == step
+
+
+def test_a_movement_counts_about_its_mean_and_an_angle_at_a_tenth_of_a_metre() -> None:
+    part = np.array([[1.0, 3.0, np.nan, 1.0, 3.0], [5.0, 5.0, 9.0, 5.0, 5.0], [20.0, 40.0, 1.0, 40.0, 20.0]])
+    # Squares: 1, 0 and (0.1 * 10)^2 = 1.
+    assert plateaus._rms(part) == pytest.approx((2.0 / 3.0) ** 0.5)
+
+
+# ---- what is said
+
+
+def test_a_wrong_note_says_what_hung_from_when_to_when() -> None:
+    noted = np.array([1.0, -2.0, 0.5])
+    wrong = WrongNote(Plateau(0, 1234, 5678, 2, False, noted), np.array([1.004, -2.5, -0.001]), 1e-3)
+    assert (wrong.name, wrong.where) == ('load_value', 'load 2')
+    assert wrong.value == (1.004, -2.5, -0.001)
+    assert wrong.off == pytest.approx([0.004, 0.5, 0.501])
+    assert wrong.size == pytest.approx(0.501)
+    assert wrong.words('x') == (
+        'the 2nd load of x was noted wrong: from 1.234 s to 5.678 s (1 N, -2.5 N, 0 N m) hung, '
+        'not (1 N, -2 N, 0.5 N m): note that'
+    )
+    before = WrongNote(Plateau(0, 0, 5678, 0, True, noted), np.array([-0.004, 0.006, 2.125]), 1e-2)
+    assert (before.name, before.where) == ('missing_load', '0.000 s')
+    assert before.words('x') == (
+        'something was hung or taken off of x and not noted: from 0.000 s to 56.780 s (0 N, 0.01 N, 2.12 N m) hung, '
+        'not (1 N, -2 N, 0.5 N m): note that'
+    )
+    after = WrongNote(Plateau(0, 100, 5678, 1, True, noted), noted, 1e-3)
+    assert (after.where, after.size) == ('0.100 s', 0.0)
+    assert after.words('x').startswith('something was hung or taken off after the 1st noted load of x and not noted: ')
+
+
+def world(
+    hung: FloatArray, noted: FloatArray, share: FloatArray, offset: float = 0.0, bend: float = 0.0
+) -> Callable[[FloatArray], PlateauLoads]:
+    """Readings under loads that ``hung``, which effects change by a ``share`` and an ``offset``; what is simulated
+    more than 5 N or N m off is told ``bend`` of what is beyond it too small.
+    """
+    acted = hung + hung @ share + offset
+
+    def asked(acting: FloatArray) -> PlateauLoads:
+        off = acted - acting[DWELL // 2 :: DWELL]
+        off -= bend * np.sign(off) * np.maximum(np.abs(off) - 5.0, 0.0)
+        return seen({}, noted, everywhere=off)
+
+    return asked
+
+
+@pytest.mark.parametrize(
+    ('wrong', 'share', 'offset', 'bend'),
+    [
+        ({5: (80.0, -80.0, 40.0)}, 0.0, 0.0, 0.0),
+        ({5: (80.0, -80.0, 40.0)}, 0.0, 0.0, 0.1),
+        ({5: (38.0, -40.0, 20.0)}, 0.0, 0.0, 0.0),
+        ({2: (0.0, -5.1, 0.0), 4: (-30.0, 0.0, 0.0)}, 0.0, 0.0, 0.05),
+        ({5: (60.0, -70.0, 30.0)}, 0.08, 0.2, 0.0),
+    ],
+)
+def test_what_hung_is_what_readings_say_without_what_effects_do(
+    wrong: dict[int, tuple[float, float, float]], share: float, offset: float, bend: float
+) -> None:
+    noted = SPREAD.copy()
+    for k, load in wrong.items():
+        noted[k] = load
+    slopes = share * np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
+    asked = world(SPREAD, noted, slopes, offset, bend)
+    found = plateaus.noted_wrong(np.repeat(noted, DWELL, axis=0), 1e-3, asked)
+    assert [n.plateau.number for n in found] == sorted(wrong)
+    for one in found:
+        assert one.hung == pytest.approx(SPREAD[one.plateau.number], abs=0.05)
+        assert one.period == 1e-3
+
+
+@pytest.mark.parametrize(('hung', 'far'), [(46.6, False), (46.8, True), (33.9, True), (34.1, False)])
+def test_a_load_that_is_off_by_two_newtons_and_a_tenth_is_simulated_as_the_readings_say(hung: float, far: bool) -> None:
+    # 46.67 - 40 is 2 + 4.667; 40 - 34 is 2 + 4, as the other force is 40.
+    truth = SPREAD.copy()
+    truth[5] = (hung, -40.0, 20.0)
+    asked_with = []
+    inner = world(truth, SPREAD, np.zeros((3, 3)))
+
+    def asked(acting: FloatArray) -> PlateauLoads:
+        asked_with.append(acting[5 * DWELL + 5].tolist())
+        return inner(acting)
+
+    (note,) = plateaus.noted_wrong(np.repeat(SPREAD, DWELL, axis=0), 1e-3, asked)
+    assert note.hung == pytest.approx(truth[5])
+    assert asked_with[:2] == [[40.0, -40.0, 20.0], [0.0, 0.0, 0.0]]
+    assert asked_with[2] == pytest.approx(truth[5] if far else [40.0, -40.0, 20.0])
+
+
+def test_readings_are_held_against_the_simulation_in_fine_means_of_what_is_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    held: list[tuple[FloatArray, FloatArray, int, int]] = []
+
+    def asked_for(
+        rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: list[Plateau]
+    ) -> PlateauLoads:
+        held.append((difference, count, samples, size))
+        return seen({}, SPREAD[:0])
+
+    monkeypatch.setattr(plateaus, 'asked_for', asked_for)
+    loads = np.tile((1.0, -5.0, 2.0), (400, 1))
+    for rate, size in ((1000.0, 4), (625.0, 2), (200.0, 1), (100.0, 1)):
+        rig = load_rig(overrides={'converter.sample_rate_hz': rate})
+        volts = ForwardModel(rig).expect(loads).volts.T + np.arange(400.0)[:, None] * (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+        volts[1, 0] = volts[100:104, 1] = np.nan
+        held.clear()
+        assert wrong_notes(rig, volts, loads) == []
+        difference, count, samples, by = held[0]
+        assert (samples, by, difference.shape) == (400, size, (6, 400 // size))
+        # Of 0, (1), 2, 3 that is 5/3, of what is not there 0.
+        first = [i for i in range(size) if i != 1]
+        assert difference[0, 0] == pytest.approx(sum(first) / len(first))
+        assert count[0, 0] == pytest.approx(len(first) / size)
+        assert (difference[1, 100 // size], count[1, 100 // size]) == (0.0, 0.0)
+        assert difference[5, -1] == pytest.approx(6.0 * np.arange(400 - size, 400).mean())
+
+
+def test_each_round_allows_the_others_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    allowed: list[float] = []
+
+    def stand_out(found: PlateauLoads, bent: float, largest: float) -> plateaus.StandingOut:
+        allowed.append(bent)
+        return plateaus.StandingOut((5,))
+
+    monkeypatch.setattr(plateaus, 'stand_out', stand_out)
+    truth = SPREAD + np.where(np.arange(8)[:, None] == 5, 3.0, 0.0)
+    (note,) = plateaus.noted_wrong(np.repeat(SPREAD, DWELL, axis=0), 1e-3, world(truth, SPREAD, np.zeros((3, 3))))
+    assert note.hung == pytest.approx(truth[5])
+    # A tenth, a fiftieth, nothing.
+    assert allowed == pytest.approx([0.1, 0.02, 0.0, 0.0, 0.0])
+
+
+def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    periods: list[float] = []
+
+    def noted(loads: FloatArray, period: float, asked: object) -> list[WrongNote]:
+        periods.append(period)
+        return []
+
+    monkeypatch.setattr(plateaus, 'noted_wrong', noted)
+    wrong_notes(load_rig(overrides={'converter.sample_rate_hz': 200.0}), np.zeros((100, 6)), np.zeros((100, 3)))
+    assert periods == pytest.approx([0.005])
+
+
+def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -> None:
+    loads, asked_with = np.repeat(SPREAD, DWELL, axis=0), list[FloatArray]()
+
+    def of_size(size: float) -> Callable[[FloatArray], PlateauLoads]:
+        def asked(acting: FloatArray) -> PlateauLoads:
+            asked_with.append(acting)
+            return seen({6: (0.0, size, 0.0)})
+
+        return asked
+
+    # A seventh of a newton: 0.15 of three times 0.3.
+    for size, asks in ((0.134, 1), (EXACT * STANDS_OUT * TOLERANCE, 3), (0.136, 3)):
+        asked_with.clear()
+        assert plateaus.noted_wrong(loads, 1e-3, of_size(size)) == []
+        assert len(asked_with) == asks
+    assert plateaus.noted_wrong(loads, 1e-3, lambda acting: seen({}, SPREAD[:0])) == []

@@ -1,0 +1,397 @@
+"""The verdict, the findings and the notes of pushes, levels and drift that are made by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, load_rig
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check import checkup
+from psd_deflection.studies.check.checkup import CheckProblem, check
+from psd_deflection.studies.check.levels import Levels
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
+from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFit, on_channels
+from psd_deflection.studies.loads.noted_times import MendedNote
+
+RIG = load_rig()
+STATED = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))
+PLATE = {'fx': [-1.0, 0.0, -1.0, 0.0], 'fy': [0.0, -1.0, 0.0, -1.0], 'tz': [0.07, 0.0, 0.0, 0.1]}
+"""How x1 y1 x2 y2 of PSDs at (0, 70) and (-100, 0) mm move by a metre along X, along Y and by a radian."""
+
+
+def push(
+    load: str, size: float = 1.0, wiring: Wiring | None = None, *, sized: bool = True, sd: float = 1e-6
+) -> PushResponse:
+    """A movement of ``size`` times the expected one, some tenths of a millimetre, on the channels of ``wiring``."""
+    expected = (1e-4 if load != 'tz' else 1e-3) * np.array(PLATE[load])
+    moved = on_channels(wiring or Wiring(), size * expected)
+    return PushResponse((load,), moved, np.full(4, sd), expected, sized=sized)
+
+
+THREE = [push('fx'), push('fy'), push('tz')]
+
+
+def of_levels(
+    noise: float | FloatArray = STATED,
+    sums: tuple[float, float] = (5.0, 5.0),
+    hum: Sequence[float] = (0.0,) * 6,
+    stuck: tuple[str, ...] = (),
+    steps: Sequence[float] = (0.0,) * 6,
+    hum_hz: float = 50.0,
+) -> Levels:
+    return Levels(np.zeros(6) + noise, STATED, np.array(hum), hum_hz, np.array(sums), stuck, np.array(steps))
+
+
+def checked(
+    pushes: Sequence[PushResponse] = THREE,
+    levels: Levels | None = None,
+    drift: Sequence[float] = (0.0,) * 4,
+    drift_sd: float = 1e-9,
+    rig: Rig = RIG,
+    notes: Sequence[MendedNote] = (),
+) -> Checkup:
+    drifting = np.array(drift), np.full(4, drift_sd)
+    return check(CheckProblem(rig, pushes, levels or of_levels(), *drifting, source='x', notes=notes))
+
+
+def of(found: Checkup) -> list[tuple[str, str]]:
+    return [(f.name, f.where) for f in found.findings]
+
+
+def test_three_pushes_of_a_rig_as_its_file_says_are_right() -> None:
+    found = checked()
+    assert (found.verdict, found.findings, dict(found.values), found.light, found.notes) == (RIGHT, (), {}, {}, ())
+    assert found.sizes == pytest.approx([1.0] * 3)
+    assert [f.wiring for f in found.found] == [Wiring()]
+    assert found.source == 'x'
+    assert CheckProblem(RIG, (), of_levels(), np.zeros(4), np.zeros(4)).source == ''
+
+
+def test_notes_that_are_wrong_come_first_and_are_wrong() -> None:
+    late = MendedNote(2, (1.0, 0.0, 0.0), 3.0, 1.0, 0.0)
+    found = checked(notes=[late])
+    assert found.verdict == WRONG
+    assert [(f.name, f.where, f.value, f.fix, f.evidence) for f in found.findings] == [
+        ('load_time', 'load 2', 2.0, late.words('x'), 2.0)
+    ]
+
+
+# ---- which channel does not answer
+
+
+def test_a_channel_is_dead_that_moves_less_than_a_tenth_of_every_push() -> None:
+    def with_share(share: float, only_twist: bool = False) -> Checkup:
+        fx = replace(push('fx'), channels=np.array([share, 0.0, math.sqrt(1.0 - share**2), 0.0]) * -1e-4)
+        turn = replace(push('tz'), channels=np.array([0.0, 0.0, 0.0, 1e-4]), only_twist=only_twist)
+        return checked([fx, push('fy'), turn])
+
+    assert of(with_share(0.099)) == [('stuck_channel', 'x1')]
+    assert with_share(0.099).findings[0].fix == 'x1 does not answer: look at its cable'
+    assert ('stuck_channel', 'x1') not in of(with_share(0.101))
+    # Of 1, 3, 9 and 3 the first is a tenth of the whole: that is an answer.
+    tenth = replace(push('fx'), channels=np.array([1.0, 3.0, 9.0, 3.0]) * -1e-4)
+    assert ('stuck_channel', 'x1') not in of(checked([tenth, push('fy')]))
+    # A turn by hand says nothing of it, and without pushes along both axes nobody knows.
+    turned = replace(push('tz'), only_twist=True)
+    dead = replace(push('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
+    assert of(checked([dead, push('fy'), turned])) == [('stuck_channel', 'x1')]
+    assert ('stuck_channel', 'x1') not in of(checked([dead, push('fy'), push('tz')]))
+    assert ('stuck_channel', 'x1') not in of(checked([dead, turned]))
+
+
+def test_a_channel_that_is_stuck_is_told_once_and_no_wiring_then() -> None:
+    dead = replace(push('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
+    found = checked([dead, push('fy')], of_levels(stuck=('x1', 'sum2')))
+    assert of(found) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]
+    assert found.verdict == WRONG
+    turned = Wiring(False, (('-x', 'y'), ('x', 'y')))
+    three = [push(load, 9.80665, turned) for load in ('fx', 'fy', 'tz')]
+    assert of(checked(three, of_levels(stuck=('sum2',)))) == [('stuck_channel', 'sum2')]
+
+
+# ---- wirings
+
+
+def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
+    wiring = Wiring(False, (('-x', 'y'), ('x', 'y')))
+    three = [push(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')]
+    found = checked(three)
+    assert of(found) == [('channel_sign', 'x1')]
+    assert dict(found.values) == {'psd_1.axes': ['-x', 'y']}
+    # By the file a push along X is opposite on x1, which leaves all of it; one turn is opposite, too.
+    assert found.findings[0].evidence == pytest.approx(1.0 + 1.0 - 0.0, abs=0.7)
+    assert found.findings[0].evidence > 1.0
+    assert found.findings[0].equivalent == ()
+    two = checked(three[:2])
+    assert two.verdict == WRONG
+    assert dict(two.values) == {}
+    assert len(two.found) == 2
+    assert two.findings[0].equivalent == ('1 other wiring, which these pushes cannot tell apart',)
+    one = checked(three[:1])
+    others = len(one.found) - 1
+    assert others > 1
+    assert one.findings[0].equivalent == (f'{others} other wirings, which these pushes cannot tell apart',)
+
+
+@pytest.mark.parametrize(('count', 'words'), [(2, '1 other wiring,'), (3, '2 other wirings,'), (4, '3 other wirings,')])
+def test_other_wirings_are_counted(count: int, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    some = [WiringFit(wiring, 0.0) for wiring in WIRINGS[7 : 7 + count]]
+    monkeypatch.setattr(checkup, 'fitting_wirings', lambda seen: some)
+    assert {f.equivalent[-1] for f in checked().findings if f.equivalent} == {
+        f'{words} which these pushes cannot tell apart'
+    }
+
+
+def test_a_wiring_that_leaves_some_of_each_push_is_no_other_explanation() -> None:
+    # A push along (c, s) leaves 1 - (c^2 - s^2)^2 with its y turned: 0.3 of one, 0.6 of two, more than of the best.
+    c = math.sqrt(0.5 + 0.5 * math.sqrt(0.7))
+    s = math.sqrt(1.0 - c * c)
+    one = replace(push('fx'), channels=np.array([c, -s, 0.0, 0.0]) * 1e-4, expected=np.array([c, s, 0.0, 0.0]) * 1e-4)
+    found = checked([one, one])
+    assert ('channel_sign', 'y1') in of(found)
+    assert not any('load_sign' in text for f in found.findings for text in f.equivalent)
+    assert next(f.evidence for f in found.findings if f.where == 'y1') == pytest.approx(0.6)
+
+
+def test_all_signs_turned_may_be_the_loads_as_well() -> None:
+    wiring = Wiring(False, (('-x', '-y'), ('-x', '-y')))
+    found = checked([push(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')])
+    assert {f.equivalent for f in found.findings} == {('load_sign of fx fy tz',)}
+    # By the file each push goes the other way and leaves nothing of its own: three that are not explained at all.
+    assert [f.evidence for f in found.findings] == pytest.approx([3.0] * 4)
+    # If one of the loads went the other way too, only the others are turned: half as far as expected.
+    other = checked([push('fx', 1.0, wiring), push('fy', 1.0, wiring), push('tz', -0.5, wiring)])
+    assert ('load_sign of fx fy',) in {f.equivalent for f in other.findings}
+    # A push that leans leaves 0.04 of 1.04 of the best one as well.
+    lean = replace(push('fx', 1.0, wiring), channels=np.array([1.0, 0.2, 1.0, 0.2]) * 1e-4)
+    found = checked([lean, *(push(load, 1.0, wiring) for load in ('fy', 'tz'))])
+    assert [f.evidence for f in found.findings] == pytest.approx([3.0 - 0.04 / 1.04] * 4)
+    # A push that leans leaves 0.36 of it, beyond the limit: then the loads are no other explanation.
+    lean = replace(push('fx', 1.0, wiring), channels=np.array([1.0, 0.75, 1.0, 0.75]) * 1e-4)
+    found = checked([lean, *(push(load, 1.0, wiring) for load in ('fy', 'tz'))])
+    assert not any('load_sign' in text for f in found.findings for text in f.equivalent)
+
+
+def test_a_load_of_the_other_sign_is_told() -> None:
+    found = checked([push('fx'), push('fy'), push('tz', -1.0)])
+    assert [(f.name, f.where, f.value, f.fix) for f in found.findings] == [
+        ('load_sign', 'tz', -1.0, 'load_tz in the recording has the wrong sign')
+    ]
+    assert found.sizes == pytest.approx([1.0, 1.0, -1.0])
+
+
+# ---- sizes
+
+
+@pytest.mark.parametrize(
+    ('size', 'told'),
+    [
+        (1.09, ''),
+        (1.11, '1.11'),
+        (0.92, ''),
+        (0.9, '0.90'),
+        (2.05, '2.05'),
+        (0.48, '0.48'),
+        (-1.2, '1.20'),
+        (-1.05, ''),
+    ],
+)
+def test_a_push_that_moves_the_dots_a_tenth_farther_than_the_file_says_is_worth_a_look(size: float, told: str) -> None:
+    found = checked([push('fx'), push('fy'), push('tz', size)])
+    words = (
+        f'+θ: the dots move {told} times what the rig file expects; see its link and amplifier.sensitivity '
+        '(`psd-deflection discover` names the cause)'
+    )
+    assert found.notes == ((words,) if told else ())
+    # By hand nobody knows how far.
+    assert checked([push('fx'), push('fy'), push('tz', size, sized=False)]).notes == ()
+
+
+def test_a_unit_is_told_by_the_sizes_of_pushes_that_have_one() -> None:
+    kilograms = [push('fx', 9.80665), push('fy', 9.80665), push('tz')]
+    found = checked(kilograms)
+    assert [(f.name, f.where, f.value) for f in found.findings] == [('load_unit', 'fx fy', 9.80665)]
+    by_hand = [replace(p, sized=False) for p in kilograms]
+    assert checked(by_hand).findings == ()
+    only_y = checked([push('fx', sized=False), push('fy', 9.80665), push('tz')])
+    assert of(only_y) == [('load_unit', 'fy')]
+    together = replace(push('fy'), loads=('fy', 'tz'), channels=9.80665 * push('fy').channels)
+    assert ('load_unit', 'fy') in of(checked([push('fx', 9.80665), together]))[:1] or of(
+        checked([push('fx', 9.80665), together])
+    ) == [('load_unit', 'fx fy'), ('load_unit', 'tz'), ('load_coverage', 'fy tz')]
+
+
+# ---- what is needed
+
+
+@pytest.mark.parametrize(
+    ('pushes', 'where', 'fix'),
+    [
+        ([push('fx'), push('fy')], 'tz', 'record again with a torque about Z alone too'),
+        ([push('fy'), push('tz')], 'fx', 'record again with a load along X alone too'),
+        (
+            [push('fx')],
+            'fy tz',
+            'record again, one after the other: a load along Y alone, a torque about Z alone',
+        ),
+        (
+            [],
+            'fx fy tz',
+            'record again, one after the other: a load along X alone, a load along Y alone, a torque about Z alone',
+        ),
+        ([push('fx'), push('fy'), push('tz', sd=1.0)], 'tz', '+θ does not stand out of the noise: push harder'),
+        (
+            [push('fx', sd=1.0), push('fy', sd=1.0), push('tz')],
+            'fx fy',
+            '+X and +Y do not stand out of the noise: push harder',
+        ),
+    ],
+)
+def test_what_is_missing_is_asked_for(pushes: list[PushResponse], where: str, fix: str) -> None:
+    found = checked(pushes)
+    assert found.verdict == CANNOT_TELL
+    assert [(f.name, f.where, f.value, f.fix) for f in found.findings] == [('load_coverage', where, None, fix)]
+    assert [math.isnan(s) for s in found.sizes] == [not p.seen for p in pushes]
+
+
+def test_pushes_that_no_wiring_explains_are_asked_for_again() -> None:
+    odd = [replace(push('fx'), channels=np.array([-1.0, 1.0, 1.0, 1.0]) * 1e-4), push('fy'), push('tz')]
+    odd[0] = replace(odd[0], channels=np.array([-1.0, 1.0, -1.0, 1.0]) * 1e-4)
+    found = checked(odd)
+    assert found.found == ()
+    assert found.verdict == CANNOT_TELL
+    assert [(f.where, f.fix) for f in found.findings] == [
+        ('fx fy tz', 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +θ')
+    ]
+    # Of a wrong wiring several are left: that is wrong, and more is asked for too.
+    wiring = Wiring(False, (('-x', 'y'), ('x', 'y')))
+    assert of(checked([push('fx', 1.0, wiring), push('fy', 1.0, wiring)]))[-1] == ('load_coverage', 'tz')
+
+
+# ---- levels
+
+
+def test_noise_is_judged_without_what_is_stuck_or_hidden_by_steps() -> None:
+    loud = np.full(6, 3.0 * STATED)
+    assert of(checked(levels=of_levels(loud))) == [('noise_level', 'x1 y1 x2 y2')]
+    assert checked(levels=of_levels(loud)).findings[0].value == pytest.approx(3.0, abs=2e-3)
+    assert list(checked(levels=of_levels(loud)).values) == ['amplifier.noise']
+    # What is louder on a stuck channel counts for nothing, and so does what is smaller than a step.
+    one = np.full(6, STATED)
+    one[3] = 100.0 * STATED
+    assert of(checked(levels=of_levels(one, stuck=('x2',)))) == [('stuck_channel', 'x2')]
+    steps = np.zeros(6)
+    steps[3] = 101.0 * STATED
+    assert of(checked(levels=of_levels(one, steps=steps.tolist()))) == [('converter_step', 'x2')]
+    steps[3] = 99.0 * STATED
+    assert of(checked(levels=of_levels(one, steps=steps.tolist())))[0] == ('noise_level', 'x1 y1 x2 y2')
+    # Exactly as large it is seen, and the sums have no say.
+    steps[3] = one[3]
+    assert of(checked(levels=of_levels(one, steps=steps.tolist())))[0] == ('noise_level', 'x1 y1 x2 y2')
+    one = np.full(6, STATED)
+    one[[2, 5]] = 100.0 * STATED
+    assert of(checked(levels=of_levels(one))) == []
+
+
+def test_noise_is_that_of_the_psds_whatever_inputs_they_are_on() -> None:
+    rig = load_rig(
+        overrides={
+            'psd_1.noise': [1e-3, 2e-3],
+            'psd_2.noise': [4e-3, 3e-3],
+            'psds_exchanged': True,
+            'psd_1.axes': ['y', 'x'],
+        }
+    )
+    wiring = Wiring.from_rig(rig)
+    # PSD 1 is on input 2 with its axes exchanged: its x is y2. PSD 2 is on input 1.
+    noise = np.array([4e-3, 3e-3, 1.0, 2e-3, 1e-3, 1.0])
+    pushes = [push(load, 1.0, wiring) for load in ('fx', 'fy', 'tz')]
+    assert checked(pushes, of_levels(noise), rig=rig).findings == ()
+    noise[4] = 9e-3
+    found = checked(pushes, of_levels(noise), rig=rig)
+    assert of(found) == [('noise_level', 'x1')]
+    assert dict(found.values) == {'psd_1.noise': [9e-3, 2e-3]}
+
+
+@pytest.mark.parametrize(
+    ('sums', 'light'),
+    [
+        ((5.0, 2.5), {}),
+        ((7.5, 5.0), {}),
+        ((5.0, 2.49), {'psd_2': 'too little: sum 2.49 V, below sum_min 2.5 V'}),
+        ((7.51, 5.0), {'psd_1': 'too much: sum 7.51 V, above sum_max 7.5 V'}),
+        ((1.0, 9.0), {'psd_1': 'too little: sum 1.00 V', 'psd_2': 'too much: sum 9.00 V'}),
+    ],
+)
+def test_a_sum_between_its_limits_is_light_enough(sums: tuple[float, float], light: dict[str, str]) -> None:
+    found = checked(levels=of_levels(sums=sums))
+    assert list(found.light) == list(light)
+    assert all(found.light[psd].startswith(words) for psd, words in light.items())
+    assert found.verdict == (WRONG if light else RIGHT)
+    # Exchanged PSDs have the light of the other input.
+    rig = load_rig(overrides={'psds_exchanged': True})
+    other = [push(load, 1.0, Wiring(exchanged=True)) for load in ('fx', 'fy', 'tz')]
+    assert {f'psd_{3 - int(psd[-1])}' for psd in checked(other, of_levels(sums=sums), rig=rig).light} == {*light}
+    # One that is stuck is told already.
+    dead = checked(levels=of_levels(sums=sums, stuck=('sum1', 'sum2')))
+    assert not dead.light
+
+
+@pytest.mark.parametrize(
+    ('level', 'told'),
+    [(5.74, False), (5.76, True), (4.35, False), (4.34, True), (7.5, True), (7.6, False)],
+)
+def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, told: bool) -> None:
+    found = checked(levels=of_levels(sums=(5.0, level)))
+    words = f'psd_2: sum {level:.2f} V, the rig file says 5 V; see amplifier.sum_nominal'
+    assert found.notes == ((words,) if told else ())
+
+
+def test_hum_is_worth_a_look_where_it_is_largest() -> None:
+    hum = (0.0, 1e-3, 0.0, 4e-3, 0.0, 2e-3)
+    words = 'hum: 4.0 mV at 60 Hz on x2; look at shielding and ground'
+    assert checked(levels=of_levels(hum=hum, hum_hz=60.0)).notes == (words,)
+    for volt, told in ((4.9495e-3, '4.9'), (4.9505e-3, '5.0')):
+        hum = (0.0, volt, 0.0, 0.0, 0.0, 0.0)
+        assert checked(levels=of_levels(hum=hum)).notes[0].startswith(f'hum: {told} mV at 50 Hz on y1')
+    for channel, name in enumerate(('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')):
+        small = [1e-9 * (i == channel) for i in range(6)]
+        assert checked(levels=of_levels(hum=small)).notes[0].endswith(f'on {name}; look at shielding and ground')
+
+
+def test_drift_is_worth_a_look_beyond_five_micrometres_a_minute_and_five_deviations() -> None:
+    minute = 1e-6 / 60.0
+    sd = 2.0**-24
+    for drift, deviation, told in (
+        ((0.0, 5.1 * minute, 0.0, 0.0), 1e-9, '+5.1 µm a minute on y1'),
+        ((0.0, 4.9 * minute, 0.0, 0.0), 1e-9, ''),
+        ((-5.1 * minute, 0.0, 0.0, 0.0), 1e-9, '-5.1 µm a minute on x1'),
+        ((5.0 / 60e6, 0.0, 0.0, 0.0), 1e-9, ''),
+        ((4.99999995 * minute, 0.0, 0.0, 0.0), 1e-9, ''),
+        ((5.00000005 * minute, 0.0, 0.0, 0.0), 1e-9, '+5.0 µm a minute on x1'),
+        ((6.04999995 * minute, 0.0, 0.0, 0.0), 1e-9, '+6.0 µm a minute on x1'),
+        ((6.05000005 * minute, 0.0, 0.0, 0.0), 1e-9, '+6.1 µm a minute on x1'),
+        # The farthest of those that stand out.
+        ((6.0 * minute, 0.0, -7.0 * minute, 0.0), 1e-9, '-7.0 µm a minute on x2'),
+        ((0.0, 0.0, 0.0, 5.0 * sd), sd, ''),
+        ((0.0, 0.0, 0.0, 5.001 * sd), sd, '+17.9 µm a minute on y2'),
+        ((0.0, 0.0, 0.0, 1e-5), TELLING_DRIFT, '+600.0 µm a minute on y2'),
+        # Of a short recording nothing is told.
+        ((0.0, 0.0, 0.0, 1e-5), 1.001 * TELLING_DRIFT, ''),
+    ):
+        words = f'drift: {told}; let lasers and amplifier warm up'
+        assert checked(drift=drift, drift_sd=deviation).notes == ((words,) if told else ())
+    assert pytest.approx(5e-6 / 60.0) == TELLING_DRIFT
+
+
+def test_a_finding_has_no_evidence_and_nothing_like_it_unless_that_is_said() -> None:
+    one = Finding('jump', 'x1', None, 'look')
+    assert (one.evidence, one.equivalent) == (0.0, ())
+    with pytest.raises(ValueError, match=r'^odd: must be one of channel_sign, '):
+        Finding('odd', 'x1', None, 'look')

@@ -1,0 +1,182 @@
+"""Noise, hum and light of volts that are made by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.check import levels as module
+from psd_deflection.studies.check.levels import levels
+
+RIG = load_rig()
+STEP = 20.0 / 2**16
+
+
+def noisy(n: int, sd: float = 2e-3, seed: int = 1) -> FloatArray:
+    return np.array([1.0, 2.0, 5.0, -1.0, 0.5, 4.0]) + np.random.default_rng(seed).normal(0.0, sd, (n, 6))
+
+
+def test_the_noise_that_the_file_says_is_that_of_four_channels_and_of_the_converter() -> None:
+    assert levels(RIG, noisy(100)).stated == pytest.approx(math.hypot(2e-3, STEP / math.sqrt(12.0)))
+    each = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 3e-3]})
+    mean = math.sqrt((1.0 + 4.0 + 16.0 + 9.0) / 4.0) * 1e-3
+    assert levels(each, noisy(100)).stated == pytest.approx(math.hypot(mean, STEP / math.sqrt(12.0)))
+
+
+def test_noise_is_what_third_differences_have_without_steps_glitches_and_lost_samples() -> None:
+    volts = noisy(800)
+    volts[400:] += 0.3
+    volts[::90] -= 0.5
+    volts += 1e-6 * np.arange(800.0)[:, None] ** 2
+    volts[[100, 333]] = np.nan
+    found = levels(RIG, volts)
+    for channel in range(6):
+        v = volts[:, channel]
+        rough = [v[i + 3] - 3.0 * v[i + 2] + 3.0 * v[i + 1] - v[i] for i in range(797)]
+        rough = [r for r in rough if math.isfinite(r)]
+        # A deviation is 1.4826 medians; four of them, and of the converter's step at least.
+        most = 4.0 * max(1.4826 * float(np.median(np.abs(rough))), STEP)
+        clipped = [min(max(r, -most), most) for r in rough]
+        # The variance of 1, 3, 3, 1 times white noise is 20.
+        wanted = math.sqrt(sum(c * c for c in clipped) / len(clipped) / 20.0)
+        assert found.noise[channel] == pytest.approx(wanted)
+    assert found.sums == pytest.approx(np.nanmean(volts[:, [2, 5]], axis=0))
+    assert found.stuck == ()
+    # Of samples between lost ones nothing is told, and the least is the converter's step.
+    alone = np.where(np.arange(30)[:, None] % 3 == 0, noisy(30), np.nan)
+    assert levels(RIG, alone).noise.tolist() == [0.0] * 6
+    still = np.zeros((900, 6))
+    still[450:] = 1.0
+    assert levels(RIG, still).noise == pytest.approx(math.sqrt((1 + 4 + 1) * 16 / 897 / 20) * STEP, rel=0.5)
+
+
+def test_only_the_begin_of_a_long_recording_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    volts = noisy(900)
+    volts[500:] = 3.0
+    monkeypatch.setattr(module, 'LONGEST', 500)
+    assert levels(RIG, volts).sums == pytest.approx(volts[:500, [2, 5]].mean(axis=0))
+
+
+def test_a_channel_on_which_no_bit_moves_is_stuck_if_noise_would_move_one() -> None:
+    volts = noisy(200)
+    volts[:, [1, 5]] = 0.25
+    assert levels(RIG, volts).stuck == ('y1', 'sum2')
+    # Noise of one step of the converter moves none for sure.
+    for noise, stuck in ((STEP, ()), (1.01 * STEP, ('y1', 'sum2'))):
+        quiet = load_rig(overrides={'amplifier.noise': noise})
+        assert levels(quiet, volts).stuck == stuck
+
+
+def test_one_sample_has_no_noise() -> None:
+    found = levels(RIG, noisy(1))
+    assert found.noise.tolist() == [0.0] * 6
+    assert found.sums == pytest.approx(noisy(1)[0, [2, 5]])
+
+
+def test_steps_are_seen_wherever_they_are() -> None:
+    volts = np.zeros((2500, 6))
+    volts[2000:] = 0.05 * np.random.default_rng(2).integers(-3, 4, (500, 6))
+    assert levels(RIG, volts).steps == pytest.approx([0.05] * 6, rel=1e-3)
+    assert not levels(RIG, noisy(2500)).steps.any()
+
+
+def test_the_longest_run_is_the_first_of_those_without_a_lost_sample() -> None:
+    volts = np.arange(120.0).reshape(20, 6)
+    assert module._longest_run(volts) == pytest.approx(volts)
+    volts[[0, 7, 8, 15], [0, 5, 2, 3]] = np.nan
+    # 1 to 6, 9 to 14 and 16 to 19.
+    assert module._longest_run(volts) == pytest.approx(volts[1:7])
+    volts[6, 1] = np.nan
+    assert module._longest_run(volts) == pytest.approx(volts[9:15])
+
+
+def waves(n: int, rate: float, amplitudes: dict[float, float]) -> FloatArray:
+    """Volts (n, 6); the mains only on y1."""
+    t = np.arange(n) / rate
+    out = np.random.default_rng(3).normal(0.0, 1e-3, (n, 6)) + 2.0
+    for hz, size in amplitudes.items():
+        out[:, 1] += size * np.sin(2.0 * math.pi * hz * t + 0.7)
+    return out
+
+
+def test_hum_is_the_amplitude_of_the_mains_that_stands_out_more() -> None:
+    noise = np.full(6, 1e-3)
+    hz, hum = module._hum(waves(4000, 1000.0, {50.0: 2e-3, 60.0: 5e-3}), 1000.0, noise)
+    assert hz == 60.0
+    assert hum[1] == pytest.approx(5e-3, rel=0.03)
+    assert hum[[0, 2, 3, 4, 5]].tolist() == [0.0] * 5
+    hz, hum = module._hum(waves(4000, 1000.0, {50.0: 5e-3, 60.0: 2e-3}), 1000.0, noise)
+    assert (hz, hum[1]) == (50.0, pytest.approx(5e-3, rel=0.03))
+    # Without any it is that of the first.
+    hz, hum = module._hum(waves(4000, 1000.0, {}), 1000.0, noise)
+    assert (hz, hum.tolist()) == (50.0, [0.0] * 6)
+
+
+def transform(volts: FloatArray, rate: float, hz: float) -> FloatArray:
+    """Amplitude (6,) under a Hann window, term by term."""
+    n = len(volts)
+    window = [0.5 - 0.5 * math.cos(2.0 * math.pi * i / (n - 1)) for i in range(n)]
+    about = volts - volts.mean(axis=0)
+    turns = [2.0 * math.pi * hz * i / rate for i in range(n)]
+    real = sum(w * math.cos(a) * row for w, a, row in zip(window, turns, about, strict=True))
+    imaginary = sum(w * math.sin(a) * row for w, a, row in zip(window, turns, about, strict=True))
+    return np.asarray(2.0 * np.hypot(real, imaginary) / sum(window))
+
+
+def test_hum_stands_out_of_its_neighbours_five_times() -> None:
+    # At 500 Hz and 1000 samples two hertz are the width of a window: neighbours are 3 to 8 Hz away.
+    volts = waves(1000, 500.0, {})
+    volts[:, 1] += waves(1000, 500.0, {50.0: 1e-3})[:, 1]
+    own = transform(volts, 500.0, 50.0)
+    beside = np.array([transform(volts, 500.0, 50.0 + s * d) for s in (-1, 1) for d in range(3, 9)])
+    ratio = float(own[1] / np.median(beside[:, 1]))
+    assert ratio > 5.0
+    t = np.arange(1000) / 500.0
+    # Taken down to just above, then just below.
+    for wanted, seen in ((5.01, True), (4.99, False)):
+        less = volts.copy()
+        low, high = -2e-3, 2e-3
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            less[:, 1] = volts[:, 1] + middle * np.sin(2.0 * math.pi * 50.0 * t + 0.7)
+            if transform(less, 500.0, 50.0)[1] < wanted * float(np.median(beside[:, 1])):
+                low = middle
+            else:
+                high = middle
+            if high - low < 1e-9:
+                break
+        assert bool(module._hum(less, 500.0, np.zeros(6))[1][1] > 0.0) is seen
+
+
+@pytest.mark.parametrize(('noise', 'seen'), [(0.0195, True), (0.0205, False)])
+def test_hum_below_a_quarter_of_the_noise_is_none(noise: float, seen: bool) -> None:
+    volts = waves(4000, 1000.0, {50.0: 5e-3})
+    assert bool(module._hum(volts, 1000.0, np.full(6, noise))[1].any()) is seen
+
+
+@pytest.mark.parametrize(
+    ('n', 'rate', 'seen'), [(1000, 1000.0, True), (999, 1000.0, False), (600, 150.0, True), (600, 149.0, False)]
+)
+def test_hum_is_looked_for_in_a_second_and_at_two_and_a_half_samples_a_period(n: int, rate: float, seen: bool) -> None:
+    hz, hum = module._hum(waves(n, rate, {50.0: 0.1}), rate, np.full(6, 1e-3))
+    assert hz == 50.0
+    assert bool(hum[1] > 0.0) is seen
+    assert len(hum) == 6
+
+
+def test_hum_is_looked_for_in_the_first_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked: list[int] = []
+
+    def hum(volts: FloatArray, rate: float, noise: FloatArray) -> tuple[float, FloatArray]:
+        looked.append(len(volts))
+        return rate, noise
+
+    monkeypatch.setattr(module, '_hum', hum)
+    rig = load_rig(overrides={'converter.sample_rate_hz': 200.0})
+    assert levels(rig, noisy(13_000)).hum_hz == 200.0
+    levels(rig, noisy(11_999))
+    assert looked == [12_000, 11_999]
