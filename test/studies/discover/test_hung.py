@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import cast
+
 import numpy as np
 import pytest
 
@@ -12,6 +15,8 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
 from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.redundant import excess
 
 RIG = load_rig()
 LEVELS = np.array(
@@ -161,3 +166,43 @@ def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wron
     assert found.moves == (0.0, 0.0, 0.0)
     assert 'The estimates of the pose are right without' in found.sentence
     assert 'is wrong by up to' not in found.sentence
+
+
+@pytest.mark.statistics
+def test_a_few_milliseconds_late_are_found_beside_a_clamp_that_twists_under_the_only_torque() -> None:
+    """What is found first is a stiffness; beside the delay, which is better, the clamp is looked for again."""
+    levels = np.array([(0, 0, 0), (0, -50, 0), (0, -20, 0), (0, -40, 0), (20, -30, 17.55), (-25, -15, 0), (0, -40, 0)])
+    acting = np.repeat(np.vstack((levels, np.zeros(3))), DWELL, axis=0).astype(np.float64)
+    soft = {'effects__e__name': 'clamp_torsional_compliance', 'effects__e__compliance': 1.56e-5}
+    noted = np.vstack((np.zeros((4, 3)), acting[:-4]))
+    found = searched(read(acting, **soft), noted)
+    assert [f.name for f in found.setup] == ['load_delay']
+    assert found.setup[0].value == pytest.approx(0.004, abs=1e-5)
+    # One torque cannot tell the clamp from the link.
+    assert [e.active.effect.name for e in found.effects] in [['clamp_torsional_compliance'], ['torsional_stiffness']]
+    assert (found.verdict, found.unknown) == ('effects_found', ())
+
+
+@pytest.mark.statistics
+def test_a_spot_that_is_clipped_at_the_ends_of_the_swing_alone_is_found() -> None:
+    """For moments a dot is far off: the fourth reading, in which an outlier counts little, acquits nothing then."""
+    clipped = {'effects__e__name': 'spot_clipping', 'effects__e__psd': 1, 'effects__e__radius': 2e-3}
+    found = searched(read(HUNG, **clipped), HUNG)
+    assert [(e.active.effect.name, e.active.values['psd']) for e in found.effects] == [('spot_clipping', 1)]
+    assert found.effects[0].active.values['radius'] == pytest.approx(2e-3, rel=0.02)
+
+
+def test_a_dot_that_is_far_off_for_moments_is_nothing_that_the_fourth_reading_could_see() -> None:
+    """Five values of 1000 sd among 4000 of dots: 5 (36 - 1) / 4000 of what an outlier counts; sums do not count."""
+    table = np.zeros((6, 1000))
+    comparison = cast(Workspace, SimpleNamespace(count=[np.ones((6, 1000))], split=lambda _: [table]))
+    table[0, :5] = 1000.0
+    table[2] = 1e6
+    beyond, throughout = excess(comparison, table)
+    assert beyond == pytest.approx(5e6 - 4000.0)
+    assert throughout == pytest.approx(5 * 36.0 / 4000.0 - 1.0)
+    table[[0, 1, 3, 4]] = 5.0
+    assert excess(comparison, table) == pytest.approx((24.0 * 4000.0, 24.0))
+    # What is not there is no value.
+    comparison.count[0][:, 500:] = 0.0
+    assert excess(comparison, table) == pytest.approx((24.0 * 2000.0, 24.0))

@@ -456,6 +456,20 @@ def test_a_line_persists_if_its_quarters_are_alike() -> None:
     assert proposals.persistent([50.0], [rows], [np.array([0.1, 10.0])], [1e-3]) == [50.0]
 
 
+def test_a_line_persists_though_most_of_a_quarter_was_left_out() -> None:
+    """As the time in which a weight swayed: what is not there is 0."""
+    hum = np.sin(2 * np.pi * 50.0 * 1e-3 * np.arange(4000.0))[:, None]
+    for first, there in ((1150, True), (1000, True), (0, False)):
+        rows = hum.copy()
+        # A quarter without samples tells nothing, two of them are too many.
+        rows[first:2000] = 0.0
+        assert (proposals.persistent([50.0], [rows], [np.ones(1)], [1e-3]) == [50.0]) is there
+    # A line that begins later is none, though the samples of before are there.
+    rows = hum.copy()
+    rows[:1000] = 0.01
+    assert proposals.persistent([50.0], [rows], [np.ones(1)], [1e-3]) == []
+
+
 def test_a_limit_is_that_of_the_highest_reading_of_all_recordings() -> None:
     o = observed(warm=None)
     low, high = (dataclasses.replace(o, volts=np.full_like(o.volts, v)) for v in (1.0, -2.0))

@@ -10,6 +10,9 @@ from scipy.optimize import minimize_scalar
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.studies.discover.observation import Observation
 
+LEAST_THERE = 0.1
+"""Share of the samples of a quarter that tell whether a line is there."""
+FEWEST_QUARTERS = 3
 PEAK = 40.0
 """A spectral line must exceed the median power around it by this factor (chance: 1e-12 per bin)."""
 
@@ -63,8 +66,9 @@ def persistent(
 ) -> list[float]:
     """Those of ``peaks`` that are always present with a constant phase, as mains hum is and ringing is not.
 
-    The line's complex amplitude is computed for each quarter of a recording. The magnitude of their
-    sum must equal the sum of their magnitudes, and no quarter may be without the line.
+    The line's complex amplitude is computed for each quarter of a recording that has samples, of those that are there
+    (the others are 0 in ``residuals``). The magnitude of their sum must equal the sum of their magnitudes, and no
+    quarter may be without the line.
     """
     out = []
     for f in peaks:
@@ -73,8 +77,15 @@ def persistent(
             n = len(residual) // 4
             t = np.arange(4 * n) * period
             scaled = residual[: 4 * n] / sigma
-            turned = np.exp(-2j * np.pi * f * t)[:, None] * (scaled - scaled.mean(axis=0))
-            quarters = turned.reshape(4, n, -1).mean(axis=1)
+            there = np.any(scaled != 0.0, axis=1)
+            shares = there.reshape(4, n).mean(axis=1)
+            told = shares >= LEAST_THERE
+            if told.sum() < FEWEST_QUARTERS:
+                steady = False
+                break
+            centred = np.where(there[:, None], scaled - scaled[there].mean(axis=0), 0.0)
+            turned = np.exp(-2j * np.pi * f * t)[:, None] * centred
+            quarters = turned.reshape(4, n, -1).mean(axis=1)[told] / shares[told, None]
             strongest = int(np.argmax(np.abs(quarters).sum(axis=0)))
             q = quarters[:, strongest]
             size = np.abs(q)
