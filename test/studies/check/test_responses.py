@@ -84,7 +84,9 @@ def test_slopes_and_their_spread_are_those_of_least_squares_and_memory_widens_th
         own = chance.normal(size=(rows, 1))
         r = own[:, 0] - some @ np.linalg.lstsq(some, own[:, 0], rcond=None)[0]
         colour = min(max(float(r[1:] @ r[:-1] / (r @ r)), 0.0), 0.98)
-        assert module._regression(some, own)[2] == pytest.approx(r @ r * (1 + colour) / (1 - colour), rel=1e-5)
+        assert module._regression(some, own)[2] == pytest.approx(
+            r @ r * (1 + colour) / (1 - colour), rel=1e-5, abs=1e-20
+        )
     # What explains all leaves nothing, and no more numbers than values have a variance still.
     _, _, exact = module._regression(np.eye(3)[:, :2], np.array([[1.0], [2.0], [0.0]]))
     assert exact.tolist() == [0.0]

