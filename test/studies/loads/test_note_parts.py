@@ -1,0 +1,364 @@
+"""Noted times piece by piece: steps of the dots, notes paired with them, loads as they acted, and the words."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.loads import noted_times
+from psd_deflection.studies.loads.noted_times import (
+    ALIKE_S,
+    LEAST_SHARE,
+    MendedNote,
+    ordinal,
+    shifts,
+)
+
+
+def note(noted: float, hung: float, took: float = 0.0, *, settled_only: bool = False, number: int = 3) -> MendedNote:
+    return MendedNote(number, (1.5, -2.0, 0.25), noted, hung, took, settled_only)
+
+
+@pytest.mark.parametrize(
+    ('one', 'name', 'value', 'size', 'wrong'),
+    [
+        (note(3.0, 1.0), 'load_time', 2.0, 2.0, True),
+        (note(1.0, 3.0), 'load_time', -2.0, 2.0, True),
+        (note(3.0, 1.0, 1.75), 'load_time', 2.0, 2.0, True),
+        # As late as it took: noted when it was done.
+        (note(3.0, 1.0, 2.0), 'load_ramp', 2.0, 2.0, True),
+        (note(1.0, 3.0, 2.0), 'load_ramp', 2.0, 2.0, True),
+        (note(1.0, 3.0, 2.5), 'load_ramp', 2.5, 2.0, True),
+        (note(1.0, 1.0, 0.5), 'load_ramp', 0.5, 0.0, True),
+        # Two milliseconds are no delay.
+        (note(ALIKE_S, 0.0), 'load_ramp', 0.0, ALIKE_S, False),
+        (note(0.0, ALIKE_S), 'load_ramp', 0.0, ALIKE_S, False),
+        (note(0.0021, 0.0), 'load_time', 0.0021, 0.0021, True),
+    ],
+)
+def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_took(
+    one: MendedNote, name: str, value: float, size: float, wrong: bool
+) -> None:
+    assert (one.name, one.value, one.size, one.wrong) == (name, value, size, wrong)
+    assert one.where == 'load 3'
+    assert MendedNote(3, one.load, one.noted, one.hung, one.took) == one
+
+
+@pytest.mark.parametrize(
+    ('one', 'words'),
+    [
+        (
+            note(3.0, 1.0, 1.75),
+            'was noted 2.000 s late and applied over 1.8 s: note it 1.000 s after the first sample, '
+            'as a ramp until 2.750 s, not 3.000 s',
+        ),
+        (note(1.125, 1.0), 'was noted 0.125 s late: note it 1.000 s after the first sample, not 1.125 s'),
+        (note(1.0, 1.125), 'was noted 0.125 s early: note it 1.125 s after the first sample, not 1.000 s'),
+        (
+            note(1.0, 1.0, 0.5, settled_only=True),
+            'was applied over 0.5 s: note it 1.000 s after the first sample, as a ramp until 1.500 s, not 1.000 s; '
+            'here only the link at rest under it is used',
+        ),
+    ],
+)
+def test_a_wrong_time_is_told_in_words_and_so_is_what_to_do(one: MendedNote, words: str) -> None:
+    assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
+
+
+def test_numbers_up_to_a_thousand_have_the_ending_of_their_last_word() -> None:
+    def ending(number: int) -> str:
+        # eleventh, twelfth, thirteenth ... nineteenth
+        teens = 10 < number % 100 < 20
+        return 'th' if teens else ['th', 'st', 'nd', 'rd', *['th'] * 6][int(str(number)[-1])]
+
+    assert [ordinal(n) for n in range(1, 1001)] == [f'{n}{ending(n)}' for n in range(1, 1001)]
+
+
+@pytest.mark.parametrize(
+    ('late', 'alike'),
+    [
+        ([0.25, 0.25, 0.25], True),
+        ([0.25, 0.375, 0.125], True),
+        ([0.25, 0.376, 0.125], False),
+        ([0.25, 0.374, 0.124], False),
+        ([-0.25, -0.375, -0.125], True),
+        ([0.9, 0.9, 0.9], True),
+        ([0.901, 0.901, 0.9], False),
+        ([-0.901, -0.901, -0.9], False),
+        # The middle one counts, not the mean.
+        ([0.25, 0.25, 0.0, 0.25], False),
+    ],
+)
+def test_delays_are_alike_within_so_much_of_the_middle_one_and_up_to_0_9_seconds(
+    late: list[float], alike: bool
+) -> None:
+    assert noted_times._alike(np.array(late), 0.125) is alike
+
+
+def test_the_dots_move_by_what_a_cantilever_and_a_shaft_do() -> None:
+    rig = load_rig(overrides={'psd_1.zero': [0.002, -0.01], 'psd_2.zero': [0.01, 0.004]})
+    link = rig.link
+    fourth = link.outer_radius**4 - link.inner_radius**4
+    bend = link.length**3 / (3.0 * link.youngs_modulus * math.pi / 4.0 * fourth)
+    twist = link.length / (link.shear_modulus * math.pi / 2.0 * fourth)
+    beams = ((0.002, 0.06), (-0.09, 0.004))
+    loads = [(2.0, 0.0, 0.0), (0.0, -3.0, 0.0), (1.0, 2.0, -4.0)]
+    wanted = []
+    for fx, fy, tz in loads:
+        x, y, turn = bend * fx, bend * fy, twist * tz
+        moved = [(-x + turn * ly, -y - turn * lx) for lx, ly in beams]
+        wanted.append(math.sqrt(sum(a * a + b * b for a, b in moved)))
+    assert noted_times._expected(rig, np.array(loads)) == pytest.approx(wanted, rel=1e-9)
+
+
+# ---- steps of the dots
+
+
+def stepped(n: int, steps: dict[int, float], noise: float = 0.0, seed: int = 0) -> FloatArray:
+    """Dots (n, 4) whose x1 steps by so much at so many samples."""
+    dots = noise * np.random.default_rng(seed).normal(size=(n, 4))
+    for at, size in steps.items():
+        dots[at:, 0] += size
+    return dots
+
+
+def sizes_of(dots: FloatArray, width: int) -> dict[int, float]:
+    """By how much the mean of ``width`` samples differs from that before, with more than a quarter of both there."""
+    out = {}
+    for at in range(width, len(dots) - width):
+        before, after = (part[np.isfinite(part).all(axis=1)] for part in (dots[at - width : at], dots[at : at + width]))
+        enough = min(len(before), len(after)) > width // 4
+        out[at] = float(np.linalg.norm(after.mean(axis=0) - before.mean(axis=0))) if enough else 0.0
+    return out
+
+
+def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
+    # The difference is a triangle from 90 to 110: above 3 % of it from 91 to 109.
+    (step,) = noted_times._steps(stepped(200, {100: 2.0}), 10)
+    assert (step.at, step.size) == pytest.approx((100.0, 2.0))
+    assert (step.first, step.last) == (91, 110)
+    # Of two rows of three the middle is between them.
+    (slow,) = noted_times._steps(stepped(200, {100: 1.0, 101: 1.0}), 10)
+    assert slow.at == pytest.approx(100.5)
+    # So it is wherever the dots are, from the first width of them on.
+    early = stepped(200, {14: 1.0})
+    (first,), (shifted,) = noted_times._steps(early, 10), noted_times._steps(early + 5.0, 10)
+    assert (shifted.at, shifted.size) == pytest.approx((first.at, first.size))
+    assert (shifted.first, shifted.last) == (first.first, first.last) == (10, 24)
+    # Four widths are the least, even if most of them is lost: more than two of ten must be there.
+    for n, told in ((40, 1), (39, 0)):
+        short = stepped(n, {20: 1.0})
+        short[:15] = short[26:] = np.nan
+        assert len(noted_times._steps(short, 10)) == told
+    assert noted_times._steps(np.zeros((200, 4)), 10) == []
+
+
+@pytest.mark.parametrize(('times', 'seen'), [(13.5, 1), (13.0, 0)])
+def test_a_step_stands_out_ten_times_of_what_is_there_without_one(times: float, seen: int) -> None:
+    # A drift of 0.01 a sample is 1 between two means of 100, everywhere. Half of the stretch, 51 samples, must be above
+    # 10: three quarters of the step, and the drift across it.
+    dots = stepped(2000, {900: times})
+    dots[:, 3] = 0.01 * np.arange(2000.0)
+    assert (0.75 * times) ** 2 + 1.0 != pytest.approx(100.0, abs=2.0)
+    assert len(noted_times._steps(dots, 100)) == seen
+
+
+def test_places_without_a_mean_have_no_step() -> None:
+    # Fifty of a hundred places have none: their middle one is half of the least that the drift makes of the others,
+    # 0.55, as three samples after the last are left. Ten times of that are more than the step.
+    dots = stepped(120, {30: 2.0})
+    dots[:, 3] = 0.1 * np.arange(120.0)
+    dots[62:] = np.nan
+    assert list(sizes_of(dots, 10).values()).count(0.0) == 50
+    assert noted_times._steps(dots, 10) == []
+    assert len(noted_times._steps(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
+
+
+def test_a_step_is_more_than_three_per_cent_of_the_largest() -> None:
+    for size, seen in ((2.9, 1), (4.0, 2)):
+        assert len(noted_times._steps(stepped(100, {30: 100.0, 70: size}), 2)) == seen
+
+
+@pytest.mark.parametrize(('share', 'seen'), [(0.0395, 1), (0.0400, 2)])
+def test_a_stretch_above_three_per_cent_of_the_largest_is_half_a_width_long(share: float, seen: int) -> None:
+    # A triangle of 102 to either side: 25 on either side of the middle one are half of it, 51, and 24 are less.
+    assert len(noted_times._steps(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
+    assert len(noted_times._steps(stepped(2000, {500: share, 1200: 1.0}), 102)) == seen
+
+
+@pytest.mark.parametrize(
+    ('width', 'lost', 'unit'), [(16, 0.3, 1.0), (16, 0.6, 1e-4), (16, 0.7, 1e-4), (16, 0.75, 1.0), (3, 0.4, 1e-4)]
+)
+@pytest.mark.parametrize('seed', range(4))
+def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample(
+    width: int, lost: float, unit: float, seed: int
+) -> None:
+    dots = unit * stepped(600, {100: 1.0, 110: 0.5, 300: -2.0, 470: 0.3}, 0.01, 3)
+    dots[np.random.default_rng(seed).random(600) < lost] = np.nan
+    dots[296:304] = np.nan
+    dots[470 - 2 * width : 470, 1] = np.nan
+    sizes = sizes_of(dots, width)
+    least = max(10.0 * float(np.median([*sizes.values()])), 0.03 * max(sizes.values()))
+    stretches: list[list[int]] = []
+    for at, size in sizes.items():
+        if size > least:
+            if not stretches or stretches[-1][-1] != at - 1:
+                stretches.append([])
+            stretches[-1].append(at)
+    wanted = []
+    for stretch in stretches:
+        if len(stretch) < width // 2:
+            continue
+        half = 0.5 * max(sizes[at] for at in stretch)
+        over = {at: sizes[at] - half for at in stretch if sizes[at] > half}
+        first, last = stretch[0], stretch[-1] + 1
+        parts = [dots[last : last + width], dots[first - width : first]]
+        there = [p[np.isfinite(p).all(axis=1)] for p in parts]
+        after, before = (p.mean(axis=0) if len(p) else np.zeros(4) for p in there)
+        middle = sum(at * w for at, w in over.items()) / sum(over.values())
+        wanted.append((middle, float(np.linalg.norm(after - before)), first, last))
+    with np.errstate(invalid='raise', divide='raise'):
+        found = [(s.at, s.size, s.first, s.last) for s in noted_times._steps(dots, width)]
+    assert len(found) == len(wanted)
+    assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-7)
+
+
+def test_a_difference_is_of_the_means_of_whole_samples_and_nothing_has_the_mean_0() -> None:
+    dots = np.arange(24.0).reshape(6, 4)
+    dots[4, 2] = np.nan
+    assert noted_times._difference(dots, slice(3, 6), slice(0, 2)) == pytest.approx([14.0] * 4)
+    assert noted_times._difference(dots, slice(4, 5), slice(0, 2)) == pytest.approx([-2.0, -3.0, -4.0, -5.0])
+
+
+# ---- which note belongs to which step
+
+
+def as_steps(*places: tuple[float, float]) -> list[noted_times._Step]:
+    return [noted_times._Step(at, size, round(at) - 5, round(at) + 5) for at, size in places]
+
+
+def cheapest(
+    changes: IntArray, sizes: FloatArray, steps: list[noted_times._Step], period: float
+) -> list[tuple[int, int]]:
+    """Of all ways to pair notes and steps in their order that of the least cost, one by one."""
+    seen = [i for i in range(len(changes)) if sizes[i] > 0.03 * max(sizes)]
+    factor = sum(s.size for s in steps) / sum(sizes[i] for i in seen)
+    best: tuple[float, list[tuple[int, int]]] = (math.inf, [])
+    for count in range(min(len(seen), len(steps)) + 1):
+        for some in itertools.combinations(seen, count):
+            for others in itertools.combinations(range(len(steps)), count):
+                pairs = list(zip(some, others, strict=True))
+                cost = 9.0 * (len(seen) - count) + 4.0 * (len(steps) - count)
+                for i, j in pairs:
+                    away = abs(steps[j].at - changes[i]) * period
+                    unlike = 2.0 * math.log(max(steps[j].size, 1e-12) / factor / sizes[i])
+                    cost += away / 5.0 + min(unlike**2, 8.0) if away <= 30.0 else math.inf
+                if cost < best[0]:
+                    best = cost, pairs
+    return best[1]
+
+
+@pytest.mark.parametrize('seed', range(40))
+def test_notes_and_steps_are_paired_at_the_least_cost_of_all_ways(seed: int) -> None:
+    chance = np.random.default_rng(seed)
+    changes = np.sort(chance.choice(6000, 5, replace=False))
+    sizes = 1e-4 * np.exp(chance.normal(size=5))
+    sizes[chance.integers(5)] *= 0.01
+    places = np.sort(changes[:4] + chance.normal(size=4) * chance.choice([20.0, 300.0, 1500.0]))
+    steps = as_steps(*zip(places.tolist(), (2e-4 * np.exp(chance.normal(size=4))).tolist(), strict=True))
+    assert noted_times._matched(changes, sizes, steps, 0.01) == cheapest(changes, sizes, steps, 0.01)
+
+
+def test_a_note_without_a_step_near_it_has_none() -> None:
+    changes = np.array([1000, 9000])
+    # Thirty seconds away is the farthest.
+    for away, pairs in ((2999.0, [(0, 0)]), (3000.0, [(0, 0)]), (3001.0, [])):
+        assert noted_times._matched(changes[:1], np.array([1e-4]), as_steps((1000.0 + away, 1e-4)), 0.01) == pairs
+    # What moves the dots by no more than 3 % of the largest does not count.
+    sizes = np.array([1.0, LEAST_SHARE])
+    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.04)), 0.01) == [(0, 0)]
+    sizes[1] = 0.04
+    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.04)), 0.01) == [(0, 0), (1, 1)]
+    assert noted_times._matched(changes, np.zeros(2), as_steps((1000.0, 1.0)), 0.01) == []
+    assert noted_times._matched(changes, sizes, [], 0.01) == []
+    # A step of no size is paired with the one that it is nearest to.
+    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.0)), 0.01) == [(0, 0), (1, 1)]
+
+
+# ---- loads between samples
+
+
+def test_a_step_between_samples_keeps_its_time_and_a_ramp_its_share() -> None:
+    t = np.arange(8.0)
+    assert noted_times._profile(t, 3.0, 0.0, 1.0) == pytest.approx([0, 0, 0, 1, 1, 1, 1, 1])
+    # A quarter after 3: three quarters of that sample, and 0.5 * 3/4 * 1/4 that the one before lacks.
+    more = 0.5 * 0.75 * 0.25
+    assert noted_times._profile(t, 3.25, 0.0, 1.0) == pytest.approx([0, 0, -more, 0.75 + more, 1, 1, 1, 1])
+    assert noted_times._profile(t, 3.25, 1.0, 1.0) == pytest.approx([0, 0, -more, 0.75 + more, 1, 1, 1, 1])
+    # A ramp from 2 to 4.5, at the end of each sample.
+    assert noted_times._profile(t, 2.0, 2.5, 1.0) == pytest.approx([0, 0, 0.4, 0.8, 1, 1, 1, 1])
+    # A millionth of a sample is none.
+    assert noted_times._profile(t, 3.0000004, 0.0, 1.0).tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
+    assert noted_times._profile(t, 3.000001, 0.0, 1.0)[3] < 1.0
+    assert noted_times._profile(t, 3.00001, 0.0, 1.0)[3] == pytest.approx(1 - 0.5e-5, abs=1e-8)
+
+
+def test_later_and_slower_shift_what_the_load_changed_by() -> None:
+    t = 0.5 * np.arange(40.0)
+    loads = np.column_stack((t, -2.0 * t, t**2))
+    # Applied from sample 20 to 28: before is the sample before 19, after is the second one beyond 28.
+    step = loads[30] - loads[18]
+    ramp = note(12.0, 10.0, 4.0)
+    later, slower = shifts(ramp, loads, 0.5)
+
+    def share(start: float, took: float) -> FloatArray:
+        return np.asarray(np.clip((t + 0.5 - start) / took, 0.0, 1.0))
+
+    # A moment is an eighth of a second here.
+    assert later(4.0) == pytest.approx(np.outer(share(10.5, 4.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert slower(8.0) == pytest.approx(np.outer(share(10.0, 5.0) - share(10.0, 4.0), step), abs=1e-3)
+    # Faster than at once it cannot be.
+    assert slower(-100.0) == pytest.approx(np.outer((t >= 10.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert later(0.0) == pytest.approx(0.0)
+    assert len(shifts(note(12.0, 10.0, 0.9), loads, 0.5)) == 2
+    assert len(shifts(note(12.0, 10.0), loads, 0.5)) == 1
+    # At the begin and at the end of a recording there is no more.
+    first, _ = shifts(note(0.0, 0.0, 1.0), loads, 0.5)
+    assert first(4.0)[0] == pytest.approx(-(loads[4] - loads[0]) / 2.0, rel=1e-5)
+    last, _ = shifts(note(19.0, 19.0, 1.0), loads, 0.5)
+    assert last(4.0)[38] == pytest.approx(-(loads[39] - loads[36]) / 2.0, rel=1e-5)
+
+
+def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_are_told() -> None:
+    loads = np.zeros((30, 3))
+    loads[5:] = (1.0, 0.0, 0.0)
+    loads[12:] = (1.0, -2.0, 0.0)
+    loads[20:] = (0.0, 0.0, 3.0)
+    acted, notes = noted_times._as_acted(loads, np.array([5, 12, 20]), {0: (0.3, 0.0), 2: (1.8, 0.2)}, 0.1)
+    wanted = np.zeros((30, 3))
+    wanted[3:] += (1.0, 0.0, 0.0)
+    wanted[12:] += (0.0, -2.0, 0.0)
+    wanted[18:] += 0.5 * np.array((-1.0, 2.0, 3.0))
+    wanted[19:] += 0.5 * np.array((-1.0, 2.0, 3.0))
+    assert acted == pytest.approx(wanted, abs=1e-5)
+    assert [(n.number, n.load) for n in notes] == [(1, (1.0, 0.0, 0.0)), (3, (0.0, 0.0, 3.0))]
+    assert [(n.noted, n.hung, n.took) for n in notes] == [
+        pytest.approx((0.5, 0.3, 0.0)),
+        pytest.approx((2.0, 1.8, 0.2)),
+    ]
+    # What took a tenth of a second was no ramp.
+    (one,) = noted_times._as_acted(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
+    assert one.took == 0.0
+    # From the second sample on, and one right after the other.
+    loads = np.zeros((6, 3))
+    loads[1:], loads[2:] = (1.0, 0.0, 0.0), (5.0, 2.0, 0.0)
+    assert noted_times._as_acted(loads, np.array([1, 2]), {}, 0.1)[0] == pytest.approx(loads)
+    loads = np.zeros((30, 3))
+    loads[5:], loads[12:], loads[20:] = (1.0, 0.0, 0.0), (1.0, -2.0, 0.0), (0.0, 0.0, 3.0)
+    begun = np.add(loads, (7.0, 8.0, 9.0))
+    assert noted_times._as_acted(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)
