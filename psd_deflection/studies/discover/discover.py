@@ -48,12 +48,14 @@ from psd_deflection.studies.discover.setup.hung import levels, times, told
 from psd_deflection.studies.discover.setup.redundant import PART, STAGES, excess, fourth_reading, visible
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
-from psd_deflection.studies.loads.plateaus import all_free
+from psd_deflection.studies.loads.plateaus import all_free, may_be_rounded, rounded
 
 FREED_FROM = 10.0
 """A gap of so many floors, beside what the search has found, is held against loads that were noted wrong."""
 CLOSED = 0.2
 """Free loads are the answer if they and the effects beside them leave less than this share of it."""
+MOST_SETTLED, SETTLED, AT_FLOOR = 4, 0.95, 1.05
+"""Free loads and times are settled so often at most, until a turn leaves this share of the gap before, or this many floors."""
 FOLLOWS = 0.1
 """Known effects of a few per cent are linear to this share of the gap: if they leave more, it follows none of them."""
 
@@ -209,12 +211,18 @@ def rig_of(problem: Problem) -> RecordedRig:
 
 def hung(problem: Problem) -> Problem:
     """With the free loads as the chosen model says."""
-    ws = workspace_of(problem.comparison)
+    ws, fit = workspace_of(problem.comparison), problem.fit
     if ws.free is None:
         return problem
-    ws = ws.settled(problem.fit.difference)
-    null = refit(ws, ())
-    fit = refit(ws, problem.fit.effects, 6) if problem.fit.effects else null
+    gap = ws.gap(fit.difference)
+    for _ in range(MOST_SETTLED):
+        ws = ws.settled(fit.difference)
+        null = refit(ws, ())
+        fit = refit(ws, fit.effects, 6) if fit.effects else null
+        left, gap = gap, ws.gap(fit.difference)
+        # Times and loads are found to first order.
+        if gap > SETTLED * left or gap < AT_FLOOR * ws.floor():
+            break
     found = problem.search.at(ws)
     found.dropped = {}
     p, delta_bic, delta_chi2 = found.weigh(null, fit)
@@ -237,9 +245,13 @@ def searched(problem: Problem) -> Problem:
         problem = step(problem)
     freed = _freed(problem)
     before = problem.comparison.gap(problem.fit.difference)
-    if freed is None or freed.comparison.gap(freed.fit.difference) >= CLOSED * before:
+    if freed is not None and freed.comparison.gap(freed.fit.difference) < CLOSED * before:
+        return freed
+    # A detector at fault may move the dots by more than rounded loads move the plate.
+    freed = _freed(problem, maybe_rounded=True) if freed is None else None
+    if freed is None or freed.comparison.gap(freed.fit.difference) >= UNSAID * freed.comparison.floor():
         return problem
-    return freed
+    return freed if _rounded(freed) else problem
 
 
 def _follows_nothing(problem: Problem) -> bool:
@@ -263,10 +275,21 @@ def _follows_nothing(problem: Problem) -> bool:
     return ws.gap(linear) > max(FOLLOWS * gap, FREED_FROM * ws.floor())
 
 
-def _freed(problem: Problem) -> Problem | None:
+def _rounded(problem: Problem) -> bool:
+    """Whether the loads of ``problem``, which were free, are the noted ones before they were rounded."""
+    observations, free = workspace_of(problem.comparison).observations, rig_of(problem).recorded.wrong
+    own = [[p for p in free if p.recording == i] for i in range(len(observations))]
+    return all(
+        rounded(np.array([p.noted for p in listed]), np.array([p.of(o.loads) for p in listed]))
+        for o, listed in zip(observations, own, strict=True)
+    )
+
+
+def _freed(problem: Problem, *, maybe_rounded: bool = False) -> Problem | None:
     """If much remains: the search beside free loads, what hung with every load that was noted free.
 
-    None if little remains, or if no loads, constant between changes, would leave next to nothing.
+    None if little remains, or if no loads, constant between changes, would leave next to nothing. ``maybe_rounded``:
+    of loads in whole steps whatever other loads would leave.
     """
     machine, ws = rig_of(problem), workspace_of(problem.comparison)
     if ws.gap(problem.fit.difference) < FREED_FROM * ws.floor():
@@ -276,7 +299,7 @@ def _freed(problem: Problem) -> Problem | None:
         noted = {p.first: p.noted for p in machine.recorded.wrong if p.recording == i}
         listed = [replace(p, noted=noted.get(p.first, p.noted)) for p in times(o, i)]
         asked = levels(ws, i, difference, listed)
-        if not all_free(asked, o.loads):
+        if not (may_be_rounded(asked) if maybe_rounded else all_free(asked, o.loads)):
             return None
         # A person knows when nothing hangs.
         own = [(p, more) for p, more in zip(asked.plateaus, asked.more, strict=True) if np.any(p.noted != 0.0)]

@@ -49,6 +49,8 @@ ROUGH = 3.0
 
 _PER_SECOND = 1.0 / 5.0
 _SKIP_STEP, _SKIP_NOTE = 4.0, 9.0
+_ON_TIME_S, _ON_TIME = 0.03, 9.0
+"""If half of the notes have a step so near, those are their own: chance puts a step there once in a hundred times."""
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -325,15 +327,19 @@ def _matched(changes: IntArray, sizes: FloatArray, steps: list[_Step], period: f
         return []
     seen = [i for i in range(len(changes)) if sizes[i] > LEAST_SHARE * float(sizes.max())]
     factor = sum(s.size for s in steps) / float(sizes[seen].sum())
+    apart = np.abs(np.array([step.at for step in steps]) - changes[seen, None]) * period
+    on_time = apart <= _ON_TIME_S
+    own = _ON_TIME if 2 * np.count_nonzero(on_time.any(axis=1)) >= len(seen) else 0.0
     cost = np.zeros((len(seen) + 1, len(steps) + 1))
     way = np.zeros(cost.shape, dtype=np.int64)
     cost[:, 0], cost[0] = _SKIP_NOTE * np.arange(len(seen) + 1), _SKIP_STEP * np.arange(len(steps) + 1)
     way[1:, 0], way[0, 1:] = 1, 2
     for a, i in enumerate(seen, start=1):
         for b, step in enumerate(steps, start=1):
-            away = abs(step.at - changes[i]) * period
+            away = float(apart[a - 1, b - 1])
             unlike = math.log(max(step.size, 1e-12) / (factor * float(sizes[i]))) / 0.5
             pair = math.inf if away > FARTHEST_S else _PER_SECOND * away + min(unlike**2, 8.0)
+            pair -= own * float(on_time[a - 1, b - 1])
             ways = (cost[a - 1, b - 1] + pair, cost[a - 1, b] + _SKIP_NOTE, cost[a, b - 1] + _SKIP_STEP)
             way[a, b] = int(np.argmin(ways))
             cost[a, b] = ways[way[a, b]]

@@ -271,20 +271,39 @@ def all_free(found: PlateauLoads, loads: FloatArray) -> bool:
     return int(np.count_nonzero(_apart(found, (), SOFTER) > 1.0)) >= 2 or _rounded(found, loads)
 
 
+def may_be_rounded(found: PlateauLoads) -> bool:
+    """Whether the noted forces are multiples of a whole step, and ``found`` asks for others by less than a step."""
+    held = found.noted[np.any(found.noted != 0.0, axis=1)]
+    if len(held) < FEWEST:
+        return False
+    forces = float(steps_of(held)[0])
+    return 0.0 < forces < np.inf and bool(np.all(np.abs(found.more[:, :2]) < forces))
+
+
 def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
-    """Whether the noted loads are what hung, rounded to a whole step: off by up to half of it, and by no less.
+    """Whether the loads that ``found`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
+    return rounded(found.noted, np.array([p.of(loads) for p in found.plateaus]) + found.more)
+
+
+def rounded(noted: FloatArray, hung: FloatArray) -> bool:
+    """Whether the ``noted`` loads (k, 3) are what ``hung`` (k, 3), rounded to a whole step: off by up to half of it, and
+    by no less. N, N, N m.
 
     An effect of the catalogue changes loads by little against such a step, or in proportion to them.
     """
-    hung = np.array([p.of(loads) for p in found.plateaus]) + found.more
-    held = np.any(found.noted != 0.0, axis=1)
+    held = np.any(noted != 0.0, axis=1)
     if np.count_nonzero(held) < FEWEST:
         return False
-    off, noted = (hung - found.noted)[held], found.noted[held]
-    steps = np.array([_step(noted[:, :2]), _step(noted[:, :2]), _step(noted[:, 2:])])
+    off, noted = (hung - noted)[held], noted[held]
+    steps = steps_of(noted)
     if np.any(np.abs(off) > (0.5 + SHARE) * steps):
         return False
     return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > LEAST_STEP * float(steps[0])
+
+
+def steps_of(noted: FloatArray) -> FloatArray:
+    """(3,): to which steps the ``noted`` loads (k, 3) are rounded, N, N, N m; 0 for none, infinity if all are 0."""
+    return np.array([_step(noted[:, :2]), _step(noted[:, :2]), _step(noted[:, 2:])])
 
 
 def _step(noted: FloatArray) -> float:

@@ -50,7 +50,7 @@ EFFECT = Effect(
     equation="tau v' = input - v",
     source='amplifier datasheets: bandwidth',
     needs='fast motion (steps, sweeps)',
-    parameters=(EffectParameter('time_constant', 's', 0.0, 10.0, 1e-5, 'its time constant'),),
+    parameters=(EffectParameter('time_constant', 's', 0.0, 10.0, 2e-4, 'its time constant'),),
     point='volts',
     apply=_apply,
     order=0,

@@ -37,8 +37,8 @@ SMALL = 1e-4
 """m and rad; movements up to this size are in proportion to the load."""
 SHARE = 0.01
 """By that a load is made larger, to see how the readings go with it."""
-FARTHEST_S = 1.0
-"""Longest delay of the loads that is looked for."""
+LEAST_S, FARTHEST_S = 0.001, 1.0
+"""Shortest and longest delay of the loads that is looked for."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -233,9 +233,15 @@ def likely_delays(workspace: Workspace) -> list[float]:
             total = around if total is None else total + around
     if total is None:
         return []
-    best = int(np.argmax(total)) - reach
+    peak = int(np.argmax(total))
+    best = peak - reach
+    if best == 0:
+        # Between two fine blocks: where a parabola has its top.
+        a, b, c = total[peak - 1 : peak + 2].tolist()
+        early = 0.5 * (a - c) / (a - 2.0 * b + c) * step
+        return [-early] if abs(early) >= LEAST_S else []
     # The readings follow later than simulated: the loads are noted early.
-    return sorted({-best * step, -(best + 1) * step, -(best - 1) * step} - {0.0}) if best else []
+    return sorted({-best * step, -(best + 1) * step, -(best - 1) * step} - {0.0})
 
 
 def likely_jumps(workspace: Workspace, residual: FloatArray) -> list[tuple[int, int, float]]:
