@@ -55,7 +55,9 @@ FREED_FROM = 10.0
 CLOSED = 0.2
 """Free loads are the answer if they and the effects beside them leave less than this share of it."""
 MOST_SETTLED, SETTLED, AT_FLOOR = 4, 0.95, 1.05
-"""Free loads and times are settled so often at most, until a turn leaves this share of the gap before, or this many floors."""
+"""Free loads and times are settled so often at most; until a turn leaves this share of the gap before, or this many
+floors.
+"""
 FOLLOWS = 0.1
 """Known effects of a few per cent are linear to this share of the gap: if they leave more, it follows none of them."""
 

@@ -286,8 +286,9 @@ def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
 
 
 def rounded(noted: FloatArray, hung: FloatArray) -> bool:
-    """Whether the ``noted`` loads (k, 3) are what ``hung`` (k, 3), rounded to a whole step: off by up to half of it, and
-    by no less. N, N, N m.
+    """Whether the ``noted`` loads (k, 3) are what ``hung`` (k, 3), N, N, N m, rounded to a whole step.
+
+    They are off by up to half of it, and by no less.
 
     An effect of the catalogue changes loads by little against such a step, or in proportion to them.
     """

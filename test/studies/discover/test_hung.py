@@ -82,6 +82,31 @@ def test_rounded_loads_are_told_one_by_one_and_the_effect_beside_them() -> None:
     assert found.law is None
 
 
+@pytest.mark.statistics
+def test_rounded_loads_are_told_beside_a_beam_that_drifts_by_more_than_they_move_the_plate() -> None:
+    drift = {'effects__e__name': 'laser_pointing_drift', 'effects__e__psd': 2}
+    rates = {'effects__e__rate_x': 5e-6, 'effects__e__rate_y': -5e-6}
+    found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0), **drift, **rates), np.repeat(ROUNDED, DWELL, axis=0))
+    assert [(f.name, f.where) for f in found.setup] == [('load_value', f'load {i}') for i in range(1, 7)]
+    assert [e.active.label for e in found.effects] == ['laser_pointing_drift (psd 2)']
+    assert found.effects[0].active.values['rate_x'] == pytest.approx(5e-6, rel=2e-3)
+    assert found.verdict == 'effects_found'
+    assert found.floors < 1.05
+
+
+@pytest.mark.statistics
+def test_a_lag_of_the_amplifiers_is_found_beside_fitted_times_which_follow_it() -> None:
+    """All times a little later leave of a lag only what bends; and they are settled again beside it."""
+    noted = np.tile(LEVELS[0], (len(HUNG), 1))
+    for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
+        noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
+    found = searched(read(HUNG, effects__e__name='amplifier_lag', effects__e__time_constant=4e-4), noted)
+    assert [e.active.effect.name for e in found.effects] == ['amplifier_lag']
+    assert found.effects[0].active.values['time_constant'] == pytest.approx(4e-4, rel=0.1)
+    assert found.verdict == 'effects_found'
+    assert found.floors < 1.1
+
+
 ROUNDED = np.array(
     [(0, 0, 0), (0, -50, 0), (5, -10, 0), (0, -35, 0), (20, -30, 18), (0, -25, -14), (30, -50, 0), (0, 0, 0)], float
 )

@@ -604,6 +604,23 @@ def test_loads_are_rounded_if_each_is_off_by_half_a_step_at_most_and_by_a_tenth_
     assert not rounded((0.70, 0.5, 0.9), (0.5, -0.70, 0.9))
 
 
+def test_loads_may_be_rounded_if_they_are_in_whole_steps_and_off_by_less_than_one() -> None:
+    noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
+
+    def may_be(*off: tuple[float, float, float], loads: FloatArray = noted) -> bool:
+        more = np.zeros((len(loads), 3))
+        more[: len(off)] = off
+        return plateaus.may_be_rounded(seen({}, loads, everywhere=more))
+
+    assert may_be((4.9, 0.0, 0.0), (0.0, -4.9, 99.0))
+    assert not may_be((5.1, 0.0, 0.0))
+    assert not may_be((0.0, -5.1, 0.0))
+    # In no steps, no forces at all, fewer than four loads.
+    assert not may_be((0.0, 0.0, 0.0), loads=noted + 0.3 * np.eye(3)[0])
+    assert not may_be((0.0, 0.0, 0.0), loads=noted * [0.0, 0.0, 1.0])
+    assert not may_be((0.0, 0.0, 0.0), loads=noted[1:])
+
+
 @pytest.mark.parametrize(
     ('noted', 'step'),
     [

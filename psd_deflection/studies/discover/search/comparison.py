@@ -100,6 +100,10 @@ class Comparison(ABC):
     def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
         """With the noise as it is with ``effects`` in the model; this one if that is the same."""
 
+    def settled_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
+        """With what is free besides the effects as ``difference`` of a fit of these asks for; this one if little is."""
+        return self
+
     @abstractmethod
     def effective_size(self) -> float:
         """Sample size for BIC: values over correlation time."""

@@ -220,6 +220,15 @@ class Search:
         self.screen = self._make_screen(self.workspace, fit)
         return fit
 
+    def settle(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
+        """Both fits again with the free loads and times as ``fit`` asks for: a small effect would stand in for these."""
+        settled = self.workspace.settled_beside(fit.difference, fit.whole)
+        if settled is self.workspace:
+            return null, fit
+        self.workspace = settled
+        self.dropped.clear()
+        return refit(settled, ()), refit(settled, fit.effects, iterations=6)
+
     def at(self, workspace: Comparison) -> Search:
         """The same search over another comparison of the same recordings."""
         out = copy.copy(self)
@@ -299,7 +308,7 @@ class Search:
             better = self._added(null, current)
             if better is None:
                 break
-            current = better
+            null, current = self.settle(null, better)
             if not renoised or self.workspace.open_level:
                 renoised = True
                 current = self.renoise(current)

@@ -29,6 +29,8 @@ from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
 
 LEAST_NOISE = 0.05
 """Share of the rig file's noise that is assumed at least."""
+UNSETTLED = 1.1
+"""Free loads are settled beside effects that leave more floors than this."""
 FOLDS = 4
 PIECE_SECONDS = 0.5
 DOTS = list(DOT_CHANNELS)
@@ -59,6 +61,10 @@ class LoadDirection:
         if self.exact is None:
             return size * self.change
         return np.asarray(self.exact(self.size + size) - self.exact(self.size), dtype=np.float64)
+
+
+def _moved(more: Sequence[tuple[LoadDirection, float]]) -> tuple[LoadDirection, ...]:
+    return tuple(dataclasses.replace(d, size=d.size + size) for d, size in more)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,15 +195,16 @@ class Workspace(Comparison):
         parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
         return np.concatenate(parts)
 
-    def freed(self, directions: Sequence[LoadDirection]) -> Self:
-        """With the loads free along ``directions``."""
+    def freed(self, directions: Sequence[LoadDirection], effects: Sequence[ActiveEffect] = ()) -> Self:
+        """With the loads free along ``directions``, which are simulated beside ``effects``."""
         if not directions:
             return self
-        nominal = self.simulate(self.base)
+        beside = [*self.base, *effects]
+        nominal = self.simulate(beside)
         tables = []
         for d in directions:
             # A free load is large: the change by one of its unit, in proportion.
-            moved = self._loaded([(d, 1.0)]).simulate(self.base)
+            moved = self._loaded([(d, 1.0)]).simulate(beside)
             tables.append([d.sd * (a - b) for a, b in zip(moved, nominal, strict=True)])
         nothing = np.zeros((0, 0))
         return self.replaced(free=self.whitened(FreeLoads(tuple(directions), tuple(tables), nothing, nothing, nothing)))
@@ -232,11 +239,19 @@ class Workspace(Comparison):
         """With the free loads as the ``difference`` of a fit, measured minus simulated, asks for."""
         if self.free is None:
             return self
-        free = self.free
+        more = self._asked(self.free, difference)
+        return self._loaded(more).replaced(free=dataclasses.replace(self.free, directions=_moved(more)))
+
+    def settled_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
+        """The same, with what one more of each does beside the ``effects``, if more than noise is left to settle."""
+        if self.free is None or self.gap(difference) <= UNSETTLED * self.floor():
+            return self
+        more = self._asked(self.free, difference)
+        return self._loaded(more).freed(_moved(more), effects)
+
+    def _asked(self, free: FreeLoads, difference: Sequence[FloatArray]) -> list[tuple[LoadDirection, float]]:
         sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * (free.rows @ self._white(difference)))
-        more = list(zip(free.directions, sizes.tolist(), strict=True))
-        moved = tuple(dataclasses.replace(d, size=d.size + size) for d, size in more)
-        return self._loaded(more).replaced(free=dataclasses.replace(free, directions=moved))
+        return list(zip(free.directions, sizes.tolist(), strict=True))
 
     def direction_sd(self) -> dict[tuple[int, int], float]:
         """Standard deviations of the free numbers by the noise, by the id of what each belongs to, and its axis."""
