@@ -54,9 +54,9 @@ FREED_FROM = 10.0
 """A gap of so many floors, beside what the search has found, is held against loads that were noted wrong."""
 CLOSED = 0.2
 """Free loads are the answer if they and the effects beside them leave less than this share of it."""
-MOST_SETTLED, SETTLED, AT_FLOOR = 4, 0.95, 1.05
-"""Free loads and times are settled so often at most; until a turn leaves this share of the gap before, or this many
-floors.
+TURNS, MOST_SETTLED, SETTLED, AT_FLOOR = 2, 4, 0.95, 1.05
+"""Free loads are settled in so many turns, and sizes beside them so often at most; until this share of the gap before is
+left, or this many floors.
 """
 FOLLOWS = 0.1
 """Known effects of a few per cent are linear to this share of the gap: if they leave more, it follows none of them."""
@@ -218,13 +218,15 @@ def hung(problem: Problem) -> Problem:
         return problem
     gap = ws.gap(fit.difference)
     for _ in range(MOST_SETTLED):
-        ws = ws.settled(fit.difference)
-        null = refit(ws, ())
-        fit = refit(ws, fit.effects, 6) if fit.effects else null
+        # Loads and times are found to first order: at the sizes as they are, then the sizes beside them.
+        ws, fit = _settled(ws, fit)
+        if fit.effects:
+            ws, fit = _settled(ws, refit(ws, fit.effects, 6))
         left, gap = gap, ws.gap(fit.difference)
-        # Times and loads are found to first order.
         if gap > SETTLED * left or gap < AT_FLOOR * ws.floor():
             break
+    null = refit(ws, ())
+    fit = fit if fit.effects else null
     found = problem.search.at(ws)
     found.dropped = {}
     p, delta_bic, delta_chi2 = found.weigh(null, fit)
@@ -233,6 +235,15 @@ def hung(problem: Problem) -> Problem:
         problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others
     )
     return replace(problem, search=found, result=result, fit=fit, null=null)
+
+
+def _settled(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
+    """The free loads as ``fit`` asks for, and what it leaves then."""
+    for _ in range(TURNS):
+        ws = ws.settled(fit.difference)
+        residual, difference = ws.residual([*ws.base, *fit.whole])
+        fit = replace(fit, residual=residual, difference=difference, chi2=ws.loss(residual))
+    return ws, fit
 
 
 def searched(problem: Problem) -> Problem:

@@ -221,7 +221,7 @@ class Search:
         return fit
 
     def settle(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
-        """Both fits again with the free loads and times as ``fit`` asks for: a small effect would stand in for these."""
+        """Both fits again, with free loads and times as ``fit`` asks for: else a small effect stands in for these."""
         settled = self.workspace.settled_beside(fit.difference, fit.whole)
         if settled is self.workspace:
             return null, fit
