@@ -6,12 +6,13 @@ and temperatures, nothing else. Each answer is saved immediately, and a stopped 
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import hashlib
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -106,9 +107,8 @@ def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:
     return digest.hexdigest()
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Seal, run what is missing, score; exit status 1 if a threshold is not met."""
-    parser = options(__doc__, jobs=1)
+def selection(parser: argparse.ArgumentParser) -> Callable[[argparse.Namespace], list[Case]]:
+    """The options that choose cases, added to ``parser``, and what gives these of the parsed ones."""
     parser.add_argument('--out', default='build/blind', help='folder for truths and answers (default: build/blind)')
     parser.add_argument('--short', action='store_true', help='the slice that runs on every change')
     parser.add_argument('--seeds', type=int, default=4)
@@ -121,27 +121,37 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--hand', type=int, default=44, help='loads hung and noted by hand')
     parser.add_argument('--first', type=int, default=0, help='number of the first seed: fresh cases')
     parser.add_argument('--only', default='', help='only cases whose name contains this')
-    parser.add_argument('--score', action='store_true', help='only score what is there')
+
+    def chosen(args: argparse.Namespace) -> list[Case]:
+        counts = (args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes, args.fours)
+        listed = short_cases() if args.short else all_cases(*counts, args.hand)
+        return [c for c in listed if args.only in c.key]
+
+    return chosen
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Seal, run what is missing, score; exit status 1 if a threshold is not met."""
+    parser = options(__doc__, jobs=1)
+    chosen = selection(parser)
+    parser.add_argument('--score', action='store_true', help='only score the answers that are there, of any tool')
     args = parser.parse_args(argv)
     folder = Path(args.out)
-    whole = all_cases(
-        args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes, args.fours, args.hand
-    )
-    listed = short_cases() if args.short else list(whole)
-    cases = [c for c in listed if args.only in c.key]
-    if not args.score:
-        print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
-        (folder / 'answers').mkdir(parents=True, exist_ok=True)
-        jobs = []
-        for case in cases:
-            target = folder / 'answers' / f'{case.key}.json'
-            if not target.exists():
-                sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
-                jobs.append((sealed['case'], sealed['truth'], str(target)))
-        for _ in over(_one, jobs, args.jobs, 'answers'):
-            pass
-    rows = score.load(folder, [c.key for c in cases])
-    return conclude(*score.summary(rows), folder / 'summary.txt')
+    if args.score:
+        rows = score.load(folder, [p.stem for p in sorted((folder / 'sealed').glob('*.json')) if args.only in p.stem])
+        return conclude(*score.summary(rows), folder / 'summary.txt')
+    cases = chosen(args)
+    print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
+    (folder / 'answers').mkdir(parents=True, exist_ok=True)
+    jobs = []
+    for case in cases:
+        target = folder / 'answers' / f'{case.key}.json'
+        if not target.exists():
+            sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
+            jobs.append((sealed['case'], sealed['truth'], str(target)))
+    for _ in over(_one, jobs, args.jobs, 'answers'):
+        pass
+    return conclude(*score.summary(score.load(folder, [c.key for c in cases])), folder / 'summary.txt')
 
 
 if __name__ == '__main__':

@@ -63,6 +63,24 @@ class Row:
         return [{e['name'], *e['equivalent']} for e in self.answer['effects']]
 
 
+def whole(answer: dict[str, Any]) -> dict[str, Any]:
+    """An answer of any tool with all that is counted: what it leaves out is nothing, or not a number."""
+    effects = [{'equivalent': [], 'parameters': {}, **e} for e in answer.get('effects', ())]
+    unknown = [{'law': None, **u} for u in answer.get('unknown', ())]
+    said = 'unknown_effect' if unknown else 'effects_found' if effects else 'nothing_missing'
+    nan = math.nan
+    return {
+        'verdict': said,
+        'setup': [],
+        'remaining': {'floors': nan},
+        'gap': {'before': nan, 'after': nan, 'floor': nan, 'heldout_after': nan},
+        'provenance': {'forward_simulations': 0},
+        **answer,
+        'effects': effects,
+        'unknown': unknown,
+    }
+
+
 def load(folder: Path, keys: Sequence[str]) -> list[Row]:
     """Every case that has an answer."""
     out = []
@@ -82,7 +100,7 @@ def load(folder: Path, keys: Sequence[str]) -> list[Row]:
                 gap,
                 apart,
                 sealed['truth'],
-                json.loads(answer.read_text()),
+                whole(json.loads(answer.read_text())),
                 mistake,
                 tuple(sealed.get('wrong', ())),
             )
@@ -302,6 +320,7 @@ def _by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
 def _held_out(sheet: _Sheet, rows: Sequence[Row]) -> None:
     """The remaining gap on load cases that the fit has not seen."""
     known = [r for r in rows if r.kind in ('single', 'pair', 'null', 'wrong')]
+    known = [r for r in known if not math.isnan(r.answer['gap']['heldout_after'])]
     if not known:
         return
     most, most_p95 = THRESHOLDS['heldout_over_floor_median'], THRESHOLDS['heldout_over_floor_p95']

@@ -55,8 +55,8 @@ FREED_FROM = 10.0
 CLOSED = 0.2
 """Free loads are the answer if they and the effects beside them leave less than this share of it."""
 TURNS, MOST_SETTLED, SETTLED, AT_FLOOR = 2, 4, 0.95, 1.05
-"""Free loads are settled in so many turns, and sizes beside them so often at most; until this share of the gap before is
-left, or this many floors.
+"""Free loads are settled in so many turns, then sizes beside them, so often at most: until a gap of this share of that
+before is left, or of this many floors.
 """
 FOLLOWS = 0.1
 """Known effects of a few per cent are linear to this share of the gap: if they leave more, it follows none of them."""

@@ -1,0 +1,69 @@
+"""The cases of the blind suite as files, for any tool. ``python -m blind.given --out DIR``; then ``blind.run --score``.
+
+``DIR/cases/KEY`` has what was measured: a CSV and a rig file for each recording, and ``case.json``. The truths are in
+``DIR/sealed``, with their hash, before any tool has run. A tool writes ``DIR/answers/KEY.json``; docs/blind.md has the
+rules, and what an answer holds.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from blind.campaign import options, over
+from blind.cases import Case
+from blind.run import observe, seal, selection
+from psd_deflection.records import CHANNELS
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.discover.observation import Observation
+
+LOADS = ('load_fx', 'load_fy', 'load_tz')
+
+
+def written(seen: Observation, stem: Path) -> None:
+    """``stem.csv``: a row for each sample that is there; ``stem.yaml``: what of the rig is not as usual."""
+    there = np.isfinite(seen.volts).all(axis=1)
+    columns = [np.arange(len(seen.volts)) * seen.period, *seen.volts.T, *seen.loads.T]
+    names = ['t', *CHANNELS, *LOADS]
+    if seen.temperature is not None:
+        columns, names = [*columns, seen.temperature], [*names, 'temperature']
+    rows = np.column_stack(columns)[there]
+    np.savetxt(stem.with_suffix('.csv'), rows, '%.10g', ',', header=','.join(names), comments='')
+    usual = load_rig().values
+    values = {name: value for name, value in seen.rig.values.items() if value != usual[name]}
+    stem.with_suffix('.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
+
+
+def given(job: tuple[Case, str, str]) -> str:
+    """One case, from its sealed truth, into a folder of its own; its key."""
+    case, sealed, folder = job
+    out = Path(folder) / case.key
+    out.mkdir(parents=True, exist_ok=True)
+    names = []
+    for i, seen in enumerate(observe(case, json.loads(Path(sealed).read_text())['truth']), start=1):
+        names.append(f'recording_{i}')
+        written(seen, out / names[-1])
+    (out / 'case.json').write_text(json.dumps({'recordings': names, 'without': list(case.without)}, indent=1))
+    return case.key
+
+
+def main() -> int:
+    """Seal the truths, write the cases."""
+    parser = options(__doc__, jobs=1)
+    chosen = selection(parser)
+    args = parser.parse_args()
+    folder = Path(args.out)
+    cases = chosen(args)
+    print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
+    jobs = [(case, str(folder / 'sealed' / f'{case.key}.json'), str(folder / 'cases')) for case in cases]
+    for _ in over(given, jobs, args.jobs, 'cases'):
+        pass
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())
