@@ -23,8 +23,9 @@ from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import DarkLevel, dark_levels, values_of_levels
 from psd_deflection.studies.calibrate.observation import CalibrationRun, usable_dots
 from psd_deflection.studies.calibrate.result import Calibrated
-from psd_deflection.studies.loads.noted_times import mend_loads
-from psd_deflection.studies.loads.plateaus import as_hung, wrong_notes
+from psd_deflection.studies.loads.noted_times import MendedNote, mend_loads
+from psd_deflection.studies.loads.plateaus import WrongNote, as_hung, wrong_notes
+from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
 from psd_deflection.studies.study import Tell, opened
 
 
@@ -105,17 +106,22 @@ def read_runs(
 
 
 def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
-    """``run`` with the loads that hung, at the times at which they acted; ``tell`` gets what was noted wrong."""
+    """``run`` with the loads that hung, at the times at which they acted, without what swayed; ``tell`` gets what was
+    noted wrong.
+    """
     if run.loads is None:
         return run
     mended = mend_loads(rig, usable_dots(run, rig), run.loads)
     loads, late = (run.loads, ()) if mended is None else (mended.loads, mended.notes)
-    wrong = wrong_notes(rig, run.volts, loads)
-    for words in (*(n.words(run.name) for n in late), *(n.words(run.name) for n in wrong)):
-        tell(words)
-    if mended is None and not wrong:
+    swayed = swaying_loads(rig, run.volts, loads)
+    volts = left_out(rig, run.volts, swayed)
+    wrong = wrong_notes(rig, volts, loads)
+    notes: list[MendedNote | WrongNote | SwayingLoad] = [*late, *swayed, *wrong]
+    for note in notes:
+        tell(note.words(run.name))
+    if mended is None and not wrong and not swayed:
         return run
-    return replace(run, loads=as_hung(loads, wrong))
+    return replace(run, volts=volts, loads=as_hung(loads, wrong))
 
 
 def today() -> str:

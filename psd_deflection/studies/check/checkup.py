@@ -33,6 +33,7 @@ from psd_deflection.studies.check.wirings import (
 )
 from psd_deflection.studies.loads.noted_times import MendedNote, mend_loads
 from psd_deflection.studies.loads.plateaus import WrongNote, as_hung, wrong_notes
+from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
 
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
@@ -48,7 +49,7 @@ _LOADS = tuple(ALONE)
 class CheckProblem:
     """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``,
     ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``source``: the recording, '' at
-    the bench. ``notes``: of loads that hung at another time than noted, or that were others.
+    the bench. ``notes``: of loads that hung at another time than noted, that swayed, or that were others.
     """
 
     rig: Rig
@@ -57,7 +58,7 @@ class CheckProblem:
     drift: FloatArray
     drift_sd: FloatArray
     source: str = ''
-    notes: Sequence[MendedNote | WrongNote] = ()
+    notes: Sequence[MendedNote | WrongNote | SwayingLoad] = ()
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
@@ -68,9 +69,13 @@ def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '
     if mended is not None:
         loads, late = mended.loads, mended.notes
         moved = np.where(mended.unused[:, None], np.nan, volts)
+    seen = Wiring.from_rig(rig).to_psds(moved)
+    swayed = swaying_loads(rig, seen, loads)
+    if swayed:
+        moved = np.where(np.isfinite(left_out(rig, seen, swayed)), moved, np.nan)
     wrong = wrong_notes(rig, Wiring.from_rig(rig).to_psds(moved), loads)
     answered = responses(rig, moved, as_hung(loads, wrong))
-    told: list[MendedNote | WrongNote] = [*late, *wrong]
+    told: list[MendedNote | WrongNote | SwayingLoad] = [*late, *swayed, *wrong]
     return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, told)
 
 

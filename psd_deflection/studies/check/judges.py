@@ -15,6 +15,7 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import differences, fix_of, line, parameters
 from psd_deflection.studies.loads.noted_times import MendedNote
 from psd_deflection.studies.loads.plateaus import WrongNote
+from psd_deflection.studies.loads.sway import SwayingLoad
 
 NOISE_FACTOR = 2.0
 """Report noise that differs from the rig file's by more than this factor.
@@ -98,8 +99,8 @@ def _far(factor: float) -> bool:
     return factor > 0.0 and not 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR
 
 
-def note_finding(note: MendedNote | WrongNote, name: str) -> Finding:
-    """A load that was noted at another time or as another one than it hung, of the recording ``name``."""
+def note_finding(note: MendedNote | WrongNote | SwayingLoad, name: str) -> Finding:
+    """A load that was noted at another time or as another one than it hung, or swayed, of the recording ``name``."""
     return Finding(note.name, note.where, note.value, note.words(name), note.size)
 
 

@@ -26,12 +26,12 @@ from psd_deflection.studies.discover.search.proposals import coarse_step
 from psd_deflection.studies.discover.search.workspace import LoadDirection, Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
-from psd_deflection.studies.discover.setup.hung import Swaying, directions, levels, of_plateau, times
-from psd_deflection.studies.discover.setup.hung import swaying as swaying_of
+from psd_deflection.studies.discover.setup.hung import directions, levels, of_plateau, swayed, times
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
-from psd_deflection.studies.loads.noted_times import SETTLED_S, MendedLoads, shifts
+from psd_deflection.studies.loads.noted_times import MendedLoads, shifts
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_hung, noted_wrong
+from psd_deflection.studies.loads.sway import SwayingLoad, left_out
 
 MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
@@ -153,9 +153,12 @@ def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Worksp
     gap = workspace.gap(difference)
     if gap > MUCH * min(workspace.floor(), _stated_floor(workspace)):
         swaying, wrong = _not_as_noted(workspace, difference)
-        findings = [s.finding(workspace.observations[s.plateau.recording]) for s in swaying]
+        findings = [note_finding(s, workspace.observations[s.plateau.recording].name) for s in swaying]
         if swaying:
-            cut = [_without_swaying(o, i, swaying) for i, o in enumerate(workspace.observations)]
+            cut = [
+                _steady(o, [s for s in swaying if s.plateau.recording == i])
+                for i, o in enumerate(workspace.observations)
+            ]
             workspace = beside(workspace, cut, recorded.known)
         observations = list(workspace.observations)
         for i, o in enumerate(observations):
@@ -183,11 +186,11 @@ def _stated_floor(workspace: Workspace) -> float:
     return float(np.sqrt(np.mean(np.square(dots))))
 
 
-def _not_as_noted(workspace: Workspace, difference: Sequence[FloatArray]) -> tuple[list[Swaying], list[WrongNote]]:
-    sways, wrong = list[Swaying](), list[WrongNote]()
+def _not_as_noted(workspace: Workspace, difference: Sequence[FloatArray]) -> tuple[list[SwayingLoad], list[WrongNote]]:
+    sways, wrong = list[SwayingLoad](), list[WrongNote]()
     for i, (o, part) in enumerate(zip(workspace.observations, difference, strict=True)):
         found = levels(workspace, i, part, times(o, i))
-        sways += swaying_of(workspace, i, part, found)
+        sways += swayed(workspace, i, part, found)
         wrong += noted_wrong(o.loads, o.period, partial(_asked, workspace, i, found), MOST_AN_EFFECT_DOES)
     return sways, wrong
 
@@ -201,15 +204,8 @@ def _asked(workspace: Workspace, i: int, found: PlateauLoads, acting: FloatArray
     return levels(workspace, i, moved.residual(moved.base)[1][i], found.plateaus)
 
 
-def _without_swaying(o: Observation, recording: int, swaying: Sequence[Swaying]) -> Observation:
-    """Without the time in which a weight swayed, and until the link has come to rest after it."""
-    volts = o.volts.copy()
-    d = o.rig.dynamics
-    slowest = 1.0 / (2.0 * math.pi * d.bending_frequency * max(d.bending_damping_ratio, 1e-3))
-    for s in swaying:
-        if s.plateau.recording == recording:
-            volts[s.plateau.first : s.plateau.last + round(SETTLED_S * slowest / o.period)] = np.nan
-    return _with_volts(o, volts)
+def _steady(o: Observation, swayed: Sequence[SwayingLoad]) -> Observation:
+    return _with_volts(o, left_out(o.rig, o.volts, swayed)) if swayed else o
 
 
 def beside(workspace: Workspace, observations: Sequence[Observation], known: Sequence[ActiveEffect]) -> Workspace:

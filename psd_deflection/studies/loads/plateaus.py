@@ -111,16 +111,19 @@ class PlateauLoads:
     """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the noted one, N, N, N m.
 
     ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
+    ``beside`` (m,): what no movement of the plate makes, m.
     ``across`` (k,): how far the dots are then from where any movement of the plate would have them, m.
-    ``compliance`` (3,): m/N, m/N, rad/(N m).
+    ``compliance`` (3,): m/N, m/N, rad/(N m). ``size``: samples of a fine block.
     """
 
     plateaus: tuple[Plateau, ...]
     more: FloatArray
     rest: FloatArray
     moved: FloatArray
+    beside: FloatArray
     across: FloatArray
     compliance: FloatArray
+    size: int
 
     @property
     def noted(self) -> FloatArray:
@@ -154,7 +157,18 @@ def asked_for(
     beside = np.where(there, across_plate(rig, difference), np.nan)
     across = np.array([_mean(beside[p.first // size : p.last // size]) for p in listed])
     # What the first time has is an offset, which all have.
-    return PlateauLoads(tuple(listed), more, rest, np.where(there, moved, np.nan), across - across[:1], compliance)
+    moved = np.where(there, moved, np.nan)
+    return PlateauLoads(tuple(listed), more, rest, moved, beside, across - across[:1], compliance, size)
+
+
+def asked_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Plateau]], PlateauLoads]:
+    """The same, of ``volts`` (n, 6) held against the rig as its file says under ``acting`` loads (n, 3)."""
+    size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
+    difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
+    there = np.isfinite(difference).astype(np.float64)
+    means = fine_means(np.where(there > 0.0, difference, 0.0), size, there)
+    count = fine_means(there, size)
+    return lambda listed: asked_for(rig, means, count, len(acting), size, listed)
 
 
 def _mean(values: FloatArray) -> float:
@@ -377,13 +391,9 @@ def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNot
     they acted. Effects of the catalogue are no reason: they change all loads in proportion, more or less.
     """
     listed = plateaus(rig, volts, loads)
-    size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
 
     def asked(acting: FloatArray) -> PlateauLoads:
-        difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
-        there = np.isfinite(difference).astype(np.float64)
-        means = fine_means(np.where(there > 0.0, difference, 0.0), size, there)
-        return asked_for(rig, means, fine_means(there, size), len(loads), size, listed)
+        return asked_beside_rig(rig, volts, acting)(listed)
 
     return noted_wrong(loads, 1.0 / rig.converter.sample_rate_hz, asked)
 

@@ -212,7 +212,7 @@ def asked(off: FloatArray, noted: FloatArray = ROUNDED, acting: FloatArray | Non
     """
     listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, noted[i]) for i in range(len(noted)))
     moved = np.repeat(off.T * 1e-6, 10, axis=1)
-    found = PlateauLoads(listed, off, np.zeros_like(moved), moved, np.zeros(8), np.ones(3))
+    found = PlateauLoads(listed, off, np.zeros_like(moved), moved, moved[0], np.zeros(8), np.ones(3), 400)
     return all_free(found, np.repeat(noted, DWELL, axis=0) if acting is None else acting)
 
 
@@ -392,7 +392,7 @@ def seen(
     beside = np.zeros(len(noted))
     for k, far in (across or {}).items():
         beside[k] = far
-    return PlateauLoads(listed, off, left * moved, moved, beside, np.array([1e-5, 1e-5, 1e-4]))
+    return PlateauLoads(listed, off, left * moved, moved, moved[0], beside, np.array([1e-5, 1e-5, 1e-4]), 400)
 
 
 def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> None:

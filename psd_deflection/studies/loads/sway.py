@@ -1,0 +1,156 @@
+"""A weight that swayed while it hung: the link swings slowly in that time, and only there.
+
+What swings is the plate, at one frequency. The time in which it did is left out, until the link has come to rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.loads.noted_times import SETTLED_S
+from psd_deflection.studies.loads.plateaus import FEWEST, Plateau, PlateauLoads, asked_beside_rig, plateaus
+
+SWAYS, SLOWEST_HZ, FASTEST_HZ = 8.0, 0.3, 6.0
+"""A weight that sways makes so much more slow movement than any other, in this band."""
+PLATE = 10.0
+"""And moves the plate: what no movement of the plate makes has so many times less energy."""
+SWAYS_M = 2e-6
+"""And at least this, rms."""
+TONE = 0.25
+"""Half of that movement is as near as this to its strongest frequency."""
+RINGS_S = 0.4
+"""The link has come to rest so long after a step, or nearly."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SwayingLoad:
+    """A weight that swayed: its plateau, the amplitude of the force, N, and the frequency, Hz. ``period``: s from one
+    sample to the next.
+    """
+
+    plateau: Plateau
+    force: float
+    frequency: float
+    period: float
+
+    @property
+    def name(self) -> str:
+        """Of the finding."""
+        return 'load_value'
+
+    @property
+    def where(self) -> str:
+        """``load 3``."""
+        return f'load {self.plateau.number}'
+
+    @property
+    def value(self) -> None:
+        """Nothing else is to be noted."""
+        return
+
+    @property
+    def size(self) -> float:
+        """N."""
+        return self.force
+
+    def words(self, name: str) -> str:
+        """What happened, and what to do; ``name``: of the recording."""
+        p = self.plateau
+        return (
+            f'the weight that hung on the link of {name} from {p.first * self.period:.3f} s to '
+            f'{p.last * self.period:.3f} s swayed at {self.frequency:.2f} Hz by {self.force:.2g} N: '
+            'steady it; this time is left out'
+        )
+
+
+def swaying(
+    found: PlateauLoads,
+    noted: Sequence[Plateau],
+    again: Callable[[Sequence[Plateau]], PlateauLoads],
+    period: float,
+) -> list[SwayingLoad]:
+    """The plateaus of ``found`` in which the link swings. ``noted``: those between noted changes alone; ``again``: the
+    loads that other plateaus ask for; ``period``: s from one sample to the next.
+    """
+    found = _not_cut(found, noted, again)
+    size, fine = found.size, period * found.size
+    rows = []
+    for p in found.plateaus:
+        a, b = p.first // size + round(RINGS_S / fine), p.last // size
+        part = found.rest[:2, a:b]
+        there = np.isfinite(part).all(axis=0)
+        # How the link moved before the first sample is nobody's mistake.
+        if p.first == 0 or there.sum() < round(0.5 / fine):
+            rows.append((0.0, 0.0, 0.0))
+            continue
+        part = np.vstack((part, found.beside[a:b]))
+        part = np.where(there, part - part[:, there].mean(axis=1, keepdims=True), 0.0)
+        power = np.abs(np.fft.rfft(part * np.hanning(b - a), axis=1)) ** 2 / (0.375 * (b - a) ** 2) * 2.0
+        f: FloatArray = np.fft.rfftfreq(b - a, fine).astype(np.float64)
+        band = (f >= SLOWEST_HZ) & (f <= FASTEST_HZ)
+        *moves, across = power[:, band].sum(axis=1).tolist()
+        each = np.array(moves) if sum(moves) > PLATE * across else np.zeros(2)
+        axis = int(np.argmax(each))
+        peak = _strongest(f[band], power[axis, band])
+        # A step that nobody noted has no tone.
+        tone = float(power[axis, band & (np.abs(f - peak) <= TONE * peak)].sum())
+        if peak * (b - a) * fine < 2.0 or tone < 0.5 * float(power[axis, band].sum()):
+            each = np.zeros(2)
+        rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / found.compliance[axis]), peak))
+    sizes = np.array([r[0] for r in rows])
+    limit = max(SWAYS * float(np.median(sizes)), SWAYS_M) if len(sizes) >= FEWEST else np.inf
+    return [SwayingLoad(p, r[1], r[2], period) for p, r in zip(found.plateaus, rows, strict=True) if r[0] > limit]
+
+
+def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[SwayingLoad]:
+    """Those of a recording of a rig that is nearly as its file says.
+
+    ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, as they acted.
+    """
+    period = 1.0 / rig.converter.sample_rate_hz
+    asked = asked_beside_rig(rig, volts, loads)
+    listed = plateaus(rig, volts, loads)
+    if len(listed) < FEWEST:
+        return []
+    return swaying(asked(listed), plateaus(rig, volts, loads, noted=True), asked, period)
+
+
+def left_out(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> FloatArray:
+    """``volts`` (n, 6) without the times in which a weight swayed, and until the link has come to rest after it."""
+    out = volts.copy()
+    d = rig.dynamics
+    slowest = 1.0 / (2.0 * math.pi * d.bending_frequency * max(d.bending_damping_ratio, 1e-3))
+    for s in swayed:
+        out[s.plateau.first : s.plateau.last + round(SETTLED_S * slowest / s.period)] = np.nan
+    return out
+
+
+def _strongest(f: FloatArray, power: FloatArray) -> float:
+    """Frequency at which ``power`` is largest, between those of ``f``: the top of a parabola through its logarithm."""
+    if not len(f) or not power.any():
+        return 0.0
+    k = min(max(int(np.argmax(power)), 1), len(f) - 2)
+    if k < 1:
+        return float(f[np.argmax(power)])
+    a, b, c = np.log(np.maximum(power[k - 1 : k + 2], 1e-300)).tolist()
+    bend = a - 2.0 * b + c
+    shift = 0.5 * (a - c) / bend if bend < 0.0 else 0.0
+    return float(f[k] + min(max(shift, -1.0), 1.0) * (f[1] - f[0]))
+
+
+def _not_cut(
+    found: PlateauLoads, noted: Sequence[Plateau], again: Callable[[Sequence[Plateau]], PlateauLoads]
+) -> PlateauLoads:
+    """What swings seems to step, too: the time of a noted load is whole if steps cut it into too short pieces."""
+    listed = list[Plateau]()
+    for whole in noted:
+        pieces = [p for p in found.plateaus if p.number == whole.number]
+        all_there = sum(p.last - p.first for p in pieces) >= whole.last - whole.first
+        listed += pieces if all_there else [whole]
+    return found if listed == [*found.plateaus] else again(listed)

@@ -1,0 +1,114 @@
+"""A weight that swayed: check, calibrate and discover tell it in the same words, and leave its time out."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.studies.calibrate.from_recordings import as_acted
+from psd_deflection.studies.calibrate.observation import CalibrationRun
+from psd_deflection.studies.check.checkup import check, of_recording
+from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.loads import sway
+from psd_deflection.studies.loads.plateaus import Plateau
+from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
+
+RIG = load_rig()
+LEVELS = np.array(
+    [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (0, 0, 0)], float
+)
+DWELL = 4000
+HUNG = np.repeat(LEVELS, DWELL, axis=0)
+T = np.arange(len(HUNG)) / 1000.0
+
+
+def read(acting: FloatArray, **true: object) -> FloatArray:
+    """What the device reads (n, 6), V, under ``acting`` loads, of a rig that differs by ``true``."""
+    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
+    return np.asarray(RigSimulator(rig, 3).step(acting).counts * RIG.converter.volts_per_count, dtype=np.float64)
+
+
+def swung(force: float, frequency: float, axis: int = 0, number: int = 3) -> FloatArray:
+    """The loads with a swing in one plateau."""
+    out = HUNG.copy()
+    since = T - number * DWELL / 1000.0
+    held = (since > 0.0) & (since < DWELL / 1000.0)
+    out[:, axis] += np.where(held, force * np.sin(2.0 * np.pi * frequency * since), 0.0)
+    return out
+
+
+SWUNG = read(swung(1.0, 1.3))
+
+
+def test_check_calibrate_and_discover_say_the_same() -> None:
+    checked = check(of_recording(RIG, SWUNG, HUNG, 'x'))
+    assert [(f.name, f.where, f.value) for f in checked.findings] == [('load_value', 'load 3', None)]
+    words = checked.findings[0].fix
+    assert words.startswith('the weight that hung on the link of x from 12.000 s to 16.000 s swayed at 1.3')
+    assert checked.verdict == 'wrong'
+    assert checked.sizes == pytest.approx([1.0] * 3, abs=0.01)
+    told: list[str] = []
+    run = CalibrationRun('x', T, SWUNG, np.zeros(0), np.zeros((0, 3)), HUNG)
+    steady = as_acted(run, RIG, told.append)
+    assert told == [words]
+    assert np.isnan(steady.volts[12_000:16_000]).all()
+    assert np.isfinite(steady.volts[:12_000]).all()
+    assert np.isfinite(steady.volts[20_000:]).all()
+    found = discover([Observation('x', RIG, SWUNG, HUNG)])
+    assert [f.fix for f in found.setup] == [words]
+    assert found.verdict == 'nothing_missing'
+
+
+@pytest.mark.parametrize(('force', 'frequency', 'axis'), [(0.5, 0.9, 0), (2.0, 1.6, 0), (1.0, 1.1, 1)])
+def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: float, axis: int) -> None:
+    (found,) = swaying_loads(RIG, read(swung(force, frequency, axis)), HUNG)
+    assert found.plateau.number == 3
+    assert found.frequency == pytest.approx(frequency, abs=0.02)
+    assert found.force == pytest.approx(force, rel=0.1)
+
+
+TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
+STICKS = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
+
+
+@pytest.mark.parametrize('true', [{}, TURNED, STICKS, {'dynamics__bending_damping_ratio': 0.01}, {'link__length': 0.6}])
+def test_what_no_weight_does_is_no_sway(true: dict[str, object]) -> None:
+    assert swaying_loads(RIG, read(HUNG, **true), HUNG) == []
+
+
+def test_a_load_that_was_never_noted_a_wrong_sign_and_a_moving_beam_are_no_sway() -> None:
+    forgotten = HUNG.copy()
+    forgotten[2 * DWELL : 3 * DWELL] = LEVELS[1]
+    quiet = read(HUNG)
+    assert swaying_loads(RIG, quiet, forgotten) == []
+    turned = quiet * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    assert swaying_loads(RIG, turned, HUNG) == []
+    beam = quiet.copy()
+    beam[12_000:16_000, 3] += 0.02 * np.sin(2.0 * np.pi * 1.3 * T[:4000])
+    assert swaying_loads(RIG, beam, HUNG) == []
+
+
+def test_the_time_is_left_out_until_the_link_has_come_to_rest() -> None:
+    rig = load_rig(overrides={'dynamics.bending_frequency': 10.0, 'dynamics.bending_damping_ratio': 0.05})
+    volts = np.zeros((9000, 6))
+    swayed = [SwayingLoad(Plateau(0, 2000, 5000, 1, False, np.zeros(3)), 1.0, 1.0, 1e-3)]
+    rest = round(5.0 / (2.0 * math.pi * 10.0 * 0.05) / 1e-3)
+    gone = np.flatnonzero(np.isnan(left_out(rig, volts, swayed)).all(axis=1))
+    assert gone.tolist() == list(range(2000, 5000 + rest))
+    assert not volts.any()
+
+
+def test_the_top_of_three_powers_is_that_of_a_parabola_through_their_logarithms() -> None:
+    f = np.array([0.5, 1.0, 1.5, 2.0])
+    top = np.exp(-(((f - 1.1) / 0.4) ** 2))
+    assert sway._strongest(f, top) == pytest.approx(1.1)
+    assert sway._strongest(f, np.array([1.0, 0.5, 0.2, 0.1])) == pytest.approx(0.5, abs=0.01)
+    assert sway._strongest(f, np.zeros(4)) == 0.0
+    assert sway._strongest(f[:2], np.array([1.0, 3.0])) == 1.0
+    assert sway._strongest(np.zeros(0), np.zeros(0)) == 0.0
