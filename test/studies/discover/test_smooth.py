@@ -100,6 +100,30 @@ def test_a_reading_is_predicted_without_itself() -> None:
     assert float(np.std(left(values))) < 0.3
 
 
+def test_with_the_shapes_of_all_cases_a_reading_is_predicted_as_its_closed_form_says() -> None:
+    """Left out one by one, with size, length and noise given: the residual of reading i is (P y)_i / P_ii, where P is
+    the inverse covariance without what the free sizes can do (Dubrule 1983).
+    """
+    rng = np.random.default_rng(3)
+    n, size, length, noise = 24, 1.3, 0.6, 0.4
+    x = rng.uniform(0.0, 1.0, n)
+    values = np.sin(9.0 * x) + 0.1 * rng.standard_normal(n)
+    free = np.column_stack([np.ones(n), x])
+    apart = {'x': (x[:, None] - x) ** 2 / np.var(x)}
+    remains = _Remains(values, np.zeros(n, dtype=np.int64), free, np.arange(n), apart)
+    left = _unseen(remains, ('x',), np.log([[noise, size, length]]), np.ones(n, dtype=bool), shaped=True)
+    inverse = np.linalg.inv(size**2 * np.exp(-0.5 * apart['x'] / length**2) + noise**2 * np.eye(n))
+    p = inverse - inverse @ free @ np.linalg.inv(free.T @ inverse @ free) @ free.T @ inverse
+    np.testing.assert_allclose(left, (p @ values) / np.diag(p), rtol=1e-6, atol=1e-9)
+
+
+def test_the_gap_with_given_shapes_is_told_beside_the_other() -> None:
+    """It is smaller, for the shapes have seen the readings, and not below the noise."""
+    found = smooth(Table(1, 1.0))
+    assert found is not None
+    assert 0.8 * NOISE < found.heldout_as_shaped < found.heldout
+
+
 def test_few_readings_tell_no_function() -> None:
     plant = Table(1, 1.0)
     plant.seen[19:] = np.nan

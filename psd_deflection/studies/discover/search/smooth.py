@@ -43,12 +43,15 @@ Variables = Mapping[str, Sequence[FloatArray]]
 @dataclass(frozen=True, slots=True, eq=False)
 class Smooth:
     """``variables``: of which it is a function, by name. ``heldout``: the gap that it and the effects leave on unseen
-    cases; ``before``: that the effects alone leave there. ``tables``: its value, in the form of what was measured, also
-    where nothing was. ``sizes`` (p,): by what the fitted sizes, in the order of the fit, are others beside it.
+    cases; ``before``: that the effects alone leave there. ``heldout_as_shaped``: as ``heldout``, with the shapes that
+    all cases show; so a table of terms is judged whose terms were chosen with all cases. ``tables``: its value, in the
+    form of what was measured, also where nothing was. ``sizes`` (p,): by what the fitted sizes, in the order of the
+    fit, are others beside it.
     """
 
     variables: tuple[str, ...]
     heldout: float
+    heldout_as_shaped: float
     before: float
     tables: tuple[FloatArray, ...]
     sizes: FloatArray
@@ -87,13 +90,17 @@ def smooth_of(ws: Comparison, fit: Fit, variables: Variables) -> Smooth | None:
     chosen, shapes = _chosen(remains.part(there))
     if not chosen:
         return None
-    change = ws.unwhitened(_unseen(remains, chosen, shapes, there) - fit.residual)
-    heldout, before = ws.gap([d + c for d, c in zip(fit.difference, change, strict=True)]), heldout_gap(ws, fit)
+
+    def gap(shaped: bool) -> float:
+        change = ws.unwhitened(_unseen(remains, chosen, shapes, there, shaped) - fit.residual)
+        return ws.gap([d + c for d, c in zip(fit.difference, change, strict=True)])
+
+    heldout, before = gap(shaped=False), heldout_gap(ws, fit)
     if heldout**2 > (1.0 - CLOSES) * before**2:
         return None
     sizes = np.zeros(len(fit.free))
     _, value, sizes[free] = _known(remains, chosen, shapes, there)
-    return Smooth(chosen, heldout, before, tuple(ws.unwhitened(value)), sizes)
+    return Smooth(chosen, heldout, gap(shaped=True), before, tuple(ws.unwhitened(value)), sizes)
 
 
 def _distances(ws: Comparison, values: Sequence[FloatArray]) -> FloatArray:
@@ -178,11 +185,15 @@ def _known(
     return remains.values - remains.sizes @ more - value, value, more
 
 
-def _unseen(remains: _Remains, names: Sequence[str], shapes: FloatArray, there: BoolArray) -> FloatArray:
-    """What is left (d,) of each value by sizes, shapes and a function that were found without its part."""
+def _unseen(
+    remains: _Remains, names: Sequence[str], shapes: FloatArray, there: BoolArray, shaped: bool = False
+) -> FloatArray:
+    """What is left (d,) of each value by sizes, shapes and a function that were found without its part. ``shaped``: the
+    shapes are ``shapes``.
+    """
     out = np.zeros(len(remains.values))
     for fold in np.unique(remains.fold[there]):
         seen = there & (remains.fold != fold)
-        own, _ = _shaped(remains.part(seen), names, shapes)
+        own = shapes if shaped else _shaped(remains.part(seen), names, shapes)[0]
         out[~seen & there] = _known(remains, names, own, seen)[0][~seen & there]
     return out
