@@ -34,6 +34,7 @@
 # make blind    hide effects with a second generator and see whether discover names them (an hour or two on two cores; JOBS=1 for one)
 # make blind-calibration  200 rigs of the second generator, misaligned by chance, calibrated and checked (six minutes on two idle cores; RIGS=20 for a look, LIGHT=--light in the light of a room)
 # make blind-laws  laws that no catalogue has, drawn by chance: does discover find where they act and on what they depend (a quarter of an hour on an idle core; LAWS='--first 500' for fresh ones)
+# make duels    discover on machines that others measured, beside other programs and published figures (their data in ../shared/data; ten minutes on an idle core; DUELS='--only boom' for a look)
 # make blind-next  one recording leaves several effects open: do the recordings that discover --next plans settle it (two minutes on two idle cores; NEXT='--only clamp' for a look)
 # make blind-watch  bumps, gains, slips and 24 quiet hours: what the watch sees, and when it is silent (half an hour on an idle core; WATCH='--runs 5 --hours 1' for a look)
 # make camera-campaign  render 10,000 frames, most of them bad, and see whether the camera is right about each (twenty minutes on an idle core)
@@ -67,7 +68,7 @@ BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe try-page page-soak gallery shots blind blind-calibration blind-laws blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rosdep deb rerun doc-commands clean
+.PHONY: help setup run test lint types contracts unit bench nodes faults crash fuzz soak fleet firmware mutants shaken bits suites golden docs notebooks axe try-page page-soak gallery shots blind blind-calibration blind-laws duels blind-next blind-watch camera-campaign compensate-faults demo-compensate demo-discover demo-thesis colcon wheel release-check release-files rosdep deb rerun doc-commands clean
 
 help:
 	@sed -n 's/^# //p' Makefile
@@ -298,6 +299,10 @@ blind-calibration: $(READY)
 LAWS ?=
 blind-laws: $(READY)
 	$(BIN)/python -m blind.laws --jobs $(JOBS) $(LAWS)
+
+DUELS ?=
+duels: $(READY)
+	$(BIN)/python -m blind.duels $(DUELS)
 
 NEXT ?=
 blind-next: $(READY)

@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.io import loadmat
 
 from blind.measured import DATA
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
@@ -44,6 +45,15 @@ LIBRARY = (
 )
 
 
+def _read(path: Path) -> FloatArray:
+    """(n, 3): time (s), position (m), voltage (V)."""
+    if path.suffix == '.mat':
+        tables = loadmat(path)
+        return np.column_stack([np.asarray(tables[name], dtype=np.float64)[:, 0] for name in ('t', 'qm', 'vir')])
+    with path.open(newline='') as stream:
+        return np.array([[float(v) for v in row] for row in list(csv.reader(stream))[1:]])
+
+
 class Emps(Plant):
     """``without``: published terms that the model lacks, ``coulomb_friction`` or ``force_offset``."""
 
@@ -52,12 +62,20 @@ class Emps(Plant):
     library: tuple[Effect, ...] = LIBRARY
     period = KEPT / RATE
 
-    def __init__(self, without: Sequence[str] = (), folder: Path = DATA / 'emps', step: int = 2) -> None:
-        """``step``: samples a step of the simulation. Raises OSError if ``folder`` has no ``emps.csv``."""
+    def __init__(
+        self,
+        without: Sequence[str] = (),
+        folder: Path = DATA / 'emps',
+        step: int = 2,
+        record: str = 'emps.csv',
+        segment: float = SEGMENT_S,
+    ) -> None:
+        """``step``: samples a step of the simulation. ``record``: a file, ``.csv`` or the benchmark's ``.mat``;
+        ``segment``: s after which the simulation starts again. Raises OSError if ``folder`` has no such file.
+        """
         self._step = step
-        with (folder / 'emps.csv').open(newline='') as stream:
-            rows = np.array([[float(v) for v in row] for row in list(csv.reader(stream))[1:]])
-        n = round(SEGMENT_S * RATE)
+        rows = _read(folder / record)
+        n = round(segment * RATE)
         count = len(rows) // n
         position = rows[: count * n, 1].reshape(count, n)
         self._voltage = rows[: count * n, 2].reshape(count, n)
@@ -69,7 +87,7 @@ class Emps(Plant):
             speed[i] = np.polyfit(np.arange(-reach, reach + 1) / RATE, around, 4)[3]
         self._start = np.stack([position[:, 0], speed])
         self._measured = [row[None, ::KEPT] for row in position]
-        self.cases = tuple(f'{SEGMENT_S * i:.0f} s' for i in range(count))
+        self.cases = tuple(f'{segment * i:.0f} s' for i in range(count))
         self._terms = (
             0.0 if 'coulomb_friction' in without else COULOMB,
             0.0 if 'force_offset' in without else OFFSET,

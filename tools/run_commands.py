@@ -155,8 +155,8 @@ ADMINISTRATION = re.compile(
 HOURS = re.compile(r'^make mutants\b')
 """Campaigns whose shortest form says nothing: never run here."""
 
-FOREIGN = re.compile(r'^python -m blind\.foreign\b')
-"""Reads data of others, which are not in the repository: test/blind/test_foreign.py does, if they are there."""
+FOREIGN = re.compile(r'^(python -m blind\.(foreign|duels)\b|make duels\b)')
+"""Reads data of others, which are not in the repository: test_foreign.py and test_duels.py do, if they are there."""
 
 NO_CAMPAIGNS = '--no-campaigns'
 
