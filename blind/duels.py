@@ -34,6 +34,7 @@ from psd_deflection.studies.discover.trees import size_of
 Progress = Callable[[str], None]
 SUBSET = 'every subset of three by BIC, as with MuJoCo sysid'
 PULSES = 'DATA_EMPS_PULSES.mat'
+PULSES_SHA256 = '0eab75bb1f6b16228ee78791343a88bf9bfd9a51036ac9807d7b5fc11c0e1704'
 EMPS_S = 24.84
 """Length of a recording of the drive, simulated in one piece."""
 EMPS_START = 20
@@ -189,6 +190,8 @@ def emps(folder: Path, progress: Progress) -> Answer:
         except OSError:
             figures.append(Figure(measure, 'published terms', f'not run: {record} is not there', math.nan))
             continue
+        if record == PULSES:
+            measure = f'{measure} (SHA-256 {checked(folder / "emps" / record, PULSES_SHA256)})'
         lacking = Emps(('coulomb_friction', 'force_offset'), folder / 'emps', record=record, segment=EMPS_S)
         ours = 1e3 * _apart(lacking, model_of(found))
         figures.append(Figure(measure, 'published terms, simulated here', 1e3 * _apart(theirs, {}), ours))
