@@ -10,10 +10,12 @@ from zipfile import ZipFile
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.io import savemat
 
 from blind import balls, duels, silverbox
 from blind.boom import Boom
-from blind.duel_peers import best_subset
+from blind.duel_peers import Answers, best_subset
+from blind.emps import Emps
 from blind.measured import DATA
 from blind.silverbox import RATE, Silverbox, rmse
 from psd_deflection.records import FloatArray
@@ -147,6 +149,23 @@ def test_drops_that_are_no_table_are_refused(tmp_path: Path) -> None:
     (tmp_path / balls.FILE).write_text('no table')
     with pytest.raises(ValueError, match='is no table of drops'):
         balls.Balls(tmp_path)
+
+
+def test_a_peer_that_is_not_installed_is_told(tmp_path: Path) -> None:
+    def absent(_: Silverbox) -> tuple[str, Answers]:
+        raise ImportError('No module named x', name='x')
+
+    oscillator(tmp_path)
+    assert duels._asked(Silverbox(tmp_path, train=(0, COUNT), shape=(4, 6)), absent) == 'not installed (x)'
+
+
+def test_the_drive_is_read_from_the_file_of_the_benchmark_too(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    t, position, voltage = np.arange(4000) * 1e-3, rng.standard_normal(4000), rng.standard_normal(4000)
+    savemat(tmp_path / 'made.mat', {'t': t[:, None], 'qm': position[:, None], 'vir': voltage[:, None]})
+    plant = Emps((), tmp_path, record='made.mat', segment=4.0)
+    np.testing.assert_array_equal(plant.measured()[0][0], position[::10])
+    np.testing.assert_array_equal(plant.inputs()['voltage'][0], voltage[::10])
 
 
 @pytest.mark.skipif(not (DATA / 'boom').is_dir(), reason='the readings of the boom are not here')
