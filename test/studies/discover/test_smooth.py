@@ -6,12 +6,15 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
+from scipy.linalg import null_space
+from scipy.stats import multivariate_normal
 
 import psd_deflection
 from psd_deflection.model.simulation.declaration import ActiveEffect, EffectParameter
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.plant_search import PlantComparison
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
+from psd_deflection.studies.discover.search import smooth as smoothing
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.smooth import Smooth, _Remains, _unseen, smooth_of
 
@@ -129,3 +132,25 @@ def test_few_readings_tell_no_function() -> None:
     plant.seen[19:] = np.nan
     assert smooth(plant) is None
     assert smooth(Table(1, 1.0), {}) is None
+
+
+def test_sizes_that_channels_share_are_left_out_of_the_likelihood_once() -> None:
+    """Up to a constant it is the density of what is left of the values across all that the effects can do."""
+    rng = np.random.default_rng(5)
+    channel = np.repeat([0, 1, 0, 1], [7, 5, 4, 6])
+    values, sizes, place = rng.standard_normal(22), rng.standard_normal((22, 3)), rng.uniform(0.0, 3.0, 22)
+    apart = {'place': (place[:, None] - place[None, :]) ** 2}
+    remains = _Remains(values, channel, sizes, np.arange(22), apart)
+    basis = smoothing._span(sizes)
+    parts = [(remains.part(channel == c), basis[channel == c]) for c in (0, 1)]
+    across = null_space(sizes.T)
+
+    def exact(shapes: FloatArray) -> float:
+        same = channel[:, None] == channel[None, :]
+        noise, size, length = np.exp(shapes)[channel].T
+        whole = same * size[:, None] ** 2 * np.exp(-0.5 * apart['place'] / length[:, None] ** 2) + np.diag(noise**2)
+        return -float(multivariate_normal(cov=across.T @ whole @ across).logpdf(across.T @ values))
+
+    first, second = np.log([[0.5, 1.0, 0.7], [0.3, 2.0, 1.5]]), np.log([[0.2, 1.5, 0.4], [0.9, 0.7, 0.9]])
+    told = [smoothing._surprise(s.ravel(), parts, ('place',)) for s in (first, second)]
+    assert told[1] - told[0] == pytest.approx(exact(second) - exact(first))

@@ -127,17 +127,16 @@ def _chosen(remains: _Remains) -> tuple[tuple[str, ...], FloatArray]:
 
 def _shaped(remains: _Remains, names: Sequence[str], start: FloatArray | None = None) -> tuple[FloatArray, float]:
     """Logarithms (channels, 1 + 2 len(names)) of noise, then size and length of each, and the likelihood of all."""
-    out, total = list[FloatArray](), 0.0
+    channels = np.unique(remains.channel)
     usual = np.log([START[2], *(START[0], START[1]) * len(names)])
     low, high = np.log([NOISES, *(SIZES, LENGTHS) * len(names)]).T
-    for c in np.unique(remains.channel).tolist():
-        own = remains.part(remains.channel == c)
-        surprise: Callable[[FloatArray], float] = partial(_surprise, own=own, basis=_span(own.sizes), names=names)
-        begin: FloatArray = usual if start is None else start[len(out)]
-        found = minimize(surprise, begin, method='L-BFGS-B', bounds=Bounds(low, high), options={'maxiter': 60})
-        out.append(found.x)
-        total -= float(found.fun)
-    return np.array(out), total
+    begin = np.tile(usual, (len(channels), 1)) if start is None else start
+    bounds = Bounds(np.tile(low, len(channels)), np.tile(high, len(channels)))
+    basis = _span(remains.sizes)
+    parts = [(remains.part(own), basis[own]) for own in (remains.channel == c for c in channels)]
+    surprise: Callable[[FloatArray], float] = partial(_surprise, parts=parts, names=names)
+    found = minimize(surprise, begin.ravel(), method='L-BFGS-B', bounds=bounds, options={'maxiter': 60})
+    return np.reshape(found.x, begin.shape), -float(found.fun)
 
 
 def _span(columns: FloatArray) -> FloatArray:
@@ -146,16 +145,23 @@ def _span(columns: FloatArray) -> FloatArray:
     return np.asarray(left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
 
 
-def _surprise(shape: FloatArray, own: _Remains, basis: FloatArray, names: Sequence[str]) -> float:
-    """Minus the restricted log-likelihood of one channel, up to a constant; ``basis``: of what the effects can do."""
-    try:
-        lower = cholesky(_covariance(shape, own, names) + np.exp(2.0 * shape[0]) * np.eye(len(own.values)), lower=True)
-    except LinAlgError:
-        return 1e12
-    white = solve_triangular(lower, np.column_stack((basis, own.values)), lower=True)
-    q, r = np.linalg.qr(white[:, :-1])
-    rest = white[:, -1] - q @ (q.T @ white[:, -1])
-    return float(0.5 * rest @ rest + np.log(np.diag(lower)).sum() + np.log(np.abs(np.diag(r))).sum())
+def _surprise(shapes: FloatArray, parts: Sequence[tuple[_Remains, FloatArray]], names: Sequence[str]) -> float:
+    """Minus the restricted log-likelihood, up to a constant. ``parts``: each channel, with what the effects can do
+    there (d, p), of an orthonormal basis over all of them.
+    """
+    white, logs = list[FloatArray](), 0.0
+    for shape, (own, basis) in zip(np.reshape(shapes, (len(parts), -1)), parts, strict=True):
+        noise = np.exp(2.0 * shape[0]) * np.eye(len(own.values))
+        try:
+            lower = cholesky(_covariance(shape, own, names) + noise, lower=True)
+        except LinAlgError:
+            return 1e12
+        white.append(solve_triangular(lower, np.column_stack((basis, own.values)), lower=True))
+        logs += float(np.log(np.diag(lower)).sum())
+    table = np.concatenate(white)
+    q, r = np.linalg.qr(table[:, :-1])
+    rest = table[:, -1] - q @ (q.T @ table[:, -1])
+    return float(0.5 * rest @ rest + logs + np.log(np.abs(np.diag(r))).sum())
 
 
 def _covariance(shape: FloatArray, own: _Remains, names: Sequence[str]) -> FloatArray:
