@@ -350,7 +350,9 @@ def output(volts: Array, effects: Sequence[Spec], bits: int = 16) -> Array:
         v = v.copy()
         v[:, cols] = np.clip(v[:, cols], -e['limit'], e['limit'])
     for e in find(effects, 'quantisation'):
-        v = e['step'] * np.round(v / e['step'])
+        v = v.copy()
+        cols = [0, 1, 3, 4] if e.get('sums', 1) == 0 else [0, 1, 2, 3, 4, 5]
+        v[:, cols] = e['step'] * np.round(v[:, cols] / e['step'])
     lsb = LSB * 2.0 ** (16 - bits)
     half = 2 ** (bits - 1)
     return np.clip(np.round(v / lsb), -half, half - 1) * lsb

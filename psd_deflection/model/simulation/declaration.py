@@ -22,7 +22,7 @@ from psd_deflection.rig.parameters import Parameter, check_value, shown
 Stage = Literal['load', 'link', 'optics', 'psd', 'electronics']
 Point = Literal['configure', 'load', 'static', 'pose', 'beam', 'dots', 'volts', 'output']
 Kind = Literal['amplitude', 'coupled', 'phase', 'shape', 'choice']
-Proposal = Literal['', 'spectral', 'line', 'highest', 'highest_dots', 'lattice']
+Proposal = Literal['', 'spectral', 'line', 'highest', 'highest_dots', 'lattice', 'lattice_dots']
 Use = Literal['time', 'temperature']
 State = dict[str, Any]
 Values = Mapping[str, float]
@@ -59,7 +59,8 @@ class EffectParameter:
     ``propose``: how the values to try are found in the recordings, or a function of the choices that returns
     this. ``spectral``: peaks of the residual's spectrum, and ``grid``; ``line``: those of steady amplitude and
     phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums; ``lattice``: the
-    step on whose multiples all readings lie, and then the effect is named without a search. ``power``: the
+    step on whose multiples all readings lie, and then the effect is named without a search; ``lattice_dots``: the same
+    without the sums. ``power``: the
     signature of a ``finite`` effect grows with this power of the parameter; 0: it does not grow in proportion.
     """
 
@@ -263,7 +264,12 @@ class Effect:
     @property
     def lattice(self) -> str:
         """The name of the parameter that is the step of all readings, '' if there is none."""
-        return next((p.name for p in self.parameters if p.propose == 'lattice'), '')
+        first = next(self.variants())
+        return next((p.name for p in self.parameters if p.proposed_by(first) == 'lattice'), '')
+
+    def steps_sums(self, values: Values) -> bool:
+        """Whether with ``values`` the step is that of the sums, too."""
+        return self.parameter(self.lattice).proposed_by(values) == 'lattice'
 
     def parameter(self, name: str) -> EffectParameter:
         """The declared parameter of that name (KeyError if there is none)."""

@@ -23,6 +23,7 @@ from psd_deflection.model.simulation.laws import Law, effect_of, law_text, value
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.parameter_files import with_effects_section, with_values
 from psd_deflection.studies.check.result import Finding, finding_tree
+from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.laws.laws import WRITTEN, FoundLaw
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
@@ -32,6 +33,7 @@ from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.ties import ties
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS
 from psd_deflection.studies.discover.trees import (
     covariance_tree,
     effect_tree,
@@ -257,6 +259,8 @@ class RigConclusion(Conclusion):
         """The sentences in one line, what puts the set-up right, what would decide, what is unknown."""
         first, *others = super().lines()
         out = [first, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
+        numbers = [RIG_NUMBERS[e.name] for e in self.effects if e.name in RIG_NUMBERS]
+        out += [f'rig file: {line(key, self.values[key])}' for key in numbers]
         for e in self.effects:
             if e.suggestion is not None:
                 out.append(f'to tell {e.active.effect.name} from {", ".join(e.equivalent)}: {e.suggestion.text}')
@@ -290,7 +294,8 @@ class RigConclusion(Conclusion):
 
     def model_yaml(self) -> str:
         """The user's parameter file with the effects, comments kept; without one what describes the rig."""
-        effects = self.active_effects
+        # Other numbers of the rig file are lines of it.
+        effects = [a for a in self.active_effects if a.effect.name not in RIG_NUMBERS]
         if self.adopted and self.law is not None:
             beside = [a for a in self.law.beside if a.effect.name in effect_names()]
             laws = [ActiveEffect(effect_of(law), values_of(law)) for law in self.laws]

@@ -15,7 +15,7 @@ from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.judges import noise_findings, step_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
@@ -43,7 +43,7 @@ from psd_deflection.studies.discover.search.signatures import (
 )
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, mistakes
+from psd_deflection.studies.discover.setup.hidden import FIRST, RIG_NUMBERS, SETUP, mistakes
 from psd_deflection.studies.discover.setup.hung import levels, times, told
 from psd_deflection.studies.discover.setup.redundant import PART, STAGES, excess, fourth_reading, visible
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
@@ -365,7 +365,7 @@ def set_up(problem: Problem) -> Problem:
             setup += [dataclasses.replace(f, equivalent=effect.equivalent) for f in more]
             values |= lines
     setup += told(ws, machine.recorded.wrong)
-    named = [n for n in problem.named if n.active.effect.name not in SETUP]
+    named = [n for n in problem.named if n.name not in SETUP or n.name in RIG_NUMBERS]
     if machine.recorded.lattice is None:
         setup += noise_findings(ws.observations[0].rig, noise_of(ws))[0]
     else:
@@ -373,7 +373,10 @@ def set_up(problem: Problem) -> Problem:
         named.append(_named_lattice(ws, lattice))
         step = float(lattice.values[lattice.effect.lattice])
         # The effect stands for the line: with both, the steps would be counted twice.
-        setup += step_findings(ws.observations[0].rig, np.full(len(CHANNELS), step))[0]
+        steps = np.full(len(CHANNELS), step)
+        if not lattice.effect.steps_sums(lattice.values):
+            steps[[c for c in range(len(CHANNELS)) if c not in DOT_CHANNELS]] = 0.0
+        setup += step_findings(ws.observations[0].rig, steps)[0]
     return replace(
         problem,
         named=tuple(named),
@@ -427,7 +430,7 @@ def lattice_gain(workspace: Workspace, lattice: ActiveEffect) -> float:
 def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
     """The named effect of coarse steps, which the readings themselves show."""
     gain = lattice_gain(workspace, lattice)
-    sd = min(s[1] for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
+    sd = min(s.sd for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
     return NamedEffect(
         active=lattice,
         sd={lattice.effect.lattice: sd},

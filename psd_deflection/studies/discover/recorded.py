@@ -16,7 +16,7 @@ import numpy as np
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
-from psd_deflection.records import FloatArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.check.judges import note_finding
 from psd_deflection.studies.check.result import Finding
@@ -106,7 +106,7 @@ def put_right(recorded: Recorded) -> Recorded:
 
 
 def snapped(recorded: Recorded) -> Recorded:
-    """With the coarse steps of the converter, if all readings lie on such."""
+    """With the coarse steps of the converter, if all readings lie on such, or all positions."""
     effects = [e for e in catalogue().values() if e.lattice and e.name not in recorded.without]
     if not effects or any(a.effect.lattice for a in recorded.known):
         return recorded
@@ -115,12 +115,21 @@ def snapped(recorded: Recorded) -> Recorded:
     if len(steps) < len(found):
         return recorded
     effect = effects[0]
-    values = effect.off_values(recorded.physics, next(effect.variants()))
     # The recording with the widest range of values determines it best.
-    step = min(steps, key=lambda s: s[1])[0]
+    step = min(steps, key=lambda s: s.sd)
+    sums = all(s.sums for s in steps)
+    choice = next(v for v in effect.variants() if effect.steps_sums(v) == sums)
+    values = {**effect.off_values(recorded.physics, choice), effect.lattice: step.step}
     # The converter has rounded each reading once more.
-    observations = tuple(_with_volts(o, np.rint(o.volts / step) * step) for o in recorded.observations)
-    return replace(recorded, observations=observations, lattice=ActiveEffect(effect, {**values, effect.lattice: step}))
+    rows = list(range(len(CHANNELS)) if sums else DOT_CHANNELS)
+    observations = tuple(_with_volts(o, _on_steps(o.volts, rows, step.step)) for o in recorded.observations)
+    return replace(recorded, observations=observations, lattice=ActiveEffect(effect, values))
+
+
+def _on_steps(volts: FloatArray, rows: list[int], step: float) -> FloatArray:
+    out = volts.copy()
+    out[:, rows] = np.rint(out[:, rows] / step) * step
+    return out
 
 
 STEPS: Sequence[Callable[[Recorded], Recorded]] = (cleaned, put_right, snapped)

@@ -71,19 +71,19 @@ def some_samples(**given: Any) -> SimulatedSamples:
 
 def test_a_mistake_is_declared_once_for_each_place() -> None:
     names = [e.name for e in mistakes(1, [], [])]
-    assert names == ['sensitivity', 'link_length', 'sample_rate']
+    assert names == ['sensitivity', 'link_length', 'sample_rate', 'bending_frequency', 'torsion_frequency']
     listed = mistakes(2, [0.04], [(1, 2, 30.5), (2, 1, 0.25)])
     assert [e.name for e in listed] == [*names, 'load_delay', 'zero', 'jump', 'jump']
-    assert listed[3].parameter('late_by').grid == (0.04,)
-    assert [v['recording'] for v in listed[4].variants()] == [1.0, 1.0, 2.0, 2.0]
-    assert [v['of_reading'] for v in listed[4].variants()] == [0.0, 1.0, 0.0, 1.0]
-    assert [dict(next(e.variants())) for e in listed[5:]] == [
+    assert listed[5].parameter('late_by').grid == (0.04,)
+    assert [v['recording'] for v in listed[6].variants()] == [1.0, 1.0, 2.0, 2.0]
+    assert [v['of_reading'] for v in listed[6].variants()] == [0.0, 1.0, 0.0, 1.0]
+    assert [dict(next(e.variants())) for e in listed[7:]] == [
         {'recording': 1.0, 'psd': 2.0, 'time_us': 30_500_000.0},
         {'recording': 2.0, 'psd': 1.0, 'time_us': 250_000.0},
     ]
     # Of a rig: each recording and each PSD has one, all others one in all.
     assert [[p.name for p in e.parameters if p.each] for e in listed] == [
-        *([],) * 4,
+        *([],) * 6,
         ['recording'],
         ['recording', 'psd'],
         ['recording', 'psd'],
@@ -92,7 +92,12 @@ def test_a_mistake_is_declared_once_for_each_place() -> None:
 
 def test_what_a_mistake_does_is_what_its_name_says() -> None:
     before = Physics.of(RIG)
-    for name, changed in (('sensitivity', 'sensitivity'), ('link_length', 'length')):
+    for name, changed in (
+        ('sensitivity', 'sensitivity'),
+        ('link_length', 'length'),
+        ('bending_frequency', 'bending_frequency'),
+        ('torsion_frequency', 'torsion_frequency'),
+    ):
         after = Physics.of(RIG)
         configure = of_setup(name).configure
         assert configure is not None

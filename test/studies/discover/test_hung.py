@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
 
@@ -11,6 +12,7 @@ import pytest
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.rig.parameter_files import flat_parameters
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
@@ -191,6 +193,58 @@ def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wron
     assert found.moves == (0.0, 0.0, 0.0)
     assert 'The estimates of the pose are right without' in found.sentence
     assert 'is wrong by up to' not in found.sentence
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize(('bending', 'torsion'), [(1.05, 1.03), (1.02, 1.0), (1.0, 0.97), (0.96, 1.05)])
+def test_other_natural_frequencies_than_the_rig_file_says_are_lines_for_it(bending: float, torsion: float) -> None:
+    true = {'dynamics__bending_frequency': 14.0 * bending, 'dynamics__torsion_frequency': 21.0 * torsion}
+    found = searched(read(HUNG, **true), HUNG)
+    wrong = {key: f for key, f in (('bending', bending), ('torsion', torsion)) if f != 1.0}
+    assert [e.name for e in found.effects] == [f'{key}_frequency' for key in wrong]
+    assert [e.values['error'] for e in found.effects] == pytest.approx([f - 1.0 for f in wrong.values()], abs=1e-5)
+    assert found.verdict == 'effects_found'
+    assert found.floors < 1.05
+    assert found.setup == ()
+    mended = {f'dynamics.{key}_frequency': (14.0 if key == 'bending' else 21.0) * f for key, f in wrong.items()}
+    assert found.values == pytest.approx(mended, rel=1e-5)
+    lines = [f'rig file: {key}: {found.values[key]}' for key in mended]
+    assert [words for words in found.lines() if words.startswith('rig file')] == lines
+    again = flat_parameters(found.model_yaml(), Path('model.yaml'))
+    assert {key: again[key] for key in mended} == found.values
+    assert not any(key.startswith('effects.') for key in again)
+    assert 'The estimates of the pose are right without' in found.sentence
+
+
+@pytest.mark.statistics
+def test_a_lower_frequency_of_the_bending_alone_may_be_a_mass_at_the_tip() -> None:
+    found = searched(read(HUNG, dynamics__bending_frequency=14.0 * 0.97), HUNG)
+    assert [(e.name, e.equivalent) for e in found.effects] == [('tip_mass', ('bending_frequency',))]
+    assert found.setup == ()
+
+
+@pytest.mark.statistics
+def test_other_frequencies_are_told_beside_an_effect() -> None:
+    true = {'dynamics__bending_frequency': 14.0 * 1.05, 'dynamics__torsion_frequency': 21.0 * 0.97}
+    found = searched(read(HUNG, **true, **TURNED), HUNG)
+    sizes = {e.name: e.values for e in found.effects}
+    assert set(sizes) == {'bending_frequency', 'torsion_frequency', 'sensor_rotation'}
+    assert sizes['sensor_rotation']['angle'] == pytest.approx(0.004, abs=2e-5)
+    assert found.verdict == 'effects_found'
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('step', [0.01, 0.07])
+def test_positions_that_step_alone_accuse_no_cable(step: float) -> None:
+    volts = read(HUNG)
+    dots = [0, 1, 3, 4]
+    volts[:, dots] = np.rint(volts[:, dots] / step) * step
+    found = searched(volts, HUNG)
+    assert [(e.name, e.values['sums']) for e in found.effects] == [('quantisation', 0.0)]
+    assert found.effects[0].values['step'] == pytest.approx(step, rel=1e-5)
+    assert [(f.name, f.where) for f in found.setup] == [('converter_step', c) for c in ('x1', 'y1', 'x2', 'y2')]
+    assert found.verdict == 'effects_found'
+    assert found.law is None
 
 
 @pytest.mark.statistics

@@ -37,6 +37,8 @@ def _rounded(volts: FloatArray, noise: float, step: float) -> FloatArray:
 def _apply(samples: SimulatedSamples, values: Values, state: State) -> None:
     if values['step'] > 0.0:
         for row, noise in enumerate(samples.noise.tolist()):
+            if row % 3 == 2 and not values['sums']:
+                continue
             samples.volts[row] = _rounded(samples.volts[row], noise, values['step'])
 
 
@@ -47,7 +49,20 @@ EFFECT = Effect(
     equation='v -> step round(v/step)',
     source='Widrow and Kollar, Quantization Noise, 2008',
     needs='nothing',
-    parameters=(EffectParameter('step', 'V', 0.0, 10.0, 1e-3, 'its step', propose='lattice'),),
+    parameters=(
+        EffectParameter(
+            'step',
+            'V',
+            0.0,
+            10.0,
+            1e-3,
+            'its step',
+            propose=lambda values: 'lattice' if values['sums'] else 'lattice_dots',
+        ),
+        EffectParameter(
+            'sums', '', 0, 1, 1, '1: the sum signals step as well', nominal=1, kind='choice', choices=(1, 0)
+        ),
+    ),
     point='output',
     apply=_apply,
     order=4,

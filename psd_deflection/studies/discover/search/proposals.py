@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -102,15 +103,33 @@ def highest_voltages(observations: Sequence[Observation], with_sums: bool, noise
     return [v for v in (top - 2.0 * noise, top - 4.0 * noise, top - 12.0 * noise, 0.98 * top) if v > 0.1]
 
 
-def coarse_step(observation: Observation) -> tuple[float, float] | None:
-    """The step on whose multiples all readings lie, if it is coarser than the converter's, and its sd; V.
+class CoarseStep(NamedTuple):
+    """``step``, V, with its standard deviation ``sd``; ``sums``: whether the sum signals step as well."""
+
+    step: float
+    sd: float
+    sums: bool = True
+
+
+def coarse_step(observation: Observation) -> CoarseStep | None:
+    """The step on whose multiples all readings lie, or all positions, if it is coarser than the converter's.
 
     The gaps between neighbouring values are whole multiples of the step. The smallest common step
     is refined until all readings are multiples of it within the converter's own rounding.
     """
     lsb = observation.rig.converter.volts_per_count
     volts = observation.volts[np.all(np.isfinite(observation.volts), axis=1)]
-    counts = np.rint(volts[:: max(1, len(volts) // 20_000)] / lsb)
+    volts = volts[:: max(1, len(volts) // 20_000)]
+    found = _common_step(volts, lsb)
+    if found is not None:
+        return CoarseStep(*found)
+    # A sum signal may have another converter, or another range.
+    found = _common_step(volts[:, list(DOT_CHANNELS)], lsb)
+    return None if found is None else CoarseStep(*found, sums=False)
+
+
+def _common_step(volts: FloatArray, lsb: float) -> tuple[float, float] | None:
+    counts = np.rint(volts / lsb)
     values = np.unique(counts)
     gaps = np.diff(values)
     if len(gaps) < 3 or np.quantile(gaps, 0.5) < 2:

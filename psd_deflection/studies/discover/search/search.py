@@ -33,6 +33,10 @@ NEARLY_ALL = 0.01
 """A mistake of the set-up is taken before any effect if it alone leaves less than this share of the chi-square beyond
 noise."""
 OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
+RINGING = ('bending_frequency', 'torsion_frequency')
+"""Mistakes about the natural frequencies, which may be wrong both."""
+OTHER_FREQUENCIES, RINGS = (-0.1, -0.05, -0.02, 0.02, 0.05, 0.1), 0.005
+"""They are tried from these errors, too, if they explain this share of what the best candidate explains."""
 FARTHEST_ERROR, HALVED = -0.7, -0.5
 """A linear step to an error of a sensitivity below the first starts at the second instead (readings twice as large)."""
 STANDS_IN = 0.2
@@ -371,14 +375,37 @@ class Search:
             if name == 'sample_rate' and far(null):
                 # A linear step does not reach another frequency of the ringing.
                 starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
+        starts += self._other_frequencies(null, [s for s in scores if s.gain > RINGS * best])
         found = self._best_of(starts, 2, 12)
         size = self.workspace.size
         if found is None or not self.passes(null, found, null):
             return null
         if found.chi2 - size > NEARLY_ALL * (null.chi2 - size):
             return null
+        if [(a.effect.name, a.values['error'] < 0.0) for a in found.effects if a.effect.name in RINGING] == [
+            (RINGING[0], True)
+        ]:
+            # A mass at the tip does the same; the catalogue has it.
+            return null
         self._say('the set-up: ' + found.effects[-1].label)
         return found
+
+    def _other_frequencies(self, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
+        """Starts: either natural frequency is wrong, or both are."""
+        near = []
+        for s in scores:
+            if s.candidate.effect.name in RINGING and s.candidate.effect.name in self.workspace.first:
+                near.append(self._frequency(null, s))
+        return [*([a] for a in near), *([near] if len(near) > 1 else [])]
+
+    def _frequency(self, beside: Fit, score: Score) -> ActiveEffect:
+        """The best start for another natural frequency: from far away a linear step does not reach it."""
+        ws, start = self.workspace, score.candidate.from_coefficients(score.coefficients)
+        others = OTHER_FREQUENCIES if far(beside) else ()
+        return min(
+            [start, *(ActiveEffect(start.effect, {'error': v}) for v in others)],
+            key=lambda a: ws.loss(ws.residual([*ws.base, *beside.whole, a])[0]),
+        )
 
     def swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
         """Try to replace each effect by its alternatives and keep the better model; at most two rounds."""
@@ -460,7 +487,8 @@ class Search:
         for s in scores:
             name = s.candidate.effect.name
             late = name in self.workspace.first and any(a.effect.name not in self.workspace.setup for a in rest)
-            if name == named.effect.name or name in {a.effect.name for a in rest} or s.gain < bar or late:
+            least = RINGS * gain if name in RINGING and far(without) else bar
+            if name == named.effect.name or name in {a.effect.name for a in rest} or s.gain < least or late:
                 continue
             if name not in best:
                 best[name] = s
@@ -469,7 +497,8 @@ class Search:
         ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self._budget(current) else 2]
         fits = []
         for s in ranked:
-            start = [*rest, s.candidate.from_coefficients(s.coefficients)]
+            ringing = s.candidate.effect.name in RINGING
+            start = [*rest, self._frequency(without, s) if ringing else s.candidate.from_coefficients(s.coefficients)]
             quick = refit(self.workspace, start, iterations=10 if self.workspace.open_level else 3)
             if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self._budget(current):
                 quick = refit(self.workspace, quick.effects, iterations=8)

@@ -112,8 +112,10 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     volts = o.volts.copy()
     coarse = coarse_step(o)
     # Coarse steps keep their value for long, and jump for a single sample.
-    still = np.zeros(volts.shape, dtype=bool) if coarse else stuck(volts, o.period, o.rig.noises.ravel(), step)
-    least = max(step if coarse is None else coarse[0], 0.25 * float(o.rig.noises.min()))
+    still = stuck(volts, o.period, o.rig.noises.ravel(), step)
+    if coarse is not None:
+        still[:, list(range(len(CHANNELS)) if coarse.sums else DOT_CHANNELS)] = False
+    least = max(step if coarse is None else coarse.step, 0.25 * float(o.rig.noises.min()))
     for c in np.flatnonzero(still.any(axis=0)).tolist():
         first = int(np.argmax(still[:, c]))
         seconds = float(still[:, c].sum()) * o.period

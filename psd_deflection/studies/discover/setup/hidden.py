@@ -81,6 +81,14 @@ def _rate(physics: Physics, values: Values) -> None:
     physics.period /= 1.0 + values['error']
 
 
+def _bending(physics: Physics, values: Values) -> None:
+    physics.bending_frequency *= 1.0 + values['error']
+
+
+def _torsion(physics: Physics, values: Values) -> None:
+    physics.torsion_frequency *= 1.0 + values['error']
+
+
 def _delay(chunk: SimulatedSamples, values: Values, state: State) -> None:
     at = np.arange(chunk.loads.shape[1]) + values['late_by'] / chunk.physics.period
     whole = np.arange(chunk.loads.shape[1])
@@ -124,6 +132,8 @@ def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int
         _factor('sensitivity', _sensitivity, 'electronics', 'sensitivity of the amplifier, all channels'),
         _factor('link_length', _length, 'link', 'length of the link'),
         _factor('sample_rate', _rate, 'electronics', 'sample rate'),
+        _factor('bending_frequency', _bending, 'link', 'natural frequency of the bending'),
+        _factor('torsion_frequency', _torsion, 'link', 'natural frequency of the torsion'),
     ]
     if delays:
         late = EffectParameter('late_by', 's', -2.0, 2.0, 1e-3, 'the loads are noted late by', grid=tuple(delays))
@@ -161,8 +171,13 @@ def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int
 
 
 BEGINNING = 'beginning'
-SETUP = frozenset(('sensitivity', 'link_length', 'sample_rate', 'load_delay', 'zero', 'jump'))
-"""Names of the effects that are mistakes of the set-up."""
-FIRST = frozenset(('sensitivity', 'link_length', 'sample_rate', 'load_delay'))
+RIG_NUMBERS = {
+    'bending_frequency': 'dynamics.bending_frequency',
+    'torsion_frequency': 'dynamics.torsion_frequency',
+}
+"""Mistakes that are told as effects, as the schema of result.json knows no name for them: keys of the rig file."""
+FIRST = frozenset(('sensitivity', 'link_length', 'sample_rate', 'load_delay', *RIG_NUMBERS))
 """Those that touch every channel: beside an effect a small one would stand in for what no effect explains, so they are
 only looked for before any effect is found."""
+SETUP = frozenset((*FIRST, 'zero', 'jump'))
+"""Names of the effects that are mistakes of the set-up."""

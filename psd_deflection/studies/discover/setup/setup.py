@@ -25,6 +25,7 @@ from psd_deflection.studies.check.wirings import WIRINGS, differences, line
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS
 
 BETTER = 10.0
 """Factor by which another wiring or sign must leave less of the movement than the rig file's."""
@@ -285,6 +286,9 @@ def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[l
         words = f'overrides of {o.name}: ' + ', '.join(line(f'psd_{i}.zero', z) for i, z in enumerate(zeros, start=1))
         return [Finding(name, o.name, float(np.abs(moved).max()), words, evidence)], {}
     factor = 1.0 + v['error']
+    if name in RIG_NUMBERS:
+        key = RIG_NUMBERS[name]
+        return [], {key: float(f'{float(str(rig.values[key])) * factor:.6g}')}
     key, old = {
         'sensitivity': ('amplifier.sensitivity', rig.amplifier.sensitivity),
         'link_length': ('link.length', rig.link.length),
