@@ -36,6 +36,21 @@ class Score:
     coefficients: FloatArray
 
 
+def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
+    """The best candidate of each variant, those that gain at least ``share`` of the best gain."""
+    out: list[Score] = []
+    seen: set[tuple[object, ...]] = set()
+    best = max((s.gain for s in scores), default=0.0)
+    for s in sorted(scores, key=lambda s: -(s.gain - penalty * s.dof)):
+        if s.candidate.variant in seen or s.gain < share * best or s.gain <= 0.0:
+            continue
+        seen.add(s.candidate.variant)
+        out.append(s)
+        if len(out) == limit:
+            break
+    return out
+
+
 def solve_seen(fisher: FloatArray, score: FloatArray, original: FloatArray) -> tuple[float, int, FloatArray]:
     """Gain, rank and coefficients of F c = g, without directions that cannot be seen.
 

@@ -20,7 +20,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.limits import Limit, beyond
-from psd_deflection.studies.discover.search.screen import Score, Screen
+from psd_deflection.studies.discover.search.screen import Score, Screen, promising
 from psd_deflection.studies.discover.search.trust import gain_beyond
 
 BIC_ACCEPT = 10.0
@@ -112,25 +112,16 @@ def far(fit: Fit) -> bool:
     return fit.chi2 > FAR * fit.residual.size
 
 
+def _is_a_mass(fit: Fit) -> bool:
+    """Whether a lower frequency of the bending is all: a mass at the tip does the same, and the catalogue has it."""
+    ringing = [a for a in fit.effects if a.effect.name in RINGING]
+    return len(ringing) == 1 and ringing[0].effect.name == RINGING[0] and ringing[0].values['error'] < 0.0
+
+
 def unbound(fit: Fit) -> FloatArray:
     """The Jacobian's columns (D, k) of the parameters that are free to move."""
     keep = [j for j, name in enumerate(fit.free) if name not in fit.at_bound]
     return fit.jacobian[:, keep]
-
-
-def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
-    """The best candidate of each variant, those that gain at least ``share`` of the best gain."""
-    out: list[Score] = []
-    seen: set[tuple[object, ...]] = set()
-    best = max((s.gain for s in scores), default=0.0)
-    for s in sorted(scores, key=lambda s: -(s.gain - penalty * s.dof)):
-        if s.candidate.variant in seen or s.gain < share * best or s.gain <= 0.0:
-            continue
-        seen.add(s.candidate.variant)
-        out.append(s)
-        if len(out) == limit:
-            break
-    return out
 
 
 class Search:
@@ -362,6 +353,17 @@ class Search:
         """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
         if not scores or min(s.p for s in scores) > self.workspace.p_accept:
             return null
+        found = self._best_of(self._mistaken(null, scores), 2, 12)
+        size = self.workspace.size
+        if found is None or not self.passes(null, found, null):
+            return null
+        if found.chi2 - size > NEARLY_ALL * (null.chi2 - size) or _is_a_mass(found):
+            return null
+        self._say('the set-up: ' + found.effects[-1].label)
+        return found
+
+    def _mistaken(self, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
+        """The starts of :meth:`mistake`."""
         best = max((s.gain for s in scores), default=0.0)
         starts: list[list[ActiveEffect]] = []
         for s in scores:
@@ -375,20 +377,7 @@ class Search:
             if name == 'sample_rate' and far(null):
                 # A linear step does not reach another frequency of the ringing.
                 starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
-        starts += self._other_frequencies(null, [s for s in scores if s.gain > RINGS * best])
-        found = self._best_of(starts, 2, 12)
-        size = self.workspace.size
-        if found is None or not self.passes(null, found, null):
-            return null
-        if found.chi2 - size > NEARLY_ALL * (null.chi2 - size):
-            return null
-        if [(a.effect.name, a.values['error'] < 0.0) for a in found.effects if a.effect.name in RINGING] == [
-            (RINGING[0], True)
-        ]:
-            # A mass at the tip does the same; the catalogue has it.
-            return null
-        self._say('the set-up: ' + found.effects[-1].label)
-        return found
+        return starts + self._other_frequencies(null, [s for s in scores if s.gain > RINGS * best])
 
     def _other_frequencies(self, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
         """Starts: either natural frequency is wrong, or both are."""
@@ -467,6 +456,28 @@ class Search:
             p.append(self.library_p(gain, len(current.columns_of(i))))
         return p, delta_bic, delta_chi2
 
+    def _in_its_place(self, current: Fit, index: int, without: Fit, gain: float) -> list[Score]:
+        """The candidates in place of effect ``index``, the best eight: an exact confounder scores as high as it.
+
+        If the search was already expensive, the case is complicated: two only.
+        """
+        named, rest = current.effects[index], [a for j, a in enumerate(current.effects) if j != index]
+        taken = {named.effect.name, *(a.effect.name for a in rest)}
+        if any(a.effect.name not in self.workspace.setup for a in rest):
+            taken |= self.workspace.first
+        # Screening is linear: a candidate that falls short by little needs a full refit.
+        bar = min(SWAP_REACH * gain, gain - 60.0) if gain > 100.0 else 0.5 * gain
+        if self.workspace.open_level:
+            # A rough machine is far from linear.
+            bar = 0.0
+        best: dict[str, Score] = {}
+        for s in self.screen.score(without.residual, unbound(without)):
+            name = s.candidate.effect.name
+            least = RINGS * gain if name in RINGING and far(without) else bar
+            if name not in taken and s.gain >= least:
+                best.setdefault(name, s)
+        return sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self._budget(current) else 2]
+
     def alternatives(self, null: Fit, current: Fit, index: int, gain: float) -> list[Fit]:
         """Refits with effect ``index`` swapped for each plausible alternative, best first.
 
@@ -474,32 +485,14 @@ class Search:
         """
         if self.spent > 2 * self._budget(current):
             return []
-        named = current.effects[index]
         rest = [a for j, a in enumerate(current.effects) if j != index]
         without = self.without_each(current, null)[index]
-        scores = self.screen.score(without.residual, unbound(without))
-        # Screening is linear: a candidate that falls short by little needs a full refit.
-        bar = min(SWAP_REACH * gain, gain - 60.0) if gain > 100.0 else 0.5 * gain
-        if self.workspace.open_level:
-            # A rough machine is far from linear.
-            bar = 0.0
-        best: dict[str, Score] = {}
-        for s in scores:
-            name = s.candidate.effect.name
-            late = name in self.workspace.first and any(a.effect.name not in self.workspace.setup for a in rest)
-            least = RINGS * gain if name in RINGING and far(without) else bar
-            if name == named.effect.name or name in {a.effect.name for a in rest} or s.gain < least or late:
-                continue
-            if name not in best:
-                best[name] = s
-        # The best eight: an exact confounder scores as high as the named effect itself. If the search was
-        # already expensive, the case is complicated; try two only.
-        ranked = sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self._budget(current) else 2]
+        ranked = self._in_its_place(current, index, without, gain)
         fits = []
         for s in ranked:
             ringing = s.candidate.effect.name in RINGING
-            start = [*rest, self._frequency(without, s) if ringing else s.candidate.from_coefficients(s.coefficients)]
-            quick = refit(self.workspace, start, iterations=10 if self.workspace.open_level else 3)
+            other = self._frequency(without, s) if ringing else s.candidate.from_coefficients(s.coefficients)
+            quick = refit(self.workspace, [*rest, other], iterations=10 if self.workspace.open_level else 3)
             if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self._budget(current):
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)
