@@ -6,6 +6,7 @@ of aliases or merge keys can stand for more than any memory holds, and some tags
 
 from __future__ import annotations
 
+import functools
 import io
 from collections.abc import Callable
 from pathlib import Path
@@ -122,6 +123,7 @@ def edited(text: str, edit: Callable[[Any], None]) -> str:
     writer = YAML(typ='rt')
     writer.preserve_quotes = True
     writer.width = 10_000
+    writer.Representer = _exact()
     out = io.StringIO()
     try:
         tree = writer.load(text)
@@ -130,6 +132,25 @@ def edited(text: str, edit: Callable[[Any], None]) -> str:
     except (YAMLError, ValueError, TypeError, RecursionError) as error:
         raise YamlError(f'cannot be written again ({type(error).__name__})') from None
     return out.getvalue()
+
+
+@functools.cache
+def _exact() -> Any:
+    """How a tree is written: a number that its own notation would round is written with all its digits."""
+    from ruamel.yaml.representer import RoundTripRepresenter
+    from ruamel.yaml.scalarfloat import ScalarFloat
+
+    class Exact(RoundTripRepresenter):
+        def represent_scalar_float(self, data: Any) -> Any:
+            node = super().represent_scalar_float(data)
+            if float(node.value) != float(data):
+                digits = repr(float(data))
+                # YAML 1.1 takes a number without a point for a word.
+                node.value = digits if '.' in digits else digits.replace('e', '.0e')
+            return node
+
+    Exact.add_representer(ScalarFloat, Exact.represent_scalar_float)
+    return Exact
 
 
 def _count(text: str) -> None:

@@ -7,11 +7,19 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError, RecordingError
-from psd_deflection.base.foreign_yaml import MAX_DEPTH, MAX_FILE_BYTES, MAX_NODES, YamlError, parse_yaml, read_text
+from psd_deflection.base.foreign_yaml import (
+    MAX_DEPTH,
+    MAX_FILE_BYTES,
+    MAX_NODES,
+    YamlError,
+    edited,
+    parse_yaml,
+    read_text,
+)
 from psd_deflection.recordings.read.bag_reader import read_information
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.budget.inputs import read_inputs
@@ -158,3 +166,12 @@ def test_any_text_is_read_or_refused(text: str) -> None:
 def test_a_text_that_cannot_be_printed_is_no_parameter(value: str) -> None:
     with pytest.raises(ConfigError, match=r'bag_dir = .*: must be text that can be printed'):
         load_rig(overrides={'bag_dir': value})
+
+
+@given(st.floats(-1e300, 1e300), st.integers(0, 17))
+@example(-1.629581928360124e-08, 0)
+@example(1e-08, 0)
+def test_numbers_are_written_again_to_the_last_bit(value: float, digits: int) -> None:
+    """As our reader reads them, in the notation of whoever wrote the file."""
+    for text in (f'a: {value:.{digits}e}\n', yaml.safe_dump({'a': value}), yaml.safe_dump({'a': [value, 1.0]})):
+        assert parse_yaml(edited(text, lambda tree: None)) == parse_yaml(text)
