@@ -28,7 +28,7 @@ from psd_deflection.measure.memory import STATE, WHOLE, Memory, Part, Value, num
 from psd_deflection.measure.motion.known import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
 from psd_deflection.measure.uncertainty.rest import why_moving
-from psd_deflection.model.detector import VoltsToDots, counts_to_volts
+from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.tip_load import TipLoads
 from psd_deflection.model.solvers.interface import SolverStatus
@@ -54,6 +54,11 @@ from psd_deflection.rig.declarations import ZEROS
 
 ZERO_BLOCKS = 25
 """Number of blocks that :meth:`Pipeline.zero` averages: half a second."""
+
+
+def zero_variances(rig: Rig) -> tuple[float, ...]:
+    """Variances (2P,), m^2, of a zero that does not tell its own: of as many blocks, with the noise of the rig file."""
+    return tuple(float(v) / rig.estimator.block_size / ZERO_BLOCKS for v in dot_noise_variances(rig))
 
 
 @dataclass(slots=True)
@@ -224,8 +229,7 @@ class Pipeline:
             self._effects = effects_of_rig(rig)
         if zeroed:
             self.tip_loads.zeroed = True
-            # A zero from elsewhere, unless its variances are told: of as many blocks, with the noise of the rig file.
-            self.estimation.zero_variances = tuple(v / ZERO_BLOCKS for v in self.estimation.variances[-1])
+            self.estimation.zero_variances = zero_variances(rig)
         self.estimation.build(rig, self._effects)
         self._take(rig)
         self.stamped.set_zeros(rig)

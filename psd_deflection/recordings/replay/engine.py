@@ -15,7 +15,8 @@ import numpy as np
 
 from msg_adapters import DEFLECTION
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.estimation import ZERO_VARIANCES
+from psd_deflection.measure.pipeline import Pipeline, zero_variances
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording, RecordingWindow
@@ -32,7 +33,7 @@ from psd_deflection.records import (
     TipLoad,
 )
 from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_as_recorded
-from psd_deflection.rig.declarations import BY_NAME
+from psd_deflection.rig.declarations import BY_NAME, ZEROS
 
 
 def rig_at_start(recording: Recording) -> Rig:
@@ -51,6 +52,19 @@ def rig_at_end(recording: Recording) -> Rig:
         if values:
             rig = replace_values(rig, values, f'{recording.path} (changed at block {change.block})')
     return rig
+
+
+def zero_variances_at_end(recording: Recording, rig: Rig) -> tuple[float, ...]:
+    """Variances (2P,), m^2, of the zero that was taken last in the recording; () if none was. ``rig``: its rig."""
+    variances: tuple[float, ...] = ()
+    for change in recording.changes:
+        told = dict(change.values)
+        if any(name in ZEROS for name in told):
+            variances = zero_variances(rig)
+        row = told.get(ZERO_VARIANCES)
+        if isinstance(row, tuple) and len(row) == 2 * len(rig.psds):
+            variances = row
+    return variances
 
 
 def warnings_about_rig(recording: Recording, params_file: str | None = None) -> list[str]:

@@ -214,7 +214,7 @@ def rig_of(problem: Problem) -> RecordedRig:
 def hung(problem: Problem) -> Problem:
     """With the free loads as the chosen model says."""
     ws, fit = workspace_of(problem.comparison), problem.fit
-    if ws.free is None:
+    if not ws.free_loads:
         return problem
     gap = ws.gap(fit.difference)
     for _ in range(MOST_SETTLED):

@@ -16,7 +16,7 @@ from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.replay.engine import check_psds, rig_at_end, warnings_about_rig
+from psd_deflection.recordings.replay.engine import check_psds, rig_at_end, warnings_about_rig, zero_variances_at_end
 from psd_deflection.recordings.sample_table import TEMPERATURE_COLUMN
 from psd_deflection.recordings.spans import WHOLE, Span
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
@@ -89,6 +89,7 @@ def read_observation(
         unknown_load=unknown,
         stated_rate_hz=stated,
         marks=recording.moments(),
+        zero_variances=zero_variances_at_end(recording, rig),
     )
 
 

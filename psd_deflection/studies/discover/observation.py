@@ -27,7 +27,7 @@ class Observation:
     overrides. ``digest``: of its source. ``unknown_load``: numbers of samples before the first known load and
     after the last; what ``loads`` holds there is only a placeholder. ``stated_rate_hz``: the rig
     file's sample rate if the recording's times say another, which ``rig`` then has; else 0. ``marks``: from the
-    first sample.
+    first sample. ``zero_variances`` (4,) m^2: of the rig's zero, if it was taken in the recording.
     """
 
     name: str
@@ -39,6 +39,7 @@ class Observation:
     unknown_load: tuple[int, int] = (0, 0)
     stated_rate_hz: float = 0.0
     marks: tuple[Moment, ...] = ()
+    zero_variances: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.volts)

@@ -22,8 +22,9 @@ from psd_deflection.studies.check.judges import note_finding
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.free import Direction, LoadDirection, ZeroDirection
 from psd_deflection.studies.discover.search.proposals import coarse_step
-from psd_deflection.studies.discover.search.workspace import LoadDirection, Workspace
+from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
 from psd_deflection.studies.discover.setup.hung import directions, levels, of_plateau, swayed, times
@@ -225,8 +226,11 @@ def beside(workspace: Workspace, observations: Sequence[Observation], known: Seq
 
 
 def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
-    """``workspace`` with the loads free that were noted wrong, and the times that were fitted."""
-    free = directions(workspace, recorded.wrong)
+    """``workspace`` with what is not known free: loads that were noted wrong, times that were fitted, zeros."""
+    free: list[Direction] = [*directions(workspace, recorded.wrong)]
+    for i, o in enumerate(workspace.observations):
+        sds = np.sqrt(o.zero_variances).tolist()
+        free += [ZeroDirection(i, axis, sd) for axis, sd in enumerate(sds) if sd > 0.0]
     for i, mended in enumerate(recorded.mended):
         if mended is None:
             continue

@@ -9,8 +9,7 @@ and counted here.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -23,6 +22,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray, Moment
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
+from psd_deflection.studies.discover.search.free import Direction, Free, LoadDirection, moved
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
 from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
 from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
@@ -39,48 +39,6 @@ MAX_FINE = 60_000
 """Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LoadDirection:
-    """A change of the loads that nobody knows: ``change`` (n, 3) N, N, N m of ``recording``, times a number of standard
-    deviation ``sd``.
-
-    ``of``: what it belongs to; ``axis``: which of its numbers it is. ``exact``: the change (n, 3) by a number, if it is
-    not in proportion; ``size``: the number that the loads have already.
-    """
-
-    recording: int
-    change: FloatArray
-    sd: float
-    of: object
-    axis: int
-    exact: Callable[[float], FloatArray] | None = None
-    size: float = 0.0
-
-    def more(self, size: float) -> FloatArray:
-        """(n, 3): what ``size`` more does to the loads."""
-        if self.exact is None:
-            return size * self.change
-        return np.asarray(self.exact(self.size + size) - self.exact(self.size), dtype=np.float64)
-
-
-def _moved(more: Sequence[tuple[LoadDirection, float]]) -> tuple[LoadDirection, ...]:
-    return tuple(dataclasses.replace(d, size=d.size + size) for d, size in more)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class FreeLoads:
-    """``tables``: what each of the ``directions`` changes, V, at its standard deviation. ``rows`` (k, D): the whitened
-    span of these, orthonormal, of variance ``energy`` (k,) against that of the noise; ``back`` (p, k): from there to
-    the numbers.
-    """
-
-    directions: tuple[LoadDirection, ...]
-    tables: tuple[list[FloatArray], ...]
-    rows: FloatArray
-    energy: FloatArray
-    back: FloatArray
-
-
 class Workspace(Comparison):
     """All recordings of the rig of one call of discover, as means of fine blocks (6, nf), V."""
 
@@ -88,7 +46,7 @@ class Workspace(Comparison):
     first = FIRST
     setup = SETUP
     digits = '.3f'
-    free: FreeLoads | None = None
+    free: Free | None = None
 
     def __init__(self, observations: Sequence[Observation], base: Sequence[ActiveEffect] = ()) -> None:
         self.observations = tuple(observations)
@@ -195,21 +153,25 @@ class Workspace(Comparison):
         parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
         return np.concatenate(parts)
 
-    def freed(self, directions: Sequence[LoadDirection], effects: Sequence[ActiveEffect] = ()) -> Self:
-        """With the loads free along ``directions``, which are simulated beside ``effects``."""
+    def freed(self, directions: Sequence[Direction], effects: Sequence[ActiveEffect] = ()) -> Self:
+        """With what ``directions`` say free; loads are simulated beside ``effects``."""
         if not directions:
             return self
         beside = [*self.base, *effects]
-        nominal = self.simulate(beside)
+        loads = [d for d in directions if isinstance(d, LoadDirection)]
+        nominal = self.simulate(beside) if loads else self.measured
         tables = []
         for d in directions:
-            # A free load is large: the change by one of its unit, in proportion.
-            moved = self._loaded([(d, 1.0)]).simulate(beside)
-            tables.append([d.sd * (a - b) for a, b in zip(moved, nominal, strict=True)])
+            if isinstance(d, LoadDirection):
+                # A free load is large: the change by one of its unit, in proportion.
+                more = self._loaded([(d, 1.0)]).simulate(beside)
+                tables.append([d.sd * (a - b) for a, b in zip(more, nominal, strict=True)])
+            else:
+                tables.append(d.table(nominal, self.observations[d.recording].rig.sensitivities))
         nothing = np.zeros((0, 0))
-        return self.replaced(free=self.whitened(FreeLoads(tuple(directions), tuple(tables), nothing, nothing, nothing)))
+        return self.replaced(free=self.whitened(Free(tuple(directions), tuple(tables), nothing, nothing, nothing)))
 
-    def whitened(self, free: FreeLoads | None) -> FreeLoads | None:
+    def whitened(self, free: Free | None) -> Free | None:
         """``free`` by the noise of this comparison."""
         if free is None:
             return None
@@ -219,13 +181,14 @@ class Workspace(Comparison):
         energy, vectors = energy[seen], vectors[:, seen]
         rows = (vectors / np.sqrt(energy)).T @ white
         back = np.array([d.sd for d in free.directions])[:, None] * vectors
-        return FreeLoads(free.directions, free.tables, rows, energy, back)
+        return Free(free.directions, free.tables, rows, energy, back)
 
-    def _loaded(self, more: Sequence[tuple[LoadDirection, float]]) -> Self:
+    def _loaded(self, more: Sequence[tuple[Direction, float]]) -> Self:
         """With the loads changed."""
         out = self
         for d, size in more:
-            out = out.loaded(d.recording, out.observations[d.recording].loads + d.more(size))
+            if isinstance(d, LoadDirection):
+                out = out.loaded(d.recording, out.observations[d.recording].loads + d.more(size))
         return out
 
     def loaded(self, recording: int, loads: FloatArray) -> Self:
@@ -235,30 +198,36 @@ class Workspace(Comparison):
         observations[recording] = dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed())
         return self.replaced(observations=tuple(observations))
 
+    @property
+    def free_loads(self) -> bool:
+        """Whether a load or its time is free."""
+        return self.free is not None and any(isinstance(d, LoadDirection) for d in self.free.directions)
+
     def settled(self, difference: Sequence[FloatArray]) -> Self:
         """With the free loads as the ``difference`` of a fit, measured minus simulated, asks for."""
-        if self.free is None:
+        if self.free is None or not self.free_loads:
             return self
         more = self._asked(self.free, difference)
-        return self._loaded(more).replaced(free=dataclasses.replace(self.free, directions=_moved(more)))
+        return self._loaded(more).replaced(free=dataclasses.replace(self.free, directions=moved(more)))
 
     def settled_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
         """The same, with what one more of each does beside the ``effects``, if more than noise is left to settle."""
-        if self.free is None or self.gap(difference) <= UNSETTLED * self.floor():
+        if self.free is None or not self.free_loads or self.gap(difference) <= UNSETTLED * self.floor():
             return self
         more = self._asked(self.free, difference)
-        return self._loaded(more).freed(_moved(more), effects)
+        return self._loaded(more).freed(moved(more), effects)
 
-    def _asked(self, free: FreeLoads, difference: Sequence[FloatArray]) -> list[tuple[LoadDirection, float]]:
+    def _asked(self, free: Free, difference: Sequence[FloatArray]) -> list[tuple[Direction, float]]:
         sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * (free.rows @ self._white(difference)))
         return list(zip(free.directions, sizes.tolist(), strict=True))
 
     def direction_sd(self) -> dict[tuple[int, int], float]:
-        """Standard deviations of the free numbers by the noise, by the id of what each belongs to, and its axis."""
+        """Standard deviations of the free loads by the noise, by the id of what each belongs to, and its axis."""
         if self.free is None:
             return {}
-        sd = np.sqrt((self.free.back**2 / (1.0 + self.free.energy)).sum(axis=1))
-        return {(id(d.of), d.axis): float(v) for d, v in zip(self.free.directions, sd, strict=True)}
+        sd = np.sqrt((self.free.back**2 / (1.0 + self.free.energy)).sum(axis=1)).tolist()
+        both = zip(self.free.directions, sd, strict=True)
+        return {(id(d.of), d.axis): v for d, v in both if isinstance(d, LoadDirection)}
 
     @property
     def size(self) -> int:

@@ -144,13 +144,14 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     volts[len(volts) - after :] = np.nan
     share = (before + after) / len(volts)
     if share > UNKNOWN_SHARE:
+        ends = [f'{name} {k * o.period:.2f} s' for name, k in (('first', before), ('last', after)) if k]
         findings.append(
             Finding(
                 'load_coverage',
                 'load_fx load_fy load_tz',
                 share,
-                f'{o.name}: no load is noted in its first {before * o.period:.2f} s and its last '
-                f'{after * o.period:.2f} s: note it all the time; these samples are left out',
+                f'{o.name}: no load is noted in its {" and its ".join(ends)}: note it all the time; '
+                'these samples are left out',
                 share,
             )
         )

@@ -16,7 +16,8 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.check.judges import note_finding
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.search.workspace import LoadDirection, Workspace
+from psd_deflection.studies.discover.search.free import LoadDirection
+from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.load_cell import MeasuredLoad
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, asked_for, plateaus
 from psd_deflection.studies.loads.sway import SwayingLoad, swaying
