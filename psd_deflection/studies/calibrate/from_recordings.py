@@ -23,9 +23,8 @@ from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import DarkLevel, dark_levels, values_of_levels
 from psd_deflection.studies.calibrate.observation import CalibrationRun, usable_dots
 from psd_deflection.studies.calibrate.result import Calibrated
-from psd_deflection.studies.loads.noted_times import MendedNote, mend_loads
-from psd_deflection.studies.loads.plateaus import WrongNote, as_hung, wrong_notes
-from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
+from psd_deflection.studies.loads.acted import loads_that_acted
+from psd_deflection.studies.loads.noted_times import mend_loads
 from psd_deflection.studies.study import Tell, opened
 
 
@@ -113,15 +112,12 @@ def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
         return run
     mended = mend_loads(rig, usable_dots(run, rig), run.loads)
     loads, late = (run.loads, ()) if mended is None else (mended.loads, mended.notes)
-    swayed = swaying_loads(rig, run.volts, loads)
-    volts = left_out(rig, run.volts, swayed)
-    wrong = wrong_notes(rig, volts, loads)
-    notes: list[MendedNote | WrongNote | SwayingLoad] = [*late, *swayed, *wrong]
-    for note in notes:
+    acted = loads_that_acted(rig, run.volts, loads)
+    for note in (*late, *acted.notes):
         tell(note.words(run.name))
-    if mended is None and not wrong and not swayed:
+    if mended is None and not acted.notes:
         return run
-    return replace(run, volts=volts, loads=as_hung(loads, wrong))
+    return replace(run, volts=acted.volts, loads=acted.loads)
 
 
 def today() -> str:

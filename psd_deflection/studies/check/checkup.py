@@ -31,9 +31,8 @@ from psd_deflection.studies.check.wirings import (
     fitting_wirings,
     misfit,
 )
+from psd_deflection.studies.loads.acted import LoadNote, loads_that_acted
 from psd_deflection.studies.loads.noted_times import MendedNote, mend_loads
-from psd_deflection.studies.loads.plateaus import WrongNote, as_hung, wrong_notes
-from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
 
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
@@ -49,7 +48,8 @@ _LOADS = tuple(ALONE)
 class CheckProblem:
     """``pushes``: how the channels answered. ``levels``: noise, hum and light. ``drift``,
     ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``source``: the recording, '' at
-    the bench. ``notes``: of loads that hung at another time than noted, that swayed, or that were others.
+    the bench. ``notes``: of loads that hung at another time than noted, that swayed, that were others, or that were
+    not noted.
     """
 
     rig: Rig
@@ -58,7 +58,7 @@ class CheckProblem:
     drift: FloatArray
     drift_sd: FloatArray
     source: str = ''
-    notes: Sequence[MendedNote | WrongNote | SwayingLoad] = ()
+    notes: Sequence[LoadNote] = ()
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
@@ -69,13 +69,11 @@ def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '
     if mended is not None:
         loads, late = mended.loads, mended.notes
         moved = np.where(mended.unused[:, None], np.nan, volts)
-    seen = Wiring.from_rig(rig).to_psds(moved)
-    swayed = swaying_loads(rig, seen, loads)
-    if swayed:
-        moved = np.where(np.isfinite(left_out(rig, seen, swayed)), moved, np.nan)
-    wrong = wrong_notes(rig, Wiring.from_rig(rig).to_psds(moved), loads)
-    answered = responses(rig, moved, as_hung(loads, wrong))
-    told: list[MendedNote | WrongNote | SwayingLoad] = [*late, *swayed, *wrong]
+    wiring = Wiring.from_rig(rig)
+    acted = loads_that_acted(rig, wiring.to_psds(moved), loads)
+    moved = np.where(np.isfinite(acted.volts).any(axis=1, keepdims=True), moved, np.nan)
+    answered = responses(rig, moved, acted.loads)
+    told = (*late, *acted.notes)
     return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, told)
 
 
@@ -99,7 +97,8 @@ def check(problem: CheckProblem) -> Checkup:
     told = not dead and len(found) == 1
     if not told and not dead:
         findings += _coverage(pushes, seen, found)
-    wrong = light or any(f.name != 'load_coverage' for f in findings)
+    # Pushes that are not there yet are no mistake.
+    wrong = light or problem.notes or any(f.name != 'load_coverage' for f in findings)
     verdict = WRONG if wrong else RIGHT if told else CANNOT_TELL
     sizes = tuple(p.misfit(best.wiring)[1] if p.seen else math.nan for p in pushes)
     return Checkup(

@@ -13,9 +13,7 @@ from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import differences, fix_of, line, parameters
-from psd_deflection.studies.loads.noted_times import MendedNote
-from psd_deflection.studies.loads.plateaus import WrongNote
-from psd_deflection.studies.loads.sway import SwayingLoad
+from psd_deflection.studies.loads.acted import LoadNote
 
 NOISE_FACTOR = 2.0
 """Report noise that differs from the rig file's by more than this factor.
@@ -99,8 +97,10 @@ def _far(factor: float) -> bool:
     return factor > 0.0 and not 1.0 / NOISE_FACTOR <= factor <= NOISE_FACTOR
 
 
-def note_finding(note: MendedNote | WrongNote | SwayingLoad, name: str) -> Finding:
-    """A load that was noted at another time or as another one than it hung, or swayed, of the recording ``name``."""
+def note_finding(note: LoadNote, name: str) -> Finding:
+    """A load that was noted at another time or as another one than it hung, swayed, or was not noted, of the recording
+    ``name``.
+    """
     return Finding(note.name, note.where, note.value, note.words(name), note.size)
 
 

@@ -244,7 +244,7 @@ def _findings(found: Checkup) -> list[tuple[str, str]]:
         where, name = f.where, NAMES[f.name]
         if f.name == 'psd_swap':
             where = where.replace(' ', ' and ')
-        elif f.name == 'load_coverage':
+        elif f.name == 'load_coverage' and f.value is None:
             where, name = 'pushes', 'not enough to tell'
         rows.append((f'{where}: {name}', f.fix))
     return [*rows, *((f'{psd}: light', text) for psd, text in found.light.items())]

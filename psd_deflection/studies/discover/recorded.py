@@ -33,6 +33,7 @@ from psd_deflection.studies.discover.setup.setup import likely_delays, wire
 from psd_deflection.studies.loads.noted_times import MendedLoads, shifts
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_hung, noted_wrong
 from psd_deflection.studies.loads.sway import SwayingLoad, left_out
+from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
 
 MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
@@ -158,32 +159,29 @@ def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
 
 
 def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Workspace]:
-    """Without the time in which a weight swayed; the few loads that were noted wrong, and fitted times, are free."""
+    """Without the time in which a weight swayed, or in which many loads were not noted; the few loads that were noted
+    wrong, and fitted times, are free.
+    """
     _, difference = workspace.residual(workspace.base)
     gap = workspace.gap(difference)
-    if gap > MUCH * min(workspace.floor(), _stated_floor(workspace)):
-        swaying, wrong = _not_as_noted(workspace, difference)
-        findings = [note_finding(s, workspace.observations[s.plateau.recording].name) for s in swaying]
-        if swaying:
-            cut = [
-                _steady(o, [s for s in swaying if s.plateau.recording == i])
-                for i, o in enumerate(workspace.observations)
-            ]
-            workspace = beside(workspace, cut, recorded.known)
-        observations = list(workspace.observations)
-        for i, o in enumerate(observations):
-            own = [n for n in wrong if n.plateau.recording == i]
-            if own:
-                observations[i] = dataclasses.replace(o, loads=as_hung(o.loads, own), digest=o.digest or o.hashed())
-        if swaying or wrong:
-            workspace = beside(workspace, observations, recorded.known)
-            recorded = replace(
-                recorded,
-                observations=workspace.observations,
-                findings=(*findings, *recorded.findings),
-                wrong=tuple(n.plateau for n in wrong),
-                stated_gap=recorded.stated_gap or gap,
-            )
+    if gap <= MUCH * min(workspace.floor(), _stated_floor(workspace)):
+        return recorded, freed(recorded, workspace)
+    noted = [_not_as_noted(workspace, i, part) for i, part in enumerate(difference)]
+    if not any(noted):
+        return recorded, freed(recorded, workspace)
+    observations = [_mended(o, own) for o, own in zip(workspace.observations, noted, strict=True)]
+    both = zip(noted, workspace.observations, strict=True)
+    findings = [note_finding(n, o.name) for own, o in both for n in own if not isinstance(n, WrongNote)]
+    recorded = replace(
+        recorded,
+        observations=tuple(observations),
+        findings=(*findings, *recorded.findings),
+        wrong=(*recorded.wrong, *(n.plateau for own in noted for n in own if isinstance(n, WrongNote))),
+        stated_gap=recorded.stated_gap or gap,
+    )
+    workspace = beside(workspace, observations, recorded.known)
+    if any(isinstance(n, UnnotedTime) for own in noted for n in own):
+        return _as_hung(recorded, workspace)
     return recorded, freed(recorded, workspace)
 
 
@@ -196,13 +194,14 @@ def _stated_floor(workspace: Workspace) -> float:
     return float(np.sqrt(np.mean(np.square(dots))))
 
 
-def _not_as_noted(workspace: Workspace, difference: Sequence[FloatArray]) -> tuple[list[SwayingLoad], list[WrongNote]]:
-    sways, wrong = list[SwayingLoad](), list[WrongNote]()
-    for i, (o, part) in enumerate(zip(workspace.observations, difference, strict=True)):
-        found = levels(workspace, i, part, times(o, i))
-        sways += swayed(workspace, i, part, found)
-        wrong += noted_wrong(o.loads, o.period, partial(_asked, workspace, i, found), MOST_AN_EFFECT_DOES)
-    return sways, wrong
+def _not_as_noted(workspace: Workspace, i: int, difference: FloatArray) -> list[WrongNote | SwayingLoad | UnnotedTime]:
+    """What of recording ``i`` was noted otherwise than it hung; ``difference`` (6, m), V: measured minus simulated."""
+    o = workspace.observations[i]
+    found = levels(workspace, i, difference, times(o, i))
+    wrong = noted_wrong(o.loads, o.period, partial(_asked, workspace, i, found), MOST_AN_EFFECT_DOES)
+    if not wrong and (unnoted := unnoted_times(found, len(o.loads), o.period)):
+        return [*unnoted]
+    return [*swayed(workspace, i, difference, found), *wrong]
 
 
 def _asked(workspace: Workspace, i: int, found: PlateauLoads, acting: FloatArray) -> PlateauLoads:
@@ -214,8 +213,14 @@ def _asked(workspace: Workspace, i: int, found: PlateauLoads, acting: FloatArray
     return levels(workspace, i, moved.residual(moved.base)[1][i], found.plateaus)
 
 
-def _steady(o: Observation, swayed: Sequence[SwayingLoad]) -> Observation:
-    return _with_volts(o, left_out(o.rig, o.volts, swayed)) if swayed else o
+def _mended(o: Observation, notes: Sequence[WrongNote | SwayingLoad | UnnotedTime]) -> Observation:
+    """With the loads that hung, without the times in which nobody knows them."""
+    if not notes:
+        return o
+    volts = left_out(o.rig, o.volts, [n for n in notes if isinstance(n, SwayingLoad)])
+    volts = without_times(volts, [n for n in notes if isinstance(n, UnnotedTime)])
+    loads = as_hung(o.loads, [n for n in notes if isinstance(n, WrongNote)])
+    return dataclasses.replace(_with_volts(o, volts), loads=loads)
 
 
 def beside(workspace: Workspace, observations: Sequence[Observation], known: Sequence[ActiveEffect]) -> Workspace:

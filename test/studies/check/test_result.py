@@ -99,7 +99,8 @@ def test_what_is_wrong_is_said_with_where_and_what_to_do() -> None:
         verdict=WRONG,
         findings=(
             finding('psd_swap', 'psd_1 psd_2', 'psds_exchanged: true', ('load_sign of fx tz', 'another')),
-            finding('load_coverage', 'fx fy', 'push'),
+            replace(finding('load_coverage', 'fx fy', 'push'), value=None),
+            finding('load_coverage', 'load_fx', 'note it'),
             finding('channel_sign', 'x1', 'turn', ('another',)),
         ),
         light={'psd_2': 'too much'},
@@ -113,6 +114,7 @@ def test_what_is_wrong_is_said_with_where_and_what_to_do() -> None:
     assert found.sentences()[1:] == [
         'psd_1 and psd_2: exchanged: psds_exchanged: true',
         'pushes: not enough to tell: push',
+        'load_fx: not seen: note it',
         'x1: sign turned: turn',
         'psd_2: light: too much',
         *causes,
@@ -121,9 +123,10 @@ def test_what_is_wrong_is_said_with_where_and_what_to_do() -> None:
     assert _other_causes(found) == causes
     lines = found.lines()
     at = lines.index(found.sentences()[0])
-    assert lines[at + 1 : at + 13] == [
+    assert lines[at + 1 : at + 14] == [
         '  psd_1 and psd_2: exchanged   psds_exchanged: true',
         '  pushes: not enough to tell   push',
+        '  load_fx: not seen            note it',
         '  x1: sign turned              turn',
         '  psd_2: light                 too much',
         *(f'  {cause}' for cause in causes),

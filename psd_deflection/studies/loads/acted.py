@@ -1,0 +1,43 @@
+"""What hung on the link of a recording, of a rig that is nearly as its file says: check and calibrate ask here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
+from psd_deflection.studies.loads.noted_times import MendedNote
+from psd_deflection.studies.loads.plateaus import WrongNote, as_hung, asked_beside_rig, plateaus, wrong_notes
+from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
+from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
+
+LoadNote = MendedNote | WrongNote | SwayingLoad | UnnotedTime
+"""What was noted of a load otherwise than it was."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ActedLoads:
+    """``loads`` (n, 3) N, N, N m, as they acted; ``volts`` (n, 6) V without the times in which nobody knows; ``notes``
+    of what was noted otherwise.
+    """
+
+    loads: FloatArray
+    volts: FloatArray
+    notes: tuple[LoadNote, ...]
+
+
+def loads_that_acted(rig: Rig, volts: FloatArray, loads: FloatArray) -> ActedLoads:
+    """Those of a recording. ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held,
+    at the times at which they acted.
+    """
+    period = 1.0 / rig.converter.sample_rate_hz
+    swayed = swaying_loads(rig, volts, loads)
+    steady = left_out(rig, volts, swayed)
+    wrong = wrong_notes(rig, steady, loads)
+    if not wrong:
+        found = asked_beside_rig(rig, volts, loads)(plateaus(rig, volts, loads))
+        if unnoted := unnoted_times(found, len(loads), period):
+            # What seemed to sway there was hung and taken off.
+            rest = loads_that_acted(rig, without_times(volts, unnoted), loads)
+            return ActedLoads(rest.loads, rest.volts, (*unnoted, *rest.notes))
+    return ActedLoads(as_hung(loads, wrong), steady, (*swayed, *wrong))

@@ -1,0 +1,90 @@
+"""Times in which loads were hung and taken off, and none was noted: somebody stopped, or a file has zeros there.
+
+A load or two are found one by one (:mod:`.plateaus`). Where many are missing, nobody knows what hung: that time is left
+out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.loads.plateaus import PLATE, PLATE_M, SHARE, STANDS_OUT, TOLERANCE, PlateauLoads
+
+MANY = 3
+"""Changes that nobody noted, during one noted load."""
+
+
+@dataclass(frozen=True, slots=True)
+class UnnotedTime:
+    """Samples ``first`` to ``last`` of ``samples``, in which ``changes`` of the load were not noted. ``period``: s from
+    one sample to the next.
+    """
+
+    first: int
+    last: int
+    samples: int
+    changes: int
+    period: float
+
+    @property
+    def name(self) -> str:
+        """Of the finding."""
+        return 'load_coverage'
+
+    @property
+    def where(self) -> str:
+        """The loads."""
+        return 'load_fx load_fy load_tz'
+
+    @property
+    def value(self) -> float:
+        """Share of the recording."""
+        return (self.last - self.first) / self.samples
+
+    @property
+    def size(self) -> float:
+        """The same."""
+        return self.value
+
+    def words(self, name: str) -> str:
+        """What was wrong, and what to do; ``name``: of the recording."""
+        end = 'the end' if self.last == self.samples else f'{self.last * self.period:.3f} s'
+        return (
+            f'{name}: from {self.first * self.period:.3f} s to {end} the load changed {self.changes} times, and nobody '
+            'noted it: note each change; this time is left out'
+        )
+
+
+def unnoted_times(found: PlateauLoads, samples: int, period: float) -> list[UnnotedTime]:
+    """Those of a recording of so many ``samples``; none if no noted load would be left. ``period``: s from one sample
+    to the next.
+
+    A change counts if the plate moves with it by what no effect does to the noted load.
+    """
+    allowed = STANDS_OUT * (TOLERANCE + SHARE * np.abs(found.noted).max(initial=0.0))
+    out = []
+    numbered = groupby(range(len(found.plateaus)), key=lambda k: found.plateaus[k].number)
+    for _, group in numbered:
+        own = list(group)
+        more = found.more[own]
+        steps = np.abs(np.diff(more, axis=0)).max(axis=1) > allowed
+        alone = [k for k, stepped in zip(own[1:], steps, strict=True) if stepped and found.plateaus[k].unnoted]
+        as_plate = np.abs(found.across[own]).max() <= PLATE * float(found.sizes[own].max()) + PLATE_M
+        if len(alone) >= MANY and as_plate:
+            first, last = found.plateaus[alone[0]].first, found.plateaus[own[-1]].last
+            out.append(UnnotedTime(first, last, samples, len(alone), period))
+    left = [p for p in found.plateaus if not any(u.first <= p.first < u.last for u in out) and np.any(p.noted != 0.0)]
+    return out if left else []
+
+
+def without_times(volts: FloatArray, times: Sequence[UnnotedTime]) -> FloatArray:
+    """``volts`` (n, 6) without these."""
+    out = volts.copy()
+    for u in times:
+        out[u.first : u.last] = np.nan
+    return out
