@@ -158,7 +158,7 @@ def judged(out: Path, turn: float, late: list[tuple[float, float]]) -> list[str]
     sizes = [e['parameters'] for e in said['effects'] if e['name'] == 'sensor_rotation']
     if len(said['effects']) != 1 or not sizes or sizes[0]['psd'] != 1:
         wrong.append(f'effects: {[e["name"] for e in said["effects"]]}')
-    elif abs(sizes[0]['angle']['value'] - turn) > 3.0 * sizes[0]['angle']['sd'] + 1e-3 * turn:
+    elif abs(sizes[0]['angle']['value'] - turn) > 3.0 * sizes[0]['angle']['sd'] + 1e-3 * abs(turn):
         wrong.append(f'angle {sizes[0]["angle"]}, true {turn}')
     told = {int(re.sub(r'\D', '', s['where'])): s['value'] for s in said['setup'] if s['name'] == 'load_time'}
     for i, (least, most) in enumerate(late, start=1):

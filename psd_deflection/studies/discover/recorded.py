@@ -171,12 +171,13 @@ def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Worksp
         return recorded, freed(recorded, workspace)
     observations = [_mended(o, own) for o, own in zip(workspace.observations, noted, strict=True)]
     both = zip(noted, workspace.observations, strict=True)
-    findings = [note_finding(n, o.name) for own, o in both for n in own if not isinstance(n, WrongNote)]
+    free = [n.plateau for own in noted for n in own if isinstance(n, WrongNote) and not n.exact]
+    findings = [note_finding(n, o.name) for own, o in both for n in own if not isinstance(n, WrongNote) or n.exact]
     recorded = replace(
         recorded,
         observations=tuple(observations),
         findings=(*findings, *recorded.findings),
-        wrong=(*recorded.wrong, *(n.plateau for own in noted for n in own if isinstance(n, WrongNote))),
+        wrong=(*recorded.wrong, *free),
         stated_gap=recorded.stated_gap or gap,
     )
     workspace = beside(workspace, observations, recorded.known)

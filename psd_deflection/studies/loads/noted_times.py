@@ -44,6 +44,10 @@ BETTER = 4.0
 """Factor by which mended times must leave less of the movement than the noted ones."""
 SETTLED_S = 5.0
 """Time constants of the slower mode after which a link is at rest."""
+MOST_AROUND_S = 4.0
+"""A step among samples that are lost is looked for so far from their middle."""
+DEEP = 10.0
+"""A valley that begins so many times higher than the deepest is not followed."""
 ROUGH = 3.0
 """Leave out the motion under a load applied slowly if its remaining ringing exceeds the noise by this factor."""
 
@@ -139,12 +143,15 @@ class MendedLoads:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """``at``: sample of its middle; ``size``: how far the dots moved, m; ``first``, ``last``: samples about it."""
+    """``at``: sample of its middle; ``size``: how far the dots moved, m; ``first``, ``last``: samples about it.
+    ``lost``: samples about it of which none is there.
+    """
 
     at: float
     size: float
     first: int
     last: int
+    lost: int = 0
 
 
 def ordinal(number: int) -> str:
@@ -287,7 +294,27 @@ def _expected(rig: Rig, changes: FloatArray) -> FloatArray:
 
 
 def _steps(dots: FloatArray, width: int) -> list[_Step]:
-    """Where the mean of ``width`` samples differs from that of as many before."""
+    """Where the mean of ``width`` samples differs from that of as many before; of samples that are there, if more than
+    a quarter of as many are lost at once: the step may lie among those.
+    """
+    there: BoolArray = np.all(np.isfinite(dots), axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([True], there, [True])).astype(np.int8)))
+    keep = np.ones(len(dots), dtype=bool)
+    for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if b - a > width // 4:
+            keep[a:b] = False
+    kept = np.flatnonzero(keep)
+    out = []
+    for step in _steps_of_kept(dots[kept], width):
+        first, last = kept[[step.first, step.last]].tolist()
+        # Between the last sample before it and the first after it.
+        before, after = np.interp((step.at - 1.0, step.at), np.arange(len(kept)), kept).tolist()
+        lost = last - first - (step.last - step.first)
+        out.append(_Step(0.5 * (before + 1.0 + after), step.size, first, last, lost))
+    return out
+
+
+def _steps_of_kept(dots: FloatArray, width: int) -> list[_Step]:
     n = len(dots)
     if n < 4 * width:
         return []
@@ -407,7 +434,8 @@ def _fitted(
         return float(((values - moved @ slopes) ** 2).sum())
 
     middle = step.at * period
-    sudden = _least(left, [(middle + d, 0.0) for d in np.arange(-0.15, 0.1501, 0.006)], period)
+    around = min(0.15 + step.lost * period, MOST_AROUND_S)
+    sudden = _least(left, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
     slow = _least(left, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
     start, took = slow[1] if slow[0] < 0.5 * sudden[0] else (sudden[1][0], 0.0)
     return start, abs(took)
@@ -416,19 +444,29 @@ def _fitted(
 def _least(
     left: Callable[[FloatArray], float], starts: list[tuple[float, float]], reach: float
 ) -> tuple[float, tuple[float, float]]:
-    """The least of ``left`` and where, from the best of ``starts``; a start without duration keeps none."""
-    best = np.array(min(starts, key=lambda x: left(np.array(x))))
+    """The least of ``left`` and where, from the best of ``starts``; starts without duration, in their order, keep none.
+
+    Each period of the ringing has a narrow valley: of starts without duration those about every deep one are followed.
+    """
+    sizes = np.array([left(np.array(x)) for x in starts])
+    best = np.array(starts[int(np.argmin(sizes))])
     if best[1] > 0.0:
         corners = best + reach * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         found = minimize(left, best, method='Nelder-Mead', options={'maxfev': 120, 'initial_simplex': corners})
         return float(found.fun), (float(found.x[0]), float(found.x[1]))
-    one = minimize_scalar(
-        lambda x: left(np.array([x, 0.0])),
-        bounds=(float(best[0]) - 6.0 * reach, float(best[0]) + 6.0 * reach),
-        method='bounded',
-        options={'xatol': 1e-3 * reach},
-    )
-    return float(one.fun), (float(one.x), 0.0)
+    around = np.concatenate(([np.inf], sizes, [np.inf]))
+    valleys = np.flatnonzero((sizes <= around[:-2]) & (sizes <= around[2:]) & (sizes <= DEEP * sizes.min()))
+    ends = []
+    for k in valleys.tolist():
+        at = starts[k][0]
+        one = minimize_scalar(
+            lambda x: left(np.array([x, 0.0])),
+            bounds=(at - 6.0 * reach, at + 6.0 * reach),
+            method='bounded',
+            options={'xatol': 1e-3 * reach},
+        )
+        ends.append((float(one.fun), (float(one.x), 0.0)))
+    return min(ends)
 
 
 def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:

@@ -241,14 +241,35 @@ def stand_out(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> S
 
 
 def _known(found: PlateauLoads, gone: IntArray, largest: float) -> bool:
-    """Whether the other loads say what effects in proportion do to those of ``gone``, or no effect does so much."""
+    """Whether the other loads say what effects in proportion do to those of ``gone``, or no effect does so much, or a
+    change was noted twice.
+    """
+    twice = np.array([_noted_twice(found, int(k)) is not None for k in gone])
+    far = np.linalg.norm(found.more[gone], axis=1) > largest * np.linalg.norm(found.noted[gone], axis=1)
+    return bool(np.all(_alike(found, gone) | far | twice))
+
+
+def _alike(found: PlateauLoads, gone: IntArray) -> BoolArray:
+    """Of each of ``gone`` whether it is a sum of the other loads, nearly."""
     noted = found.noted
     right = np.delete(noted, gone, axis=0)
     own = noted[gone]
     rest = own - own @ np.linalg.pinv(right, rcond=ALONE) @ right
-    alike = np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(own, axis=1)
-    far = np.linalg.norm(found.more[gone], axis=1) > largest * np.linalg.norm(own, axis=1)
-    return bool(np.all(alike | far))
+    return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(own, axis=1))
+
+
+def _noted_twice(found: PlateauLoads, k: int) -> FloatArray | None:
+    """(3,): what hung in plateau ``k`` if the change that began it was noted twice; None if something else did.
+
+    Of the first load that is ambiguous: half of it may be another unit, or another stiffness.
+    """
+    noted, before = found.noted[k], found.noted[k - 1]
+    if k == 0 or found.plateaus[k].unnoted or not np.any(before != 0.0):
+        return None
+    hung = 0.5 * (before + noted)
+    off = np.abs(found.more[k] - (hung - noted))
+    allowed = TOLERANCE + SHARE * np.abs(noted).max() + SOFTER * np.abs(hung)
+    return hung if np.all(off <= allowed) and np.any(np.abs(hung - noted) > STANDS_OUT * allowed) else None
 
 
 def _stands(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
@@ -342,12 +363,13 @@ def _rms(part: FloatArray) -> float:
 @dataclass(frozen=True, slots=True, eq=False)
 class WrongNote:
     """A load that was noted wrong, or not at all: ``hung`` (3,) N, N, N m in ``plateau``. ``period``: s from one sample
-    to the next.
+    to the next. ``exact``: by what was noted, not by what the readings say.
     """
 
     plateau: Plateau
     hung: FloatArray
     period: float
+    exact: bool = False
 
     @property
     def name(self) -> str:
@@ -430,7 +452,12 @@ def noted_wrong(
             hung[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + found.more[k] - offset)
         found = against()
         which = stand_out(found, bent, largest)
-    return [WrongNote(first.plateaus[k], hung[k], period) for k in which.gone]
+    out = []
+    for k in which.gone:
+        # What effects do to a load that no other is like, the readings alone do not tell from the load.
+        twice = None if _alike(found, np.array([k]))[0] else _noted_twice(found, k)
+        out.append(WrongNote(first.plateaus[k], hung[k] if twice is None else twice, period, twice is not None))
+    return out
 
 
 def as_hung(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:

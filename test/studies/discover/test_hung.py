@@ -285,3 +285,21 @@ def test_a_dot_that_is_far_off_for_moments_is_nothing_that_the_fourth_reading_co
     # What is not there is no value.
     comparison.count[0][:, 500:] = 0.0
     assert excess(comparison, table) == pytest.approx((24.0 * 2000.0, 24.0))
+
+
+@pytest.mark.statistics
+def test_the_only_torque_noted_twice_is_told_with_the_clamp_that_twists() -> None:
+    """If the load were free, nothing would tell it from what the clamp does."""
+    levels = np.array(
+        [(0, 0, 0), (0, -20, 0), (15, 0, 0), (24, -40, 0), (20, -30, 17.5), (-15, 0, 0), (0, -35, 0), (0, 0, 0)]
+    )
+    acting = np.repeat(levels, DWELL, axis=0)
+    noted = acting.copy()
+    noted[4 * DWELL : 5 * DWELL] = (16, -20, 35)
+    clamp = {'effects__e__name': 'clamp_torsional_compliance', 'effects__e__compliance': 6e-6}
+    found = searched(read(acting, **clamp), noted)
+    assert [(f.name, f.where, f.value) for f in found.setup] == [('load_value', 'load 4', (20.0, -30.0, 17.5))]
+    (effect,) = found.effects
+    assert 'clamp_torsional_compliance' in (effect.active.effect.name, *effect.equivalent)
+    assert found.verdict == 'effects_found'
+    assert found.law is None

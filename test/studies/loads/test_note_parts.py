@@ -139,23 +139,23 @@ def sizes_of(dots: FloatArray, width: int) -> dict[int, float]:
 
 def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
     # The difference is a triangle from 90 to 110: above 3 % of it from 91 to 109.
-    (step,) = noted_times._steps(stepped(200, {100: 2.0}), 10)
+    (step,) = noted_times._steps_of_kept(stepped(200, {100: 2.0}), 10)
     assert (step.at, step.size) == pytest.approx((100.0, 2.0))
     assert (step.first, step.last) == (91, 110)
     # Of two rows of three the middle is between them.
-    (slow,) = noted_times._steps(stepped(200, {100: 1.0, 101: 1.0}), 10)
+    (slow,) = noted_times._steps_of_kept(stepped(200, {100: 1.0, 101: 1.0}), 10)
     assert slow.at == pytest.approx(100.5)
     # So it is wherever the dots are, from the first width of them on.
     early = stepped(200, {14: 1.0})
-    (first,), (shifted,) = noted_times._steps(early, 10), noted_times._steps(early + 5.0, 10)
+    (first,), (shifted,) = noted_times._steps_of_kept(early, 10), noted_times._steps_of_kept(early + 5.0, 10)
     assert (shifted.at, shifted.size) == pytest.approx((first.at, first.size))
     assert (shifted.first, shifted.last) == (first.first, first.last) == (10, 24)
     # Four widths are the least, even if most of them is lost: more than two of ten must be there.
     for n, told in ((40, 1), (39, 0)):
         short = stepped(n, {20: 1.0})
         short[:15] = short[26:] = np.nan
-        assert len(noted_times._steps(short, 10)) == told
-    assert noted_times._steps(np.zeros((200, 4)), 10) == []
+        assert len(noted_times._steps_of_kept(short, 10)) == told
+    assert noted_times._steps_of_kept(np.zeros((200, 4)), 10) == []
 
 
 @pytest.mark.parametrize(('times', 'seen'), [(13.5, 1), (13.0, 0)])
@@ -165,7 +165,7 @@ def test_a_step_stands_out_ten_times_of_what_is_there_without_one(times: float, 
     dots = stepped(2000, {900: times})
     dots[:, 3] = 0.01 * np.arange(2000.0)
     assert (0.75 * times) ** 2 + 1.0 != pytest.approx(100.0, abs=2.0)
-    assert len(noted_times._steps(dots, 100)) == seen
+    assert len(noted_times._steps_of_kept(dots, 100)) == seen
 
 
 def test_places_without_a_mean_have_no_step() -> None:
@@ -175,20 +175,20 @@ def test_places_without_a_mean_have_no_step() -> None:
     dots[:, 3] = 0.1 * np.arange(120.0)
     dots[62:] = np.nan
     assert list(sizes_of(dots, 10).values()).count(0.0) == 50
-    assert noted_times._steps(dots, 10) == []
-    assert len(noted_times._steps(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
+    assert noted_times._steps_of_kept(dots, 10) == []
+    assert len(noted_times._steps_of_kept(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
 
 
 def test_a_step_is_more_than_three_per_cent_of_the_largest() -> None:
     for size, seen in ((2.9, 1), (4.0, 2)):
-        assert len(noted_times._steps(stepped(100, {30: 100.0, 70: size}), 2)) == seen
+        assert len(noted_times._steps_of_kept(stepped(100, {30: 100.0, 70: size}), 2)) == seen
 
 
 @pytest.mark.parametrize(('share', 'seen'), [(0.0395, 1), (0.0400, 2)])
 def test_a_stretch_above_three_per_cent_of_the_largest_is_half_a_width_long(share: float, seen: int) -> None:
     # A triangle of 102 to either side: 25 on either side of the middle one are half of it, 51, and 24 are less.
-    assert len(noted_times._steps(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
-    assert len(noted_times._steps(stepped(2000, {500: share, 1200: 1.0}), 102)) == seen
+    assert len(noted_times._steps_of_kept(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
+    assert len(noted_times._steps_of_kept(stepped(2000, {500: share, 1200: 1.0}), 102)) == seen
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample(
         middle = sum(at * w for at, w in over.items()) / sum(over.values())
         wanted.append((middle, float(np.linalg.norm(after - before)), first, last))
     with np.errstate(invalid='raise', divide='raise'):
-        found = [(s.at, s.size, s.first, s.last) for s in noted_times._steps(dots, width)]
+        found = [(s.at, s.size, s.first, s.last) for s in noted_times._steps_of_kept(dots, width)]
     assert len(found) == len(wanted)
     assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-7)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -800,3 +801,47 @@ def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -
         assert plateaus.noted_wrong(loads, 1e-3, of_size(size)) == []
         assert len(asked_with) == asks
     assert plateaus.noted_wrong(loads, 1e-3, lambda acting: seen({}, SPREAD[:0])) == []
+
+
+ONE_TORQUE = np.array(
+    [(0, 0, 0), (0, -20, 0), (15, 0, 0), (24, -40, 0), (16, -20, 35), (-15, 0, 0), (0, -35, 0), (0, 0, 0)], float
+)
+"""The fifth is the only torque, and its change from the fourth was noted twice: (20, -30, 17.5) hung."""
+HUNG_ONCE = np.array((20.0, -30.0, 17.5))
+
+
+def test_the_only_torque_is_accused_if_its_change_was_noted_twice() -> None:
+    more = HUNG_ONCE - ONE_TORQUE[4]
+    for allowed in ((0.0, 0.0, 0.0), (1.0, -1.5, 1.5)):
+        off = tuple((more + allowed).tolist())
+        assert plateaus.stand_out(seen({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
+    # Another torque, and half of the torque alone: another unit or stiffness may make that.
+    assert plateaus.stand_out(seen({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
+    assert plateaus.stand_out(seen({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
+    # The first load that was hung: half of it may be another unit, too.
+    first = ONE_TORQUE.copy()
+    first[3] = 0.0
+    assert plateaus.stand_out(seen({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
+
+
+def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> None:
+    more = HUNG_ONCE - ONE_TORQUE[4] + (0.2, -0.01, 0.4)
+    listed = seen({4: (float(more[0]), float(more[1]), float(more[2]))}, ONE_TORQUE)
+    noted = np.repeat(ONE_TORQUE, DWELL, axis=0)
+
+    def asked(acting: FloatArray) -> PlateauLoads:
+        held = acting[DWELL // 2 :: DWELL]
+        hung = ONE_TORQUE + listed.more
+        return replace(listed, more=hung - held)
+
+    (note,) = plateaus.noted_wrong(noted, 1e-3, asked)
+    assert note.exact
+    assert note.hung.tolist() == HUNG_ONCE.tolist()
+    assert note.where == 'load 4'
+    # One that others are like is what the readings say.
+    other = seen({3: (0.0, 5.0, 0.0)}, ONE_TORQUE)
+    (free,) = plateaus.noted_wrong(
+        noted, 1e-3, lambda acting: replace(other, more=ONE_TORQUE + other.more - acting[DWELL // 2 :: DWELL])
+    )
+    assert not free.exact
+    assert free.hung == pytest.approx((24.0, -35.0, 0.0))

@@ -1,0 +1,82 @@
+"""Samples that were lost just as a load began to act."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.loads import noted_times
+from psd_deflection.studies.loads.noted_times import mend_loads
+
+RIG = load_rig()
+LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, -29), (30, 0, 0), (20, -40, 12), (0, 0, 0)], float)
+DWELL = 5000
+HUNG = np.repeat(LEVELS, DWELL, axis=0)
+READ = np.asarray(RigSimulator(RIG, 3).step(HUNG).counts * RIG.converter.volts_per_count, dtype=np.float64)
+DOTS = READ[:, [0, 1, 3, 4]] * RIG.sensitivities.ravel()
+LATE = (2.3, 0.9, 3.1, 1.7, 2.6)
+
+
+def noted() -> FloatArray:
+    out = np.zeros_like(HUNG)
+    for i, late in enumerate(LATE, start=1):
+        out[i * DWELL + round(1000 * late) :] = LEVELS[i]
+    return out
+
+
+def told(dots: FloatArray) -> list[float]:
+    mended = mend_loads(RIG, dots, noted())
+    assert mended is not None
+    return [note.late for note in mended.timed]
+
+
+@pytest.mark.parametrize('lost', [80, 150, 450, 1500])
+@pytest.mark.parametrize('share', [0.02, 0.5, 0.98])
+def test_a_time_is_found_among_lost_samples_by_the_ringing_after_them(lost: int, share: float) -> None:
+    dots = DOTS.copy()
+    first = 2 * DWELL - round(share * lost)
+    dots[first : first + lost] = np.nan
+    assert told(dots) == pytest.approx(LATE, abs=2e-3)
+
+
+def test_samples_lost_between_the_steps_change_no_time() -> None:
+    dots = DOTS.copy()
+    for at in range(2000, 27_000, 5000):
+        dots[at : at + 1200] = np.nan
+    assert told(dots) == pytest.approx(LATE, abs=1e-3)
+
+
+def test_a_step_among_lost_samples_is_in_their_middle_and_says_how_many_they_are() -> None:
+    dots = np.zeros((400, 4))
+    dots[200:, 2] = 3.0
+    # A quarter of the width is not yet a loss.
+    for lost, said in ((10, 0), (11, 11), (60, 60)):
+        part = dots.copy()
+        part[200 - lost // 2 : 200 - lost // 2 + lost] = np.nan
+        (step,) = noted_times._steps(part, 40)
+        assert step.lost == said
+        assert step.size == pytest.approx(3.0)
+        assert step.at == pytest.approx(200.0, abs=1.5 if said else 7.0)
+        assert step.first < 200 - lost // 2
+        assert step.last > 200 + lost // 2
+
+
+def test_the_deepest_valley_is_found_though_it_begins_higher() -> None:
+    """A valley at 0 that is deep and wide, and one at 1 that is deeper and so narrow that no start is in it."""
+
+    def left(x: FloatArray) -> float:
+        at = float(x[0])
+        return min(0.5 + 20.0 * at**2, 0.0 + 60.0 * abs(at - 1.0) + (at - 1.0) ** 2)
+
+    starts = [(float(at), 0.0) for at in np.arange(-0.5, 1.5, 0.09)]
+    assert min(starts, key=lambda s: left(np.array(s)))[0] == pytest.approx(0.0, abs=0.1)
+    value, (at, took) = noted_times._least(left, starts, 0.02)
+    assert at == pytest.approx(1.0, abs=1e-3)
+    assert took == 0.0
+    assert value < 0.1
+    # One that begins more than ten times higher is left alone.
+    far = noted_times._least(lambda x: min(0.1 + 20.0 * x[0] ** 2, 90.0 * abs(x[0] - 1.0)), starts, 0.02)
+    assert far[1][0] == pytest.approx(0.0, abs=0.02)
