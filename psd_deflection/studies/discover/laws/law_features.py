@@ -92,6 +92,8 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
         noise = ws.noise[i]
         scale = np.sqrt(ws.count[i]) / noise.innovation[:, None]
         vectors = [ws.split(fit.residual)[i], *(c[i] for c in columns)]
+        if noise.slow is not None:
+            vectors = [noise.slow.whiten(v) for v in vectors]
         # Each vector, as it multiplies unwhitened fine blocks: (6, 1 + p, nf).
         back = np.stack([_unwhiten(np.stack([v[c] * scale[c] for v in vectors]), noise.ar[c]) for c in range(6)])
         gain = (scale * (1.0 - noise.ar.sum(axis=1))[:, None]) ** 2

@@ -25,6 +25,7 @@ from psd_deflection.studies.discover.search.comparison import Comparison, Simula
 from psd_deflection.studies.discover.search.free import Direction, Free, LoadDirection, moved
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
 from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
+from psd_deflection.studies.discover.setup.slow_noise import corners_of
 from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
 
 LEAST_NOISE = 0.05
@@ -79,15 +80,23 @@ class Workspace(Comparison):
 
     def _noise_beside(self, effects: Sequence[ActiveEffect]) -> tuple[NoiseModel, ...]:
         """The noise, with the link's motion simulated with ``effects``."""
-        out = []
+        out, left = list[NoiseModel](), list[FloatArray]()
         self.tally.count += 1
         for i, (o, size) in enumerate(zip(self.observations, self.fine, strict=True)):
             chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
+            difference = o.volts - chunk.volts.T
             # Coarse steps hide the noise of a reading that rests.
             share = 0.25 if any(a.effect.lattice for a in effects) else LEAST_NOISE
             floors = np.maximum(share * o.rig.noises.ravel(), o.rig.converter.volts_per_count / np.sqrt(12.0))
-            out.append(estimate_noise(o, o.volts - chunk.volts.T, size, floors))
-        return tuple(out)
+            noise = estimate_noise(o, difference, size, floors)
+            present = self._present[i]
+            rows = difference.T if present is None else np.where(present > 0.0, difference.T, 0.0)
+            left.append(noise.whiten(fine_means(rows, size, present), self.count[i]))
+            out.append(noise)
+        corners = corners_of(left, self.periods)
+        blocks = [o.rig.estimator.block_size * o.period for o in self.observations]
+        both = zip(out, left, self.periods, blocks, strict=True)
+        return tuple(w.with_slow_noise(corners, part.shape[1], period, block) for w, part, period, block in both)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -107,10 +116,7 @@ class Workspace(Comparison):
     def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
         """With the noise as it is with ``effects`` in the model; this one if that is the same."""
         noise = self._noise_beside(effects)
-        if all(
-            a.coloured == b.coloured and np.allclose(a.innovation, b.innovation, rtol=0.02)
-            for a, b in zip(self.noise, noise, strict=True)
-        ):
+        if all(a.like(b) for a, b in zip(self.noise, noise, strict=True)):
             return self
         out = self.replaced(noise=noise)
         return out.replaced(free=out.whitened(self.free))
@@ -287,10 +293,7 @@ class Workspace(Comparison):
 
     def unwhitened(self, white: FloatArray) -> list[FloatArray]:
         """Fine-block volts of a change that is slow compared with a fine block: a scaling per channel."""
-        return [
-            part * (noise.innovation / np.maximum(1.0 - noise.ar.sum(axis=1), 0.05))[:, None]
-            for part, noise in zip(self.split(white), self.noise, strict=True)
-        ]
+        return [noise.of_slow_change(part) for part, noise in zip(self.split(white), self.noise, strict=True)]
 
     def folds(self) -> IntArray:
         """Whole recordings if there are enough, else load cases in turn, so that each fold has several kinds."""
@@ -354,6 +357,7 @@ class Workspace(Comparison):
                 'rest_seconds': w.rest_seconds,
                 'noise_v': [float(s) for s in w.sigma],
                 'coloured': list(w.coloured),
+                'corners_hz': w.corners.tolist(),
             }
             for o, w in zip(self.observations, self.noise, strict=True)
         ]

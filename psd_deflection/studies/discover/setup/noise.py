@@ -10,7 +10,7 @@ tests more sensitive.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ from scipy.signal import detrend
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.setup.slow_noise import SlowNoise, block_factor
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -29,11 +30,15 @@ SIGNIFICANT = 5.0
 MOVING = 10.0
 """Coloured noise is at most so many times what neighbouring samples show; beyond, what is taken for rest moves."""
 
+ALIKE = 0.2
+"""Share by which corners of slow noise may differ."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseModel:
     """``sigma`` (6,) V rms a sample; ``ar`` (6, p): on fine blocks; ``innovation`` (6,): V rms of a
-    fine block after prediction; ``block_sigma`` (6,): V rms of the mean of one estimate block.
+    fine block after prediction; ``block_sigma`` (6,): V rms of the mean of one estimate block. ``slow``: what all
+    channels have besides; ``block_sigma`` has it, the others do not.
     """
 
     sigma: FloatArray
@@ -42,6 +47,17 @@ class NoiseModel:
     block_sigma: FloatArray
     rest_seconds: float
     coloured: tuple[bool, ...]
+    slow: SlowNoise | None = None
+
+    def with_slow_noise(self, corners: FloatArray, n: int, period: float, block: float) -> NoiseModel:
+        """With slow noise of the ``corners`` (6,), Hz, in ``n`` fine blocks ``period`` s apart.
+
+        ``block``: s of the blocks of an estimate.
+        """
+        if not corners.any():
+            return self
+        more = np.sqrt(block_factor(n * period, block, corners))
+        return replace(self, slow=SlowNoise.of(corners, n, period), block_sigma=self.block_sigma * more)
 
     def whiten(self, fine: FloatArray, count: FloatArray) -> FloatArray:
         """White, unit-variance innovations (6, nf) of fine-block rows (6, nf); 0 where unknown.
@@ -57,7 +73,28 @@ class NoiseModel:
                 good[:, j:] &= (count[:, :-j] > 0.0) | (column == 0.0)
         out *= np.sqrt(count) / self.innovation[:, None]
         out[~good] = 0.0
+        if self.slow is not None:
+            out = np.where(good, self.slow.whiten(out), 0.0)
         return out
+
+    @property
+    def corners(self) -> FloatArray:
+        """(6,) Hz: of the slow noise, 0 without."""
+        return np.zeros(6) if self.slow is None else self.slow.corners
+
+    def like(self, other: NoiseModel) -> bool:
+        """Whether a search need not tell it from ``other``."""
+        return (
+            self.coloured == other.coloured
+            and np.allclose(self.innovation, other.innovation, rtol=0.02)
+            and np.allclose(self.corners, other.corners, rtol=ALIKE, atol=0.0)
+        )
+
+    def of_slow_change(self, white: FloatArray) -> FloatArray:
+        """V (6, nf): the fine blocks of a change that is slow compared with one, of which ``white`` (6, nf) is left."""
+        if self.slow is not None:
+            white = self.slow.unwhiten(white)
+        return np.asarray(white * (self.innovation / np.maximum(1.0 - self.ar.sum(axis=1), 0.05))[:, None])
 
 
 def rest_windows(observation: Observation) -> list[slice]:
