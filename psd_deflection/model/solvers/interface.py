@@ -151,7 +151,7 @@ def flat_gain(
     arithmetic: Arithmetic = LIBRARY,
 ) -> FloatArray:
     """:meth:`Solver.gain` of weighted least squares on a flat plate. ``centers``: (x1, y1, x2, y2, ...), m."""
-    points = tuple(center + dot for center, dot in zip(centers, dots, strict=True))
+    points = tuple([center + dot for center, dot in zip(centers, dots, strict=True)])
     return weighted_gain(points, solution.theta, variances, solution.covariance, arithmetic)
 
 
