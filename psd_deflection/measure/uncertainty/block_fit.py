@@ -257,7 +257,7 @@ class BlockFit:
             if misfit:
                 rest = z - by.einsum('sk,ak->as', terms.q[:, :told], c)
                 more += np.where(squares > limit, _WIDEN * _WIDEN * by.sum(rest * rest, 1) / left, 0.0)
-            covariance[self._diagonal, self._diagonal] += more
+            covariance.flat[:: self._count + 1] += more
         for vibration in self._vibrations:
             covariance += self._left_of(vibration, x, weights)
         return Fitted(*self._combinations.back(value.tolist(), covariance), misfit)
