@@ -37,6 +37,7 @@ HELD, SYSTEMATIC, ZERO_VARIANCES = 'state.held_twist', 'state.systematic', 'stat
 
 Dots = tuple[float, ...]
 Failure = tuple[BlockStatus, str]
+_Found = tuple['BlockReadings', DeflectionEstimate | None, Failure | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,7 +231,16 @@ class Estimation:
 
         ``whole``: the readings of all PSDs.
         """
+        used, estimate, failure = self._most_agreed(block, whole, readings)
+        if estimate is not None:
+            self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
+        return BlockSolution(whole.dots, used, estimate, failure)
+
+    def _most_agreed(self, block: SeenBlock, whole: BlockReadings, readings: BlockReadings) -> _Found:
+        """As :meth:`_primary`, without the PSD that contradicts the others if it can be told."""
         before = tuple(range(len(self._rig.psds))) if readings.kept is None else readings.kept
+        if len(before) < 3 or self._rig.estimator.consistency == 'report':
+            return self._primary(block, readings)
         taken: dict[int, BlockReadings | None] = {}
 
         def without(psd: int) -> BlockReadings | None:
@@ -243,23 +253,15 @@ class Estimation:
             others = without(before[number - 1])
             return others is not None and self._agree(others)
 
-        if len(before) < 3 or self._rig.estimator.consistency == 'report':
-            found = self._primary(block, readings)
-        else:
-            found = self._primary(block, readings, agree_without)
-            checked = found[0].checked
-            wrong = before[checked.wrong - 1] if checked is not None and checked.wrong else -1
-            still = [psd for psd in before if block.frozen[psd] >= FROZEN_BLOCKS]
-            if wrong < 0 and checked is not None and checked.contradict and len(still) == 1:
-                # The check cannot tell, but a detector whose values do not change by one bit tells on itself.
-                wrong = still[0]
-            others = without(wrong) if wrong >= 0 else None
-            if others is not None:
-                found = self._primary(block, others._replace(wrong=wrong + 1))
-        used, estimate, failure = found
-        if estimate is not None:
-            self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
-        return BlockSolution(whole.dots, used, estimate, failure)
+        found = self._primary(block, readings, agree_without)
+        checked = found[0].checked
+        wrong = before[checked.wrong - 1] if checked is not None and checked.wrong else -1
+        still = [psd for psd in before if block.frozen[psd] >= FROZEN_BLOCKS]
+        if wrong < 0 and checked is not None and checked.contradict and len(still) == 1:
+            # The check cannot tell, but a detector whose values do not change by one bit tells on itself.
+            wrong = still[0]
+        others = without(wrong) if wrong >= 0 else None
+        return found if others is None else self._primary(block, others._replace(wrong=wrong + 1))
 
     def _agree(self, readings: BlockReadings) -> bool:
         """Whether the readings of some PSDs agree with each other."""
@@ -295,7 +297,7 @@ class Estimation:
 
     def _primary(
         self, block: SeenBlock, readings: BlockReadings, agree_without: Callable[[int], bool] | None = None
-    ) -> tuple[BlockReadings, DeflectionEstimate | None, Failure | None]:
+    ) -> _Found:
         """The readings with their check, the primary solver's estimate, and why there is none.
 
         ``agree_without``: as :meth:`StampedDots.check` has it.
@@ -347,7 +349,7 @@ class Estimation:
             phi=s.phi,
             omega=s.omega,
             covariance=covariance,
-            residual_rms=self._by.root(self._by.total(r * r for r in s.residual) / len(s.residual)),
+            residual_rms=self._by.root(self._by.total([r * r for r in s.residual]) / len(s.residual)),
             primary=primary,
             chi_square=checked.chi_square if primary and checked is not None and checked.freedom else nan,
             on_own_topic=block.due,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import gt, neg
 
 import numpy as np
 import numpy.typing as npt
@@ -107,6 +108,8 @@ class Loudness:
 
     def take(self, psd: int, level: Sequence[float], noisy: bool) -> list[float]:
         """Take a block of detector ``psd`` (from 1): rms of x, y, sum, V; return those of the last blocks, V."""
+        if not noisy and psd not in self._noises:
+            return list(level)
         blocks, quiet, *squares = self._noises.get(psd, (0.0, 0.0, 0.0, 0.0, 0.0))
         quiet = 0.0 if noisy else quiet + 1.0
         if not noisy and (blocks == 0.0 or quiet > QUIET_BLOCKS):
@@ -151,7 +154,7 @@ class OpticsHealth:
         step = rig.converter.volts_per_count
         self._full_scale = rig.converter.full_scale
         # The converter's last step on either side: the true value may lie beyond it.
-        self._rail = np.float32((2 ** (rig.converter.bits - 1) - 1) * step)
+        self._rail = float(np.float32((2 ** (rig.converter.bits - 1) - 1) * step))
         self._half = tuple(half / 2.0 for psd in rig.psds for half in psd.active_area)
         self._radius = tuple(psd.spot_radius for psd in rig.psds for _ in range(2))
         # If the noise is below one step, constant values are normal.
@@ -174,7 +177,6 @@ class OpticsHealth:
         block: SampleBlock,
         volts: npt.NDArray[np.float32],
         dots: tuple[float, ...],
-        sums: FloatArray,
         frozen: tuple[int, ...],
     ) -> Verdict:
         """The block's verdict, causes before consequences. ``volts`` (n, 3P): of the PSDs, x y sum of each.
@@ -188,9 +190,10 @@ class OpticsHealth:
                 faults.setdefault(psd, (status, reason))
 
         present = len(block.seq)
-        low = sums.min(axis=0).tolist()
+        least, most = np.minimum.reduce(volts).tolist(), np.maximum.reduce(volts).tolist()
+        low, high = least[2::3], most[2::3]
         add(self._dark(low))
-        add(saturated := self._saturated(volts))
+        add(saturated := self._saturated(least, most))
         if not saturated and not faults and bool((block.flags & FLAG_OVER_RANGE).any()):
             return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)
         if self.refuses_frozen:
@@ -200,7 +203,7 @@ class OpticsHealth:
             return Verdict(BlockStatus.TOO_FEW_SAMPLES, reason, 0)
         add(self._outside(dots))
         half_light = self._half_light(low) if self._splitter else False
-        findings = self._findings(dots, sums, set(faults), half_light)
+        findings = self._findings(dots, high, set(faults), half_light)
         if not faults:
             return Verdict(BlockStatus.OK, '', 0, findings, half_light)
         # The worst cause first: a lost laser explains a saturated or outside reading.
@@ -217,19 +220,18 @@ class OpticsHealth:
                 reason = f'laser {psd} lost: sum {least:.3f} V, below {self._sum_min:g} V'
                 yield psd, BlockStatus.LASER_LOST, reason
 
-    def _saturated(self, volts: npt.NDArray[np.float32]) -> list[tuple[int, BlockStatus, str]]:
-        sizes = np.abs(volts)
-        if float(sizes.max()) < self._rail:
+    def _saturated(self, least: list[float], most: list[float]) -> list[tuple[int, BlockStatus, str]]:
+        sizes = list(map(max, most, map(neg, least)))
+        if max(sizes) < self._rail:
             return []
-        extremes = sizes.max(axis=0)
         return [
             (
                 1 + column // 3,
                 BlockStatus.SATURATED,
-                f'{name} saturated: {float(extremes[column]):.3f} V, converter.full_scale is {self._full_scale:g} V',
+                f'{name} saturated: {size:.3f} V, converter.full_scale is {self._full_scale:g} V',
             )
-            for column, name in enumerate(channel_names(self._psds))
-            if extremes[column] >= self._rail
+            for column, (name, size) in enumerate(zip(channel_names(self._psds), sizes, strict=True))
+            if size >= self._rail
         ]
 
     def _outside(self, dots: tuple[float, ...]) -> Iterator[tuple[int, BlockStatus, str]]:
@@ -242,12 +244,11 @@ class OpticsHealth:
         return all(HALF_LIGHT[0] * self._nominal < s < HALF_LIGHT[1] * self._nominal for s in low)
 
     def _findings(
-        self, dots: tuple[float, ...], sums: FloatArray, faulty: set[int], half_light: bool
+        self, dots: tuple[float, ...], high: list[float], faulty: set[int], half_light: bool
     ) -> tuple[str, ...]:
         out = []
         if half_light:
             out.append('one of the two lasers is out: half the light on both detectors')
-        high = sums.max(axis=0)
         for psd in range(1, self._psds + 1):
             if psd in faulty:
                 continue
@@ -276,7 +277,7 @@ class OpticsHealth:
             level = np.sqrt(self._by.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE)).tolist()
             for psd in range(1, self._psds + 1):
                 own = level[3 * psd - 3 : 3 * psd]
-                noisy = psd not in faulty and any([a > b for a, b in zip(own, self._noise[psd - 1], strict=True)])
+                noisy = psd not in faulty and any(map(gt, own, self._noise[psd - 1]))
                 usual = loudness.take(psd, own, noisy)
                 if noisy:
                     out.append(f'psd_{psd} is noisy: {max(usual) * 1e3:.1f} mV a sample')

@@ -313,7 +313,9 @@ class Pipeline:
 
     def dots(self, block: SampleBlock) -> FloatArray:
         """Dots (n, 2P), m, of the samples of ``block``, calibrated and corrected as for the estimate."""
-        volts = self._calibration.seen(block.volts)
+        return self._dots(block, self._calibration.seen(block.volts))
+
+    def _dots(self, block: SampleBlock, volts: npt.NDArray[np.float32]) -> FloatArray:
         samples = self._calibration.dots(volts)
         if not self._correction.active:
             return samples
@@ -354,7 +356,7 @@ class Pipeline:
         self.counters.samples += len(block.seq)
         self._end_ns = int(block.t_ns[-1])
         sums = volts[:, 2::3].astype(np.float64)
-        samples = self.dots(block)
+        samples = self._dots(block, volts)
         means: Dots = tuple((self._by.sum(samples, 0) / len(samples)).tolist())
         if self._optics.refuses_frozen:
             self._stillness.count(self._optics.still(volts))
@@ -366,7 +368,7 @@ class Pipeline:
             samples=samples,
             means=means,
             sums=sums,
-            verdict=self._optics.judge(block, volts, means, sums, frozen),
+            verdict=self._optics.judge(block, volts, means, frozen),
             frozen=frozen,
             due=block.index % self.rig.estimator.decimation == 0,
         )

@@ -35,7 +35,7 @@ class Wiring:
     @property
     def nominal(self) -> bool:
         """Whether every PSD is wired as the channels are named."""
-        return not self.exchanged and all(axes == ('x', 'y') for axes in self.axes)
+        return not self.exchanged and self.axes == (('x', 'y'),) * len(self.axes)
 
     def input_of(self, psd: int) -> int:
         """Of a PSD (from 1), the input of the device that it is wired to: 1 is x1 y1 sum1, 2 is x2 y2 sum2 ..."""

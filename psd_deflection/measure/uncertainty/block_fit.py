@@ -257,7 +257,7 @@ class BlockFit:
             if misfit:
                 rest = z - by.einsum('sk,ak->as', terms.q[:, :told], c)
                 more += np.where(squares > limit, _WIDEN * _WIDEN * by.sum(rest * rest, 1) / left, 0.0)
-            covariance[self._diagonal, self._diagonal] += more
+            covariance.flat[:: self._count + 1] += more
         for vibration in self._vibrations:
             covariance += self._left_of(vibration, x, weights)
         return Fitted(*self._combinations.back(value.tolist(), covariance), misfit)
@@ -318,7 +318,7 @@ class BlockFit:
         self._before = self._usual(late)
         tau = self._before.copy()
         sudden = square > _SUDDEN * (v + before[:, :told])
-        if sudden.any():
+        if np.count_nonzero(sudden):
             usual = tau[:, :told]
             np.maximum(excess, usual, out=usual, where=sudden)
         # What does not move with the link has no motion that this block alone tells of: that would be noise, chosen
@@ -347,7 +347,7 @@ class BlockFit:
         long += step
         # Of the noise and the motion of late: three standard deviations of the short mean; less where both began alike.
         over = long - late > (_OVER + blocks * ((1.0 - _OVER) / _LASTING)) * (v + np.maximum(late, 0.0))
-        if over.any():
+        if np.count_nonzero(over):
             long[over] = late[over]
             blocks[over] = 1.0 / _FORGET
 
@@ -385,49 +385,51 @@ def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, by: Arithmet
 
     A few numbers: floats, of which numpy's calls would cost a multiple.
     """
-    used = terms.used
+    used, orders = terms.used, motion.shape[1]
     priors = (1.0 / motion[:, used]).tolist()
     rows = []
     more = []
     for rest, right, first, share, prior in zip(terms.rest, terms.right, terms.first, terms.share, priors, strict=True):
-        known = [row.copy() for row in rest]
-        for k, p in enumerate(prior):
-            known[k][k] += p
-        found = _solved(known, right.copy())
+        found = _solved(rest, prior, right)
         # What the weights miss of an order is its weight times its prior's precision.
         missed = 0.0
         for w, p, s in zip(found, prior, share, strict=True):
             missed += w * w * p
             first -= s * w
-        row = [0.0] * motion.shape[1]
+        row = [0.0] * orders
         row[used] = found
         row[0] = first
         rows.append(row)
         more.append(missed)
     x, left_out = np.array(rows), np.array(more)
     told = terms.v.shape[1]
-    if told < motion.shape[1]:
+    if told < orders:
         # So few samples cannot tell of these.
         untold = middle[told:] - by.einsum('akj,aj->ak', terms.information[:, told:], x)
         left_out += by.sum(untold * untold * motion[:, told:], 1)
     return x, left_out
 
 
-def _solved(matrix: list[list[float]], right: list[float]) -> list[float]:
-    """x (k,) of ``matrix`` (k, k), positive definite, times x = ``right`` (k,); both are used up."""
+def _solved(matrix: list[list[float]], added: list[float], right: list[float]) -> list[float]:
+    """x (k,) of ``matrix`` (k, k), positive definite once ``added`` is on its diagonal, times x = ``right`` (k,)."""
     size = len(right)
-    for i, pivot in enumerate(matrix):
-        for j in range(i + 1, size):
-            row = matrix[j]
-            factor = row[i] / pivot[i]
-            for m in range(i + 1, size):
+    x = right.copy()
+    pivots: list[list[float]] = []
+    for i, row in enumerate(matrix):
+        row = row.copy()
+        row[i] += added[i]
+        for j, pivot in enumerate(pivots):
+            factor = row[j] / pivot[j]
+            for m in range(j + 1, size):
                 row[m] -= factor * pivot[m]
-            right[j] -= factor * right[i]
+            x[i] -= factor * x[j]
+        pivots.append(row)
     for i in range(size - 1, -1, -1):
+        row = pivots[i]
         for m in range(i + 1, size):
-            right[i] -= matrix[i][m] * right[m]
-        right[i] /= matrix[i][i]
-    return right
+            x[i] -= row[m] * x[m]
+        x[i] /= row[i]
+    return x
 
 
 def _precision(gamma: FloatArray, white: bool) -> FloatArray:

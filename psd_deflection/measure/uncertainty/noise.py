@@ -380,7 +380,9 @@ def _autocovariance(
     padded[:count, places] = centred.T
     padded[count, places] = 1.0
     spectra = np.fft.rfft(padded)
-    pairs = np.fft.irfft(by.times_conjugate(spectra[:count, None], spectra[None, :count]))[:, :, :far]
+    own = spectra[:count]
+    # Series by series: memory for all pairs at once would be asked of the system anew each time, page by page.
+    pairs = np.stack([np.fft.irfft(by.times_conjugate(one, own))[:, :far] for one in own])
     present = np.fft.irfft(by.power_spectrum(spectra[count]))[:far]
     # Where two samples are never that far apart, nothing is known: taken as independent.
     each = np.where(present > 0.5, pairs / np.maximum(present, 1.0), 0.0)

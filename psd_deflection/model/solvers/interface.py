@@ -23,7 +23,7 @@ import numpy.typing as npt
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
 from psd_deflection.model.plate.layout import Geometry
 from psd_deflection.model.plate.plate import Tilts
-from psd_deflection.model.solvers.plane import checked_variances
+from psd_deflection.model.solvers.plane import Covariance, checked_variances
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 
@@ -56,7 +56,7 @@ class Solution(NamedTuple):
     theta: float
     phi: float
     omega: float
-    covariance: tuple[float, float, float, float, float, float, float, float, float]
+    covariance: Covariance
     residual: tuple[float, ...]
     status: SolverStatus
     iterations: int
@@ -151,23 +151,23 @@ def flat_gain(
     arithmetic: Arithmetic = LIBRARY,
 ) -> FloatArray:
     """:meth:`Solver.gain` of weighted least squares on a flat plate. ``centers``: (x1, y1, x2, y2, ...), m."""
-    points = tuple(center + dot for center, dot in zip(centers, dots, strict=True))
-    return weighted_gain(points, solution.theta, variances, solution, arithmetic)
+    points = tuple([center + dot for center, dot in zip(centers, dots, strict=True)])
+    return weighted_gain(points, solution.theta, variances, solution.covariance, arithmetic)
 
 
 def weighted_gain(
     points: tuple[float, ...],
     theta: float,
     variances: tuple[float, ...],
-    solution: Solution,
+    covariance: Covariance,
     arithmetic: Arithmetic = LIBRARY,
 ) -> FloatArray:
-    """P A^T V^-1, P the solution's own covariance: the gain of least squares with the weights 1/``variances``.
+    """P A^T V^-1, P the answer's own ``covariance``: the gain of least squares with the weights 1/``variances``.
 
     ``points``: q = (x1, y1, ...), m. The readings of a dot at q go with the pose as -R(-theta) and (q_y, -q_x).
     """
     c, s = arithmetic.cos_sin(theta)
-    xx, xy, xt, _, yy, yt, _, _, tt = solution.covariance
+    xx, xy, xt, _, yy, yt, _, _, tt = covariance
     rows: tuple[list[float], list[float], list[float]] = ([], [], [])
     for i in range(0, len(points), 2):
         qx, qy = points[i], points[i + 1]

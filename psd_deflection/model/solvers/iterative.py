@@ -96,10 +96,10 @@ class IterativeSolver(Solver):
         by = self._arithmetic
         c, s = by.cos_sin(solution.theta)
         plate = [(r[0] + dots[2 * i], r[1] + dots[2 * i + 1], r[2], r[3]) for i, r in enumerate(self._rows)]
-        mx = by.total(p[0] for p in plate) / count
-        my = by.total(p[1] for p in plate) / count
+        mx = by.total([p[0] for p in plate]) / count
+        my = by.total([p[1] for p in plate]) / count
         # The beams are about their mean, so the dots' mean counts for nothing.
-        agreement = by.total(c * (qx * lx + qy * ly) + s * (qx * ly - qy * lx) for qx, qy, lx, ly in plate)
+        agreement = by.total([c * (qx * lx + qy * ly) + s * (qx * ly - qy * lx) for qx, qy, lx, ly in plate])
         gx, gy = s * mx + c * my, s * my - c * mx
         rows: tuple[list[float], list[float], list[float]] = ([], [], [])
         for _, _, lx, ly in plate:

@@ -12,10 +12,12 @@ no matrix is inverted. The linear model still leaves d unrotated; ``wls_exact`` 
 
 from __future__ import annotations
 
+import functools
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from psd_deflection.base.arithmetic import Arithmetic
 from psd_deflection.base.errors import ConfigError, SolverError
 from psd_deflection.model.plate.layout import Geometry, check_twist
 from psd_deflection.model.plate.linear import design_matrix
@@ -26,6 +28,8 @@ from psd_deflection.rig.config import Rig
 
 THESIS_ROW_SCALING = (0.03, 0.5, 10.0, 0.1)
 """Po of x1, y1, x2, y2 for the thesis's loads on the sidebar (section 5.5, Figs 5.12-5.20)."""
+
+_Rows = tuple[tuple[float, float, float, float], ...]
 
 Weights = Literal['inverse_variance', 'thesis']
 
@@ -55,8 +59,8 @@ class WlsSolver(Solver):
         check_twist(geometry)
         beams, zeros = np.asarray(geometry.beams).tolist(), np.asarray(geometry.zeros).tolist()
         self._rows = tuple((lx, ly, x0, y0) for (lx, ly), (x0, y0) in zip(beams, zeros, strict=True))
-        self._places = tuple(np.asarray(geometry.beams, dtype=np.float64).ravel().tolist())
         self._arithmetic = geometry.arithmetic
+        self._known: _Weighted | None = None
         self._fixed = fixed_weights(geometry, weights, row_scaling)
 
     @classmethod
@@ -75,42 +79,25 @@ class WlsSolver(Solver):
         """One block, pure floats. See :class:`Solver`."""
         if self._fixed is not None:
             return self._fixed.solve(dots, variances)
-        sum_x = sum_y = mean_x = mean_y = shift_x = shift_y = 0.0
+        known = self._weighted(variances)
+        shift_x = shift_y = 0.0
         terms = []
-        try:
-            for i, (lx, ly, x0, y0) in enumerate(self._rows):
-                wx = 1.0 / variances[2 * i]
-                wy = 1.0 / variances[2 * i + 1]
-                bx = dots[2 * i] - x0
-                by = dots[2 * i + 1] - y0
-                sum_x += wx
-                sum_y += wy
-                mean_y += wx * ly
-                mean_x += wy * lx
-                shift_x += wx * bx
-                shift_y += wy * by
-                terms.append((wx, wy, bx, by, lx, ly))
-        except ZeroDivisionError:
-            raise SolverError('solve: variances must be above 0 m^2') from None
-        mean_y /= sum_x
-        mean_x /= sum_y
-        shift_x /= sum_x
-        shift_y /= sum_y
-        moment = information = 0.0
-        for wx, wy, bx, by, lx, ly in terms:
-            ty = ly - mean_y
-            tx = lx - mean_x
-            moment += wx * ty * bx - wy * tx * by
-            information += wx * ty * ty + wy * tx * tx
-        vtt = 1.0 / information
-        theta = moment * vtt
-        dx = mean_y * theta - shift_x
-        dy = -mean_x * theta - shift_y
-        vxt = mean_y * vtt
-        vyt = -mean_x * vtt
-        vxy = mean_y * vyt
+        for i, ((lx, ly, x0, y0), (wx, wy)) in enumerate(zip(self._rows, known.weights, strict=True)):
+            bx = dots[2 * i] - x0
+            by = dots[2 * i + 1] - y0
+            shift_x += wx * bx
+            shift_y += wy * by
+            terms.append((bx, by, lx, ly))
+        shift_x /= known.sum_x
+        shift_y /= known.sum_y
+        moment = 0.0
+        for (bx, by, _, _), (wx_ty, wy_tx) in zip(terms, known.levers, strict=True):
+            moment += wx_ty * bx - wy_tx * by
+        theta = moment * known.variance
+        dx = known.mean_y * theta - shift_x
+        dy = -known.mean_x * theta - shift_y
         residual: list[float] = []
-        for _, _, bx, by, lx, ly in terms:
+        for bx, by, lx, ly in terms:
             residual.append(bx + dx - ly * theta)
             residual.append(by + dy + lx * theta)
         return Solution(
@@ -119,7 +106,7 @@ class WlsSolver(Solver):
             theta,
             0.0,
             0.0,
-            (1.0 / sum_x + mean_y * vxt, vxy, vxt, vxy, 1.0 / sum_y - mean_x * vyt, vyt, vxt, vyt, vtt),
+            known.covariance,
             tuple(residual),
             SolverStatus.OK if theta - theta == 0.0 else SolverStatus.NOT_CONVERGED,
             0,
@@ -129,7 +116,59 @@ class WlsSolver(Solver):
         """In closed form: that of the beams' places without twist. See :class:`Solver`."""
         if self._fixed is not None:
             return self._fixed.gain(dots, variances, solution)
-        return weighted_gain(self._places, 0.0, variances, solution, self._arithmetic)
+        return self._weighted(variances).gain
+
+    def _weighted(self, variances: tuple[float, ...]) -> _Weighted:
+        known = self._known
+        # In a run all blocks without a finding have the same variances.
+        if known is None or known.variances != variances:
+            known = self._known = _Weighted(self._rows, variances, self._arithmetic)
+        return known
+
+
+class _Weighted:
+    """What does not depend on the dots: all but the answer and its residual. ``variances`` (2P,), m^2: as given.
+
+    ``weights`` (P, 2): of x and y, 1/m^2; ``levers`` (P, 2): those times the places across, 1/m. ``sum_x``, ``sum_y``:
+    of the weights. ``mean_x``, ``mean_y`` m: of the beams, with the weights of the other axis. ``covariance``: as of
+    :class:`Solution`; ``variance`` rad^2: of the twist.
+    """
+
+    def __init__(self, rows: _Rows, variances: tuple[float, ...], by: Arithmetic) -> None:
+        """``rows``: lx, ly, x0, y0 of each PSD, m. Raises SolverError if a variance is 0."""
+        self._rows, self.variances, self._by = rows, variances, by
+        try:
+            self.weights = [(1.0 / variances[2 * i], 1.0 / variances[2 * i + 1]) for i in range(len(rows))]
+        except ZeroDivisionError:
+            raise SolverError('solve: variances must be above 0 m^2') from None
+        sum_x = sum_y = mean_x = mean_y = 0.0
+        for (lx, ly, _, _), (wx, wy) in zip(rows, self.weights, strict=True):
+            sum_x += wx
+            sum_y += wy
+            mean_y += wx * ly
+            mean_x += wy * lx
+        mean_y /= sum_x
+        mean_x /= sum_y
+        information = 0.0
+        self.levers = []
+        for (lx, ly, _, _), (wx, wy) in zip(rows, self.weights, strict=True):
+            ty = ly - mean_y
+            tx = lx - mean_x
+            self.levers.append((wx * ty, wy * tx))
+            information += wx * ty * ty + wy * tx * tx
+        self.sum_x, self.sum_y, self.mean_x, self.mean_y = sum_x, sum_y, mean_x, mean_y
+        vtt = self.variance = 1.0 / information
+        vxt = mean_y * vtt
+        vyt = -mean_x * vtt
+        vxy = mean_y * vyt
+        vxx, vyy = 1.0 / sum_x + mean_y * vxt, 1.0 / sum_y - mean_x * vyt
+        self.covariance = (vxx, vxy, vxt, vxy, vyy, vyt, vxt, vyt, vtt)
+
+    @functools.cached_property
+    def gain(self) -> FloatArray:
+        """See :class:`Solver`."""
+        places = tuple([place for lx, ly, _, _ in self._rows for place in (lx, ly)])
+        return weighted_gain(places, 0.0, self.variances, self.covariance, self._by)
 
 
 def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float, ...]) -> FixedGain | None:

@@ -36,7 +36,7 @@ def judge(
     flags[3] = flag
     seq = np.arange(present)
     block = SampleBlock(0, seq, seq * 1_000_000, rows, flags)
-    return OpticsHealth(rig).judge(block, rows, dots, rows[:, 2::3].astype(np.float64), frozen)
+    return OpticsHealth(rig).judge(block, rows, dots, frozen)
 
 
 def changed(i: int, value: float) -> tuple[float, ...]:
@@ -91,7 +91,7 @@ def judge_frozen(frozen: tuple[int, int]) -> Verdict:
     rig = dataclasses.replace(rig, estimator=dataclasses.replace(rig.estimator, frozen='refuse'))
     rows = np.tile(np.array(GOOD, np.float32), (20, 1))
     block = SampleBlock(0, np.arange(20), np.arange(20) * 1_000_000, rows, np.zeros(20, np.uint8))
-    return OpticsHealth(rig).judge(block, rows, DOTS, rows[:, 2::3].astype(np.float64), frozen)
+    return OpticsHealth(rig).judge(block, rows, DOTS, frozen)
 
 
 @pytest.mark.parametrize('axis', range(4))
