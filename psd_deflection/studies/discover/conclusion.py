@@ -377,7 +377,7 @@ def _seconds(finding: Finding) -> str:
     if not isinstance(finding.value, float) or finding.name not in ('load_time', 'load_ramp'):
         return ''
     late = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
-    return f', {abs(finding.value):.2g} s{late}'
+    return f', {abs(finding.value):.3g} s{late}'
 
 
 def _moved(discovery: RigConclusion) -> str:
