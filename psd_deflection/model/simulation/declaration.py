@@ -262,6 +262,15 @@ class Effect:
         return STAGES.index(self.stage), self.order, self.name
 
     @property
+    def corrected(self) -> str:
+        """What the daemon frees from it if the rig file lists it: ``reading``, ``wrench`` or ''."""
+        if self.correct is not None or self.point == 'beam':
+            return 'reading'
+        if self.point == 'configure':
+            return 'reading' if self.stage in ('optics', 'psd') else 'wrench'
+        return 'wrench' if self.trace_back is not None else ''
+
+    @property
     def lattice(self) -> str:
         """The name of the parameter that is the step of all readings, '' if there is none."""
         first = next(self.variants())

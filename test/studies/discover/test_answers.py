@@ -779,6 +779,27 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
     )
 
 
+def named_as(name: str, **values: float) -> NamedEffect:
+    return NamedEffect(make_active(name, values, 'test'), {}, 0.0, 100.0, HeldOut(1.0, 0.1), (), (), (), None)
+
+
+def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery) -> None:
+    turned, lag = found.effects[0], named_as('amplifier_lag', time_constant=1e-4)
+    soft = named_as('bending_stiffness', scale=-0.02)
+    right = 'The estimates of the pose are right without; the simulated motion, and with it the wrench, is not.'
+    not_corrected = 'An estimate is not corrected for amplifier_lag.'
+    wrong = 'Without them an estimate is wrong by up to ΔX 1 µm, θ 2 µrad.'
+
+    def said_of(*effects: NamedEffect, moves: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> str:
+        return dataclasses.replace(found, effects=effects, moves=moves).sentences()[-1]
+
+    assert said_of(soft, moves=(1e-10, 1e-10, 9.9e-10)) == right
+    assert said_of(lag) == not_corrected
+    assert said_of(soft, lag) == not_corrected
+    assert said_of(turned, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
+    assert said_of(turned, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
+
+
 def test_places_are_told_if_one_in_twenty_by_chance(found: Discovery) -> None:
     first = found.where.cells[0]
     cells = tuple(dataclasses.replace(first, p=p) for p in (0.0, 0.0499, 0.05, 1.0))
