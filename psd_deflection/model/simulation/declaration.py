@@ -182,7 +182,7 @@ class Effect:
 
     ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
     ``PLACED_OF_PSD`` (an effect with a PSD) or of ``CALIBRATED_OF_LINK``. The calibration then finds their sizes;
-    without it a calibration refuses rigs that have the effect.
+    without it a calibration refuses rigs that have the effect. ``law``: its text in YAML, if it is a law.
     Raises ValueError if the declaration contradicts itself.
     """
 
@@ -203,6 +203,7 @@ class Effect:
     whole: bool = False
     order: int = 0
     calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
+    law: str = ''
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
