@@ -219,8 +219,8 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
     # Late by one fine block: no delay at all is looked for anyway.
     late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, 4, axis=0))])
     assert likely_delays(late) == pytest.approx([0.004, 0.008])
-    # Late or early by half of one: found from there or from the next.
-    for shift in (2, -2):
+    # Late or early by half of one, or by one sample: found from there or from the next.
+    for shift in (2, -2, 1, -1):
         late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0))])
         assert min(abs(delay - shift / 1000.0) for delay in likely_delays(late)) < 0.0025
     # The link follows its loads as simulated: nothing is late.
