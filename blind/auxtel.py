@@ -48,7 +48,8 @@ class AuxTel(Plant):
         self, path: Path = DATA / 'auxtel.txt', known: Sequence[str] = (), without: Sequence[str] = ()
     ) -> None:
         """Raises OSError if there is no file."""
-        rows = np.radians(np.loadtxt(path))
+        with path.open() as stream:
+            rows = np.radians(np.loadtxt(stream))
         self.azimuth, self.elevation = rows[:, 0], rows[:, 1]
         turned = np.mod(rows[:, 2] - rows[:, 0] + np.pi, 2.0 * np.pi) - np.pi
         self._seen = ARCSECONDS * np.stack([turned * np.cos(self.elevation), rows[:, 3] - self.elevation])

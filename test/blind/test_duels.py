@@ -12,7 +12,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.io import savemat
 
-from blind import balls, duels, silverbox
+from blind import balls, duels, foreign, silverbox
 from blind.boom import Boom
 from blind.duel_peers import Answers, best_subset
 from blind.emps import Emps
@@ -96,6 +96,14 @@ def test_what_is_not_there_has_a_row_each(tmp_path: Path, capsys: pytest.Capture
     out = capsys.readouterr().out
     for name, duel in duels.DUELS.items():
         assert f'| {name} | not run: {duel.file} is not there |' in out
+
+
+def test_a_file_of_others_that_is_not_there_is_told_by_its_name(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr('sys.argv', ['foreign', 'auxtel', '--data', str(tmp_path)])
+    assert foreign.main() == 3
+    assert capsys.readouterr().err == f'{tmp_path / "auxtel.txt"}: No such file or directory\n'
 
 
 def test_a_file_without_a_model_and_another_file_are_told(tmp_path: Path) -> None:

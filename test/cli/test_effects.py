@@ -46,11 +46,10 @@ def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_what_is_corrected_is_said() -> None:
-    from psd_deflection.cli.studies.effects import corrected
 
-    said = {name: corrected(catalogue()[name]) for name in ('plane_tilt', 'refraction', 'creep', 'bending_stiffness')}
+    said = {name: catalogue()[name].corrected for name in ('plane_tilt', 'refraction', 'creep', 'bending_stiffness')}
     assert said == {'plane_tilt': 'reading', 'refraction': 'reading', 'creep': 'wrench', 'bending_stiffness': 'wrench'}
-    assert corrected(catalogue()['amplifier_lag']) == ''
+    assert catalogue()['amplifier_lag'].corrected == ''
 
 
 def test_a_wrong_name_is_told_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:

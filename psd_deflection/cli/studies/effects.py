@@ -66,7 +66,7 @@ def explained(effect: Effect) -> list[str]:
         f'  equation  {effect.equation}',
         f'  source    {effect.source}',
         f'  needs     {effect.needs}',
-        f'  corrected {_CORRECTED[corrected(effect)]}',
+        f'  corrected {_CORRECTED[effect.corrected]}',
         '  parameters',
     ]
     for p in effect.parameters:
@@ -80,15 +80,6 @@ def explained(effect: Effect) -> list[str]:
     given += [f'{p.name}={example(p):g}' for p in effect.parameters if p.kind == 'amplitude'][:1]
     command = ','.join((effect.name, *given))
     return [*out, f'  try       psd-deflection simulate --out run --loads thesis --effect {command}']
-
-
-def corrected(effect: Effect) -> str:
-    """What the daemon frees from it if the rig file lists it: ``reading``, ``wrench`` or ''."""
-    if effect.correct is not None or effect.point == 'beam':
-        return 'reading'
-    if effect.point == 'configure':
-        return 'reading' if effect.stage in ('optics', 'psd') else 'wrench'
-    return 'wrench' if effect.trace_back is not None else ''
 
 
 def example(parameter: EffectParameter) -> float:
@@ -107,7 +98,7 @@ def as_json(effect: Effect) -> dict[str, Any]:
         'equation': effect.equation,
         'source': effect.source,
         'needs': effect.needs,
-        'corrected': corrected(effect),
+        'corrected': effect.corrected,
         'parameters': {
             p.name: {
                 'unit': p.unit,

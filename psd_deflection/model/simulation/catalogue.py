@@ -9,7 +9,8 @@ In a rig file the effects are listed below ``effects:``, one map each, under any
     effects:
       sensor_rotation_2: {name: sensor_rotation, psd: 2, angle: 0.01}
 
-This keeps the file a valid ROS 2 parameter file.
+This keeps the file a valid ROS 2 parameter file. A law has its text there too, as ``law:``, so that it needs no folder
+where the file, or a recording made with it, is read.
 """
 
 from __future__ import annotations
@@ -30,10 +31,13 @@ from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.simulation import effects as ours
 from psd_deflection.model.simulation.declaration import PSD, ActiveEffect, Effect
 from psd_deflection.rig.config import Rig
+from psd_deflection.rig.parameter_files import EFFECTS_PREFIX
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
+LAW = 'law'
+"""Key of the text of a law, among the parameters of an effect."""
 GROUP = 'psd_deflection.effects'
 FOLDERS = 'PSD_DEFLECTION_EFFECTS'
 
@@ -108,6 +112,15 @@ def _of_file(path: Path) -> object:
     return module.EFFECT
 
 
+@functools.cache
+def _of_text(text: str, source: str) -> Effect:
+    # Imported here, as above.
+    from psd_deflection.model.simulation.law_files import law_of_text
+    from psd_deflection.model.simulation.laws import effect_of
+
+    return effect_of(law_of_text(text, source))
+
+
 def _load(name: str, place: Place) -> Effect:
     found = loaded(
         f'{_words(place)}: holds no effect', lambda: _of_file(place) if isinstance(place, Path) else place.load()
@@ -144,10 +157,8 @@ def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveE
 
 
 def _made(name: str, values: Mapping[str, object], source: str, places: Mapping[str, Place]) -> ActiveEffect:
-    if name not in places:
-        hint = did_you_mean(name, places) or f'; there are: {", ".join(sorted(places))}'
-        raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}')
-    effect = _load(name, places[name])
+    effect = _effect(name, values, source, places)
+    values = {key: value for key, value in values.items() if key != LAW}
     known = [p.name for p in effect.parameters]
     for key in values:
         if key not in known:
@@ -166,6 +177,40 @@ def _made(name: str, values: Mapping[str, object], source: str, places: Mapping[
             f'{source}: {name} is off without {" or ".join(sizes)}: psd-deflection effects {name} explains them'
         )
     return ActiveEffect(effect, out)
+
+
+def _effect(name: str, values: Mapping[str, object], source: str, places: Mapping[str, Place]) -> Effect:
+    """The effect that ``values`` have the law of, or the one that is in its place."""
+    if LAW in values:
+        effect = _of_text(str(values[LAW]), f'{source}.{LAW}')
+        if effect.name != name:
+            raise ConfigError(f'{source}.{LAW}: name = {effect.name!r}: must be {name!r}, as in {source}.name')
+        return effect
+    if name not in places:
+        hint = did_you_mean(name, places) or f'; there are: {", ".join(sorted(places))}'
+        folders = ', '.join(str(folder) for folder in effect_folders())
+        yours = f' (one of your own is {name}.py or {name}.yaml in {folders}, see {FOLDERS})' if folders else ''
+        raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}{yours}')
+    return _load(name, places[name])
+
+
+def with_laws(values: Mapping[str, object]) -> dict[str, object]:
+    """Flat ``values`` of a rig with the text of each law that its effects are, for where their folder is not.
+
+    As they were if the folders have none that can be read: these values are kept, and not used.
+    """
+    out = dict(values)
+    groups = {key.split('.')[1] for key in values if key.startswith(EFFECTS_PREFIX) and key.count('.') == 2}
+    try:
+        places = _places() if groups else {}
+        for group in sorted(groups):
+            name = str(values.get(f'{EFFECTS_PREFIX}{group}.name', group))
+            place = places.get(name)
+            if isinstance(place, Path) and (law := _load(name, place).law):
+                out.setdefault(f'{EFFECTS_PREFIX}{group}.{LAW}', law)
+    except ConfigError:
+        return dict(values)
+    return out
 
 
 def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
@@ -211,5 +256,7 @@ def effects_to_values(effects: Sequence[ActiveEffect]) -> dict[str, dict[str, ob
             value = float(active.values[p.name])
             if math.isfinite(value):
                 body[p.name] = int(value) if p.kind == 'choice' else value
+        if active.effect.law:
+            body[LAW] = active.effect.law
         out[key] = body
     return out

@@ -182,7 +182,7 @@ class Effect:
 
     ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
     ``PLACED_OF_PSD`` (an effect with a PSD) or of ``CALIBRATED_OF_LINK``. The calibration then finds their sizes;
-    without it a calibration refuses rigs that have the effect.
+    without it a calibration refuses rigs that have the effect. ``law``: its text in YAML, if it is a law.
     Raises ValueError if the declaration contradicts itself.
     """
 
@@ -203,6 +203,7 @@ class Effect:
     whole: bool = False
     order: int = 0
     calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
+    law: str = ''
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
@@ -260,6 +261,15 @@ class Effect:
     def rank(self) -> tuple[int, int, str]:
         """Sorts effects into the order in which they act."""
         return STAGES.index(self.stage), self.order, self.name
+
+    @property
+    def corrected(self) -> str:
+        """What the daemon frees from it if the rig file lists it: ``reading``, ``wrench`` or ''."""
+        if self.correct is not None or self.point == 'beam':
+            return 'reading'
+        if self.point == 'configure':
+            return 'reading' if self.stage in ('optics', 'psd') else 'wrench'
+        return 'wrench' if self.trace_back is not None else ''
 
     @property
     def lattice(self) -> str:

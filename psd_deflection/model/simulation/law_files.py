@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import cast
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.foreign_yaml import tree_of_file
+from psd_deflection.base.foreign_yaml import tree_of_file, tree_of_text
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.simulation.declaration import STAGES, Stage
 from psd_deflection.model.simulation.laws import ANY, DOTS, FORMS, TARGETS, Law, LawTerm
@@ -20,7 +20,15 @@ _FREE = (-math.inf, math.inf)
 
 def read_law(path: Path) -> Law:
     """The law of a file. Raises ConfigError naming file, key, value and what is allowed."""
-    tree = tree_of_file(path, 'law')
+    return _law_of(tree_of_file(path, 'law'), path)
+
+
+def law_of_text(text: str, source: str) -> Law:
+    """The law of the text that a rig file or a recording has as ``source``. Raises ConfigError as :func:`read_law`."""
+    return _law_of(tree_of_text(text, Path(source)), Path(source))
+
+
+def _law_of(tree: object, path: Path) -> Law:
     if not isinstance(tree, dict):
         raise ConfigError(f'{path}: must be a map with name, stage, acts_on and terms')
     for key in ('name', 'acts_on', 'terms'):

@@ -400,6 +400,7 @@ def effect_of(law: Law) -> Effect:
         correct=partial(_correct, law) if correctable else None,
         uses=uses if correctable else frozenset(),
         order=50,
+        law=_in_yaml(law, line=True).strip(),
     )
 
 
@@ -414,6 +415,11 @@ def values_of(law: Law) -> dict[str, float]:
 
 def law_text(law: Law, comment: Sequence[str] = ()) -> str:
     """The law as a YAML file; :func:`~psd_deflection.model.simulation.law_files.read_law` reads it again."""
+    return ''.join(f'# {line}\n' for line in comment) + _in_yaml(law)
+
+
+def _in_yaml(law: Law, *, line: bool = False) -> str:
+    """The law in YAML; in one ``line``."""
     terms = []
     for t in law.terms:
         body: dict[str, Any] = {'form': t.form, 'of': list(t.of), 'coefficient': float(t.coefficient)}
@@ -433,5 +439,5 @@ def law_text(law: Law, comment: Sequence[str] = ()) -> str:
         'expression': law.expression,
         'terms': terms,
     }
-    head = ''.join(f'# {line}\n' for line in comment)
-    return head + yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=1000)
+    width = 10**9 if line else 1000
+    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=width, default_flow_style=line)

@@ -21,6 +21,7 @@ from msg_adapters import BY_NAME, MESSAGE_TYPES, to_messages
 from psd_deflection import __version__
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder, creating, lock
+from psd_deflection.model.simulation.catalogue import with_laws
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import provenance
 from psd_deflection.recordings.write.bag_metadata import (
@@ -118,6 +119,7 @@ class McapFile(_RecordSink):
         node: str = '',
     ) -> None:
         super().__init__(rig_values)
+        rig_values = with_laws(rig_values)
         self.path = path
         self._durable = durable
         self.topics: dict[str, TopicCount] = {}

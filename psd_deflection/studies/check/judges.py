@@ -24,6 +24,8 @@ check measures, is down to 0.6 of the whole if it has a memory. Neither is a mis
 FORCE_UNITS = {9.80665: 'kg', 9.80665e-3: 'g', 4.4482216: 'lbf', 1e3: 'kN', 1e-3: 'mN', 0.2780139: 'ozf'}
 TORQUE_UNITS = {9.80665: 'kg m', 0.0980665: 'kg cm', 9.80665e-3: 'kg mm', 1e3: 'kN m', 1e-3: 'N mm', 1e-2: 'N cm'}
 """Newtons and newton metres of each unit."""
+OF_POUNDS = {1.3558179: 'lbf ft', 0.1129848: 'lbf in'}
+"""Of a torque beside forces in pounds; by itself a torque that is off by a third is a stiffness."""
 UNIT_TOLERANCE = 0.03
 """Share by which the size of a load may differ from another unit's. The rest is stiffness: a modulus that is wrong by a
 digit makes forces ten times too large, which is 2 % from kilograms.
@@ -128,9 +130,27 @@ def _units(sizes: FloatArray) -> dict[int, tuple[float, str]]:
     torque = float(sizes[2])
     if force and not _power_of_ten(force, torque) and (found := _nearest(force, FORCE_UNITS, 'N')):
         out.update({k: found for k in range(2) if math.isfinite(sizes[k])})
-    if math.isfinite(torque) and (found := _nearest([torque], TORQUE_UNITS, 'N m')):
+    beside = next((factor for factor, _ in out.values()), 0.0)
+    if math.isfinite(torque) and (found := _of_torque(torque, beside)):
         out[2] = found
     return out
+
+
+def _of_torque(size: float, force: float) -> tuple[float, str] | None:
+    """The factor and unit of a torque; one with the unit of the forces, whose factor is ``force``, if that fits."""
+    if not force:
+        return _nearest([size], TORQUE_UNITS, 'N m')
+    pounds = OF_POUNDS if _is('lbf', force) else {}
+    alike = {f: unit for f, unit in TORQUE_UNITS.items() if _whole_decades(f / force) or _whole_decades(f * force)}
+    return _nearest([size], {**alike, **pounds}, 'N m') or _nearest([size], TORQUE_UNITS, 'N m')
+
+
+def _is(unit: str, factor: float) -> bool:
+    return any(name == unit and factor in (f, 1.0 / f) for f, name in FORCE_UNITS.items())
+
+
+def _whole_decades(ratio: float) -> bool:
+    return abs(math.log10(ratio) - round(math.log10(ratio))) < 1e-3
 
 
 def _nearest(sizes: Sequence[float], units: Mapping[float, str], own: str) -> tuple[float, str] | None:

@@ -34,6 +34,7 @@ from psd_deflection.studies.discover.search.ties import ties
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS
+from psd_deflection.studies.discover.setup.redundant import STAGES
 from psd_deflection.studies.discover.trees import (
     covariance_tree,
     effect_tree,
@@ -213,7 +214,7 @@ class RigConclusion(Conclusion):
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
     ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
     set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
-    ``moves``: by how much at most an estimate that does not know of the effects is wrong: dX m, dY m, theta rad.
+    ``moves``: by how much at most an estimate is wrong that is not corrected for the effects: dX m, dY m, theta rad.
     ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
     became, '' if it is none. ``tell``: takes warnings.
     """
@@ -377,7 +378,7 @@ def _seconds(finding: Finding) -> str:
     if not isinstance(finding.value, float) or finding.name not in ('load_time', 'load_ramp'):
         return ''
     late = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
-    return f', {abs(finding.value):.2g} s{late}'
+    return f', {abs(finding.value):.3g} s{late}'
 
 
 def _moved(discovery: RigConclusion) -> str:
@@ -385,12 +386,17 @@ def _moved(discovery: RigConclusion) -> str:
     if not discovery.effects:
         return ''
     dx, dy, theta = (1e6 * v for v in discovery.moves)
+    found = [e.active.effect for e in discovery.effects]
+    stays = dict.fromkeys(effect.name for effect in found if effect.stage in STAGES and not effect.corrected)
+    uncorrected = f'An estimate is not corrected for {", ".join(stays)}.' if stays else ''
+    if max(dx, dy, theta) < SHOWN and uncorrected:
+        return uncorrected
     if max(dx, dy, theta) < SHOWN:
         return 'The estimates of the pose are right without; the simulated motion, and with it the wrench, is not.'
     them = 'it' if len(discovery.effects) == 1 else 'them'
     sizes = (('ΔX', dx, 'µm'), ('ΔY', dy, 'µm'), ('θ', theta, 'µrad'))
     words = ', '.join(f'{name} {size:.3g} {unit}' for name, size, unit in sizes if size >= SHOWN)
-    return f'Without {them} an estimate is wrong by up to {words}.'
+    return ' '.join(filter(None, (f'Without {them} an estimate is wrong by up to {words}.', uncorrected)))
 
 
 def _law(discovery: RigConclusion) -> str:

@@ -401,18 +401,21 @@ def _proposals(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> di
 
 
 def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
-    """By how much at most the effects of ``fit`` make the estimates of the recordings wrong: dX m, dY m, theta rad.
+    """By how much at most the effects of ``fit`` that the daemon corrects for move estimates: dX m, dY m, theta rad.
 
     An effect on the load or the link moves the tip, and an estimate says rightly where it is.
     """
-    moving = [a for a in fit.effects if a.effect.stage not in STAGES or a.effect.name in SETUP]
+    moving = [a for a in fit.effects if a.effect.corrected != 'reading' or a.effect.name in SETUP]
     if len(moving) == len(fit.effects):
         return (0.0, 0.0, 0.0)
-    tables = ws.block_dots(ws.simulate([*ws.base, *fit.effects])), ws.block_dots(ws.simulate([*ws.base, *moving]))
+    tables = ws.simulate([*ws.base, *fit.effects]), ws.simulate([*ws.base, *moving])
     most = np.zeros(3)
-    for o, dots, nominal in zip(ws.observations, *tables, strict=True):
+    # In fine means: an estimate is of a moment, and the mean of a block in which the link swings is of none.
+    for o, count, *volts in zip(ws.observations, ws.count, *tables, strict=True):
+        rows = list(DOT_CHANNELS)
+        dots, nominal = (v[rows] * o.rig.sensitivities.reshape(4, 1) for v in volts)
         solver = solver_from_rig(o.rig.estimator.solver, o.rig)
-        there = np.isfinite(dots).all(axis=0) & np.isfinite(nominal).all(axis=0)
+        there = (count[rows] > 0.0).all(axis=0)
         variances = dot_noise_variances(o.rig) / o.rig.estimator.block_size
         poses = [solver.solve_many(d[:, there].T, variances).pose for d in (dots, nominal)]
         change = np.abs(poses[0] - poses[1])

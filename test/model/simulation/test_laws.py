@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import psd_deflection
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.cli.main import main
 from psd_deflection.measure.correction import Correction
 from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
@@ -26,6 +28,7 @@ from psd_deflection.model.simulation.laws import (
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
+from psd_deflection.studies.study import described
 
 RIG = load_rig()
 LOADS = np.repeat([[0.0, 0.0, 0.0], [20.0, -30.0, 10.0], [5.0, 10.0, -20.0], [0.0, 0.0, 0.0]], 150, axis=0)
@@ -137,6 +140,62 @@ def test_a_file_is_read_as_it_was_written_and_switched_on(tmp_path: Path, monkey
     volts = RigSimulator(rig, 1).step(LOADS).counts
     assert effects_of_rig(rig)[0].values['threshold1'] == 10.0
     assert np.any(volts != RigSimulator(RIG, 1).step(LOADS).counts)
+
+
+def test_a_law_travels_with_the_recording_and_the_rig_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ours, elsewhere = tmp_path / 'ours', tmp_path / 'elsewhere'
+    ours.mkdir()
+    elsewhere.mkdir()
+    law = Law(
+        'yielding', 'psd', 'y2', (LawTerm('product', ('y2', 'x2'), 3.0, sd={'coefficient': 0.1}),), 'the mount yields'
+    )
+    (ours / 'yielding.yaml').write_text(law_text(law))
+    monkeypatch.setenv(FOLDERS, str(ours))
+    by_hand = tmp_path / 'rig.yaml'
+    by_hand.write_text('/**:\n  ros__parameters:\n    effects:\n      e: {name: yielding, c1: 4.0}\n')
+    words = ['simulate', '--params-file', str(by_hand), '--loads', 'steps:0,0,0;9,-20,5:0.5']
+    for name in ('a', 'a.mcap'):
+        assert main([*words, '--out', str(tmp_path / name)]) == 0
+    seen = psd_deflection.replay(tmp_path / 'a')
+    # What discover writes for others.
+    (active,) = effects_of_rig(load_rig(by_hand))
+    model = tmp_path / 'model.yaml'
+    model.write_text(described(load_rig(by_hand), [active]))
+    monkeypatch.setenv(FOLDERS, str(elsewhere))
+    assert main(['replay', str(tmp_path / 'a'), '--compare']) == 0
+    assert 'no bit differs' in capsys.readouterr().out
+    for rig in (None, model):
+        again = psd_deflection.replay(tmp_path / 'a', rig)
+        np.testing.assert_array_equal(again.dy, seen.dy)
+    assert len(psd_deflection.replay(tmp_path / 'a.mcap').dy) == len(seen.dy)
+    assert np.any(psd_deflection.replay(tmp_path / 'a', RIG).dy != seen.dy)
+    (carried,) = effects_of_rig(load_rig(model))
+    assert carried.values == {'c1': 4.0}
+    assert carried.effect.law == active.effect.law
+    # A rig file that names it alone does not have it, and is told where it would be.
+    assert main(['replay', str(tmp_path / 'a'), '--params-file', str(by_hand)]) == 3
+    assert f'(one of your own is yielding.py or yielding.yaml in {elsewhere}, see {FOLDERS})' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('text', 'said'),
+    [
+        (
+            '{name: other, acts_on: y2, terms: [{form: product, of: [x2], coefficient: 1}]}',
+            "law: name = 'other': must be",
+        ),
+        ('{name: e, acts_on: y3, terms: []}', "law: acts_on = 'y3': unknown"),
+        ('[', 'law:2:1: malformed YAML'),
+        ('7', 'law: must be a map'),
+    ],
+)
+def test_a_malformed_law_in_a_rig_file_is_refused_with_its_key(text: str, said: str) -> None:
+    rig = load_rig(overrides={'effects.e.name': 'e', 'effects.e.c1': 1.0, 'effects.e.law': text})
+    with pytest.raises(ConfigError) as error:
+        effects_of_rig(rig)
+    assert str(error.value).startswith(f'effects.e.{said}')
 
 
 def test_units_and_words_are_those_of_the_variables() -> None:

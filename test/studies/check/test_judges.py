@@ -124,6 +124,14 @@ NAN = math.nan
         ((NAN, 1 / 9.80665, NAN), {1: 'N, and then converted from kg once more'}),
         ((NAN, NAN, 0.01), {2: 'N cm instead of N m'}),
         ((NAN, NAN, 100.0), {2: 'N m, and then converted from N cm once more'}),
+        # Beside forces in grams a torque has their unit if that fits, though newton centimetres are nearer.
+        ((9.80665e-3, 9.8e-3, 9.92e-3), {0: 'g instead of N', 1: 'g instead of N', 2: 'kg mm instead of N m'}),
+        ((1e-3, 1e-3, 9.88e-3), {0: 'mN instead of N', 1: 'mN instead of N', 2: 'N cm instead of N m'}),
+        ((NAN, NAN, 9.92e-3), {2: 'N cm instead of N m'}),
+        # Pounds of torque are asked for beside pounds of force alone.
+        ((4.45, 4.44, 1.36), {0: 'lbf instead of N', 1: 'lbf instead of N', 2: 'lbf ft instead of N m'}),
+        ((4.45, 4.44, 0.113), {0: 'lbf instead of N', 1: 'lbf instead of N', 2: 'lbf in instead of N m'}),
+        ((1.0, 1.0, 1.36), {}),
         # A digit of Young's modulus is no unit: the forces alone, by ten.
         ((10.0, 10.05, 1.0), {}),
         ((0.1, 0.1, 1.05), {}),

@@ -219,8 +219,8 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
     # Late by one fine block: no delay at all is looked for anyway.
     late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, 4, axis=0))])
     assert likely_delays(late) == pytest.approx([0.004, 0.008])
-    # Late or early by half of one: found from there or from the next.
-    for shift in (2, -2):
+    # Late or early by half of one, or by one sample: found from there or from the next.
+    for shift in (2, -2, 1, -1):
         late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0))])
         assert min(abs(delay - shift / 1000.0) for delay in likely_delays(late)) < 0.0025
     # The link follows its loads as simulated: nothing is late.
@@ -777,6 +777,27 @@ def test_the_answer_is_written_as_it_is(found: Discovery) -> None:
         f'µm, {found.floors:.2f} times what noise alone leaves ({1e6 * found.gap_floor:.3f} µm). '
         f'Fitted: sensor_rotation {size}. Without it an estimate is wrong by up to {off}.'
     )
+
+
+def named_as(name: str, **values: float) -> NamedEffect:
+    return NamedEffect(make_active(name, values, 'test'), {}, 0.0, 100.0, HeldOut(1.0, 0.1), (), (), (), None)
+
+
+def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery) -> None:
+    turned, lag = found.effects[0], named_as('amplifier_lag', time_constant=1e-4)
+    soft = named_as('bending_stiffness', scale=-0.02)
+    right = 'The estimates of the pose are right without; the simulated motion, and with it the wrench, is not.'
+    not_corrected = 'An estimate is not corrected for amplifier_lag.'
+    wrong = 'Without them an estimate is wrong by up to ΔX 1 µm, θ 2 µrad.'
+
+    def said_of(*effects: NamedEffect, moves: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> str:
+        return dataclasses.replace(found, effects=effects, moves=moves).sentences()[-1]
+
+    assert said_of(soft, moves=(1e-10, 1e-10, 9.9e-10)) == right
+    assert said_of(lag) == not_corrected
+    assert said_of(soft, lag) == not_corrected
+    assert said_of(turned, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
+    assert said_of(turned, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
 
 
 def test_places_are_told_if_one_in_twenty_by_chance(found: Discovery) -> None:

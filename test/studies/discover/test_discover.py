@@ -356,6 +356,23 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert [a.effect.name for a in effects_of_rig(load_rig(model))] == ['sensor_gain']
 
 
+@pytest.mark.parametrize(
+    ('effect', 'wrong'), [('sensor_rotation,psd=1,angle=0.02', True), ('amplifier_lag,time_constant=2e-4', False)]
+)
+def test_what_an_estimate_is_wrong_by_is_what_the_model_changes_in_a_replay(
+    effect: str, wrong: bool, tmp_path: Path
+) -> None:
+    assert main(['simulate', '--out', str(tmp_path / 'a'), '--loads', 'thesis:1', '--effect', effect]) == 0
+    found = psd_deflection.discover([tmp_path / 'a'])
+    (tmp_path / 'model.yaml').write_text(found.model_yaml())
+    without, corrected = (psd_deflection.replay(tmp_path / 'a', rig) for rig in (None, tmp_path / 'model.yaml'))
+    changed = [float(np.abs(getattr(corrected, axis) - getattr(without, axis)).max()) for axis in ('dx', 'dy', 'theta')]
+    # An estimate is of a moment; this is of the mean of a block, in which the link may swing.
+    assert found.moves == pytest.approx(changed, rel=0.2, abs=1e-12)
+    assert ('Without it an estimate is wrong by up to' in found.sentence) is wrong
+    assert ('An estimate is not corrected for amplifier_lag.' in found.sentence) is not wrong
+
+
 def test_a_bag_tells_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = tmp_path / 'short.yaml'
     short.write_text(described(replace_values(RIG, {'link.length': 0.4}), ()))

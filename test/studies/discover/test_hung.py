@@ -263,6 +263,28 @@ def test_a_few_milliseconds_late_are_found_beside_a_clamp_that_twists_under_the_
 
 
 @pytest.mark.statistics
+@pytest.mark.parametrize(('late', 'angle'), [(1, 0.02), (2, 0.02), (5, 0.02), (2, 0.06)])
+def test_a_few_milliseconds_late_are_found_beside_a_detector_that_is_turned_far(late: int, angle: float) -> None:
+    """Neither leaves next to nothing without the other, and stiffnesses would stand in for the delay."""
+    noted = np.vstack((np.zeros((late, 3)), HUNG[:-late]))
+    found = searched(read(HUNG, **{**TURNED, 'effects__e__angle': angle}), noted)
+    assert [f.name for f in found.setup] == ['load_delay']
+    assert found.setup[0].value == pytest.approx(1e-3 * late, abs=1e-5)
+    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
+    assert found.effects[0].active.values['angle'] == pytest.approx(angle, abs=2e-5)
+    assert (found.verdict, found.unknown, found.law) == ('effects_found', (), None)
+    assert found.floors < 1.05
+
+
+@pytest.mark.statistics
+def test_loads_that_are_one_sample_late_are_told() -> None:
+    found = searched(read(HUNG), np.vstack((np.zeros((1, 3)), HUNG[:-1])))
+    assert [f.name for f in found.setup] == ['load_delay']
+    assert found.setup[0].value == pytest.approx(0.001, abs=1e-5)
+    assert (found.verdict, found.effects) == ('nothing_missing', ())
+
+
+@pytest.mark.statistics
 def test_a_spot_that_is_clipped_at_the_ends_of_the_swing_alone_is_found() -> None:
     """For moments a dot is far off: the fourth reading, in which an outlier counts little, acquits nothing then."""
     clipped = {'effects__e__name': 'spot_clipping', 'effects__e__psd': 1, 'effects__e__radius': 2e-3}

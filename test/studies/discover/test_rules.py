@@ -654,6 +654,14 @@ def test_a_remainder_is_unknown_from_stated_limits_on(p: float, excess: float, e
         assert got[0].remains
 
 
+@pytest.mark.parametrize(('gap', 'unknown'), [(0.5, False), (2.0, False), (2.01, True)])
+def test_nothing_is_unknown_that_noise_alone_would_leave(gap: float, unknown: bool) -> None:
+    """In micrometres, of which noise leaves two."""
+    assert bool(unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 1e-6 * gap, 2e-6)) is unknown
+    # Of a machine whose noise nobody knows.
+    assert unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 1e-6 * gap, math.inf)
+
+
 def test_an_unknown_is_described_by_what_it_follows() -> None:
     def words(*d: tuple[str, float]) -> str:
         depends = tuple(Dependence('x2', name, gain, 1e-6) for name, gain in d)

@@ -33,6 +33,7 @@ NEARLY_ALL = 0.01
 """A mistake of the set-up is taken before any effect if it alone leaves less than this share of the chi-square beyond
 noise."""
 OTHER_RATES = (-0.2, -0.1, -0.04, 0.04, 0.1, 0.25)
+LATE = 'load_delay'
 RINGING = ('bending_frequency', 'torsion_frequency')
 """Mistakes about the natural frequencies, which may be wrong both."""
 OTHER_FREQUENCIES, RINGS = (-0.1, -0.05, -0.02, 0.02, 0.05, 0.1), 0.005
@@ -350,17 +351,36 @@ class Search:
         return self._best_of(starts, 2, 6) if current.effects else self._best_of(starts, 4, 12)
 
     def mistake(self, null: Fit, scores: Sequence[Score]) -> Fit:
-        """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``."""
+        """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``.
+
+        Late loads may be taken with one effect, if they explain nearly all together: each would hide the other.
+        """
         if not scores or min(s.p for s in scores) > self.workspace.p_accept:
             return null
         found = self._best_of(self._mistaken(null, scores), 2, 12)
+        if not self._nearly_all(null, found):
+            found = self._late_beside_an_effect(null, scores)
+        if found is None or not self._nearly_all(null, found) or _is_a_mass(found):
+            return null
+        self._say('the set-up: ' + ', '.join(a.label for a in found.effects))
+        return found
+
+    def _nearly_all(self, null: Fit, found: Fit | None) -> bool:
+        """Whether ``found`` passes and leaves next to nothing."""
         size = self.workspace.size
         if found is None or not self.passes(null, found, null):
-            return null
-        if found.chi2 - size > NEARLY_ALL * (null.chi2 - size) or _is_a_mass(found):
-            return null
-        self._say('the set-up: ' + found.effects[-1].label)
-        return found
+            return False
+        return found.chi2 - size <= NEARLY_ALL * (null.chi2 - size)
+
+    def _late_beside_an_effect(self, null: Fit, scores: Sequence[Score]) -> Fit | None:
+        """Late loads with the best effect beside them."""
+        late = [s for s in scores if s.candidate.effect.name == LATE and s.p <= self.workspace.p_accept]
+        alone = self._best_of([[s.candidate.from_coefficients(s.coefficients)] for s in late], 1, 6)
+        if alone is None or not self.passes(null, alone, null):
+            return None
+        others = self.screen.score(alone.residual, unbound(alone))
+        both = self._further(alone, [s for s in others if s.candidate.effect.name not in self.workspace.first])
+        return both if both is not None and self.passes(alone, both, null) else None
 
     def _mistaken(self, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
         """The starts of :meth:`mistake`."""

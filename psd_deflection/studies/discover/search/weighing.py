@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -171,6 +172,9 @@ def unknown_of(
     ``worded``: a gap with its unit.
     """
     if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
+        return ()
+    if 0.0 < gap <= floor < math.inf:
+        # Noise alone leaves more.
         return ()
     strong = [d for d in left.dependences if d.p < 1e-3][:6]
     size = _beyond(gap, floor)

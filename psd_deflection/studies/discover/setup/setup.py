@@ -38,7 +38,7 @@ SMALL = 1e-4
 """m and rad; movements up to this size are in proportion to the load."""
 SHARE = 0.01
 """By that a load is made larger, to see how the readings go with it."""
-LEAST_S, FARTHEST_S = 0.001, 1.0
+LEAST_S, FARTHEST_S = 0.0005, 1.0
 """Shortest and longest delay of the loads that is looked for."""
 
 
