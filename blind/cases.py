@@ -22,6 +22,8 @@ from blind.generator import Array, Generator
 BLOCK = 20
 FLOOR = generator.SIGMA * generator.MM_PER_V / math.sqrt(BLOCK)
 SIZES = (1.0, 3.0, 10.0)
+NOISES = ('heavy', 'coloured', 'loud', 'flicker')
+"""Other noise than the rig file's."""
 
 SHOWS_ACROSS_LENGTHS = frozenset(
     (
@@ -295,7 +297,7 @@ def all_cases(
             for seed in range(first, first + 2):
                 yield Case(f'alien-{name}-{gap:g}-{seed}', 'alien', 'one', ((name, gap),))
     for i in range(first, first + wrong):
-        yield Case(f'wrong-{i}', 'wrong', 'one', (), noise=('heavy', 'coloured', 'loud')[i % 3])
+        yield Case(f'wrong-{i}', 'wrong', 'one', (), noise=NOISES[i % len(NOISES)])
     for i in range(first, first + nulls):
         yield Case(f'null-{i}', 'null', 'one', ())
     yield from hard_cases(first, spreads, mistakes)
@@ -390,5 +392,5 @@ def short_cases() -> list[Case]:
     out.append(Case('spread-s', 'spread', 'one', (('sensor_rotation', 3.0), ('load_direction', 300.0))))
     out.append(Case('mistake-s', 'mistake', 'one', (), mistake=('link_length', 1.02)))
     out += [Case(f'null-s{i}', 'null', 'one', ()) for i in range(3)]
-    out += [Case(f'wrong-s{i}', 'wrong', 'one', (), noise=k) for i, k in enumerate(('heavy', 'coloured', 'loud'))]
+    out += [Case(f'wrong-s{i}', 'wrong', 'one', (), noise=k) for i, k in enumerate(NOISES)]
     return out

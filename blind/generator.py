@@ -359,8 +359,12 @@ def output(volts: Array, effects: Sequence[Spec], bits: int = 16) -> Array:
 
 
 def noise(n: int, kind: str, seed: int) -> Array:
-    """(n, 6) V: ``white``, ``heavy`` (Student's t, 4 degrees), ``coloured`` (AR 0.5), ``loud`` (1.5 sigma)."""
+    """(n, 6) V: ``white``, ``heavy`` (Student's t, 4 degrees), ``coloured`` (AR 0.5), ``loud`` (1.5 sigma), ``flicker``
+    (white, and 1/f noise that is as much at 0.3 to 30 Hz).
+    """
     rng = np.random.default_rng(seed)
+    if kind == 'flicker':
+        return SIGMA * flicker(n, math.exp(rng.uniform(math.log(0.3), math.log(30.0))), rng)
     if kind == 'heavy':
         return SIGMA * rng.standard_t(4, size=(n, 6)) / math.sqrt(2.0)
     e = rng.normal(size=(n, 6))
@@ -373,6 +377,17 @@ def noise(n: int, kind: str, seed: int) -> Array:
             out[i] = 0.5 * out[i - 1] + math.sqrt(0.75) * e[i]
         return SIGMA * out
     return SIGMA * e
+
+
+def flicker(n: int, corner: float, rng: np.random.Generator) -> Array:
+    """(n, 6): white noise of unit variance, and 1/f noise whose density is as much at ``corner`` Hz.
+
+    A part of a noise four times as long: its ends do not meet.
+    """
+    spectrum = np.fft.rfft(rng.normal(size=(4 * n, 6)), axis=0)
+    f = np.fft.rfftfreq(4 * n, 1.0 / RATE)
+    f[0] = f[1]
+    return np.asarray(np.fft.irfft(spectrum * np.sqrt(1.0 + corner / f)[:, None], 4 * n, axis=0)[:n])
 
 
 def jitter(volts: Array, effects: Sequence[Spec], seed: int) -> Array:

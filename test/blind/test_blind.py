@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from blind import generator, run, score
-from blind.cases import MISTAKES, Case, all_cases, designs, gap_of, scaled, short_cases
+from blind.cases import MISTAKES, NOISES, Case, all_cases, designs, gap_of, scaled, short_cases
 from blind.mistakes import observed
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
@@ -65,7 +65,7 @@ def test_a_hidden_effect_is_named(key: str) -> None:
     assert found.simulations <= 2000
 
 
-@pytest.mark.parametrize('noise', ['white', 'heavy', 'coloured', 'loud'])
+@pytest.mark.parametrize('noise', ['white', *NOISES])
 def test_nothing_is_missing_from_noise_of_any_kind(noise: str) -> None:
     answer, _ = run.answer(Case(f'slice-{noise}', 'null', 'one', (), noise=noise), [])
     assert answer['verdict'] == 'nothing_missing'

@@ -27,7 +27,9 @@ CLEAR = 0.5
 makes a drift of noise.
 """
 WIDER = 1.3
-"""How much larger than the light's, and than the second smallest of the dots', a channel's corner may be."""
+"""How much larger than those of the lights, and than the second smallest of the dots, a channel's corner may be."""
+APART = 4.0
+"""How much larger than that of the other light the corner of one may be."""
 LEAST_VALUES = 64
 """Of a recording and channel."""
 SUMS = (2, 5)
@@ -46,8 +48,8 @@ def corners_of(parts: Sequence[FloatArray], periods: Sequence[float]) -> FloatAr
     # What moves three of the dots, or one light, alone is more than this noise.
     if light.sum(axis=0).max() < CLEAR or light.max(axis=1).min() <= 0.0 or dots[1] == 0.0:
         return np.zeros(6)
-    most = WIDER * float(own[list(SUMS)].max())
-    return np.asarray(np.minimum(own, min(most, WIDER * dots[1])))
+    low, high = np.sort(own[list(SUMS)])
+    return np.asarray(np.minimum(own, WIDER * min(high, APART * low, dots[1])))
 
 
 def _gains(rows: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
