@@ -246,6 +246,20 @@ def _settled(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
     return ws, fit
 
 
+def settled(problem: Problem) -> Problem:
+    """With the free loads as the effects ask for that hold, if not all that were searched do."""
+    ws = workspace_of(problem.comparison)
+    if not ws.free_loads or problem.fit is problem.result.fit:
+        return problem
+    ws, fit = _settled(ws, problem.fit)
+    null = refit(ws, ())
+    return replace(problem, search=problem.search.at(ws), fit=fit if fit.effects else null, null=null)
+
+
+SEARCH = (search, hung, weigh, settled)
+"""The search with its verdict, of the loads as they are."""
+
+
 def searched(problem: Problem) -> Problem:
     """The search with its verdict: with the loads as noted, or free if they were noted wrong."""
     machine = rig_of(problem)
@@ -254,7 +268,7 @@ def searched(problem: Problem) -> Problem:
         freed = _freed(problem)
         if freed is not None and freed.comparison.gap(freed.fit.difference) < UNSAID * freed.comparison.floor():
             return freed
-    for step in (search, hung, weigh):
+    for step in SEARCH:
         problem = step(problem)
     freed = _freed(problem)
     before = problem.comparison.gap(problem.fit.difference)
@@ -327,7 +341,7 @@ def _freed(problem: Problem, *, maybe_rounded: bool = False) -> Problem | None:
     freed = recordings_ready.freed(recorded, recordings_ready.beside(ws, observations, recorded.known))
     recorded = replace(recorded, fourth=fourth_reading(freed, freed.residual(freed.base)[0]))
     other = replace(machine, recorded=recorded, workspace=freed, bank=SignatureBank(), proposals=_proposals(freed))
-    return solve(other, (search, hung, weigh), problem.seed, problem.progress, problem.rng)
+    return solve(other, SEARCH, problem.seed, problem.progress, problem.rng)
 
 
 def law(problem: Problem) -> Problem:
