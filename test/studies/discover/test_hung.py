@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -13,10 +14,14 @@ from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.rig.parameter_files import flat_parameters
-from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.discover import RecordedRig, discover, settled
 from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
 from psd_deflection.studies.discover.result import Discovery
+from psd_deflection.studies.discover.search.fit import refit
+from psd_deflection.studies.discover.search.free import moved
+from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.redundant import excess
 
@@ -325,3 +330,25 @@ def test_the_only_torque_noted_twice_is_told_with_the_clamp_that_twists() -> Non
     assert 'clamp_torsional_compliance' in (effect.active.effect.name, *effect.equivalent)
     assert found.verdict == 'effects_found'
     assert found.law is None
+
+
+def test_free_times_are_settled_again_if_an_effect_beside_which_they_were_does_not_hold() -> None:
+    noted = np.tile(LEVELS[0], (len(HUNG), 1))
+    for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
+        noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
+    machine = RecordedRig.of([Observation('x', RIG, read(HUNG), noted)], RIG, (), None, lambda _: None)
+    problem = Problem.of(machine, 0, lambda _: None, np.random.default_rng(0))
+    ws = machine.workspace
+    assert ws.free is not None
+    # As beside a lag of 0.25 ms.
+    more = [(d, 1.0) for d in ws.free.directions]
+    off = ws._loaded(more).replaced(free=replace(ws.free, directions=moved(more)))
+    fit = refit(off, ())
+    assert off.gap(fit.difference) > 3.0 * off.floor()
+    dropped = replace(problem, search=problem.search.at(off), fit=fit)
+    again = settled(dropped)
+    assert again.comparison.gap(again.fit.difference) < 1.05 * off.floor()
+    assert again.fit is again.null
+    # If all effects hold, they were settled beside these.
+    same = replace(dropped, result=SearchResult(fit, fit))
+    assert settled(same) is same
