@@ -58,16 +58,19 @@ def noise_findings(
     return [found], {'amplifier.noise': level}
 
 
-def step_findings(rig: Rig, steps: FloatArray) -> tuple[list[Finding], dict[str, object]]:
+def step_findings(rig: Rig, steps: FloatArray, *, finer: bool = False) -> tuple[list[Finding], dict[str, object]]:
     """Channels whose converter steps more coarsely than the rig file says; lines that put it right.
 
-    ``steps`` (6,), V, of the device's channels, 0 where they are the rig file's.
+    ``steps`` (6,), V, of the device's channels, 0 where they are the rig file's. ``finer``: some channels are seen to
+    have these.
     """
     if not steps.any():
         return [], {}
     own = rig.converter.volts_per_count
     bits = rig.converter.bits - round(math.log2(float(steps.max()) / own))
-    right: dict[str, object] = {'converter.bits': bits} if LEAST_BITS <= bits < rig.converter.bits else {}
+    # There is one number of bits for all channels.
+    told = not finer and LEAST_BITS <= bits < rig.converter.bits
+    right: dict[str, object] = {'converter.bits': bits} if told else {}
     findings = []
     for name, step in zip(CHANNELS, steps.tolist(), strict=True):
         if step:

@@ -85,7 +85,7 @@ def discover(
         **fields_of(problem),
         setup=problem.setup,
         values=problem.values,
-        known=machine.recorded.known,
+        known=machine.recorded.stated,
         law=problem.law if problem.unknown else None,
         rivals=problem.rivals,
         unsettled=problem.unsettled,
@@ -382,15 +382,16 @@ def set_up(problem: Problem) -> Problem:
     named = [n for n in problem.named if n.name not in SETUP or n.name in RIG_NUMBERS]
     if machine.recorded.lattice is None:
         setup += noise_findings(ws.observations[0].rig, noise_of(ws))[0]
-    else:
+    elif not machine.recorded.lattice_stated:
         lattice = machine.recorded.lattice
         named.append(_named_lattice(ws, lattice))
         step = float(lattice.values[lattice.effect.lattice])
         # The effect stands for the line: with both, the steps would be counted twice.
         steps = np.full(len(CHANNELS), step)
-        if not lattice.effect.steps_sums(lattice.values):
+        finer = not lattice.effect.steps_sums(lattice.values)
+        if finer:
             steps[[c for c in range(len(CHANNELS)) if c not in DOT_CHANNELS]] = 0.0
-        setup += step_findings(ws.observations[0].rig, steps)[0]
+        setup += step_findings(ws.observations[0].rig, steps, finer=finer)[0]
     return replace(
         problem,
         named=tuple(named),

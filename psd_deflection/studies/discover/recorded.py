@@ -23,7 +23,7 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.free import Direction, LoadDirection, ZeroDirection
-from psd_deflection.studies.discover.search.proposals import coarse_step
+from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_step
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
@@ -49,7 +49,8 @@ MOST_MEASURED = 40
 class Recorded:
     """``observations`` of the ``rig``, whose file has the effects ``known``. ``without``: effects that are not looked
     for. ``findings``: what was wrong, with ``values`` that put the rig file right. ``stated_gap``: m, before loads and
-    wiring were put right, 0 if they were right. ``lattice``: the effect of coarse steps that the readings show.
+    wiring were put right, 0 if they were right. ``lattice``: the effect of coarse steps that the readings show;
+    ``lattice_stated``: the rig file has it.
     ``delays``: by how much the loads may be noted late, s. ``mended``: of each recording, its loads as they were put
     right, if they were. ``wrong``: where another load hung than noted; it is free.
     ``fourth``: what the readings say of themselves.
@@ -63,10 +64,16 @@ class Recorded:
     values: Mapping[str, object] = field(default_factory=dict)
     stated_gap: float = 0.0
     lattice: ActiveEffect | None = None
+    lattice_stated: bool = False
     delays: tuple[float, ...] = ()
     mended: tuple[MendedLoads | None, ...] = ()
     wrong: tuple[Plateau, ...] = ()
     fourth: FourthReading | None = None
+
+    @property
+    def stated(self) -> tuple[ActiveEffect, ...]:
+        """The effects that the rig file has."""
+        return (*self.known, self.lattice) if self.lattice is not None and self.lattice_stated else self.known
 
     @property
     def physics(self) -> Physics:
@@ -110,22 +117,30 @@ def put_right(recorded: Recorded) -> Recorded:
 def snapped(recorded: Recorded) -> Recorded:
     """With the coarse steps of the converter, if all readings lie on such, or all positions."""
     effects = [e for e in catalogue().values() if e.lattice and e.name not in recorded.without]
-    if not effects or any(a.effect.lattice for a in recorded.known):
+    stated = [a for a in recorded.known if a.effect.lattice]
+    step = _common_step(recorded.observations) if effects or stated else None
+    if step is None:
         return recorded
-    found = [coarse_step(o) for o in recorded.observations]
-    steps = [s for s in found if s is not None]
-    if len(steps) < len(found):
-        return recorded
-    effect = effects[0]
-    # The recording with the widest range of values determines it best.
-    step = min(steps, key=lambda s: s.sd)
-    sums = all(s.sums for s in steps)
-    choice = next(v for v in effect.variants() if effect.steps_sums(v) == sums)
-    values = {**effect.off_values(recorded.physics, choice), effect.lattice: step.step}
     # The converter has rounded each reading once more.
-    rows = list(range(len(CHANNELS)) if sums else DOT_CHANNELS)
+    rows = list(range(len(CHANNELS)) if step.sums else DOT_CHANNELS)
     observations = tuple(_with_volts(o, _on_steps(o.volts, rows, step.step)) for o in recorded.observations)
+    if stated:
+        known = tuple(a for a in recorded.known if a is not stated[0])
+        return replace(recorded, observations=observations, known=known, lattice=stated[0], lattice_stated=True)
+    effect = effects[0]
+    choice = next(v for v in effect.variants() if effect.steps_sums(v) == step.sums)
+    values = {**effect.off_values(recorded.physics, choice), effect.lattice: step.step}
     return replace(recorded, observations=observations, lattice=ActiveEffect(effect, values))
+
+
+def _common_step(observations: Sequence[Observation]) -> CoarseStep | None:
+    """That of all recordings, None if one has none."""
+    found = [coarse_step(o) for o in observations]
+    steps = [s for s in found if s is not None]
+    if not steps or len(steps) < len(found):
+        return None
+    # The recording with the widest range of values determines it best.
+    return min(steps, key=lambda s: s.sd)._replace(sums=all(s.sums for s in steps))
 
 
 def _on_steps(volts: FloatArray, rows: list[int], step: float) -> FloatArray:

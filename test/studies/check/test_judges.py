@@ -258,6 +258,10 @@ def test_each_doubling_of_the_step_is_a_bit_less(bits: int, step: float, right: 
     told = f'sum1 steps by {words}'
     if words:
         assert found.fix == (told if right is None else f'converter.bits: {right} ({told})')
+    # If other channels are finer, no number of bits is right for all.
+    (found,), lines = judges.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]), finer=True)
+    assert lines == {}
+    assert not found.fix.startswith('converter.bits')
 
 
 def test_a_unit_has_the_evidence_that_is_told_or_none() -> None:

@@ -248,8 +248,16 @@ def test_positions_that_step_alone_accuse_no_cable(step: float) -> None:
     assert [(e.name, e.values['sums']) for e in found.effects] == [('quantisation', 0.0)]
     assert found.effects[0].values['step'] == pytest.approx(step, rel=1e-5)
     assert [(f.name, f.where) for f in found.setup] == [('converter_step', c) for c in ('x1', 'y1', 'x2', 'y2')]
+    # A line for the bits would make the sums coarse, too.
+    assert not any(f.fix.startswith('converter.bits') for f in found.setup)
     assert found.verdict == 'effects_found'
     assert found.law is None
+    # With the model that has them, nothing is missing: no noise, no steps.
+    own = replace_values(RIG, {f'effects.q.{name}': v for name, v in found.effects[0].values.items()})
+    again = discover([Observation('x', replace_values(own, {'effects.q.name': 'quantisation'}), volts, HUNG)])
+    assert (again.verdict, again.setup, again.effects) == ('nothing_missing', (), ())
+    assert [a.effect.name for a in again.known] == ['quantisation']
+    assert again.floors < 1.1
 
 
 @pytest.mark.statistics
