@@ -32,6 +32,7 @@ from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap, heldout_residual
 from psd_deflection.studies.discover.search.localise import (
     NOWHERE,
+    Cell,
     Dependence,
     Localisation,
     _energies,
@@ -660,6 +661,10 @@ def test_nothing_is_unknown_that_noise_alone_would_leave(gap: float, unknown: bo
     assert bool(unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 1e-6 * gap, 2e-6)) is unknown
     # Of a machine whose noise nobody knows.
     assert unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 1e-6 * gap, math.inf)
+    # Hum is in no mean of a block, and no gap has it.
+    for low, p, told in ((25.0, 0.009, True), (25.0, 0.011, unknown), (17.0, 0.009, unknown)):
+        hum = Cell('x1', 0, (0.0, 1.0), (low, 60.0), (), 9.0, p, 50.0)
+        assert bool(unknown_of(nowhere(p=0.0, excess=100.0, cells=(hum,)), 0.0, 1e-6 * gap, 2e-6)) is told
 
 
 def test_an_unknown_is_described_by_what_it_follows() -> None:

@@ -31,6 +31,8 @@ STEPS_SHARE = 0.02
 """Coarse steps cause noise that varies with the signal; up to this share of what they explain it is nothing else."""
 UNSAID = 1.5
 """A gap of more floors than this never remains without being reported as unknown."""
+BLOCKS_HZ = 25.0
+"""What is faster is in no mean of a block, and so in no gap."""
 RIVAL_BIC = 10.0
 """An effect in place of the named one counts as its rival up to this loss in BIC."""
 
@@ -173,7 +175,8 @@ def unknown_of(
     """
     if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
         return ()
-    if 0.0 < gap <= floor < math.inf:
+    fast = any(c.p < 0.01 and c.band[0] >= BLOCKS_HZ for c in left.cells)
+    if 0.0 < gap <= floor < math.inf and not fast:
         # Noise alone leaves more.
         return ()
     strong = [d for d in left.dependences if d.p < 1e-3][:6]
