@@ -12,7 +12,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.localise import NOWHERE, Localisation
+from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Localisation
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST
@@ -86,7 +86,9 @@ def test_nothing_is_missing_in_noise() -> None:
 def test_what_remains_somewhere_is_unknown_and_takes_weak_effects_with_it() -> None:
     shown = pictures(A)
     plant = Plant(shown, without_noise((shown[A], 200.0)) + noise())
-    left = nowhere(p=0.0, excess=900.0)
+    # Faster than blocks, so that no gap has it.
+    fast = Cell('x1', 0, (0.0, 1.0), (25.0, 60.0), (), 9.0, 0.0, 900.0)
+    left = nowhere(p=0.0, excess=900.0, cells=(fast,))
     last = solve(Library(plant, left), STEPS, 0, lambda _: None)
     assert (fields_of(last)['verdict'], names(last.fit), last.left) == ('unknown_effect', [], left)
     assert last.search.trace[-1].endswith('explains less than what remains unknown')
