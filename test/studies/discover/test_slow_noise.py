@@ -7,6 +7,7 @@ import functools
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.simulator import ForwardModel
@@ -35,14 +36,9 @@ def flicker(n: int, period: float, corner: float, seed: int, channels: int = 6) 
         a = np.exp(-pole * period)
         # A process of variance v has the density 4 v / pole / (1 + (f / f0)^2); their sum is v times 4.5 / f.
         v = corner * np.log(ratio) * 2.0 * period
-        x = rng.normal(size=channels) * np.sqrt(v)
         new = rng.normal(size=(n, channels)) * np.sqrt(v * (1.0 - a * a))
-        if a * a > 0.0:
-            for i in range(n):
-                x = a * x + new[i]
-                out[i] += x
-        else:
-            out += new
+        before = a * np.sqrt(v) * rng.normal(size=(1, channels))
+        out += lfilter([1.0], [1.0, -a], new, axis=0, zi=before)[0]
     return out
 
 
