@@ -153,8 +153,7 @@ def few_products(spec: str, operands: Sequence[AnyFloats]) -> FewProducts | None
         if len(kept) >= _MOST_SHAPES:
             kept.clear()
         turns, summed = plan(spec)
-        # take() wants the indices of the machine, which has 32 bits in a browser.
-        own = [np.arange(a.size, dtype=np.intp).reshape(a.shape) for a in operands]
+        own = [np.arange(a.size).reshape(a.shape) for a in operands]
         views = [(a if axes is None else a.transpose(axes))[at] for (axes, at), a in zip(turns, own, strict=True)]
         table = np.broadcast_shapes(*[view.shape for view in views])
         few = len(views) > 1 and prod(table[:summed]) > 1 and 0 < prod(table) <= _FEW
