@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 
 from psd_deflection.base.arithmetic.elementary import FixedFunctions
@@ -11,7 +9,6 @@ from psd_deflection.base.arithmetic.library import ComplexArray
 from psd_deflection.base.arithmetic.matrices import (
     AT_ONCE,
     AnyFloats,
-    few_products,
     in_pairs,
     orthogonal,
     pivots,
@@ -27,33 +24,12 @@ _NEWTON_STEPS = 8
 _SWEEPS = 30
 """Jacobi's method doubles its digits in each sweep; ten are more than enough for a hundred unknowns."""
 
-_PRODUCTS = {
-    (1, 1): 'm,m->',
-    (1, 2): 'm,mb->b',
-    (2, 1): 'am,m->a',
-    (2, 2): 'am,mb->ab',
-    (3, 1): 'nam,m->na',
-    (3, 2): 'nam,mb->nab',
-}
-"""Matrix products by the dimensions of the factors."""
-
-
-@cache
-def _to_front(dimensions: int, axis: int) -> tuple[int, ...]:
-    """The axes with one of them first."""
-    order = list(range(dimensions))
-    order.insert(0, order.pop(axis))
-    return tuple(order)
-
 
 class FixedArithmetic(FixedFunctions):
     """Sums in an order that stands in :mod:`psd_deflection.base.arithmetic.matrices`."""
 
     def einsum(self, spec: str, *operands: AnyFloats) -> FloatArray:
         """See :class:`Arithmetic`. Factors from the left; sums as in :func:`in_pairs`, indices as ``spec`` has them."""
-        few = few_products(spec, operands)
-        if few is not None:
-            return few.of(operands)
         turns, summed = plan(spec)
         views = [(a if axes is None else a.transpose(axes))[at] for (axes, at), a in zip(turns, operands, strict=True)]
         if summed == 1 and max([a.size for a in operands]) > AT_ONCE:
@@ -70,12 +46,17 @@ class FixedArithmetic(FixedFunctions):
 
     def sum(self, values: FloatArray, axis: int) -> FloatArray:
         """See :class:`Arithmetic`."""
-        # np.moveaxis costs more than the sum of a block.
-        return in_pairs(values.transpose(_to_front(values.ndim, axis)) if axis else values)
+        if axis:
+            # np.moveaxis, which costs more than the sum of a block.
+            order = list(range(values.ndim))
+            order.insert(0, order.pop(axis))
+            values = values.transpose(order)
+        return in_pairs(values)
 
     def product(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`."""
-        return self.einsum(_PRODUCTS[np.ndim(a), np.ndim(b)], a, b)
+        left, right = 'nam'[3 - np.ndim(a) :], 'mb'[: np.ndim(b)]
+        return self.einsum(f'{left},{right}->{left[:-1]}{right[1:]}', a, b)
 
     def solve(self, a: FloatArray, b: FloatArray) -> FloatArray:
         """See :class:`Arithmetic`. By elimination; the row with the largest number of the column is next."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from functools import cache
-from math import inf, prod, sqrt
+from math import inf, sqrt
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import FloatArray
 
 AnyFloats = npt.NDArray[np.floating[Any]]
 
@@ -21,8 +21,6 @@ _MARGIN = 1e-13
 """Of the largest element, times the square of the number of unknowns: 500 times the rounding of one operation."""
 _SMALL = 1 << 12
 """Numbers of rows up to which the partial sums have places that are kept: at most 32 kB a shape."""
-_FEW = 1 << 9
-"""Products up to which :class:`FewProducts` makes them."""
 _MOST_SHAPES = 256
 """Shapes of which they are kept. Blocks with gaps have as many lengths as they have samples."""
 
@@ -59,34 +57,17 @@ def in_pairs(rows: AnyFloats) -> FloatArray:
     calls.
     """
     rest = np.asarray(rows, dtype=np.float64)
+    if len(rest) < 2:
+        return np.asarray(rest[0]) if len(rest) else np.zeros(rest.shape[1:])
     kept = _KEPT.by_shape
     scratch = kept.get(rest.shape)
     if scratch is None:
-        if len(rest) < 2:
-            return np.asarray(rest[0]) if len(rest) else np.zeros(rest.shape[1:])
         scratch = _Scratch(rest.shape)
         if rest.size <= _SMALL:
             if len(kept) >= _MOST_SHAPES:
                 kept.clear()
             kept[rest.shape] = scratch
     return scratch.sum(rest)
-
-
-_Turn = tuple[FloatArray, FloatArray, FloatArray]
-"""Two arrays, and where their sum goes."""
-
-
-def _turns(rest: FloatArray) -> tuple[list[_Turn], FloatArray]:
-    """What is added in turn until one row of ``rest`` is left, and where that is."""
-    turns: list[_Turn] = []
-    while (count := len(rest)) > 1:
-        half = count // 2
-        pairs = np.empty((half, *rest.shape[1:]))
-        turns.append((rest[:half], rest[half : 2 * half], pairs))
-        if count & 1:
-            turns.append((pairs[0, ...], rest[-1, ...], pairs[0, ...]))
-        rest = pairs
-    return turns, rest[0, ...]
 
 
 class _Scratch:
@@ -97,76 +78,34 @@ class _Scratch:
         count = shape[0]
         self._half = count // 2
         self._both = 2 * self._half
-        self._first = np.empty((self._half, *shape[1:]))
-        self._odd = self._first[0, ...] if count & 1 else None
-        self._turns, self._last = _turns(self._first)
+        self._first = rest = np.empty((self._half, *shape[1:]))
+        self._odd = rest[0, ...] if count & 1 else None
+        self._turns: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+        while (count := len(rest)) > 1:
+            half = count // 2
+            pairs = np.empty((half, *shape[1:]))
+            self._turns.append((rest[:half], rest[half : 2 * half], pairs))
+            if count & 1:
+                self._turns.append((pairs[0, ...], rest[-1, ...], pairs[0, ...]))
+            rest = pairs
+        self._last = rest[0, ...]
 
     def sum(self, rows: FloatArray) -> FloatArray:
         """Of rows of that shape."""
-        half, both, add = self._half, self._both, np.add
-        add(rows[:half], rows[half:both], self._first)
+        half, both = self._half, self._both
+        np.add(rows[:half], rows[half:both], self._first)
         if self._odd is not None:
-            add(self._odd, rows[-1], self._odd)
+            np.add(self._odd, rows[-1], self._odd)
         for a, b, pairs in self._turns:
-            add(a, b, pairs)
+            np.add(a, b, pairs)
         return self._last.copy()
-
-
-class FewProducts:
-    """The sum of the products of some operands, of few numbers. To go through them index by index costs numpy most.
-
-    So the numbers of each operand are first put in the order in which the table of all products has them.
-    """
-
-    def __init__(self, views: Sequence[IntArray], summed: int) -> None:
-        """``views``: of each operand the places of its numbers, turned as :func:`plan` has it; two operands or more."""
-        shape = np.broadcast_shapes(*[view.shape for view in views])
-        self._places = [self._in_order(np.broadcast_to(view, shape).ravel(), view.size) for view in views]
-        self._products = np.empty(prod(shape))
-        self._turns, self._last = _turns(self._products.reshape(-1, *shape[summed:]))
-
-    @staticmethod
-    def _in_order(places: IntArray, count: int) -> IntArray | None:
-        """None if they are all the operand's numbers in turn."""
-        return None if np.array_equal(places, np.arange(count)) else places
-
-    def of(self, operands: Sequence[AnyFloats]) -> FloatArray:
-        """Factors from the left; sums as in :func:`in_pairs`."""
-        first, *factors = [
-            operand.ravel() if places is None else operand.take(places)
-            for operand, places in zip(operands, self._places, strict=True)
-        ]
-        for factor in factors[:-1]:
-            first = first * factor
-        np.multiply(first, factors[-1], self._products)
-        add = np.add
-        for a, b, pairs in self._turns:
-            add(a, b, pairs)
-        return self._last.copy()
-
-
-def few_products(spec: str, operands: Sequence[AnyFloats]) -> FewProducts | None:
-    """None where the numbers are many, where nothing is summed, and of one operand."""
-    kept = _KEPT.few
-    key = (spec, *[a.shape for a in operands])
-    if key not in kept:
-        if len(kept) >= _MOST_SHAPES:
-            kept.clear()
-        turns, summed = plan(spec)
-        own = [np.arange(a.size).reshape(a.shape) for a in operands]
-        views = [(a if axes is None else a.transpose(axes))[at] for (axes, at), a in zip(turns, own, strict=True)]
-        table = np.broadcast_shapes(*[view.shape for view in views])
-        few = len(views) > 1 and prod(table[:summed]) > 1 and 0 < prod(table) <= _FEW
-        kept[key] = FewProducts(views, summed) if few else None
-    return kept[key]
 
 
 class _Kept(threading.local):
-    """``by_shape``, ``few``: what this thread has; another one would write into it."""
+    """``by_shape``: what this thread has; another one would write into it."""
 
     def __init__(self) -> None:
         self.by_shape: dict[tuple[int, ...], _Scratch] = {}
-        self.few: dict[tuple[object, ...], FewProducts | None] = {}
 
 
 _KEPT = _Kept()
