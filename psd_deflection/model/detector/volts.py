@@ -44,7 +44,7 @@ class VoltsToDots:
 
     def __post_init__(self) -> None:
         """Make the arrays of every block once."""
-        object.__setattr__(self, '_columns', np.array(dot_channels(len(self.sensors)), dtype=np.int64))
+        object.__setattr__(self, '_columns', np.array(dot_channels(len(self.sensors)), dtype=np.intp))
         object.__setattr__(self, '_per_volt', np.array(self.sensitivities, dtype=np.float64))
 
     @classmethod
