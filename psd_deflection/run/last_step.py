@@ -8,7 +8,7 @@ import numpy as np
 
 from psd_deflection.records import BlockStatus, Record, SpotMeans
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.noted_times import last_step
+from psd_deflection.studies.loads.steps import last_step
 
 REACH_S = 60.0
 """A step that is older is not looked for."""

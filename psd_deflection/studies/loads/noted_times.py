@@ -1,10 +1,8 @@
 """When noted loads began to act, by the motion of the dots: a person notes a weight some seconds after it was hung.
 
-Every step of the dots that lasts is found without a model of the rig: the mean just after a moment against the mean
-just before it, over whole periods of the link's bending. Steps and notes are matched in their order. If they agree, or
-all notes are late alike, nothing is changed. Else one time is fitted to each step, with the ringing that follows and,
-if the load was applied slowly, the time that it took. Only the link's natural frequencies are taken from the rig file,
-so a wrong wiring, sign or unit changes no time.
+Steps of the dots (:mod:`.steps`) and notes are matched in their order. If they agree, or all notes are late alike,
+nothing is changed. Else each load gets the time of its step. Only the link's natural frequencies are taken from the rig
+file, so a wrong wiring, sign or unit changes no time.
 """
 
 from __future__ import annotations
@@ -15,7 +13,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import minimize, minimize_scalar
 
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.plate.linear import design_matrix
@@ -23,13 +20,16 @@ from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.load_cell import MeasuredLoad, without_cell_noise
+from psd_deflection.studies.loads.steps import (
+    LEAST_SHARE,
+    PERIODS,
+    DotStep,
+    applied,
+    lasting_steps,
+    link_modes,
+    time_of_step,
+)
 
-PERIODS = 4
-"""Bending periods that each mean on either side of a moment takes."""
-STANDS_OUT = 10.0
-"""Factor by which a step must exceed the median of what is there without one."""
-LEAST_SHARE = 0.03
-"""A step is at least this share of the largest."""
 APART_S = 0.25
 """Noted changes that follow each other faster than this are a sweep or a ramp, not notes of a person."""
 FARTHEST_S = 30.0
@@ -44,10 +44,6 @@ BETTER = 4.0
 """Factor by which mended times must leave less of the movement than the noted ones."""
 SETTLED_S = 5.0
 """Time constants of the slower mode after which a link is at rest."""
-MOST_AROUND_S = 4.0
-"""A step among samples that are lost is looked for so far from their middle."""
-DEEP = 10.0
-"""A valley that begins so many times higher than the deepest is not followed."""
 ROUGH = 3.0
 """Leave out the motion under a load applied slowly if its remaining ringing exceeds the noise by this factor."""
 
@@ -141,19 +137,6 @@ class MendedLoads:
     timed: tuple[MendedNote, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class _Step:
-    """``at``: sample of its middle; ``size``: how far the dots moved, m; ``first``, ``last``: samples about it.
-    ``lost``: samples about it of which none is there.
-    """
-
-    at: float
-    size: float
-    first: int
-    last: int
-    lost: int = 0
-
-
 def ordinal(number: int) -> str:
     """1st, 2nd, 3rd, 4th."""
     ending = 'th' if 10 <= number % 100 <= 20 else {1: 'st', 2: 'nd', 3: 'rd'}.get(number % 10, 'th')
@@ -184,24 +167,14 @@ def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
     if np.any(np.diff(ends) * period < APART_S):
         return []
     width = max(2, round(PERIODS / rig.dynamics.bending_frequency / period))
-    steps = _steps(dots, width)
+    steps = lasting_steps(dots, width)
     edges = [0.0, *(s.at for s in steps), float(len(dots))]
     out = []
     for j, step in enumerate(steps):
         near = (changes >= step.first - 2 * width) & (changes <= step.last + 2 * width)
         if not near.any():
-            out.append(_fitted(rig, dots, step, (edges[j], edges[j + 2]), period)[0])
+            out.append(time_of_step(rig, dots, step, (edges[j], edges[j + 2]), period)[0])
     return out
-
-
-def last_step(rig: Rig, dots: FloatArray, period: float) -> float | None:
-    """When the last lasting step of ``dots`` (n, 4), m, was, s from the first of them; None if they have none.
-
-    ``period``: s from one to the next; they may be means of blocks. The time is that of the step's middle, to a
-    fraction of a period of the link's bending.
-    """
-    steps = _steps(dots, max(2, round(PERIODS / rig.dynamics.bending_frequency / period)))
-    return steps[-1].at * period if steps else None
 
 
 def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
@@ -210,7 +183,7 @@ def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads 
     if len(changes) == 0 or np.any(np.diff(changes) * period < APART_S):
         return None
     width = max(2, round(PERIODS / rig.dynamics.bending_frequency / period))
-    steps = _steps(dots, width)
+    steps = lasting_steps(dots, width)
     sizes = _expected(rig, loads[changes] - loads[changes - 1])
     matched = _matched(changes, sizes, steps, period)
     if not matched:
@@ -220,7 +193,7 @@ def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads 
     if _alike(late, ALIKE_S) and not long.any():
         return None
     edges = [0.0, *(s.at for s in steps), float(len(dots))]
-    fitted = {i: _fitted(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}
+    fitted = {i: time_of_step(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}
     late = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
     if _alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
         return None
@@ -241,7 +214,7 @@ def _as_acted(
     for i, at in enumerate(changes.tolist()):
         noted = at * period
         start, took = fitted.get(i, (noted, 0.0))
-        mended += _profile(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
+        mended += applied(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
         if i in fitted:
             fx, fy, tz = loads[at].tolist()
             notes.append(MendedNote(i + 1, (fx, fy, tz), noted, start, took if took > GRADUAL_S else 0.0))
@@ -270,14 +243,14 @@ def shifts(note: MendedNote, loads: FloatArray, period: float) -> list[Callable[
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
     before, after = np.searchsorted(t, (note.hung - period, note.hung + note.took + 2.0 * period))
     step = loads[min(int(after), len(loads) - 1)] - loads[max(int(before) - 1, 0)]
-    now, moment = _profile(t, note.hung, note.took, period), 0.25 * period
+    now, moment = applied(t, note.hung, note.took, period), 0.25 * period
 
     def later(moments: float) -> FloatArray:
-        return np.asarray((_profile(t, note.hung + moments * moment, note.took, period) - now)[:, None] * step)
+        return np.asarray((applied(t, note.hung + moments * moment, note.took, period) - now)[:, None] * step)
 
     def slower(moments: float) -> FloatArray:
         took = max(note.took + moments * moment, 0.0)
-        return np.asarray((_profile(t, note.hung, took, period) - now)[:, None] * step)
+        return np.asarray((applied(t, note.hung, took, period) - now)[:, None] * step)
 
     return [later, slower] if note.took > 0.0 else [later]
 
@@ -293,62 +266,7 @@ def _expected(rig: Rig, changes: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(poses @ design_matrix(rig.centers + rig.zeros).T, axis=1))
 
 
-def _steps(dots: FloatArray, width: int) -> list[_Step]:
-    """Where the mean of ``width`` samples differs from that of as many before; of samples that are there, if more than
-    a quarter of as many are lost at once: the step may lie among those.
-    """
-    there: BoolArray = np.all(np.isfinite(dots), axis=1)
-    edges = np.flatnonzero(np.diff(np.concatenate(([True], there, [True])).astype(np.int8)))
-    keep = np.ones(len(dots), dtype=bool)
-    for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        if b - a > width // 4:
-            keep[a:b] = False
-    kept = np.flatnonzero(keep)
-    out = []
-    for step in _steps_of_kept(dots[kept], width):
-        first, last = kept[[step.first, step.last]].tolist()
-        # Between the last sample before it and the first after it.
-        before, after = np.interp((step.at - 1.0, step.at), np.arange(len(kept)), kept).tolist()
-        lost = last - first - (step.last - step.first)
-        out.append(_Step(0.5 * (before + 1.0 + after), step.size, first, last, lost))
-    return out
-
-
-def _steps_of_kept(dots: FloatArray, width: int) -> list[_Step]:
-    n = len(dots)
-    if n < 4 * width:
-        return []
-    there: BoolArray = np.all(np.isfinite(dots), axis=1)
-    sums = np.vstack((np.zeros(4), np.cumsum(np.where(there[:, None], dots, 0.0), axis=0)))
-    counts = np.concatenate(([0], np.cumsum(there)))
-    at = np.arange(width, n - width)
-    before, after = counts[at] - counts[at - width], counts[at + width] - counts[at]
-    apart = (sums[at + width] - sums[at]) / np.maximum(after, 1)[:, None]
-    apart -= (sums[at] - sums[at - width]) / np.maximum(before, 1)[:, None]
-    size = np.where((before > width // 4) & (after > width // 4), np.linalg.norm(apart, axis=1), 0.0)
-    least = max(STANDS_OUT * float(np.median(size)), LEAST_SHARE * float(size.max(initial=0.0)))
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], size > least, [False])).astype(np.int8)))
-    out = []
-    for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        # Two steps close together make one stretch with two peaks.
-        weights = np.maximum(size[a:b] - 0.5 * size[a:b].max(), 0.0)
-        if b - a < width // 2:
-            continue
-        first, last = a + width, b + width
-        moved = _difference(dots, slice(last, last + width), slice(a, first))
-        out.append(_Step(float(at[a:b] @ weights / weights.sum()), float(np.linalg.norm(moved, axis=0)), first, last))
-    return out
-
-
-def _difference(dots: FloatArray, after: slice, before: slice) -> FloatArray:
-    means = []
-    for part in (dots[after], dots[before]):
-        good = part[np.isfinite(part).all(axis=1)]
-        means.append(good.mean(axis=0) if len(good) else np.zeros(4))
-    return np.asarray(means[0] - means[1])
-
-
-def _matched(changes: IntArray, sizes: FloatArray, steps: list[_Step], period: float) -> list[tuple[int, int]]:
+def _matched(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period: float) -> list[tuple[int, int]]:
     """Pairs of a noted change and a step, both in their order, at least cost; changes that move nothing have none."""
     if not steps or float(sizes.sum()) <= 0.0:
         return []
@@ -380,100 +298,11 @@ def _matched(changes: IntArray, sizes: FloatArray, steps: list[_Step], period: f
     return out[::-1]
 
 
-def _profile(t: FloatArray, start: float, took: float, period: float) -> FloatArray:
-    """Share (n,) of a load that acts from ``t`` to the next sample, if applied from ``start`` on in ``took`` s.
-
-    A step between two samples is the mean of the one, more of it, and as much less in the sample before as gives it
-    the right time: the mean alone makes a link of 14 Hz ring by up to a thousandth of its movement that is not there.
-    Behind the step nothing turns back: a clamp that sticks would keep that.
-    """
-    # Rounded, so that a step at a sample is one in floating point, too.
-    share = np.clip(np.round((t + period - start) / max(took, period), 6), 0.0, 1.0)
-    if took <= period:
-        more = 0.5 * share * (1.0 - share)
-        share += more
-        share[:-1] -= more[1:]
-    return np.asarray(share)
-
-
-def _modes(rig: Rig) -> tuple[tuple[float, float], ...]:
-    d = rig.dynamics
-    return (d.bending_frequency, d.bending_damping_ratio), (d.torsion_frequency, d.torsion_damping_ratio)
-
-
-def _fitted(
-    rig: Rig, dots: FloatArray, step: _Step, between: tuple[float, float], period: float
-) -> tuple[float, float]:
-    """When the load of ``step`` began to act, and over which time it was applied, s.
-
-    ``between``: samples of the steps before and after it. Fitted with it: a constant, drift, the ringing of before.
-    """
-    reach = round(2.0 / period)
-    a = max(step.first - reach // 2, math.ceil(between[0]) + round(0.1 / period), 0)
-    b = min(step.last + reach, math.floor(between[1]) - round(0.1 / period), len(dots))
-    a, b = min(a, step.first), max(b, step.last)
-    t: FloatArray = np.arange(a, b, dtype=np.float64) * period
-    part = dots[a:b]
-    there = np.isfinite(part).all(axis=1)
-    since = t - t[0]
-    columns = [np.ones_like(t), since]
-    for frequency, ratio in _modes(rig):
-        w = 2.0 * math.pi * frequency
-        fade = np.exp(-ratio * w * since)
-        columns += [fade * np.cos(w * since), fade * np.sin(w * since)]
-    plain = np.column_stack(columns)[there]
-    basis, _ = np.linalg.qr(plain)
-    values = part[there] - basis @ (basis.T @ part[there])
-    filters = [mode_coefficients(f, ratio, period) for f, ratio in _modes(rig)]
-
-    def left(x: FloatArray) -> float:
-        pushed = _profile(t, float(x[0]), abs(float(x[1])), period)
-        moved = np.column_stack([Filter(c)(pushed) for c in filters])[there]
-        moved = moved - basis @ (basis.T @ moved)
-        slopes = np.linalg.lstsq(moved, values, rcond=1e-9)[0]
-        return float(((values - moved @ slopes) ** 2).sum())
-
-    middle = step.at * period
-    around = min(0.15 + step.lost * period, MOST_AROUND_S)
-    sudden = _least(left, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
-    slow = _least(left, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
-    start, took = slow[1] if slow[0] < 0.5 * sudden[0] else (sudden[1][0], 0.0)
-    return start, abs(took)
-
-
-def _least(
-    left: Callable[[FloatArray], float], starts: list[tuple[float, float]], reach: float
-) -> tuple[float, tuple[float, float]]:
-    """The least of ``left`` and where, from the best of ``starts``; starts without duration, in their order, keep none.
-
-    Each period of the ringing has a narrow valley: of starts without duration those about every deep one are followed.
-    """
-    sizes = np.array([left(np.array(x)) for x in starts])
-    best = np.array(starts[int(np.argmin(sizes))])
-    if best[1] > 0.0:
-        corners = best + reach * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        found = minimize(left, best, method='Nelder-Mead', options={'maxfev': 120, 'initial_simplex': corners})
-        return float(found.fun), (float(found.x[0]), float(found.x[1]))
-    around = np.concatenate(([np.inf], sizes, [np.inf]))
-    valleys = np.flatnonzero((sizes <= around[:-2]) & (sizes <= around[2:]) & (sizes <= DEEP * sizes.min()))
-    ends = []
-    for k in valleys.tolist():
-        at = starts[k][0]
-        one = minimize_scalar(
-            lambda x: left(np.array([x, 0.0])),
-            bounds=(at - 6.0 * reach, at + 6.0 * reach),
-            method='bounded',
-            options={'xatol': 1e-3 * reach},
-        )
-        ends.append((float(one.fun), (float(one.x), 0.0)))
-    return min(ends)
-
-
 def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:
     """What a regression of the dots on the motion under ``loads`` leaves, m^2; block means of it (n, 4), m."""
     period = 1.0 / rig.converter.sample_rate_hz
     static = loads @ LinkStatics.from_rig(rig).compliance
-    bending, torsion = (mode_coefficients(f, ratio, period) for f, ratio in _modes(rig))
+    bending, torsion = (mode_coefficients(f, ratio, period) for f, ratio in link_modes(rig))
     poses = np.column_stack([Filter(c)(static[:, k]) for k, c in enumerate((bending, bending, torsion))])
     scale = np.maximum(np.abs(poses).max(axis=0), 1e-30)
     t = np.linspace(-1.0, 1.0, len(dots))
@@ -492,7 +321,7 @@ def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatAr
 
 def _moving(rig: Rig, note: MendedNote, t: FloatArray) -> BoolArray:
     """Samples (n,) in which the link moves by the load of ``note``."""
-    slowest = max(1.0 / (2.0 * math.pi * f * max(ratio, 1e-3)) for f, ratio in _modes(rig))
+    slowest = max(1.0 / (2.0 * math.pi * f * max(ratio, 1e-3)) for f, ratio in link_modes(rig))
     ends = note.hung + note.took + SETTLED_S * slowest
     return np.asarray((t >= note.hung - 0.02) & (t < ends))
 

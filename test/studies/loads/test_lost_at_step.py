@@ -8,7 +8,7 @@ import pytest
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.loads import noted_times
+from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.noted_times import mend_loads
 
 RIG = load_rig()
@@ -56,7 +56,7 @@ def test_a_step_among_lost_samples_is_in_their_middle_and_says_how_many_they_are
     for lost, said in ((10, 0), (11, 11), (60, 60)):
         part = dots.copy()
         part[200 - lost // 2 : 200 - lost // 2 + lost] = np.nan
-        (step,) = noted_times._steps(part, 40)
+        (step,) = steps_module.lasting_steps(part, 40)
         assert step.lost == said
         assert step.size == pytest.approx(3.0)
         assert step.at == pytest.approx(200.0, abs=1.5 if said else 7.0)
@@ -73,10 +73,10 @@ def test_the_deepest_valley_is_found_though_it_begins_higher() -> None:
 
     starts = [(float(at), 0.0) for at in np.arange(-0.5, 1.5, 0.09)]
     assert min(starts, key=lambda s: left(np.array(s)))[0] == pytest.approx(0.0, abs=0.1)
-    value, (at, took) = noted_times._least(left, starts, 0.02)
+    value, (at, took) = steps_module._least(left, starts, 0.02)
     assert at == pytest.approx(1.0, abs=1e-3)
     assert took == 0.0
     assert value < 0.1
     # One that begins more than ten times higher is left alone.
-    far = noted_times._least(lambda x: min(0.1 + 20.0 * x[0] ** 2, 90.0 * abs(x[0] - 1.0)), starts, 0.02)
+    far = steps_module._least(lambda x: min(0.1 + 20.0 * x[0] ** 2, 90.0 * abs(x[0] - 1.0)), starts, 0.02)
     assert far[1][0] == pytest.approx(0.0, abs=0.02)

@@ -12,11 +12,12 @@ from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import noted_times
+from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.noted_times import (
-    last_step,
     mend_loads,
     unnoted_steps,
 )
+from psd_deflection.studies.loads.steps import last_step
 from test.studies.loads.test_note_parts import as_steps, note
 
 RIG = load_rig()
@@ -68,8 +69,10 @@ class Looked:
     [(3.0, 0.0, 3.0), (3.0, 0.0, 3.14), (3.0, 0.0, 2.86), (3.0, 0.2, 3.1), (3.0, 2.0, 4.0)],
 )
 def test_one_time_is_fitted_beside_drift_and_the_ringing_of_before(start: float, took: float, middle: float) -> None:
-    step = noted_times._Step(1000.0 * middle, 1e-4, round(1000.0 * start) - 200, round(1000.0 * (start + took)) + 200)
-    found = noted_times._fitted(RIG, moved_by(start, took), step, (2000.0, 6000.0), 1e-3)
+    step = steps_module.DotStep(
+        1000.0 * middle, 1e-4, round(1000.0 * start) - 200, round(1000.0 * (start + took)) + 200
+    )
+    found = steps_module.time_of_step(RIG, moved_by(start, took), step, (2000.0, 6000.0), 1e-3)
     assert found == pytest.approx((start, took), abs=1e-3 if took else 2e-5)
 
 
@@ -88,15 +91,15 @@ def test_a_time_is_fitted_to_a_second_before_and_two_after_without_the_neighbour
     between: tuple[float, float], window: tuple[int, int]
 ) -> None:
     looked = Looked(moved_by(5.0, 0.0, 9000))
-    step = noted_times._Step(5000.0, 1e-4, 4900, 5100)
-    noted_times._fitted(RIG, cast(FloatArray, looked), step, between, 1e-3)
+    step = steps_module.DotStep(5000.0, 1e-4, 4900, 5100)
+    steps_module.time_of_step(RIG, cast(FloatArray, looked), step, between, 1e-3)
     assert {(part.start, part.stop) for part in looked.parts} == {window}
 
 
 def test_a_time_is_fitted_to_no_more_than_there_is() -> None:
     looked = Looked(moved_by(0.5, 0.0, 1500))
-    step = noted_times._Step(500.0, 1e-4, 400, 600)
-    found = noted_times._fitted(RIG, cast(FloatArray, looked), step, (-2000.0, 9000.0), 1e-3)
+    step = steps_module.DotStep(500.0, 1e-4, 400, 600)
+    found = steps_module.time_of_step(RIG, cast(FloatArray, looked), step, (-2000.0, 9000.0), 1e-3)
     assert {(part.start, part.stop) for part in looked.parts} == {(0, 1500)}
     assert found[0] == pytest.approx(0.5, abs=1e-4)
 
@@ -109,8 +112,10 @@ def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
         def __getitem__(self, part: slice) -> FloatArray:
             return self.dots[part.start - 1_000_000 : part.stop - 1_000_000]
 
-    step = noted_times._Step(1_003_000.0, 1e-4, 1_002_800, 1_003_200)
-    found = noted_times._fitted(RIG, cast(FloatArray, Later(moved_by(3.0, 0.0, rung=100.0))), step, (0.0, 2e6), 1e-3)
+    step = steps_module.DotStep(1_003_000.0, 1e-4, 1_002_800, 1_003_200)
+    found = steps_module.time_of_step(
+        RIG, cast(FloatArray, Later(moved_by(3.0, 0.0, rung=100.0))), step, (0.0, 2e6), 1e-3
+    )
     assert found == pytest.approx((1003.0, 0.0), abs=3e-4)
 
 
@@ -124,11 +129,11 @@ def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_i
         asked.append((starts, reach))
         return (1.0, (3.01, 0.0)) if len(asked) % 2 else (slowly[0], (2.5, -1.1))
 
-    monkeypatch.setattr(noted_times, '_least', least)
-    step = noted_times._Step(3000.0, 1e-4, 2800, 3200)
+    monkeypatch.setattr(steps_module, '_least', least)
+    step = steps_module.DotStep(3000.0, 1e-4, 2800, 3200)
     for left, found in ((0.49, (2.5, 1.1)), (0.5, (3.01, 0.0)), (1.2, (3.01, 0.0))):
         slowly[0] = left
-        assert noted_times._fitted(RIG, moved_by(3.0, 0.0), step, (0.0, 6000.0), 1e-3) == found
+        assert steps_module.time_of_step(RIG, moved_by(3.0, 0.0), step, (0.0, 6000.0), 1e-3) == found
     (sudden, by), (ramps, seconds) = asked[:2]
     assert [at for at, _ in sudden] == pytest.approx([2.85 + 0.006 * i for i in range(51)])
     assert {took for _, took in sudden} == {0.0}
@@ -145,7 +150,7 @@ def test_the_search_begins_with_a_reach_to_either_side_and_ends_after_120_looks(
         looks.append((float(x[0]), float(x[1])))
         return float(-x[0] - 2.0 * x[1])
 
-    noted_times._least(down, [(1.0, 0.5), (2.0, 1.0)], 0.25)
+    steps_module._least(down, [(1.0, 0.5), (2.0, 1.0)], 0.25)
     assert looks[2:5] == [(2.0, 1.0), (2.25, 1.0), (2.0, 1.25)]
     assert len(looks) == 2 + 120
 
@@ -154,15 +159,15 @@ def test_the_least_of_a_valley_is_found_from_the_best_start() -> None:
     def valley(x: FloatArray) -> float:
         return float((x[0] - 1.23) ** 2 + 4.0 * (x[1] - 0.61) ** 2 + 2.0)
 
-    least, (at, took) = noted_times._least(valley, [(0.0, 0.3), (1.2, 0.6), (5.0, 1.0)], 0.05)
+    least, (at, took) = steps_module._least(valley, [(0.0, 0.3), (1.2, 0.6), (5.0, 1.0)], 0.05)
     assert (least, at, took) == pytest.approx((2.0, 1.23, 0.61), abs=1e-3)
     # Without a duration it keeps none, and looks six reaches about.
-    least, (at, took) = noted_times._least(valley, [(0.0, 0.0), (1.2, 0.0), (5.0, 0.0)], 0.01)
+    least, (at, took) = steps_module._least(valley, [(0.0, 0.0), (1.2, 0.0), (5.0, 0.0)], 0.01)
     assert at == pytest.approx(1.23, abs=2e-5)
     assert took == 0.0
     assert least == pytest.approx(2.0 + 4.0 * 0.61**2)
     for begun, end in ((1.1, 1.16), (1.4, 1.34)):
-        assert noted_times._least(valley, [(begun, 0.0)], 0.01)[1][0] == pytest.approx(end, abs=5e-5)
+        assert steps_module._least(valley, [(begun, 0.0)], 0.01)[1][0] == pytest.approx(end, abs=5e-5)
 
 
 # ---- what is left
@@ -277,11 +282,12 @@ def test_means_take_four_periods_of_bending_and_two_samples_at_least(
 ) -> None:
     widths: list[int] = []
 
-    def none(dots: FloatArray, width: int) -> list[noted_times._Step]:
+    def none(dots: FloatArray, width: int) -> list[steps_module.DotStep]:
         widths.append(width)
         return []
 
-    monkeypatch.setattr(noted_times, '_steps', none)
+    monkeypatch.setattr(noted_times, 'lasting_steps', none)
+    monkeypatch.setattr(steps_module, 'lasting_steps', none)
     rig = load_rig(overrides={'converter.sample_rate_hz': rate, 'dynamics.bending_frequency': 14.0})
     loads = np.zeros((100, 3))
     loads[50:] = 1.0
@@ -293,7 +299,7 @@ def test_means_take_four_periods_of_bending_and_two_samples_at_least(
 
 def with_pieces(
     monkeypatch: pytest.MonkeyPatch,
-    steps: list[noted_times._Step],
+    steps: list[steps_module.DotStep],
     fitted: dict[float, tuple[float, float]],
     left: tuple[float, float] = (1.0, 100.0),
 ) -> list[tuple[float, float]]:
@@ -301,14 +307,15 @@ def with_pieces(
     between: list[tuple[float, float]] = []
 
     def fit(
-        rig: Rig, dots: FloatArray, step: noted_times._Step, edges: tuple[float, float], period: float
+        rig: Rig, dots: FloatArray, step: steps_module.DotStep, edges: tuple[float, float], period: float
     ) -> tuple[float, float]:
         between.append(edges)
         return fitted[step.at]
 
     leaves = iter([left[0], left[1]] * 9)
-    monkeypatch.setattr(noted_times, '_steps', lambda dots, width: steps)
-    monkeypatch.setattr(noted_times, '_fitted', fit)
+    monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
+    monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
+    monkeypatch.setattr(noted_times, 'time_of_step', fit)
     monkeypatch.setattr(noted_times, '_left', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4))))
     return between
 
@@ -327,7 +334,7 @@ def test_last_step_is_the_last_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_steps_without_a_note_near_them_are_told_by_their_fitted_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = [noted_times._Step(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0, 15000.0)]
+    steps = [steps_module.DotStep(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0, 15000.0)]
     fitted = {3000.0: (3.01, 0.5), 8000.0: (8.02, 0.7), 15000.0: (15.03, 0.9)}
     between = with_pieces(monkeypatch, steps, fitted)
     dots = np.zeros((20_000, 4))
@@ -347,7 +354,7 @@ def test_steps_without_a_note_near_them_are_told_by_their_fitted_time(monkeypatc
 
 
 def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
-    steps = [noted_times._Step(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0)]
+    steps = [steps_module.DotStep(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0)]
     with_pieces(monkeypatch, steps, {3000.0: (3.01, 0.0), 8000.0: (8.0, 0.0)})
     dots = np.zeros((20_000, 4))
     for apart, told in ((249, []), (250, [3.01])):
@@ -365,7 +372,9 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
 def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(monkeypatch: pytest.MonkeyPatch) -> None:
     places = (3000.0, 8000.0, 15000.0)
     sizes = noted_times._expected(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
-    steps = [noted_times._Step(at, size, int(at) - 200, int(at) + 200) for at, size in zip(places, sizes, strict=True)]
+    steps = [
+        steps_module.DotStep(at, size, int(at) - 200, int(at) + 200) for at, size in zip(places, sizes, strict=True)
+    ]
     fitted = {3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0), 15000.0: (15.0, 0.0)}
     dots = np.zeros((20_000, 4))
     between = with_pieces(monkeypatch, steps, fitted)
@@ -386,8 +395,9 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     # A step that is longer than two widths and a tenth of a second is looked at: 2 * 286 + 100 samples.
     for long, looks in ((672, 0), (673, 3)):
         between.clear()
-        some = [steps[0], noted_times._Step(8000.0, sizes[1], 7700, 7700 + long), steps[2]]
-        monkeypatch.setattr(noted_times, '_steps', lambda dots, width, some=some: some)
+        some = [steps[0], steps_module.DotStep(8000.0, sizes[1], 7700, 7700 + long), steps[2]]
+        monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width, some=some: some)
+        monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width, some=some: some)
         assert mend_loads(RIG, dots, noted_at(3000, 8000, 15000)) is None
         assert len(between) == looks
     # Applied over a tenth of a second is a step.
@@ -396,7 +406,8 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
         ramp = mend_loads(RIG, dots, noted_at(3000, 8000, 15000))
         assert (None if ramp is None else [n.took for n in ramp.notes]) == told
     fitted[8000.0] = (8.0, 0.0)
-    monkeypatch.setattr(noted_times, '_steps', lambda dots, width: steps)
+    monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
+    monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
     # Alike by the fitted times, though not by the middles of the steps.
     fitted.update({3000.0: (2.999, 0.0), 8000.0: (9.498, 0.0), 15000.0: (15.0, 0.0)})
     assert mend_loads(RIG, dots, late) is None

@@ -11,13 +11,14 @@ import pytest
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.loads import noted_times
+from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.noted_times import (
     ALIKE_S,
-    LEAST_SHARE,
     MendedNote,
     ordinal,
     shifts,
 )
+from psd_deflection.studies.loads.steps import LEAST_SHARE
 
 
 def note(noted: float, hung: float, took: float = 0.0, *, settled_only: bool = False, number: int = 3) -> MendedNote:
@@ -139,23 +140,23 @@ def sizes_of(dots: FloatArray, width: int) -> dict[int, float]:
 
 def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
     # The difference is a triangle from 90 to 110: above 3 % of it from 91 to 109.
-    (step,) = noted_times._steps_of_kept(stepped(200, {100: 2.0}), 10)
+    (step,) = steps_module._steps_of_kept(stepped(200, {100: 2.0}), 10)
     assert (step.at, step.size) == pytest.approx((100.0, 2.0))
     assert (step.first, step.last) == (91, 110)
     # Of two rows of three the middle is between them.
-    (slow,) = noted_times._steps_of_kept(stepped(200, {100: 1.0, 101: 1.0}), 10)
+    (slow,) = steps_module._steps_of_kept(stepped(200, {100: 1.0, 101: 1.0}), 10)
     assert slow.at == pytest.approx(100.5)
     # So it is wherever the dots are, from the first width of them on.
     early = stepped(200, {14: 1.0})
-    (first,), (shifted,) = noted_times._steps_of_kept(early, 10), noted_times._steps_of_kept(early + 5.0, 10)
+    (first,), (shifted,) = steps_module._steps_of_kept(early, 10), steps_module._steps_of_kept(early + 5.0, 10)
     assert (shifted.at, shifted.size) == pytest.approx((first.at, first.size))
     assert (shifted.first, shifted.last) == (first.first, first.last) == (10, 24)
     # Four widths are the least, even if most of them is lost: more than two of ten must be there.
     for n, told in ((40, 1), (39, 0)):
         short = stepped(n, {20: 1.0})
         short[:15] = short[26:] = np.nan
-        assert len(noted_times._steps_of_kept(short, 10)) == told
-    assert noted_times._steps_of_kept(np.zeros((200, 4)), 10) == []
+        assert len(steps_module._steps_of_kept(short, 10)) == told
+    assert steps_module._steps_of_kept(np.zeros((200, 4)), 10) == []
 
 
 @pytest.mark.parametrize(('times', 'seen'), [(13.5, 1), (13.0, 0)])
@@ -165,7 +166,7 @@ def test_a_step_stands_out_ten_times_of_what_is_there_without_one(times: float, 
     dots = stepped(2000, {900: times})
     dots[:, 3] = 0.01 * np.arange(2000.0)
     assert (0.75 * times) ** 2 + 1.0 != pytest.approx(100.0, abs=2.0)
-    assert len(noted_times._steps_of_kept(dots, 100)) == seen
+    assert len(steps_module._steps_of_kept(dots, 100)) == seen
 
 
 def test_places_without_a_mean_have_no_step() -> None:
@@ -175,20 +176,20 @@ def test_places_without_a_mean_have_no_step() -> None:
     dots[:, 3] = 0.1 * np.arange(120.0)
     dots[62:] = np.nan
     assert list(sizes_of(dots, 10).values()).count(0.0) == 50
-    assert noted_times._steps_of_kept(dots, 10) == []
-    assert len(noted_times._steps_of_kept(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
+    assert steps_module._steps_of_kept(dots, 10) == []
+    assert len(steps_module._steps_of_kept(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
 
 
 def test_a_step_is_more_than_three_per_cent_of_the_largest() -> None:
     for size, seen in ((2.9, 1), (4.0, 2)):
-        assert len(noted_times._steps_of_kept(stepped(100, {30: 100.0, 70: size}), 2)) == seen
+        assert len(steps_module._steps_of_kept(stepped(100, {30: 100.0, 70: size}), 2)) == seen
 
 
 @pytest.mark.parametrize(('share', 'seen'), [(0.0395, 1), (0.0400, 2)])
 def test_a_stretch_above_three_per_cent_of_the_largest_is_half_a_width_long(share: float, seen: int) -> None:
     # A triangle of 102 to either side: 25 on either side of the middle one are half of it, 51, and 24 are less.
-    assert len(noted_times._steps_of_kept(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
-    assert len(noted_times._steps_of_kept(stepped(2000, {500: share, 1200: 1.0}), 102)) == seen
+    assert len(steps_module._steps_of_kept(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
+    assert len(steps_module._steps_of_kept(stepped(2000, {500: share, 1200: 1.0}), 102)) == seen
 
 
 @pytest.mark.parametrize(
@@ -223,7 +224,7 @@ def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample(
         middle = sum(at * w for at, w in over.items()) / sum(over.values())
         wanted.append((middle, float(np.linalg.norm(after - before)), first, last))
     with np.errstate(invalid='raise', divide='raise'):
-        found = [(s.at, s.size, s.first, s.last) for s in noted_times._steps_of_kept(dots, width)]
+        found = [(s.at, s.size, s.first, s.last) for s in steps_module._steps_of_kept(dots, width)]
     assert len(found) == len(wanted)
     assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-7)
 
@@ -231,19 +232,19 @@ def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample(
 def test_a_difference_is_of_the_means_of_whole_samples_and_nothing_has_the_mean_0() -> None:
     dots = np.arange(24.0).reshape(6, 4)
     dots[4, 2] = np.nan
-    assert noted_times._difference(dots, slice(3, 6), slice(0, 2)) == pytest.approx([14.0] * 4)
-    assert noted_times._difference(dots, slice(4, 5), slice(0, 2)) == pytest.approx([-2.0, -3.0, -4.0, -5.0])
+    assert steps_module._difference(dots, slice(3, 6), slice(0, 2)) == pytest.approx([14.0] * 4)
+    assert steps_module._difference(dots, slice(4, 5), slice(0, 2)) == pytest.approx([-2.0, -3.0, -4.0, -5.0])
 
 
 # ---- which note belongs to which step
 
 
-def as_steps(*places: tuple[float, float]) -> list[noted_times._Step]:
-    return [noted_times._Step(at, size, round(at) - 5, round(at) + 5) for at, size in places]
+def as_steps(*places: tuple[float, float]) -> list[steps_module.DotStep]:
+    return [steps_module.DotStep(at, size, round(at) - 5, round(at) + 5) for at, size in places]
 
 
 def cheapest(
-    changes: IntArray, sizes: FloatArray, steps: list[noted_times._Step], period: float
+    changes: IntArray, sizes: FloatArray, steps: list[steps_module.DotStep], period: float
 ) -> list[tuple[int, int]]:
     """Of all ways to pair notes and steps in their order that of the least cost, one by one."""
     seen = [i for i in range(len(changes)) if sizes[i] > 0.03 * max(sizes)]
@@ -309,17 +310,17 @@ def test_a_note_without_a_step_near_it_has_none() -> None:
 
 def test_a_step_between_samples_keeps_its_time_and_a_ramp_its_share() -> None:
     t = np.arange(8.0)
-    assert noted_times._profile(t, 3.0, 0.0, 1.0) == pytest.approx([0, 0, 0, 1, 1, 1, 1, 1])
+    assert steps_module.applied(t, 3.0, 0.0, 1.0) == pytest.approx([0, 0, 0, 1, 1, 1, 1, 1])
     # A quarter after 3: three quarters of that sample, and 0.5 * 3/4 * 1/4 that the one before lacks.
     more = 0.5 * 0.75 * 0.25
-    assert noted_times._profile(t, 3.25, 0.0, 1.0) == pytest.approx([0, 0, -more, 0.75 + more, 1, 1, 1, 1])
-    assert noted_times._profile(t, 3.25, 1.0, 1.0) == pytest.approx([0, 0, -more, 0.75 + more, 1, 1, 1, 1])
+    assert steps_module.applied(t, 3.25, 0.0, 1.0) == pytest.approx([0, 0, -more, 0.75 + more, 1, 1, 1, 1])
+    assert steps_module.applied(t, 3.25, 1.0, 1.0) == pytest.approx([0, 0, -more, 0.75 + more, 1, 1, 1, 1])
     # A ramp from 2 to 4.5, at the end of each sample.
-    assert noted_times._profile(t, 2.0, 2.5, 1.0) == pytest.approx([0, 0, 0.4, 0.8, 1, 1, 1, 1])
+    assert steps_module.applied(t, 2.0, 2.5, 1.0) == pytest.approx([0, 0, 0.4, 0.8, 1, 1, 1, 1])
     # A millionth of a sample is none.
-    assert noted_times._profile(t, 3.0000004, 0.0, 1.0).tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
-    assert noted_times._profile(t, 3.000001, 0.0, 1.0)[3] < 1.0
-    assert noted_times._profile(t, 3.00001, 0.0, 1.0)[3] == pytest.approx(1 - 0.5e-5, abs=1e-8)
+    assert steps_module.applied(t, 3.0000004, 0.0, 1.0).tolist() == [0, 0, 0, 1, 1, 1, 1, 1]
+    assert steps_module.applied(t, 3.000001, 0.0, 1.0)[3] < 1.0
+    assert steps_module.applied(t, 3.00001, 0.0, 1.0)[3] == pytest.approx(1 - 0.5e-5, abs=1e-8)
 
 
 def test_later_and_slower_shift_what_the_load_changed_by() -> None:
