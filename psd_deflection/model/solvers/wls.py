@@ -168,7 +168,10 @@ class _Weighted:
     def gain(self) -> FloatArray:
         """See :class:`Solver`."""
         places = tuple([place for lx, ly, _, _ in self._rows for place in (lx, ly)])
-        return weighted_gain(places, 0.0, self.variances, self.covariance, self._by)
+        out = weighted_gain(places, 0.0, self.variances, self.covariance, self._by)
+        # Every block gets this one.
+        out.setflags(write=False)
+        return out
 
 
 def fixed_weights(geometry: Geometry, weights: Weights, row_scaling: tuple[float, ...]) -> FixedGain | None:

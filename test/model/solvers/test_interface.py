@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,24 @@ def agree(solver: Any, dots: np.ndarray[Any, Any], variances: tuple[float, ...],
 def test_one_block_and_many_agree(golden: Any, rays: Any, method: str, options: dict[str, Any], kind: str) -> None:
     geometry = golden.geometry('G11')
     agree(make_solver(method, geometry, **options), some_dots(rays, geometry, 20, 2e-5, 0.01), VARIANCES[kind])
+
+
+@pytest.mark.parametrize(('method', 'options'), [*SMOOTH, *STEPPED])
+def test_what_a_solver_keeps_from_block_to_block_changes_no_answer(
+    golden: Any, method: str, options: dict[str, Any]
+) -> None:
+    """Nor does a caller who writes into a gain that he was given."""
+    geometry, dots = golden.geometry(), golden.dots('G4')
+    solver = make_solver(method, geometry, **options)
+    for kind in (*VARIANCES, *VARIANCES):
+        variances = VARIANCES[kind]
+        fresh = make_solver(method, geometry, **options)
+        want, got = fresh.solve(dots, variances), solver.solve(dots, variances)
+        assert repr(got) == repr(want)
+        gain = solver.gain(dots, variances, got)
+        with contextlib.suppress(ValueError):
+            gain[:] = 7.0
+        np.testing.assert_array_equal(solver.gain(dots, variances, got), fresh.gain(dots, variances, want))
 
 
 @pytest.mark.parametrize(('method', 'options'), SMOOTH)
