@@ -42,7 +42,8 @@ LOSSES = {'none': (0.0, 0), '2 %': (0.02, 0), '20 %': (0.2, 0), 'bursts of 8': (
 class Row:
     """One rig: rms noise of each channel V, AR(1) memory, tails, hum V, converter, offsets of x1, y1, x2, y2 V.
 
-    ``stated``: the rig file names the noise of each channel.
+    ``stated``: the rig file names the noise of each channel. ``corner``: Hz, at which 1/f noise is as much as the
+    white.
     """
 
     label: str
@@ -53,6 +54,7 @@ class Row:
     bits: int = 16
     offsets: tuple[float, ...] = ()
     stated: bool = False
+    corner: float = 0.0
 
 
 ROWS = (
@@ -70,6 +72,8 @@ ROWS = (
     Row('unequal channels', sigmas=(1e-3, 2e-3, 2e-3, 4e-3, 2e-3, 2e-3), stated=True),
 )
 UNEQUAL = ROWS[-1]
+SLOW = (Row('1/f, corner 1 Hz', corner=1.0), Row('1/f, corner 10 Hz', corner=10.0))
+"""What the estimates do not cover in full."""
 TONES = (5.0, 20.0, 45.0, 75.0, 87.0, 130.0, 180.0, 300.0, 480.0)
 """Hz of a steady vibration."""
 SHAKEN = (8e-6, 20e-6, 0.1e-3)
@@ -119,7 +123,7 @@ def rig(row: Row, **overrides: object) -> Rig:
 def motion(rest_s: int, steps: int) -> tuple[Array, Array]:
     """Volts (n, 6) without noise and poses (n / 20, 3) at the blocks' middles."""
     fine = _poses(rest_s, steps)
-    return _optics(fine), _middles(fine)
+    return optics_of(fine), middles(fine)
 
 
 def _poses(rest_s: int, steps: int) -> Array:
@@ -132,7 +136,7 @@ def _poses(rest_s: int, steps: int) -> Array:
     return generator.motion(loads, 0.585, [])
 
 
-def _optics(fine: Array, warm: Array | None = None, effects: Sequence[generator.Spec] = ()) -> Array:
+def optics_of(fine: Array, warm: Array | None = None, effects: Sequence[generator.Spec] = ()) -> Array:
     """Volts (n, 6) without noise; ``warm``: K above the first temperature, for ``effects`` of the sensors."""
     none = np.zeros(len(fine))
     shifted = [
@@ -143,7 +147,8 @@ def _optics(fine: Array, warm: Array | None = None, effects: Sequence[generator.
     return generator.electronics(m, light, none, [])
 
 
-def _middles(fine: Array) -> Array:
+def middles(fine: Array) -> Array:
+    """Poses (n / 20, 3) at the blocks' middles."""
     # Between samples 9 and 10: by the four fine places about it.
     at = np.arange(0, len(fine) - 99, 100) + 47
     return np.asarray((9.0 * (fine[at] + fine[at + 1]) - fine[at - 1] - fine[at + 2]) / 16.0)
@@ -152,6 +157,9 @@ def _middles(fine: Array) -> Array:
 def volts_of(row: Row, clean: Array, seed: int) -> Array:
     """What the converter gives, (n, 6) V."""
     out = clean + generator.electronic_noise(len(clean), seed, sigmas=row.sigmas, memory=row.memory, heavy=row.heavy)
+    if row.corner:
+        rng = np.random.default_rng(seed)
+        out = clean + np.asarray(row.sigmas) * generator.flicker(len(clean), row.corner, rng)
     t = np.arange(len(clean)) / generator.RATE
     out += row.hum * np.sin(2.0 * np.pi * 60.0 * t)[:, None]
     if row.offsets:
@@ -203,7 +211,7 @@ def warming(told: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) 
     fine = _poses(rest_s, steps)
     warm = np.linspace(0.0, RISE, len(fine))
     names = [{'name': 'thermal_drift', 'psd': psd, **drift} for psd, drift in enumerate(DRIFT, 1)]
-    volts = volts_of(ROWS[0], _optics(fine, warm, names), seed)
+    volts = volts_of(ROWS[0], optics_of(fine, warm, names), seed)
     known = {f'effects.drift_{one["psd"]}.{key}': value for one in names for key, value in one.items()}
     pipeline = Pipeline(rig(ROWS[0], **(known if told else {})))
     got: list[DeflectionEstimate] = []
@@ -211,7 +219,7 @@ def warming(told: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) 
         if told:
             pipeline.temperature(20.0 + round(float(warm[second * 1000 * generator.FINER]), 1))
         got += _published(pipeline, part, volts)
-    return _scored(got, _middles(fine), rest_s, pipeline)
+    return _scored(got, middles(fine), rest_s, pipeline)
 
 
 def on_a_moving_base(seconds: int = 60, seed: int = 1) -> Inside:
@@ -263,12 +271,12 @@ def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **ov
     fine = np.sin(2.0 * np.pi * hz * t[:, None] + phases) * SHAKEN
     pipeline = Pipeline(rig(row, **overrides))
     seq = np.arange(n)
-    volts = volts_of(row, _optics(fine), seed).astype(np.float32)
+    volts = volts_of(row, optics_of(fine), seed).astype(np.float32)
     records = list(pipeline.process(RawChunk(seq, seq * 1_000_000, volts, np.zeros(n, np.uint8))))
     got = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary and r.block >= 2 * SETTLED]
     spots = [r for r in records if isinstance(r, SpotMeans)]
     words = {s.index: next((f for f in s.findings if f.startswith('vibrates')), '') for s in spots}
-    error, covariance, block = _errors(got, _middles(fine))
+    error, covariance, block = _errors(got, middles(fine))
     sd = np.sqrt(np.einsum('nii->ni', covariance))
     named = np.array([bool(words[b]) for b in block.tolist()])
     beyond = (np.abs(error) > 3.0 * sd).any(axis=1)
@@ -314,64 +322,11 @@ def coarse(poses: int = 150, seed: int = 1, *, told: bool = True, **overrides: o
     errors, covariances = [], []
     for _ in range(poses):
         pose = rng.uniform(-1.0, 1.0, 3) * (1e-3, 1e-3, 1e-2)
-        volts = volts_of(row, _optics(np.tile(pose, (120 * SIZE * generator.FINER, 1))), int(rng.integers(1 << 30)))
+        volts = volts_of(row, optics_of(np.tile(pose, (120 * SIZE * generator.FINER, 1))), int(rng.integers(1 << 30)))
         for e in estimates(Pipeline(rig(row, **more)), volts, np.ones(len(volts), bool))[100:]:
             errors.append(np.array((e.dx, e.dy, e.theta)) - pose)
             covariances.append(np.array(e.covariance).reshape(3, 3))
     return inside(np.array(errors), np.array(covariances))
-
-
-def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int = 1) -> tuple[float, str]:
-    """Largest error in own standard deviations of any estimate of a rig with one wrong reading, and what is named.
-
-    ``kind``: dead, stuck, inverted (``channel`` 0 to 3: x1, y1, x2, y2) or swapped (0 or 1: the PSD whose x and y are
-    exchanged). Four seconds at rest, then ``load`` (N, N, N m) switched on for four.
-    """
-    n = 8000
-    loads = np.zeros((n, 3))
-    loads[n // 2 + 7 :] = load
-    fine = generator.motion(loads, 0.585, [])
-    clean, truth = _optics(fine), _middles(fine)
-    volts = volts_of(Row(kind), clean, seed)
-    column = (0, 1, 3, 4)[channel]
-    if kind == 'dead':
-        volts[:, column] = 0.0
-    elif kind == 'stuck':
-        volts[n // 4 :, column] = volts[n // 4, column]
-    elif kind == 'inverted':
-        volts[:, column] *= -1.0
-    else:
-        pair = [3 * channel, 3 * channel + 1]
-        volts[:, pair] = volts[:, pair[::-1]]
-    # Zeroed as it is: the readings at rest are what they are then.
-    pipeline = Pipeline(rig(Row(kind)))
-    worst = 0.0
-    for e in estimates(pipeline, volts, np.ones(n, bool), zero_at=SETTLED // 2):
-        if e.block < SETTLED // 2:
-            continue
-        sd = np.sqrt(np.array(e.covariance).reshape(3, 3).diagonal())
-        worst = max(worst, float(np.abs((np.array((e.dx, e.dy, e.theta)) - truth[e.block]) / sd).max()))
-    return worst, pipeline.stamped.most_likely_wrong()
-
-
-FAULTS = tuple(
-    [(kind, channel) for kind in ('dead', 'stuck', 'inverted') for channel in range(4)]
-    + [('swapped', psd) for psd in range(2)]
-)
-
-
-def faults(rows: int | None = None) -> int:
-    """Print :func:`fault` for every wrong reading (or the first ``rows``) at 10, 30 and 50 N."""
-    print('| wrong | load | largest error, own sd | named |\n|---|---|---|---|')
-    for kind, channel in FAULTS[:rows]:
-        for force in (10.0, 30.0, 50.0):
-            for name, load in (('sidebar', (0.0, -force, -0.585 * force)), ('link', (0.0, -force, 0.0))):
-                worst, named = fault(kind, channel, load)
-                print(
-                    f'| {kind} {channel} | {force:g} N, {name} | {worst:.1f} | {named or "cannot be told"} |',
-                    flush=True,
-                )
-    return 0
 
 
 def bound(row: Row) -> Array:
@@ -388,7 +343,7 @@ def over_the_bound(
 ) -> dict[str, Array]:
     """rms error (3,) of each solver on a link at rest over :func:`bound`; the thesis's mean of a block."""
     n = rest_s * 1000
-    volts = volts_of(row, _optics(np.zeros((n * generator.FINER, 3))), seed).astype(np.float32)
+    volts = volts_of(row, optics_of(np.zeros((n * generator.FINER, 3))), seed).astype(np.float32)
     chosen = {'block_fit': 'mean', 'solver': solvers[0], 'solvers': list(solvers), **more}
     seq = np.arange(n)
     chunk = RawChunk(seq, seq * 1_000_000, volts, np.zeros(n, np.uint8))
@@ -437,11 +392,8 @@ def _job(job: tuple[Row, str]) -> tuple[Row, str, Scored]:
 def main(argv: Sequence[str] | None = None) -> int:
     """Print the table of docs/accuracy.md."""
     parser = options(__doc__, jobs=2)
-    parser.add_argument(
-        '--rows', type=int, help='only the first kinds of noise (of wrong readings with --faults), and only the table'
-    )
+    parser.add_argument('--rows', type=int, help='only the first kinds of noise, and only the table')
     parser.add_argument('--losses', type=int, default=len(LOSSES), help='only the first kinds of loss')
-    parser.add_argument('--faults', action='store_true', help='instead: each reading wrong in turn')
     parser.add_argument(
         '--alarms', type=int, metavar='SEEDS', help='instead: false alarms of faultless rigs, each by so many seeds'
     )
@@ -456,14 +408,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         return vibrations(args.vibration)
     if args.alarms:
         return false_alarms(args.alarms, args.rows)
-    if args.faults:
-        return faults(args.rows)
     print(HEAD)
     print('|---' * (HEAD.count('|') - 1) + '|')
     cost: Array | None = None
     motion(100, 16)
     pairs = [(row, loss) for row in ROWS[: args.rows] for loss in list(LOSSES)[: args.losses]]
     whole = args.rows is None
+    pairs += [(row, 'none') for row in SLOW] if whole else []
     with ProcessPoolExecutor(args.jobs) as pool:
         rough = {told: pool.submit(coarse, told=told) for told in (True, False)} if whole else {}
         for row, loss, s in pool.map(_job, pairs):

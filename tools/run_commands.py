@@ -111,7 +111,7 @@ SHORTEST = {
 
 SHORTER = {
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
-    r'^python -m blind\.coverage --faults$': '--rows 1',
+    r'^python -m blind\.faults$': '--rows 1',
     r'^python -m blind\.coverage --alarms \d+$': '--alarms 1 --rows 1',
     r'^python -m blind\.coverage --vibration \d+$': '--vibration 1',
     r'^python -m blind\.thesis$': '--parts 1',

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from blind.coverage import ROWS, UNEQUAL, Inside, fault, on_a_moving_base, over_the_bound, score, warming
+from blind.coverage import ROWS, UNEQUAL, Inside, on_a_moving_base, over_the_bound, score, warming
+from blind.faults import fault
 
 LABELS = ('white', 'AR(1) 0.9', 'twice the noise', '1, 2, 4, 2 mV', 'unequal channels')
 
