@@ -195,7 +195,9 @@ def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads 
     edges = [0.0, *(s.at for s in steps), float(len(dots))]
     fitted = {i: time_of_step(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}
     late = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
-    if _alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
+    # One delay is left to a search, unless it would have to find it from what was lost.
+    unseen = abs(float(np.median(late))) > ALIKE_S and any(steps[j].lost for _, j in matched)
+    if not unseen and _alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
         return None
     mended, timed = _as_acted(loads, changes, fitted, period)
     left, rest = _left(rig, dots, mended)

@@ -49,6 +49,18 @@ def test_samples_lost_between_the_steps_change_no_time() -> None:
     assert told(dots) == pytest.approx(LATE, abs=1e-3)
 
 
+def test_notes_that_are_alike_late_since_their_samples_are_lost_are_mended_and_right_ones_stay() -> None:
+    """Rows of a CSV have the load: after a loss it seems to begin late."""
+    dots, after = DOTS.copy(), HUNG.copy()
+    for at in range(DWELL, len(HUNG), DWELL):
+        dots[at - 100 : at + 200] = np.nan
+        after[at : at + 200] = HUNG[at - 1]
+    mended = mend_loads(RIG, dots, after)
+    assert mended is not None
+    assert [note.late for note in mended.notes] == pytest.approx([0.2] * 5, abs=2e-3)
+    assert mend_loads(RIG, dots, HUNG) is None
+
+
 def test_a_step_among_lost_samples_is_in_their_middle_and_says_how_many_they_are() -> None:
     dots = np.zeros((400, 4))
     dots[200:, 2] = 3.0
