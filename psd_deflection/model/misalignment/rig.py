@@ -22,6 +22,7 @@ from psd_deflection.model.simulation.catalogue import effects_of_rig, make_activ
 from psd_deflection.model.simulation.declaration import CALIBRATED_OF_LINK, PSD, ActiveEffect, Effect
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, check_two_psds
+from psd_deflection.rig.declarations import BY_NAME
 
 _SLOPE = 'link.slope_ratio'
 CLAMP = tuple(name for name in CALIBRATED_OF_LINK if name != _SLOPE)
@@ -181,6 +182,8 @@ def rig_values(
     """
     # Editors of YAML keep twelve digits of a number with an exponent, not all of them sixteen.
     p = np.array([float(f'{v:.12g}') for v in p])
+    # Hardly determined, it may come out below what it can be.
+    p[SLOPE] = max(p[SLOPE], BY_NAME[_SLOPE].minimum or 0.0)
     values: dict[str, object] = {'link.slope_ratio': float(p[SLOPE])}
     effects = list(vector.others)
     for n in (1, 2):

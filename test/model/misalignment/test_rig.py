@@ -14,7 +14,7 @@ from psd_deflection.model.misalignment.model import INDEX, TOLERANCES
 from psd_deflection.model.misalignment.rig import CLAMP, rig_values, vector_of_rig
 from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue
 from psd_deflection.model.simulation.declaration import CALIBRATED_OF_LINK, CALIBRATED_OF_PSD, PLACED_OF_PSD
-from psd_deflection.rig.config import load_rig
+from psd_deflection.rig.config import load_rig, replace_values
 
 RIG = load_rig()
 
@@ -123,3 +123,17 @@ def test_an_effect_listed_twice_is_refused() -> None:
              {'name': 'sensor_gain', 'psd': 1, 'x': 0.01}.items()}  # fmt: skip
     with pytest.raises(ConfigError, match='listed twice'):
         vector_of_rig(load_rig(overrides=twice))
+
+
+@pytest.mark.parametrize('found', [-0.006, 0.0, 0.3])
+def test_a_slope_ratio_that_is_hardly_determined_is_written_as_one_that_a_rig_file_may_have(found: float) -> None:
+    vector = vector_of_rig(RIG)
+    p = vector.values.copy()
+    p[INDEX['link.slope_ratio']] = found
+    values, effects = rig_values(vector, p, vector.clamp)
+    assert values['link.slope_ratio'] == max(found, 0.0)
+    tilts = [a.values['slope_ratio'] for a in effects if 'slope_ratio' in a.values]
+    assert tilts == ([found] if found > 0.0 else [])
+    replace_values(RIG, values)
+    # The caller's own numbers stay.
+    assert p[INDEX['link.slope_ratio']] == found
