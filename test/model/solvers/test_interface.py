@@ -80,6 +80,7 @@ def test_one_block_and_many_agree(golden: Any, rays: Any, method: str, options: 
     agree(make_solver(method, geometry, **options), some_dots(rays, geometry, 20, 2e-5, 0.01), VARIANCES[kind])
 
 
+@pytest.mark.repeatable
 @pytest.mark.parametrize(('method', 'options'), [*SMOOTH, *STEPPED])
 def test_what_a_solver_keeps_from_block_to_block_changes_no_answer(
     golden: Any, method: str, options: dict[str, Any]
