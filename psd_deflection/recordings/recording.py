@@ -247,6 +247,11 @@ class Recording(abc.ABC):
             return 0.0
         return (last[0] - first[0]) * 1e9 / (last[1] - first[1])
 
+    @property
+    def has_samples(self) -> bool:
+        """Whether there are samples in it; a bag may hold messages of other nodes alone."""
+        return True
+
     def lasts(self, first_ns: int, last_ns: int) -> float:
         """Seconds from the sample at ``first_ns`` to the end of the one at ``last_ns``, by their stamps."""
         rate = self.sample_rate_hz

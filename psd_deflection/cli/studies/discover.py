@@ -147,9 +147,9 @@ def run(args: argparse.Namespace) -> int:
         except ConfigError as error:
             raise UsageError(f'--adopt {error}') from None
     if tables := asked.tables(args.recordings, warn):
-        refuse(args, {'next': False, 'adopt': None}, 'is for recordings: a table of readings has no times')
+        refuse(args, {'next': False, 'adopt': None}, 'is for recordings of samples, not for readings of a link at rest')
         if args.span != WHOLE:
-            raise UsageError('--from, --to: are for recordings; a table of readings has no times')
+            raise UsageError('--from, --to: are for recordings of samples, not for readings of a link at rest')
         make_writable(args.out)
         with told('searching', quiet=args.quiet or args.json):
             in_tables = asked.discovered_in_tables(tables, warn)

@@ -271,6 +271,11 @@ class BagRecording(Recording):
             counts[channel.topic] = counts.get(channel.topic, 0) + 1
         return counts
 
+    @property
+    def has_samples(self) -> bool:
+        """Whether there is a message of samples."""
+        return next(self.messages([SAMPLES]), None) is not None
+
     def blocks(self) -> Iterator[SampleBlock]:
         """The samples, cut into blocks at seq // block_size. Raises RecordingError if there are none."""
         blocks = super().blocks()

@@ -1,6 +1,6 @@
 """Reads a table of readings: a CSV with one row for each load that was hung on the link (docs/recording.md).
 
-It has no column ``t``, by which it is told from a recording.
+It has no column ``t``, by which it is told from a recording; or it has one, and references in place of samples.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from psd_deflection.records import FloatArray
 GRAVITY = 9.80665
 """m/s^2, standard."""
 MASS, ARM = 'mass', 'arm'
+TIMES = 't'
 VOLTS = ('x1', 'y1', 'x2', 'y2')
 MILLIMETRES = tuple(f'{name}_mm' for name in VOLTS)
 ESTIMATES = ('dx', 'dy', 'theta')
@@ -31,7 +32,7 @@ KINDS: Mapping[tuple[str, ...], str] = {
     REFERENCE_COLUMNS: 'poses',
 }
 """The columns of each kind of readings."""
-KNOWN = frozenset((*LOAD_COLUMNS, MASS, ARM, TEMPERATURE_COLUMN, *(c for group in KINDS for c in group)))
+KNOWN = frozenset((TIMES, *LOAD_COLUMNS, MASS, ARM, TEMPERATURE_COLUMN, *(c for group in KINDS for c in group)))
 MAX_BYTES = 10_000_000
 FORM = (
     'a table of readings has load_fx,load_fy,load_tz (N, N, N m) or mass (kg), and one of x1,y1,x2,y2 (V), '
@@ -40,7 +41,7 @@ FORM = (
 
 
 def is_table(source: Recording | str | Path) -> bool:
-    """Whether ``source`` is a CSV that says loads and no times. What cannot be read is none."""
+    """Whether ``source`` is a CSV that says loads, and no times or references alone. What cannot be read is none."""
     if isinstance(source, Recording):
         return False
     path = Path(source)
@@ -51,7 +52,8 @@ def is_table(source: Recording | str | Path) -> bool:
             names = _names(next(csv.reader([stream.readline(10_000)], skipinitialspace=True), []))
     except (OSError, UnicodeDecodeError, csv.Error):
         return False
-    return 't' not in names and (MASS in names or bool(set(LOAD_COLUMNS) & set(names)))
+    alone = TIMES not in names or (VOLTS[0] not in names and bool(set(REFERENCE_COLUMNS) & set(names)))
+    return alone and (MASS in names or bool(set(LOAD_COLUMNS) & set(names)))
 
 
 def _names(cells: Sequence[str]) -> list[str]:
@@ -133,6 +135,8 @@ class ReadingsTable:
         there = [group for group in KINDS if set(group) & set(self.names)]
         if not there:
             raise self.refuse(self.head, f'the header has no readings; {FORM}')
+        if TIMES in self.names and there != [REFERENCE_COLUMNS]:
+            raise self.refuse(self.head, f'has {TIMES}: beside times only {",".join(REFERENCE_COLUMNS)} are read')
         if len(there) > 1:
             raise self.refuse(self.head, f'has {" and ".join(",".join(g) for g in there)}: leave one of them')
         lacking = [n for n in there[0] if n not in self.names]
@@ -148,10 +152,13 @@ def described(path: Path) -> list[tuple[str, str]]:
     values = table.columns(names, empty=True)
     distinct = np.unique(loads, axis=0)
     out = [('rows', f'{len(loads)}, of {len(distinct)} different loads')]
+    if TIMES in table.names:
+        t = table.column(TIMES)
+        out.append((TIMES, f'{t.min():g} to {t.max():g} s: discover takes what rests under each load'))
     for name, unit, column in zip(LOAD_COLUMNS, ('N', 'N', 'N m'), loads.T, strict=True):
         out.append((name, f'{column.min():g} to {column.max():g} {unit}'))
     out.append(('readings', f'{",".join(names)}; {np.count_nonzero(np.isnan(values))} of {values.size} are empty'))
-    if len(distinct) == len(loads):
+    if len(distinct) == len(loads) and TIMES not in table.names:
         out.append(('lacks', 'a load that is there twice: it would show how well readings repeat'))
     if TEMPERATURE_COLUMN in table.names:
         warm = table.column(TEMPERATURE_COLUMN)

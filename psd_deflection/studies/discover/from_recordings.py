@@ -14,7 +14,7 @@ from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_file
 from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, ReadingsTable, is_table
+from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, TIMES, ReadingsTable, is_table
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds, rig_at_end, warnings_about_rig, zero_variances_at_end
 from psd_deflection.recordings.sample_table import TEMPERATURE_COLUMN
@@ -26,6 +26,7 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.plant_search import PlantDiscovery, discover_in
 from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
+from psd_deflection.studies.discover.reference_readings import Resting, resting_in, resting_rows
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.study import Tell, warn_caller
 
@@ -230,6 +231,7 @@ def read_readings(
         rig = replace_values(rig, overrides, where)
     check_two_psds(rig, 'a comparison with the simulation')
     values = table.columns(names, empty=True)
+    warm = table.column(TEMPERATURE_COLUMN) if TEMPERATURE_COLUMN in table.names else None
     kind = KINDS[names]
     if kind == 'dots':
         channels = np.zeros((len(values), 6))
@@ -242,30 +244,64 @@ def read_readings(
     unknown = [n for n in table.names if n not in KNOWN]
     if unknown and warn is not None:
         warn(f'{path}:{table.head}: columns that are not read: {", ".join(unknown)}')
-    warm = table.column(TEMPERATURE_COLUMN) if TEMPERATURE_COLUMN in table.names else None
+    if TIMES in table.names:
+        return _readings_of(path, rig, resting_rows(table, rig, loads, values, warm))
     return Readings(str(path), rig, kind, loads, values, warm, digest_of(path))
+
+
+def _readings_of(path: Path, rig: Rig, rest: Resting) -> Readings:
+    return Readings(str(path), rig, 'poses', rest.loads, rest.poses, rest.temperature, digest_of(path))
+
+
+def _references_of(
+    recording: Recording, rig: Rig | None, overrides: Mapping[str, object] | None, where: str, warn: Tell
+) -> Readings:
+    """The references of a recording without samples, with its rig (by default its own), changed by ``overrides``."""
+    if rig is None:
+        rig = rig_at_end(recording)
+        for warning in warnings_about_rig(recording):
+            warn(warning)
+    if overrides:
+        rig = replace_values(rig, overrides, where)
+    return _readings_of(recording.path, rig, resting_in(recording, rig))
+
+
+def _without_samples(source: Recording | str | Path, namespace: str | None) -> Recording | None:
+    """``source`` opened if it is a recording that has references and no samples, as a CSV of samples never is."""
+    if not isinstance(source, Recording) and Path(source).suffix.lower() == '.csv':
+        return None
+    recording = source if isinstance(source, Recording) else open_recording(source, namespace=namespace)
+    return None if recording.has_samples or not recording.references() else recording
 
 
 def read_tables(
     sources: Sequence[Recording | str | Path],
     rig: Rig | None = None,
-    warn: Callable[[str], None] | None = None,
+    warn: Tell = lambda _: None,
+    namespace: str | None = None,
 ) -> list[Readings]:
-    """The tables among ``sources``, which may be ``.yaml`` lists; none if all are recordings.
+    """The tables among ``sources``, which may be ``.yaml`` lists; none if all are recordings of samples.
 
-    Raises RecordingError if some are tables and some are recordings.
+    A recording that has references and no samples counts as a table. ``namespace``: as in :func:`open_recording`.
+    Raises RecordingError if some are tables and some are not.
     """
     listed = list(entries(sources))
-    kinds = [is_table(source) for source, _, _ in listed]
+    alone = [None if is_table(source) else _without_samples(source, namespace) for source, _, _ in listed]
+    kinds = [is_table(source) or found is not None for (source, _, _), found in zip(listed, alone, strict=True)]
     if not any(kinds):
         return []
     if not all(kinds):
         other = next(s for (s, _, _), table in zip(listed, kinds, strict=True) if not table)
         name = other.path if isinstance(other, Recording) else other
         raise RecordingError(f'{name}: is no table of readings, but others are: search them one by one')
-    if rig is None and warn is not None:
+    if rig is None and None in alone:
         warn('a table of readings says nothing of its rig: the nominal rig is taken; give --params-file')
-    return [read_readings(Path(str(s)), rig, overrides, where, warn) for s, overrides, where in listed]
+    return [
+        read_readings(Path(str(source)), rig, overrides, where, warn)
+        if recording is None
+        else _references_of(recording, rig, overrides, where, warn)
+        for (source, overrides, where), recording in zip(listed, alone, strict=True)
+    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +335,7 @@ class DiscoverOptions:
 
     def tables(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Readings]:
         """The tables of readings; none if ``sources`` are recordings."""
-        return read_tables(sources, self.rig(), tell)
+        return read_tables(sources, self.rig(), tell, self.namespace)
 
     def discovered(
         self,
@@ -317,5 +353,5 @@ class DiscoverOptions:
         Raises RecordingError if a part of a table is asked for.
         """
         if self.span != WHOLE:
-            raise RecordingError(f'{tables[0].name}: is a table of readings, which has no times: take all of it')
+            raise RecordingError(f'{tables[0].name}: holds readings of a link at rest: take all of it')
         return discover_in(ReadingsPlant(tables, self.without, self.params_file, tell), seed=self.seed)

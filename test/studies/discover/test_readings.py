@@ -197,7 +197,7 @@ def test_options_for_recordings_are_refused_and_other_commands_say_who_takes_a_t
 ) -> None:
     table = written(tmp_path / 'hung.csv', 1e3 * read([]).values)
     assert main(['discover', str(table), '--out', str(tmp_path / 'found'), '--next']) == 2
-    assert '--next is for recordings: a table of readings has no times' in capsys.readouterr().err
+    assert '--next is for recordings of samples, not for readings of a link at rest' in capsys.readouterr().err
     assert main(['replay', str(table)]) != 0
     assert 'discover and info take a table of readings without times' in capsys.readouterr().err
 

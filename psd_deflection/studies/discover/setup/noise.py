@@ -19,6 +19,7 @@ from scipy.ndimage import median_filter
 from scipy.signal import detrend
 
 from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.setup.slow_noise import SlowNoise, block_factor
 
@@ -97,14 +98,16 @@ class NoiseModel:
         return np.asarray(white * (self.innovation / np.maximum(1.0 - self.ar.sum(axis=1), 0.05))[:, None])
 
 
+def settling(rig: Rig) -> float:
+    """s until the link of ``rig`` rings with a thousandth of what it began with."""
+    d = rig.dynamics
+    slow = min(d.bending_damping_ratio * d.bending_frequency, d.torsion_damping_ratio * d.torsion_frequency)
+    return float(7.0 / (2.0 * np.pi * max(slow, 1e-3)))
+
+
 def rest_windows(observation: Observation) -> list[slice]:
     """Samples at which the link is at rest according to its known loads."""
-    dynamics = observation.rig.dynamics
-    slow = min(
-        dynamics.bending_damping_ratio * dynamics.bending_frequency,
-        dynamics.torsion_damping_ratio * dynamics.torsion_frequency,
-    )
-    settle = 7.0 / (2.0 * np.pi * max(slow, 1e-3))
+    settle = settling(observation.rig)
     n, period = len(observation.loads), observation.period
     changed = np.flatnonzero(np.any(np.diff(observation.loads, axis=0) != 0.0, axis=1)) + 1
     edges = np.concatenate(([0], changed, [n]))
