@@ -80,7 +80,7 @@ def discover(
     """
     known = recordings[0].rig if rig is None else rig
     machine = RecordedRig.of(recordings, known, without, bank, progress)
-    problem = solve(machine, (searched, law, alternatives, set_up, where), seed, progress)
+    problem = solve(machine, (searched, law, alternatives, set_up, where, noise_level), seed, progress)
     return Discovery(
         **fields_of(problem),
         setup=problem.setup,
@@ -380,9 +380,7 @@ def set_up(problem: Problem) -> Problem:
             values |= lines
     setup += told(ws, machine.recorded.wrong)
     named = [n for n in problem.named if n.name not in SETUP or n.name in RIG_NUMBERS]
-    if machine.recorded.lattice is None:
-        setup += noise_findings(ws.observations[0].rig, noise_of(ws))[0]
-    elif not machine.recorded.lattice_stated:
+    if machine.recorded.lattice is not None and not machine.recorded.lattice_stated:
         lattice = machine.recorded.lattice
         named.append(_named_lattice(ws, lattice))
         step = float(lattice.values[lattice.effect.lattice])
@@ -399,6 +397,15 @@ def set_up(problem: Problem) -> Problem:
         values=values,
         stated_gap=machine.recorded.stated_gap,
     )
+
+
+def noise_level(problem: Problem) -> Problem:
+    """Whether the noise is the rig file's. What is unknown may move faster than noise can be told from it."""
+    if problem.unknown or rig_of(problem).recorded.lattice is not None:
+        return problem
+    ws = workspace_of(problem.comparison)
+    more, _ = noise_findings(ws.observations[0].rig, noise_of(ws))
+    return replace(problem, setup=(*problem.setup, *more))
 
 
 def _proposals(workspace: Workspace, effects: Sequence[ActiveEffect] = ()) -> dict[str, list[float]]:

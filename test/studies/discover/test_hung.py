@@ -290,6 +290,28 @@ def test_a_few_milliseconds_late_are_found_beside_a_detector_that_is_turned_far(
 
 
 @pytest.mark.statistics
+def test_a_few_milliseconds_late_are_found_beside_a_second_mode_whose_line_they_hide() -> None:
+    mode = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
+    found = searched(
+        read(HUNG, **{f'effects__e__{k}': v for k, v in mode.items()}), np.vstack((np.zeros((2, 3)), HUNG[:-2]))
+    )
+    assert [f.name for f in found.setup] == ['load_delay']
+    assert found.setup[0].value == pytest.approx(0.002, abs=1e-5)
+    assert [e.active.effect.name for e in found.effects] == ['second_bending_mode']
+    assert found.effects[0].active.values['frequency'] == pytest.approx(107.0, abs=0.1)
+    assert (found.verdict, found.unknown) == ('effects_found', ())
+
+
+@pytest.mark.statistics
+def test_no_noise_is_told_of_what_rings_and_is_unknown() -> None:
+    ringing = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
+    volts = read(HUNG, **{f'effects__e__{k}': v for k, v in ringing.items()})
+    found = discover([Observation('x', RIG, volts, HUNG)], without=('second_bending_mode',))
+    assert found.verdict == 'unknown_effect'
+    assert 'noise_level' not in [f.name for f in found.setup]
+
+
+@pytest.mark.statistics
 def test_loads_that_are_one_sample_late_are_told() -> None:
     found = searched(read(HUNG), np.vstack((np.zeros((1, 3)), HUNG[:-1])))
     assert [f.name for f in found.setup] == ['load_delay']

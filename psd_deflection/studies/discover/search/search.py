@@ -378,9 +378,16 @@ class Search:
         alone = self._best_of([[s.candidate.from_coefficients(s.coefficients)] for s in late], 1, 6)
         if alone is None or not self.passes(null, alone, null):
             return None
-        others = self.screen.score(alone.residual, unbound(alone))
-        both = self._further(alone, [s for s in others if s.candidate.effect.name not in self.workspace.first])
+        both = self._beside_late(alone, self.screen)
+        if far(alone) and not self._nearly_all(null, both) and alone.chi2 < MOST_CLOSED * null.chi2:
+            # Late loads hide the spectral lines of a small effect, and change its signature.
+            both = self._beside_late(alone, self._make_screen(self.workspace, alone))
         return both if both is not None and self.passes(alone, both, null) else None
+
+    def _beside_late(self, alone: Fit, screen: Screen) -> Fit | None:
+        """The late loads of ``alone`` with the best effect of ``screen`` beside them."""
+        scores = screen.score(alone.residual, unbound(alone))
+        return self._further(alone, [s for s in scores if s.candidate.effect.name not in self.workspace.first])
 
     def _mistaken(self, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
         """The starts of :meth:`mistake`."""
