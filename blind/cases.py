@@ -275,6 +275,7 @@ def all_cases(
     mistakes: int = 5,
     fours: int = 40,
     hand: int = 44,
+    sixes: int = 20,
 ) -> Iterator[Case]:
     """The whole suite. ``first``: number of the first seed, for a run on cases never seen before."""
     for seed in range(first, first + seeds):
@@ -301,18 +302,21 @@ def all_cases(
     for i in range(first, first + nulls):
         yield Case(f'null-{i}', 'null', 'one', ())
     yield from hard_cases(first, spreads, mistakes)
-    yield from cases_of_four(first, fours)
+    yield from cases_of_many(first, fours, 4, 20261123)
+    yield from cases_of_many(first, sixes, 6, 20261127)
     yield from cases_by_hand(first, hand)
 
 
-def cases_of_four(first: int, fours: int) -> Iterator[Case]:
-    """Four effects at once, each with a gap of 3 to 30 floors."""
-    rng = np.random.default_rng(20261123 + first)
-    for i in range(first, first + fours):
-        names = [str(n) for n in rng.choice([n for n in EFFECTS if n not in UNSPREAD], 4, replace=False)]
-        gaps = np.exp(rng.uniform(math.log(3.0), math.log(30.0), 4)).tolist()
+def cases_of_many(first: int, count: int, effects: int, seed: int) -> Iterator[Case]:
+    """So many ``effects`` at once, each with a gap of 3 to 30 floors; the draws are those of ``seed``."""
+    rng = np.random.default_rng(seed + first)
+    kind = {4: 'four', 6: 'six'}[effects]
+    for i in range(first, first + count):
+        names = [str(n) for n in rng.choice([n for n in EFFECTS if n not in UNSPREAD], effects, replace=False)]
+        gaps = np.exp(rng.uniform(math.log(3.0), math.log(30.0), effects)).tolist()
         two = bool(set(names) & SHOWS_ACROSS_LENGTHS)
-        yield Case(f'four-{i}-{"-".join(names)}', 'four', 'two' if two else 'one', tuple(zip(names, gaps, strict=True)))
+        wanted = tuple(zip(names, gaps, strict=True))
+        yield Case(f'{kind}-{i}-{"-".join(names)}', kind, 'two' if two else 'one', wanted)
 
 
 def cases_by_hand(first: int, hand: int) -> Iterator[Case]:

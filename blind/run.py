@@ -118,13 +118,14 @@ def selection(parser: argparse.ArgumentParser) -> Callable[[argparse.Namespace],
     parser.add_argument('--spreads', type=int, default=60, help='pairs and triples of very different size')
     parser.add_argument('--mistakes', type=int, default=5, help='sizes of each mistake of the set-up')
     parser.add_argument('--fours', type=int, default=40, help='four effects at once')
+    parser.add_argument('--sixes', type=int, default=20, help='six effects at once')
     parser.add_argument('--hand', type=int, default=44, help='loads hung and noted by hand')
     parser.add_argument('--first', type=int, default=0, help='number of the first seed: fresh cases')
     parser.add_argument('--only', default='', help='only cases whose name contains this')
 
     def chosen(args: argparse.Namespace) -> list[Case]:
         counts = (args.seeds, args.nulls, args.wrong, args.pairs, args.first, args.spreads, args.mistakes, args.fours)
-        listed = short_cases() if args.short else all_cases(*counts, args.hand)
+        listed = short_cases() if args.short else all_cases(*counts, args.hand, args.sixes)
         return [c for c in listed if args.only in c.key]
 
     return chosen

@@ -26,6 +26,7 @@ THRESHOLDS: dict[str, float] = {
     'unknown': 0.90,
     'all_of_a_spread': 0.95,
     'all_of_four': 0.85,
+    'all_of_six': 0.6,
     'unsaid_floors': 1.5,
     'mistake_named': 0.95,
     'hand_effect': 0.95,
@@ -236,9 +237,10 @@ def _spread(sheet: _Sheet, rows: Sequence[Row]) -> None:
     of = [r for r in rows if r.kind == 'spread']
     hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
     sheet.rate('all of a pair or triple of 1:10:100 floors', of, hits, THRESHOLDS['all_of_a_spread'], 1.0, True)
-    of = [r for r in rows if r.kind == 'four']
-    hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
-    sheet.rate('all of four effects at once, 3 to 30 floors', of, hits, THRESHOLDS['all_of_four'], 1.0, True)
+    for kind in ('four', 'six'):
+        of = [r for r in rows if r.kind == kind]
+        hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
+        sheet.rate(f'all of {kind} effects at once, 3 to 30 floors', of, hits, THRESHOLDS[f'all_of_{kind}'], 1.0, True)
     most = THRESHOLDS['unsaid_floors']
     unsaid = [r for r in rows if r.answer['remaining']['floors'] > most and not r.answer['unknown']]
     sheet.failures += [f'{r.key}: {_said(r)}' for r in unsaid]
@@ -250,7 +252,7 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
     of = [r for r in rows if r.kind == 'mistake']
     hits = [{s['name'] for s in r.answer['setup']} == {r.mistake} and not r.named for r in of]
     sheet.rate('mistake of the set-up named, and nothing else', of, hits, THRESHOLDS['mistake_named'], 1.0, True)
-    sound = [r for r in rows if r.kind in ('faultless', 'null', 'single', 'pair', 'spread', 'four')]
+    sound = [r for r in rows if r.kind in ('faultless', 'null', 'single', 'pair', 'spread', 'four', 'six')]
     # Coarse steps are both: an effect, and a line of the rig file that is wrong.
     said = [[s['name'] for s in r.answer['setup'] if s['name'] != 'converter_step'] for r in sound]
     sheet.failures += [f'{r.key}: set-up {", ".join(s)}' for r, s in zip(sound, said, strict=True) if s]

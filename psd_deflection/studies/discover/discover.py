@@ -58,6 +58,8 @@ TURNS, MOST_SETTLED, SETTLED, AT_FLOOR = 2, 4, 0.95, 1.05
 """Free loads are settled in so many turns, then sizes beside them, so often at most: until a gap of this share of that
 before is left, or of this many floors.
 """
+FOLLOWED = 4
+"""So many known effects are asked, to first order, whether they make the gap."""
 FOLLOWS = 0.1
 """Known effects of a few per cent are linear to this share of the gap: if they leave more, it follows none of them."""
 
@@ -282,13 +284,13 @@ def searched(problem: Problem) -> Problem:
 
 
 def _follows_nothing(problem: Problem) -> bool:
-    """Whether as many effects as are looked for leave a good part of the gap, to first order: no simulation is made."""
+    """Whether some effects leave a good part of the gap, to first order: no simulation is made."""
     ws, fit = problem.comparison, problem.fit
     gap = ws.gap(fit.difference)
     if gap < FREED_FROM * ws.floor():
         return False
     columns = [fit.jacobian[:, j] for j in range(len(fit.free))]
-    for _ in range(int(ws.most_effects)):
+    for _ in range(FOLLOWED):
         known = np.column_stack(columns) if columns else None
         best = max(problem.search.screen.score(fit.residual, known), key=lambda s: s.gain, default=None)
         if best is None:

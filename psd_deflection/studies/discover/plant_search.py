@@ -46,7 +46,7 @@ class PlantComparison(Comparison):
 
     open_level = True
     budget = BUDGET
-    most_effects = math.inf
+    most_budgets = math.inf
     # Its values are few, and one machine is asked once.
     p_accept = 0.01
 

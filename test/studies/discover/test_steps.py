@@ -156,11 +156,6 @@ def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_said
     names = 'abcdef'
     shown = pictures(*((n, 'x') for n in names))
     plant = Plant(shown, without_noise(*((shown[n, 'x'], 900.0) for n in names)) + noise())
-    four = ran(searching(plant, shown, names))
-    assert len(four.fit.effects) == 4
-    assert [x.limit for x in four.limits] == ['4 effects, which is the most that are looked for']
-    assert four.limits[0].beyond.startswith('2 more terms (')
-    monkeypatch.setattr(plant, 'most_effects', math.inf)
     whole = ran(searching(plant, shown, names))
     assert (named(whole.fit), whole.limits) == (list(names), ())
     # The fit of no effect is one simulation; after the first effect there are more than two.
@@ -176,6 +171,19 @@ def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_said
         left, of = (float(words.split()[0]) for words in limit.beyond.split('be ')[-1].split(' instead of '))
         # Six effects of 900 in 14400 values.
         assert left < 0.9 * of
+
+
+def test_beside_many_effects_a_small_share_is_enough_if_the_library_explains_the_rest() -> None:
+    names = 'abcdefghijkl'
+    sizes = [9e5, 3e5, 1e5, 4e4, *[3000.0] * 8]
+    shown = pictures(*((n, 'x') for n in names))
+    measured = without_noise(*((shown[n, 'x'], size) for n, size in zip(names, sizes, strict=True))) + noise()
+    found = ran(searching(Plant(shown, measured), shown, names))
+    assert (named(found.fit), found.limits) == (list(names), ())
+    # The library lacks so much that the rest does not leave next to nothing.
+    few = ran(searching(Plant(shown, measured), shown, names[:7]))
+    assert named(few.fit) == list('abcd')
+    assert 'beside 4 effects explains less than 20% of what remains' in few.limits[0].limit
 
 
 def test_an_effect_that_may_stand_in_is_not_added_and_that_is_said() -> None:

@@ -36,8 +36,8 @@ class Comparison(ABC):
     case of each column, counted over all recordings. ``first``: names of effects that are only looked for before any
     other is found; ``setup``: of those that are mistakes of the set-up. ``open_level``: the level of what remains is
     fitted too, because nobody knows how exact the model of the machine is. ``budget``: forward simulations for each
-    effect of the model after which nothing more is added; the alternatives end at twice as many. ``most_effects``:
-    beside so many nothing more is added. ``p_accept``: largest library-wide p of an accepted
+    effect of the model after which nothing more is added; the alternatives end at twice as many. ``most_budgets``:
+    more effects share the budgets of so many. ``p_accept``: largest library-wide p of an accepted
     effect. ``digits``: format of a gap in the sentence.
     """
 
@@ -51,7 +51,7 @@ class Comparison(ABC):
     setup: frozenset[str] = frozenset()
     open_level: bool = False
     budget: int = 700
-    most_effects: float = 4
+    most_budgets: float = 4
     # At 1e-3, where BIC alone ends in a recording of minutes, one of 1000 without fault has an effect by chance.
     p_accept: float = 1e-4
     digits: str = '.4g'

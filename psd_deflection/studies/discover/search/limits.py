@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.hold_out import unseen_gap
@@ -25,18 +26,25 @@ class Limit:
     beyond: str
 
 
-def beyond(
-    workspace: Comparison, screen: Screen, fit: Fit, passes: Callable[[Score], bool], taken: frozenset[str]
-) -> str:
-    """The terms of ``screen`` that pass one by one beside ``fit``, and the gap that they leave on unseen load cases.
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """``names`` of effects; ``columns`` (D, p), whitened: what they and the parameters of a fit do, in proportion."""
 
-    Linear: no simulation is made. ``passes``: the rule for one more term; ``taken``: names of effects that are not
-    asked. '' if no term passes.
+    names: Sequence[str]
+    columns: FloatArray
+
+
+def further_terms(
+    screen: Screen, fit: Fit, passes: Callable[[Score], bool], taken: frozenset[str], most: int = MOST_TERMS
+) -> Terms | None:
+    """The terms of ``screen`` that pass one by one beside ``fit``, to first order; None if no term passes.
+
+    No simulation is made. ``passes``: the rule for one more term; ``taken``: names of effects that are not asked.
     """
     columns = [fit.jacobian[:, j] for j, name in enumerate(fit.free) if name not in fit.at_bound]
     names: list[str] = []
     used: set[tuple[object, ...]] = set()
-    while len(names) < MOST_TERMS:
+    while len(names) < most:
         known = np.column_stack(columns) if columns else None
         further = [
             s
@@ -49,14 +57,18 @@ def beyond(
         used.add(best.candidate.variant)
         names.append(best.candidate.effect.name)
         columns += screen.columns_of(best.candidate)
-    if not names:
-        return ''
-    gap = unseen_gap(workspace, fit, np.column_stack(columns))
+    return Terms(names, np.column_stack(columns)) if names else None
+
+
+def beyond(workspace: Comparison, fit: Fit, terms: Terms) -> str:
+    """What ``terms`` beside ``fit`` would give on unseen load cases, in words."""
+    gap = unseen_gap(workspace, fit, terms.columns)
     now = workspace.gap(fit.difference)
-    terms = ', '.join(name if n == 1 else f'{n} × {name}' for name, n in Counter(names).items())
-    many = f'{MOST_TERMS} or more' if len(names) == MOST_TERMS else f'{len(names)} more'
+    listed = ', '.join(name if n == 1 else f'{n} × {name}' for name, n in Counter(terms.names).items())
+    count = len(terms.names)
+    many = f'{MOST_TERMS} or more' if count == MOST_TERMS else f'{count} more'
     return (
-        f'{many} term{"" if len(names) == 1 else "s"} ({terms}) would pass one by one, to first order; '
+        f'{many} term{"" if count == 1 else "s"} ({listed}) would pass one by one, to first order; '
         'on unseen load cases the gap would be '
         f'{workspace.worded(gap)} instead of {workspace.worded(now)}'
     )

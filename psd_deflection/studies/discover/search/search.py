@@ -19,7 +19,8 @@ from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
-from psd_deflection.studies.discover.search.limits import Limit, beyond
+from psd_deflection.studies.discover.search.hold_out import unseen_gap
+from psd_deflection.studies.discover.search.limits import Limit, beyond, further_terms
 from psd_deflection.studies.discover.search.screen import Score, Screen, promising
 from psd_deflection.studies.discover.search.trust import gain_beyond
 
@@ -42,6 +43,8 @@ FARTHEST_ERROR, HALVED = -0.7, -0.5
 """A linear step to an error of a sensitivity below the first starts at the second instead (readings twice as large)."""
 STANDS_IN = 0.2
 """An effect beside others explains this share of what they leave at least, in chi-square beyond noise."""
+MANY, FEW_TERMS = 4, 8
+"""Unless so many effects were found, and so few more terms would leave next to nothing on load cases not seen."""
 NEAR = 0.1
 """Unless it leaves less than this share of the noise itself."""
 MOST_CLOSED = 0.5
@@ -154,7 +157,7 @@ class Search:
 
     def _budget(self, fit: Fit) -> int:
         """Forward simulations that a model of this many effects may cost."""
-        return self.workspace.budget * max(1, len(fit.effects))
+        return round(self.workspace.budget * min(max(1, len(fit.effects)), self.workspace.most_budgets))
 
     def without_each(self, fit: Fit, null: Fit) -> list[Fit]:
         """``fit`` refitted without each of its effects in turn; ``null``: the fit of no effect."""
@@ -194,8 +197,17 @@ class Search:
     def _stands_in(self, smaller: Fit, larger: Fit) -> bool:
         """Whether what ``larger`` adds only stands in for something that the library lacks."""
         size = self.workspace.size
+        if not smaller.effects or self.workspace.open_level or larger.chi2 <= (1.0 + NEAR) * size:
+            return False
         little = larger.chi2 - size > (1.0 - STANDS_IN) * (smaller.chi2 - size)
-        return little and larger.chi2 > (1.0 + NEAR) * size and bool(smaller.effects) and not self.workspace.open_level
+        return little and not (len(smaller.effects) >= MANY and self._library_explains(smaller))
+
+    def _library_explains(self, fit: Fit) -> bool:
+        """Whether some more effects beside ``fit`` would leave next to nothing on unseen load cases, to first order."""
+        terms = further_terms(self.screen, fit, self._may_pass, self.workspace.first, FEW_TERMS)
+        if terms is None:
+            return False
+        return unseen_gap(self.workspace, fit, terms.columns) < (1.0 + NEAR) * self.workspace.floor()
 
     def library_p(self, gain: float, dof: int) -> float:
         """p of a gain in chi-square, over the whole library (Sidak)."""
@@ -284,11 +296,12 @@ class Search:
         if not self._stopped or little:
             return ()
 
-        def passes(score: Score) -> bool:
-            return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_ACCEPT
+        terms = further_terms(self.screen, current, self._may_pass, self.workspace.first)
+        return (Limit(self._stopped, beyond(self.workspace, current, terms)),) if terms is not None else ()
 
-        words = beyond(self.workspace, self.screen, current, passes, self.workspace.first)
-        return (Limit(self._stopped, words),) if words else ()
+    def _may_pass(self, score: Score) -> bool:
+        """Whether one more effect would pass, to first order."""
+        return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_ACCEPT
 
     def _grown(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
         """The fit of no effect, and ``current`` with all that passes added."""
@@ -297,9 +310,6 @@ class Search:
             self._stopped = ''
             if self.spent >= self._budget(current):
                 self._stopped = f'{self._budget(current)} simulations for {counted(current)}'
-                break
-            if len(current.effects) >= self.workspace.most_effects:
-                self._stopped = f'{counted(current)}, which is the most that are looked for'
                 break
             better = self._added(null, current)
             if better is None:
