@@ -442,7 +442,7 @@ def test_a_law_of_the_noise_passes_at_the_p_of_its_limit_and_not_at_the_bic(monk
 
 @pytest.mark.parametrize(('gains', 'share'), [((-5.0, 1.0), 0.0), ((3.0, 2.0), 0.5), ((30.0, 2.0), 1.0)])
 def test_tied_effects_explain_none_to_all_of_the_gap(gains: tuple[float, float], share: float) -> None:
-    tie = coincidence.Coincidence((0, 'x'), (1, 'x'), (1.0, 1.0), 'V', 50.0)
+    tie = coincidence.Coincidence(((0, 'x'), (1, 'x')), (1.0, 1.0), 'V', 50.0)
     fit = SimpleNamespace(effects=(active('a', x=1.0), active('b', x=1.0)), chi2=90.0)
     found = SimpleNamespace(delta_chi2=list(gains), null=SimpleNamespace(chi2=100.0))
     (unknown,) = weighing.tied(
@@ -478,7 +478,7 @@ def test_two_sizes_agree_as_their_ratio_is_known(together: float) -> None:
     z = math.log(sizes[0] / sizes[1]) / sd
     want = 2.0 * math.log(10.0) * math.exp(-0.5 * z * z) / (sd * math.sqrt(2.0 * math.pi))
     assert tie.odds == pytest.approx(want, rel=1e-6)
-    assert (tie.first, tie.second, tie.sizes, tie.unit) == (*free, sizes, 'V')
+    assert (tie.members, tie.sizes, tie.unit) == (free, sizes, 'V')
 
 
 def test_a_zero_may_be_of_the_beam_or_of_the_reading() -> None:
@@ -549,7 +549,7 @@ def test_the_nuisance_takes_part_in_no_tie() -> None:
     for free in (((-1, 'x'), (0, 'x'), (1, 'x')), ((0, 'x'), (-1, 'x'), (1, 'x'))):
         fit = Fit(effects, 0.0, np.zeros(200), [], jacobian, free, (), (beside,))
         (tie,) = coincidence.coincidences(fit, Physics.of(RIG))
-        assert (tie.first, tie.second) == ((0, 'x'), (1, 'x'))
+        assert tie.members == ((0, 'x'), (1, 'x'))
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])

@@ -596,8 +596,8 @@ def test_what_is_tied_is_told_in_words() -> None:
     fit = cast(Fit, SimpleNamespace(effects=effects, chi2=100.0))
     result = cast(SearchResult, SimpleNamespace(delta_chi2=[50.0, 999.0, 30.0], null=SimpleNamespace(chi2=300.0)))
     ties = [
-        Coincidence((0, 'x'), (2, 'y'), (0.12345, 0.12346), 'V', 123.4),
-        Coincidence((0, 'x'), (1, 'x'), (0.5, 0.5), '', 22.0),
+        Coincidence(((0, 'x'), (2, 'y')), (0.12345, 0.12346), 'V', 123.4),
+        Coincidence(((0, 'x'), (1, 'x')), (0.5, 0.5), '', 22.0),
     ]
     depends = tuple(
         Dependence('x2', name, 9.0, p)
@@ -613,6 +613,9 @@ def test_what_is_tied_is_told_in_words() -> None:
     (u,) = weighing.tied(ties[1:], fit, result, nowhere())
     assert 'a and b agree in size (x 0.5, x 0.5) as' in u.signature
     assert u.explains == 1.0
+    three = Coincidence(((0, 'x'), (1, 'x'), (2, 'y')), (0.5, 0.5, -0.5), '', 22.0)
+    (u,) = weighing.tied([three], fit, result, nowhere())
+    assert u.signature.startswith('a, b and c agree in size (x 0.5, x 0.5, y -0.5) as')
 
 
 def test_gaps_of_channels_are_before_and_after() -> None:

@@ -627,7 +627,7 @@ def test_two_sizes_are_tied_if_their_ratio_is_one_within_the_fit(ratio: float, t
         spread = math.sqrt(k[0, 0] / a**2 + k[1, 1] / b**2 - 2.0 * k[0, 1] / (a * b) + 0.003**2)
         density = math.exp(-0.5 * (math.log(abs(a / b)) / spread) ** 2) / (spread * math.sqrt(2.0 * math.pi))
         assert got[0].odds == pytest.approx(density * 2.0 * math.log(10.0), rel=1e-6)
-        assert (got[0].first, got[0].second, got[0].unit) == ((0, 'x'), (1, 'x'), 'V')
+        assert (got[0].members, got[0].unit) == (((0, 'x'), (1, 'x')), 'V')
 
 
 # Where, and what it depends on.

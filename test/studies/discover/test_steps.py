@@ -411,7 +411,7 @@ def test_only_sizes_of_one_kind_and_of_different_effects_are_compared() -> None:
     physics = Physics.of(RIG)
     two = [('x', 'V', 0.5), ('y', 'V', 0.5)]
     ((tie),) = coincidences(amplitudes(*two), physics)
-    assert (tie.first, tie.second, tie.sizes, tie.unit) == ((0, 'x'), (1, 'y'), (0.5, 0.5), 'V')
+    assert (tie.members, tie.sizes, tie.unit) == (((0, 'x'), (1, 'y')), (0.5, 0.5), 'V')
     assert coincidences(amplitudes(*two, same=True), physics) == []
     assert coincidences(amplitudes(('x', 'V', 0.5), ('y', 'm', 0.5)), physics) == []
     # An angle is a number.
@@ -426,7 +426,18 @@ def test_only_sizes_of_one_kind_and_of_different_effects_are_compared() -> None:
     assert [t.odds for t in three] == pytest.approx([tie.odds / 3.0])
     several = coincidences(amplitudes(*two, ('z', 'V', 0.501)), physics)
     assert [t.odds for t in several] == sorted((t.odds for t in several), reverse=True)
-    assert len(several) == 3
+    assert [len(t.members) for t in several] == [3, 2, 2, 2]
+
+
+def test_three_sizes_that_agree_a_little_are_tied_though_no_two_are() -> None:
+    physics = Physics.of(RIG)
+    two = [('x', '', 0.03), ('y', '', 0.0303)]
+    assert coincidences(amplitudes(*two), physics)[0].odds < 40.0
+    others = [('u', '', 0.4), ('v', '', 2.0), ('w', '', 8.0)]
+    assert coincidences(amplitudes(*two, *others), physics) == []
+    (tie,) = coincidences(amplitudes(*two, ('z', '', -0.0297), *others), physics)
+    assert [name for _, name in tie.members] == ['x', 'y', 'z']
+    assert 20.0 < tie.odds < 200.0
 
 
 def test_turned_loads_are_changes_as_wirings_are() -> None:

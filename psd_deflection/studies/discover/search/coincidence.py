@@ -2,16 +2,17 @@
 
 If the true cause is not in the catalogue, several effects together may explain the data so well that
 nothing unknown remains. But then their sizes are tied: a lag of the amplifiers becomes two delays of
-equal length, a rotated load becomes two detectors rotated by the same angle. Two hypotheses about
-the ratio of two amplitudes are compared. Under "one cause" it is 1 within the uncertainty of the
-fit. Under "independent" it may be anywhere within two decades (Jeffreys's prior for a scale).
+equal length, a rotated load becomes two detectors rotated by the same angle, a mass at the tip a
+softer link and two detectors that read as much too little. Two hypotheses about the ratios of two or
+three amplitudes are compared. Under "one cause" they are 1 within the uncertainty of the fit. Under
+"independent" each may be anywhere within two decades (Jeffreys's prior for a scale).
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ from psd_deflection.studies.discover.search.fit import Fit
 DECADES = 2.0
 """Range over which the ratio of two independent sizes is spread."""
 ODDS = 20.0
-"""Odds for one cause against independent effects, over all pairs compared. By Markov's inequality,
+"""Odds for one cause against independent effects, over all pairs or triples compared. By Markov's inequality,
 independent effects reach odds of N at most once in N searches.
 """
 EXACT = 0.003
@@ -34,11 +35,10 @@ _SAME_UNIT: Mapping[str, str] = {'rad': ''}
 
 @dataclass(frozen=True, slots=True)
 class Coincidence:
-    """Two of the fit's amplitudes, (index of the effect, parameter), that agree; ``odds`` for one cause."""
+    """Amplitudes of the fit, (index of the effect, parameter), whose ``sizes`` agree; ``odds`` for one cause."""
 
-    first: tuple[int, str]
-    second: tuple[int, str]
-    sizes: tuple[float, float]
+    members: tuple[tuple[int, str], ...]
+    sizes: tuple[float, ...]
     unit: str
     odds: float
 
@@ -61,21 +61,34 @@ def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
     """The ties between amplitudes of different effects of ``fit`` that are beyond chance, the strongest first."""
     covariance = fit.covariance()
     sizes = _amplitudes(fit, physics, covariance)
-    # What ties two stiffnesses is known, and told by :mod:`.ties`.
-    stiff = [MOVES_FREQUENCY in fit.effects[fit.free[size[0]][0]].effect.parameters for size in sizes]
-    compared = [
-        (a, b)
-        for (a, first), (b, second) in itertools.combinations(zip(sizes, stiff, strict=True), 2)
-        if fit.free[a[0]][0] != fit.free[b[0]][0] and a[2] == b[2] and not (first and second)
-    ]
     out = []
-    for (j, a, unit), (k, b, _) in compared:
-        slope = np.zeros(len(fit.free))
-        slope[j], slope[k] = 1.0 / a, -1.0 / b
-        sd = math.hypot(math.sqrt(max(float(slope @ covariance @ slope), 0.0)), EXACT)
-        z = math.log(abs(a / b)) / sd
-        factor = DECADES * math.log(10.0) / (sd * math.sqrt(2.0 * math.pi)) * math.exp(-0.5 * z * z)
-        odds = factor / len(compared)
-        if odds >= ODDS:
-            out.append(Coincidence(fit.free[j], fit.free[k], (a, b), unit, odds))
+    for count in (2, 3):
+        compared = [group for group in itertools.combinations(sizes, count) if _may_be_one(fit, group)]
+        for group in compared:
+            odds = _odds(group, covariance) / len(compared)
+            if odds >= ODDS:
+                members = tuple(fit.free[column] for column, _, _ in group)
+                out.append(Coincidence(members, tuple(size for _, size, _ in group), group[0][2], odds))
     return sorted(out, key=lambda c: -c.odds)
+
+
+def _may_be_one(fit: Fit, group: Sequence[tuple[int, float, str]]) -> bool:
+    """Whether these amplitudes are of different effects and of one unit, and no known cause ties them."""
+    effects = [fit.free[column][0] for column, _, _ in group]
+    # What ties two stiffnesses is known, and told by :mod:`.ties`.
+    stiff = [i for i in effects if MOVES_FREQUENCY in fit.effects[i].effect.parameters]
+    return len(set(effects)) == len(group) == len([g for g in group if g[2] == group[0][2]]) and len(stiff) < 2
+
+
+def _odds(group: Sequence[tuple[int, float, str]], covariance: FloatArray) -> float:
+    """Odds that the sizes of ``group`` are one against independent ones, of this group alone."""
+    columns, sizes = [g[0] for g in group], np.array([g[1] for g in group])
+    of_logs = covariance[np.ix_(columns, columns)] / np.outer(sizes, sizes)
+    # The logarithm of the first less those of the others.
+    less = np.column_stack((np.ones(len(group) - 1), -np.eye(len(group) - 1)))
+    spread = less @ (of_logs + 0.5 * EXACT**2 * np.eye(len(group))) @ less.T
+    off = less @ np.log(np.abs(sizes))
+    density = math.exp(-0.5 * float(off @ np.linalg.solve(spread, off))) / math.sqrt(
+        np.linalg.det(2.0 * np.pi * spread)
+    )
+    return float((DECADES * math.log(10.0)) ** len(off) * density)

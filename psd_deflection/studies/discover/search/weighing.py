@@ -214,14 +214,15 @@ def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Lo
     if not ties:
         return ()
     tie = ties[0]
-    (i, first), (j, second) = tie.first, tie.second
-    (a, b), unit = tie.sizes, f' {tie.unit}' if tie.unit else ''
+    *others, last = [fit.effects[i].label for i, _ in tie.members]
+    unit = f' {tie.unit}' if tie.unit else ''
+    sizes = ', '.join(f'{name} {size:.4g}' for (_, name), size in zip(tie.members, tie.sizes, strict=True))
     words = (
-        f'{fit.effects[i].label} and {fit.effects[j].label} agree in size ({first} {a:.4g}, {second} {b:.4g}{unit}) as '
+        f'{", ".join(others)} and {last} agree in size ({sizes}{unit}) as '
         f'independent effects hardly would (odds {tie.odds:.0f} to 1): one cause that is not in the catalogue'
     )
     names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < 1e-3))
-    share = (result.delta_chi2[i] + result.delta_chi2[j]) / max(result.null.chi2 - fit.chi2, 1e-300)
+    share = sum(result.delta_chi2[i] for i, _ in tie.members) / max(result.null.chi2 - fit.chi2, 1e-300)
     return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), remains=False),)
 
 
