@@ -1,8 +1,8 @@
-"""discover_in on machines that others measured. ``python -m blind.foreign [boom|emps|arm|auxtel]``.
+"""discover_in on machines that others measured. ``python -m blind.foreign [boom|emps|arm|auxtel|...]``.
 
 The boom lacks gravity and gives way at its root; the drive lacks its Coulomb friction and its offset; the arm is its
-maker's model; the telescope lacks all terms but the zeros of its encoders. ``--null`` gives each model what is
-published. result.json and report.html go to ``--out``.
+maker's model; the telescope lacks all terms but the zeros of its encoders, or one of four. ``--null`` gives each model
+what is published. result.json and report.html go to ``--out``.
 """
 
 from __future__ import annotations
@@ -26,8 +26,13 @@ MACHINES: Mapping[str, tuple[Callable[[Path], Plant], Callable[[Path], Plant] | 
     'emps': (lambda folder: Emps(('coulomb_friction', 'force_offset'), folder), lambda folder: Emps((), folder)),
     'arm': (lambda folder: Arm(folder), None),
     'auxtel': (lambda path: AuxTel(path), lambda path: AuxTel(path, known=PHYSICAL[:4])),
+    'auxtel-AN': (lambda path: AuxTel(path, known=('CA', 'NPAE', 'AW')), None),
+    'auxtel-AW': (lambda path: AuxTel(path, known=('CA', 'NPAE', 'AN')), None),
+    # Of CA and NPAE the stars of that night show one: each takes the place of the other.
+    'auxtel-NPAE': (lambda path: AuxTel(path, known=('AN', 'AW')), None),
 }
 FOLDERS = {'boom': 'boom', 'emps': 'emps', 'arm': 'two_link_arm', 'auxtel': 'auxtel.txt'}
+"""Of each machine, as it is called up to a hyphen."""
 
 
 def lines(found: PlantDiscovery) -> list[str]:
@@ -50,7 +55,7 @@ def lines(found: PlantDiscovery) -> list[str]:
 def main() -> int:
     """Search, print, write."""
     parser = options(__doc__)
-    parser.add_argument('machines', nargs='*', help='boom, emps, arm, auxtel (default: all)')
+    parser.add_argument('machines', nargs='*', help=f'of {", ".join(MACHINES)} (default: all)')
     parser.add_argument('--data', type=Path, default=DATA, help='folder with a folder of each (default: %(default)s)')
     parser.add_argument('--null', action='store_true', help='with the published terms in the model')
     parser.add_argument('--out', type=Path, help='folder for result.json and report.html of each')
@@ -62,7 +67,7 @@ def main() -> int:
         if make is None:
             continue
         try:
-            plant = make(args.data / FOLDERS[name])
+            plant = make(args.data / FOLDERS[name.split('-')[0]])
         except OSError as error:
             print(f'{error.filename}: {error.strerror}', file=sys.stderr)
             return 3

@@ -74,6 +74,23 @@ def test_a_term_that_the_model_of_the_telescope_lacks_is_named(name: str) -> Non
     assert name in names(discover_in(AuxTel(known=known)))
 
 
+def test_of_collimation_and_axes_the_stars_show_one_and_it_is_named() -> None:
+    found = discover_in(AuxTel(known=('AN', 'AW')))
+    (between,) = (e for e in found.effects if {'NPAE', 'CA'} & {e.active.effect.name, *e.equivalent})
+    assert {'NPAE', 'CA'} <= {between.active.effect.name, *between.equivalent}
+    # Beside either the other one is no evidence: BIC is worse with both.
+    telescope = AuxTel()
+    seen = telescope.measured()[0].ravel()
+
+    def bic(*names: str) -> float:
+        terms = np.column_stack([telescope.simulate({n: {'size': 1.0}})[0].ravel() for n in names])
+        left = seen - terms @ np.linalg.lstsq(terms, seen, rcond=None)[0]
+        return len(seen) * math.log(float(left @ left)) + math.log(len(seen)) * len(names)
+
+    beside = ('IA', 'IE', 'AN', 'AW', 'HECE4', 'HECE7')
+    assert min(bic(*beside, 'NPAE'), bic(*beside, 'CA')) + 1.0 < bic(*beside, 'NPAE', 'CA')
+
+
 @pytest.mark.statistics
 def test_the_sd_of_the_weight_is_its_scatter_over_lengths() -> None:
     """Lengths drawn by chance, with replacement, against the sd of one search."""
