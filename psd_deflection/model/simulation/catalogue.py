@@ -231,6 +231,11 @@ def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
             raise ConfigError(
                 f'effects.{group}: psd = {active.values[PSD.name]:g}: the rig has {len(rig.psds)} PSDs (psd_N.center)'
             )
+        if active.effect.least_psds > len(rig.psds):
+            raise ConfigError(
+                f'effects.{group}: {name} is of a rig of {active.effect.least_psds} PSDs, this one has {len(rig.psds)} '
+                '(psd_N.center)'
+            )
         found.append(active)
     return sort_effects(found)
 

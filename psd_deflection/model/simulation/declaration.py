@@ -183,6 +183,7 @@ class Effect:
     ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
     ``PLACED_OF_PSD`` (an effect with a PSD) or of ``CALIBRATED_OF_LINK``. The calibration then finds their sizes;
     without it a calibration refuses rigs that have the effect. ``law``: its text in YAML, if it is a law.
+    ``least_psds``: the fewest PSDs of a rig that may have it.
     Raises ValueError if the declaration contradicts itself.
     """
 
@@ -204,6 +205,7 @@ class Effect:
     order: int = 0
     calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
     law: str = ''
+    least_psds: int = 2
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
@@ -288,10 +290,10 @@ class Effect:
                 return p
         raise KeyError(name)
 
-    def variants(self) -> Iterator[dict[str, float]]:
-        """Each combination of the choices, by parameter name; of two PSDs."""
+    def variants(self, psds: int = 2) -> Iterator[dict[str, float]]:
+        """Each combination of the choices, by parameter name, on a rig of so many ``psds``."""
         discrete = [p for p in self.parameters if p.kind == 'choice']
-        for combination in itertools.product(*(p.choices[:2] if p is PSD else p.choices for p in discrete)):
+        for combination in itertools.product(*(p.choices[:psds] if p is PSD else p.choices for p in discrete)):
             yield {p.name: float(c) for p, c in zip(discrete, combination, strict=True)}
 
     def off_values(self, physics: Physics | None, choice: Values) -> dict[str, float]:

@@ -181,7 +181,7 @@ def isolable(
         matrix.append(shares)
     hidden = {}
     for effect in catalogue().values():
-        for choice in effect.variants():
+        for choice in effect.variants(len(rig.psds)):
             label = ActiveEffect(effect, choice).label
             # Lines of a spectrum and coarse steps are looked for where readings have them; none are there yet.
             by_itself = any(p.proposed_by(choice) in FROM_READINGS for p in effect.parameters)
