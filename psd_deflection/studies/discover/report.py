@@ -63,7 +63,7 @@ def _against_chart(discovery: Conclusion) -> Chart | None:
     ws = discovery.workspace
     tables = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
     gaps = list(discovery.per_channel.values())
-    row = max(range(len(gaps)), key=lambda c: (gaps[c][0] ** 2 - gaps[c][1] ** 2) / max(gaps[c][0], 1e-300) ** 2)
+    row = max(range(len(gaps)), key=lambda c: (gaps[c][0] ** 2 - gaps[c][1] ** 2) / max(gaps[c][0] ** 2, 1e-300))
     before, after = (np.concatenate([t[row] for t in table]) for table in tables)
     panels = []
     for name, values in ws.against().items():
