@@ -6,10 +6,11 @@ of them refers to an effect by name.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
@@ -60,7 +61,8 @@ class EffectParameter:
     this. ``spectral``: peaks of the residual's spectrum, and ``grid``; ``line``: those of steady amplitude and
     phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums; ``lattice``: the
     step on whose multiples all readings lie, and then the effect is named without a search; ``lattice_dots``: the same
-    without the sums. ``power``: the
+    without the sums. ``of_psd``: the PSD that it is
+    of, from 3: a rig without that PSD has no such parameter. ``power``: the
     signature of a ``finite`` effect grows with this power of the parameter; 0: it does not grow in proportion.
     """
 
@@ -80,6 +82,7 @@ class EffectParameter:
     of_rig: str = ''
     required: bool = False
     each: bool = False
+    of_psd: int = 0
     within: Callable[[Physics, Values], tuple[float, float]] | None = None
 
     def checked(self, value: object, source: str) -> float:
@@ -296,9 +299,18 @@ class Effect:
         for combination in itertools.product(*(p.choices[:psds] if p is PSD else p.choices for p in discrete)):
             yield {p.name: float(c) for p, c in zip(discrete, combination, strict=True)}
 
+    def on(self, psds: int) -> Effect:
+        """The effect with the parameters that it has on a rig of so many ``psds``."""
+        return _on(self, psds) if any(p.of_psd > psds for p in self.parameters) else self
+
     def off_values(self, physics: Physics | None, choice: Values) -> dict[str, float]:
         """All parameters at the value where the effect is off."""
         return {p.name: choice.get(p.name, p.off(physics)) for p in self.parameters}
+
+
+@functools.cache
+def _on(effect: Effect, psds: int) -> Effect:
+    return replace(effect, parameters=tuple(p for p in effect.parameters if p.of_psd <= psds))
 
 
 @dataclass(frozen=True, slots=True)

@@ -153,7 +153,7 @@ class RecordedRig(Machine):
         residual = ws.residual([*ws.base, *ws.nuisance])[0] if fit is None else fit.residual
         more = mistakes(len(ws.observations), self.recorded.delays, likely_jumps(ws, residual), ws.psds)
         more = [e for e in more if e.name not in FIRST or e.name in ws.first]
-        ours = [e for e in catalogue().values() if e.name not in self.recorded.without and not e.lattice]
+        ours = [e for e in catalogue(ws.psds).values() if e.name not in self.recorded.without and not e.lattice]
         library = [e for e in ours if e.least_psds <= ws.psds]
         values = self.proposals
         if fit is not None and fit.effects:

@@ -180,7 +180,7 @@ def isolable(
         found.append(one)
         matrix.append(shares)
     hidden = {}
-    for effect in catalogue().values():
+    for effect in catalogue(len(rig.psds)).values():
         for choice in effect.variants(len(rig.psds)):
             label = ActiveEffect(effect, choice).label
             # Lines of a spectrum and coarse steps are looked for where readings have them; none are there yet.

@@ -110,7 +110,7 @@ class ReadingsPlant(Plant):
         self.known = tuple(effects_of_rig(tables[0].rig))
         self.library = tuple(
             e
-            for name, effect in catalogue().items()
+            for name, effect in catalogue(tables[0].psds).items()
             if name not in without
             and not effect.lattice
             and effect.least_psds <= tables[0].psds
@@ -132,7 +132,7 @@ class ReadingsPlant(Plant):
 
     def simulate(self, model: Model) -> Sequence[FloatArray]:
         """What the rig would read with the effects of ``model``, each once."""
-        every = catalogue()
+        every = catalogue(self.tables[0].psds)
         return self.simulate_effects([ActiveEffect(every[name], values) for name, values in model.items()])
 
     def simulate_effects(self, effects: Sequence[ActiveEffect]) -> Sequence[FloatArray]:

@@ -12,7 +12,7 @@ import pytest
 
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.cli.main import main
-from psd_deflection.model.simulation.catalogue import make_active
+from psd_deflection.model.simulation.catalogue import catalogue, make_active
 from psd_deflection.model.simulation.effect_words import with_effects
 from psd_deflection.model.simulation.law_files import read_law
 from psd_deflection.model.simulation.laws import effect_of
@@ -108,6 +108,26 @@ def test_a_rig_without_the_psd_of_a_law_refuses_it(tmp_path: Path, monkeypatch: 
     dark = RigSimulator(SIX).step(LOADS).counts
     assert np.flatnonzero(np.any(lit != dark, axis=0)).tolist() == [8]
     assert make_active('lifts', {'c1': 1.0}, 'test').effect.least_psds == 4
+
+
+def test_hum_is_named_on_the_channels_of_the_third_psd() -> None:
+    hidden = 'mains_interference,frequency=50,amplitude_y3=0.004,amplitude_sum3=0.003,phase_sum3=1.0'
+    (effect,) = discover([observed(RIG, hidden)]).effects
+    assert effect.active.effect.name == 'mains_interference'
+    for name, size in (('amplitude_y3', 0.004), ('amplitude_sum3', 0.003), ('phase_sum3', 1.0), ('amplitude_x1', 0.0)):
+        assert effect.active.values[name] == pytest.approx(size, abs=4.0 * max(effect.sd[name], 1e-5))
+
+
+def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
+    for psds in (2, 3, 6):
+        names = [p.name for p in catalogue(psds)['mains_interference'].parameters]
+        sizes, phases = ([f'{of}_{c}' for c in channel_names(psds)] for of in ('amplitude', 'phase'))
+        assert names == ['frequency', *sizes, *phases]
+        turned = catalogue(psds)['sensor_rotation']
+        assert [v['psd'] for v in turned.variants(psds)] == list(range(1, psds + 1))
+    assert [e.name for e in catalogue().values()] == [e.name for e in catalogue(6).values()]
+    with pytest.raises(ConfigError, match='amplitude_x3'):
+        with_effects(TWO, ['mains_interference,amplitude_x3=0.01'], 'test')
 
 
 # Wirings.

@@ -20,7 +20,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, Ef
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.loads.plate_motion import across_of, moved_plate
+from psd_deflection.studies.loads.plate_motion import across_of, dot_rows, moved_plate
 
 CLIP = 6.0
 """Outliers of heavy-tailed noise count no more than so many standard deviations."""
@@ -89,8 +89,9 @@ def excess(ws: Workspace, residual: FloatArray) -> tuple[float, float]:
 
     The second is what the fourth reading could see: a dot that is far off for some moments has much of the first alone.
     """
-    there = [count[ws.rows] > 0.0 for count in ws.count]
-    dots = np.concatenate([part[ws.rows][here] for part, here in zip(ws.split(residual), there, strict=True)])
+    rows = dot_rows(len(ws.count[0]) // 3)
+    there = [count[rows] > 0.0 for count in ws.count]
+    dots = np.concatenate([part[rows][here] for part, here in zip(ws.split(residual), there, strict=True)])
     clipped = np.clip(dots, -CLIP, CLIP)
     return float(dots @ dots) - len(dots), float(clipped @ clipped) / len(dots) - 1.0
 
