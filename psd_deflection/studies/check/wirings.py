@@ -35,7 +35,7 @@ def wirings_of(file: Wiring) -> Sequence[Wiring]:
     """The wirings that are tried of a rig whose file says ``file``: of two PSDs all.
 
     Of more, those in which at most two PSDs are wired otherwise than ``file`` says, and those in which all are wired
-    alike; each with PSD 1 and 2 exchanged and not.
+    alike; each with any two PSDs exchanged, and with none.
     """
     count = len(file.axes)
     if count == 2:
@@ -47,7 +47,9 @@ def wirings_of(file: Wiring) -> Sequence[Wiring]:
             axes[first], axes[second] = one, other
             tried[tuple(axes)] = None
     tried.update(dict.fromkeys((axes,) * count for axes in _AXES))
-    return [Wiring(exchanged, axes) for exchanged in (file.exchanged, not file.exchanged) for axes in tried]
+    swaps: list[tuple[bool, tuple[int, ...]]] = [(file.exchanged, ()), (not file.exchanged, ())]
+    swaps += [(file.exchanged, pair) for pair in itertools.combinations(range(1, count + 1), 2) if pair != (1, 2)]
+    return [Wiring(exchanged, axes, crossed) for exchanged, crossed in swaps for axes in tried]
 
 
 MARGIN = 0.35
@@ -187,17 +189,23 @@ def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
 @dataclass(frozen=True, slots=True)
 class Difference:
     """One way in which a wiring differs from another: ``name`` channel_sign, axis_swap or psd_swap; ``where``: the
-    channel of the device, the PSD of the rig file, or both PSDs."""
+    channel of the device, the PSD of the rig file, or the two PSDs."""
 
     name: str
     where: str
+
+
+SWAP = 'psd_1 psd_2'
+"""The two PSDs whose exchange the rig file can say."""
 
 
 def differences(wiring: Wiring, file: Wiring) -> list[Difference]:
     """What of ``wiring`` is not as the rig file has it."""
     out = []
     if wiring.exchanged != file.exchanged:
-        out.append(Difference('psd_swap', 'psd_1 psd_2'))
+        out.append(Difference('psd_swap', SWAP))
+    if wiring.crossed:
+        out.append(Difference('psd_swap', ' '.join(f'psd_{n}' for n in wiring.crossed)))
     now, then = _of_channels(wiring), _of_channels(file)
     for number in range(1, len(file.axes) + 1):
         psd, axis, _ = now[f'x{number}']
@@ -228,7 +236,10 @@ def parameters(wiring: Wiring, file: Wiring) -> dict[str, object]:
 
 
 def fix_of(difference: Difference, wiring: Wiring, right: Mapping[str, object]) -> str:
-    """The line of the rig file that puts one difference right."""
+    """The line of the rig file that puts one difference right, or what else does."""
+    if difference.name == 'psd_swap' and difference.where != SWAP:
+        both = difference.where.replace(' ', ' and ')
+        return f'exchange the cables of {both} at the device, or what the rig file says of {both}'
     if difference.name == 'psd_swap':
         return line('psds_exchanged', right['psds_exchanged'])
     if difference.name == 'axis_swap':

@@ -149,6 +149,28 @@ def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], told: l
     assert right.volts == pytest.approx(Wiring.from_rig(replace_values(RIG, world)).to_psds(given.volts))
 
 
+def test_two_others_that_are_exchanged_are_named_and_put_right() -> None:
+    """No parameter says it, so there is no line for it."""
+    right = observed(RIG, world={'psd_1.axes': ['x', '-y']})
+    exchanged = dataclasses.replace(right, volts=right.volts[:, [6, 7, 8, 3, 4, 5, 0, 1, 2]])
+    (mended,), findings, lines = wire([exchanged], ())
+    assert [(f.name, f.where) for f in findings] == [('psd_swap', 'psd_1 psd_3'), ('channel_sign', 'y3')]
+    assert findings[0].fix.startswith('exchange the cables of psd_1 and psd_3 at the device')
+    assert lines == {'psd_1.axes': ['x', '-y']}
+    assert mended.volts == pytest.approx(right.volts * [1, -1, 1, *[1] * 6])
+
+
+def test_a_crossed_wiring_goes_to_the_device_and_back() -> None:
+    wiring = Wiring(True, (('x', 'y'), ('-y', 'x'), ('x', '-y'), ('x', 'y')), (2, 4))
+    assert [wiring.input_of(psd) for psd in (1, 2, 3, 4)] == [2, 4, 3, 1]
+    volts = np.arange(24.0).reshape(2, 12)
+    device = wiring.to_device(volts)
+    assert wiring.to_psds(device) == pytest.approx(volts)
+    # x of PSD 2 is minus y of input 4.
+    assert device[:, 10] == pytest.approx(-volts[:, 3])
+    assert not Wiring(crossed=(1, 3), axes=(('x', 'y'),) * 3).nominal
+
+
 def test_a_wiring_as_the_rig_file_says_it_is_no_finding() -> None:
     file = replace_values(RIG, {'psd_1.axes': ['y', '-x'], 'psd_3.axes': ['-x', 'y']})
     right = observed(file)
@@ -156,14 +178,15 @@ def test_a_wiring_as_the_rig_file_says_it_is_no_finding() -> None:
     assert wire([read], ())[1:] == ([], {})
 
 
-def test_the_wirings_of_more_psds_are_those_with_two_wrong_ones_and_those_that_are_alike() -> None:
+def test_the_wirings_of_more_psds_are_those_with_two_wrong_ones_and_those_alike() -> None:
     nominal = Wiring(axes=(('x', 'y'),) * 3)
     each = [wiring.axes[0] for wiring in WIRINGS[:64:8]]
     all_of_three = set(itertools.product(each, repeat=3))
     few = {a for a in all_of_three if sum(axes != ('x', 'y') for axes in a) <= 2 or len(set(a)) == 1}
     tried = wirings_of(nominal)
-    assert len(tried) == len(set(tried)) == 2 * len(few)
-    assert {w.axes for w in tried if w.exchanged} == {w.axes for w in tried if not w.exchanged} == few
+    assert len(tried) == len(set(tried)) == 4 * len(few)
+    for swap in ((False, ()), (True, ()), (False, (1, 3)), (False, (2, 3))):
+        assert {w.axes for w in tried if (w.exchanged, w.crossed) == swap} == few
     assert tried[0] == nominal
     assert wirings_of(Wiring()) is WIRINGS
 

@@ -6,8 +6,8 @@ free sizes. The sizes tell the sign and the unit of each load. A wiring that is 
 less.
 
 More PSDs have too many wirings for that. Of these any two PSDs may be wired otherwise than the rig file says, or all of
-them in one way, each with PSD 1 and 2 exchanged or not: some 350 wirings of three PSDs, 1570 of six. No parameter of
-the rig file says that others than PSD 1 and 2 are exchanged, so this is not tried.
+them in one way, each with any two PSDs exchanged and with none: some 700 wirings of three PSDs, 12 560 of six. No
+parameter of the rig file says that others than PSD 1 and 2 are exchanged, so that has no line.
 """
 
 from __future__ import annotations
@@ -172,10 +172,12 @@ def wire(
     plain = told if not np.any(told_sizes < 0.0) else m.squared + noise
     findings: list[Finding] = []
     lines: dict[str, object] = {}
+    crossed: tuple[int, ...] = ()
     loads = np.ones(3)
     if plain > BETTER * left:
         others = tuple(_words(tried[i][1], file, tried[i][2]) for _, _, i in sorted(as_good)[1:3])
         findings, lines = wiring_findings(wiring, file, plain / left, others)
+        crossed = wiring.crossed
         turned = [k for k in range(3) if sizes[k] < 0.0]
         loads[turned] = -1.0
         findings += [
@@ -187,14 +189,14 @@ def wire(
     if unit_findings(sizes)[0]:
         # kg mm and N cm are 2 % apart, and a large movement is not in proportion to its load.
         sizes = np.abs(sizes) * _over_simulated(
-            [_mended(o, lines, np.nan_to_num(sizes, nan=1.0)) for o in observations], base
+            [_mended(o, lines, crossed, np.nan_to_num(sizes, nan=1.0)) for o in observations], base
         )
     units, factors = unit_findings(sizes, plain / left)
     findings += units
     loads = loads * factors
     if not findings:
         return list(observations), [], {}
-    return [_mended(o, lines, loads) for o in observations], findings, lines
+    return [_mended(o, lines, crossed, loads) for o in observations], findings, lines
 
 
 def _noise_energy(observations: Sequence[Observation]) -> float:
@@ -217,9 +219,12 @@ def _words(wiring: Wiring, file: Wiring, sizes: FloatArray) -> str:
     return ' and '.join(out) or 'as the rig file says'
 
 
-def _mended(o: Observation, lines: dict[str, object], loads: FloatArray) -> Observation:
-    rig = replace_values(o.rig, lines) if lines else o.rig
-    volts = Wiring.from_rig(rig).to_psds(Wiring.from_rig(o.rig).to_device(o.volts)) if lines else o.volts
+def _mended(o: Observation, lines: dict[str, object], crossed: tuple[int, ...], loads: FloatArray) -> Observation:
+    rig, volts = o.rig, o.volts
+    if lines or crossed:
+        rig = replace_values(o.rig, lines)
+        right = dataclasses.replace(Wiring.from_rig(rig), crossed=crossed)
+        volts = right.to_psds(Wiring.from_rig(o.rig).to_device(o.volts))
     return dataclasses.replace(o, rig=rig, volts=volts, loads=o.loads * loads, digest=o.digest or o.hashed())
 
 
