@@ -140,6 +140,11 @@ def catalogue(psds: int = 2) -> Mapping[str, Effect]:
     return {name: effect.on(psds) for name, effect in _loaded(_places()).items()}
 
 
+def effects_for(psds: int) -> list[Effect]:
+    """Every effect that a rig of so many ``psds`` may have, as it is there. Raises ConfigError as :func:`catalogue`."""
+    return [effect for effect in catalogue(psds).values() if effect.least_psds <= psds]
+
+
 def our_effects(*others: str) -> Mapping[str, Effect]:
     """The package's own effects and ``others``, by name, as of two PSDs.
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psd_deflection.model.detector import dot_noise_variances
-from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
+from psd_deflection.model.simulation.catalogue import effects_for, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
 from psd_deflection.records import FloatArray
@@ -153,8 +153,7 @@ class RecordedRig(Machine):
         residual = ws.residual([*ws.base, *ws.nuisance])[0] if fit is None else fit.residual
         more = mistakes(len(ws.observations), self.recorded.delays, likely_jumps(ws, residual), ws.psds)
         more = [e for e in more if e.name not in FIRST or e.name in ws.first]
-        ours = [e for e in catalogue(ws.psds).values() if e.name not in self.recorded.without and not e.lattice]
-        library = [e for e in ours if e.least_psds <= ws.psds]
+        library = [e for e in effects_for(ws.psds) if e.name not in self.recorded.without and not e.lattice]
         values = self.proposals
         if fit is not None and fit.effects:
             # A large effect hides the spectral lines of a small one.

@@ -17,7 +17,7 @@ import numpy as np
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.model.detector import dot_noise_variances
-from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, sort_effects
+from psd_deflection.model.simulation.catalogue import catalogue, effects_for, effects_of_rig, sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
@@ -110,11 +110,8 @@ class ReadingsPlant(Plant):
         self.known = tuple(effects_of_rig(tables[0].rig))
         self.library = tuple(
             e
-            for name, effect in catalogue(tables[0].psds).items()
-            if name not in without
-            and not effect.lattice
-            and effect.least_psds <= tables[0].psds
-            and (e := self._shown(effect)) is not None
+            for effect in effects_for(tables[0].psds)
+            if effect.name not in without and not effect.lattice and (e := self._shown(effect)) is not None
         )
 
     def measured(self) -> Sequence[FloatArray]:
