@@ -424,7 +424,7 @@ def test_a_recording_of_three_is_replayed_without_a_differing_bit(
     assert main(['replay', str(tmp_path / 'c.csv'), '--params-file', str(THREE)]) == 0
 
 
-@pytest.mark.parametrize('command', ['check', 'discover', 'calibrate'])
+@pytest.mark.parametrize('command', ['check', 'calibrate'])
 def test_commands_for_two_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     words = ['--params-file', str(THREE), '--loads', 'constant:0,0,0:1']
     assert main(['simulate', *words, '--out', str(tmp_path / 'a.csv')]) == 0

@@ -22,10 +22,12 @@ class Wiring:
     """``exchanged``: the device's x1 y1 sum1 come from PSD 2, its x2 y2 sum2 from PSD 1.
 
     ``axes``: for each PSD which channels of the device are its x and its y, with their signs: ``('-y', 'x')``.
+    ``crossed``: two other PSDs (from 1), each on the input of the other; no parameter says that, so no rig has it.
     """
 
     exchanged: bool = False
     axes: tuple[tuple[str, str], ...] = (('x', 'y'), ('x', 'y'))
+    crossed: tuple[int, ...] = ()
 
     @classmethod
     def from_rig(cls, rig: Rig) -> Wiring:
@@ -35,10 +37,12 @@ class Wiring:
     @property
     def nominal(self) -> bool:
         """Whether every PSD is wired as the channels are named."""
-        return not self.exchanged and self.axes == (('x', 'y'),) * len(self.axes)
+        return not self.exchanged and not self.crossed and self.axes == (('x', 'y'),) * len(self.axes)
 
     def input_of(self, psd: int) -> int:
         """Of a PSD (from 1), the input of the device that it is wired to: 1 is x1 y1 sum1, 2 is x2 y2 sum2 ..."""
+        if psd in self.crossed:
+            psd = sum(self.crossed) - psd
         return 3 - psd if self.exchanged and psd <= 2 else psd
 
     @property

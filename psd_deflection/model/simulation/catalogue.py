@@ -132,15 +132,27 @@ def _load(name: str, place: Place) -> Effect:
     return found
 
 
-def catalogue() -> Mapping[str, Effect]:
-    """Every effect by name, in the order in which they act. Raises ConfigError if one cannot be loaded."""
-    return _loaded(_places())
+def catalogue(psds: int = 2) -> Mapping[str, Effect]:
+    """Every effect by name, as it is on a rig of so many ``psds``, in the order in which they act.
+
+    Raises ConfigError if one cannot be loaded.
+    """
+    return {name: effect.on(psds) for name, effect in _loaded(_places()).items()}
+
+
+def effects_for(psds: int) -> list[Effect]:
+    """Every effect that a rig of so many ``psds`` may have, as it is there. Raises ConfigError as :func:`catalogue`."""
+    return [effect for effect in catalogue(psds).values() if effect.least_psds <= psds]
 
 
 def our_effects(*others: str) -> Mapping[str, Effect]:
-    """The package's own effects and ``others``, by name. What else a user has is not loaded, so it cannot fail."""
+    """The package's own effects and ``others``, by name, as of two PSDs.
+
+    What else a user has is not loaded, so it cannot fail.
+    """
     own = {module.name for module in pkgutil.iter_modules(ours.__path__)}
-    return _loaded({name: place for name, place in _places().items() if name in own or name in others})
+    found = _loaded({name: place for name, place in _places().items() if name in own or name in others})
+    return {name: effect.on(2) for name, effect in found.items()}
 
 
 def _loaded(places: Mapping[str, Place]) -> dict[str, Effect]:
@@ -148,16 +160,16 @@ def _loaded(places: Mapping[str, Place]) -> dict[str, Effect]:
     return {e.name: e for e in sorted(found, key=lambda e: e.rank)}
 
 
-def make_active(name: str, values: Mapping[str, object], source: str) -> ActiveEffect:
-    """Load this effect only, and check its parameters.
+def make_active(name: str, values: Mapping[str, object], source: str, psds: int = 2) -> ActiveEffect:
+    """Load this effect only, as it is on a rig of so many ``psds``, and check its parameters.
 
     Raises ConfigError naming source, key, value, bound, or the file that cannot be loaded.
     """
-    return _made(name, values, source, _places())
+    return _made(name, values, source, _places(), psds)
 
 
-def _made(name: str, values: Mapping[str, object], source: str, places: Mapping[str, Place]) -> ActiveEffect:
-    effect = _effect(name, values, source, places)
+def _made(name: str, values: Mapping[str, object], source: str, places: Mapping[str, Place], psds: int) -> ActiveEffect:
+    effect = _effect(name, values, source, places).on(psds)
     values = {key: value for key, value in values.items() if key != LAW}
     known = [p.name for p in effect.parameters]
     for key in values:
@@ -226,10 +238,15 @@ def effects_of_rig(rig: Rig) -> list[ActiveEffect]:
     places = _places() if groups else {}
     for group, body in groups.items():
         name = str(body.pop('name', group))
-        active = _made(name, body, f'effects.{group}', places)
+        active = _made(name, body, f'effects.{group}', places, len(rig.psds))
         if PSD in active.effect.parameters and active.values[PSD.name] > len(rig.psds):
             raise ConfigError(
                 f'effects.{group}: psd = {active.values[PSD.name]:g}: the rig has {len(rig.psds)} PSDs (psd_N.center)'
+            )
+        if active.effect.least_psds > len(rig.psds):
+            raise ConfigError(
+                f'effects.{group}: {name} is of a rig of {active.effect.least_psds} PSDs, this one has {len(rig.psds)} '
+                '(psd_N.center)'
             )
         found.append(active)
     return sort_effects(found)

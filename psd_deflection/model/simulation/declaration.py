@@ -6,10 +6,11 @@ of them refers to an effect by name.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import typing
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
 from psd_deflection.base.arithmetic import LIBRARY, Arithmetic
@@ -60,7 +61,8 @@ class EffectParameter:
     this. ``spectral``: peaks of the residual's spectrum, and ``grid``; ``line``: those of steady amplitude and
     phase; ``highest``: the largest voltage seen, ``highest_dots``: the same without the sums; ``lattice``: the
     step on whose multiples all readings lie, and then the effect is named without a search; ``lattice_dots``: the same
-    without the sums. ``power``: the
+    without the sums. ``of_psd``: the PSD that it is
+    of, from 3: a rig without that PSD has no such parameter. ``power``: the
     signature of a ``finite`` effect grows with this power of the parameter; 0: it does not grow in proportion.
     """
 
@@ -80,6 +82,7 @@ class EffectParameter:
     of_rig: str = ''
     required: bool = False
     each: bool = False
+    of_psd: int = 0
     within: Callable[[Physics, Values], tuple[float, float]] | None = None
 
     def checked(self, value: object, source: str) -> float:
@@ -183,6 +186,7 @@ class Effect:
     ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
     ``PLACED_OF_PSD`` (an effect with a PSD) or of ``CALIBRATED_OF_LINK``. The calibration then finds their sizes;
     without it a calibration refuses rigs that have the effect. ``law``: its text in YAML, if it is a law.
+    ``least_psds``: the fewest PSDs of a rig that may have it.
     Raises ValueError if the declaration contradicts itself.
     """
 
@@ -204,6 +208,7 @@ class Effect:
     order: int = 0
     calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
     law: str = ''
+    least_psds: int = 2
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
@@ -288,15 +293,24 @@ class Effect:
                 return p
         raise KeyError(name)
 
-    def variants(self) -> Iterator[dict[str, float]]:
-        """Each combination of the choices, by parameter name; of two PSDs."""
+    def variants(self, psds: int = 2) -> Iterator[dict[str, float]]:
+        """Each combination of the choices, by parameter name, on a rig of so many ``psds``."""
         discrete = [p for p in self.parameters if p.kind == 'choice']
-        for combination in itertools.product(*(p.choices[:2] if p is PSD else p.choices for p in discrete)):
+        for combination in itertools.product(*(p.choices[:psds] if p is PSD else p.choices for p in discrete)):
             yield {p.name: float(c) for p, c in zip(discrete, combination, strict=True)}
+
+    def on(self, psds: int) -> Effect:
+        """The effect with the parameters that it has on a rig of so many ``psds``."""
+        return _on(self, psds) if any(p.of_psd > psds for p in self.parameters) else self
 
     def off_values(self, physics: Physics | None, choice: Values) -> dict[str, float]:
         """All parameters at the value where the effect is off."""
         return {p.name: choice.get(p.name, p.off(physics)) for p in self.parameters}
+
+
+@functools.cache
+def _on(effect: Effect, psds: int) -> Effect:
+    return replace(effect, parameters=tuple(p for p in effect.parameters if p.of_psd <= psds))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import tree_of_file, tree_of_text
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.simulation.declaration import STAGES, Stage
-from psd_deflection.model.simulation.laws import ANY, DOTS, FORMS, TARGETS, Law, LawTerm
+from psd_deflection.model.simulation.laws import ANY, DOTS, FORMS, SUMS, TARGETS, Law, LawTerm
 from psd_deflection.rig.parameters import Parameter, check_value
 
 _FREE = (-math.inf, math.inf)
@@ -42,8 +42,8 @@ def _law_of(tree: object, path: Path) -> Law:
     terms = tuple(_term(path, f'terms[{i}]', body, acts_on) for i, body in enumerate(listed))
     if len({t.kind == 'variance' for t in terms}) > 1:
         raise ConfigError(f'{path}: terms: jitter stands alone; write a law of its own for the other terms')
-    if terms[0].kind == 'variance' and acts_on not in (*DOTS, 'sum1', 'sum2'):
-        raise ConfigError(f'{path}: acts_on = {acts_on!r}: jitter acts on x1, y1, sum1, x2, y2 or sum2')
+    if terms[0].kind == 'variance' and acts_on not in (*DOTS, *SUMS):
+        raise ConfigError(f'{path}: acts_on = {acts_on!r}: jitter acts on x1, y1, sum1 and those of the other PSDs')
     return Law(str(tree['name']), cast(Stage, stage), acts_on, terms, str(tree.get('summary', '')))
 
 

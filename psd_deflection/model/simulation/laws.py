@@ -39,7 +39,7 @@ from psd_deflection.model.simulation.declaration import (
     Values,
 )
 from psd_deflection.model.simulation.samples import SimulatedSamples
-from psd_deflection.records import FloatArray
+from psd_deflection.records import MOST_PSDS, FloatArray, dot_names
 
 Kind = Literal['static', 'switched', 'rate', 'history', 'resonance', 'variance']
 
@@ -50,28 +50,34 @@ VARIABLES: Mapping[str, str] = {
     'dx': 'm',
     'dy': 'm',
     'theta': 'rad',
-    'x1': 'm',
-    'y1': 'm',
-    'x2': 'm',
-    'y2': 'm',
+    **dict.fromkeys(dot_names(MOST_PSDS), 'm'),
     'temperature': 'K',
     'time': 's',
 }
-"""What a law may depend on, with its unit. ``temperature``: above the first one; ``time``: since
-the first sample."""
+"""What a law may depend on, with its unit, on a rig with that PSD. ``temperature``: above the first one;
+``time``: since the first sample."""
 
-_LOADS, _POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
+_LOADS, _POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), dot_names(MOST_PSDS)
+SUMS = tuple(f'sum{n}' for n in range(1, MOST_PSDS + 1))
+
+
+def variables_of(psds: int) -> tuple[str, ...]:
+    """Those of ``VARIABLES`` that a rig of so many PSDs has."""
+    return tuple(n for n in VARIABLES if n not in DOTS or n in dot_names(psds))
 
 
 @dataclass(frozen=True, slots=True)
 class LawTarget:
-    """A quantity that a law adds to: row ``row`` of the samples at ``point``. ``variables``: what is known there."""
+    """A quantity that a law adds to: row ``row`` of the samples at ``point``, of the sums if ``of_sums``.
+    ``variables``: what is known there.
+    """
 
     stage: Stage
     point: Point
     row: int
     unit: str
     variables: tuple[str, ...]
+    of_sums: bool = False
 
 
 _ALWAYS = ('temperature', 'time')
@@ -81,7 +87,7 @@ TARGETS: Mapping[str, LawTarget] = {
     **{n: LawTarget('link', 'pose', i, VARIABLES[n], (*_LOADS, *_POSE, *_ALWAYS)) for i, n in enumerate(_POSE)},
     **{f'beam_{n}': LawTarget('optics', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(DOTS)},
     **{n: LawTarget('psd', 'dots', i, 'm', tuple(VARIABLES)) for i, n in enumerate(DOTS)},
-    **{f'sum{i + 1}': LawTarget('psd', 'dots', 4 + i, 'V', tuple(VARIABLES)) for i in range(2)},
+    **{n: LawTarget('psd', 'dots', i, 'V', tuple(VARIABLES), of_sums=True) for i, n in enumerate(SUMS)},
 }
 """What a law may act on. ``static_dx`` is what the link swings towards, ``dx`` where it is;
 ``beam_x1`` moves a laser's beam sideways."""
@@ -307,8 +313,8 @@ def _apply(law: Law, samples: SimulatedSamples, values: Values, state: State) ->
         y += added * (c if target.row & 1 else -s)
         return
     if target.point == 'dots':
-        rows = samples.dots if target.row < 4 else samples.sums
-        rows[target.row % 4] += added
+        rows = samples.sums if target.of_sums else samples.dots
+        rows[target.row] += added
         return
     {'load': samples.loads, 'static': samples.static, 'pose': samples.pose}[target.point][target.row] += added
 
@@ -323,11 +329,11 @@ def _jitter(law: Law, samples: SimulatedSamples, values: Values, state: State) -
         rms += np.abs(term.coefficient * term.evaluate(partial(known, samples), n, samples.physics.period, {}))
     rng = state.setdefault('noise', np.random.default_rng(zlib.crc32(law.name.encode())))
     hiss = rms * rng.standard_normal(n)
-    if target.row < 4:
+    if target.of_sums:
+        samples.volts[3 * target.row + 2] += hiss
+    else:
         psd, axis = divmod(target.row, 2)
         samples.volts[3 * psd + axis] += hiss / samples.physics.sensitivity[psd, axis]
-    else:
-        samples.volts[3 * (target.row - 4) + 2] += hiss
 
 
 _PASSES = 6
@@ -335,8 +341,8 @@ _PASSES = 6
 
 def _correct(law: Law, reading: Reading, values: Values) -> None:
     """The reading without the law, which is a function of what is read: a fixed point."""
-    terms, row = _with_values(law.terms, values), TARGETS[law.acts_on].row
-    place = reading.dots[row] if row < 4 else reading.sums[row - 4]
+    terms, target = _with_values(law.terms, values), TARGETS[law.acts_on]
+    place = (reading.sums if target.of_sums else reading.dots)[target.row]
     read, n = place.copy(), len(place)
 
     def read_as(name: str) -> FloatArray:
@@ -382,6 +388,11 @@ def _parameters(law: Law) -> list[EffectParameter]:
     return out
 
 
+def _least_psds(law: Law) -> int:
+    named = [law.acts_on.removeprefix('beam_'), *law.variables]
+    return max([2, *(int(n[-1]) for n in named if n in DOTS or n in SUMS)])
+
+
 def effect_of(law: Law) -> Effect:
     """The law as an effect of the simulation; its values are those of the law unless a rig file says others."""
     variance = law.kind == 'variance'
@@ -400,6 +411,7 @@ def effect_of(law: Law) -> Effect:
         correct=partial(_correct, law) if correctable else None,
         uses=uses if correctable else frozenset(),
         order=50,
+        least_psds=_least_psds(law),
         law=_in_yaml(law, line=True).strip(),
     )
 

@@ -89,6 +89,11 @@ class Physics:
         )
 
     @property
+    def psds(self) -> int:
+        """How many PSDs the rig has."""
+        return len(self.centers)
+
+    @property
     def statics(self) -> LinkStatics:
         """The link with these constants."""
         return LinkStatics(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,27 +16,34 @@ from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.sample_table import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
-from psd_deflection.records import FloatArray
+from psd_deflection.records import MOST_PSDS, FloatArray, dot_names
 
 GRAVITY = 9.80665
 """m/s^2, standard."""
 MASS, ARM = 'mass', 'arm'
 TIMES = 't'
-VOLTS = ('x1', 'y1', 'x2', 'y2')
-MILLIMETRES = tuple(f'{name}_mm' for name in VOLTS)
+IN_MILLIMETRES = '_mm'
 ESTIMATES = ('dx', 'dy', 'theta')
-KINDS: Mapping[tuple[str, ...], str] = {
-    VOLTS: 'dots',
-    MILLIMETRES: 'dots',
-    ESTIMATES: 'estimates',
-    REFERENCE_COLUMNS: 'poses',
-}
-"""The columns of each kind of readings."""
-KNOWN = frozenset((TIMES, *LOAD_COLUMNS, MASS, ARM, TEMPERATURE_COLUMN, *(c for group in KINDS for c in group)))
+
+
+def _of_dots(psds: int) -> tuple[tuple[str, ...], ...]:
+    volts = dot_names(psds)
+    return volts, tuple(f'{name}{IN_MILLIMETRES}' for name in volts)
+
+
+def kinds_of(names: Collection[str]) -> Mapping[tuple[str, ...], str]:
+    """The columns of each kind of readings, those of the dots of as many PSDs as ``names`` have."""
+    there = [n for n in range(3, MOST_PSDS + 1) if {*_of_dots(n)[0][-2:], *_of_dots(n)[1][-2:]} & set(names)]
+    volts, millimetres = _of_dots(max(there, default=2))
+    return {volts: 'dots', millimetres: 'dots', ESTIMATES: 'estimates', REFERENCE_COLUMNS: 'poses'}
+
+
+_READ = (name for group in (*_of_dots(MOST_PSDS), ESTIMATES, REFERENCE_COLUMNS) for name in group)
+KNOWN = frozenset((TIMES, *LOAD_COLUMNS, MASS, ARM, TEMPERATURE_COLUMN, *_READ))
 MAX_BYTES = 10_000_000
 FORM = (
     'a table of readings has load_fx,load_fy,load_tz (N, N, N m) or mass (kg), and one of x1,y1,x2,y2 (V), '
-    'x1_mm,y1_mm,x2_mm,y2_mm, dx,dy,theta (m, m, rad) and ref_dx,ref_dy,ref_theta'
+    'x1_mm,y1_mm,x2_mm,y2_mm (of more PSDs also x3,y3 ...), dx,dy,theta (m, m, rad) and ref_dx,ref_dy,ref_theta'
 )
 
 
@@ -52,7 +59,7 @@ def is_table(source: Recording | str | Path) -> bool:
             names = _names(next(csv.reader([stream.readline(10_000)], skipinitialspace=True), []))
     except (OSError, UnicodeDecodeError, csv.Error):
         return False
-    alone = TIMES not in names or (VOLTS[0] not in names and bool(set(REFERENCE_COLUMNS) & set(names)))
+    alone = TIMES not in names or ('x1' not in names and bool(set(REFERENCE_COLUMNS) & set(names)))
     return alone and (MASS in names or bool(set(LOAD_COLUMNS) & set(names)))
 
 
@@ -132,7 +139,7 @@ class ReadingsTable:
 
     def values(self) -> tuple[str, ...]:
         """The names of the columns that hold readings."""
-        there = [group for group in KINDS if set(group) & set(self.names)]
+        there = [group for group in kinds_of(self.names) if set(group) & set(self.names)]
         if not there:
             raise self.refuse(self.head, f'the header has no readings; {FORM}')
         if TIMES in self.names and there != [REFERENCE_COLUMNS]:

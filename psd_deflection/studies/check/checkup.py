@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
-from psd_deflection.rig.config import Rig
+from psd_deflection.rig.config import Rig, check_two_psds
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.judges import (
     noise_findings,
@@ -62,7 +62,11 @@ class CheckProblem:
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
-    """The problem of a recording: ``volts`` (n, 6) of the device's channels, ``loads`` (n, 3), N, N, N m, held."""
+    """The problem of a recording: ``volts`` (n, 6) of the device's channels, ``loads`` (n, 3), N, N, N m, held.
+
+    Raises ConfigError for a rig of more than two PSDs.
+    """
+    check_two_psds(rig, 'check')
     mended = mend_loads(rig, volts[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
     late: Sequence[MendedNote] = ()
     moved = volts

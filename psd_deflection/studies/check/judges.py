@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, channel_names, dot_names
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.wiring import Wiring
@@ -36,12 +36,12 @@ LOADS = ('load_fx', 'load_fy', 'load_tz')
 def noise_findings(
     rig: Rig, noise: FloatArray, steps: FloatArray | None = None
 ) -> tuple[list[Finding], dict[str, object]]:
-    """Whether ``noise`` (2, 2), V rms a sample of x and y of each PSD, is the rig file's; lines that put it right.
+    """Whether ``noise`` (P, 2), V rms a sample of x and y of each PSD, is the rig file's; lines that put it right.
 
     NaN for a channel that is stuck. A rig file that says the noise of each channel is held against each. ``steps``
-    (2, 2), V: of the converter, where they are coarser than the rig file's: they make noise of their own.
+    (P, 2), V: of the converter, where they are coarser than the rig file's: they make noise of their own.
     """
-    dots = np.asarray(noise, dtype=np.float64).reshape(2, 2)
+    dots = np.asarray(noise, dtype=np.float64).reshape(-1, 2)
     step = np.maximum(0.0 if steps is None else steps, rig.converter.volts_per_count)
     stated = np.hypot(rig.noises[:, :2], step / math.sqrt(12.0))
     if any(any(psd.noise) for psd in rig.psds):
@@ -54,14 +54,14 @@ def noise_findings(
         return [], {}
     level = float(f'{factor * rig.amplifier.noise:.2g}')
     fix = line('amplifier.noise', level)
-    found = Finding('noise_level', 'x1 y1 x2 y2', round(factor, 3), fix, abs(math.log(factor)))
+    found = Finding('noise_level', ' '.join(dot_names(len(rig.psds))), round(factor, 3), fix, abs(math.log(factor)))
     return [found], {'amplifier.noise': level}
 
 
 def step_findings(rig: Rig, steps: FloatArray, *, finer: bool = False) -> tuple[list[Finding], dict[str, object]]:
     """Channels whose converter steps more coarsely than the rig file says; lines that put it right.
 
-    ``steps`` (6,), V, of the device's channels, 0 where they are the rig file's. ``finer``: some channels are seen to
+    ``steps`` (3P,), V, of the device's channels, 0 where they are the rig file's. ``finer``: some channels are seen to
     have these.
     """
     if not steps.any():
@@ -72,7 +72,7 @@ def step_findings(rig: Rig, steps: FloatArray, *, finer: bool = False) -> tuple[
     told = not finer and LEAST_BITS <= bits < rig.converter.bits
     right: dict[str, object] = {'converter.bits': bits} if told else {}
     findings = []
-    for name, step in zip(CHANNELS, steps.tolist(), strict=True):
+    for name, step in zip(channel_names(len(steps) // 3), steps.tolist(), strict=True):
         if step:
             words = f'{name} steps by {step * 1e3:.3g} mV, the rig file says {own * 1e3:.3g} mV'
             fix = f'{line("converter.bits", bits)} ({words})' if right else words
@@ -82,7 +82,7 @@ def step_findings(rig: Rig, steps: FloatArray, *, finer: bool = False) -> tuple[
 
 def _of_each_channel(noise: FloatArray, stated: FloatArray) -> tuple[list[Finding], dict[str, object]]:
     findings, lines = [], dict[str, object]()
-    for psd in (1, 2):
+    for psd in range(1, len(noise) + 1):
         own = noise[psd - 1]
         factors = own / stated[psd - 1]
         if not np.isfinite(own).all() or not any(map(_far, factors.tolist())):

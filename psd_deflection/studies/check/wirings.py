@@ -19,7 +19,7 @@ import numpy as np
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.plate.linear import design_matrix
-from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray, dot_names
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.wiring import Wiring
 
@@ -29,6 +29,28 @@ WIRINGS = tuple(
     Wiring(exchanged, (first, second)) for exchanged in (False, True) for first in _AXES for second in _AXES
 )
 """All 128, the nominal one first."""
+
+
+def wirings_of(file: Wiring) -> Sequence[Wiring]:
+    """The wirings that are tried of a rig whose file says ``file``: of two PSDs all.
+
+    Of more, those in which at most two PSDs are wired otherwise than ``file`` says, and those in which all are wired
+    alike; each with any two PSDs exchanged, and with none.
+    """
+    count = len(file.axes)
+    if count == 2:
+        return WIRINGS
+    tried = {file.axes: None}
+    for first, second in itertools.combinations(range(count), 2):
+        for one, other in itertools.product(_AXES, _AXES):
+            axes = list(file.axes)
+            axes[first], axes[second] = one, other
+            tried[tuple(axes)] = None
+    tried.update(dict.fromkeys((axes,) * count for axes in _AXES))
+    swaps: list[tuple[bool, tuple[int, ...]]] = [(file.exchanged, ()), (not file.exchanged, ())]
+    swaps += [(file.exchanged, pair) for pair in itertools.combinations(range(1, count + 1), 2) if pair != (1, 2)]
+    return [Wiring(exchanged, axes, crossed) for exchanged, crossed in swaps for axes in tried]
+
 
 MARGIN = 0.35
 """A wiring whose misfit is larger than the best one's by more than this is ruled out."""
@@ -167,23 +189,29 @@ def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
 @dataclass(frozen=True, slots=True)
 class Difference:
     """One way in which a wiring differs from another: ``name`` channel_sign, axis_swap or psd_swap; ``where``: the
-    channel of the device, the PSD of the rig file, or both PSDs."""
+    channel of the device, the PSD of the rig file, or the two PSDs."""
 
     name: str
     where: str
+
+
+SWAP = 'psd_1 psd_2'
+"""The two PSDs whose exchange the rig file can say."""
 
 
 def differences(wiring: Wiring, file: Wiring) -> list[Difference]:
     """What of ``wiring`` is not as the rig file has it."""
     out = []
     if wiring.exchanged != file.exchanged:
-        out.append(Difference('psd_swap', 'psd_1 psd_2'))
+        out.append(Difference('psd_swap', SWAP))
+    if wiring.crossed:
+        out.append(Difference('psd_swap', ' '.join(f'psd_{n}' for n in wiring.crossed)))
     now, then = _of_channels(wiring), _of_channels(file)
-    for number in (1, 2):
+    for number in range(1, len(file.axes) + 1):
         psd, axis, _ = now[f'x{number}']
         if axis != then[f'x{number}'][1]:
             out.append(Difference('axis_swap', f'psd_{psd}'))
-    out += [Difference('channel_sign', channel) for channel in DOTS if now[channel][2] != then[channel][2]]
+    out += [Difference('channel_sign', c) for c in dot_names(len(file.axes)) if now[c][2] != then[c][2]]
     return out
 
 
@@ -208,13 +236,20 @@ def parameters(wiring: Wiring, file: Wiring) -> dict[str, object]:
 
 
 def fix_of(difference: Difference, wiring: Wiring, right: Mapping[str, object]) -> str:
-    """The line of the rig file that puts one difference right."""
+    """The line of the rig file that puts one difference right, or what else does."""
+    if difference.name == 'psd_swap' and difference.where != SWAP:
+        both = difference.where.replace(' ', ' and ')
+        return f'exchange the cables of {both} at the device, or what the rig file says of {both}'
     if difference.name == 'psd_swap':
         return line('psds_exchanged', right['psds_exchanged'])
     if difference.name == 'axis_swap':
         name = f'{difference.where}.axes'
     else:
-        name = next(f'psd_{psd}.axes' for psd in (1, 2) if wiring.input_of(psd) == int(difference.where[-1]))
+        name = next(
+            f'psd_{psd}.axes'
+            for psd in range(1, len(wiring.axes) + 1)
+            if wiring.input_of(psd) == int(difference.where[-1])
+        )
     return line(name, right[name] if name in right else list(wiring.axes[int(name[4]) - 1]))
 
 

@@ -208,7 +208,7 @@ class Conclusion(StudyResult):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RigConclusion(Conclusion):
-    """The answer for the rig. Gaps in m (rms of block means over x1 y1 x2 y2).
+    """The answer for the rig. Gaps in m (rms of block means over all dots).
 
     ``setup``: mistakes of the set-up and the recording, with ``values`` that put the rig file right; ``known``: the
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.

@@ -12,15 +12,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from psd_deflection.model.detector import dot_noise_variances
-from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig
+from psd_deflection.model.simulation.catalogue import effects_for, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.solvers import solver_from_rig
-from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.check.judges import noise_findings, step_findings
 from psd_deflection.studies.discover import recorded as recordings_ready
 from psd_deflection.studies.discover.laws.laws import FoundLaw, find_law
-from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.observation import Observation, check_same_psds
 from psd_deflection.studies.discover.planning import Suggestion, suggest
 from psd_deflection.studies.discover.problem import Machine, Problem, Progress
 from psd_deflection.studies.discover.recorded import Recorded
@@ -48,6 +48,7 @@ from psd_deflection.studies.discover.setup.hung import levels, times, told
 from psd_deflection.studies.discover.setup.redundant import PART, STAGES, excess, fourth_reading, visible
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
+from psd_deflection.studies.loads.plate_motion import dots_of
 from psd_deflection.studies.loads.plateaus import all_free, may_be_rounded, rounded
 
 FREED_FROM = 10.0
@@ -78,7 +79,7 @@ def discover(
     Each recording carries its rig with its own overrides; ``rig`` is the common one (that of the
     first by default), whose effects count as known. ``without``: effects to leave out of the
     library. ``bank``: signatures of the same design from an earlier call. Raises ConfigError if the
-    rig's effects are malformed.
+    rig's effects are malformed, RecordingError if the recordings are not of as many PSDs as the rig has.
     """
     known = recordings[0].rig if rig is None else rig
     machine = RecordedRig.of(recordings, known, without, bank, progress)
@@ -117,6 +118,7 @@ class RecordedRig(Machine):
         progress: Progress,
     ) -> RecordedRig:
         """The recordings made ready. ``bank``: see :func:`discover`."""
+        check_same_psds(recordings, rig)
         progress('checking the recording')
         recorded = Recorded(tuple(recordings), rig, tuple(effects_of_rig(rig)), tuple(without))
         for step in recordings_ready.STEPS:
@@ -151,9 +153,9 @@ class RecordedRig(Machine):
         """The catalogue's effects and the mistakes of the set-up, beside ``fit`` if that leaves much."""
         ws = workspace_of(comparison)
         residual = ws.residual([*ws.base, *ws.nuisance])[0] if fit is None else fit.residual
-        more = mistakes(len(ws.observations), self.recorded.delays, likely_jumps(ws, residual))
+        more = mistakes(len(ws.observations), self.recorded.delays, likely_jumps(ws, residual), ws.psds)
         more = [e for e in more if e.name not in FIRST or e.name in ws.first]
-        library = [e for e in catalogue().values() if e.name not in self.recorded.without and not e.lattice]
+        library = [e for e in effects_for(ws.psds) if e.name not in self.recorded.without and not e.lattice]
         values = self.proposals
         if fit is not None and fit.effects:
             # A large effect hides the spectral lines of a small one.
@@ -387,10 +389,10 @@ def set_up(problem: Problem) -> Problem:
         named.append(_named_lattice(ws, lattice))
         step = float(lattice.values[lattice.effect.lattice])
         # The effect stands for the line: with both, the steps would be counted twice.
-        steps = np.full(len(CHANNELS), step)
+        steps = np.full(3 * ws.psds, step)
         finer = not lattice.effect.steps_sums(lattice.values)
         if finer:
-            steps[[c for c in range(len(CHANNELS)) if c not in DOT_CHANNELS]] = 0.0
+            steps[2::3] = 0.0
         setup += step_findings(ws.observations[0].rig, steps, finer=finer)[0]
     return replace(
         problem,
@@ -436,10 +438,9 @@ def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
     most = np.zeros(3)
     # In fine means: an estimate is of a moment, and the mean of a block in which the link swings is of none.
     for o, count, *volts in zip(ws.observations, ws.count, *tables, strict=True):
-        rows = list(DOT_CHANNELS)
-        dots, nominal = (v[rows] * o.rig.sensitivities.reshape(4, 1) for v in volts)
+        dots, nominal = (dots_of(o.rig, v) for v in volts)
         solver = solver_from_rig(o.rig.estimator.solver, o.rig)
-        there = (count[rows] > 0.0).all(axis=0)
+        there = (count[ws.rows] > 0.0).all(axis=0)
         variances = dot_noise_variances(o.rig) / o.rig.estimator.block_size
         poses = [solver.solve_many(d[:, there].T, variances).pose for d in (dots, nominal)]
         change = np.abs(poses[0] - poses[1])

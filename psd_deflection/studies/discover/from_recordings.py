@@ -14,13 +14,20 @@ from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_file
 from psd_deflection.recordings.read.grid import MAX_SAMPLES, digest_of, held_at
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.read.readings_table import KINDS, KNOWN, MILLIMETRES, TIMES, ReadingsTable, is_table
+from psd_deflection.recordings.read.readings_table import (
+    IN_MILLIMETRES,
+    KNOWN,
+    TIMES,
+    ReadingsTable,
+    is_table,
+    kinds_of,
+)
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import check_psds, rig_at_end, warnings_about_rig, zero_variances_at_end
 from psd_deflection.recordings.sample_table import TEMPERATURE_COLUMN
 from psd_deflection.recordings.spans import WHOLE, Span
-from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
-from psd_deflection.rig.config import Rig, check_two_psds, load_rig, replace_values
+from psd_deflection.records import FloatArray, channel_names, dot_channels
+from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
@@ -63,7 +70,6 @@ def read_observation(
                 warn(warning)
     if overrides:
         rig = replace_values(rig, overrides, where)
-    check_two_psds(rig, 'a comparison with the simulation')
     check_psds(recording, rig)
     recording = recording.with_block_size(rig.estimator.block_size)
     samples = recording.samples
@@ -73,8 +79,8 @@ def read_observation(
     if n > MAX_SAMPLES:
         raise RecordingError(f'{path}: {n} samples; discover takes at most {MAX_SAMPLES}')
     place = (samples['seq'] - first).astype(np.int64)
-    volts = np.full((n, 6), np.nan)
-    for i, channel in enumerate(CHANNELS):
+    volts = np.full((n, 3 * len(rig.psds)), np.nan)
+    for i, channel in enumerate(channel_names(len(rig.psds))):
         volts[place, i] = samples[channel]
     period = 1e9 / rig.converter.sample_rate_hz
     # Times of the whole grid, lost samples included: straight lines between the samples present.
@@ -229,15 +235,19 @@ def read_readings(
         rig = load_rig()
     if overrides:
         rig = replace_values(rig, overrides, where)
-    check_two_psds(rig, 'a comparison with the simulation')
     values = table.columns(names, empty=True)
     warm = table.column(TEMPERATURE_COLUMN) if TEMPERATURE_COLUMN in table.names else None
-    kind = KINDS[names]
+    kind = kinds_of(names)[names]
     if kind == 'dots':
-        channels = np.zeros((len(values), 6))
-        channels[:, list(DOT_CHANNELS)] = values
-        scale = 1e-3 if names == MILLIMETRES else rig.sensitivities.ravel()
-        values = Wiring.from_rig(rig).to_psds(channels)[:, list(DOT_CHANNELS)] * scale
+        psds = len(rig.psds)
+        if len(names) != 2 * psds:
+            raise RecordingError(
+                f'{path}: has readings of {len(names) // 2} PSDs, the rig file has {psds} (psd_N.center)'
+            )
+        channels = np.zeros((len(values), 3 * psds))
+        channels[:, dot_channels(psds)] = values
+        scale = 1e-3 if names[0].endswith(IN_MILLIMETRES) else rig.sensitivities.ravel()
+        values = Wiring.from_rig(rig).to_psds(channels)[:, dot_channels(psds)] * scale
     for name, column in zip(names, values.T, strict=True):
         if np.count_nonzero(np.isfinite(column)) < 2:
             raise RecordingError(f'{path}: column {name} has less than 2 readings')

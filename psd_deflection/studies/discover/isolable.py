@@ -21,7 +21,7 @@ from scipy.stats import chi2
 from psd_deflection.base.drawings import Matrix
 from psd_deflection.base.pages import table, wide
 from psd_deflection.base.tables import Column, Table, columns, text_column
-from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.catalogue import effects_for
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
@@ -180,8 +180,8 @@ def isolable(
         found.append(one)
         matrix.append(shares)
     hidden = {}
-    for effect in catalogue().values():
-        for choice in effect.variants():
+    for effect in effects_for(len(rig.psds)):
+        for choice in effect.variants(len(rig.psds)):
             label = ActiveEffect(effect, choice).label
             # Lines of a spectrum and coarse steps are looked for where readings have them; none are there yet.
             by_itself = any(p.proposed_by(choice) in FROM_READINGS for p in effect.parameters)

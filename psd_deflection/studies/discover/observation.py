@@ -7,6 +7,7 @@ are NaN, so the simulation runs on the true time axis and no sample is made up.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,13 +22,13 @@ QUIET = 0.25
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observation:
-    """``volts`` (n, 6) V of the PSDs, x y sum of each, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held.
+    """``volts`` (n, 3P) V of the PSDs, x y sum of each, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held.
 
     ``temperature`` (n,) degrees Celsius or None. ``rig``: the rig with this recording's own
     overrides. ``digest``: of its source. ``unknown_load``: numbers of samples before the first known load and
     after the last; what ``loads`` holds there is only a placeholder. ``stated_rate_hz``: the rig
     file's sample rate if the recording's times say another, which ``rig`` then has; else 0. ``marks``: from the
-    first sample. ``zero_variances`` (4,) m^2: of the rig's zero, if it was taken in the recording.
+    first sample. ``zero_variances`` (2P,) m^2: of the rig's zero, if it was taken in the recording.
     """
 
     name: str
@@ -45,12 +46,17 @@ class Observation:
         n = len(self.volts)
         if n < 4 * self.rig.estimator.block_size:
             raise RecordingError(f'{self.name}: {n} samples: discover needs at least 4 blocks')
-        if self.volts.shape != (n, 6) or self.loads.shape != (n, 3):
+        if self.volts.shape != (n, 3 * self.psds) or self.loads.shape != (n, 3):
             raise RecordingError(f'{self.name}: volts {self.volts.shape} and loads {self.loads.shape} do not match')
         if not np.all(np.isfinite(self.loads)):
             raise RecordingError(f'{self.name}: a load is not a finite number')
         if self.temperature is not None and not np.all(np.isfinite(self.temperature)):
             raise RecordingError(f'{self.name}: a temperature is not a finite number')
+
+    @property
+    def psds(self) -> int:
+        """How many PSDs the rig has."""
+        return len(self.rig.psds)
 
     @property
     def period(self) -> float:
@@ -69,6 +75,15 @@ class Observation:
             if a is not None:
                 h.update(np.ascontiguousarray(a, dtype=np.float32).tobytes())
         return h.hexdigest()
+
+
+def check_same_psds(observations: Sequence[Observation], rig: Rig) -> None:
+    """Raise RecordingError if a recording is of another number of PSDs than the ``rig`` of the search."""
+    for o in observations:
+        if o.psds != len(rig.psds):
+            raise RecordingError(
+                f'{o.name}: is of {o.psds} PSDs, the rig of the search has {len(rig.psds)}: search them one by one'
+            )
 
 
 def load_cases(loads: FloatArray, period: float) -> IntArray:

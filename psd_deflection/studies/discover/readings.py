@@ -17,27 +17,25 @@ import numpy as np
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.model.detector import dot_noise_variances
-from psd_deflection.model.simulation.catalogue import catalogue, effects_of_rig, sort_effects
+from psd_deflection.model.simulation.catalogue import catalogue, effects_for, effects_of_rig, sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.model.solvers import solver_from_rig
-from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
+from psd_deflection.records import FloatArray, IntArray, dot_names
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.conclusion import model_yaml
 from psd_deflection.studies.discover.plants import Model, Plant
+from psd_deflection.studies.loads.plate_motion import dots_of
 from psd_deflection.studies.study import Tell, warn_caller
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {
-    'dots': ('x1', 'y1', 'x2', 'y2'),
+    'dots': dot_names(2),
     'estimates': ('dx', 'dy', 'theta'),
     'poses': ('ref_dx', 'ref_dy', 'ref_theta'),
 }
-UNITS: Mapping[str, tuple[str, ...]] = {
-    'dots': ('µm',) * 4,
-    'estimates': ('µm', 'µm', 'µrad'),
-    'poses': ('µm', 'µm', 'µrad'),
-}
+"""Of two PSDs."""
+OF_POSE = ('µm', 'µm', 'µrad')
 MICRO = 1e6
 LEAST_LOADS = 4
 FOLDS = 6
@@ -71,11 +69,17 @@ class Readings:
         """The different loads (k, 3)."""
         return np.asarray(np.unique(self.loads, axis=0))
 
+    @property
+    def psds(self) -> int:
+        """How many PSDs the rig has."""
+        return len(self.rig.psds)
+
 
 class ReadingsPlant(Plant):
     """The rig as its tables show it. All tables hold the same kind of readings; each has its own rig.
 
-    ``known``: the effects that the rig file has already. Raises RecordingError if the tables differ in kind.
+    ``known``: the effects that the rig file has already. Raises RecordingError if the tables differ in kind, or their
+    rigs in the number of PSDs.
     """
 
     def __init__(
@@ -90,17 +94,24 @@ class ReadingsPlant(Plant):
         if len(kinds) > 1:
             words = ' and '.join(','.join(CHANNELS[k]) for k in sorted(kinds))
             raise RecordingError(f'{", ".join(t.name for t in tables)}: one has {words}: search them one by one')
+        other = next((t for t in tables if t.psds != tables[0].psds), None)
+        if other is not None:
+            raise RecordingError(
+                f'{other.name}: is of {other.psds} PSDs, {tables[0].name} of {tables[0].psds}: search them one by one'
+            )
         self.tables = tuple(tables)
         self._params_file, self._tell = params_file, tell
         self.kind = tables[0].kind
-        self.channels, self.units = CHANNELS[self.kind], UNITS[self.kind]
+        of_dots = self.kind == 'dots'
+        self.channels = dot_names(tables[0].psds) if of_dots else CHANNELS[self.kind]
+        self.units = ('µm',) * len(self.channels) if of_dots else OF_POSE
         self.cases = tuple(t.name for t in tables)
         self.physics = Physics.of(tables[0].rig)
         self.known = tuple(effects_of_rig(tables[0].rig))
         self.library = tuple(
             e
-            for name, effect in catalogue().items()
-            if name not in without and not effect.lattice and (e := self._shown(effect)) is not None
+            for effect in effects_for(tables[0].psds)
+            if effect.name not in without and not effect.lattice and (e := self._shown(effect)) is not None
         )
 
     def measured(self) -> Sequence[FloatArray]:
@@ -118,7 +129,7 @@ class ReadingsPlant(Plant):
 
     def simulate(self, model: Model) -> Sequence[FloatArray]:
         """What the rig would read with the effects of ``model``, each once."""
-        every = catalogue()
+        every = catalogue(self.tables[0].psds)
         return self.simulate_effects([ActiveEffect(every[name], values) for name, values in model.items()])
 
     def simulate_effects(self, effects: Sequence[ActiveEffect]) -> Sequence[FloatArray]:
@@ -143,7 +154,7 @@ class ReadingsPlant(Plant):
         rig, warm = table.rig, table.temperature
         model = ForwardModel(rig, sort_effects([*self.known, *effects]), settled=True)
         samples = model.expect(table.loads[order], None if warm is None else warm[order])
-        dots = samples.volts[list(DOT_CHANNELS)] * rig.sensitivities.reshape(4, 1)
+        dots = dots_of(rig, samples.volts)
         back = np.argsort(order)
         if self.kind == 'dots':
             return np.asarray(MICRO * dots[:, back])
@@ -160,7 +171,7 @@ class ReadingsPlant(Plant):
         backward = np.concatenate((forward[:1], forward[:0:-1]))
         by_choice: dict[tuple[float, ...], list[FloatArray]] = {}
         choices = [p for p in effect.parameters if p.kind == 'choice' and not p.each]
-        for choice in effect.variants():
+        for choice in effect.variants(table.psds):
             active = ActiveEffect(effect, _dosed(effect, effect.off_values(self.physics, choice)))
             rows = self._rows(table, [active], forward)
             if not np.allclose(rows, self._rows(table, [active], backward), rtol=1e-9, atol=1e-6):

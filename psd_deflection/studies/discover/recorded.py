@@ -16,7 +16,7 @@ import numpy as np
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
-from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.studies.check.judges import note_finding
 from psd_deflection.studies.check.result import Finding
@@ -122,7 +122,8 @@ def snapped(recorded: Recorded) -> Recorded:
     if step is None:
         return recorded
     # The converter has rounded each reading once more.
-    rows = list(range(len(CHANNELS)) if step.sums else DOT_CHANNELS)
+    psds = len(recorded.rig.psds)
+    rows = list(range(3 * psds) if step.sums else dot_channels(psds))
     observations = tuple(_with_volts(o, _on_steps(o.volts, rows, step.step)) for o in recorded.observations)
     if stated:
         known = tuple(a for a in recorded.known if a is not stated[0])
@@ -211,7 +212,7 @@ def _stated_floor(workspace: Workspace) -> float:
 
 
 def _not_as_noted(workspace: Workspace, i: int, difference: FloatArray) -> list[WrongNote | SwayingLoad | UnnotedTime]:
-    """What of recording ``i`` was noted otherwise than it hung; ``difference`` (6, m), V: measured minus simulated."""
+    """What of recording ``i`` was noted otherwise than it hung; ``difference`` (3P, m), V: measured minus simulated."""
     o = workspace.observations[i]
     found = levels(workspace, i, difference, times(o, i))
     wrong = noted_wrong(o.loads, o.period, partial(_asked, workspace, i, found), MOST_AN_EFFECT_DOES)

@@ -13,7 +13,7 @@ from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Series, Time
 from psd_deflection.base.drawings import CELL, BarColumn, Bars, Drawing, Matrix
 from psd_deflection.base.pages import table
 from psd_deflection.model.simulation.laws import VARIABLES
-from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, channel_names
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.conclusion import Conclusion, RigConclusion
 from psd_deflection.studies.discover.laws.law_features import known_values
@@ -25,9 +25,9 @@ from psd_deflection.studies.discover.search.smooth import Smooth
 from psd_deflection.studies.discover.search.trust import BANDS
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Unknown
 from psd_deflection.studies.discover.trees import parameters_of, size_of
+from psd_deflection.studies.loads.plate_motion import dots_of
 from psd_deflection.studies.study import PageSection
 
-DOTS = ('x1', 'y1', 'x2', 'y2')
 BEFORE: Final = 'red'
 AFTER: Final = 'blue'
 
@@ -63,7 +63,7 @@ def _against_chart(discovery: Conclusion) -> Chart | None:
     ws = discovery.workspace
     tables = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
     gaps = list(discovery.per_channel.values())
-    row = max(range(len(gaps)), key=lambda c: (gaps[c][0] ** 2 - gaps[c][1] ** 2) / max(gaps[c][0], 1e-300) ** 2)
+    row = max(range(len(gaps)), key=lambda c: (gaps[c][0] ** 2 - gaps[c][1] ** 2) / max(gaps[c][0] ** 2, 1e-300))
     before, after = (np.concatenate([t[row] for t in table]) for table in tables)
     panels = []
     for name, values in ws.against().items():
@@ -117,17 +117,15 @@ def _spectrum(rows: FloatArray, period: float) -> tuple[FloatArray, FloatArray]:
 def _spectrum_chart(discovery: RigConclusion) -> Chart:
     ws = discovery.workspace
     o, size = ws.observations[0], ws.fine[0]
-    rows = list(DOT_CHANNELS)
     curves = []
     fits: tuple[tuple[Fit, Colour, str], ...] = (
         (discovery.search.null, BEFORE, 'before'),
         (discovery.fit, AFTER, 'after'),
     )
     for fit, colour, name in fits:
-        dots = fit.difference[0][rows] * o.rig.sensitivities.reshape(4, 1)
-        f, p = _spectrum(dots, o.period * size)
+        f, p = _spectrum(dots_of(o.rig, fit.difference[0]), o.period * size)
         curves.append(Series(name, f, np.sqrt(p) * 1e6, colour))
-    words = f'spectrum of the residual, mean of x1 y1 x2 y2 ({o.name})'
+    words = f'spectrum of the residual, mean of {" ".join(ws.channels)} ({o.name})'
     return Chart(words, [Panel(curves, 'frequency / Hz', 'density / µm/√Hz', log='x, y', height=240)])
 
 
@@ -146,8 +144,9 @@ def _waterfall(discovery: Conclusion) -> Bars:
 
 def _where_matrix(discovery: Conclusion) -> tuple[str, Matrix]:
     of_rig = isinstance(discovery, RigConclusion)
+    ws = discovery.workspace
     bands = [f'{a:g}-{b:g}' for a, b in itertools.pairwise(BANDS)] if of_rig else ['']
-    names = CHANNELS if of_rig else discovery.workspace.channels
+    names = channel_names(len(ws.channels) // 2) if of_rig else ws.channels
     shown = discovery.where.map
     most = float(np.clip(np.nanmax(shown), 8.0, 60.0))
     # With a gap between channels.
@@ -155,7 +154,7 @@ def _where_matrix(discovery: Conclusion) -> tuple[str, Matrix]:
     labels = ['' if of_rig and label in names else label for label in labels]
     parts = [np.pad(shown[:, c, :], ((0, 0), (0, 1)), constant_values=np.nan) for c in range(len(names))]
     spans = discovery.where.spans
-    told = [f'{a:.1f}-{b:.1f} s' if of_rig else discovery.workspace.names[i] for i, a, b in spans]
+    told = [f'{a:.1f}-{b:.1f} s' if of_rig else ws.names[i] for i, a, b in spans]
     height = max(4, min(CELL, 400 // len(spans)))
     every = -(-CELL // height)
     rows = [name if i % every == 0 else '' for i, name in enumerate(told)]
@@ -213,12 +212,12 @@ def _law_chart(discovery: RigConclusion, found: FoundLaw) -> Chart:
         Series('missing', at, before, BEFORE, 'points'),
         Series('law', at, moved[row] * 1e6, 'text', 'points'),
     )
-    along, label = f'{name} / {unit}', f'{DOTS[row]} / µm'
+    along, label = f'{name} / {unit}', f'{ws.channels[row]} / µm'
     panels = [
         Panel(law, along, label, height=SMALL),
         Panel((Series('left with the law', at, after, AFTER, 'points'),), along, label, height=SMALL),
     ]
-    return Chart(f'measured minus simulated {DOTS[row]} against {name}, block means', panels, beside=2)
+    return Chart(f'measured minus simulated {ws.channels[row]} against {name}, block means', panels, beside=2)
 
 
 def _law_section(discovery: RigConclusion, found: FoundLaw) -> list[str | Drawing]:

@@ -17,7 +17,7 @@ LoadNote = MendedNote | WrongNote | SwayingLoad | UnnotedTime
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ActedLoads:
-    """``loads`` (n, 3) N, N, N m, as they acted; ``volts`` (n, 6) V without the times in which nobody knows; ``notes``
+    """``loads`` (n, 3) N, N, N m, as they acted; ``volts`` (n, 3P) V without the times in which nobody knows; ``notes``
     of what was noted otherwise.
     """
 
@@ -27,7 +27,7 @@ class ActedLoads:
 
 
 def loads_that_acted(rig: Rig, volts: FloatArray, loads: FloatArray) -> ActedLoads:
-    """Those of a recording. ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held,
+    """Those of a recording. ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held,
     at the times at which they acted.
     """
     period = 1.0 / rig.converter.sample_rate_hz

@@ -147,7 +147,7 @@ def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | N
     """The loads with the times at which they acted and without the noise of a load cell; None if they are right as
     noted or the motion does not tell.
 
-    ``dots`` (n, 4) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as noted, held.
+    ``dots`` (n, 2P) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as noted, held.
     """
     calm, measured = without_cell_noise(loads)
     mended = _mended_times(rig, dots, calm)
@@ -157,7 +157,7 @@ def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | N
 
 
 def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
-    """When a load began to act that nobody noted, s from the first sample: steps of ``dots`` (n, 4), m, without a
+    """When a load began to act that nobody noted, s from the first sample: steps of ``dots`` (n, 2P), m, without a
     change of ``loads`` (n, 3) near them.
     """
     period = 1.0 / rig.converter.sample_rate_hz
@@ -224,7 +224,7 @@ def _as_acted(
 
 
 def _without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNote], rest: FloatArray) -> MendedLoads:
-    """The mended loads; the motion under one applied slowly is left out if it is not what ``rest`` (n, 4), m, shows."""
+    """The mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
     t: FloatArray = np.arange(len(mended), dtype=np.float64) / rig.converter.sample_rate_hz
     unused = np.zeros(len(mended), dtype=bool)
     told = []
@@ -301,7 +301,7 @@ def _matched(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period:
 
 
 def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:
-    """What a regression of the dots on the motion under ``loads`` leaves, m^2; block means of it (n, 4), m."""
+    """What a regression of the dots on the motion under ``loads`` leaves, m^2; block means of it (n, 2P), m."""
     period = 1.0 / rig.converter.sample_rate_hz
     static = loads @ LinkStatics.from_rig(rig).compliance
     bending, torsion = (mode_coefficients(f, ratio, period) for f, ratio in link_modes(rig))
@@ -329,7 +329,7 @@ def _moving(rig: Rig, note: MendedNote, t: FloatArray) -> BoolArray:
 
 
 def _rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
-    """Whether the link rings otherwise than the mended load makes it; ``rest`` (n, 4): means of blocks of ``size``."""
+    """Whether the link rings otherwise than the mended load makes it; ``rest`` (n, 2P): means of blocks of ``size``."""
     blocks, rings = rest[::size], ringing[::size]
     noise = 0.5 * np.nanmedian((np.diff(blocks, axis=0) ** 2).sum(axis=1))
     seen = blocks[rings & np.all(np.isfinite(blocks), axis=1)]

@@ -1,4 +1,8 @@
-"""Readings taken apart: a movement of the plate, and what no movement of a plate makes of four readings."""
+"""Readings taken apart: a movement of the plate, and what no movement of a plate makes of them.
+
+P PSDs give 2P readings, a plate has three ways to move: 2P - 3 combinations of the readings show none of them, one of
+two PSDs.
+"""
 
 from __future__ import annotations
 
@@ -6,25 +10,34 @@ import numpy as np
 from scipy.linalg import null_space
 
 from psd_deflection.model.plate.linear import design_matrix
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig
 
-DOTS = list(DOT_CHANNELS)
+
+def dot_rows(psds: int) -> list[int]:
+    """Which of the channels of so many PSDs are coordinates of the dots, as an index."""
+    return list(dot_channels(psds))
+
+
+def dots_of(rig: Rig, volts: FloatArray) -> FloatArray:
+    """The dots x1 y1 x2 ... (2P, m), m, of readings (3P, m), V."""
+    return np.asarray(volts[dot_rows(len(rig.psds))] * rig.sensitivities.reshape(-1, 1))
 
 
 def moved_plate(rig: Rig, volts: FloatArray, there: FloatArray) -> FloatArray:
-    """The plate's movement (3, m), m, m, rad, of readings (6, m), V; NaN where one is missing (``there`` 0)."""
-    dots = volts[DOTS] * rig.sensitivities.reshape(4, 1)
+    """The plate's movement (3, m), m, m, rad, of readings (3P, m), V; NaN where one is missing (``there`` 0)."""
+    dots = dots_of(rig, volts)
     out = np.linalg.pinv(design_matrix(rig.centers + rig.zeros)) @ dots
-    out[:, (there[DOTS] <= 0.0).any(axis=0)] = np.nan
+    out[:, (there[dot_rows(len(rig.psds))] <= 0.0).any(axis=0)] = np.nan
     return np.asarray(out)
 
 
 def across_plate(rig: Rig, volts: FloatArray) -> FloatArray:
-    """What no movement of the plate makes (m,), m, of readings (6, m), V."""
-    return np.asarray(across_of(rig) @ (volts[DOTS] * rig.sensitivities.reshape(4, 1)))
+    """What no movement of the plate makes (2P - 3, m), m, of readings (3P, m), V."""
+    dots = dots_of(rig, volts)
+    return np.array([row @ dots for row in across_of(rig)])
 
 
 def across_of(rig: Rig) -> FloatArray:
-    """(4,): the combination of the dots, of length 1, that no movement of the plate moves."""
-    return np.asarray(null_space(design_matrix(rig.centers + rig.zeros).T)[:, 0])
+    """(2P - 3, 2P): the combinations of the dots, orthonormal, that no movement of the plate moves."""
+    return np.asarray(null_space(design_matrix(rig.centers + rig.zeros).T).T)

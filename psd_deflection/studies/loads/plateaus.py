@@ -20,7 +20,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
 from psd_deflection.studies.loads.noted_times import ordinal, unnoted_steps
-from psd_deflection.studies.loads.plate_motion import DOTS, across_plate, moved_plate
+from psd_deflection.studies.loads.plate_motion import across_plate, dot_rows, moved_plate
 
 BoolArray = npt.NDArray[np.bool_]
 IntArray = npt.NDArray[np.intp]
@@ -86,14 +86,14 @@ def plateaus(
 ) -> list[Plateau]:
     """The times between changes of ``loads`` (n, 3), also between those that only the motion shows.
 
-    ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost. ``recording``: which one it is. ``noted``: only between
+    ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost. ``recording``: which one it is. ``noted``: only between
     changes that were noted.
     """
     period = 1.0 / rig.converter.sample_rate_hz
     changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
     # A load that was applied slowly changes from sample to sample: what counts is its end.
     ends = changed[np.append(np.diff(changed) > 1, True)].tolist() if len(changed) else []
-    dots = volts[:, DOTS] * rig.sensitivities.ravel()
+    dots = volts[:, dot_rows(len(rig.psds))] * rig.sensitivities.ravel()
     unnoted = [] if noted else [round(t / period) for t in unnoted_steps(rig, dots, loads)]
     starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unnoted)])
     stops = np.append(np.union1d(changed, unnoted), len(loads))
@@ -111,8 +111,9 @@ class PlateauLoads:
     """``more`` (k, 3): by what the load of each of the ``plateaus`` seems to differ from the noted one, N, N, N m.
 
     ``rest`` (3, m): the movement in fine blocks that no load explains, m, m, rad; ``moved`` (3, m): all of it.
-    ``beside`` (m,): what no movement of the plate makes, m.
-    ``across`` (k,): how far the dots are then from where any movement of the plate would have them, m.
+    ``beside`` (2P - 3, m): what no movement of the plate makes, m.
+    ``across`` (k,): how far the dots are then from where any movement of the plate would have them, m; of two PSDs with
+    a sign.
     ``compliance`` (3,): m/N, m/N, rad/(N m). ``size``: samples of a fine block.
     """
 
@@ -139,9 +140,9 @@ class PlateauLoads:
 def asked_for(
     rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: Sequence[Plateau]
 ) -> PlateauLoads:
-    """The loads that readings ask for: ``difference`` (6, m), V, measured minus simulated.
+    """The loads that readings ask for: ``difference`` (3P, m), V, measured minus simulated.
 
-    Of a recording of so many ``samples``, in means of ``size``, of which the share ``count`` (6, m) is there.
+    Of a recording of so many ``samples``, in means of ``size``, of which the share ``count`` (3P, m) is there.
     """
     moved = moved_plate(rig, difference, count)
     compliance = np.diag(LinkStatics.from_rig(rig).compliance)
@@ -155,14 +156,16 @@ def asked_for(
         more[:, axis] = found[1:] / compliance[axis]
         rest[axis, there] = moved[axis, there] - found @ columns[:, there]
     beside = np.where(there, across_plate(rig, difference), np.nan)
-    across = np.array([_mean(beside[p.first // size : p.last // size]) for p in listed])
+    across = np.array([[_mean(row[p.first // size : p.last // size]) for p in listed] for row in beside])
+    across = across - across[:, :1]
+    far = across[0] if len(across) == 1 else np.linalg.norm(across, axis=0)
     # What the first time has is an offset, which all have.
     moved = np.where(there, moved, np.nan)
-    return PlateauLoads(tuple(listed), more, rest, moved, beside, across - across[:1], compliance, size)
+    return PlateauLoads(tuple(listed), more, rest, moved, beside, far, compliance, size)
 
 
 def asked_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Plateau]], PlateauLoads]:
-    """The same, of ``volts`` (n, 6) held against the rig as its file says under ``acting`` loads (n, 3)."""
+    """The same, of ``volts`` (n, 3P) held against the rig as its file says under ``acting`` loads (n, 3)."""
     size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
     difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
     there = np.isfinite(difference).astype(np.float64)
@@ -409,7 +412,7 @@ class WrongNote:
 def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNote]:
     """The few loads of a recording that are not what hung, of a rig that is nearly as its file says.
 
-    ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, at the times at which
+    ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, at the times at which
     they acted. Effects of the catalogue are no reason: they change all loads in proportion, more or less.
     """
     listed = plateaus(rig, volts, loads)

@@ -47,7 +47,7 @@ class DotStep:
 
 
 def last_step(rig: Rig, dots: FloatArray, period: float) -> float | None:
-    """When the last lasting step of ``dots`` (n, 4), m, was, s from the first of them; None if they have none.
+    """When the last lasting step of ``dots`` (n, 2P), m, was, s from the first of them; None if they have none.
 
     ``period``: s from one to the next; they may be means of blocks. The time is that of the step's middle, to a
     fraction of a period of the link's bending.
@@ -82,7 +82,7 @@ def _steps_of_kept(dots: FloatArray, width: int) -> list[DotStep]:
     if n < 4 * width:
         return []
     there: BoolArray = np.all(np.isfinite(dots), axis=1)
-    sums = np.vstack((np.zeros(4), np.cumsum(np.where(there[:, None], dots, 0.0), axis=0)))
+    sums = np.vstack((np.zeros(dots.shape[1]), np.cumsum(np.where(there[:, None], dots, 0.0), axis=0)))
     counts = np.concatenate(([0], np.cumsum(there)))
     at = np.arange(width, n - width)
     before, after = counts[at] - counts[at - width], counts[at + width] - counts[at]
@@ -107,7 +107,7 @@ def _difference(dots: FloatArray, after: slice, before: slice) -> FloatArray:
     means = []
     for part in (dots[after], dots[before]):
         good = part[np.isfinite(part).all(axis=1)]
-        means.append(good.mean(axis=0) if len(good) else np.zeros(4))
+        means.append(good.mean(axis=0) if len(good) else np.zeros(dots.shape[1]))
     return np.asarray(means[0] - means[1])
 
 

@@ -89,13 +89,13 @@ def swaying(
         if p.first == 0 or there.sum() < round(0.5 / fine):
             rows.append((0.0, 0.0, 0.0))
             continue
-        part = np.vstack((part, found.beside[a:b]))
+        part = np.vstack((part, found.beside[..., a:b]))
         part = np.where(there, part - part[:, there].mean(axis=1, keepdims=True), 0.0)
         power = np.abs(np.fft.rfft(part * np.hanning(b - a), axis=1)) ** 2 / (0.375 * (b - a) ** 2) * 2.0
         f: FloatArray = np.fft.rfftfreq(b - a, fine).astype(np.float64)
         band = (f >= SLOWEST_HZ) & (f <= FASTEST_HZ)
-        *moves, across = power[:, band].sum(axis=1).tolist()
-        each = np.array(moves) if sum(moves) > PLATE * across else np.zeros(2)
+        moves, across = np.split(power[:, band].sum(axis=1), [2])
+        each = moves if sum(moves) > PLATE * sum(across) else np.zeros(2)
         axis = int(np.argmax(each))
         peak = _strongest(f[band], power[axis, band])
         # A step that nobody noted has no tone.
@@ -111,7 +111,7 @@ def swaying(
 def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[SwayingLoad]:
     """Those of a recording of a rig that is nearly as its file says.
 
-    ``volts`` (n, 6) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, as they acted.
+    ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, as they acted.
     """
     period = 1.0 / rig.converter.sample_rate_hz
     asked = asked_beside_rig(rig, volts, loads)
@@ -122,7 +122,7 @@ def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[Swayin
 
 
 def left_out(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> FloatArray:
-    """``volts`` (n, 6) without the times in which a weight swayed, and until the link has come to rest after it."""
+    """``volts`` (n, 3P) without the times in which a weight swayed, and until the link has come to rest after it."""
     out = volts.copy()
     d = rig.dynamics
     slowest = 1.0 / (2.0 * math.pi * d.bending_frequency * max(d.bending_damping_ratio, 1e-3))

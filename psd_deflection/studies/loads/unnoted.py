@@ -83,7 +83,7 @@ def unnoted_times(found: PlateauLoads, samples: int, period: float) -> list[Unno
 
 
 def without_times(volts: FloatArray, times: Sequence[UnnotedTime]) -> FloatArray:
-    """``volts`` (n, 6) without these."""
+    """``volts`` (n, 3P) without these."""
     out = volts.copy()
     for u in times:
         out[u.first : u.last] = np.nan

@@ -13,7 +13,7 @@ import pytest
 
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.model.simulation.laws import TARGETS, VARIABLES, Law, LawTerm, effect_of, values_of
+from psd_deflection.model.simulation.laws import TARGETS, Law, LawTerm, effect_of, values_of, variables_of
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import CHANNELS, FloatArray
 from psd_deflection.studies.discover.laws import law_features, laws, variance
@@ -41,12 +41,12 @@ def term_names(found: list[LawTerm]) -> dict[tuple[str, tuple[str, ...]], list[d
 
 def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit]) -> None:
     (r,) = responses(*seen)
-    assert set(r.known) == set(VARIABLES)
+    assert set(r.known) == set(variables_of(2))
     # load_fx takes a few values, load_tz never changes, x1 many.
     few = np.repeat([0.0, 5.0, -10.0, 1.0], 300)
     ramp = np.linspace(-1e-3, 3e-3, 1200)
     still = np.zeros(1200)
-    known = dict.fromkeys(VARIABLES, still) | {'load_fx': few, 'x1': ramp, 'time': np.arange(1200) * 1e-3}
+    known = dict.fromkeys(variables_of(2), still) | {'load_fx': few, 'x1': ramp, 'time': np.arange(1200) * 1e-3}
     got = term_names(list(terms([dataclasses.replace(r, known=known)])))
     moving = ['load_fx', 'x1', 'time']
     products: list[tuple[str, ...]] = [(a,) for a in moving]
@@ -95,7 +95,7 @@ def test_two_dozen_values_are_few_and_one_more_is_many(seen: tuple[Workspace, Fi
     (r,) = responses(*seen)
     for count in (24, 25):
         values = np.arange(count) ** 2.0
-        known = {n: np.zeros(1200) for n in VARIABLES} | {'load_fy': np.resize(values, 1200)}
+        known = {n: np.zeros(1200) for n in variables_of(2)} | {'load_fy': np.resize(values, 1200)}
         got = term_names(list(terms([dataclasses.replace(r, known=known)])))
         between = 0.5 * (values[1:] + values[:-1]) if count == 24 else values[-1] * (np.arange(24) + 0.5) / 24
         assert [s['threshold'] for s in got['over', ('load_fy',)]] == pytest.approx(between.tolist())
@@ -550,7 +550,7 @@ def test_whatever_was_looked_for_counts_as_a_parameter() -> None:
 
 def test_the_best_of_each_kind_is_refitted_first(monkeypatch: pytest.MonkeyPatch) -> None:
     """Down to three tenths of the best gain, a dozen at most; the cheapest three once more in full."""
-    names = list(VARIABLES)
+    names = list(variables_of(2))
     scored = [law_features.Scored('y2', LawTerm('product', (v,)), 100.0 - i) for i, v in enumerate(names)]
     scored.insert(1, dataclasses.replace(scored[0], gain=99.5))
     monkeypatch.setattr(laws, 'score', lambda *_: scored)
@@ -623,7 +623,7 @@ def test_events_are_looked_for_in_one_recording_only(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(laws, 'responses', lambda *_: [])
     monkeypatch.setattr(laws, 'terms', lambda _: iter([term]))
     monkeypatch.setattr(laws, 'switchings', lambda _: [event])
-    ws = cast(Workspace, SimpleNamespace(observations=[None] * recordings, simulations=7))
+    ws = cast(Workspace, SimpleNamespace(observations=[None] * recordings, simulations=7, psds=2))
     seeker = laws._Seeker(ws, cast(Fit, None), 3.0)
     assert seeker.listed == [term, event][: 3 - recordings]
     assert (seeker.last, seeker.tried) == (607, len(seeker.listed) * 12)

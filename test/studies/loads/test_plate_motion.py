@@ -44,7 +44,7 @@ def test_the_movement_of_a_plate_is_told_from_its_readings_and_none_from_reading
 def test_what_no_movement_of_the_plate_makes_is_what_least_squares_leave() -> None:
     dots = np.random.default_rng(1).normal(size=(4, 5))
     left = dots - PLATE @ np.linalg.lstsq(PLATE, dots, rcond=None)[0]
-    found = across_plate(RIG, as_volts(dots))
+    (found,), (across,) = across_plate(RIG, as_volts(dots)), across_of(RIG)
     assert np.abs(found) == pytest.approx(np.linalg.norm(left, axis=0))
-    assert across_of(RIG)[:, None] * found == pytest.approx(left)
-    assert PLATE.T @ across_of(RIG) == pytest.approx(np.zeros(3), abs=1e-12)
+    assert across[:, None] * found == pytest.approx(left)
+    assert PLATE.T @ across == pytest.approx(np.zeros(3), abs=1e-12)

@@ -18,20 +18,28 @@ from scipy.signal import lfilter
 
 from psd_deflection.model.simulation.catalogue import sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.model.simulation.laws import FORMS, TARGETS, VARIABLES, LawTerm, known
+from psd_deflection.model.simulation.laws import DOTS, FORMS, TARGETS, LawTerm, known, variables_of
 from psd_deflection.model.simulation.modes import mode_coefficients
 from psd_deflection.model.simulation.optics import dots_on_plate
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray
+from psd_deflection.records import FloatArray, IntArray, dot_names
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import only_in
 from psd_deflection.studies.loads.fine import fine_means
 
-LOADS, POSE, DOTS = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta'), ('x1', 'y1', 'x2', 'y2')
-SOUGHT = (*(f'static_{n}' for n in POSE), *POSE, *DOTS, 'sum1', 'sum2')
-"""The targets that are looked at. A law on a load does what one on the static pose does."""
+LOADS, POSE = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta')
+
+
+def sought(psds: int) -> tuple[str, ...]:
+    """The targets that are looked at of so many PSDs. A law on a load does what one on the static pose does."""
+    sums = (f'sum{n}' for n in range(1, psds + 1))
+    return (*(f'static_{n}' for n in POSE), *POSE, *dot_names(psds), *sums)
+
+
+SOUGHT = sought(2)
+"""Those of two PSDs."""
 _BATCH = 64
 LEVELS = 24
 """Thresholds that are tried of a form that jumps there."""
@@ -39,7 +47,8 @@ LEVELS = 24
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """One recording beside the effects of a fit. ``known``: every variable (n,); ``weight`` (nf, targets (1 + p)):
+    """One recording beside the effects of a fit. ``known``: every variable (n,); ``targets``: what is looked at;
+    ``weight`` (nf, targets (1 + p)):
     what a term on fine blocks is multiplied with for its product with the residual and p fitted columns;
     ``length`` (nf, targets): likewise for its squared length. ``error`` and ``power`` (targets, nf): the residual as
     an estimate of what the target lacks, and the inverse of its variance. ``modes``: of bending and torsion;
@@ -55,11 +64,12 @@ class Response:
     power: FloatArray
     modes: tuple[tuple[FloatArray, FloatArray], ...]
     rings: tuple[int, int]
+    targets: tuple[str, ...] = SOUGHT
 
 
 def _jacobian(pose: FloatArray, beams: FloatArray, model: ForwardModel) -> FloatArray:
-    """Change of the dots (3, 4, nf) with dX, dY, theta."""
-    out = np.empty((3, 4, pose.shape[1]))
+    """Change of the dots (3, 2P, nf) with dX, dY, theta."""
+    out = np.empty((3, len(beams), pose.shape[1]))
     for k, h in enumerate((1e-6, 1e-6, 1e-6)):
         plus, minus = pose.copy(), pose.copy()
         plus[k] += h
@@ -77,35 +87,37 @@ def _unwhiten(rows: FloatArray, ar: FloatArray) -> FloatArray:
 
 
 def responses(ws: Workspace, fit: Fit) -> list[Response]:
-    """How each recording answers to a term on each of ``SOUGHT``, beside the effects of ``fit``."""
+    """How each recording answers to a term on each of its targets, beside the effects of ``fit``."""
     q, _ = np.linalg.qr(fit.jacobian / np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300))
     columns = [ws.split(c) for c in np.ascontiguousarray(q.T)]
     out = []
+    targets, channels, variables = sought(ws.psds), 3 * ws.psds, variables_of(ws.psds)
     ws.tally.count += 1
     for i, size in enumerate(ws.fine):
         model, s = _variables(ws, fit.effects, i)
         p = model.physics
         nf = ws.measured[i].shape[1]
-        values = {name: known(s, name) for name in VARIABLES}
+        values = {name: known(s, name) for name in variables}
         jacobian = _jacobian(fine_means(s.pose, size), fine_means(s.beams, size), model)
-        jacobian = jacobian / p.sensitivity.reshape(1, 4, 1)
+        jacobian = jacobian / p.sensitivity.reshape(1, -1, 1)
         noise = ws.noise[i]
         scale = np.sqrt(ws.count[i]) / noise.innovation[:, None]
         vectors = [ws.split(fit.residual)[i], *(c[i] for c in columns)]
         if noise.slow is not None:
             vectors = [noise.slow.whiten(v) for v in vectors]
-        # Each vector, as it multiplies unwhitened fine blocks: (6, 1 + p, nf).
-        back = np.stack([_unwhiten(np.stack([v[c] * scale[c] for v in vectors]), noise.ar[c]) for c in range(6)])
+        # Each vector, as it multiplies unwhitened fine blocks: (3P, 1 + p, nf).
+        own = [np.stack([v[c] * scale[c] for v in vectors]) for c in range(channels)]
+        back = np.stack([_unwhiten(rows, ar) for rows, ar in zip(own, noise.ar, strict=True)])
         gain = (scale * (1.0 - noise.ar.sum(axis=1))[:, None]) ** 2
-        mixing = np.zeros((len(SOUGHT), 6, nf))
-        for t, name in enumerate(SOUGHT):
+        mixing = np.zeros((len(targets), channels, nf))
+        for t, name in enumerate(targets):
             target = TARGETS[name]
             if target.point in ('static', 'pose'):
-                mixing[t, list(DOT_CHANNELS)] = jacobian[target.row]
-            elif target.row < 4:
-                mixing[t, DOT_CHANNELS[target.row]] = 1.0 / p.sensitivity.ravel()[target.row]
+                mixing[t, ws.rows] = jacobian[target.row]
+            elif target.of_sums:
+                mixing[t, 3 * target.row + 2] = 1.0
             else:
-                mixing[t, 3 * (target.row - 4) + 2] = 1.0
+                mixing[t, ws.rows[target.row]] = 1.0 / p.sensitivity.ravel()[target.row]
         weight = np.einsum('tcn,ckn->ntk', mixing, back).reshape(nf, -1)
         power = np.einsum('tcn,cn->tn', mixing**2, gain)
         direct = np.einsum('tcn,cn->tn', mixing, back[:, 0])
@@ -123,6 +135,7 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
                 power,
                 (bending, torsion),
                 (round(1.0 / (p.bending_frequency * fine)), round(1.0 / (p.torsion_frequency * fine))),
+                targets,
             )
         )
     return out
@@ -164,9 +177,9 @@ def _levels(parts: Sequence[FloatArray], count: int) -> list[float]:
 
 def terms(found: Sequence[Response]) -> Iterator[LawTerm]:
     """Every term that is tried, with a grid for its shapes; variables that never change are left out."""
-    parts = {name: [r.known[name] for r in found] for name in VARIABLES}
+    parts = {name: [r.known[name] for r in found] for name in found[0].known}
     size = {name: _spread(values) for name, values in parts.items()}
-    moving = [n for n in VARIABLES if size[n] > 0.0]
+    moving = [n for n in parts if size[n] > 0.0]
     placed = [n for n in moving if n != 'time']
     for k in (1, 2, 3):
         for several in itertools.combinations_with_replacement(moving, k):
@@ -246,10 +259,11 @@ def _through(r: Response, way: int, row: FloatArray) -> FloatArray:
     return row if way == 0 else np.asarray(lfilter(*r.modes[way - 1], row))
 
 
-def score(found: Sequence[Response], listed: Sequence[LawTerm], targets: Sequence[str] = SOUGHT) -> list[Scored]:
-    """Each term on each target, the best first."""
+def score(found: Sequence[Response], listed: Sequence[LawTerm], targets: Sequence[str] = ()) -> list[Scored]:
+    """Each term on each of ``targets``, by default all, the best first."""
     out: list[Scored] = []
-    count, k = len(SOUGHT), found[0].weight.shape[1] // len(SOUGHT)
+    every = found[0].targets
+    targets, count, k = targets or every, len(every), found[0].weight.shape[1] // len(every)
     listed = [t for t in listed if any(allowed(name, t) for name in targets)]
     ways = sorted({_way(name) for name in targets})
     for start in range(0, len(listed), _BATCH):
@@ -267,7 +281,7 @@ def score(found: Sequence[Response], listed: Sequence[LawTerm], targets: Sequenc
                     totals[way, some] += (at @ r.weight).reshape(len(some), count, k)
                     lengths[way, some] += at**2 @ r.length
         for i, term in enumerate(batch):
-            for t, name in enumerate(SOUGHT):
+            for t, name in enumerate(every):
                 if name not in targets or not allowed(name, term):
                     continue
                 way = _way(name)
@@ -287,16 +301,16 @@ TOGGLE_COST = 24.0
 """Chi-square that each switching must gain: twice the logarithm of the blocks of a recording, and some more."""
 
 
-def switchings(found: Sequence[Response], targets: Sequence[str] = SOUGHT) -> list[LawTerm]:
-    """Terms that are on between times which the residual of the only recording shows.
+def switchings(found: Sequence[Response], targets: Sequence[str] = ()) -> list[LawTerm]:
+    """Terms that are on between times which the residual of the only recording shows, on ``targets``, by default all.
 
     The states are the likeliest of two levels, 0 and A (Viterbi's algorithm), with A fitted in turn. What the link
     rings after a switching is averaged over its period first, and the times are improved with the modes in the model.
     """
     seen: list[Scored] = []
     (r,) = found
-    for t, name in enumerate(SOUGHT):
-        if name not in targets or TARGETS[name].point == 'static':
+    for t, name in enumerate(r.targets):
+        if (targets and name not in targets) or TARGETS[name].point == 'static':
             continue
         own = [n for n in DOTS if name in DOTS and (n[1] == name[1])]
         on_link = TARGETS[name].point == 'pose'

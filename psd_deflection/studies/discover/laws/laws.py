@@ -17,18 +17,17 @@ import numpy as np
 from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
-from psd_deflection.model.simulation.laws import FORMS, TARGETS, VARIABLES, Law, LawTerm, effect_of, values_of
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.model.simulation.laws import DOTS, FORMS, TARGETS, Law, LawTerm, effect_of, values_of, variables_of
+from psd_deflection.records import FloatArray, channel_names
 from psd_deflection.studies.discover.laws.law_features import (
-    DOTS,
     LOADS,
     POSE,
-    SOUGHT,
     Response,
     Scored,
     known_fine,
     responses,
     score,
+    sought,
     switchings,
     terms,
     with_better_level,
@@ -161,7 +160,7 @@ class _Seeker:
         if len(ws.observations) == 1:
             # In another recording the events have other times.
             self.listed += switchings(self.found)
-        self.tried = len(self.listed) * len(SOUGHT)
+        self.tried = len(self.listed) * len(sought(ws.psds))
 
     def cost(self, laws: Sequence[Law], fit: Fit) -> float:
         """BIC; whatever was looked for counts, also what a refit does not improve."""
@@ -334,7 +333,7 @@ def _law_of_the_mean(
     parameters = found.parameters - without.parameters
     chosen = sum(len(t.times) for law in best.laws for t in law.terms)
     # Every term on every target might have been taken, and every block as a time of a switching.
-    chances = best.terms * math.log(seeker.tried) + chosen * math.log(max(ws.size / 6.0, 2.0))
+    chances = best.terms * math.log(seeker.tried) + chosen * math.log(max(ws.size / (3.0 * ws.psds), 2.0))
     p = math.exp(chances + float(chi2_law.logsf(gain, max(parameters, 1))))
     bic = gain - (best.cost - found.chi2 - penalty * without.parameters)
     held = heldout_gain(ws, without, found, rng)
@@ -379,14 +378,14 @@ def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
 
 def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     """The channel and the variable that its noise grows with, or None: variance = a + b v^2."""
-    known = {name: known_fine(ws, fit.effects, name) for name in VARIABLES}
+    known = {name: known_fine(ws, fit.effects, name) for name in variables_of(ws.psds)}
     folds = [ws.folds()[case] for case in ws.case]
     fold = np.concatenate(folds)
     best, tried = most_jitter(ws, fit, known)
     if best is None:
         return None
     gain, channel, name, slope, full = best
-    c = CHANNELS.index(channel)
+    c = channel_names(ws.psds).index(channel)
     squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
     v2 = np.concatenate(known[name]) ** 2 / full
     held = []
@@ -404,14 +403,14 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         return None
     scale = float(np.mean([n.innovation[c] * math.sqrt(s) for n, s in zip(ws.noise, ws.fine, strict=True)]))
     if not channel.startswith('sum'):
-        scale *= float(ws.physics.sensitivity.ravel()[DOTS.index(channel)])
+        scale *= float(ws.physics.sensitivity.ravel()[ws.channels.index(channel)])
     coefficient = math.sqrt(slope) * scale
     # The curvature of the likelihood of a single parameter, to first order.
     term = LawTerm('jitter', (name,), coefficient, sd={'coefficient': coefficient / math.sqrt(gain)})
     law = Law(f'law_{channel}', 'electronics', channel, (term,))
     # What this noise adds to block means is no gap any more.
     added = sum(float(np.sum((coefficient * v) ** 2)) for v in known[name]) / sum(len(v) for v in known[name])
-    added /= 4.0 * ws.observations[0].rig.estimator.block_size
+    added /= float(len(ws.channels)) * ws.observations[0].rig.estimator.block_size
     added = 0.0 if channel.startswith('sum') else added
     whole = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
     others = [dataclasses.replace(law, stage='psd')]
@@ -468,4 +467,4 @@ def _channels(ws: Workspace, best: _Trial) -> tuple[str, ...]:
     _, alone = ws.residual([*ws.base, *best.fit.nuisance, *best.beside])
     moved = ws.whiten([a - b for a, b in zip(alone, best.fit.difference, strict=True)])
     energy: FloatArray = np.sum([np.sum(part**2, axis=1) for part in ws.split(moved)], axis=0)
-    return tuple(c for c, e in zip(CHANNELS, energy, strict=True) if e > 0.05 * float(energy.sum()))
+    return tuple(c for c, e in zip(channel_names(ws.psds), energy, strict=True) if e > 0.05 * float(energy.sum()))

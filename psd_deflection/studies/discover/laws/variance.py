@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, channel_names
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
@@ -19,7 +19,7 @@ def most_jitter(
     """
     best: tuple[float, str, str, float, float] | None = None
     tried = 0
-    for c, channel in enumerate(CHANNELS):
+    for c, channel in enumerate(channel_names(ws.psds)):
         squares = np.concatenate([part[c] for part in ws.split(fit.residual)]) ** 2
         there = squares > 0.0
         for name, values in known.items():

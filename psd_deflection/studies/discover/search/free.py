@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, dot_channels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,7 +37,7 @@ class LoadDirection:
 
 @dataclass(frozen=True, slots=True)
 class ZeroDirection:
-    """The error of a zero that was taken in ``recording``: a constant of ``axis`` (0 to 3: x1, y1, x2, y2), known to
+    """The error of a zero that was taken in ``recording``: a constant of ``axis`` (from 0: x1, y1, x2 ...), known to
     ``sd``, m.
     """
 
@@ -46,9 +46,9 @@ class ZeroDirection:
     sd: float
 
     def table(self, like: Sequence[FloatArray], sensitivities: FloatArray) -> list[FloatArray]:
-        """One standard deviation, V, in tables as ``like`` (6, m) of each recording. ``sensitivities`` (2, 2) m/V."""
+        """One standard deviation, V, in tables as ``like`` (3P, m) of each recording. ``sensitivities`` (P, 2) m/V."""
         out = [np.zeros_like(t) for t in like]
-        out[self.recording][DOT_CHANNELS[self.axis]] = self.sd / sensitivities.ravel()[self.axis]
+        out[self.recording][dot_channels(len(sensitivities))[self.axis]] = self.sd / sensitivities.ravel()[self.axis]
         return out
 
 

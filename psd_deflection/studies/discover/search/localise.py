@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import CHANNELS, FloatArray, IntArray
+from psd_deflection.records import FloatArray, IntArray, channel_names
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.trust import BANDS, RELATIVE
 from psd_deflection.studies.discover.search.workspace import Workspace
@@ -57,7 +57,7 @@ class Dependence:
 class Localisation:
     """Cells, most conspicuous first; dependences likewise. ``excess``:
     chi-square beyond noise in all significant places; ``p``: probability that noise alone gives
-    this. ``map`` (spans, 6, bands): all cells; ``spans``: recording, start and end of each load
+    this. ``map`` (spans, channels, bands): all cells; ``spans``: recording, start and end of each load
     case, s."""
 
     cells: tuple[Cell, ...]
@@ -111,7 +111,7 @@ def _energies(
     parts: list[FloatArray], layouts: list[_Layout], explained: list[FloatArray] | None = None
 ) -> tuple[FloatArray, FloatArray]:
     """z and excess energy (layout, channel, band), beyond what the simulation of ``explained`` may be wrong by."""
-    z = np.full((len(layouts), 6, len(BANDS) - 1), -9.0)
+    z = np.full((len(layouts), len(parts[0]), len(BANDS) - 1), -9.0)
     excess = np.zeros_like(z)
     for i, layout in enumerate(layouts):
         span = slice(layout.start, layout.stop)
@@ -133,7 +133,7 @@ def _energies(
 
 def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArray]]]]:
     """Per channel, per name, per recording: regressors of a residual, on fine blocks (nf,)."""
-    out: list[dict[str, list[FloatArray]]] = [{}, {}]
+    out: list[dict[str, list[FloatArray]]] = [{} for _ in range(workspace.psds)]
     for i, (o, size) in enumerate(zip(workspace.observations, workspace.fine, strict=True)):
         chunk = ForwardModel(o.rig, only_in([*workspace.base, *workspace.nuisance], i)).run(o.loads, o.temperature)
         dots, loads = fine_means(chunk.dots, size) * 1e3, fine_means(chunk.loads, size)
@@ -147,7 +147,7 @@ def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArra
         time = np.arange(n) / n
         warmer = np.zeros(n) if o.temperature is None else fine_means(chunk.warmer[None, :], size)[0]
         axes = ('fx', 'fy', 'tz')
-        for psd in range(2):
+        for psd, own in enumerate(out):
             x, y = dots[2 * psd], dots[2 * psd + 1]
             named = {
                 'constant': np.ones(n),
@@ -173,8 +173,8 @@ def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArra
                 'temperature^2': warmer**2,
             }
             for name, values in named.items():
-                out[psd].setdefault(name, []).append(values)
-    return [(channel, out[c // 3]) for c, channel in enumerate(CHANNELS)]
+                own.setdefault(name, []).append(values)
+    return [(channel, out[c // 3]) for c, channel in enumerate(channel_names(workspace.psds))]
 
 
 def dependences(
@@ -264,7 +264,7 @@ def localise(
             name = _plain(d.regressor)
             if name not in main[d.channel]:
                 main[d.channel].append(name)
-    order = np.argsort(-z, axis=None)
+    order, channels = np.argsort(-z, axis=None), channel_names(workspace.psds)
     cells = []
     for flat in order[:limit].tolist():
         i, c, b = np.unravel_index(flat, z.shape)
@@ -274,10 +274,9 @@ def localise(
         shown = float(raw_z[i, c, b]) if p_of(value) < 0.01 else value
         when = (layout.start * layout.period, layout.stop * layout.period)
         band = (BANDS[int(b)], min(BANDS[int(b) + 1], 0.5 / layout.period))
-        names = tuple(main.get(CHANNELS[int(c)], [])) if BANDS[int(b)] < 25.0 else ()
-        cells.append(
-            Cell(CHANNELS[int(c)], layout.recording, when, band, names, shown, p_of(value), float(raw_excess[i, c, b]))
-        )
+        channel = channels[int(c)]
+        names = tuple(main.get(channel, [])) if BANDS[int(b)] < 25.0 else ()
+        cells.append(Cell(channel, layout.recording, when, band, names, shown, p_of(value), float(raw_excess[i, c, b])))
     cells.sort(key=lambda cell: -cell.statistic)
     significant = np.array([p_of(v) < 0.01 for v in z.ravel()])
     total = float(raw_excess.ravel()[significant].sum())

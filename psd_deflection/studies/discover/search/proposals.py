@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.studies.discover.observation import Observation
 
 LEAST_THERE = 0.1
@@ -21,7 +21,7 @@ PEAK = 40.0
 def spectral_peaks(
     residuals: Sequence[FloatArray], sigmas: Sequence[FloatArray], periods: Sequence[float], limit: int = 3
 ) -> list[float]:
-    """Frequencies, Hz, of the strongest lines of raw residuals (n, 6) V, strongest first.
+    """Frequencies, Hz, of the strongest lines of raw residuals (n, 3P) V, strongest first.
 
     The recording with the strongest line is used. Each frequency is refined to the line's greatest
     amplitude, because a search by derivatives needs the right phase over the whole recording.
@@ -98,7 +98,8 @@ def persistent(
 
 def highest_voltages(observations: Sequence[Observation], with_sums: bool, noise: float) -> list[float]:
     """Limits, V, at which the outputs may have clipped: the largest reading and a little less."""
-    rows = [0, 1, 2, 3, 4, 5] if with_sums else list(DOT_CHANNELS)
+    psds = observations[0].psds
+    rows = list(range(3 * psds) if with_sums else dot_channels(psds))
     top = max(float(np.nanmax(np.abs(o.volts[:, rows]))) for o in observations)
     return [v for v in (top - 2.0 * noise, top - 4.0 * noise, top - 12.0 * noise, 0.98 * top) if v > 0.1]
 
@@ -124,7 +125,7 @@ def coarse_step(observation: Observation) -> CoarseStep | None:
     if found is not None:
         return CoarseStep(*found)
     # A sum signal may have another converter, or another range.
-    found = _common_step(volts[:, list(DOT_CHANNELS)], lsb)
+    found = _common_step(volts[:, dot_channels(observation.psds)], lsb)
     return None if found is None else CoarseStep(*found, sums=False)
 
 

@@ -14,7 +14,7 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 
 Columns = list[list[FloatArray]]
-"""Per column, per recording: fine-block volts (6, nf)."""
+"""Per column, per recording: fine-block volts (3P, nf)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,8 +81,9 @@ def candidates(
 
     ``proposals``: the values to try, by the name that a parameter's ``propose`` gives.
     """
+    psds = 2 if physics is None else physics.psds
     for effect in library:
-        for choice in effect.variants():
+        for choice in effect.variants(psds):
             off = effect.off_values(physics, choice)
             shapes: list[list[tuple[str, float]]] = []
             probed: list[tuple[str, float]] = []

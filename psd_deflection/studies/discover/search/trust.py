@@ -21,7 +21,7 @@ BANDS = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, 125.0)
 
 
 def energies(workspace: Comparison, vector: FloatArray) -> FloatArray:
-    """Chi-square of a whitened vector (D,) by recording, channel and band: (recordings, 6, bands)."""
+    """Chi-square of a whitened vector (D,) by recording, channel and band: (recordings, channels, bands)."""
     out = []
     for part, period in zip(workspace.split(vector), workspace.periods, strict=True):
         n = part.shape[1]

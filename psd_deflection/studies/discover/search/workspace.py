@@ -19,7 +19,7 @@ from psd_deflection.model.simulation.catalogue import sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import DOT_CHANNELS, FloatArray, IntArray, Moment
+from psd_deflection.records import FloatArray, IntArray, Moment, dot_names
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.search.free import Direction, Free, LoadDirection, moved
@@ -27,6 +27,7 @@ from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
 from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
 from psd_deflection.studies.discover.setup.slow_noise import corners_of
 from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
+from psd_deflection.studies.loads.plate_motion import dot_rows
 
 LEAST_NOISE = 0.05
 """Share of the rig file's noise that is assumed at least."""
@@ -34,14 +35,13 @@ UNSETTLED = 1.1
 """Free loads are settled beside effects that leave more floors than this."""
 FOLDS = 4
 PIECE_SECONDS = 0.5
-DOTS = list(DOT_CHANNELS)
 LOADS_SHOWN = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
 MAX_FINE = 60_000
 """Approximate total number of fine blocks; long recordings get longer blocks, which limits memory."""
 
 
 class Workspace(Comparison):
-    """All recordings of the rig of one call of discover, as means of fine blocks (6, nf), V."""
+    """All recordings of the rig of one call of discover, as means of fine blocks (3P, nf), V."""
 
     physics: Physics
     first = FIRST
@@ -106,7 +106,17 @@ class Workspace(Comparison):
     @property
     def channels(self) -> tuple[str, ...]:
         """The dots."""
-        return ('x1', 'y1', 'x2', 'y2')
+        return dot_names(self.psds)
+
+    @property
+    def psds(self) -> int:
+        """How many PSDs the rig has."""
+        return self.physics.psds
+
+    @property
+    def rows(self) -> list[int]:
+        """The rows of the dots in a table, as an index."""
+        return dot_rows(self.psds)
 
     @property
     def periods(self) -> list[float]:
@@ -122,7 +132,7 @@ class Workspace(Comparison):
         return out.replaced(free=out.whitened(self.free))
 
     def raw_residual(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
-        """Measured minus simulated (n, 6) V of each recording, samples, 0 if lost."""
+        """Measured minus simulated (n, 3P) V of each recording, samples, 0 if lost."""
         self.tally.count += 1
         out = []
         for i, o in enumerate(self.observations):
@@ -132,12 +142,12 @@ class Workspace(Comparison):
         return out
 
     def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
-        """Fine-block means (6, nf) V of each recording, simulated without noise."""
+        """Fine-block means (3P, nf) V of each recording, simulated without noise."""
         self.tally.count += 1
         out = []
         for i, (o, size, present) in enumerate(zip(self.observations, self.fine, self._present, strict=True)):
             model = ForwardModel(o.rig, only_in(sort_effects(effects), i))
-            means = np.empty((6, len(o.loads) // size))
+            means = np.empty((3 * o.psds, len(o.loads) // size))
             for at, volts in model.expect_in_pieces(o.loads, o.temperature, size):
                 there = None if present is None else present[:, at]
                 means[:, at.start // size : at.stop // size] = fine_means(volts, size, there)
@@ -248,24 +258,24 @@ class Workspace(Comparison):
         )
 
     def block_dots(self, fine: Sequence[FloatArray]) -> list[FloatArray]:
-        """Block means of the dots (4, blocks), m, of fine-block volts; NaN if less than half of the block is there."""
+        """Block means of the dots (2P, blocks), m, of fine-block volts; NaN if less than half of the block is there."""
         out = []
         for f, c, s, o in zip(fine, self.count, self.fine, self.observations, strict=True):
             per_block = o.rig.estimator.block_size // s
-            share = fine_means(c[DOTS], per_block)
-            total = fine_means(f[DOTS] * c[DOTS], per_block)
+            share = fine_means(c[self.rows], per_block)
+            total = fine_means(f[self.rows] * c[self.rows], per_block)
             means = np.where(share >= 0.5, total / np.maximum(share, 0.5), np.nan)
-            out.append(means * o.rig.sensitivities.reshape(4, 1))
+            out.append(means * o.rig.sensitivities.reshape(-1, 1))
         return out
 
     def gap(self, residual: Sequence[FloatArray]) -> float:
-        """rms of the block-mean residual over x1 y1 x2 y2, m; ``residual`` in fine-block volts."""
+        """rms of the block-mean residual over x1 y1 x2 y2 ..., m; ``residual`` in fine-block volts."""
         blocks = np.concatenate([b.ravel() for b in self.block_dots(residual)])
         blocks = blocks[np.isfinite(blocks)]
         return float(np.sqrt(np.mean(blocks**2))) if len(blocks) else 0.0
 
     def gap_per_channel(self, residual: Sequence[FloatArray]) -> FloatArray:
-        """The same for each of x1 y1 x2 y2, (4,) m."""
+        """The same for each of x1 y1 x2 y2 ..., (2P,) m."""
         blocks = np.concatenate(self.block_dots(residual), axis=1)
         there = np.isfinite(blocks)
         return np.asarray(np.sqrt(np.where(there, blocks**2, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)))
@@ -274,8 +284,8 @@ class Workspace(Comparison):
         """The gap from noise alone, m."""
         total, count = 0.0, 0
         for w, o, c, s in zip(self.noise, self.observations, self.count, self.fine, strict=True):
-            share = fine_means(c[DOTS], o.rig.estimator.block_size // s)
-            variance = (w.block_sigma[DOTS] * o.rig.sensitivities.ravel())[:, None] ** 2
+            share = fine_means(c[self.rows], o.rig.estimator.block_size // s)
+            variance = (w.block_sigma[self.rows] * o.rig.sensitivities.ravel())[:, None] ** 2
             counted = share >= 0.5
             # A block with some samples missing is noisier.
             total += float((variance / np.maximum(share, 0.5))[counted].sum())
@@ -318,10 +328,10 @@ class Workspace(Comparison):
     @property
     def units_shown(self) -> tuple[str, ...]:
         """Micrometres."""
-        return ('µm',) * 4
+        return ('µm',) * len(self.channels)
 
     def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
-        """Block means of the dots (4, blocks), µm."""
+        """Block means of the dots (2P, blocks), µm."""
         return [1e6 * d for d in self.block_dots(tables)]
 
     def along(self) -> tuple[TimeAxis, list[FloatArray]]:

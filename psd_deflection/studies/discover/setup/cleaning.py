@@ -16,7 +16,7 @@ from scipy.ndimage import maximum_filter1d, median_filter
 
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import CHANNELS, DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, channel_names, dot_channels
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.observation import Observation
@@ -37,7 +37,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 def outliers(residual: FloatArray, least: float) -> BoolArray:
-    """(n, 6): samples of ``residual`` (n, 6), measured minus simulated, V, that stand out from their neighbours.
+    """(n, 3P): samples of ``residual`` (n, 3P), measured minus simulated, V, that stand out from their neighbours.
 
     Each is held against the cubic through the two samples before it and the two after it, so that a movement, hum and
     ringing are none. ``least``: V, smallest standard deviation assumed.
@@ -78,9 +78,9 @@ def _from_cubic(x: FloatArray) -> FloatArray:
 
 
 def stuck(volts: FloatArray, period: float, noise: FloatArray, step: float) -> BoolArray:
-    """(n, 6): where a channel keeps one value for ``STUCK_S``, as noise never lets it.
+    """(n, 3P): where a channel keeps one value for ``STUCK_S``, as noise never lets it.
 
-    At its greatest or least value it may be limited. A channel with less ``noise`` (6,) V than the converter's
+    At its greatest or least value it may be limited. A channel with less ``noise`` (3P,) V than the converter's
     ``step`` V may rest.
     """
     out = np.zeros(volts.shape, dtype=bool)
@@ -110,11 +110,11 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     step = o.rig.converter.volts_per_count
     findings = []
     volts = o.volts.copy()
-    coarse = coarse_step(o)
+    coarse, names = coarse_step(o), channel_names(o.psds)
     # Coarse steps keep their value for long, and jump for a single sample.
     still = stuck(volts, o.period, o.rig.noises.ravel(), step)
     if coarse is not None:
-        still[:, list(range(len(CHANNELS)) if coarse.sums else DOT_CHANNELS)] = False
+        still[:, list(range(len(names)) if coarse.sums else dot_channels(o.psds))] = False
     least = max(step if coarse is None else coarse.step, 0.25 * float(o.rig.noises.min()))
     for c in np.flatnonzero(still.any(axis=0)).tolist():
         first = int(np.argmax(still[:, c]))
@@ -122,9 +122,9 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
         findings.append(
             Finding(
                 'stuck_channel',
-                CHANNELS[c],
+                names[c],
                 first * o.period,
-                f'{CHANNELS[c]} of {o.name} keeps one value from {first * o.period:.3f} s on, {seconds:.3f} s in all: '
+                f'{names[c]} of {o.name} keeps one value from {first * o.period:.3f} s on, {seconds:.3f} s in all: '
                 'look at its cable; these samples are left out',
                 seconds / o.duration,
             )
@@ -163,7 +163,7 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
 def time_loads(observation: Observation) -> tuple[Observation, MendedLoads | None]:
     """The recording with its loads at the times at which they acted, by the motion, and what was noted otherwise."""
     o = observation
-    mended = mend_loads(o.rig, o.volts[:, list(DOT_CHANNELS)] * o.rig.sensitivities.ravel(), o.loads)
+    mended = mend_loads(o.rig, o.volts[:, dot_channels(o.psds)] * o.rig.sensitivities.ravel(), o.loads)
     if mended is None:
         return o, None
     volts = o.volts.copy()

@@ -15,6 +15,7 @@ import numpy as np
 from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, EffectParameter, Stage, State, Values
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.samples import SimulatedSamples
+from psd_deflection.records import FloatArray, dot_names
 
 AXES = ('dx', 'dy', 'theta')
 
@@ -96,8 +97,13 @@ def _delay(chunk: SimulatedSamples, values: Values, state: State) -> None:
         chunk.loads[row] = np.interp(at, whole, chunk.loads[row])
 
 
+def zero_moved(values: Values, psds: int) -> FloatArray:
+    """By how much the unloaded dots of so many PSDs are elsewhere, (P, 2), m, by ``values`` of the mistake ``zero``."""
+    return np.array([values[name] for name in dot_names(psds)]).reshape(-1, 2)
+
+
 def _zero(physics: Physics, values: Values) -> None:
-    moved = np.array([[values['x1'], values['y1']], [values['x2'], values['y2']]])
+    moved = zero_moved(values, len(physics.centers))
     if values['of_reading']:
         # A constant added to the reading, as by an amplifier's offset.
         physics.centers = physics.centers - moved
@@ -122,8 +128,10 @@ def _factor(name: str, configure: Callable[[Physics, Values], None], stage: Stag
     return Effect(name, stage, words, '', '', '', (scale,), 'configure', configure=configure, order=98)
 
 
-def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int, int, float]]) -> list[Effect]:
-    """The mistakes of the set-up that have a size.
+def mistakes(
+    recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int, int, float]], psds: int = 2
+) -> list[Effect]:
+    """The mistakes of the set-up of a rig of so many ``psds`` that have a size.
 
     ``delays``: by how much the loads may be noted late, s. ``jumps``: recording, PSD, time, s, of steps that the
     readings seem to have.
@@ -153,8 +161,7 @@ def mistakes(recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int
         )
         out.append(late_loads)
     if recordings > 1:
-        names = ('x1', 'y1', 'x2', 'y2')
-        places = [_amplitude(n, 'm', -0.02, 0.02, 1e-5, 'unloaded dot') for n in names]
+        places = [_amplitude(n, 'm', -0.02, 0.02, 1e-5, 'unloaded dot') for n in dot_names(psds)]
         of_reading = EffectParameter('of_reading', '', 0, 1, 1, '0: beam, 1: reading', kind='choice', choices=(0, 1))
         parameters = (_of_recording(recordings), of_reading, *places)
         out.append(Effect('zero', 'optics', 'zero', '', '', '', parameters, 'configure', configure=_zero, order=98))

@@ -36,7 +36,7 @@ def times(o: Observation, recording: int) -> list[Plateau]:
 
 
 def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Plateau]) -> PlateauLoads:
-    """The loads that ``difference`` (6, m), V, measured minus simulated, asks for."""
+    """The loads that ``difference`` (3P, m), V, measured minus simulated, asks for."""
     o = ws.observations[recording]
     return asked_for(o.rig, difference, ws.count[recording], len(o.loads), ws.fine[recording], listed)
 

@@ -37,8 +37,8 @@ ALIKE = 0.2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseModel:
-    """``sigma`` (6,) V rms a sample; ``ar`` (6, p): on fine blocks; ``innovation`` (6,): V rms of a
-    fine block after prediction; ``block_sigma`` (6,): V rms of the mean of one estimate block. ``slow``: what all
+    """``sigma`` (3P,) V rms a sample; ``ar`` (3P, p): on fine blocks; ``innovation`` (3P,): V rms of a
+    fine block after prediction; ``block_sigma`` (3P,): V rms of the mean of one estimate block. ``slow``: what all
     channels have besides; ``block_sigma`` has it, the others do not.
     """
 
@@ -51,7 +51,7 @@ class NoiseModel:
     slow: SlowNoise | None = None
 
     def with_slow_noise(self, corners: FloatArray, n: int, period: float, block: float) -> NoiseModel:
-        """With slow noise of the ``corners`` (6,), Hz, in ``n`` fine blocks ``period`` s apart.
+        """With slow noise of the ``corners`` (3P,), Hz, in ``n`` fine blocks ``period`` s apart.
 
         ``block``: s of the blocks of an estimate.
         """
@@ -61,9 +61,9 @@ class NoiseModel:
         return replace(self, slow=SlowNoise.of(corners, n, period), block_sigma=self.block_sigma * more)
 
     def whiten(self, fine: FloatArray, count: FloatArray) -> FloatArray:
-        """White, unit-variance innovations (6, nf) of fine-block rows (6, nf); 0 where unknown.
+        """White, unit-variance innovations (3P, nf) of fine-block rows (3P, nf); 0 where unknown.
 
-        ``count`` (6, nf): the share of each block's samples that is there. Fewer samples make a noisier mean.
+        ``count`` (3P, nf): the share of each block's samples that is there. Fewer samples make a noisier mean.
         """
         out = fine.copy()
         good = count > 0.0
@@ -80,8 +80,8 @@ class NoiseModel:
 
     @property
     def corners(self) -> FloatArray:
-        """(6,) Hz: of the slow noise, 0 without."""
-        return np.zeros(6) if self.slow is None else self.slow.corners
+        """(3P,) Hz: of the slow noise, 0 without."""
+        return np.zeros(len(self.sigma)) if self.slow is None else self.slow.corners
 
     def like(self, other: NoiseModel) -> bool:
         """Whether a search need not tell it from ``other``."""
@@ -92,7 +92,7 @@ class NoiseModel:
         )
 
     def of_slow_change(self, white: FloatArray) -> FloatArray:
-        """V (6, nf): the fine blocks of a change that is slow compared with one, of which ``white`` (6, nf) is left."""
+        """V (3P, nf): the fine blocks of a change that is slow against one, of which ``white`` (3P, nf) is left."""
         if self.slow is not None:
             white = self.slow.unwhiten(white)
         return np.asarray(white * (self.innovation / np.maximum(1.0 - self.ar.sum(axis=1), 0.05))[:, None])
@@ -201,20 +201,20 @@ def _between_neighbours(values: FloatArray) -> float:
 
 
 def estimate_noise(observation: Observation, residual: FloatArray, fine: int, floors: FloatArray) -> NoiseModel:
-    """Noise of ``residual`` (n, 6) V, measured minus simulated; NaN where samples are lost.
+    """Noise of ``residual`` (n, 3P) V, measured minus simulated; NaN where samples are lost.
 
-    ``fine``: samples a fine block. ``floors`` (6,): V, smallest noise that is assumed of each channel.
+    ``fine``: samples a fine block. ``floors`` (3P,): V, smallest noise that is assumed of each channel.
     """
     block = observation.rig.estimator.block_size
     windows = rest_windows(observation)
     long = [w for w in windows if w.stop - w.start > 100]
-    n = len(residual)
-    sigma, innovation, block_sigma = np.empty(6), np.empty(6), np.empty(6)
-    ar = np.zeros((6, ORDER))
+    n, channels = residual.shape
+    sigma, innovation, block_sigma = np.empty(channels), np.empty(channels), np.empty(channels)
+    ar = np.zeros((channels, ORDER))
     coloured = []
     frequency = np.asarray(np.fft.rfftfreq(n, 1.0), dtype=np.float64)
     upper = frequency > 0.2
-    for c in range(6):
+    for c in range(channels):
         there = np.isfinite(residual[:, c])
         filled = _filled(residual[:, c], there)
         power = np.abs(np.fft.rfft(filled * np.hanning(n))) ** 2 / (0.375 * n) / _kept(there, upper)

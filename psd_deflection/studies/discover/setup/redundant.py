@@ -1,5 +1,8 @@
 """Two PSDs give four readings, a plate has three ways to move: the fourth reading, asked before any model of the link.
 
+P PSDs have 2P - 3 such numbers. They are taken in units of the noise and made orthonormal there, so that each is noise
+of unit variance, and none follows another, if nothing is wrong.
+
 What the readings lack to the simulation is taken apart: a movement of the plate, and what no movement of a plate makes.
 If the latter is noise, no detector, beam or amplifier is at fault, as far as its fault would show there; if it is more,
 one of them is, and the link may be as well.
@@ -17,7 +20,7 @@ from psd_deflection.model.simulation.declaration import ActiveEffect, Effect, Ef
 from psd_deflection.model.simulation.samples import SimulatedSamples
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.loads.plate_motion import DOTS, across_of, moved_plate
+from psd_deflection.studies.loads.plate_motion import across_of, dot_rows, moved_plate
 
 CLIP = 6.0
 """Outliers of heavy-tailed noise count no more than so many standard deviations."""
@@ -50,15 +53,29 @@ class FourthReading:
 
 
 def fourth(ws: Workspace, vectors: FloatArray) -> FloatArray:
-    """What no movement of the plate makes of whitened ``vectors`` (k, D): (k, m), of unit variance if it is noise."""
+    """What no movement of the plate makes of whitened ``vectors`` (k, D): (k, m), of unit variance if it is noise.
+
+    The 2P - 3 numbers of a recording follow one after the other.
+    """
     out = []
     for i, (o, noise) in enumerate(zip(ws.observations, ws.noise, strict=True)):
-        across = across_of(o.rig) * o.rig.sensitivities.ravel() * noise.innovation[DOTS]
-        across = across / np.linalg.norm(across)
-        rows = np.array([ws.split(v)[i][DOTS] for v in vectors])
-        there = (ws.count[i][DOTS] > 0.0).all(axis=0)
-        out.append(np.einsum('c,kct->kt', across, rows[:, :, there]))
+        scale = o.rig.sensitivities.ravel()
+        rows = np.array([ws.split(v)[i][ws.rows] for v in vectors])
+        there = (ws.count[i][ws.rows] > 0.0).all(axis=0)
+        for across in _orthonormal(across_of(o.rig) * scale * noise.innovation[ws.rows]):
+            out.append(np.einsum('c,kct->kt', across, rows[:, :, there]))
     return np.concatenate(out, axis=1)
+
+
+def _orthonormal(rows: FloatArray) -> list[FloatArray]:
+    """The span of ``rows`` (k, n), which are independent, by rows of length 1 at right angles (Gram and Schmidt)."""
+    out: list[FloatArray] = []
+    for row in rows:
+        # Twice: the first time leaves what rounding makes of it.
+        for other in (*out, *out):
+            row = row - (other @ row) * other
+        out.append(row / np.linalg.norm(row))
+    return out
 
 
 def fourth_reading(ws: Workspace, residual: FloatArray) -> FourthReading:
@@ -72,8 +89,9 @@ def excess(ws: Workspace, residual: FloatArray) -> tuple[float, float]:
 
     The second is what the fourth reading could see: a dot that is far off for some moments has much of the first alone.
     """
-    there = [count[DOTS] > 0.0 for count in ws.count]
-    dots = np.concatenate([part[DOTS][here] for part, here in zip(ws.split(residual), there, strict=True)])
+    rows = dot_rows(len(ws.count[0]) // 3)
+    there = [count[rows] > 0.0 for count in ws.count]
+    dots = np.concatenate([part[rows][here] for part, here in zip(ws.split(residual), there, strict=True)])
     clipped = np.clip(dots, -CLIP, CLIP)
     return float(dots @ dots) - len(dots), float(clipped @ clipped) / len(dots) - 1.0
 

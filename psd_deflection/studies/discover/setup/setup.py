@@ -1,8 +1,13 @@
 """The recording is checked before the physics: wiring, signs and units of the loads, and what the search found besides.
 
-Signs, exchanged axes and exchanged PSDs make 128 wirings. Each is held against the whole recording: the movement that
-each load alone would cause is simulated, and every wiring's readings are fitted by these movements with free sizes. The
-sizes tell the sign and the unit of each load. A wiring that is not the rig file's must leave ten times less.
+Signs, exchanged axes and exchanged PSDs make 128 wirings of two PSDs. Each is held against the whole recording: the
+movement that each load alone would cause is simulated, and every wiring's readings are fitted by these movements with
+free sizes. The sizes tell the sign and the unit of each load. A wiring that is not the rig file's must leave ten times
+less.
+
+More PSDs have too many wirings for that. Of these any two PSDs may be wired otherwise than the rig file says, or all of
+them in one way, each with any two PSDs exchanged and with none: some 700 wirings of three PSDs, 12 560 of six. No
+parameter of the rig file says that others than PSD 1 and 2 are exchanged, so that has no line.
 """
 
 from __future__ import annotations
@@ -16,16 +21,17 @@ from psd_deflection.model.simulation.catalogue import sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, dot_channels
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.judges import LOADS, unit_findings, wiring_findings
 from psd_deflection.studies.check.result import Finding
-from psd_deflection.studies.check.wirings import WIRINGS, differences, line
+from psd_deflection.studies.check.wirings import differences, line, wirings_of
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS
+from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS, zero_moved
+from psd_deflection.studies.loads.plate_motion import dots_of
 
 BETTER = 10.0
 """Factor by which another wiring or sign must leave less of the movement than the rig file's."""
@@ -44,7 +50,7 @@ LEAST_S, FARTHEST_S = 0.0005, 1.0
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Movement:
-    """Sums over block means: ``squared`` of the readings; ``cross`` (3, 4, 4): load, simulated dot, device's channel;
+    """Sums over block means: ``squared`` of the readings; ``cross`` (3, 2P, 2P): load, simulated dot, device's channel;
     ``own`` (3, 3): of the simulated movements, load by load; ``noise``: variance of a block's mean, m^2.
     """
 
@@ -55,9 +61,9 @@ class _Movement:
 
 
 def _moved(rig: Rig, base: Sequence[ActiveEffect], loads: FloatArray, temperature: FloatArray | None) -> FloatArray:
-    """Dots (4, n), m, as the volts of the simulation show them."""
+    """Dots (2P, n), m, as the volts of the simulation show them."""
     chunk = ForwardModel(rig, sort_effects(base)).expect(loads, temperature)
-    return np.asarray(chunk.volts[list(DOT_CHANNELS)] * rig.sensitivities.reshape(4, 1))
+    return dots_of(rig, chunk.volts)
 
 
 def _blocks(rows: FloatArray, size: int) -> FloatArray:
@@ -70,10 +76,11 @@ def _blocks(rows: FloatArray, size: int) -> FloatArray:
 
 
 def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> _Movement:
-    squared, cross, own = 0.0, np.zeros((3, 4, 4)), np.zeros((3, 3))
+    count = 2 * observations[0].psds
+    squared, cross, own = 0.0, np.zeros((3, count, count)), np.zeros((3, 3))
     for o in observations:
         size, physics = o.rig.estimator.block_size, Physics.of(o.rig)
-        device = Wiring.from_rig(o.rig).to_device(o.volts)[:, list(DOT_CHANNELS)].T
+        device = Wiring.from_rig(o.rig).to_device(o.volts)[:, dot_channels(o.psds)].T
         seen = _blocks(device * o.rig.amplifier.sensitivity, size)
         still = _moved(o.rig, base, np.zeros_like(o.loads), o.temperature)
         alone = []
@@ -90,7 +97,7 @@ def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect])
         moves = np.stack(alone)[:, :, there]
         moves = moves - moves.mean(axis=2, keepdims=True)
         # The volts of one PSD may have a sensitivity of their own; the channels are compared by the amplifier's.
-        moves = moves / (o.rig.sensitivities.reshape(4, 1) / o.rig.amplifier.sensitivity)
+        moves = moves / (o.rig.sensitivities.reshape(-1, 1) / o.rig.amplifier.sensitivity)
         squared += float((seen**2).sum())
         cross += np.einsum('kdt,ct->kdc', moves, seen)
         own += np.einsum('kdt,jdt->kj', moves, moves)
@@ -101,9 +108,10 @@ def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect])
 
 def _sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     """What ``wiring`` leaves of the movement, and the size of each load (3,) over the noted one; NaN for none."""
-    columns = [DOT_CHANNELS.index(wiring.columns[c]) for c in DOT_CHANNELS]
-    signs = np.array(wiring.signs)[list(DOT_CHANNELS)]
-    along = np.einsum('d,kd->k', signs, m.cross[:, range(4), columns])
+    dots = dot_channels(len(wiring.axes))
+    columns = [dots.index(wiring.columns[c]) for c in dots]
+    signs = np.array(wiring.signs)[list(dots)]
+    along = np.einsum('d,kd->k', signs, m.cross[:, range(len(dots)), columns])
     # A load in kN or mN is a million times weaker or stronger than the others.
     applied = np.diag(m.own) > 1e-18 * float(np.diag(m.own).max())
     sizes = np.full(3, np.nan)
@@ -126,7 +134,7 @@ def _over_simulated(observations: Sequence[Observation], base: Sequence[ActiveEf
     for o in observations:
         size = o.rig.estimator.block_size
         simulated = _moved(o.rig, base, o.loads, o.temperature)
-        rest = _blocks((o.volts[:, list(DOT_CHANNELS)] * o.rig.sensitivities.ravel()).T - simulated, size)
+        rest = _blocks((o.volts[:, dot_channels(o.psds)] * o.rig.sensitivities.ravel()).T - simulated, size)
         slopes = []
         for more in np.eye(3):
             larger = _moved(o.rig, base, o.loads * (1.0 + SHARE * more), o.temperature)
@@ -152,7 +160,7 @@ def wire(
         return list(observations), [], {}
     noise = _noise_energy(observations)
     tried = []
-    for wiring in WIRINGS:
+    for wiring in wirings_of(file):
         left, sizes = _sizes(m, wiring)
         tried.append((left + noise, wiring, sizes))
     best = min(left for left, _, _ in tried)
@@ -164,10 +172,12 @@ def wire(
     plain = told if not np.any(told_sizes < 0.0) else m.squared + noise
     findings: list[Finding] = []
     lines: dict[str, object] = {}
+    crossed: tuple[int, ...] = ()
     loads = np.ones(3)
     if plain > BETTER * left:
         others = tuple(_words(tried[i][1], file, tried[i][2]) for _, _, i in sorted(as_good)[1:3])
         findings, lines = wiring_findings(wiring, file, plain / left, others)
+        crossed = wiring.crossed
         turned = [k for k in range(3) if sizes[k] < 0.0]
         loads[turned] = -1.0
         findings += [
@@ -179,14 +189,14 @@ def wire(
     if unit_findings(sizes)[0]:
         # kg mm and N cm are 2 % apart, and a large movement is not in proportion to its load.
         sizes = np.abs(sizes) * _over_simulated(
-            [_mended(o, lines, np.nan_to_num(sizes, nan=1.0)) for o in observations], base
+            [_mended(o, lines, crossed, np.nan_to_num(sizes, nan=1.0)) for o in observations], base
         )
     units, factors = unit_findings(sizes, plain / left)
     findings += units
     loads = loads * factors
     if not findings:
         return list(observations), [], {}
-    return [_mended(o, lines, loads) for o in observations], findings, lines
+    return [_mended(o, lines, crossed, loads) for o in observations], findings, lines
 
 
 def _noise_energy(observations: Sequence[Observation]) -> float:
@@ -209,9 +219,12 @@ def _words(wiring: Wiring, file: Wiring, sizes: FloatArray) -> str:
     return ' and '.join(out) or 'as the rig file says'
 
 
-def _mended(o: Observation, lines: dict[str, object], loads: FloatArray) -> Observation:
-    rig = replace_values(o.rig, lines) if lines else o.rig
-    volts = Wiring.from_rig(rig).to_psds(Wiring.from_rig(o.rig).to_device(o.volts)) if lines else o.volts
+def _mended(o: Observation, lines: dict[str, object], crossed: tuple[int, ...], loads: FloatArray) -> Observation:
+    rig, volts = o.rig, o.volts
+    if lines or crossed:
+        rig = replace_values(o.rig, lines)
+        right = dataclasses.replace(Wiring.from_rig(rig), crossed=crossed)
+        volts = right.to_psds(Wiring.from_rig(o.rig).to_device(o.volts))
     return dataclasses.replace(o, rig=rig, volts=volts, loads=o.loads * loads, digest=o.digest or o.hashed())
 
 
@@ -222,7 +235,7 @@ def likely_delays(workspace: Workspace) -> list[float]:
     step = workspace.observations[0].period * workspace.fine[0]
     reach = round(FARTHEST_S / step)
     for s, m, c, noise in zip(simulated, workspace.measured, workspace.count, workspace.noise, strict=True):
-        for k in DOT_CHANNELS:
+        for k in workspace.rows:
             there = c[k] > 0.0
             if there.sum() < 4 * reach:
                 continue
@@ -253,7 +266,7 @@ def likely_jumps(workspace: Workspace, residual: FloatArray) -> list[tuple[int, 
         if n < 50:
             continue
         k = np.arange(1, n)
-        for psd in (1, 2):
+        for psd in range(1, len(part) // 3 + 1):
             rows = part[3 * psd - 3 : 3 * psd - 1]
             sums = np.cumsum(rows - rows.mean(axis=1, keepdims=True), axis=1)[:, :-1]
             gain = (sums**2).sum(axis=0) * n / (k * (n - k))
@@ -281,7 +294,7 @@ def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[l
         return [Finding(name, ' '.join(LOADS), v['late_by'], words, evidence)], {}
     if name == 'zero':
         o = workspace.observations[int(v['recording']) - 1]
-        moved = np.array([[v['x1'], v['y1']], [v['x2'], v['y2']]])
+        moved = zero_moved(v, o.psds)
         zeros = [[float(f'{x:.7g}') for x in row] for row in (o.rig.zeros + moved).tolist()]
         words = f'overrides of {o.name}: ' + ', '.join(line(f'psd_{i}.zero', z) for i, z in enumerate(zeros, start=1))
         return [Finding(name, o.name, float(np.abs(moved).max()), words, evidence)], {}
@@ -299,6 +312,6 @@ def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[l
 
 
 def noise_of(workspace: Workspace) -> FloatArray:
-    """Noise (2, 2) of x and y of each PSD, V rms a sample, over all recordings."""
-    squares = [n.sigma[list(DOT_CHANNELS)] ** 2 for n in workspace.noise]
-    return np.asarray(np.sqrt(np.mean(squares, axis=0)).reshape(2, 2))
+    """Noise (P, 2) of x and y of each PSD, V rms a sample, over all recordings."""
+    squares = [n.sigma[workspace.rows] ** 2 for n in workspace.noise]
+    return np.asarray(np.sqrt(np.mean(squares, axis=0)).reshape(-1, 2))

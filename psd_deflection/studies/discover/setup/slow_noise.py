@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import dct, idct
 
-from psd_deflection.records import DOT_CHANNELS, FloatArray
+from psd_deflection.records import FloatArray, dot_channels
 
 CLIP = 6.0
 """Whitened values are limited to this: an outlier is no slow noise."""
@@ -23,32 +23,32 @@ HIGHEST_HZ = 20.0
 CORNERS = np.geomspace(0.02, 200.0, 120)
 """Hz: those that are tried."""
 CLEAR = 0.5
-"""Log-likelihood that a corner must gain on both sums. A small corner that is none costs little; one that is not seen
-makes a drift of noise.
+"""Log-likelihood that a corner must gain on all sums together. A small corner that is none costs little; one that is
+not seen makes a drift of noise.
 """
 WIDER = 1.3
 """How much larger than those of the lights, and than the second smallest of the dots, a channel's corner may be."""
 APART = 4.0
-"""How much larger than that of the other light the corner of one may be."""
+"""How much larger than the smallest of the other lights the corner of one may be."""
 LEAST_VALUES = 64
 """Of a recording and channel."""
-SUMS = (2, 5)
 
 
 def corners_of(parts: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
-    """(6,) Hz: the corner of the noise of each channel, 0 if not all have such noise.
+    """(3P,) Hz: the corner of the noise of each channel, 0 if not all have such noise.
 
-    ``parts``: whitened residuals (6, n) of each recording, 0 where nothing was measured; ``periods``: s from one to the
-    next.
+    ``parts``: whitened residuals (3P, n) of each recording, 0 where nothing was measured; ``periods``: s from one to
+    the next.
     """
-    gains = np.array([_gains([p[c] for p in parts], periods) for c in range(6)])
-    light = gains[list(SUMS)]
+    channels = len(parts[0])
+    gains = np.array([_gains([p[c] for p in parts], periods) for c in range(channels)])
+    light = gains[2::3]
     own = np.where(gains.max(axis=1) > 0.0, CORNERS[np.argmax(gains, axis=1)], 0.0)
-    dots = np.sort(own[list(DOT_CHANNELS)])
-    # What moves three of the dots, or one light, alone is more than this noise.
+    dots = np.sort(own[list(dot_channels(channels // 3))])
+    # What moves some of the dots (three of four), or one light, alone is more than this noise.
     if light.sum(axis=0).max() < CLEAR or light.max(axis=1).min() <= 0.0 or dots[1] == 0.0:
-        return np.zeros(6)
-    low, high = np.sort(own[list(SUMS)])
+        return np.zeros(channels)
+    low, high = own[2::3].min(), own[2::3].max()
     return np.asarray(np.minimum(own, WIDER * min(high, APART * low, dots[1])))
 
 
@@ -70,8 +70,8 @@ def _gains(rows: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlowNoise:
-    """``corners`` (6,) Hz, of a recording of n values; ``pass_`` (6, n): what makes their cosine spectra white. Cosines
-    do not take a drift from the first to the last value for a jump.
+    """``corners`` (3P,) Hz, of a recording of n values; ``pass_`` (3P, n): what makes their cosine spectra white.
+    Cosines do not take a drift from the first to the last value for a jump.
     """
 
     corners: FloatArray
@@ -86,16 +86,16 @@ class SlowNoise:
         return cls(corners, 1.0 / np.sqrt(1.0 + corners[:, None] / f))
 
     def whiten(self, rows: FloatArray) -> FloatArray:
-        """Rows (6, n), white but for this, made white; it is its own adjoint."""
+        """Rows (3P, n), white but for this, made white; it is its own adjoint."""
         return np.asarray(idct(dct(rows, norm='ortho') * self.pass_, norm='ortho'))
 
     def unwhiten(self, rows: FloatArray) -> FloatArray:
-        """Rows (6, n) as they were."""
+        """Rows (3P, n) as they were."""
         return np.asarray(idct(dct(rows, norm='ortho') / self.pass_, norm='ortho'))
 
 
 def block_factor(seconds: float, block: float, corners: FloatArray) -> FloatArray:
-    """(6,): by how much slow noise increases the variance of means over ``block`` s, in a recording of ``seconds``.
+    """(3P,): by how much slow noise increases the variance of means over ``block`` s, in a recording of ``seconds``.
 
     That of white noise is its density over twice the length; between the recording's length and the block's there are
     as many octaves as their ratio has, each with the same slow noise.

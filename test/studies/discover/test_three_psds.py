@@ -1,0 +1,349 @@
+"""A search on rigs of three and more PSDs: what is hidden is named on the PSD that has it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.cli.main import main
+from psd_deflection.model.simulation.catalogue import catalogue, make_active
+from psd_deflection.model.simulation.effect_words import with_effects
+from psd_deflection.model.simulation.law_files import read_law
+from psd_deflection.model.simulation.laws import effect_of
+from psd_deflection.model.simulation.simulator import RigSimulator
+from psd_deflection.records import channel_names, dot_names
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.rig.wiring import Wiring
+from psd_deflection.studies.check.wirings import WIRINGS, differences, fix_of, parameters, wirings_of
+from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.from_recordings import read_observation, read_observations, read_tables
+from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.plant_search import discover_in
+from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
+from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.redundant import fourth, fourth_reading
+from psd_deflection.studies.discover.setup.setup import wire
+from psd_deflection.studies.discover.setup.slow_noise import corners_of
+from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
+
+TWO = load_rig()
+RIG = load_rig(overrides={'psd_3.center': [0.080, -0.060]})
+SIX = replace_values(
+    RIG, {'psd_4.center': [0.060, 0.050], 'psd_5.center': [-0.060, -0.070], 'psd_6.center': [0.0, -0.090]}
+)
+LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, 0, 0), (15, -10, 4), (0, 0, 0), (0, -10, -6), (0, 0, 0)], float)
+LOADS = np.repeat(LEVELS, 1000, axis=0)
+
+
+def observed(rig: Rig, *words: str, seed: int = 0, world: Mapping[str, object] | None = None) -> Observation:
+    """What the device shows under ``LOADS`` of a rig with the effects of ``words``, which ``world`` has otherwise."""
+    true = with_effects(replace_values(rig, world or {}), words, 'test')
+    volts = RigSimulator(true, seed).step(LOADS).counts * rig.converter.volts_per_count
+    return Observation('x', rig, np.asarray(volts, dtype=np.float64), LOADS)
+
+
+@pytest.mark.parametrize(
+    ('word', 'name', 'value'),
+    [
+        ('sensor_rotation,psd=3,angle=0.01', 'angle', 0.01),
+        ('sensor_rotation,psd=1,angle=-0.01', 'angle', -0.01),
+        ('sensor_gain,psd=3,x=0.02', 'x', 0.02),
+        ('load_offset,x=0.01', 'x', 0.01),
+    ],
+)
+def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: float) -> None:
+    (effect,) = (found := discover([observed(RIG, word)])).effects
+    wanted = dict(pair.split('=') for pair in word.split(',')[1:])
+    assert effect.active.effect.name == word.split(',', maxsplit=1)[0]
+    assert effect.active.values.get('psd', 0.0) == float(wanted.get('psd', 0.0))
+    assert effect.active.values[name] == pytest.approx(value, abs=4.0 * effect.sd[name])
+    assert (found.verdict, found.setup) == ('effects_found', ())
+    assert list(found.per_channel) == list(dot_names(3))
+
+
+@pytest.mark.parametrize('seed', [1, 2])
+def test_nothing_is_missing_where_nothing_is_hidden(seed: int) -> None:
+    found = discover([observed(RIG, seed=seed)])
+    assert (found.verdict, found.effects, found.setup) == ('nothing_missing', (), ())
+    assert 0.95 < found.floors < 1.05
+
+
+def test_of_six_psds_a_wrong_wiring_and_an_effect_are_named_together() -> None:
+    found = discover([observed(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
+    assert [(f.name, f.where) for f in found.setup] == [('channel_sign', 'x6')]
+    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 5)']
+
+
+def test_a_law_may_act_on_the_third_psd(tmp_path: Path) -> None:
+    """Beyond 12 N downwards the third detector lifts."""
+    plain = observed(RIG)
+    volts = plain.volts.copy()
+    volts[:, 7] += 0.004 * np.maximum(-LOADS[:, 1] - 12.0, 0.0)
+    found = discover([dataclasses.replace(plain, volts=volts)])
+    assert found.law is not None
+    assert found.law.law.acts_on == 'y3'
+    path = tmp_path / 'lifts.yaml'
+    path.write_text(
+        'name: lifts\nacts_on: sum3\nterms:\n  - {form: product, of: [x3], coefficient: 100.0}\n', encoding='utf-8'
+    )
+    effect = effect_of(read_law(path))
+    assert (effect.least_psds, effect_of(found.law.law).least_psds) == (3, 3)
+
+
+def test_a_rig_without_the_psd_of_a_law_refuses_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = 'name: lifts\nacts_on: sum3\nterms:\n  - {form: product, of: [y4], coefficient: 100.0}\n'
+    (tmp_path / 'lifts.yaml').write_text(text, encoding='utf-8')
+    monkeypatch.setenv('PSD_DEFLECTION_EFFECTS', str(tmp_path))
+    with pytest.raises(ConfigError, match='lifts is of a rig of 4 PSDs, this one has 3'):
+        RigSimulator(with_effects(RIG, ['lifts,c1=100'], 'test'))
+    # A search on a rig without that PSD does not look for it.
+    assert discover([observed(RIG)]).verdict == 'nothing_missing'
+    lit = RigSimulator(with_effects(SIX, ['lifts,c1=1e4'], 'test')).step(LOADS).counts
+    dark = RigSimulator(SIX).step(LOADS).counts
+    assert np.flatnonzero(np.any(lit != dark, axis=0)).tolist() == [8]
+    assert make_active('lifts', {'c1': 1.0}, 'test').effect.least_psds == 4
+
+
+def test_hum_is_named_on_the_channels_of_the_third_psd() -> None:
+    hidden = 'mains_interference,frequency=50,amplitude_y3=0.004,amplitude_sum3=0.003,phase_sum3=1.0'
+    (effect,) = discover([observed(RIG, hidden)]).effects
+    assert effect.active.effect.name == 'mains_interference'
+    for name, size in (('amplitude_y3', 0.004), ('amplitude_sum3', 0.003), ('phase_sum3', 1.0), ('amplitude_x1', 0.0)):
+        assert effect.active.values[name] == pytest.approx(size, abs=4.0 * max(effect.sd[name], 1e-5))
+
+
+def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
+    for psds in (2, 3, 6):
+        names = [p.name for p in catalogue(psds)['mains_interference'].parameters]
+        sizes, phases = ([f'{of}_{c}' for c in channel_names(psds)] for of in ('amplitude', 'phase'))
+        assert names == ['frequency', *sizes, *phases]
+        turned = catalogue(psds)['sensor_rotation']
+        assert [v['psd'] for v in turned.variants(psds)] == list(range(1, psds + 1))
+    assert [e.name for e in catalogue().values()] == [e.name for e in catalogue(6).values()]
+    with pytest.raises(ConfigError, match='amplitude_x3'):
+        with_effects(TWO, ['mains_interference,amplitude_x3=0.01'], 'test')
+
+
+# Wirings.
+
+
+@pytest.mark.parametrize(
+    ('world', 'told'),
+    [
+        ({'psd_3.axes': ['-x', 'y']}, [('channel_sign', 'x3')]),
+        ({'psd_3.axes': ['y', 'x']}, [('axis_swap', 'psd_3')]),
+        ({'psds_exchanged': True, 'psd_3.axes': ['x', '-y']}, [('psd_swap', 'psd_1 psd_2'), ('channel_sign', 'y3')]),
+    ],
+)
+def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], told: list[tuple[str, str]]) -> None:
+    given = observed(RIG, world=world)
+    (right,), findings, lines = wire([given], ())
+    assert [(f.name, f.where) for f in findings] == told
+    assert lines == world
+    assert right.volts == pytest.approx(Wiring.from_rig(replace_values(RIG, world)).to_psds(given.volts))
+
+
+def test_two_others_that_are_exchanged_are_named_and_put_right() -> None:
+    """No parameter says it, so there is no line for it."""
+    right = observed(RIG, world={'psd_1.axes': ['x', '-y']})
+    exchanged = dataclasses.replace(right, volts=right.volts[:, [6, 7, 8, 3, 4, 5, 0, 1, 2]])
+    (mended,), findings, lines = wire([exchanged], ())
+    assert [(f.name, f.where) for f in findings] == [('psd_swap', 'psd_1 psd_3'), ('channel_sign', 'y3')]
+    assert findings[0].fix.startswith('exchange the cables of psd_1 and psd_3 at the device')
+    assert lines == {'psd_1.axes': ['x', '-y']}
+    assert mended.volts == pytest.approx(right.volts * [1, -1, 1, *[1] * 6])
+
+
+def test_a_crossed_wiring_goes_to_the_device_and_back() -> None:
+    wiring = Wiring(True, (('x', 'y'), ('-y', 'x'), ('x', '-y'), ('x', 'y')), (2, 4))
+    assert [wiring.input_of(psd) for psd in (1, 2, 3, 4)] == [2, 4, 3, 1]
+    volts = np.arange(24.0).reshape(2, 12)
+    device = wiring.to_device(volts)
+    assert wiring.to_psds(device) == pytest.approx(volts)
+    # x of PSD 2 is minus y of input 4.
+    assert device[:, 10] == pytest.approx(-volts[:, 3])
+    assert not Wiring(crossed=(1, 3), axes=(('x', 'y'),) * 3).nominal
+
+
+def test_a_wiring_as_the_rig_file_says_it_is_no_finding() -> None:
+    file = replace_values(RIG, {'psd_1.axes': ['y', '-x'], 'psd_3.axes': ['-x', 'y']})
+    right = observed(file)
+    read = dataclasses.replace(right, volts=Wiring.from_rig(file).to_psds(right.volts))
+    assert wire([read], ())[1:] == ([], {})
+
+
+def test_the_wirings_of_more_psds_are_those_with_two_wrong_ones_and_those_alike() -> None:
+    nominal = Wiring(axes=(('x', 'y'),) * 3)
+    each = [wiring.axes[0] for wiring in WIRINGS[:64:8]]
+    all_of_three = set(itertools.product(each, repeat=3))
+    few = {a for a in all_of_three if sum(axes != ('x', 'y') for axes in a) <= 2 or len(set(a)) == 1}
+    tried = wirings_of(nominal)
+    assert len(tried) == len(set(tried)) == 4 * len(few)
+    for swap in ((False, ()), (True, ()), (False, (1, 3)), (False, (2, 3))):
+        assert {w.axes for w in tried if (w.exchanged, w.crossed) == swap} == few
+    assert tried[0] == nominal
+    assert wirings_of(Wiring()) is WIRINGS
+
+
+def test_what_is_wired_otherwise_is_said_of_any_psd() -> None:
+    file = Wiring(axes=(('x', 'y'),) * 4)
+    wired = Wiring(True, (('x', 'y'), ('x', 'y'), ('x', 'y'), ('-y', 'x')))
+    wrong = differences(wired, file)
+    assert [(d.name, d.where) for d in wrong] == [
+        *(('psd_swap', 'psd_1 psd_2'), ('axis_swap', 'psd_4'), ('channel_sign', 'y4'))
+    ]
+    lines = parameters(wired, file)
+    assert lines == {'psds_exchanged': True, 'psd_4.axes': ['-y', 'x']}
+    assert [fix_of(d, wired, lines) for d in wrong] == ['psds_exchanged: true', *['psd_4.axes: [-y, x]'] * 2]
+
+
+# Redundant readings.
+
+
+@pytest.mark.parametrize(('rig', 'count'), [(TWO, 1), (RIG, 3), (SIX, 9)])
+def test_what_no_movement_makes_is_as_many_numbers_as_there_are_readings_too_many(rig: Rig, count: int) -> None:
+    psds = len(rig.psds)
+    rows = across_of(rig)
+    assert rows.shape == (count, 2 * psds)
+    assert rows @ rows.T == pytest.approx(np.eye(count), abs=1e-12)
+    # x = -X + ly theta, y = -Y - lx theta.
+    places = rig.centers + rig.zeros
+    plate = np.zeros((2 * psds, 3))
+    plate[0::2, 0] = plate[1::2, 1] = -1.0
+    plate[0::2, 2], plate[1::2, 2] = places[:, 1], -places[:, 0]
+    pose = np.array([[1e-4, 0.0], [-2e-4, 1e-5], [0.0, 3e-4]])
+    volts = np.full((3 * psds, 2), 5.0)
+    volts[[c for c in range(3 * psds) if c % 3 != 2]] = (plate @ pose) / rig.sensitivities.reshape(-1, 1)
+    assert moved_plate(rig, volts, np.ones_like(volts)) == pytest.approx(pose, abs=1e-12)
+    assert across_plate(rig, volts) == pytest.approx(np.zeros((count, 2)), abs=1e-12)
+    volts[3 * psds - 3] += 1.0
+    assert np.linalg.norm(across_plate(rig, volts), axis=0) == pytest.approx(
+        np.linalg.norm(rows[:, -2]) * rig.sensitivities[-1, 0]
+    )
+
+
+@pytest.mark.parametrize('rig', [TWO, RIG, SIX])
+def test_the_readings_too_many_of_pure_noise_have_unit_covariance(rig: Rig) -> None:
+    """Also if the noise of the detectors and their sensitivities differ."""
+    other = {'psd_2.noise': [3e-3, 1e-3], 'psd_2.sensitivity': [1e-3, 2e-3], 'psd_1.sensitivity': [4e-4, 7e-4]}
+    ws = Workspace([observed(replace_values(rig, other))])
+    readings, blocks = 2 * len(rig.psds), ws.measured[0].shape[1]
+    # The combinations themselves: every reading alone, one after the other.
+    each = np.zeros((readings, ws.measured[0].size))
+    for k, row in enumerate(ws.rows):
+        each[k, row * blocks] = 1.0
+    basis = fourth(ws, each).reshape(readings, -1, blocks)[:, :, 0]
+    assert basis.shape == (readings, readings - 3)
+    assert basis.T @ basis == pytest.approx(np.eye(readings - 3), abs=1e-9)
+    # And what noise makes of them.
+    white = np.random.default_rng(0).standard_normal((1, ws.measured[0].size))
+    seen = fourth(ws, white)[0].reshape(readings - 3, blocks)
+    assert seen @ seen.T / blocks == pytest.approx(np.eye(readings - 3), abs=5.0 * (2.0 / blocks) ** 0.5)
+    # A movement of the plate is none of them.
+    moved = ws.simulate([make_active('load_offset', {'x': 0.01}, 'test')])
+    change = ws.whiten([a - b for a, b in zip(moved, ws.simulate([]), strict=True)])
+    assert np.abs(fourth(ws, change[None, :])).max() < 1e-2 * np.abs(change).max()
+
+
+@pytest.mark.parametrize(
+    ('word', 'acquitted'),
+    [
+        ('tip_mass,mass=0.3', True),
+        ('bending_stiffness,scale=-0.01', True),
+        ('sensor_rotation,psd=3,angle=0.01', False),
+        ('sensor_gain,psd=1,y=0.01', False),
+    ],
+)
+def test_the_readings_too_many_acquit_the_detectors_of_what_the_link_does(word: str, acquitted: bool) -> None:
+    ws = Workspace([observed(RIG, word)])
+    residual, _ = ws.residual([])
+    reading = fourth_reading(ws, residual)
+    assert reading.values == 3 * ws.measured[0].shape[1]
+    assert reading.acquits == acquitted
+
+
+def test_slow_noise_is_seen_if_all_lights_and_all_dots_but_one_have_it() -> None:
+    """1/f noise of a corner of 4 Hz, of nine channels."""
+    rng, n, period = np.random.default_rng(3), 4000, 0.004
+    f = np.fft.rfftfreq(n, period)
+    f[0] = f[1]
+    spectrum = np.fft.rfft(rng.standard_normal((9, n)))
+    pink = np.fft.irfft(spectrum * np.sqrt(1.0 + 4.0 / f), n)
+    found = corners_of([pink], [period])
+    assert found.shape == (9,)
+    assert np.all((found > 2.0) & (found < 8.0))
+    white = rng.standard_normal((9, n))
+    for without in ((8,), (0, 6), (0, 1, 3, 4)):
+        rows = pink.copy()
+        rows[list(without)] = white[list(without)]
+        assert not corners_of([rows], [period]).any()
+    assert not corners_of([white], [period]).any()
+
+
+# Files.
+
+
+def test_recordings_of_one_search_are_of_as_many_psds() -> None:
+    both = [observed(RIG), dataclasses.replace(observed(TWO), name='other')]
+    with pytest.raises(RecordingError, match='other: is of 2 PSDs, the rig of the search has 3'):
+        discover(both)
+    with pytest.raises(RecordingError, match='x: is of 3 PSDs, the rig of the search has 2'):
+        discover(both[:1], TWO)
+
+
+def test_volts_of_another_number_of_psds_than_the_rig_has_are_refused() -> None:
+    with pytest.raises(RecordingError, match=r'volts \(7000, 9\)'):
+        Observation('x', SIX, observed(RIG).volts, LOADS)
+
+
+def test_the_command_searches_a_recording_of_three_and_writes_what_it_found(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = tmp_path / 'rig.yaml'
+    rig.write_text('/**:\n  ros__parameters:\n    psd_3:\n      center: [0.080, -0.060]\n', encoding='utf-8')
+    steps = 'steps:0,0,0;0,-20,0;0,0,0;15,-10,4;0,0,0;0,-10,-6;0,0,0:1'
+    words = ['--params-file', str(rig), '--loads', steps, '--effect', 'sensor_rotation,psd=3,angle=0.01']
+    assert main(['simulate', *words, '--out', str(tmp_path / 'three.csv')]) == 0
+    assert main(['simulate', '--loads', steps, '--out', str(tmp_path / 'two.csv')]) == 0
+    seen = read_observation(tmp_path / 'three.csv', RIG)
+    assert (seen.psds, seen.volts.shape) == (3, (7000, 9))
+    out = tmp_path / 'out'
+    assert main(['discover', str(tmp_path / 'three.csv'), '--params-file', str(rig), '--out', str(out)]) == 0
+    assert 'sensor_rotation (psd 3) is missing' in capsys.readouterr().out
+    assert 'psd: 3' in (out / 'model.yaml').read_text(encoding='utf-8')
+    page = (out / 'report.html').read_text(encoding='utf-8')
+    assert all(name in page for name in channel_names(3))
+    with pytest.raises(ConfigError, match=r'two.csv: has samples of 2 PSDs, the rig file has 3'):
+        read_observations([tmp_path / 'three.csv', tmp_path / 'two.csv'], RIG)
+
+
+def test_a_table_of_readings_may_be_of_three_psds(tmp_path: Path) -> None:
+    levels = np.array(
+        [(0, 0, 0), (0, -5, 0), (0, -10, 0), (0, -30, 0), (0, -10, -5.85), (0, -50, -29.25), (20, 0, 0), (-20, 0, 0)],
+        float,
+    )
+    turned = make_active('sensor_rotation', {'psd': 3, 'angle': 0.02}, 'test')
+    blank = Readings('table', RIG, 'dots', levels, np.zeros((len(levels), 6)))
+    dots = ReadingsPlant([blank]).simulate_effects([turned])[0].T * 1e-3
+    dots += np.random.default_rng(0).normal(0.0, 1e-3, dots.shape)
+    header = ','.join(('load_fx,load_fy,load_tz', *(f'{name}_mm' for name in dot_names(3))))
+    rows = [','.join(f'{v:.6g}' for v in (*load, *row)) for load, row in zip(levels, dots, strict=True)]
+    path = tmp_path / 'hung.csv'
+    path.write_text('\n'.join((header, *rows)) + '\n', encoding='utf-8')
+    (table,) = read_tables([path], RIG)
+    assert table.values == pytest.approx(1e-3 * dots, abs=1e-8)
+    found = discover_in(ReadingsPlant([table]))
+    assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 3)']
+    with pytest.raises(RecordingError, match='has readings of 3 PSDs, the rig file has 2'):
+        read_tables([path], TWO)
+    with pytest.raises(RecordingError, match=r'table: is of 6 PSDs, .*hung.csv of 3'):
+        ReadingsPlant([table, Readings('table', SIX, 'dots', levels, np.zeros((len(levels), 12)))])
+    path.write_text(path.read_text(encoding='utf-8').replace('y3_mm', 'z'), encoding='utf-8')
+    with pytest.raises(RecordingError, match='the header lacks y3_mm beside the other readings'):
+        read_tables([path], RIG)
