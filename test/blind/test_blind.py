@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from blind import generator, run, score
-from blind.cases import MISTAKES, NOISES, Case, all_cases, designs, gap_of, scaled, short_cases
+from blind.cases import MISTAKES, NOISES, Case, all_cases, cases_by_hand, designs, gap_of, scaled, short_cases
 from blind.mistakes import observed
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
@@ -63,6 +63,17 @@ def test_a_hidden_effect_is_named(key: str) -> None:
     answer, found = run.answer(case, run.truth_of(case))
     assert [e['name'] for e in answer['effects']] == [case.wanted[0][0]]
     assert found.simulations <= 2000
+
+
+@pytest.mark.statistics
+def test_times_that_leave_the_noise_are_kept_beside_an_effect_that_is_far_from_linear() -> None:
+    """Friction: a further step of the free times led away."""
+    key = 'hand-slow-64146-clamp_friction'
+    case = next(c for c in cases_by_hand(64000, 200) if c.key == key)
+    answer, found = run.answer(case, run.truth_of(case))
+    assert [e['name'] for e in answer['effects']] == ['clamp_friction']
+    assert (answer['verdict'], answer['unknown']) == ('effects_found', [])
+    assert found.floors < 1.05
 
 
 @pytest.mark.parametrize('noise', ['white', *NOISES])

@@ -223,10 +223,14 @@ def hung(problem: Problem) -> Problem:
     gap = ws.gap(fit.difference)
     for _ in range(MOST_SETTLED):
         # Loads and times are found to first order: at the sizes as they are, then the sizes beside them.
-        ws, fit = _settled(ws, fit)
+        turned, better = _settled(ws, fit)
         if fit.effects:
-            ws, fit = _settled(ws, refit(ws, fit.effects, 6))
-        left, gap = gap, ws.gap(fit.difference)
+            turned, better = _settled(turned, refit(turned, fit.effects, 6))
+        left, gap = gap, turned.gap(better.difference)
+        if gap > left:
+            # Beside an effect that is far from linear a step may lead away.
+            break
+        ws, fit = turned, better
         if gap > SETTLED * left or gap < AT_FLOOR * ws.floor():
             break
     null = refit(ws, ())
@@ -244,7 +248,8 @@ def hung(problem: Problem) -> Problem:
 def _settled(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
     """The free loads as ``fit`` asks for, and what it leaves then."""
     for _ in range(TURNS):
-        ws = ws.settled(fit.difference)
+        beside = ws.settled_beside(fit.difference, fit.whole)
+        ws = ws.settled(fit.difference) if beside is ws else beside
         residual, difference = ws.residual([*ws.base, *fit.whole])
         fit = replace(fit, residual=residual, difference=difference, chi2=ws.loss(residual))
     return ws, fit

@@ -39,7 +39,7 @@ MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
 FREE_MOMENTS = 40.0
 """How far fitted times may be off: 10 samples, in the quarters of one by which they are shifted."""
-MOST_AN_EFFECT_DOES = 0.5
+MOST_AN_EFFECT_DOES = 0.45
 """Share by which an effect may change a load."""
 MOST_MEASURED = 40
 """Measured loads of a recording whose errors are considered; each takes three simulations."""

@@ -303,6 +303,20 @@ def test_a_few_milliseconds_late_are_found_beside_a_second_mode_whose_line_they_
 
 
 @pytest.mark.statistics
+def test_the_first_load_noted_twice_is_told_if_no_other_pulls_that_way() -> None:
+    down = [(0, -20, 0), (0, -40, -23.4), (0, -10, 0), (0, -30, 17.55)]
+    acting = np.repeat(np.array([(0, 0, 0), (15, 0, 0), *down, (0, 0, 0)]), DWELL, axis=0)
+    noted = acting.copy()
+    noted[DWELL : 2 * DWELL] *= 2.0
+    more = {'name': 'sensor_gain', 'psd': 1, 'x': 0.004, 'y': 0.004}
+    found = searched(read(acting, **{f'effects__e__{k}': v for k, v in more.items()}), noted)
+    assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 1')]
+    assert found.setup[0].value == pytest.approx((15.0, 0.0, 0.0), abs=0.05)
+    assert [e.active.label for e in found.effects] == ['sensor_gain (psd 1)']
+    assert (found.verdict, found.unknown, found.law) == ('effects_found', (), None)
+
+
+@pytest.mark.statistics
 def test_no_noise_is_told_of_what_rings_and_is_unknown() -> None:
     ringing = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
     volts = read(HUNG, **{f'effects__e__{k}': v for k, v in ringing.items()})
