@@ -126,7 +126,7 @@ class RecordedRig(Machine):
         progress('simulating the rig as it is described')
         recorded, workspace = recordings_ready.compared(recorded)
         # Signatures that are kept are those of recordings as they were, from rest.
-        changed = bool(recorded.findings or workspace.nuisance) or any(d > 0.0 for d in recorded.delays)
+        changed = recorded.mistaken or bool(workspace.nuisance) or any(d > 0.0 for d in recorded.delays)
         kept = SignatureBank() if bank is None or changed else bank
         kept.nominal(workspace)
         found = _proposals(workspace)
@@ -228,7 +228,6 @@ def hung(problem: Problem) -> Problem:
             turned, better = _settled(turned, refit(turned, fit.effects, 6))
         left, gap = gap, turned.gap(better.difference)
         if gap > left:
-            # Beside an effect that is far from linear a step may lead away.
             break
         ws, fit = turned, better
         if gap > SETTLED * left or gap < AT_FLOOR * ws.floor():
@@ -246,12 +245,15 @@ def hung(problem: Problem) -> Problem:
 
 
 def _settled(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
-    """The free loads as ``fit`` asks for, and what it leaves then."""
+    """The free loads as ``fit`` asks for, and what it leaves then: never more than before."""
     for _ in range(TURNS):
-        beside = ws.settled_beside(fit.difference, fit.whole)
-        ws = ws.settled(fit.difference) if beside is ws else beside
-        residual, difference = ws.residual([*ws.base, *fit.whole])
-        fit = replace(fit, residual=residual, difference=difference, chi2=ws.loss(residual))
+        turned = ws.settled_beside(fit.difference, fit.whole)
+        turned = ws.settled(fit.difference) if turned is ws else turned
+        residual, difference = turned.residual([*turned.base, *fit.whole])
+        if turned.gap(difference) > ws.gap(fit.difference):
+            # Beside an effect that is far from linear a step may lead away.
+            break
+        ws, fit = turned, replace(fit, residual=residual, difference=difference, chi2=turned.loss(residual))
     return ws, fit
 
 
@@ -381,7 +383,8 @@ def _beside(problem: Problem, found: FoundLaw) -> Problem:
 def set_up(problem: Problem) -> Problem:
     """What is wrong with the set-up, beside the named effects that are physics; and the coarse steps."""
     machine, ws = rig_of(problem), workspace_of(problem.comparison)
-    setup, values = list(machine.recorded.findings), dict(machine.recorded.values)
+    setup = [*machine.recorded.late_loads(ws), *machine.recorded.findings]
+    values = dict(machine.recorded.values)
     for i, effect in enumerate(problem.named):
         if effect.active.effect.name in SETUP:
             more, lines = said(ws, problem.fit, i, effect.delta_bic)

@@ -30,7 +30,7 @@ from psd_deflection.studies.discover.setup.hidden import beginning
 from psd_deflection.studies.discover.setup.hung import directions, levels, of_plateau, swayed, times
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
-from psd_deflection.studies.loads.noted_times import MendedLoads, shifts
+from psd_deflection.studies.loads.noted_times import MendedLoads, MendedNote, shifted
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_hung, noted_wrong
 from psd_deflection.studies.loads.sway import SwayingLoad, left_out
 from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
@@ -80,6 +80,20 @@ class Recorded:
         """Of the rig as it was put right."""
         return Physics.of(self.rig)
 
+    @property
+    def mistaken(self) -> bool:
+        """Whether anything was noted or wired otherwise than it was."""
+        return bool(self.findings) or any(m is not None and m.notes for m in self.mended)
+
+    def late_loads(self, workspace: Workspace) -> list[Finding]:
+        """Loads that acted at another time than noted; ``workspace``: where their times were fitted."""
+        sizes = {id(d.of): d.sizes for d in workspace.directions if isinstance(d, LoadDirection) and d.exact}
+        out = []
+        for o, mended in zip(workspace.observations, self.mended, strict=True):
+            for note in mended.notes if mended is not None else ():
+                out.append(note_finding(note.moved(sizes.get(id(note), ()), o.period), o.name))
+        return out
+
 
 def cleaned(recorded: Recorded) -> Recorded:
     """Without outliers, stuck channels and times without a known load."""
@@ -96,10 +110,9 @@ def cleaned(recorded: Recorded) -> Recorded:
 def put_right(recorded: Recorded) -> Recorded:
     """With loads at the times at which they acted, and with wiring, signs and units as they are."""
     timed = [time_loads(o) for o in recorded.observations]
-    late = [note_finding(n, o.name) for o, mended in timed if mended is not None for n in mended.notes]
     observations, wrong, lines = wire([o for o, _ in timed], recorded.known)
     gap = 0.0
-    if wrong or late:
+    if wrong or any(mended is not None and mended.notes for _, mended in timed):
         stated = Workspace(recorded.observations, recorded.known)
         gap = stated.gap(stated.residual(recorded.known)[1])
     values = {**recorded.values, **lines}
@@ -107,7 +120,7 @@ def put_right(recorded: Recorded) -> Recorded:
         recorded,
         observations=tuple(observations),
         rig=replace_values(recorded.rig, values) if values else recorded.rig,
-        findings=(*late, *recorded.findings, *wrong),
+        findings=(*recorded.findings, *wrong),
         values=values,
         stated_gap=gap,
         mended=tuple(mended for _, mended in timed),
@@ -258,8 +271,7 @@ def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
             continue
         o = workspace.observations[i]
         for note in mended.timed:
-            for axis, shifted in enumerate(shifts(note, o.loads, o.period)):
-                free.append(LoadDirection(i, shifted(1.0), FREE_MOMENTS, note, axis, exact=shifted))
+            free += _in_time(i, note, shifted(note, o.loads, o.period))
         # In whatever unit they were measured.
         unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(mended.loads).max(axis=0), 1e-30)
         if len(mended.measured) <= MOST_MEASURED:
@@ -269,6 +281,15 @@ def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
     for _ in range(2 if recorded.wrong else 0):
         workspace = workspace.settled(workspace.residual(workspace.base)[1])
     return workspace
+
+
+def _in_time(recording: int, note: MendedNote, acted: Callable[[Sequence[float]], FloatArray]) -> list[LoadDirection]:
+    """The time of a ``note`` and, if its load was applied slowly, how long that took; ``acted``: what they do."""
+    none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
+    changes = [acted([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
+    return [
+        LoadDirection(recording, change, FREE_MOMENTS, note, axis, acted, none) for axis, change in enumerate(changes)
+    ]
 
 
 def _beginnings(workspace: Workspace) -> tuple[ActiveEffect, ...]:

@@ -99,6 +99,14 @@ class MendedNote:
         """Whether it was noted otherwise than it was hung."""
         return abs(self.late) > ALIKE_S or self.took > 0.0
 
+    def moved(self, moments: Sequence[float], period: float) -> MendedNote:
+        """It acted so many moments later and, the second number, took so many longer. A moment is a quarter of a
+        sample, of which one comes every ``period``, s.
+        """
+        later, slower = (*moments, 0.0, 0.0)[:2]
+        moment = 0.25 * period
+        return replace(self, hung=self.hung + later * moment, took=max(self.took + slower * moment, 0.0))
+
     @property
     def _is_late(self) -> bool:
         return abs(self.late) > ALIKE_S and abs(self.late) > self.took
@@ -238,23 +246,20 @@ def _without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNo
     return MendedLoads(mended, tuple(told), unused)
 
 
-def shifts(note: MendedNote, loads: FloatArray, period: float) -> list[Callable[[float], FloatArray]]:
-    """What so many moments more do to ``loads`` (n, 3): of the time at which the load of ``note`` began to act and, if
-    it was applied slowly, of how long that took. A moment is a quarter of a sample.
+def shifted(note: MendedNote, loads: FloatArray, period: float) -> Callable[[Sequence[float]], FloatArray]:
+    """What so many moments more do to ``loads`` (n, 3): of the time at which the load of ``note`` began to act and, the
+    second number if it was applied slowly, of how long that took.
     """
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
     before, after = np.searchsorted(t, (note.hung - period, note.hung + note.took + 2.0 * period))
     step = loads[min(int(after), len(loads) - 1)] - loads[max(int(before) - 1, 0)]
-    now, moment = applied(t, note.hung, note.took, period), 0.25 * period
+    now = applied(t, note.hung, note.took, period)
 
-    def later(moments: float) -> FloatArray:
-        return np.asarray((applied(t, note.hung + moments * moment, note.took, period) - now)[:, None] * step)
+    def more(moments: Sequence[float]) -> FloatArray:
+        then = note.moved(moments, period)
+        return np.asarray((applied(t, then.hung, then.took, period) - now)[:, None] * step)
 
-    def slower(moments: float) -> FloatArray:
-        took = max(note.took + moments * moment, 0.0)
-        return np.asarray((applied(t, note.hung, took, period) - now)[:, None] * step)
-
-    return [later, slower] if note.took > 0.0 else [later]
+    return more
 
 
 def _alike(late: FloatArray, within: float) -> bool:

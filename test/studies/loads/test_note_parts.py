@@ -16,7 +16,7 @@ from psd_deflection.studies.loads.noted_times import (
     ALIKE_S,
     MendedNote,
     ordinal,
-    shifts,
+    shifted,
 )
 from psd_deflection.studies.loads.steps import LEAST_SHARE
 
@@ -329,24 +329,26 @@ def test_later_and_slower_shift_what_the_load_changed_by() -> None:
     # Applied from sample 20 to 28: before is the sample before 19, after is the second one beyond 28.
     step = loads[30] - loads[18]
     ramp = note(12.0, 10.0, 4.0)
-    later, slower = shifts(ramp, loads, 0.5)
+    acted = shifted(ramp, loads, 0.5)
 
     def share(start: float, took: float) -> FloatArray:
         return np.asarray(np.clip((t + 0.5 - start) / took, 0.0, 1.0))
 
     # A moment is an eighth of a second here.
-    assert later(4.0) == pytest.approx(np.outer(share(10.5, 4.0) - share(10.0, 4.0), step), abs=1e-3)
-    assert slower(8.0) == pytest.approx(np.outer(share(10.0, 5.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert acted([4.0, 0.0]) == pytest.approx(np.outer(share(10.5, 4.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert acted([0.0, 8.0]) == pytest.approx(np.outer(share(10.0, 5.0) - share(10.0, 4.0), step), abs=1e-3)
     # Faster than at once it cannot be.
-    assert slower(-100.0) == pytest.approx(np.outer((t >= 10.0) - share(10.0, 4.0), step), abs=1e-3)
-    assert later(0.0) == pytest.approx(0.0)
-    assert len(shifts(note(12.0, 10.0, 0.9), loads, 0.5)) == 2
-    assert len(shifts(note(12.0, 10.0), loads, 0.5)) == 1
+    assert acted([0.0, -100.0]) == pytest.approx(np.outer((t >= 10.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert acted([0.0, 0.0]) == pytest.approx(0.0)
+    # Both at once are no sum of the two: its end moves by both.
+    both = np.outer(share(9.5, 4.75) - share(10.0, 4.0), step)
+    assert acted([-4.0, 6.0]) == pytest.approx(both, abs=1e-3)
+    assert np.abs(acted([-4.0, 0.0]) + acted([0.0, 6.0]) - both).max() > 0.01 * np.abs(step).max()
     # At the begin and at the end of a recording there is no more.
-    first, _ = shifts(note(0.0, 0.0, 1.0), loads, 0.5)
-    assert first(4.0)[0] == pytest.approx(-(loads[4] - loads[0]) / 2.0, rel=1e-5)
-    last, _ = shifts(note(19.0, 19.0, 1.0), loads, 0.5)
-    assert last(4.0)[38] == pytest.approx(-(loads[39] - loads[36]) / 2.0, rel=1e-5)
+    first = shifted(note(0.0, 0.0, 1.0), loads, 0.5)
+    assert first([4.0, 0.0])[0] == pytest.approx(-(loads[4] - loads[0]) / 2.0, rel=1e-5)
+    last = shifted(note(19.0, 19.0, 1.0), loads, 0.5)
+    assert last([4.0, 0.0])[38] == pytest.approx(-(loads[39] - loads[36]) / 2.0, rel=1e-5)
 
 
 def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_are_told() -> None:

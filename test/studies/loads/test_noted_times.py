@@ -22,7 +22,7 @@ from psd_deflection.studies.loads.noted_times import (
     MendedNote,
     mend_loads,
     ordinal,
-    shifts,
+    shifted,
 )
 
 RIG = load_rig()
@@ -204,8 +204,8 @@ def test_a_load_between_two_samples_moves_the_link_as_one_at_that_time(moments: 
     loads = np.zeros((1000, 3))
     loads[first:, 1] = -50.0
     note = MendedNote(1, (0.0, -50.0, 0.0), 0.1, 0.1, 0.0)
-    (later,) = shifts(note, loads, 1e-3)
-    moved = Filter(mode_coefficients(frequency, ratio, 1e-3))((loads + later(moments))[:, 1] / -50.0)
+    later = shifted(note, loads, 1e-3)
+    moved = Filter(mode_coefficients(frequency, ratio, 1e-3))((loads + later([moments]))[:, 1] / -50.0)
     # The step response of an oscillator, from the time of the step on.
     w = 2.0 * math.pi * frequency
     damped = w * math.sqrt(1.0 - ratio**2)
@@ -231,20 +231,30 @@ def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
     loads = np.tile([0.0, -20.0, 0.0], (100, 1))
     loads[0] = 0.0
     note = MendedNote(1, (0.0, -20.0, 0.0), 0.001, 0.001, 0.0)
-    (later,) = shifts(note, loads, 0.001)
+    later = shifted(note, loads, 0.001)
     # Four quarters of a sample later nothing acts in the second sample.
-    assert later(4.0)[1] == pytest.approx([0.0, 20.0, 0.0])
-    assert later(4.0)[2:] == pytest.approx(0.0)
+    assert later([4.0])[1] == pytest.approx([0.0, 20.0, 0.0])
+    assert later([4.0])[2:] == pytest.approx(0.0)
 
 
 def test_a_step_between_two_samples_has_its_time_and_turns_back_before_it_not_behind() -> None:
     """Half a sample later than sample 10: the sum over the samples is -1/2, the moment about sample 10 is 1/8."""
     loads = np.where(np.arange(20)[:, None] < 10, 0.0, [[4.0, -8.0, 2.0]])
-    (later,) = shifts(MendedNote(1, (4.0, -8.0, 2.0), 0.01, 0.01, 0.0), loads, 1e-3)
+    later = shifted(MendedNote(1, (4.0, -8.0, 2.0), 0.01, 0.01, 0.0), loads, 1e-3)
     for more in (2.0, -2.0):
-        changed = later(more) / [4.0, -8.0, 2.0]
+        changed = later([more]) / [4.0, -8.0, 2.0]
         assert changed.sum(axis=0) == pytest.approx(-0.25 * more)
         about = np.arange(20) - 10.0 if more > 0.0 else np.arange(20) - 9.0
         assert about @ changed == pytest.approx(0.125)
         assert not changed[11:].any()
-        assert (loads + later(more))[11:] == pytest.approx(np.tile([4.0, -8.0, 2.0], (9, 1)))
+        assert (loads + later([more]))[11:] == pytest.approx(np.tile([4.0, -8.0, 2.0], (9, 1)))
+
+
+def test_ramps_beside_a_clamp_that_sticks_are_told_with_the_times_that_the_search_fitted() -> None:
+    sticks = {'effects__e__name': 'clamp_friction', 'effects__e__axis': 3, 'effects__e__width': 2.3e-5}
+    found = discover([Observation('x', RIG, volts(hung(0.8), **sticks), noted((0.0,) * 6))])
+    assert [e.active.label for e in found.effects] == ['clamp_friction (axis 3)']
+    assert found.effects[0].active.values['width'] == pytest.approx(2.3e-5, rel=1e-3)
+    assert found.verdict == 'effects_found'
+    assert found.floors < 1.05
+    assert [f.value for f in found.setup] == pytest.approx([0.8] * 6, abs=5e-4)

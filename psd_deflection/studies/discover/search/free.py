@@ -16,8 +16,8 @@ class LoadDirection:
     """A change of the loads that nobody knows: ``change`` (n, 3) N, N, N m of ``recording``, times a number of standard
     deviation ``sd``.
 
-    ``of``: what it belongs to; ``axis``: which of its numbers it is. ``exact``: the change (n, 3) by a number, if it is
-    not in proportion; ``size``: the number that the loads have already.
+    ``of``: what it belongs to; ``axis``: which of its numbers it is. ``exact``: the change (n, 3) by all of these
+    numbers, if it is not in proportion; ``sizes``: the numbers that the loads have already.
     """
 
     recording: int
@@ -25,14 +25,8 @@ class LoadDirection:
     sd: float
     of: object
     axis: int
-    exact: Callable[[float], FloatArray] | None = None
-    size: float = 0.0
-
-    def more(self, size: float) -> FloatArray:
-        """(n, 3): what ``size`` more does to the loads."""
-        if self.exact is None:
-            return size * self.change
-        return np.asarray(self.exact(self.size + size) - self.exact(self.size), dtype=np.float64)
+    exact: Callable[[Sequence[float]], FloatArray] | None = None
+    sizes: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,9 +49,37 @@ class ZeroDirection:
 Direction = LoadDirection | ZeroDirection
 
 
+def added(more: Sequence[tuple[Direction, float]]) -> list[tuple[int, FloatArray]]:
+    """Recordings, and what so much ``more`` adds to the loads (n, 3) of each."""
+    sizes, out = _sizes(more), []
+    for d, size in more:
+        if isinstance(d, LoadDirection):
+            if d.exact is None:
+                out.append((d.recording, size * d.change))
+            elif (now := sizes.pop(id(d.of), None)) is not None:
+                # The end of a ramp moves by its start and by its time: the two are no sum.
+                out.append((d.recording, d.exact(now) - d.exact(d.sizes)))
+    return out
+
+
 def moved(more: Sequence[tuple[Direction, float]]) -> tuple[Direction, ...]:
     """The directions, with the sizes that the loads have after so much ``more``."""
-    return tuple(dataclasses.replace(d, size=d.size + size) if isinstance(d, LoadDirection) else d for d, size in more)
+    sizes = _sizes(more)
+    return tuple(
+        dataclasses.replace(d, sizes=sizes.get(id(d.of), d.sizes)) if isinstance(d, LoadDirection) else d
+        for d, _ in more
+    )
+
+
+def _sizes(more: Sequence[tuple[Direction, float]]) -> dict[int, tuple[float, ...]]:
+    """All numbers after so much ``more``, by the id of what they belong to."""
+    out: dict[int, tuple[float, ...]] = {}
+    for d, size in more:
+        if isinstance(d, LoadDirection) and d.exact is not None:
+            sizes = list(out.get(id(d.of), d.sizes))
+            sizes[d.axis] += size
+            out[id(d.of)] = tuple(sizes)
+    return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -233,9 +233,12 @@ class Search:
         settled = self.workspace.settled_beside(fit.difference, fit.whole)
         if settled is self.workspace:
             return null, fit
+        better = refit(settled, fit.effects, iterations=6)
+        if settled.gap(better.difference) > self.workspace.gap(fit.difference):
+            return null, fit
         self.workspace = settled
         self.dropped.clear()
-        return refit(settled, ()), refit(settled, fit.effects, iterations=6)
+        return refit(settled, ()), better
 
     def at(self, workspace: Comparison) -> Search:
         """The same search over another comparison of the same recordings."""

@@ -22,7 +22,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray, IntArray, Moment, dot_names
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
-from psd_deflection.studies.discover.search.free import Direction, Free, LoadDirection, moved
+from psd_deflection.studies.discover.search.free import Direction, Free, LoadDirection, added, moved
 from psd_deflection.studies.discover.setup.hidden import FIRST, SETUP, only_in
 from psd_deflection.studies.discover.setup.noise import NoiseModel, estimate_noise
 from psd_deflection.studies.discover.setup.slow_noise import corners_of
@@ -202,9 +202,8 @@ class Workspace(Comparison):
     def _loaded(self, more: Sequence[tuple[Direction, float]]) -> Self:
         """With the loads changed."""
         out = self
-        for d, size in more:
-            if isinstance(d, LoadDirection):
-                out = out.loaded(d.recording, out.observations[d.recording].loads + d.more(size))
+        for recording, change in added(more):
+            out = out.loaded(recording, out.observations[recording].loads + change)
         return out
 
     def loaded(self, recording: int, loads: FloatArray) -> Self:
@@ -215,9 +214,14 @@ class Workspace(Comparison):
         return self.replaced(observations=tuple(observations))
 
     @property
+    def directions(self) -> tuple[Direction, ...]:
+        """What is free."""
+        return () if self.free is None else self.free.directions
+
+    @property
     def free_loads(self) -> bool:
         """Whether a load or its time is free."""
-        return self.free is not None and any(isinstance(d, LoadDirection) for d in self.free.directions)
+        return any(isinstance(d, LoadDirection) for d in self.directions)
 
     def settled(self, difference: Sequence[FloatArray]) -> Self:
         """With the free loads as the ``difference`` of a fit, measured minus simulated, asks for."""
