@@ -241,6 +241,9 @@ def _spread(sheet: _Sheet, rows: Sequence[Row]) -> None:
         of = [r for r in rows if r.kind == kind]
         hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
         sheet.rate(f'all of {kind} effects at once, 3 to 30 floors', of, hits, THRESHOLDS[f'all_of_{kind}'], 1.0, True)
+    of = [r for r in rows if r.kind in ('single', 'pair', 'spread', 'four', 'six')]
+    sheet.rate('an effect named that is none', of, [_names_none(r) for r in of], 0.0, 0.0, False)
+    sheet.failures += [f'{r.key}: {_said(r)}' for r in of if _names_none(r)]
     most = THRESHOLDS['unsaid_floors']
     unsaid = [r for r in rows if r.answer['remaining']['floors'] > most and not r.answer['unknown']]
     sheet.failures += [f'{r.key}: {_said(r)}' for r in unsaid]
@@ -293,7 +296,7 @@ def _by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
         return
     told = [[_told(w, r.answer['setup']) for w in r.wrong] for r in of]
     found = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
-    false = [len(r.sets) > sum(any(t['name'] in s for t in r.truth) for s in r.sets) for r in of]
+    false = [_names_none(r) for r in of]
     unknown = [r.answer['verdict'] == 'unknown_effect' for r in of]
     some = [i for i, r in enumerate(of) if r.wrong]
     named = [any(a for a, _ in told[i]) for i in some]
@@ -363,6 +366,11 @@ def _confusion(rows: Sequence[Row]) -> list[str]:
         said = r.named[0] if r.named else r.answer['verdict']
         table.setdefault(r.truth[0]['name'], Counter())[said] += 1
     return [f'  {name:28s}' + ', '.join(f'{s} {n}' for s, n in table[name].most_common()) for name in sorted(table)]
+
+
+def _names_none(r: Row) -> bool:
+    """Whether an effect is named that is none: neither it nor one that cannot be told from it is hidden."""
+    return any(not any(t['name'] in s for t in r.truth) for s in r.sets)
 
 
 def _both(row: Row) -> bool:

@@ -136,6 +136,18 @@ def test_what_is_left_unsaid_fails_the_suite() -> None:
         assert 'all of a pair or triple of 1:10:100 floors: 0.0 % (0/1' in text
 
 
+def test_an_effect_that_is_none_fails_the_suite_unless_it_cannot_be_told_from_the_true_one() -> None:
+    for names, false in (((), 0), (('creep',), 0), (('creep', 'damping'), 1)):
+        effects = [{'name': n} for n in names]
+        row = score.Row(
+            'pair', 'pair', 3.0, True, [{'name': 'creep'}, {'name': 'x'}], score.whole({'effects': effects})
+        )
+        assert f'an effect named that is none: {100 * false:.1f} % ({false}/1;' in score.summary([row])[0]
+    alike = score.whole({'effects': [{'name': 'tip_force', 'equivalent': ['mount_tilt']}]})
+    row = score.Row('single', 'single', 3.0, True, [{'name': 'mount_tilt'}], alike)
+    assert 'an effect named that is none: 0.0 % (0/1;' in score.summary([row])[0]
+
+
 def test_intervals_are_clopper_and_pearsons() -> None:
     # The rule of three: none of 300 leaves up to 1.2 %.
     low, high = score.interval(0, 300)

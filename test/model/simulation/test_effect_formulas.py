@@ -111,6 +111,7 @@ def test_it_does_what_the_second_formula_says(active: ActiveEffect, length: floa
         ('amplifier_saturation', {'limit': 0.3}, 1.5),
         # With little noise a step of the converter is all but sharp; with much it is all but gone.
         ('quantisation', {'step': 0.05}, 0.0),
+        ('quantisation', {'step': 0.05}, 0.002),
         ('quantisation', {'step': 0.05}, 0.005),
         ('quantisation', {'step': 0.05}, 0.007),
         ('quantisation', {'step': 0.05}, 0.02),
@@ -130,9 +131,7 @@ def test_a_signal_without_its_noise_shows_the_mean_over_it(name: str, size: dict
     noisy = volts[:, None] + sigma * deviate
     each = np.clip(noisy, -0.3, 0.3) if 'limit' in size else np.rint(noisy / 0.05) * 0.05
     want = (each * weight).sum(axis=1) / weight.sum()
-    # Forty-one nodes stand for the noise where the steps are sharp.
-    allowed = 0.08 * 0.05 if 0.0 < sigma < 0.006 else 2e-5
-    assert np.abs(samples.volts - want).max() < allowed
+    assert np.abs(samples.volts - want).max() < 2e-5
 
 
 def traced(name: str, values: dict[str, float], poses: FloatArray, seconds: float) -> FloatArray:
