@@ -126,6 +126,36 @@ def test_a_mistake_is_named_and_no_effect_beside_it() -> None:
     assert 'mistake named where there is none: 100.0 % (1/1' in score.summary([worse])[0]
 
 
+@pytest.mark.statistics
+def test_a_torque_that_was_never_noted_gets_its_time_beside_another_torsional_stiffness() -> None:
+    key = 'hand-forgotten-65019-torsional_stiffness'
+    case = Case(key, 'hand', 'hand-forgotten-65019', (), mistake=('hand', 0.0))
+    truth = {'name': 'torsional_stiffness', 'moves_frequency': 1, 'scale': 0.006287795979194355}
+    found, _ = run.answer(case, [truth])
+    assert not found['unknown']
+    assert [e['name'] for e in found['effects']] == ['torsional_stiffness']
+    assert found['effects'][0]['parameters']['scale']['value'] == pytest.approx(truth['scale'], rel=1e-3)
+    (forgotten,) = found['setup']
+    # It was one sample off, in which the link turns by thirteen times the noise.
+    assert (forgotten['name'], forgotten['where']) == ('missing_load', '48.540 s')
+    assert forgotten['value'] == pytest.approx([0.0, -40.0, -23.4], abs=0.002)
+
+
+@pytest.mark.statistics
+def test_loads_that_are_right_as_noted_are_not_called_wrong_beside_a_clamp_that_sticks() -> None:
+    case = Case('spread-81014-tip_mass-mount_tilt-clamp_friction', 'spread', 'two', ())
+    found, _ = run.answer(
+        case,
+        [
+            {'name': 'tip_mass', 'mass': 0.0005053527573859099},
+            {'name': 'mount_tilt', 'x': -2.3576229901900842e-07, 'y': 1.893015547892475e-05},
+            {'name': 'clamp_friction', 'axis': 3, 'width': 0.00016795581759153236},
+        ],
+    )
+    assert {e['name'] for e in found['effects']} == {'tip_mass', 'mount_tilt', 'clamp_friction'}
+    assert (found['setup'], found['unknown']) == ([], [])
+
+
 def test_what_is_left_unsaid_fails_the_suite() -> None:
     gap = {'before': 4.0, 'after': 2.0, 'floor': 1.0, 'heldout_after': 1.0}
     answer = {'verdict': 'effects_found', 'effects': [], 'unknown': [], 'setup': [], 'gap': gap}

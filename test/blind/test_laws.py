@@ -89,6 +89,26 @@ def test_a_dot_that_jumps_may_be_told_as_jumps_of_its_detector() -> None:
         assert not judged({**truth, **other}, {**nothing, 'setup': found})['jumps']
 
 
+def test_a_law_that_acts_under_one_load_only_may_be_told_as_another_load() -> None:
+    truth = next(law for law in drawn(1400, 12) if law['number'] == 1410)
+    truth = {**truth, 'size': 0.5}
+    found = [{'name': 'load_value', 'where': 'load 6', 'value': [30.0, 0.57, 0.0]}]
+    nothing = {**told(), 'unknown': [], 'verdict': 'nothing_missing'}
+    row = judged(truth, {**nothing, 'setup': found})
+    assert (row['stage'], row['variables'], row['stage_alone'], row['note']) == (True, True, False, True)
+    # Under forces along y it acts at five of the noted loads.
+    several = {**truth, 'of': ['load_fy'], 'where': 'load_fx', 'at': 0.1, 'sign': -1.0}
+    for law, said in (
+        (truth, []),
+        (truth, found * 2),
+        (truth, [{**found[0], 'where': 'load 7'}]),
+        (several, found),
+    ):
+        row = judged(law, {**nothing, 'setup': said})
+        assert (row['stage'], row['note']) == (False, False)
+    assert not judged(truth, {**told(stage='psd'), 'setup': found})['note']
+
+
 def test_a_threshold_that_is_missed_is_said() -> None:
     truth = {**law_forms.draw(1, 'psd', 'cube'), 'of': ['x1'], 'gap': 9.0}
     good = {**judged(truth, told()), 'seconds': 1.0}

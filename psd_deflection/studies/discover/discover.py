@@ -8,6 +8,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from psd_deflection.studies.discover.search import proposals as propose
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.free import LoadDirection
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Localisation, localise, regressors
 from psd_deflection.studies.discover.search.remainder import Table
@@ -278,18 +280,31 @@ def searched(problem: Problem) -> Problem:
         # No detector is at fault, and nothing that is known: the loads are asked before the search spends on stand-ins.
         freed = _freed(problem)
         if freed is not None and freed.comparison.gap(freed.fit.difference) < UNSAID * freed.comparison.floor():
-            return freed
+            return _as_noted(problem, freed)
     for step in SEARCH:
         problem = step(problem)
     freed = _freed(problem)
     before = problem.comparison.gap(problem.fit.difference)
     if freed is not None and freed.comparison.gap(freed.fit.difference) < CLOSED * before:
-        return freed
+        return _as_noted(problem, freed)
     # A detector at fault may move the dots by more than rounded loads move the plate.
     freed = _freed(problem, maybe_rounded=True) if freed is None else None
     if freed is None or freed.comparison.gap(freed.fit.difference) >= UNSAID * freed.comparison.floor():
         return problem
-    return freed if _rounded(freed) else problem
+    return _as_noted(problem, freed) if _rounded(freed) else problem
+
+
+def _as_noted(problem: Problem, freed: Problem) -> Problem:
+    """``freed``; or the search as noted, from the effects that were found beside free loads, if these leave no more."""
+    ws, effects = problem.comparison, freed.fit.effects
+    begun = refit(ws, effects, 12) if effects else problem.null
+    numbers = sum(isinstance(d, LoadDirection) for d in workspace_of(freed.comparison).directions)
+    if begun.chi2 - freed.fit.chi2 > problem.search.penalty * numbers:
+        return freed
+    problem.progress('as noted')
+    for step in (partial(search, begun=begun), *SEARCH[1:]):
+        problem = step(problem)
+    return problem
 
 
 def _follows_nothing(problem: Problem) -> bool:

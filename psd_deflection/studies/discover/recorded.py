@@ -27,18 +27,16 @@ from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
-from psd_deflection.studies.discover.setup.hung import directions, levels, of_plateau, swayed, times
+from psd_deflection.studies.discover.setup.hung import directions, in_time, levels, of_plateau, swayed, times
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
-from psd_deflection.studies.loads.noted_times import MendedLoads, MendedNote, shifted
+from psd_deflection.studies.loads.noted_times import MendedLoads
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_hung, noted_wrong
 from psd_deflection.studies.loads.sway import SwayingLoad, left_out
 from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
 
 MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
-FREE_MOMENTS = 40.0
-"""How far fitted times may be off: 10 samples, in the quarters of one by which they are shifted."""
 MOST_AN_EFFECT_DOES = 0.45
 """Share by which an effect may change a load."""
 MOST_MEASURED = 40
@@ -271,7 +269,7 @@ def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
             continue
         o = workspace.observations[i]
         for note in mended.timed:
-            free += _in_time(i, note, shifted(note, o.loads, o.period))
+            free += in_time(o, i, note)
         # In whatever unit they were measured.
         unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(mended.loads).max(axis=0), 1e-30)
         if len(mended.measured) <= MOST_MEASURED:
@@ -281,15 +279,6 @@ def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
     for _ in range(2 if recorded.wrong else 0):
         workspace = workspace.settled(workspace.residual(workspace.base)[1])
     return workspace
-
-
-def _in_time(recording: int, note: MendedNote, acted: Callable[[Sequence[float]], FloatArray]) -> list[LoadDirection]:
-    """The time of a ``note`` and, if its load was applied slowly, how long that took; ``acted``: what they do."""
-    none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
-    changes = [acted([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
-    return [
-        LoadDirection(recording, change, FREE_MOMENTS, note, axis, acted, none) for axis, change in enumerate(changes)
-    ]
 
 
 def _beginnings(workspace: Workspace) -> tuple[ActiveEffect, ...]:

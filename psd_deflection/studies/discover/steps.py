@@ -44,10 +44,10 @@ def solve(
     return problem
 
 
-def search(problem: Problem) -> Problem:
-    """The model that the search chooses, beside its alternatives."""
+def search(problem: Problem, begun: Fit | None = None) -> Problem:
+    """The model that the search chooses, beside its alternatives; from the effects of ``begun`` on, if given."""
     start = problem.comparison
-    found, result = problem.search.run(problem.null)
+    found, result = problem.search.run(problem.null, begun)
     names = {a.effect.name for a in result.fit.effects}
     if names & start.first and names - start.setup:
         # A mistake that needs an effect beside it must be much better than effects alone.

@@ -66,7 +66,7 @@ class Plateau:
     """One time between two changes of the load: samples ``first`` to ``last`` of recording ``recording``.
 
     ``number``: of the noted change that began it, from 1; 0 before the first. ``unnoted``: nothing was noted when it
-    began. ``noted`` (3,): N, N, N m.
+    began; ``left``: nor when it ended. ``noted`` (3,): N, N, N m.
     """
 
     recording: int
@@ -75,6 +75,7 @@ class Plateau:
     number: int
     unnoted: bool
     noted: FloatArray
+    left: bool = False
 
     def of(self, loads: FloatArray) -> FloatArray:
         """(3,): the load in its middle, of ``loads`` (n, 3)."""
@@ -102,7 +103,8 @@ def plateaus(
         number += not alone and first > 0
         last = int(stops[np.searchsorted(stops, first, side='right')])
         if (last - first) * period >= LONG_S:
-            out.append(Plateau(recording, first, last, number, alone, loads[(first + last) // 2].copy()))
+            middle = loads[(first + last) // 2].copy()
+            out.append(Plateau(recording, first, last, number, alone, middle, last in unnoted))
     return out
 
 

@@ -251,8 +251,8 @@ def test_a_step_between_two_samples_has_its_time_and_turns_back_before_it_not_be
 
 
 def test_ramps_beside_a_clamp_that_sticks_are_told_with_the_times_that_the_search_fitted() -> None:
-    sticks = {'effects__e__name': 'clamp_friction', 'effects__e__axis': 3, 'effects__e__width': 2.3e-5}
-    found = discover([Observation('x', RIG, volts(hung(0.8), **sticks), noted((0.0,) * 6))])
+    read = volts(hung(0.8), effects__e__name='clamp_friction', effects__e__axis=3, effects__e__width=2.3e-5)
+    found = discover([Observation('x', RIG, read, noted((0.0,) * 6))])
     assert [e.active.label for e in found.effects] == ['clamp_friction (axis 3)']
     assert found.effects[0].active.values['width'] == pytest.approx(2.3e-5, rel=1e-3)
     assert found.verdict == 'effects_found'

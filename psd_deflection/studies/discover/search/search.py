@@ -246,20 +246,21 @@ class Search:
         out.workspace = workspace
         return out
 
-    def run(self, null: Fit) -> tuple[Search, SearchResult]:
-        """The search after it ran, and what it found: perhaps that nothing is missing. ``null``: the fit of no effect.
+    def run(self, null: Fit, begun: Fit | None = None) -> tuple[Search, SearchResult]:
+        """The search after it ran, and what it found: perhaps that nothing is missing. ``null``: the fit of no effect;
+        ``begun``: that of the effects to begin with.
 
         This one stays as it is.
         """
         out = copy.copy(self)
         out.trace, out.dropped = [], {}
-        return out, out.searched(null)
+        return out, out.searched(null, begun)
 
-    def searched(self, null: Fit) -> SearchResult:
+    def searched(self, null: Fit, begun: Fit | None = None) -> SearchResult:
         """What :meth:`run` gives beside itself; it changes this search."""
         scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
-        null, grown = self._settled(null, self.mistake(null, scores))
+        null, grown = self._settled(null, self.mistake(null, scores) if begun is None else begun)
         current, others = self.swap(null, grown)
         if self._much_closer(grown, current):
             # Beside the wrong effect nothing held that holds beside the right one; what that cost is not counted.

@@ -7,6 +7,7 @@ then leave next to nothing.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 
@@ -19,9 +20,12 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.free import LoadDirection
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.load_cell import MeasuredLoad
+from psd_deflection.studies.loads.noted_times import MendedNote, shifted
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, asked_for, plateaus
 from psd_deflection.studies.loads.sway import SwayingLoad, swaying
 
+FREE_MOMENTS = 40.0
+"""How far fitted times may be off: 10 samples, in the quarters of one by which they are shifted."""
 FREE = 100.0
 """N or N m: standard deviation of a load that nobody knows."""
 TELLING = 4.0
@@ -49,9 +53,31 @@ def swayed(ws: Workspace, recording: int, difference: FloatArray, found: Plateau
 
 
 def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
-    """Any load in each of ``wrong``."""
-    free = np.full(3, FREE)
-    return [d for p in wrong for d in of_plateau(ws.observations[p.recording], p.recording, p, free)]
+    """Any load in each of ``wrong``, and the times at which it was hung and taken off if nobody noted them."""
+    free, out = np.full(3, FREE), list[LoadDirection]()
+    for p in wrong:
+        o = ws.observations[p.recording]
+        out += of_plateau(o, p.recording, p, free)
+        for at in _unnoted(p):
+            out += in_time(
+                o, p.recording, MendedNote(p.number, tuple(p.of(o.loads).tolist()), at * o.period, at * o.period, 0.0)
+            )
+    return out
+
+
+def _unnoted(p: Plateau) -> list[int]:
+    """The samples at which it began and ended, if nothing was noted then."""
+    return [*([p.first] if p.unnoted else []), *([p.last] if p.left else [])]
+
+
+def in_time(o: Observation, recording: int, note: MendedNote) -> list[LoadDirection]:
+    """The time of a ``note`` and, if its load was applied slowly, how long that took."""
+    acted = shifted(note, o.loads, o.period)
+    none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
+    changes = [acted([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
+    return [
+        LoadDirection(recording, change, FREE_MOMENTS, note, axis, acted, none) for axis, change in enumerate(changes)
+    ]
 
 
 def of_plateau(o: Observation, recording: int, plateau: Plateau | MeasuredLoad, sd: FloatArray) -> list[LoadDirection]:
@@ -70,8 +96,19 @@ def told(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding]:
     out = []
     for p in wrong:
         o = ws.observations[p.recording]
-        note = WrongNote(p, p.of(o.loads), o.period)
+        note = WrongNote(_timed(ws, p), p.of(o.loads), o.period)
         sd = np.array([sds.get((id(p), axis), 0.0) for axis in range(3)])
         if np.any(note.off > np.maximum(TELLING * sd, LEAST_TOLD)):
             out.append(note_finding(note, o.name))
     return out
+
+
+def _timed(ws: Workspace, p: Plateau) -> Plateau:
+    """``p`` between the times that were fitted, in whole samples."""
+    moved = {}
+    for d in ws.directions:
+        if isinstance(d, LoadDirection) and d.recording == p.recording and isinstance(d.of, MendedNote):
+            period = ws.observations[d.recording].period
+            moved[round(d.of.hung / period)] = round(d.of.moved(d.sizes, period).hung / period)
+    first, last = (moved.get(at, at) if at in _unnoted(p) else at for at in (p.first, p.last))
+    return dataclasses.replace(p, first=first, last=last)
