@@ -50,6 +50,7 @@ def test_the_weighed_boom_lacks_no_weight() -> None:
     assert found.gap_after == pytest.approx(1.58e-3, rel=0.02)
 
 
+@pytest.mark.statistics
 def test_the_telescope_has_five_effects_and_their_sizes_are_those_of_tpoint() -> None:
     """More than four effects by evidence. TPOINT, with 22 free terms: AN 44.26, AW 69.89, NPAE -50.97 arcsec."""
     found = discover_in(AuxTel())
@@ -68,12 +69,14 @@ def test_the_telescope_has_five_effects_and_their_sizes_are_those_of_tpoint() ->
     assert found.verdict == 'unknown_effect'
 
 
+@pytest.mark.statistics
 @pytest.mark.parametrize('name', ['AN', 'AW'])
 def test_a_term_that_the_model_of_the_telescope_lacks_is_named(name: str) -> None:
     known = [n for n in ('AN', 'AW', 'NPAE', 'CA') if n != name]
     assert name in names(discover_in(AuxTel(known=known)))
 
 
+@pytest.mark.statistics
 def test_of_collimation_and_axes_the_stars_show_one_and_it_is_named() -> None:
     found = discover_in(AuxTel(known=('AN', 'AW')))
     (between,) = (e for e in found.effects if {'NPAE', 'CA'} & {e.active.effect.name, *e.equivalent})

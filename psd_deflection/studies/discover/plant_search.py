@@ -67,7 +67,8 @@ class PlantComparison(Comparison):
         for part in plant.parts():
             self.case.append(part + (int(self.case[-1].max()) + 1 if self.case else 0))
         self.known = np.array(plant.noise or (0.0,) * len(plant.channels))
-        self.shares = len(set(plant.units)) > 1
+        self.shares = len(set(plant.units)) > 1 and not plant.levers
+        self.levers = np.array(plant.levers or (1.0,) * len(plant.channels))
         self.whole = np.ones(len(plant.channels))
         self.level = np.ones(len(plant.channels))
         self.independent = np.ones(len(plant.channels))
@@ -222,10 +223,12 @@ class PlantComparison(Comparison):
     def _joined(self, gaps: FloatArray) -> float:
         if self.shares:
             return float(np.sqrt(np.mean((gaps / self.whole) ** 2)))
-        return float(np.sqrt(np.sum(self.total * gaps**2) / self.total.sum()))
+        return float(np.sqrt(np.sum(self.total * (self.levers * gaps) ** 2) / self.total.sum()))
 
     def gap(self, residual: Sequence[FloatArray]) -> float:
-        """rms over all channels; if their units differ, each relative to its gap before, which is then 1."""
+        """rms over all channels; if their units differ and nobody says what they count, each relative to its gap
+        before, which is then 1.
+        """
         return self._joined(self.gap_per_channel(residual))
 
     def floor(self) -> float:
@@ -234,7 +237,7 @@ class PlantComparison(Comparison):
 
     @property
     def unit(self) -> str:
-        """That of the channels if they have one."""
+        """That of the channels if they have one, or of the first."""
         return 'share of the gap before' if self.shares else self.plant.units[0]
 
     @property

@@ -49,8 +49,9 @@ class Plant(ABC):
     ``channels``, with their ``units``: the rows of every table. ``cases``: names of the recordings, or of what else is
     left out of the fit in one piece to test it (a length, a trajectory). ``library``: the effects that may be missing;
     ``nuisance``: those whose size is not known, which every model has and which are never named. ``noise``: of each
-    channel, rms; empty if not known. ``period``: s between the columns; 0: every column is a reading by itself.
-    ``physics``: of a PSD rig, whose effects have bounds that depend on it.
+    channel, rms; empty if not known. ``levers``: what one unit of each channel counts as in that of the first, if it
+    does (a small angle at some distance is a movement). ``period``: s between the columns; 0: every column is a reading
+    by itself. ``physics``: of a PSD rig, whose effects have bounds that depend on it.
     """
 
     channels: tuple[str, ...]
@@ -59,6 +60,7 @@ class Plant(ABC):
     library: tuple[Effect, ...]
     nuisance: tuple[Effect, ...] = ()
     noise: tuple[float, ...] = ()
+    levers: tuple[float, ...] = ()
     period: float = 0.0
     physics: Physics | None = None
 
@@ -121,11 +123,13 @@ def measured_by(plant: Plant) -> list[FloatArray]:
 
 
 def check_plant(plant: Plant) -> None:
-    """Raise ConfigError if units, noise and library contradict each other."""
+    """Raise ConfigError if units, noise, levers and library contradict each other."""
     if len(plant.units) != len(plant.channels):
         raise ConfigError(f'units: {len(plant.units)} of them for {len(plant.channels)} channels')
     if plant.noise and (len(plant.noise) != len(plant.channels) or min(plant.noise) <= 0.0):
         raise ConfigError(f'noise = {plant.noise}: must be one number above 0 for each channel, or none at all')
+    if plant.levers and (len(plant.levers) != len(plant.channels) or min(plant.levers) <= 0.0):
+        raise ConfigError(f'levers = {plant.levers}: must be one number above 0 for each channel, or none at all')
     names = [e.name for e in (*plant.library, *plant.nuisance)]
     twice = sorted({n for n in names if names.count(n) > 1})
     if twice:

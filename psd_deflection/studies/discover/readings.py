@@ -105,6 +105,9 @@ class ReadingsPlant(Plant):
         of_dots = self.kind == 'dots'
         self.channels = dot_names(tables[0].psds) if of_dots else CHANNELS[self.kind]
         self.units = ('µm',) * len(self.channels) if of_dots else OF_POSE
+        if not of_dots:
+            # A twist counts as what it moves at the distance of the PSDs.
+            self.levers = (1.0, 1.0, float(np.sqrt(np.mean(np.sum(tables[0].rig.centers ** 2, axis=1)))))
         self.cases = tuple(t.name for t in tables)
         self.physics = Physics.of(tables[0].rig)
         self.known = tuple(effects_of_rig(tables[0].rig))

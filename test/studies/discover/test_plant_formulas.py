@@ -144,6 +144,19 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     assert ws.worded(0.1234) == '12.3 % of the gap before'
     assert ws.worded(0.1234, '.1f') == '12.3 % of the gap before'
     assert ws.worded(math.nan) == 'not known'
+    # A radian that moves something by 0.1 of the first unit.
+    with_lever = Pictures(seen, {})
+    with_lever.levers = (1.0, 0.1)
+    ws = PlantComparison(with_lever)
+    ws = ws.begun(refit(ws, ()))
+    count = [np.isfinite(whole(seen, k)).sum() for k in (0, 1)]
+    squares = count[0] * rms(forces) ** 2 + count[1] * (0.1 * rms(turns)) ** 2
+    assert ws.gap(seen) == pytest.approx(math.sqrt(squares / sum(count)))
+    assert ws.gap_per_channel(seen) == pytest.approx([rms(forces), rms(turns)])
+    assert (ws.unit, ws.worded(0.1234)) == ('N', '0.123 N')
+    with_lever.levers = (1.0,)
+    with pytest.raises(ConfigError, match=r'levers = \(1\.0,\): must be one number above 0 for each channel'):
+        PlantComparison(with_lever)
     same = PlantComparison(Pictures(seen, {}, units=('N', 'N'), noise=(0.3, 0.1)))
     both = np.concatenate((forces, turns))
     assert same.gap(seen) == pytest.approx(rms(both))

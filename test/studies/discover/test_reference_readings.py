@@ -64,8 +64,14 @@ def test_a_reference_alone_names_what_the_link_lacks_though_loads_are_noted_late
     bag = recorded(tmp_path / 'camera.mcap', [SOFT])
     assert main(['discover', str(bag), '--out', str(tmp_path / 'found')]) == 0
     assert 'bending_stiffness' in capsys.readouterr().out
-    (effect,) = json.loads((tmp_path / 'found' / 'result.json').read_text())['effects']
+    found = json.loads((tmp_path / 'found' / 'result.json').read_text())
+    (effect,) = found['effects']
     assert {effect['name'], *effect['equivalent']} == {'bending_stiffness', 'clamp_bending_compliance'}
+    # Metres and radians are one gap, of what moves at the distance of the PSDs.
+    assert found['gap']['unit'] == 'µm'
+    of_each = [c['before'] for c in found['gap']['per_channel'].values()]
+    distance = float(np.sqrt(np.mean(np.sum(RIG.centers**2, axis=1))))
+    assert found['gap']['before'] == pytest.approx(float(np.sqrt(np.mean(np.multiply(of_each, (1, 1, distance)) ** 2))))
     repaired = load_rig(tmp_path / 'found' / 'model.yaml')
     assert discover_in(ReadingsPlant(read_tables([bag], repaired))).verdict == 'nothing_missing'
 

@@ -110,6 +110,7 @@ def test_a_rig_without_the_psd_of_a_law_refuses_it(tmp_path: Path, monkeypatch: 
     assert make_active('lifts', {'c1': 1.0}, 'test').effect.least_psds == 4
 
 
+@pytest.mark.statistics
 def test_hum_is_named_on_the_channels_of_the_third_psd() -> None:
     hidden = 'mains_interference,frequency=50,amplitude_y3=0.004,amplitude_sum3=0.003,phase_sum3=1.0'
     (effect,) = discover([observed(RIG, hidden)]).effects

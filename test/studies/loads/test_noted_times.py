@@ -250,6 +250,7 @@ def test_a_step_between_two_samples_has_its_time_and_turns_back_before_it_not_be
         assert (loads + later([more]))[11:] == pytest.approx(np.tile([4.0, -8.0, 2.0], (9, 1)))
 
 
+@pytest.mark.statistics
 def test_ramps_beside_a_clamp_that_sticks_are_told_with_the_times_that_the_search_fitted() -> None:
     read = volts(hung(0.8), effects__e__name='clamp_friction', effects__e__axis=3, effects__e__width=2.3e-5)
     found = discover([Observation('x', RIG, read, noted((0.0,) * 6))])
