@@ -16,11 +16,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from blind import byhand, score
+from blind import byhand, score, suite_peers
 from blind.campaign import conclude, options, over
 from blind.cases import Case, all_cases, designs, scaled, short_cases
 from blind.mistakes import observed
-from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
@@ -56,12 +56,17 @@ def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any],
     # A mistake may change the rig, the loads or the length of the recording.
     bank = None if case.mistake[0] else _BANKS.setdefault(case.design, SignatureBank())
     seen = observe(case, truth)
-    found = discover(seen, seen[0].rig if case.mistake[0] else load_rig(), seed=0, without=case.without, bank=bank)
+    found = discover(seen, _rig(case, seen), seed=0, without=case.without, bank=bank)
     return found.tree(), found
 
 
-def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:
-    fields, truth, target = job
+def _rig(case: Case, seen: Sequence[Observation]) -> Rig:
+    """As its file says."""
+    return seen[0].rig if case.mistake[0] else load_rig()
+
+
+def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str, str]) -> str:
+    fields, truth, target, peer = job
     case = Case(
         **{
             **fields,
@@ -71,7 +76,11 @@ def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str]) -> str:
         }
     )
     start = time.perf_counter()
-    got, _ = answer(case, truth)
+    if peer:
+        seen = observe(case, truth)
+        got = suite_peers.answer(peer, seen, _rig(case, seen), case.without)
+    else:
+        got, _ = answer(case, truth)
     got['seconds'] = time.perf_counter() - start
     path = Path(target)
     partial = path.with_suffix('.partial')
@@ -135,6 +144,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Seal, run what is missing, score; exit status 1 if a threshold is not met."""
     parser = options(__doc__, jobs=1)
     chosen = selection(parser)
+    parser.add_argument('--peer', choices=('', *suite_peers.PEERS), default='', help='who answers instead of discover')
     parser.add_argument('--score', action='store_true', help='only score the answers that are there, of any tool')
     args = parser.parse_args(argv)
     folder = Path(args.out)
@@ -149,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         target = folder / 'answers' / f'{case.key}.json'
         if not target.exists():
             sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
-            jobs.append((sealed['case'], sealed['truth'], str(target)))
+            jobs.append((sealed['case'], sealed['truth'], str(target), args.peer))
     for _ in over(_one, jobs, args.jobs, 'answers'):
         pass
     return conclude(*score.summary(score.load(folder, [c.key for c in cases])), folder / 'summary.txt')

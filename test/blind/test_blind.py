@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from blind import generator, run, score
+from blind import generator, run, score, suite_peers
 from blind.cases import MISTAKES, NOISES, Case, all_cases, cases_by_hand, designs, gap_of, scaled, short_cases
 from blind.mistakes import observed
 from psd_deflection.model.simulation.simulator import ForwardModel
@@ -176,6 +176,19 @@ def test_an_effect_that_is_none_fails_the_suite_unless_it_cannot_be_told_from_th
     alike = score.whole({'effects': [{'name': 'tip_force', 'equivalent': ['mount_tilt']}]})
     row = score.Row('single', 'single', 3.0, True, [{'name': 'mount_tilt'}], alike)
     assert 'an effect named that is none: 0.0 % (0/1;' in score.summary([row])[0]
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('peer', ['subsets', 'stlsq'])
+def test_a_peer_answers_the_same_cases(peer: str) -> None:
+    if peer == 'stlsq':
+        pytest.importorskip('pysindy')
+    for name in ('single-creep-3-s', 'null-s0', 'single-quantisation-3-s'):
+        case = next(c for c in short_cases() if c.key == name)
+        found = suite_peers.answer(peer, run.observe(case, run.truth_of(case)), load_rig(), ())
+        row = score.Row(case.key, case.kind, 3.0, True, run.truth_of(case), score.whole(found))
+        assert row.named == [n for n, _ in case.wanted], name
+        assert row.answer['remaining']['floors'] < 1.1
 
 
 def test_intervals_are_clopper_and_pearsons() -> None:
