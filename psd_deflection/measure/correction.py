@@ -18,7 +18,7 @@ from psd_deflection.base.arithmetic import ARITHMETICS
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.memory import Memory, Value, misfit
 from psd_deflection.model.plate.plate import flat_poses
-from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.model.simulation.catalogue import acting, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect, Reading, Use, Values
 from psd_deflection.model.simulation.optics import dots_on_plate
 from psd_deflection.model.simulation.physics import Physics
@@ -90,7 +90,7 @@ class Correction:
         if self._moves_optics and self._true.psds_at_base:
             raise ConfigError('beam_N.angle: a beam that leans is not corrected for PSDs at the base; set it to 0')
         uses: set[Use] = set()
-        for active in effects:
+        for active in acting(effects):
             try:
                 corrects = self._add(active)
             except ConfigError:

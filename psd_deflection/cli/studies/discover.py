@@ -243,11 +243,11 @@ def _hints(args: argparse.Namespace, answer: Discovery | Settled) -> list[str]:
     """What to type next."""
     out, found = Path(args.out), answer.found if isinstance(answer, Settled) else answer
     hints = []
-    if args.adopt is not None and not found.laws:
+    if args.adopt is not None and found.model_of_law is None:
         hints.append(f'--adopt {args.adopt}: there is no law to adopt')
     elif args.adopt is not None:
-        hints += [f'{law.name} is an effect now: {effect_folders()[0] / law.name}.yaml' for law in found.laws]
-    elif found.laws:
+        hints.append(f'{args.adopt} is an effect now: {effect_folders()[0] / args.adopt}.yaml')
+    elif found.model_of_law is not None:
         hints.append(f'law: {out / "law.yaml"}; --adopt NAME makes it an effect')
     if isinstance(answer, Settled):
         if answer.outcome is None and answer.open is not None and answer.open.useful:

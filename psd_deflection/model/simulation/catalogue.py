@@ -257,6 +257,12 @@ def sort_effects(effects: Sequence[ActiveEffect]) -> list[ActiveEffect]:
     return sorted(effects, key=lambda a: a.effect.rank)
 
 
+def acting(effects: Sequence[ActiveEffect]) -> tuple[ActiveEffect, ...]:
+    """The parts of ``effects``: ordered as these are, or as they act if one acts at several points."""
+    parts = [part for active in effects for part in active.parts]
+    return tuple(sort_effects(parts) if len(parts) > len(effects) else parts)
+
+
 def effects_to_values(effects: Sequence[ActiveEffect]) -> dict[str, dict[str, object]]:
     """The map that goes below ``effects:`` in a rig file."""
     out: dict[str, dict[str, object]] = {}

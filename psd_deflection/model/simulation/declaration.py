@@ -186,7 +186,8 @@ class Effect:
     ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
     ``PLACED_OF_PSD`` (an effect with a PSD) or of ``CALIBRATED_OF_LINK``. The calibration then finds their sizes;
     without it a calibration refuses rigs that have the effect. ``law``: its text in YAML, if it is a law.
-    ``least_psds``: the fewest PSDs of a rig that may have it.
+    ``least_psds``: the fewest PSDs of a rig that may have it. ``further``: what the same cause does at other points;
+    these parts take the values of the whole.
     Raises ValueError if the declaration contradicts itself.
     """
 
@@ -209,6 +210,7 @@ class Effect:
     calibrated_as: Mapping[str, str] = field(default_factory=dict, hash=False)
     law: str = ''
     least_psds: int = 2
+    further: tuple[Effect, ...] = ()
 
     def __post_init__(self) -> None:
         if self.stage not in STAGES:
@@ -274,7 +276,9 @@ class Effect:
             return 'reading'
         if self.point == 'configure':
             return 'reading' if self.stage in ('optics', 'psd') else 'wrench'
-        return 'wrench' if self.trace_back is not None else ''
+        if self.trace_back is not None:
+            return 'wrench'
+        return next((part.corrected for part in self.further if part.corrected), '')
 
     @property
     def lattice(self) -> str:
@@ -319,6 +323,12 @@ class ActiveEffect:
 
     effect: Effect
     values: Values
+
+    @property
+    def parts(self) -> tuple[ActiveEffect, ...]:
+        """What it does at each point at which it acts."""
+        further = self.effect.further
+        return (self, *(ActiveEffect(part, self.values) for part in further)) if further else (self,)
 
     @property
     def choices(self) -> tuple[float, ...]:

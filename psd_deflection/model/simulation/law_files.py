@@ -3,6 +3,7 @@ allowed."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,20 +32,37 @@ def law_of_text(text: str, source: str) -> Law:
 def _law_of(tree: object, path: Path) -> Law:
     if not isinstance(tree, dict):
         raise ConfigError(f'{path}: must be a map with name, stage, acts_on and terms')
-    for key in ('name', 'acts_on', 'terms'):
+    if 'name' not in tree:
+        raise ConfigError(f'{path}: name is missing')
+    first = _part(path, '', tree, tree)
+    listed = tree.get('further', [])
+    if not isinstance(listed, list):
+        raise ConfigError(f'{path}: further = {listed!r}: must be a list of maps with acts_on and terms')
+    further = [_part(path, f'further[{i}].', body, tree) for i, body in enumerate(listed)]
+    targets = [part.acts_on for part in (first, *further)]
+    if twice := [name for name in dict.fromkeys(targets) if targets.count(name) > 1]:
+        raise ConfigError(f'{path}: further: {", ".join(twice)} is there twice: put its terms together')
+    return dataclasses.replace(first, further=tuple(further))
+
+
+def _part(path: Path, at: str, tree: object, whole: Mapping[str, object]) -> Law:
+    """What the law does to one target; ``at``: where in the file."""
+    if not isinstance(tree, dict):
+        raise ConfigError(f'{path}: {at}: must be a map with acts_on and terms, not {tree!r}')
+    for key in ('acts_on', 'terms'):
         if key not in tree:
-            raise ConfigError(f'{path}: {key} is missing')
-    acts_on = _one_of(path, 'acts_on', tree['acts_on'], TARGETS)
-    stage = _one_of(path, 'stage', tree.get('stage', TARGETS[acts_on].stage), STAGES)
+            raise ConfigError(f'{path}: {at}{key} is missing')
+    acts_on = _one_of(path, f'{at}acts_on', tree['acts_on'], TARGETS)
+    stage = _one_of(path, f'{at}stage', tree.get('stage', TARGETS[acts_on].stage), STAGES)
     listed = tree['terms']
     if not isinstance(listed, list) or not listed:
-        raise ConfigError(f'{path}: terms = {listed!r}: must be a list of at least one term')
-    terms = tuple(_term(path, f'terms[{i}]', body, acts_on) for i, body in enumerate(listed))
+        raise ConfigError(f'{path}: {at}terms = {listed!r}: must be a list of at least one term')
+    terms = tuple(_term(path, f'{at}terms[{i}]', body, acts_on) for i, body in enumerate(listed))
     if len({t.kind == 'variance' for t in terms}) > 1:
-        raise ConfigError(f'{path}: terms: jitter stands alone; write a law of its own for the other terms')
+        raise ConfigError(f'{path}: {at}terms: jitter stands alone; write a law of its own for the other terms')
     if terms[0].kind == 'variance' and acts_on not in (*DOTS, *SUMS):
-        raise ConfigError(f'{path}: acts_on = {acts_on!r}: jitter acts on x1, y1, sum1 and those of the other PSDs')
-    return Law(str(tree['name']), cast(Stage, stage), acts_on, terms, str(tree.get('summary', '')))
+        raise ConfigError(f'{path}: {at}acts_on = {acts_on!r}: jitter acts on x1, y1, sum1 and those of the other PSDs')
+    return Law(str(whole['name']), cast(Stage, stage), acts_on, terms, str(tree.get('summary', '')))
 
 
 def _one_of(path: Path, key: str, value: object, allowed: Mapping[str, object] | Sequence[str]) -> str:

@@ -18,6 +18,8 @@ coefficients are ``c1``, ``c2`` ... and shapes ``threshold1`` ... in the order o
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -249,13 +251,21 @@ def unit_of(variables: Sequence[str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Law:
-    """``acts_on``: one of ``TARGETS``, to which the sum of ``terms`` is added."""
+    """``acts_on``: one of ``TARGETS``, to which the sum of ``terms`` is added. ``further``: what the same cause adds to
+    other targets; their terms are counted on.
+    """
 
     name: str
     stage: Stage
     acts_on: str
     terms: tuple[LawTerm, ...]
     summary: str = ''
+    further: tuple[Law, ...] = ()
+
+    @property
+    def parts(self) -> tuple[Law, ...]:
+        """It, and what it does to each further target."""
+        return (self, *self.further)
 
     @property
     def kind(self) -> Kind:
@@ -290,18 +300,18 @@ def known(samples: SimulatedSamples, name: str) -> FloatArray:
     return np.asarray(rows)
 
 
-def _with_values(terms: Sequence[LawTerm], values: Values) -> list[LawTerm]:
-    """The terms with the coefficients and shapes of a rig file."""
+def _with_values(terms: Sequence[LawTerm], first: int, values: Values) -> list[LawTerm]:
+    """The terms, the first of which is number ``first``, with the coefficients and shapes of a rig file."""
     return [
         LawTerm(t.form, t.of, values[f'c{i}'], {k: values[f'{k}{i}'] for k in t.shapes}, t.times)
-        for i, t in enumerate(terms, 1)
+        for i, t in enumerate(terms, first)
     ]
 
 
-def _apply(law: Law, samples: SimulatedSamples, values: Values, state: State) -> None:
+def _apply(law: Law, first: int, samples: SimulatedSamples, values: Values, state: State) -> None:
     target, n = TARGETS[law.acts_on], len(samples.t)
     added = np.zeros(n)
-    for i, term in enumerate(_with_values(law.terms, values)):
+    for i, term in enumerate(_with_values(law.terms, first, values)):
         own = state.setdefault(str(i), {})
         grown = term.coefficient * term.evaluate(partial(known, samples), n, samples.physics.period, own)
         added += grown
@@ -319,13 +329,13 @@ def _apply(law: Law, samples: SimulatedSamples, values: Values, state: State) ->
     {'load': samples.loads, 'static': samples.static, 'pose': samples.pose}[target.point][target.row] += added
 
 
-def _jitter(law: Law, samples: SimulatedSamples, values: Values, state: State) -> None:
+def _jitter(law: Law, first: int, samples: SimulatedSamples, values: Values, state: State) -> None:
     """Noise whose rms is the sum of the terms. Its mean is zero, so an expectation has none of it."""
     if np.any(samples.noise):
         return
     target, n = TARGETS[law.acts_on], len(samples.t)
     rms = np.zeros(n)
-    for term in _with_values(law.terms, values):
+    for term in _with_values(law.terms, first, values):
         rms += np.abs(term.coefficient * term.evaluate(partial(known, samples), n, samples.physics.period, {}))
     rng = state.setdefault('noise', np.random.default_rng(zlib.crc32(law.name.encode())))
     hiss = rms * rng.standard_normal(n)
@@ -339,9 +349,9 @@ def _jitter(law: Law, samples: SimulatedSamples, values: Values, state: State) -
 _PASSES = 6
 
 
-def _correct(law: Law, reading: Reading, values: Values) -> None:
+def _correct(law: Law, first: int, reading: Reading, values: Values) -> None:
     """The reading without the law, which is a function of what is read: a fixed point."""
-    terms, target = _with_values(law.terms, values), TARGETS[law.acts_on]
+    terms, target = _with_values(law.terms, first, values), TARGETS[law.acts_on]
     place = (reading.sums if target.of_sums else reading.dots)[target.row]
     read, n = place.copy(), len(place)
 
@@ -360,9 +370,9 @@ def _correctable(law: Law) -> bool:
     return TARGETS[law.acts_on].point == 'dots' and apart and set(law.variables) <= seen
 
 
-def _parameters(law: Law) -> list[EffectParameter]:
+def _parameters(law: Law, first: int) -> list[EffectParameter]:
     out = []
-    for i, t in enumerate(law.terms, 1):
+    for i, t in enumerate(law.terms, first):
         size = abs(t.coefficient) or 1.0
         unit = t.unit(law.acts_on)
         unit = '' if unit == '1' else unit
@@ -395,31 +405,46 @@ def _least_psds(law: Law) -> int:
 
 def effect_of(law: Law) -> Effect:
     """The law as an effect of the simulation; its values are those of the law unless a rig file says others."""
+    firsts = itertools.accumulate((len(part.terms) for part in law.parts), initial=1)
+    first, *further = [_part(law, part, number) for part, number in zip(law.parts, firsts, strict=False)]
+    parts = (first, *further)
+    return dataclasses.replace(
+        first,
+        parameters=tuple(p for part in parts for p in part.parameters),
+        equation='; '.join(part.equation for part in parts),
+        needs=', '.join(dict.fromkeys(v for part in law.parts for v in part.variables)) or 'time',
+        least_psds=max(part.least_psds for part in parts),
+        law=_in_yaml(law, line=True).strip(),
+        further=tuple(further),
+    )
+
+
+def _part(whole: Law, law: Law, first: int) -> Effect:
+    """What ``law``, whose terms are counted from ``first``, does of the ``whole``."""
     variance = law.kind == 'variance'
     uses = cast('frozenset[Use]', frozenset(law.variables) & frozenset(('time', 'temperature')))
     correctable = _correctable(law) and not variance
     return Effect(
-        name=law.name,
+        name=whole.name,
         stage=law.stage,
-        summary=law.summary or f'an empirical law on {law.acts_on}',
+        summary=whole.summary or f'an empirical law on {", ".join(part.acts_on for part in whole.parts)}',
         equation=law.expression,
         source='empirical: found by psd-deflection discover',
-        needs=', '.join(law.variables) or 'time',
-        parameters=tuple(_parameters(law)),
+        needs='',
+        parameters=tuple(_parameters(law, first)),
         point='output' if variance else TARGETS[law.acts_on].point,
-        apply=partial(_jitter if variance else _apply, law),
-        correct=partial(_correct, law) if correctable else None,
+        apply=partial(_jitter if variance else _apply, law, first),
+        correct=partial(_correct, law, first) if correctable else None,
         uses=uses if correctable else frozenset(),
         order=50,
         least_psds=_least_psds(law),
-        law=_in_yaml(law, line=True).strip(),
     )
 
 
 def values_of(law: Law) -> dict[str, float]:
     """The values of the effect's parameters as the law has them."""
     out = {}
-    for i, t in enumerate(law.terms, 1):
+    for i, t in enumerate((t for part in law.parts for t in part.terms), 1):
         out[f'c{i}'] = t.coefficient
         out.update({f'{k}{i}': v for k, v in t.shapes.items()})
     return out
@@ -432,6 +457,15 @@ def law_text(law: Law, comment: Sequence[str] = ()) -> str:
 
 def _in_yaml(law: Law, *, line: bool = False) -> str:
     """The law in YAML; in one ``line``."""
+    tree = {'name': law.name, 'summary': law.summary, **_tree(law)}
+    if law.further:
+        tree['further'] = [_tree(part) for part in law.further]
+    width = 10**9 if line else 1000
+    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=width, default_flow_style=line)
+
+
+def _tree(law: Law) -> dict[str, Any]:
+    """What it does to its target."""
     terms = []
     for t in law.terms:
         body: dict[str, Any] = {'form': t.form, 'of': list(t.of), 'coefficient': float(t.coefficient)}
@@ -442,14 +476,10 @@ def _in_yaml(law: Law, *, line: bool = False) -> str:
         if t.sd:
             body['sd'] = {k: float(f'{v:.3g}') for k, v in t.sd.items()}
         terms.append(body)
-    tree = {
-        'name': law.name,
+    return {
         'stage': law.stage,
         'acts_on': law.acts_on,
         'kind': law.kind,
-        'summary': law.summary,
         'expression': law.expression,
         'terms': terms,
     }
-    width = 10**9 if line else 1000
-    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True, width=width, default_flow_style=line)

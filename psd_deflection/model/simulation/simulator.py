@@ -16,7 +16,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.model.simulation.catalogue import effects_of_rig
+from psd_deflection.model.simulation.catalogue import acting, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect, State
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.optics import dots_on_plate
@@ -54,7 +54,7 @@ class ForwardModel:
     def __init__(
         self, rig: Rig, effects: Sequence[ActiveEffect] | None = None, phase: float = 0.0, *, settled: bool = False
     ) -> None:
-        self.effects = tuple(effects_of_rig(rig) if effects is None else effects)
+        self.effects = acting(effects_of_rig(rig) if effects is None else effects)
         self.physics = Physics.of(rig)
         self.physics.phase = phase
         self._rig = rig

@@ -134,7 +134,7 @@ def check_effects(rig: Rig) -> None:
     A calibration reads the detectors without it, so it would be counted twice.
     """
     for active in vector_of_rig(rig).others:
-        if active.effect.correct is not None and not active.effect.uses:
+        if any(part.effect.correct is not None and not part.effect.uses for part in active.parts):
             raise ConfigError(
                 f'effects: {active.label}: a calibration reads the detectors without it and would count it twice; '
                 f"take it out of the file (light that is not the lasers' is measured with --dark)"

@@ -238,10 +238,10 @@ class RigConclusion(Conclusion):
         return [*self.known, *(e.active for e in self.effects)]
 
     @property
-    def laws(self) -> list[Law]:
-        """The law's parts, by the name that they get."""
+    def model_of_law(self) -> Law | None:
+        """The law by the name that it gets; None if there is none, or if it leaves too much to be a model."""
         if self.law is None or self.law.heldout_gap > WRITTEN * self.gap_floor:
-            return []
+            return None
         return self.law.adopted(self.adopted or 'law')
 
     @property
@@ -287,8 +287,8 @@ class RigConclusion(Conclusion):
         out = replace(self, adopted=name)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            for law in out.laws:
-                replace_file(folder / f'{law.name}.yaml', _law_file(law).encode())
+            if (law := out.model_of_law) is not None:
+                replace_file(folder / f'{name}.yaml', _law_file(law).encode())
         except OSError as error:
             raise RecordingError(f'{folder}: cannot be written ({error.strerror or error})') from None
         return out
@@ -299,14 +299,15 @@ class RigConclusion(Conclusion):
         effects = [a for a in self.active_effects if a.effect.name not in RIG_NUMBERS]
         if self.adopted and self.law is not None:
             beside = [a for a in self.law.beside if a.effect.name in effect_names()]
-            laws = [ActiveEffect(effect_of(law), values_of(law)) for law in self.laws]
+            law = self.model_of_law
+            laws = [] if law is None else [ActiveEffect(effect_of(law), values_of(law))]
             effects = [*self.known, *beside, *laws]
         return model_yaml(self.params_file, self.rig, effects, self.values, self.tell)
 
     def files(self) -> dict[str, str]:
         """The rig file with the effects, the page, the JSON, and the law as an effect that can be adopted."""
-        named = {law.name.replace(self.adopted, 'law', 1) if self.adopted else law.name: law for law in self.laws}
-        laws = {f'{name}.yaml': _law_file(law) for name, law in named.items()}
+        law = self.model_of_law
+        laws = {} if law is None else {'law.yaml': _law_file(law)}
         return {'model.yaml': self.model_yaml(), **super().files(), **laws}
 
 

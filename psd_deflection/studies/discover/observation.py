@@ -28,7 +28,8 @@ class Observation:
     overrides. ``digest``: of its source. ``unknown_load``: numbers of samples before the first known load and
     after the last; what ``loads`` holds there is only a placeholder. ``stated_rate_hz``: the rig
     file's sample rate if the recording's times say another, which ``rig`` then has; else 0. ``marks``: from the
-    first sample. ``zero_variances`` (2P,) m^2: of the rig's zero, if it was taken in the recording.
+    first sample. ``zero_variances`` (2P,) m^2: of the rig's zero, if it was taken in the recording. ``swing`` (n, 3):
+    N, N, N m, what a weight that swayed added to the loads, or None.
     """
 
     name: str
@@ -41,6 +42,7 @@ class Observation:
     stated_rate_hz: float = 0.0
     marks: tuple[Moment, ...] = ()
     zero_variances: tuple[float, ...] = ()
+    swing: FloatArray | None = None
 
     def __post_init__(self) -> None:
         n = len(self.volts)
@@ -52,6 +54,11 @@ class Observation:
             raise RecordingError(f'{self.name}: a load is not a finite number')
         if self.temperature is not None and not np.all(np.isfinite(self.temperature)):
             raise RecordingError(f'{self.name}: a temperature is not a finite number')
+
+    @property
+    def acting(self) -> FloatArray:
+        """(n, 3): the loads with what swayed."""
+        return self.loads if self.swing is None else self.loads + self.swing
 
     @property
     def psds(self) -> int:

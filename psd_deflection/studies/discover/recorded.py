@@ -32,7 +32,7 @@ from psd_deflection.studies.discover.setup.redundant import FourthReading, fourt
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
 from psd_deflection.studies.loads.noted_times import MendedLoads
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_hung, noted_wrong
-from psd_deflection.studies.loads.sway import SwayingLoad, left_out
+from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swung
 from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
 
 MUCH = 10.0
@@ -245,10 +245,11 @@ def _mended(o: Observation, notes: Sequence[WrongNote | SwayingLoad | UnnotedTim
     """With the loads that hung, without the times in which nobody knows them."""
     if not notes:
         return o
-    volts = left_out(o.rig, o.volts, [n for n in notes if isinstance(n, SwayingLoad)])
+    swayed = [n for n in notes if isinstance(n, SwayingLoad)]
+    volts = left_out(o.rig, o.volts, swayed)
     volts = without_times(volts, [n for n in notes if isinstance(n, UnnotedTime)])
     loads = as_hung(o.loads, [n for n in notes if isinstance(n, WrongNote)])
-    return dataclasses.replace(_with_volts(o, volts), loads=loads)
+    return dataclasses.replace(_with_volts(o, volts), loads=loads, swing=swung(len(loads), swayed))
 
 
 def beside(workspace: Workspace, observations: Sequence[Observation], known: Sequence[ActiveEffect]) -> Workspace:

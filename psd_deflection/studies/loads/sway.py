@@ -31,13 +31,15 @@ RINGS_S = 0.4
 @dataclass(frozen=True, slots=True, eq=False)
 class SwayingLoad:
     """A weight that swayed: its plateau, the amplitude of the force, N, and the frequency, Hz. ``period``: s from one
-    sample to the next.
+    sample to the next. ``swung`` (k, 3): N, N, N m, what it added to the load in each sample of the plateau, about; a
+    clamp that sticks keeps the last of it.
     """
 
     plateau: Plateau
     force: float
     frequency: float
     period: float
+    swung: FloatArray | None = None
 
     @property
     def name(self) -> str:
@@ -105,7 +107,43 @@ def swaying(
         rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / found.compliance[axis]), peak))
     sizes = np.array([r[0] for r in rows])
     limit = max(SWAYS * float(np.median(sizes)), SWAYS_M) if len(sizes) >= FEWEST else np.inf
-    return [SwayingLoad(p, r[1], r[2], period) for p, r in zip(found.plateaus, rows, strict=True) if r[0] > limit]
+    return [
+        SwayingLoad(p, r[1], r[2], period, _swung(found, p, r[2], period))
+        for p, r in zip(found.plateaus, rows, strict=True)
+        if r[0] > limit
+    ]
+
+
+def _swung(found: PlateauLoads, p: Plateau, frequency: float, period: float) -> FloatArray:
+    """(k, 3): the load in each sample of ``p`` that the link swings with: a tone whose amplitude changes slowly."""
+    size, count = found.size, p.last - p.first
+    a, b = p.first // size + round(RINGS_S / (period * size)), p.last // size
+
+    def tone(at: FloatArray) -> FloatArray:
+        along, turn = at / count, 2.0 * math.pi * frequency * period * at
+        swing = np.array([np.sin(turn), np.cos(turn)])
+        return np.array([*swing, *along * swing, *along**2 * swing, np.ones_like(at)])
+
+    part = found.rest[:2, a:b]
+    there = np.flatnonzero(np.isfinite(part).all(axis=0))
+    middles = np.asarray((a + there + 0.5) * size - 0.5 - p.first, dtype=np.float64)
+    sizes = np.asarray(np.linalg.lstsq(tone(middles).T, part[:, there].T, rcond=1e-9)[0])
+    every: FloatArray = np.arange(count, dtype=np.float64)
+    out = np.zeros((count, 3))
+    # What does not swing is no sway.
+    out[:, :2] = tone(every)[:-1].T @ sizes[:-1] / found.compliance[:2]
+    return out
+
+
+def swung(samples: int, swayed: Sequence[SwayingLoad]) -> FloatArray | None:
+    """What swayed, (samples, 3) N, N, N m, of a recording; None if nothing did."""
+    if not swayed:
+        return None
+    out = np.zeros((samples, 3))
+    for s in swayed:
+        if s.swung is not None:
+            out[s.plateau.first : s.plateau.last] += s.swung
+    return out
 
 
 def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[SwayingLoad]:

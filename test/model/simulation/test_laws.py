@@ -240,3 +240,67 @@ def test_every_form_has_a_sound_unit() -> None:
         a = term.evaluate(lambda _: values, 50, 1e-3, {})
         b = scaled.evaluate(lambda _: 1e3 * values, 50, 1e-3, {})
         np.testing.assert_allclose(b, 1e3 ** FORMS[form].unit_of_v * a, rtol=1e-9, atol=1e-15, err_msg=form)
+
+
+LOAD = Law('both', 'load', 'load_fx', (LawTerm('product', ('load_fy',), 0.02), LawTerm('product', ('load_tz',), 0.01)))
+DOT = Law('both', 'psd', 'y2', (LawTerm('above', ('y1',), 0.1, {'threshold': 1.2e-4}),))
+JOINT = Law('both', 'load', 'load_fx', LOAD.terms, 'a base that yields', (DOT,))
+
+
+def test_one_cause_on_two_quantities_is_one_law() -> None:
+    (joint,) = active(JOINT)
+    assert [p.name for p in joint.effect.parameters] == ['c1', 'c2', 'c3', 'threshold3']
+    assert (joint.effect.stage, joint.effect.needs) == ('load', 'load_fy, load_tz, y1')
+    assert joint.effect.equation == f'{LOAD.expression}; {DOT.expression}'
+    together = ForwardModel(RIG, [joint]).run(LOADS).volts
+    apart = ForwardModel(RIG, [*active(LOAD), *active(DOT)]).run(LOADS).volts
+    np.testing.assert_array_equal(together, apart)
+    # A rig file may say other sizes, of the whole.
+    half = ActiveEffect(joint.effect, {**joint.values, 'c1': 0.01, 'c2': 0.0, 'c3': 0.0})
+    less = Law('less', 'load', 'load_fx', (LawTerm('product', ('load_fy',), 0.01),))
+    np.testing.assert_array_equal(
+        ForwardModel(RIG, [half]).run(LOADS).volts, ForwardModel(RIG, active(less)).run(LOADS).volts
+    )
+
+
+def test_what_can_be_corrected_of_a_joint_law_is() -> None:
+    (joint,) = active(JOINT)
+    assert joint.effect.corrected == 'reading'
+    dots = np.full((1, 4), 3e-4)
+    np.testing.assert_allclose(
+        Correction(RIG, [joint]).apply(dots), Correction(RIG, active(DOT)).apply(dots), rtol=0, atol=1e-15
+    )
+    assert Correction(RIG, [joint]).apply(dots)[0, 3] != dots[0, 3]
+
+
+def test_a_joint_law_is_one_file(tmp_path: Path) -> None:
+    path = tmp_path / 'both.yaml'
+    path.write_text(law_text(JOINT, ['found']))
+    assert read_law(path) == JOINT
+    rig = load_rig(
+        overrides={'effects.both.law': effect_of(JOINT).law, 'effects.both.c1': 0.02, 'effects.both.c3': 0.2}
+    )
+    (found,) = effects_of_rig(rig)
+    assert (len(found.parts), found.values['c1'], found.values['c3']) == (2, 0.02, 0.2)
+
+
+@pytest.mark.parametrize(
+    ('further', 'words'),
+    [
+        ('7', r'further = 7: must be a list of maps with acts_on and terms'),
+        ('[7]', r'further\[0\]\.: must be a map with acts_on and terms, not 7'),
+        ('[{terms: []}]', r'further\[0\]\.acts_on is missing'),
+        ('[{acts_on: y3x, terms: []}]', r"further\[0\]\.acts_on = 'y3x': unknown"),
+        ('[{acts_on: y1, terms: 3}]', r'further\[0\]\.terms = 3: must be a list of at least one term'),
+        (
+            '[{acts_on: y1, terms: [{form: product, of: [dx], coefficient: x}]}]',
+            r'further\[0\]\.terms\[0\]\.coefficient',
+        ),
+        ('[{acts_on: load_fx, terms: [{form: product, of: [load_fy], coefficient: 1}]}]', 'load_fx is there twice'),
+    ],
+)
+def test_a_wrong_further_part_is_named(tmp_path: Path, further: str, words: str) -> None:
+    path = tmp_path / 'both.yaml'
+    path.write_text(law_text(LOAD) + f'further: {further}\n')
+    with pytest.raises(ConfigError, match=words):
+        read_law(path)

@@ -71,6 +71,26 @@ def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: flo
     assert found.plateau.number == 3
     assert found.frequency == pytest.approx(frequency, abs=0.02)
     assert found.force == pytest.approx(force, rel=0.1)
+    # How it swung, but for how much more a link of 14 Hz swings than under a load that rests.
+    assert found.swung is not None
+    true = (swung(force, frequency, axis) - HUNG)[3 * DWELL : 4 * DWELL]
+    assert np.abs(found.swung - true).max() < 0.03 * force
+    assert sway.swung(len(HUNG), []) is None
+    every = sway.swung(len(HUNG), [found])
+    assert every is not None
+    np.testing.assert_array_equal(every[3 * DWELL : 4 * DWELL], found.swung)
+
+
+@pytest.mark.statistics
+def test_a_clamp_that_sticks_keeps_the_last_of_a_sway() -> None:
+    """Without the sway its friction would hold the link on the other side, as a law that switches then."""
+    friction = {'effects__e__name': 'clamp_friction', 'effects__e__width': 3e-6, 'effects__e__axis': 3}
+    found = discover([Observation('x', RIG, read(swung(0.8, 1.4375, number=6), **friction), HUNG)])
+    assert [(e.active.effect.name, e.active.values['axis']) for e in found.effects] == [('clamp_friction', 3)]
+    assert found.effects[0].active.values['width'] == pytest.approx(3e-6, rel=0.02)
+    assert (found.verdict, found.unknown, found.law) == ('effects_found', (), None)
+    assert found.floors < 1.05
+    assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 6')]
 
 
 TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}

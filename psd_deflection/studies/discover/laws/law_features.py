@@ -145,7 +145,7 @@ def _variables(ws: Workspace, effects: Sequence[ActiveEffect], i: int) -> tuple[
     """Recording number ``i``, simulated with ``effects`` besides those of the rig file."""
     o = ws.observations[i]
     model = ForwardModel(o.rig, only_in(sort_effects([*ws.base, *ws.nuisance, *effects]), i))
-    return model, model.run(o.loads, o.temperature)
+    return model, model.run(o.acting, o.temperature)
 
 
 def known_values(ws: Workspace, effects: Sequence[ActiveEffect], name: str) -> list[FloatArray]:

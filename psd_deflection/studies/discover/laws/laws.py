@@ -89,10 +89,9 @@ class FoundLaw:
         """All of it."""
         return (self.law, *self.further)
 
-    def adopted(self, name: str) -> list[Law]:
-        """The laws as effects of that name; those on further quantities get it with a number."""
-        names = [name, *(f'{name}_{i}' for i in range(2, len(self.laws) + 1))]
-        return [dataclasses.replace(law, name=n) for law, n in zip(self.laws, names, strict=True)]
+    def adopted(self, name: str) -> Law:
+        """All of it as one law of that name."""
+        return dataclasses.replace(self.law, name=name, further=self.further)
 
     @property
     def beside(self) -> tuple[ActiveEffect, ...]:

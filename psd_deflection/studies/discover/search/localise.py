@@ -135,7 +135,7 @@ def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArra
     """Per channel, per name, per recording: regressors of a residual, on fine blocks (nf,)."""
     out: list[dict[str, list[FloatArray]]] = [{} for _ in range(workspace.psds)]
     for i, (o, size) in enumerate(zip(workspace.observations, workspace.fine, strict=True)):
-        chunk = ForwardModel(o.rig, only_in([*workspace.base, *workspace.nuisance], i)).run(o.loads, o.temperature)
+        chunk = ForwardModel(o.rig, only_in([*workspace.base, *workspace.nuisance], i)).run(o.acting, o.temperature)
         dots, loads = fine_means(chunk.dots, size) * 1e3, fine_means(chunk.loads, size)
         n = dots.shape[1]
         changes = np.sign(np.diff(chunk.loads, axis=1, prepend=chunk.loads[:, :1]))

@@ -83,7 +83,7 @@ class Workspace(Comparison):
         out, left = list[NoiseModel](), list[FloatArray]()
         self.tally.count += 1
         for i, (o, size) in enumerate(zip(self.observations, self.fine, strict=True)):
-            chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
+            chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.acting, o.temperature)
             difference = o.volts - chunk.volts.T
             # Coarse steps hide the noise of a reading that rests.
             share = 0.25 if any(a.effect.lattice for a in effects) else LEAST_NOISE
@@ -136,7 +136,7 @@ class Workspace(Comparison):
         self.tally.count += 1
         out = []
         for i, o in enumerate(self.observations):
-            chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.loads, o.temperature)
+            chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.acting, o.temperature)
             difference = o.volts - chunk.volts.T
             out.append(np.where(np.isfinite(difference), difference, 0.0))
         return out
@@ -148,7 +148,7 @@ class Workspace(Comparison):
         for i, (o, size, present) in enumerate(zip(self.observations, self.fine, self._present, strict=True)):
             model = ForwardModel(o.rig, only_in(sort_effects(effects), i))
             means = np.empty((3 * o.psds, len(o.loads) // size))
-            for at, volts in model.expect_in_pieces(o.loads, o.temperature, size):
+            for at, volts in model.expect_in_pieces(o.acting, o.temperature, size):
                 there = None if present is None else present[:, at]
                 means[:, at.start // size : at.stop // size] = fine_means(volts, size, there)
             out.append(means)
