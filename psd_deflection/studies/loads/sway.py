@@ -107,11 +107,13 @@ def swaying(
         rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / found.compliance[axis]), peak))
     sizes = np.array([r[0] for r in rows])
     limit = max(SWAYS * float(np.median(sizes)), SWAYS_M) if len(sizes) >= FEWEST else np.inf
-    return [
-        SwayingLoad(p, r[1], r[2], period, _swung(found, p, r[2], period))
-        for p, r in zip(found.plateaus, rows, strict=True)
-        if r[0] > limit
-    ]
+    out: dict[int, SwayingLoad] = {}
+    for p, (moved, force, frequency) in sorted(zip(found.plateaus, rows, strict=True), key=lambda both: both[1][0]):
+        if moved > limit:
+            # A strong sway seems to step: all of the time of that load, from its largest part.
+            whole = next((w for w in noted if w.first <= p.first < w.last), p)
+            out[whole.first] = SwayingLoad(whole, force, frequency, period, _swung(found, whole, frequency, period))
+    return [out[first] for first in sorted(out)]
 
 
 def _swung(found: PlateauLoads, p: Plateau, frequency: float, period: float) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -16,7 +17,7 @@ from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads import sway
-from psd_deflection.studies.loads.plateaus import Plateau
+from psd_deflection.studies.loads.plateaus import Plateau, asked_beside_rig, plateaus
 from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
 
 RIG = load_rig()
@@ -79,6 +80,19 @@ def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: flo
     every = sway.swung(len(HUNG), [found])
     assert every is not None
     np.testing.assert_array_equal(every[3 * DWELL : 4 * DWELL], found.swung)
+
+
+def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
+    asked, noted = asked_beside_rig(RIG, SWUNG, HUNG), plateaus(RIG, SWUNG, HUNG, noted=True)
+    cut = 3 * DWELL + 1200
+    pieces = [
+        *noted[:3],
+        dataclasses.replace(noted[3], last=cut),
+        dataclasses.replace(noted[3], first=cut, unnoted=True),
+        *noted[4:],
+    ]
+    (found,) = sway.swaying(asked(pieces), noted, asked, 1e-3)
+    assert (found.plateau.first, found.plateau.last) == (3 * DWELL, 4 * DWELL)
 
 
 @pytest.mark.statistics
