@@ -65,7 +65,7 @@ def _rig(case: Case, seen: Sequence[Observation]) -> Rig:
     return seen[0].rig if case.mistake[0] else load_rig()
 
 
-def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str, str]) -> str:
+def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | None]) -> str:
     fields, truth, target, peer = job
     case = Case(
         **{
@@ -144,25 +144,30 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Seal, run what is missing, score; exit status 1 if a threshold is not met."""
     parser = options(__doc__, jobs=1)
     chosen = selection(parser)
-    parser.add_argument('--peer', choices=('', *suite_peers.PEERS), default='', help='who answers instead of discover')
+    parser.add_argument('--peer', choices=tuple(suite_peers.PEERS), help='who answers instead of discover')
     parser.add_argument('--score', action='store_true', help='only score the answers that are there, of any tool')
     args = parser.parse_args(argv)
+    if args.peer and (lacks := suite_peers.lacking(args.peer)):
+        parser.error(f'--peer {args.peer}: {lacks}')
     folder = Path(args.out)
+    # Nobody's answers are taken for another's.
+    whose = f'-{args.peer}' if args.peer else ''
+    summary = folder / f'summary{whose}.txt'
     if args.score:
-        rows = score.load(folder, [p.stem for p in sorted((folder / 'sealed').glob('*.json')) if args.only in p.stem])
-        return conclude(*score.summary(rows), folder / 'summary.txt')
+        keys = [p.stem for p in sorted((folder / 'sealed').glob('*.json')) if args.only in p.stem]
+        return conclude(*score.summary(score.load(folder, keys, f'answers{whose}')), summary)
     cases = chosen(args)
     print(f'{len(cases)} cases; truths sealed: {seal(cases, folder, args.jobs)}')
-    (folder / 'answers').mkdir(parents=True, exist_ok=True)
+    (folder / f'answers{whose}').mkdir(parents=True, exist_ok=True)
     jobs = []
     for case in cases:
-        target = folder / 'answers' / f'{case.key}.json'
+        target = folder / f'answers{whose}' / f'{case.key}.json'
         if not target.exists():
             sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
             jobs.append((sealed['case'], sealed['truth'], str(target), args.peer))
     for _ in over(_one, jobs, args.jobs, 'answers'):
         pass
-    return conclude(*score.summary(score.load(folder, [c.key for c in cases])), folder / 'summary.txt')
+    return conclude(*score.summary(score.load(folder, [c.key for c in cases], f'answers{whose}')), summary)
 
 
 if __name__ == '__main__':

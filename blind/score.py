@@ -82,11 +82,11 @@ def whole(answer: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def load(folder: Path, keys: Sequence[str]) -> list[Row]:
-    """Every case that has an answer."""
+def load(folder: Path, keys: Sequence[str], answers: str = 'answers') -> list[Row]:
+    """Every case that has an answer in the folder ``answers``."""
     out = []
     for key in keys:
-        answer = folder / 'answers' / f'{key}.json'
+        answer = folder / answers / f'{key}.json'
         if not answer.exists():
             continue
         sealed = json.loads((folder / 'sealed' / f'{key}.json').read_text())

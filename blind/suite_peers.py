@@ -9,7 +9,7 @@ smallest BIC.
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import itertools
 import math
 import warnings
@@ -92,6 +92,12 @@ def subsets(pictures: Pictures) -> list[int]:
         (list(s) for n in range(MOST + 1) for s in itertools.combinations(alone, n)),
         key=pictures.bic,
     )
+
+
+def lacking(peer: str) -> str:
+    """What has to be installed for ``peer``, in words; '' if it is."""
+    missing = peer == 'stlsq' and importlib.util.find_spec('pysindy') is None
+    return 'PySINDy is not installed: pip install pysindy' if missing else ''
 
 
 PEERS: dict[str, Callable[[Pictures], list[int]]] = {'stlsq': stlsq, 'subsets': subsets}

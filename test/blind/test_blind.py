@@ -191,6 +191,28 @@ def test_a_peer_answers_the_same_cases(peer: str) -> None:
         assert row.answer['remaining']['floors'] < 1.1
 
 
+def test_no_answer_is_taken_for_that_of_another_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / 'answers').mkdir()
+    (tmp_path / 'answers' / 'null-s0.json').write_text(json.dumps({'effects': [{'name': 'creep'}]}))
+    said = {'effects': [], 'remaining': {'floors': 1.0}}
+    monkeypatch.setattr(suite_peers, 'answer', lambda *given: said if given[0] == 'subsets' else {})
+    run.main(['--short', '--only', 'null-s0', '--peer', 'subsets', '--out', str(tmp_path)])
+    assert json.loads((tmp_path / 'answers-subsets' / 'null-s0.json').read_text())['effects'] == []
+    assert 'false alarm, right noise: 0.0 % (0/1' in (tmp_path / 'summary-subsets.txt').read_text()
+    run.main(['--score', '--out', str(tmp_path)])
+    assert 'false alarm, right noise: 100.0 % (1/1' in (tmp_path / 'summary.txt').read_text()
+
+
+def test_a_peer_that_is_not_installed_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr('importlib.util.find_spec', lambda name: None)
+    with pytest.raises(SystemExit):
+        run.main(['--short', '--peer', 'stlsq', '--out', str(tmp_path)])
+    assert '--peer stlsq: PySINDy is not installed: pip install pysindy' in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_intervals_are_clopper_and_pearsons() -> None:
     # The rule of three: none of 300 leaves up to 1.2 %.
     low, high = score.interval(0, 300)

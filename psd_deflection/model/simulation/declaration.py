@@ -326,9 +326,11 @@ class ActiveEffect:
 
     @property
     def parts(self) -> tuple[ActiveEffect, ...]:
-        """What it does at each point at which it acts."""
-        further = self.effect.further
-        return (self, *(ActiveEffect(part, self.values) for part in further)) if further else (self,)
+        """What it does at each point at which it acts; these have no further parts."""
+        if not self.effect.further:
+            return (self,)
+        first = replace(self.effect, further=())
+        return tuple(ActiveEffect(part, self.values) for part in (first, *self.effect.further))
 
     @property
     def choices(self) -> tuple[float, ...]:

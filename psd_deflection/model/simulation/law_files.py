@@ -48,7 +48,7 @@ def _law_of(tree: object, path: Path) -> Law:
 def _part(path: Path, at: str, tree: object, whole: Mapping[str, object]) -> Law:
     """What the law does to one target; ``at``: where in the file."""
     if not isinstance(tree, dict):
-        raise ConfigError(f'{path}: {at}: must be a map with acts_on and terms, not {tree!r}')
+        raise ConfigError(f'{path}: {at.rstrip(".")} = {tree!r}: must be a map with acts_on and terms')
     for key in ('acts_on', 'terms'):
         if key not in tree:
             raise ConfigError(f'{path}: {at}{key} is missing')

@@ -12,7 +12,7 @@ import psd_deflection
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
 from psd_deflection.measure.correction import Correction
-from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_of_rig
+from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_of_rig, make_active, sort_effects
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.law_files import read_law
 from psd_deflection.model.simulation.laws import (
@@ -263,6 +263,13 @@ def test_one_cause_on_two_quantities_is_one_law() -> None:
     )
 
 
+def test_a_joint_law_acts_once_before_what_reads_between_samples() -> None:
+    late = make_active('channel_skew', {'psd': 2, 'delay': 3e-4}, 'test')
+    together = ForwardModel(RIG, sort_effects([*active(JOINT), late])).run(LOADS).volts
+    apart = ForwardModel(RIG, sort_effects([*active(LOAD), *active(DOT), late])).run(LOADS).volts
+    np.testing.assert_array_equal(together, apart)
+
+
 def test_what_can_be_corrected_of_a_joint_law_is() -> None:
     (joint,) = active(JOINT)
     assert joint.effect.corrected == 'reading'
@@ -288,7 +295,7 @@ def test_a_joint_law_is_one_file(tmp_path: Path) -> None:
     ('further', 'words'),
     [
         ('7', r'further = 7: must be a list of maps with acts_on and terms'),
-        ('[7]', r'further\[0\]\.: must be a map with acts_on and terms, not 7'),
+        ('[7]', r'further\[0\] = 7: must be a map with acts_on and terms'),
         ('[{terms: []}]', r'further\[0\]\.acts_on is missing'),
         ('[{acts_on: y3x, terms: []}]', r"further\[0\]\.acts_on = 'y3x': unknown"),
         ('[{acts_on: y1, terms: 3}]', r'further\[0\]\.terms = 3: must be a list of at least one term'),
