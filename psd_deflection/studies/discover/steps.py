@@ -186,7 +186,7 @@ def where(problem: Problem) -> Problem:
     explained = max(null.chi2 - fit.chi2, 0.0) + steps
     gap_after = ws.gap(fit.difference)
     unknown = (
-        unknown_of(left, explained, gap_after, ws.floor(), steps, ws.worded)
+        unknown_of(left, explained, gap_after, ws.floor(), ws.most_by_noise(), steps, ws.worded)
         or unsaid(ws, problem.gap_before, gap_after)
         or tied(coincidences(fit, ws.physics), fit, problem.result, before)
     )

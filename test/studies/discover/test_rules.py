@@ -665,6 +665,16 @@ def test_nothing_is_unknown_that_noise_alone_would_leave(gap: float, unknown: bo
     for low, p, told in ((25.0, 0.009, True), (25.0, 0.011, unknown), (17.0, 0.009, unknown)):
         hum = Cell('x1', 0, (0.0, 1.0), (low, 60.0), (), 9.0, p, 50.0)
         assert bool(unknown_of(nowhere(p=0.0, excess=100.0, cells=(hum,)), 0.0, 1e-6 * gap, 2e-6)) is told
+    # The noise of one recording may be a little more than that of most.
+    assert not unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 1e-6 * gap, 2e-6, 2.01e-6)
+    assert unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 2.02e-6, 2e-6, 2.01e-6)
+
+
+def test_one_recording_of_a_thousand_has_a_larger_gap_from_noise_alone() -> None:
+    rng = np.random.default_rng(7)
+    plant = Plant({}, noise())
+    above = [plant.gap([SIGMA * rng.standard_normal((6, FINE))]) > plant.most_by_noise() for _ in range(4000)]
+    assert 1 <= sum(above) <= 10
 
 
 def test_an_unknown_is_described_by_what_it_follows() -> None:

@@ -13,11 +13,15 @@ from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
+from scipy.stats import chi2 as chi2_law
 
 from psd_deflection.base.charts import TimeAxis
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray, IntArray
+
+EXCEEDED = 1e-3
+"""Share of recordings whose gap from noise alone is more than the most that is expected of noise."""
 
 
 class SimulationCount:
@@ -119,6 +123,11 @@ class Comparison(ABC):
     @abstractmethod
     def floor(self) -> float:
         """The gap from noise alone; NaN if nobody knows the noise."""
+
+    def most_by_noise(self) -> float:
+        """The gap that noise alone exceeds in one of a thousand recordings; NaN if nobody knows the noise."""
+        size = self.effective_size() * len(self.channels) / len(self.measured[0])
+        return self.floor() * float(np.sqrt(chi2_law.isf(EXCEEDED, size) / size))
 
     @abstractmethod
     def pieces(self, a: FloatArray, b: FloatArray) -> FloatArray:

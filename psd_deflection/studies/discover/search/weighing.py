@@ -167,17 +167,18 @@ def unknown_of(
     explained: float,
     gap: float = 0.0,
     floor: float = 0.0,
+    by_noise: float = 0.0,
     steps: float = 0.0,
     worded: Callable[[float], str] = str,
 ) -> tuple[Unknown, ...]:
-    """``gap``, ``floor``: what remains and what noise leaves. ``steps``: chi-square that coarse steps explain.
-    ``worded``: a gap with its unit.
+    """``gap``: what remains; ``floor``: what noise leaves, ``by_noise``: at most. ``steps``: chi-square that coarse
+    steps explain. ``worded``: a gap with its unit.
     """
     if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
         return ()
     fast = any(c.p < 0.01 and c.band[0] >= BLOCKS_HZ for c in left.cells)
-    if 0.0 < gap <= floor < math.inf and not fast:
-        # Noise alone leaves more.
+    if 0.0 < gap <= max(floor, by_noise) < math.inf and not fast:
+        # Noise alone may leave more.
         return ()
     strong = [d for d in left.dependences if d.p < 1e-3][:6]
     size = _beyond(gap, floor)
