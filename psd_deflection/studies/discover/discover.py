@@ -35,7 +35,6 @@ from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Localisation, localise, regressors
 from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
-from psd_deflection.studies.discover.search.search import FAR, far
 from psd_deflection.studies.discover.search.signatures import (
     Candidate,
     Columns,
@@ -43,6 +42,7 @@ from psd_deflection.studies.discover.search.signatures import (
     candidates,
     signatures_beside,
 )
+from psd_deflection.studies.discover.search.trials import FAR, far
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST, RIG_NUMBERS, SETUP, mistakes

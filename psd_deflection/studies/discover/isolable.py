@@ -31,8 +31,9 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import TELLS_APART
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.search.screen import Screen, solve_seen
-from psd_deflection.studies.discover.search.search import BIC_ACCEPT, Search
+from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.trials import BIC_ACCEPT
 from psd_deflection.studies.study import PageSection, StudyResult
 
 ALIKE = 1e-5

@@ -17,7 +17,8 @@ from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldout_tables
 from psd_deflection.studies.discover.search.remainder import Remainder, remainder_of
-from psd_deflection.studies.discover.search.search import BIC_ACCEPT, Search, unphysical
+from psd_deflection.studies.discover.search.search import Search
+from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, unphysical
 from psd_deflection.studies.discover.search.weighing import (
     EQUIVALENT,
     EQUIVALENT_BIC,

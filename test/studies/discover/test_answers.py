@@ -31,8 +31,8 @@ from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Cell, Dependence, Localisation
 from psd_deflection.studies.discover.search.screen import promising
-from psd_deflection.studies.discover.search.search import far, slot, unbound, unphysical
 from psd_deflection.studies.discover.search.signatures import Candidate, candidates, signature_columns
+from psd_deflection.studies.discover.search.trials import far, slot, unbound, unphysical
 from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes, only_in

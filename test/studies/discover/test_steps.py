@@ -25,6 +25,7 @@ from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Dependence, dependences, localise, regressors
+from psd_deflection.studies.discover.search.mistakes import mistake
 from psd_deflection.studies.discover.search.proposals import coarse_step
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search
@@ -115,7 +116,7 @@ def test_a_mistake_is_taken_first_if_it_explains_nearly_all(left: float, taken: 
     search = searching(plant, shown, ['link_length', 'b'], said)
     null = refit(plant, ())
     scores = search.screen.score(null.residual)
-    first = search.mistake(null, scores)
+    first = mistake(search, null, scores)
     assert named(first) == (['link_length'] if taken else [])
     assert said == (['the set-up: link_length'] if taken else [])
     if taken:
@@ -126,9 +127,9 @@ def test_a_mistake_is_taken_first_if_it_explains_nearly_all(left: float, taken: 
         for s in scores
     ]
     best = dataclasses.replace(scores[0], candidate=candidate('b', 'x'))
-    assert search.mistake(null, [best, *weak[:1]]) is null
-    assert search.mistake(null, [dataclasses.replace(s, p=0.011) for s in scores]) is null
-    assert search.mistake(null, []) is null
+    assert mistake(search, null, [best, *weak[:1]]) is null
+    assert mistake(search, null, [dataclasses.replace(s, p=0.011) for s in scores]) is null
+    assert mistake(search, null, []) is null
 
 
 def test_another_sample_rate_is_tried_from_afar() -> None:
@@ -145,7 +146,7 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
     found = [(candidate('sample_rate', 'error'), [[1e-3 * shown['sample_rate', 'error']]])]
     search = Search(plant, lambda ws, _: Screen(ws, found))
     null = refit(plant, ())
-    first = search.mistake(null, search.screen.score(null.residual))
+    first = mistake(search, null, search.screen.score(null.residual))
     assert named(first) == ['sample_rate']
     assert {-0.2, -0.1, -0.04, 0.04, 0.1, 0.25} <= set(tried)
 

@@ -36,7 +36,7 @@ from psd_deflection.studies.discover.laws.law_features import (
 from psd_deflection.studies.discover.laws.variance import likelihood, most_jitter, variance
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut, heldout_gain, heldout_gap
-from psd_deflection.studies.discover.search.search import BIC_ACCEPT
+from psd_deflection.studies.discover.search.trials import BIC_ACCEPT
 from psd_deflection.studies.discover.search.workspace import Workspace
 
 P_ACCEPT = 0.01

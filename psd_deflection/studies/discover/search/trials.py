@@ -1,0 +1,215 @@
+"""What every step of a search does: refit from some starts, and hold the results against each other."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Self
+
+import numpy as np
+from scipy.stats import chi2 as chi2_law
+
+from psd_deflection.model.simulation.declaration import ActiveEffect, Effect
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.hold_out import unseen_gap
+from psd_deflection.studies.discover.search.limits import further_terms
+from psd_deflection.studies.discover.search.screen import Score, Screen, promising
+from psd_deflection.studies.discover.search.trust import gain_beyond
+
+BIC_ACCEPT = 10.0
+"""Smallest improvement of BIC by an accepted effect."""
+FAR = 10.0
+"""Chi-square per value from which on what remains is screened with signatures beside the effects found so far."""
+STANDS_IN = 0.2
+"""An effect beside others explains this share of what they leave at least, in chi-square beyond noise."""
+MANY, FEW_TERMS = 4, 8
+"""Unless so many effects were found, and so few more terms would leave next to nothing on load cases not seen."""
+NEAR = 0.1
+"""Unless it leaves less than this share of the noise itself."""
+MOST_CLOSED = 0.5
+"""A change that leaves less than this share of chi-square beyond noise is worth another look at what else holds."""
+TRIALS = 7
+
+
+def key_of(active: ActiveEffect) -> tuple[object, ...]:
+    """Effect and discrete choices."""
+    return (active.effect.name, *active.choices)
+
+
+def slot(effect: Effect, values: Mapping[str, float]) -> tuple[object, ...]:
+    """Key of which a model has at most one: an effect, for each PSD."""
+    return (effect.name, *(values[p.name] for p in effect.parameters if p.each))
+
+
+def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
+    """Whether effect ``index`` of ``fit`` has run into a bound: it fits only as something that it is not.
+
+    An amplitude may end at the bound at which it is off, as long as another one is on.
+    """
+    effect = fit.effects[index].effect
+    on = False
+    for j in fit.columns_of(index):
+        p = effect.parameter(fit.free[j][1])
+        if fit.free[j] not in fit.at_bound:
+            on = on or p.kind == 'amplitude'
+        elif p.kind == 'shape' or (
+            p.kind == 'amplitude' and fit.effects[index].values[p.name] != p.off(workspace.physics)
+        ):
+            return True
+    return not on
+
+
+def counted(fit: Fit) -> str:
+    """How many effects ``fit`` has, in words."""
+    count = len(fit.effects)
+    return f'{count} effect{"" if count == 1 else "s"}'
+
+
+def far(fit: Fit) -> bool:
+    """Whether ``fit`` leaves so much that small signatures beside it would mislead."""
+    return fit.chi2 > FAR * fit.residual.size
+
+
+def unbound(fit: Fit) -> FloatArray:
+    """The Jacobian's columns (D, k) of the parameters that are free to move."""
+    keep = [j for j, name in enumerate(fit.free) if name not in fit.at_bound]
+    return fit.jacobian[:, keep]
+
+
+class Trials:
+    """Refits over one comparison, and the rules by which one passes.
+
+    ``screen`` gives the signatures beside a fit; ``progress`` takes each step in words.
+    """
+
+    def __init__(
+        self,
+        workspace: Comparison,
+        screen: Callable[[Comparison, Fit | None], Screen],
+        progress: Callable[[str], None] = lambda _: None,
+    ) -> None:
+        self.workspace = workspace
+        self._make_screen = screen
+        self._progress = progress
+        self._begun = workspace.simulations
+        self.screen = screen(workspace, None)
+        self.penalty = float(np.log(workspace.effective_size()))
+        self.trace: list[str] = []
+        self.dropped: dict[int, tuple[Fit, list[Fit]]] = {}
+
+    @property
+    def spent(self) -> int:
+        """Forward simulations of this search."""
+        return self.workspace.simulations - self._begun
+
+    def budget_of(self, fit: Fit) -> int:
+        """Forward simulations that a model of this many effects may cost."""
+        return round(self.workspace.budget * min(max(1, len(fit.effects)), self.workspace.most_budgets))
+
+    def without_each(self, fit: Fit, null: Fit) -> list[Fit]:
+        """``fit`` refitted without each of its effects in turn; ``null``: the fit of no effect."""
+        kept = self.dropped.get(id(fit))
+        if kept is None:
+            fits = []
+            for i in range(len(fit.effects)):
+                rest = [a for j, a in enumerate(fit.effects) if j != i]
+                fits.append(refit(self.workspace, rest, iterations=6) if rest else null)
+            # Keep the fit itself too, so that no other object gets its id.
+            kept = self.dropped[id(fit)] = (fit, fits)
+        return kept[1]
+
+    def say(self, text: str) -> None:
+        """Keep a step of the search, with the simulations so far, and tell it."""
+        self.trace.append(f'{text} [{self.workspace.simulations}]')
+        self._progress(text)
+
+    def bic(self, fit: Fit) -> float:
+        """Bayesian information criterion of ``fit``, up to a constant."""
+        return fit.chi2 + self.penalty * fit.parameters
+
+    def screen_beside(self, fit: Fit) -> Screen:
+        """The signatures beside ``fit``."""
+        return self._make_screen(self.workspace, fit)
+
+    def best_of(self, starts: Sequence[Sequence[ActiveEffect]], keep: int, iterations: int) -> Fit | None:
+        """Refit each start a little, the best few in full."""
+        fits = [refit(self.workspace, s, iterations=3) for s in starts]
+        fits.sort(key=self.bic)
+        full = [refit(self.workspace, f.effects, iterations=iterations) for f in fits[:keep]]
+        return min(full, key=self.bic, default=None)
+
+    def passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
+        """Whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
+        gain = smaller.chi2 - larger.chi2
+        if not self.workspace.open_level:
+            explained = null.residual - smaller.residual
+            gain = min(gain, gain_beyond(self.workspace, smaller.residual, larger.residual, explained))
+        more = self.penalty * (larger.parameters - smaller.parameters)
+        return gain - more > BIC_ACCEPT
+
+    def stands_in(self, smaller: Fit, larger: Fit) -> bool:
+        """Whether what ``larger`` adds only stands in for something that the library lacks."""
+        size = self.workspace.size
+        if not smaller.effects or self.workspace.open_level or larger.chi2 <= (1.0 + NEAR) * size:
+            return False
+        little = larger.chi2 - size > (1.0 - STANDS_IN) * (smaller.chi2 - size)
+        return little and not (len(smaller.effects) >= MANY and self._library_explains(smaller))
+
+    def _library_explains(self, fit: Fit) -> bool:
+        """Whether some more effects beside ``fit`` would leave next to nothing on unseen load cases, to first order."""
+        terms = further_terms(self.screen, fit, self.may_pass, self.workspace.first, FEW_TERMS)
+        if terms is None:
+            return False
+        return unseen_gap(self.workspace, fit, terms.columns) < (1.0 + NEAR) * self.workspace.floor()
+
+    def library_p(self, gain: float, dof: int) -> float:
+        """p of a gain in chi-square, over the whole library (Sidak)."""
+        count = max(1, len(self.screen.candidates))
+        local = float(chi2_law.sf(gain, max(dof, 1)))
+        return float(-np.expm1(count * np.log1p(-min(local, 1.0 - 1e-16))))
+
+    def renoise(self, fit: Fit) -> Fit:
+        """Estimate the noise again, now that most of the discrepancy is explained; refit if it differs."""
+        renoised = self.workspace.renoised([*self.workspace.base, *fit.whole])
+        if renoised is self.workspace:
+            return fit
+        self.workspace = renoised
+        self.dropped.clear()
+        if self.workspace.open_level:
+            self.penalty = float(np.log(self.workspace.effective_size()))
+        fit = refit(self.workspace, fit.effects, iterations=6)
+        self.screen = self.screen_beside(fit)
+        return fit
+
+    def settle(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
+        """Both fits again, with free loads and times as ``fit`` asks for: else a small effect stands in for these."""
+        settled = self.workspace.settled_beside(fit.difference, fit.whole)
+        if settled is self.workspace:
+            return null, fit
+        better = refit(settled, fit.effects, iterations=6)
+        if settled.gap(better.difference) > self.workspace.gap(fit.difference):
+            return null, fit
+        self.workspace = settled
+        self.dropped.clear()
+        return refit(settled, ()), better
+
+    def at(self, workspace: Comparison) -> Self:
+        """The same search over another comparison of the same recordings."""
+        out = copy.copy(self)
+        out.workspace = workspace
+        return out
+
+    def may_pass(self, score: Score) -> bool:
+        """Whether one more effect would pass, to first order."""
+        return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_ACCEPT
+
+    def further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:
+        """``current`` with the best further effect."""
+        if not scores or min(s.p for s in scores) > self.workspace.p_accept:
+            return None
+        # From the second effect on, the residual is smaller and the first guess better.
+        tried = promising(scores, self.penalty, 0.3, TRIALS if not current.effects else 4)
+        starts = [[*current.effects, s.candidate.from_coefficients(s.coefficients)] for s in tried]
+        return self.best_of(starts, 2, 6) if current.effects else self.best_of(starts, 4, 12)
