@@ -265,6 +265,13 @@ def scaled(case_seed: int, name: str, gap: float, design: tuple[Generator, ...])
     return best[1]
 
 
+def possible(effect: Mapping[str, Any]) -> bool:
+    """Whether a machine can have it: no second mode swings farther than the link bends, as some must to be seen if the
+    loads were applied slowly.
+    """
+    return effect['name'] != 'second_bending_mode' or float(abs(effect['gain'])) <= 1.0
+
+
 def all_cases(
     seeds: int = 4,
     nulls: int = 300,

@@ -18,7 +18,7 @@ from typing import Any
 
 from blind import byhand, score, suite_peers
 from blind.campaign import conclude, options, over
-from blind.cases import Case, all_cases, designs, scaled, short_cases
+from blind.cases import Case, all_cases, designs, possible, scaled, short_cases
 from blind.mistakes import observed
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
@@ -30,8 +30,9 @@ _BANKS: dict[str, SignatureBank] = {}
 
 
 def truth_of(case: Case) -> list[dict[str, Any]]:
-    """The effects of a case, scaled to their gaps."""
-    return [scaled(case.seed, name, gap, designs(case.design)) for name, gap in case.wanted]
+    """The effects of a case, scaled to their gaps; none that no machine can have."""
+    effects = [scaled(case.seed, name, gap, designs(case.design)) for name, gap in case.wanted]
+    return [e for e in effects if possible(e)]
 
 
 def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:

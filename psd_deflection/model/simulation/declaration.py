@@ -53,7 +53,8 @@ class EffectParameter:
 
     ``kind``: an ``amplitude`` switches the effect on; ``coupled`` means nothing while the amplitudes
     are nominal; a ``phase`` (rad) belongs to the amplitude that ``partner`` names; a ``shape`` also
-    means nothing while they are, and ``grid`` says where to look; a ``choice`` takes the values of
+    means nothing while they are, and ``grid`` says where to look (for an amplitude: from where too, if a fit is far
+    off); a ``choice`` takes the values of
     ``choices``. A rig may have one such effect for each value of an ``each`` choice (one for each
     PSD), otherwise one.
 

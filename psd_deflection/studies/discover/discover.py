@@ -46,7 +46,7 @@ from psd_deflection.studies.discover.search.trials import FAR, far
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST, RIG_NUMBERS, SETUP, mistakes
-from psd_deflection.studies.discover.setup.hung import levels, times, told
+from psd_deflection.studies.discover.setup.hung import levels, ringing_on, times, told, unseen
 from psd_deflection.studies.discover.setup.redundant import PART, STAGES, excess, fourth_reading, visible
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
@@ -222,6 +222,21 @@ def hung(problem: Problem) -> Problem:
     ws, fit = workspace_of(problem.comparison), problem.fit
     if not ws.free_loads:
         return problem
+    ws, fit = _in_turns(ws, fit)
+    null = refit(ws, ())
+    fit = fit if fit.effects else null
+    found = problem.search.at(ws)
+    found.dropped = {}
+    p, delta_bic, delta_chi2 = found.weigh(null, fit)
+    others = [found.alternatives(null, fit, i, delta_chi2[i]) for i in range(len(fit.effects))]
+    result = replace(
+        problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others
+    )
+    return replace(problem, search=found, result=result, fit=fit, null=null)
+
+
+def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
+    """The free loads as ``fit`` asks for, and the sizes of its effects beside them, in turns."""
     gap = ws.gap(fit.difference)
     for _ in range(MOST_SETTLED):
         # Loads and times are found to first order: at the sizes as they are, then the sizes beside them.
@@ -234,16 +249,7 @@ def hung(problem: Problem) -> Problem:
         ws, fit = turned, better
         if gap > SETTLED * left or gap < AT_FLOOR * ws.floor():
             break
-    null = refit(ws, ())
-    fit = fit if fit.effects else null
-    found = problem.search.at(ws)
-    found.dropped = {}
-    p, delta_bic, delta_chi2 = found.weigh(null, fit)
-    others = [found.alternatives(null, fit, i, delta_chi2[i]) for i in range(len(fit.effects))]
-    result = replace(
-        problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others
-    )
-    return replace(problem, search=found, result=result, fit=fit, null=null)
+    return ws, fit
 
 
 def _settled(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
@@ -274,7 +280,30 @@ SEARCH = (search, hung, weigh, settled)
 
 
 def searched(problem: Problem) -> Problem:
-    """The search with its verdict: with the loads as noted, or free if they were noted wrong."""
+    """The search with its verdict: with the loads as noted, or free if they were noted wrong. If much remains, with the
+    ringing free that outlasts what is left out.
+    """
+    problem = _searched(problem)
+    ws, effects = workspace_of(problem.comparison), problem.result.fit.effects
+    if ws.gap(problem.fit.difference) < UNSAID * ws.floor():
+        return problem
+    ringing = [d for i, o in enumerate(ws.observations) for d in ringing_on(o, i, [*ws.base, *effects])]
+    if not ringing:
+        return problem
+    problem.progress('how the link rang on after what is left out')
+    # What rings on is all that is seen of loads that were hung in what is left out.
+    seen = [d for d in ws.directions if not unseen(ws, d)]
+    free = ws.freed((*seen, *ringing), effects)
+    begun = refit(free, effects, 12)
+    # Else the noise beside it would be that of a link that does not ring as it did.
+    free, begun = _in_turns(free, begun)
+    other = replace(problem, search=problem.search.at(free), fit=begun, null=refit(free, ()))
+    for step in (partial(search, begun=begun), *SEARCH[1:]):
+        other = step(other)
+    return other if other.comparison.gap(other.fit.difference) < UNSAID * ws.floor() else problem
+
+
+def _searched(problem: Problem) -> Problem:
     machine = rig_of(problem)
     if machine.recorded.fourth is not None and machine.recorded.fourth.acquits and _follows_nothing(problem):
         # No detector is at fault, and nothing that is known: the loads are asked before the search spends on stand-ins.

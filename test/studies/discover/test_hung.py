@@ -10,6 +10,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
@@ -20,10 +21,13 @@ from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.fit import refit
-from psd_deflection.studies.discover.search.free import moved
+from psd_deflection.studies.discover.search.free import LoadDirection, ZeroDirection, moved
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.hung import ringing_on, unseen
 from psd_deflection.studies.discover.setup.redundant import excess
+from psd_deflection.studies.loads.noted_times import MendedNote
+from psd_deflection.studies.loads.steps import applied
 
 RIG = load_rig()
 LEVELS = np.array(
@@ -396,3 +400,63 @@ def test_free_times_are_settled_again_if_an_effect_beside_which_they_were_does_n
     # If all effects hold, they were settled beside these.
     same = replace(dropped, result=SearchResult(fit, fit))
     assert settled(same) is same
+
+
+@pytest.mark.statistics
+def test_a_link_that_rings_on_through_loads_applied_slowly_has_its_damping() -> None:
+    """What rings outlasts what is left out, and a search begins far from it."""
+    t = np.arange(len(HUNG)) / 1000.0
+    acting = np.tile(LEVELS[0], (len(HUNG), 1))
+    for number, took in enumerate((0.67, 1.17, 0.36, 1.08, 0.62, 0.9, 1.23), start=1):
+        share = applied(t, number * DWELL / 1000.0, took, 1e-3)
+        acting += share[:, None] * (LEVELS[number] - LEVELS[number - 1])
+    dynamics = {'dynamics__bending_damping_ratio': 0.028, 'dynamics__torsion_damping_ratio': 4e-4}
+    found = searched(read(acting, **dynamics), HUNG)
+    assert [f.name for f in found.setup] == ['load_ramp'] * 7
+    assert [e.active.effect.name for e in found.effects] == ['damping']
+    assert found.effects[0].active.values['torsion_ratio'] == pytest.approx(4e-4, abs=2e-5)
+    assert (found.verdict, found.unknown) == ('effects_found', ())
+    assert found.floors < 1.1
+
+
+def test_what_rings_on_is_free_after_what_is_left_out_in_the_modes_that_decay_more_slowly() -> None:
+    volts = np.zeros((2000, 6))
+    volts[500:900] = np.nan
+    volts[1990:] = np.nan
+    volts[100:1900, 0] = np.nan
+    o = Observation('x', RIG, volts, np.zeros((2000, 3)))
+
+    def pulses(bending: float, torsion: float) -> list[tuple[int, int]]:
+        lighter = make_active('damping', {'bending_ratio': bending, 'torsion_ratio': torsion}, 'test')
+        free = ringing_on(o, 0, [lighter])
+        assert all(d.swings and float(d.change.sum()) == 1.0 for d in free)
+        return [tuple(np.argwhere(d.change)[0].tolist()) for d in free]
+
+    stated = RIG.dynamics.bending_damping_ratio, RIG.dynamics.torsion_damping_ratio
+    assert pulses(0.51 * stated[0], 0.51 * stated[1]) == []
+    # A quarter of a period of 21 Hz apart, and of 14 Hz.
+    assert pulses(stated[0], 0.49 * stated[1]) == [(899, 2), (887, 2)]
+    assert pulses(0.49 * stated[0], stated[1]) == [(899, 0), (881, 0), (899, 1), (881, 1)]
+
+
+def test_a_motion_that_nobody_noted_changes_no_load_that_was() -> None:
+    ws = Workspace([Observation('x', RIG, read(HUNG), HUNG)])
+    change = np.zeros_like(HUNG)
+    change[7000, 0] = 1.0
+    swings = LoadDirection(0, change, 1.0, 'x', 0, swings=True)
+    (o,) = ws._loaded([(swings, 2.0), (swings, 1.0)]).observations
+    np.testing.assert_array_equal(o.loads, HUNG)
+    np.testing.assert_array_equal(o.acting - o.loads, 3.0 * change)
+    assert ws._loaded([(replace(swings, swings=False), 2.0)]).observations[0].loads[7000, 0] == HUNG[7000, 0] + 2.0
+
+
+def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> None:
+    volts = read(HUNG)
+    volts[7900:9000] = np.nan
+    volts[3900:4100, 0] = np.nan
+    ws = Workspace([Observation('x', RIG, volts, HUNG)])
+    nothing = np.zeros_like(HUNG)
+    notes = [MendedNote(i, (0.0, 0.0, 0.0), t, t, 0.0) for i, t in enumerate((4.0, 8.0, 12.0, 40.0), start=1)]
+    assert [unseen(ws, LoadDirection(0, nothing, 1.0, n, 0)) for n in notes] == [False, True, False, False]
+    assert not unseen(ws, LoadDirection(0, nothing, 1.0, 'x', 0))
+    assert not unseen(ws, ZeroDirection(0, 0, 1e-6))

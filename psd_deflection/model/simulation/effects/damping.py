@@ -7,6 +7,9 @@ import math
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter, Values
 from psd_deflection.model.simulation.physics import Physics
 
+RINGS_ON = (3e-4, 1e-3, 3e-3)
+"""Ratios at which a mode still moves when the next load is hung."""
+
 
 def _configure(physics: Physics, values: Values) -> None:
     if not math.isnan(values['bending_ratio']):
@@ -31,6 +34,7 @@ EFFECT = Effect(
             1e-3,
             'damping ratio of ΔX and ΔY',
             nominal=math.nan,
+            grid=RINGS_ON,
             of_rig='bending_damping_ratio',
         ),
         EffectParameter(
@@ -41,6 +45,7 @@ EFFECT = Effect(
             1e-3,
             'damping ratio of θ',
             nominal=math.nan,
+            grid=RINGS_ON,
             of_rig='torsion_damping_ratio',
         ),
     ),

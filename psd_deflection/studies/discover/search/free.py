@@ -27,6 +27,7 @@ class LoadDirection:
     axis: int
     exact: Callable[[Sequence[float]], FloatArray] | None = None
     sizes: tuple[float, ...] = ()
+    swings: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,16 +50,16 @@ class ZeroDirection:
 Direction = LoadDirection | ZeroDirection
 
 
-def added(more: Sequence[tuple[Direction, float]]) -> list[tuple[int, FloatArray]]:
-    """Recordings, and what so much ``more`` adds to the loads (n, 3) of each."""
+def added(more: Sequence[tuple[Direction, float]]) -> list[tuple[int, FloatArray, bool]]:
+    """Recordings, what so much ``more`` adds to the loads (n, 3) of each, and whether that is a motion nobody noted."""
     sizes, out = _sizes(more), []
     for d, size in more:
         if isinstance(d, LoadDirection):
             if d.exact is None:
-                out.append((d.recording, size * d.change))
+                out.append((d.recording, size * d.change, d.swings))
             elif (now := sizes.pop(id(d.of), None)) is not None:
                 # The end of a ramp moves by its start and by its time: the two are no sum.
-                out.append((d.recording, d.exact(now) - d.exact(d.sizes)))
+                out.append((d.recording, d.exact(now) - d.exact(d.sizes), d.swings))
     return out
 
 

@@ -138,7 +138,26 @@ class Trials:
         fits = [refit(self.workspace, s, iterations=3) for s in starts]
         fits.sort(key=self.bic)
         full = [refit(self.workspace, f.effects, iterations=iterations) for f in fits[:keep]]
-        return min(full, key=self.bic, default=None)
+        best = min(full, key=self.bic, default=None)
+        return best if best is None else self._elsewhere(best, iterations)
+
+    def _elsewhere(self, fit: Fit, iterations: int) -> Fit:
+        """``fit``, or a better one from elsewhere: a link that rings on cannot be reached from one that does not."""
+        ws = self.workspace
+        if not far(fit):
+            return fit
+        starts = [
+            [ActiveEffect(a.effect, {**a.values, p.name: value}) if a is moved else a for a in fit.effects]
+            for moved in fit.effects
+            for p in moved.effect.parameters
+            if p.kind == 'amplitude' and not moved.effect.finite
+            for value in p.grid
+        ]
+        losses = [ws.loss(ws.residual([*ws.base, *fit.nuisance, *start])[0]) for start in starts]
+        if not losses or min(losses) >= fit.chi2:
+            return fit
+        other = refit(ws, starts[int(np.argmin(losses))], iterations, fit.nuisance)
+        return min(fit, other, key=self.bic)
 
     def passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
         """Whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""

@@ -202,15 +202,27 @@ class Workspace(Comparison):
     def _loaded(self, more: Sequence[tuple[Direction, float]]) -> Self:
         """With the loads changed."""
         out = self
-        for recording, change in added(more):
-            out = out.loaded(recording, out.observations[recording].loads + change)
+        for recording, change, swings in added(more):
+            if swings:
+                out = out._swung(recording, change)
+            else:
+                out = out.loaded(recording, out.observations[recording].loads + change)
         return out
 
     def loaded(self, recording: int, loads: FloatArray) -> Self:
         """With other ``loads`` (n, 3) N, N, N m of one recording."""
+        o = self.observations[recording]
+        return self._with(recording, dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed()))
+
+    def _swung(self, recording: int, more: FloatArray) -> Self:
+        """With ``more`` (n, 3) N, N, N m of what swung in one recording."""
+        o = self.observations[recording]
+        swing = more if o.swing is None else o.swing + more
+        return self._with(recording, dataclasses.replace(o, swing=swing, digest=o.digest or o.hashed()))
+
+    def _with(self, recording: int, observation: Observation) -> Self:
         observations = list(self.observations)
-        o = observations[recording]
-        observations[recording] = dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed())
+        observations[recording] = observation
         return self.replaced(observations=tuple(observations))
 
     @property

@@ -12,12 +12,16 @@ from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.model.simulation.physics import Physics
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.check.judges import note_finding
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.search.free import LoadDirection
+from psd_deflection.studies.discover.search.free import Direction, LoadDirection
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.load_cell import MeasuredLoad
 from psd_deflection.studies.loads.noted_times import MendedNote, shifted
@@ -28,10 +32,17 @@ FREE_MOMENTS = 40.0
 """How far fitted times may be off: 10 samples, in the quarters of one by which they are shifted."""
 FREE = 100.0
 """N or N m: standard deviation of a load that nobody knows."""
+PULSE = 1000.0
+"""N or N m: standard deviation of a load that acts for one sample; it makes a link of 14 Hz ring as 90 N do."""
+LONGER = 0.5
+"""A mode rings longer than the rig file says if it decays at less than this share of that rate."""
+RINGING = 'ringing after what is left out'
 TELLING = 4.0
 """Standard deviations by which a load that is told differs from the noted one."""
 LEAST_TOLD = (0.02, 0.02, 0.01)
 """N, N, N m: a smaller difference is not told."""
+
+BoolArray = npt.NDArray[np.bool_]
 
 
 def times(o: Observation, recording: int) -> list[Plateau]:
@@ -88,6 +99,41 @@ def of_plateau(o: Observation, recording: int, plateau: Plateau | MeasuredLoad, 
         more[plateau.first : plateau.last, axis] = 1.0
         out.append(LoadDirection(recording, more, float(sd[axis]), plateau, axis))
     return out
+
+
+def ringing_on(o: Observation, recording: int, effects: Sequence[ActiveEffect]) -> list[LoadDirection]:
+    """How the link rang when each stretch ended that is left out, of the modes that keep their energy longer with
+    ``effects`` than the rig file says: the stretch ends when the link of the rig file is at rest. Two pulses of a load,
+    a quarter of a period of its mode apart, give the mode any speed and place.
+    """
+    stated, now = (_decays(ForwardModel(o.rig, e).physics) for e in ((), effects))
+    there: BoolArray = np.any(np.isfinite(o.volts), axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([True], there)).astype(np.int8)))
+    out = []
+    # A stretch that ends with the recording is followed by nothing.
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=False):
+        for axis, ((_, usual), (frequency, decay)) in enumerate(zip(stated, now, strict=True)):
+            for before in (1, 1 + round(0.25 / (frequency * o.period))):
+                if decay < LONGER * usual and last - before >= first:
+                    change = np.zeros_like(o.loads)
+                    change[last - before, axis] = 1.0
+                    out.append(LoadDirection(recording, change, PULSE, RINGING, axis, swings=True))
+    return out
+
+
+def unseen(ws: Workspace, direction: Direction) -> bool:
+    """Whether it is the time of a load that was hung in what is left out."""
+    if not isinstance(direction, LoadDirection) or not isinstance(direction.of, MendedNote):
+        return False
+    o = ws.observations[direction.recording]
+    at = min(round(direction.of.hung / o.period), len(o.volts) - 1)
+    return bool(np.isnan(o.volts[at]).all())
+
+
+def _decays(p: Physics) -> list[tuple[float, float]]:
+    """Frequency, Hz, of the mode of each load, and 1/s by which it decays, in units of a turn."""
+    bending, torsion = p.bending_frequency, p.torsion_frequency
+    return [*[(bending, bending * p.bending_damping_ratio)] * 2, (torsion, torsion * p.torsion_damping_ratio)]
 
 
 def told(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding]:
