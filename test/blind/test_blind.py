@@ -76,16 +76,6 @@ def test_times_that_leave_the_noise_are_kept_beside_an_effect_that_is_far_from_l
     assert found.floors < 1.05
 
 
-@pytest.mark.statistics
-def test_a_torsion_that_never_rests_is_named_though_the_search_begins_far_from_it() -> None:
-    """A fit ended at 0.109 and called the rest unknown."""
-    case = next(c for c in cases_by_hand(67000, 60) if c.key == 'hand-slow-67050-damping')
-    answer, found = run.answer(case, [{'name': 'damping', 'bending_ratio': 0.11588468, 'torsion_ratio': 0.0}])
-    assert [e['name'] for e in answer['effects']] == ['damping']
-    assert found.effects[0].values['torsion_ratio'] < 1e-4
-    assert (answer['verdict'], answer['unknown']) == ('effects_found', [])
-
-
 def test_no_case_has_an_effect_that_no_machine_can_have() -> None:
     """Loads that are applied slowly show little of a second mode."""
     by_key = {c.key: c for c in cases_by_hand(68000, 110)}

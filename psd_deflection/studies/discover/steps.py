@@ -14,11 +14,12 @@ import numpy as np
 
 from psd_deflection.studies.discover.problem import Machine, Problem, Progress, Step
 from psd_deflection.studies.discover.search.coincidence import coincidences
+from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldout_tables
 from psd_deflection.studies.discover.search.remainder import Remainder, remainder_of
 from psd_deflection.studies.discover.search.search import Search
-from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, unphysical
+from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, by_its_size, unphysical
 from psd_deflection.studies.discover.search.weighing import (
     EQUIVALENT,
     EQUIVALENT_BIC,
@@ -95,7 +96,7 @@ def accepted(problem: Problem) -> Problem:
             if (
                 not gain.holds
                 or unphysical(ws, fit, i)
-                or found.library_p(chi2, len(columns)) > ws.p_accept
+                or found.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
                 or bic <= BIC_ACCEPT
             ):
                 fails.append((bic, i))
@@ -103,6 +104,11 @@ def accepted(problem: Problem) -> Problem:
         if not fails:
             return problem
         problem = without_one(problem, min(fails)[1], 'fails the joint rule')
+
+
+def _gain(ws: Comparison, fit: Fit, index: int, chi2: float) -> float:
+    """What effect ``index`` explains: the ``chi2`` that is lost without it, or less if its size says less."""
+    return chi2 if ws.open_level else min(chi2, by_its_size(ws, fit, index))
 
 
 def credible(problem: Problem) -> Problem:

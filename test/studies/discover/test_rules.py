@@ -45,6 +45,7 @@ from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.trials import by_its_size
 from psd_deflection.studies.discover.search.weighing import tied, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.noise import (
@@ -319,6 +320,32 @@ def test_an_effect_is_named_from_stated_limits_on(gain: float, penalty: float, l
     weighed = after.result
     assert len(after.heldout) == len(weighed.p) == len(weighed.delta_bic) == len(weighed.delta_chi2) == named
     assert bool(search.trace) == (not named)
+
+
+@pytest.mark.parametrize(
+    ('weaker', 'open_level', 'named'), [(1.0, False, True), (0.1, False, False), (0.1, True, True)]
+)
+def test_an_effect_whose_size_may_be_none_is_not_named_whatever_is_lost_without_it(
+    monkeypatch: pytest.MonkeyPatch, weaker: float, open_level: bool, named: bool
+) -> None:
+    """As if something that is free beside it could take nearly all of its place."""
+    shown = pictures(A, ('a', 'y'))
+    plant = Plant(shown, without_noise((shown[A], 200.0), (shown['a', 'y'], 100.0)))
+    monkeypatch.setattr(plant, 'open_level', open_level)
+    search = search_of(plant)
+    result = result_of(search, [active('a', x=0.0, y=0.0)])
+    fit = dataclasses.replace(result.fit, jacobian=weaker * result.fit.jacobian)
+    lost = result.null.chi2 - fit.chi2
+    assert by_its_size(plant, fit, 0) == pytest.approx(weaker**2 * lost, rel=1e-3)
+    after = accepted(problem_of(search, dataclasses.replace(result, fit=fit)))
+    assert bool(after.fit.effects) is named
+
+
+def test_where_the_size_of_none_is_no_number_what_is_lost_without_it_decides() -> None:
+    endless = EffectParameter('x', 'V', -1.0, 1.0, 1e-3, '', nominal=math.inf)
+    plant = Plant(pictures(A), noise())
+    active = ActiveEffect(dataclasses.replace(effect('a', 'x'), parameters=(endless,)), {'x': 0.0})
+    assert by_its_size(plant, refit(plant, [active]), 0) == math.inf
 
 
 @pytest.mark.parametrize(('cases', 'named'), [(range(8), True), ((0, 4), False)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Self
 
@@ -59,6 +60,22 @@ def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
         ):
             return True
     return not on
+
+
+def by_its_size(workspace: Comparison, fit: Fit, index: int) -> float:
+    """Chi-square by which the size of effect ``index`` of ``fit`` is another than none, by its own covariance.
+
+    Infinite if the size of none is no number. What is free beside it may take its place; a refit
+    without it, in which that stays as it is, says too much for it then.
+    """
+    effect, columns = fit.effects[index].effect, fit.columns_of(index)
+    sizes = [j for j in columns if effect.parameter(fit.free[j][1]).kind in ('amplitude', 'coupled')]
+    names = [fit.free[j][1] for j in sizes]
+    off = np.array([effect.parameter(n).off(workspace.physics) for n in names])
+    apart = np.array([fit.effects[index].values[n] for n in names]) - off
+    if not np.isfinite(apart).all():
+        return math.inf
+    return float(apart @ np.linalg.pinv(fit.covariance()[np.ix_(sizes, sizes)], hermitian=True) @ apart)
 
 
 def counted(fit: Fit) -> str:
