@@ -147,11 +147,12 @@ ROOMS: Mapping[str, Room] = {
             'test/studies/discover/test_discover.py -k stripped or refined or coarse or imagined',
             'test/studies/discover/test_planning.py -k loop or words or every_proposal or pieces',
             'test/studies/discover/test_setup.py -k put_right or other_unit or at_its or outliers or stuck',
+            'test/studies/discover/test_hung.py -k what_rings_on or nobody_noted_changes or is_unseen or settled_again',
         ),
         leave=('psd_deflection/studies/discover/report.py',),
         slow=tuple(
             f'test/studies/discover/test_{n}.py'
-            for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings')
+            for n in ('discover', 'plants', 'planning', 'setup', 'laws', 'readings', 'hung')
         ),
     ),
     'link': Room(

@@ -293,6 +293,31 @@ def test_what_an_effect_weighs_is_the_chi_square_that_is_lost_without_it() -> No
     assert result.p == pytest.approx(want, rel=1e-3)
 
 
+class Basins(Plant):
+    """Its only size moves the picture by ``x**3 - 0.75 x``: from below 0 a fit ends at the top at -0.5."""
+
+    def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+        self.tally.count += 1
+        return [
+            sum((a.values['x'] ** 3 - 0.75 * a.values['x']) * self.pictures[A] for a in effects) + np.zeros((6, FINE))
+        ]
+
+
+@pytest.mark.parametrize(
+    ('grid', 'size', 'found'),
+    # Of no use are a start that leaves more, and any if little is left.
+    [((), 1.0, -0.5), ((1.05,), 1.0, 1.1), ((0.6, 1.05, 0.9), 1.0, 1.1), ((0.6,), 1.0, -0.5), ((1.05,), 0.01, -0.5)],
+)
+def test_a_fit_that_is_far_off_is_tried_from_elsewhere(grid: tuple[float, ...], size: float, found: float) -> None:
+    shown = {A: size * pictures(A)[A]}
+    search = search_of(Basins(shown, (1.1**3 - 0.75 * 1.1) * shown[A]))
+    parameter = EffectParameter('x', 'V', -2.0, 2.0, 1e-2, '', grid=grid)
+    start = ActiveEffect(dataclasses.replace(effect('a', 'x'), parameters=(parameter,)), {'x': -0.6})
+    best = search.best_of([[start]], 1, 30)
+    assert best is not None
+    assert best.effects[0].values['x'] == pytest.approx(found, abs=0.01)
+
+
 # The rules by which an effect is named.
 
 
