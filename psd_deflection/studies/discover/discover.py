@@ -46,7 +46,7 @@ from psd_deflection.studies.discover.search.trials import FAR, far
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST, RIG_NUMBERS, SETUP, mistakes
-from psd_deflection.studies.discover.setup.hung import levels, ringing_on, times, told, unseen
+from psd_deflection.studies.discover.setup.hung import directions, levels, ringing_on, times, told, unseen
 from psd_deflection.studies.discover.setup.redundant import PART, STAGES, excess, fourth_reading, visible
 from psd_deflection.studies.discover.setup.setup import likely_jumps, noise_of, said
 from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
@@ -310,17 +310,18 @@ def _searched(problem: Problem) -> Problem:
         freed = _freed(problem)
         if freed is not None and freed.comparison.gap(freed.fit.difference) < UNSAID * freed.comparison.floor():
             return _as_noted(problem, freed)
+    asked = _freed(problem, maybe_rounded=True) if _rounded_beside_one(problem) else None
+    if asked is not None and _rounded(asked):
+        return _as_noted(problem, asked)
     for step in SEARCH:
         problem = step(problem)
-    freed = _freed(problem)
+    freed = _freed(problem, had=asked)
     before = problem.comparison.gap(problem.fit.difference)
     if freed is not None and freed.comparison.gap(freed.fit.difference) < CLOSED * before:
         return _as_noted(problem, freed)
     # A detector at fault may move the dots by more than rounded loads move the plate.
-    freed = _freed(problem, maybe_rounded=True) if freed is None else None
-    if freed is None or freed.comparison.gap(freed.fit.difference) >= UNSAID * freed.comparison.floor():
-        return problem
-    return _as_noted(problem, freed) if _rounded(freed) else problem
+    freed = _freed(problem, maybe_rounded=True) if freed is None and asked is None else None
+    return _as_noted(problem, freed) if freed is not None and _rounded(freed) else problem
 
 
 def _as_noted(problem: Problem, freed: Problem) -> Problem:
@@ -349,17 +350,48 @@ def _follows_nothing(problem: Problem) -> bool:
         if best is None:
             break
         columns += problem.search.screen.columns_of(best.candidate)
-    if not columns:
-        return True
+    return not columns or _left(ws, fit, columns) > max(FOLLOWS * gap, FREED_FROM * ws.floor())
+
+
+def _left(ws: Comparison, fit: Fit, columns: Sequence[FloatArray]) -> float:
+    """The gap that ``columns`` (D,), whitened, leave of ``fit``, to first order."""
     moved = np.column_stack(columns)
     left = fit.residual - moved @ np.linalg.lstsq(moved, fit.residual, rcond=1e-9)[0]
-    linear = [d + c for d, c in zip(fit.difference, ws.unwhitened(left - fit.residual), strict=True)]
-    return ws.gap(linear) > max(FOLLOWS * gap, FREED_FROM * ws.floor())
+    return ws.gap([d + c for d, c in zip(fit.difference, ws.unwhitened(left - fit.residual), strict=True)])
+
+
+def _rounded_beside_one(problem: Problem) -> bool:
+    """Whether one effect leaves little of the gap beside loads that may be rounded, and much alone, to first order."""
+    ws, fit = workspace_of(problem.comparison), problem.fit
+    gap = ws.gap(fit.difference)
+    if gap < FREED_FROM * ws.floor():
+        return False
+    hung = []
+    for i, (o, difference) in enumerate(zip(ws.observations, fit.difference, strict=True)):
+        asked = levels(ws, i, difference, times(o, i))
+        if not may_be_rounded(asked):
+            return False
+        hung += [p for p in asked.plateaus if np.any(p.noted != 0.0)]
+    free = ws.freed((*ws.directions, *directions(ws, hung))).free
+    loads = [] if free is None else [*free.rows]
+    alone, beside = (_left(ws, fit, [*known, *_best_beside(problem, known)]) for known in ([], loads))
+    return beside < FOLLOWS * gap and beside < CLOSED * alone
+
+
+def _best_beside(problem: Problem, columns: Sequence[FloatArray]) -> list[FloatArray]:
+    """The signatures of the effect that explains most beside ``columns`` (D,), whitened."""
+    screen, known = problem.search.screen, np.column_stack(columns) if columns else None
+    return screen.columns_of(max(screen.score(problem.fit.residual, known), key=lambda s: s.gain).candidate)
 
 
 def _rounded(problem: Problem) -> bool:
-    """Whether the loads of ``problem``, which were free, are the noted ones before they were rounded."""
-    observations, free = workspace_of(problem.comparison).observations, rig_of(problem).recorded.wrong
+    """Whether the loads of ``problem``, which were free, leave next to nothing and are the noted ones before they were
+    rounded.
+    """
+    ws, free = workspace_of(problem.comparison), rig_of(problem).recorded.wrong
+    if ws.gap(problem.fit.difference) >= UNSAID * ws.floor():
+        return False
+    observations = ws.observations
     own = [[p for p in free if p.recording == i] for i in range(len(observations))]
     return all(
         rounded(np.array([p.noted for p in listed]), np.array([p.of(o.loads) for p in listed]))
@@ -367,11 +399,11 @@ def _rounded(problem: Problem) -> bool:
     )
 
 
-def _freed(problem: Problem, *, maybe_rounded: bool = False) -> Problem | None:
+def _freed(problem: Problem, *, maybe_rounded: bool = False, had: Problem | None = None) -> Problem | None:
     """If much remains: the search beside free loads, what hung with every load that was noted free.
 
     None if little remains, or if no loads, constant between changes, would leave next to nothing. ``maybe_rounded``:
-    of loads in whole steps whatever other loads would leave.
+    of loads in whole steps whatever other loads would leave. ``had``: this search, if it was made before.
     """
     machine, ws = rig_of(problem), workspace_of(problem.comparison)
     if ws.gap(problem.fit.difference) < FREED_FROM * ws.floor():
@@ -390,6 +422,8 @@ def _freed(problem: Problem, *, maybe_rounded: bool = False) -> Problem | None:
             loads[p.first : p.last] += more
         wrong += [p for p, _ in own]
         observations.append(dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed()))
+    if had is not None:
+        return had
     problem.progress('what hung instead of what was noted')
     recorded = replace(machine.recorded, observations=tuple(observations), wrong=tuple(wrong))
     recorded = replace(recorded, stated_gap=recorded.stated_gap or problem.gap_before)

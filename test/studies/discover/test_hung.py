@@ -103,6 +103,7 @@ def test_rounded_loads_are_told_beside_a_beam_that_drifts_by_more_than_they_move
     assert found.effects[0].active.values['rate_x'] == pytest.approx(5e-6, rel=2e-3)
     assert found.verdict == 'effects_found'
     assert found.floors < 1.05
+    assert found.simulations <= 600
 
 
 @pytest.mark.statistics
@@ -460,3 +461,12 @@ def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> No
     assert [unseen(ws, LoadDirection(0, nothing, 1.0, n, 0)) for n in notes] == [False, True, False, False]
     assert not unseen(ws, LoadDirection(0, nothing, 1.0, 'x', 0))
     assert not unseen(ws, ZeroDirection(0, 0, 1e-6))
+
+
+@pytest.mark.statistics
+def test_two_effects_under_loads_in_whole_steps_are_no_rounded_loads() -> None:
+    """One of them moves the plate as a load does. Whether loads were rounded is asked first, at no search's expense."""
+    two = {**TURNED, 'effects__f__name': 'load_direction', 'effects__f__angle': 0.02}
+    found = searched(read(HUNG, **two), HUNG)
+    assert {e.active.effect.name for e in found.effects} == {'sensor_rotation', 'load_direction'}
+    assert (found.verdict, found.setup) == ('effects_found', ())

@@ -159,8 +159,8 @@ def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_said
     plant = Plant(shown, without_noise(*((shown[n, 'x'], 900.0) for n in names)) + noise())
     whole = ran(searching(plant, shown, names))
     assert (named(whole.fit), whole.limits) == (list(names), ())
-    # The fit of no effect is one simulation; after the first effect there are more than two.
-    for budget, effects in ((1, 0), (2, 1)):
+    # The fit of no effect was before the search; after the first effect there is more than one simulation.
+    for budget, effects in ((0, 0), (1, 1)):
         monkeypatch.setattr(plant, 'budget', budget)
         found = ran(searching(plant, shown, names))
         assert len(found.fit.effects) == effects
@@ -211,6 +211,15 @@ def test_a_model_of_two_effects_may_cost_twice_as_much(monkeypatch: pytest.Monke
     plant.tally.count = 0
     monkeypatch.setattr(plant, 'budget', budget)
     assert named(ran(searching(plant, shown, 'abc')).fit) == ['a', 'b', 'c']
+
+
+def test_what_another_search_has_cost_ends_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = pictures(A)
+    plant = Plant(shown, without_noise((shown[A], 900.0)) + noise())
+    monkeypatch.setattr(plant, 'budget', 50)
+    search, null = searching(plant, shown, 'a'), refit(plant, ())
+    plant.tally.count += 1000
+    assert named(search.run(null)[1].fit) == ['a']
 
 
 def test_noise_estimated_beside_a_large_effect_hides_no_small_one() -> None:

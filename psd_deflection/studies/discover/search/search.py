@@ -68,6 +68,7 @@ class Search(Trials):
         """
         out = copy.copy(self)
         out.trace, out.dropped = [], {}
+        out.count_anew()
         return out, out.searched(null, begun)
 
     def searched(self, null: Fit, begun: Fit | None = None) -> SearchResult:

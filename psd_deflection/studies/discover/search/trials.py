@@ -110,8 +110,10 @@ class Trials:
         self.workspace = workspace
         self._make_screen = screen
         self._progress = progress
-        self._begun = workspace.simulations
+        begun = workspace.simulations
         self.screen = screen(workspace, None)
+        self._signatures = workspace.simulations - begun
+        self._begun = begun
         self.penalty = float(np.log(workspace.effective_size()))
         self.trace: list[str] = []
         self.dropped: dict[int, tuple[Fit, list[Fit]]] = {}
@@ -120,6 +122,10 @@ class Trials:
     def spent(self) -> int:
         """Forward simulations of this search."""
         return self.workspace.simulations - self._begun
+
+    def count_anew(self) -> None:
+        """Count only simulations from now on, and those of its signatures: not what another search has cost."""
+        self._begun = self.workspace.simulations - self._signatures
 
     def budget_of(self, fit: Fit) -> int:
         """Forward simulations that a model of this many effects may cost."""
