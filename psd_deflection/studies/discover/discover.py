@@ -394,7 +394,7 @@ def _rounded(problem: Problem) -> bool:
     observations = ws.observations
     own = [[p for p in free if p.recording == i] for i in range(len(observations))]
     return all(
-        rounded(np.array([p.noted for p in listed]), np.array([p.of(o.loads) for p in listed]))
+        rounded(*(np.array(of).reshape(-1, 3) for of in ([p.noted for p in listed], [p.of(o.loads) for p in listed])))
         for o, listed in zip(observations, own, strict=True)
     )
 

@@ -131,7 +131,7 @@ class PlateauLoads:
     @property
     def noted(self) -> FloatArray:
         """(k, 3) N, N, N m."""
-        return np.array([p.noted for p in self.plateaus])
+        return np.array([p.noted for p in self.plateaus]).reshape(-1, 3)
 
     @property
     def sizes(self) -> FloatArray:
@@ -322,7 +322,7 @@ def may_be_rounded(found: PlateauLoads) -> bool:
 
 def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
     """Whether the loads that ``found`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
-    return rounded(found.noted, np.array([p.of(loads) for p in found.plateaus]) + found.more)
+    return rounded(found.noted, np.array([p.of(loads) for p in found.plateaus]).reshape(-1, 3) + found.more)
 
 
 def rounded(noted: FloatArray, hung: FloatArray) -> bool:

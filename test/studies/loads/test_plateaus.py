@@ -605,6 +605,15 @@ def test_loads_are_rounded_if_each_is_off_by_half_a_step_at_most_and_by_a_tenth_
     assert not rounded((0.70, 0.5, 0.9), (0.5, -0.70, 0.9))
 
 
+def test_loads_of_which_none_held_were_not_rounded() -> None:
+    """As those of a sweep."""
+    none = np.zeros((0, 3))
+    found = plateaus.PlateauLoads((), none, none.T, none.T, none[:, 0], none[:, 0], np.ones(3), 4)
+    assert found.noted.shape == (0, 3)
+    assert not plateaus.may_be_rounded(found)
+    assert not plateaus.all_free(found, none)
+
+
 def test_loads_may_be_rounded_if_they_are_in_whole_steps_and_off_by_less_than_one() -> None:
     noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
 
