@@ -53,8 +53,7 @@ class EffectParameter:
 
     ``kind``: an ``amplitude`` switches the effect on; ``coupled`` means nothing while the amplitudes
     are nominal; a ``phase`` (rad) belongs to the amplitude that ``partner`` names; a ``shape`` also
-    means nothing while they are, and ``grid`` says where to look (for an amplitude: from where too, if a fit is far
-    off); a ``choice`` takes the values of
+    means nothing while they are, and ``grid`` says where to look; a ``choice`` takes the values of
     ``choices``. A rig may have one such effect for each value of an ``each`` choice (one for each
     PSD), otherwise one.
 
@@ -65,6 +64,7 @@ class EffectParameter:
     without the sums. ``of_psd``: the PSD that it is
     of, from 3: a rig without that PSD has no such parameter. ``power``: the
     signature of a ``finite`` effect grows with this power of the parameter; 0: it does not grow in proportion.
+    ``starts``: values of an amplitude from which a fit that is far off is tried, too.
     """
 
     name: str
@@ -77,6 +77,7 @@ class EffectParameter:
     kind: Kind = 'amplitude'
     choices: tuple[int, ...] = ()
     grid: tuple[float, ...] = ()
+    starts: tuple[float, ...] = ()
     propose: Proposal | Callable[[Values], Proposal] = ''
     power: int = 0
     partner: str = ''

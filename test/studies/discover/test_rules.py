@@ -304,14 +304,14 @@ class Basins(Plant):
 
 
 @pytest.mark.parametrize(
-    ('grid', 'size', 'found'),
+    ('starts', 'size', 'found'),
     # Of no use are a start that leaves more, and any if little is left.
     [((), 1.0, -0.5), ((1.05,), 1.0, 1.1), ((0.6, 1.05, 0.9), 1.0, 1.1), ((0.6,), 1.0, -0.5), ((1.05,), 0.01, -0.5)],
 )
-def test_a_fit_that_is_far_off_is_tried_from_elsewhere(grid: tuple[float, ...], size: float, found: float) -> None:
+def test_a_fit_that_is_far_off_is_tried_from_elsewhere(starts: tuple[float, ...], size: float, found: float) -> None:
     shown = {A: size * pictures(A)[A]}
     search = search_of(Basins(shown, (1.1**3 - 0.75 * 1.1) * shown[A]))
-    parameter = EffectParameter('x', 'V', -2.0, 2.0, 1e-2, '', grid=grid)
+    parameter = EffectParameter('x', 'V', -2.0, 2.0, 1e-2, '', starts=starts)
     start = ActiveEffect(dataclasses.replace(effect('a', 'x'), parameters=(parameter,)), {'x': -0.6})
     best = search.best_of([[start]], 1, 30)
     assert best is not None

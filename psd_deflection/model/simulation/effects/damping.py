@@ -34,7 +34,7 @@ EFFECT = Effect(
             1e-3,
             'damping ratio of ΔX and ΔY',
             nominal=math.nan,
-            grid=RINGS_ON,
+            starts=RINGS_ON,
             of_rig='bending_damping_ratio',
         ),
         EffectParameter(
@@ -45,7 +45,7 @@ EFFECT = Effect(
             1e-3,
             'damping ratio of θ',
             nominal=math.nan,
-            grid=RINGS_ON,
+            starts=RINGS_ON,
             of_rig='torsion_damping_ratio',
         ),
     ),

@@ -173,8 +173,7 @@ class Trials:
             [ActiveEffect(a.effect, {**a.values, p.name: value}) if a is moved else a for a in fit.effects]
             for moved in fit.effects
             for p in moved.effect.parameters
-            if p.kind == 'amplitude' and not moved.effect.finite
-            for value in p.grid
+            for value in p.starts
         ]
         losses = [ws.loss(ws.residual([*ws.base, *fit.nuisance, *start])[0]) for start in starts]
         if not losses or min(losses) >= fit.chi2:
