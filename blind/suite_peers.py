@@ -21,8 +21,8 @@ import numpy as np
 from blind import score
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.discover.discover import RecordedRig
 from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.studies.discover.recorded_rig import RecordedRig
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import SETUP

@@ -26,10 +26,10 @@ from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.discover.discover import RecordedRig
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import TELLS_APART
 from psd_deflection.studies.discover.problem import Problem, Progress
+from psd_deflection.studies.discover.recorded_rig import RecordedRig
 from psd_deflection.studies.discover.search.screen import Screen, solve_seen
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.signatures import Candidate

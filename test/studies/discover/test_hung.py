@@ -15,10 +15,12 @@ from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.rig.parameter_files import flat_parameters
-from psd_deflection.studies.discover.discover import RecordedRig, discover, settled
+from psd_deflection.studies.discover.discover import discover
+from psd_deflection.studies.discover.free_loads import settled
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
+from psd_deflection.studies.discover.recorded_rig import RecordedRig
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.free import LoadDirection, ZeroDirection, moved
