@@ -116,6 +116,7 @@ SHORTER = {
     r'^python -m blind\.coverage --vibration \d+$': '--vibration 1',
     r'^python -m blind\.thesis$': '--parts 1',
     r'^python -m blind\.clock$': '--runs 5',
+    r'^python -m blind\.given$': '--hand 2 --only hand-late',
     r'^python -m blind\.watch\b': '--runs 1 --hours 0',
     r'^python -m blind\.modes$': '--rigs 3',
     r'^python -m blind\.motion\b': '--runs 1 --seconds 4',
