@@ -12,6 +12,7 @@ import numpy as np
 from psd_deflection.base.charts import SMALL, Chart, Colour, Panel, Series, TimeAxis
 from psd_deflection.base.drawings import CELL, BarColumn, Bars, Drawing, Matrix
 from psd_deflection.base.pages import table
+from psd_deflection.model.simulation.declaration import EffectParameter
 from psd_deflection.model.simulation.laws import VARIABLES
 from psd_deflection.records import FloatArray, channel_names
 from psd_deflection.studies.check.result import Finding
@@ -164,6 +165,11 @@ def _where_matrix(discovery: Conclusion) -> tuple[str, Matrix]:
     return f'<p class=quiet>{html.escape(words)}</p>', drawn
 
 
+def _sd_text(parameter: EffectParameter, sd: float) -> str:
+    """``sd``; of one that exceeds the range of the parameter, that these recordings do not determine it."""
+    return 'not determined' if sd > parameter.maximum - parameter.minimum else f'{sd:.2g}'
+
+
 def _effect_section(effect: NamedEffect) -> str:
     e = effect.active.effect
     out = [
@@ -173,7 +179,7 @@ def _effect_section(effect: NamedEffect) -> str:
     rows: list[tuple[object, ...]] = []
     for name, v in parameters_of(effect).items():
         if isinstance(v, dict):
-            rows.append((name, f'{v["value"]:.6g}', f'{v["sd"]:.2g}', v['unit']))
+            rows.append((name, f'{v["value"]:.6g}', _sd_text(e.parameter(name), v['sd']), v['unit']))
         else:
             rows.append((name, v, '', ''))
     out.append(table(('parameter', 'value', '± sd', 'unit'), rows))
@@ -288,7 +294,7 @@ def _nuisance(discovery: Conclusion) -> list[str]:
     if not discovery.nuisance:
         return []
     fitted = [
-        (a.label, name, f'{a.values[name]:.6g}', f'{sd:.2g}', a.effect.parameter(name).unit)
+        (a.label, name, f'{a.values[name]:.6g}', _sd_text(a.effect.parameter(name), sd), a.effect.parameter(name).unit)
         for a, sds in discovery.nuisance
         for name, sd in sds.items()
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -112,6 +113,16 @@ def test_a_small_effect_behind_a_large_one_is_named_too(large: dict[str, object]
     tree = found.tree()
     assert tree['remaining'] == {'rms': found.gap_after, 'floors': found.floors}
     assert f'{found.floors:.2f} times what noise alone leaves' in found.sentence
+
+
+def test_a_size_that_the_recordings_leave_open_has_no_number_for_its_sd(rotated: Discovery) -> None:
+    without = replace(rotated, effects=tuple(replace(e, sd={'angle': 14000.0}) for e in rotated.effects))
+    known, left_open = (
+        ''.join(map(str, s.parts)) for found in (rotated, without) for s in found.sections() if s.title == 'What'
+    )
+    assert 'not determined' not in known
+    assert 'not determined' in left_open
+    assert '1.4e+04' not in left_open
 
 
 def test_where_is_the_turned_sensor(rotated: Discovery) -> None:
