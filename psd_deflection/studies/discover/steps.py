@@ -24,6 +24,7 @@ from psd_deflection.studies.discover.search.weighing import (
     EQUIVALENT,
     EQUIVALENT_BIC,
     RIVAL_BIC,
+    UNSAID,
     NamedEffect,
     Rival,
     heldout_per_channel_of,
@@ -119,10 +120,28 @@ def credible(problem: Problem) -> Problem:
         steps = problem.machine.seen(problem.comparison)
         if not problem.fit.effects or not unknown_of(left, 0.0, steps=steps):
             return problem
+        closer = _of_another_shape(problem)
+        if closer is not problem:
+            problem = closer
+            continue
         weakest = int(np.argmin(problem.result.delta_chi2))
         if problem.result.delta_chi2[weakest] >= left.excess:
             return problem
         problem = without_one(problem, weakest, 'explains less than what remains unknown')
+
+
+def _of_another_shape(problem: Problem) -> Problem:
+    """``problem`` with a better fit of its effects, if another shape explains the little that this one leaves."""
+    ws, found, fit, result = problem.comparison, problem.search, problem.fit, problem.result
+    if ws.open_level or ws.gap(fit.difference) > UNSAID * ws.floor():
+        return problem
+    better = found.of_another_shape(fit)
+    if better is fit:
+        return problem
+    found.say('another shape: ' + ', '.join(a.label for a in better.effects))
+    p, delta_bic, delta_chi2 = found.weigh(result.null, better)
+    result = replace(result, fit=better, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2)
+    return accepted(replace(problem, fit=better, result=result))
 
 
 def without_one(problem: Problem, index: int, why: str) -> Problem:

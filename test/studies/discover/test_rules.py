@@ -758,6 +758,38 @@ def test_effects_weaker_than_the_unknown_remainder_are_taken_out() -> None:
         assert len(after.heldout) == len(kept) == len(after.result.delta_chi2)
 
 
+class Valleys(Plant):
+    """It gives way and hums for a moment: over the frequency its loss has side valleys, in which a fit ends."""
+
+    def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
+        self.tally.count += 1
+        t = np.arange(FINE) / FINE
+        out = np.zeros((6, FINE))
+        for a in effects:
+            out += a.values['x'] * (1.0 + (t < 0.1) * np.sin(2.0 * np.pi * a.values['f'] * t))
+        return [out]
+
+
+@pytest.mark.parametrize(
+    ('size', 'excess', 'open_level', 'found'),
+    # It stays if nothing is unknown, if nobody knows the noise, and if much remains.
+    [(2e-3, 100.0, False, 40.0), (2e-3, 0.0, False, 52.0), (2e-3, 100.0, True, 52.0), (4e-3, 100.0, False, 52.0)],
+)
+def test_a_fit_in_a_side_valley_is_begun_anew_if_it_leaves_little_that_is_unknown(
+    size: float, excess: float, open_level: bool, found: float
+) -> None:
+    shape = EffectParameter('f', 'Hz', 2.0, 190.0, 0.2, '', kind='shape')
+    hums = effect('a', 'x')
+    hums = dataclasses.replace(hums, parameters=(*hums.parameters, shape))
+    plant = Valleys({}, noise())
+    plant.measured[0] += plant.simulate([ActiveEffect(hums, {'x': size, 'f': 40.0})])[0]
+    search = search_of(plant.replaced(open_level=open_level))
+    result = result_of(search, [ActiveEffect(hums, {'x': 1e-3, 'f': 52.0})])
+    assert result.fit.effects[0].values['f'] == pytest.approx(52.0, abs=1.0)
+    after = credible(problem_of(search, result, [HeldOut(1.0, 1.0)], nowhere(p=0.0, excess=excess)))
+    assert [a.values['f'] for a in after.fit.effects] == pytest.approx([found], abs=1.0)
+
+
 def test_tied_effects_are_told_with_what_they_explain() -> None:
     shown = pictures(A, B)
     size = 200 * SIGMA / np.linalg.norm(shown[A])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Self
@@ -32,6 +33,8 @@ NEAR = 0.1
 MOST_CLOSED = 0.5
 """A change that leaves less than this share of chi-square beyond noise is worth another look at what else holds."""
 TRIALS = 7
+VALLEYS, DEEPEST = 49, 3
+"""Shapes over their whole ranges at which the loss of a fit is looked at again; from so many it is begun anew."""
 
 
 def key_of(active: ActiveEffect) -> tuple[object, ...]:
@@ -93,6 +96,18 @@ def unbound(fit: Fit) -> FloatArray:
     """The Jacobian's columns (D, k) of the parameters that are free to move."""
     keep = [j for j, name in enumerate(fit.free) if name not in fit.at_bound]
     return fit.jacobian[:, keep]
+
+
+def _shapes(workspace: Comparison, active: ActiveEffect) -> list[dict[str, float]]:
+    """Shapes of ``active`` over their whole ranges; none if it has no shape."""
+    shapes = [p for p in active.effect.parameters if p.kind == 'shape']
+    grids = []
+    for p in shapes:
+        low, high = p.bounds(workspace.physics, active.values)
+        between = np.geomspace if low > 0.0 else np.linspace
+        each = round(VALLEYS ** (1.0 / len(shapes)))
+        grids.append([(p.name, float(v)) for v in between(low, high, each + 2)[1:-1]])
+    return [dict(shape) for shape in itertools.product(*grids)] if grids else []
 
 
 class Trials:
@@ -180,6 +195,19 @@ class Trials:
             return fit
         other = refit(ws, starts[int(np.argmin(losses))], iterations, fit.nuisance)
         return min(fit, other, key=self.bic)
+
+    def of_another_shape(self, fit: Fit) -> Fit:
+        """``fit``, or a better one with the shapes of an effect elsewhere: its frequency may be in a side valley."""
+        ws, best = self.workspace, fit
+        for i, moved in enumerate(fit.effects):
+            starts = [
+                [*fit.effects[:i], ActiveEffect(moved.effect, {**moved.values, **shape}), *fit.effects[i + 1 :]]
+                for shape in _shapes(ws, moved)
+            ]
+            losses = [ws.loss(ws.residual([*ws.base, *fit.nuisance, *start])[0]) for start in starts]
+            for k in np.argsort(losses)[:DEEPEST].tolist():
+                best = min(best, refit(ws, starts[k], 12, fit.nuisance), key=self.bic)
+        return best if self.bic(best) < self.bic(fit) - BIC_ACCEPT else fit
 
     def passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
         """Whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
