@@ -108,16 +108,16 @@ def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | N
         z_b, z_t = e['bending_ratio'], e['torsion_ratio']
     give_b = length**3 / (3.0 * stiff_b)
     give_t = length / stiff_t
-    for e in find(effects, 'tip_mass'):
-        # k = m w^2 of the massless spring with the mass that gives 14 Hz.
-        k = 1.0 / give_b
-        m = k / (2.0 * math.pi * f_b) ** 2
-        f_b = math.sqrt(k / (m + e['mass'])) / (2.0 * math.pi)
     for e in find(effects, 'clamp_bending_compliance'):
         # Root moment F L turns the root by c F L; the tip moves L times that.
         give_b = give_b + e['compliance'] * length * length
     for e in find(effects, 'clamp_torsional_compliance'):
         give_t = give_t + e['compliance']
+    for e in find(effects, 'tip_mass'):
+        # k = m w^2 of the massless spring with the mass that gives 14 Hz.
+        k = 1.0 / give_b
+        m = k / (2.0 * math.pi * f_b) ** 2
+        f_b = math.sqrt(k / (m + e['mass'])) / (2.0 * math.pi)
     static = f * np.array([give_b, give_b, give_t])
     for e in find(effects, 'alien_cubic_spring'):
         static = static * (1.0 + e['size'] * (static / np.array([1e-3, 1e-3, 1e-2])) ** 2)
@@ -167,11 +167,11 @@ def motion(loads: Array, length: float, effects: Sequence[Spec], warm: Array | N
         if axis < 2:
             for e in find(effects, 'second_bending_mode'):
                 a3, b3 = _oscillator(e['frequency'], e['damping_ratio'])
-                ringing = _march(a3, b3, static[:, axis : axis + 1], np.zeros(2))[:, 0]
+                ringing = _march(a3, b3, total[:, None], np.zeros(2))[:, 0]
                 if int(e['shares']) == 1:
                     ringing = ringing - states[:, 0]
                 elif int(e['shares']) == 2:
-                    ringing = ringing - np.repeat(static[:, axis], FINER)
+                    ringing = ringing - np.repeat(total, FINER)
                 pose[:, axis] += e['gain'] * ringing
     for e in find(effects, 'alien_soft_mode'):
         # A spring that stiffens with speed: not in the catalogue.

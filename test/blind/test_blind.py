@@ -10,8 +10,22 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from blind import generator, run, score, suite_peers
-from blind.cases import MISTAKES, NOISES, Case, all_cases, cases_by_hand, designs, gap_of, scaled, short_cases
+from blind.cases import (
+    DRAWS,
+    EFFECTS,
+    MISTAKES,
+    NOISES,
+    Case,
+    all_cases,
+    cases_by_hand,
+    designs,
+    gap_of,
+    scaled,
+    short_cases,
+)
+from blind.generator import LINK
 from blind.mistakes import observed
+from psd_deflection.model.simulation.catalogue import make_active, sort_effects
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
@@ -39,6 +53,21 @@ def test_both_generators_show_the_nominal_rig_alike() -> None:
     ours = ForwardModel(load_rig(), []).run(g.loads, g.temperature).volts.T
     # A thousandth of the noise: what differs is the step of the second integrator.
     assert np.abs(g.clean([]) - ours).max() < 2e-6
+
+
+@pytest.mark.statistics
+@pytest.mark.parametrize('first', sorted(LINK & set(EFFECTS)))
+def test_both_generators_show_two_effects_of_the_link_alike(first: str) -> None:
+    """What each reads of the other: the mass the clamp, the second mode the creep. A case of several has both."""
+    (g,) = designs('one')
+    for second in sorted(LINK & set(EFFECTS)):
+        if second < first:
+            continue
+        pair = [{'name': n, **DRAWS[n](np.random.default_rng(3), 10.0)} for n in {first, second}]
+        shown = [make_active(e['name'], {k: v for k, v in e.items() if k != 'name'}, 'test') for e in pair]
+        ours = ForwardModel(load_rig(), sort_effects(shown)).run(g.loads, g.temperature).volts.T
+        moved = np.abs(ours - g.clean([])).max()
+        assert np.abs(g.clean(pair) - ours).max() < 2e-6 + 1e-5 * moved, second
 
 
 @pytest.mark.repeatable

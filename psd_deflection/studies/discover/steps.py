@@ -36,6 +36,9 @@ from psd_deflection.studies.discover.search.weighing import (
     waterfall_of,
 )
 
+LITTLE = 0.1
+"""A fit that leaves less than this share of the gap is of the right effects, or nearly so."""
+
 
 def solve(
     machine: Machine, steps: Sequence[Step], seed: int, progress: Progress, rng: np.random.Generator | None = None
@@ -133,7 +136,8 @@ def credible(problem: Problem) -> Problem:
 def _of_another_shape(problem: Problem) -> Problem:
     """``problem`` with a better fit of its effects, if another shape explains the little that this one leaves."""
     ws, found, fit, result = problem.comparison, problem.search, problem.fit, problem.result
-    if ws.open_level or ws.gap(fit.difference) > UNSAID * ws.floor():
+    little = max(UNSAID * ws.floor(), LITTLE * problem.gap_before)
+    if ws.open_level or ws.gap(fit.difference) > little:
         return problem
     better = found.of_another_shape(fit)
     if better is fit:

@@ -353,6 +353,21 @@ def test_a_memory_is_seen_in_more_than_400_samples_at_rest(n: int, known: bool) 
     assert all(model.coloured) == any(model.coloured) == known
 
 
+@pytest.mark.parametrize(('clear', 'others'), [(3, False), (4, True)])
+def test_a_weak_memory_counts_if_most_of_the_channels_have_a_clear_one(clear: int, others: bool) -> None:
+    """Amplifiers are alike. The weak one is 3.1 standard errors, a clear one 23; without any it is less than 2."""
+    n = 6000
+    o = Observation('x', RIG, np.zeros((n, 6)), np.zeros((n, 3)))
+    rows = resting(n, 1e-3, 0.04, 5)
+    rows[:, :clear] = resting(n, 1e-3, 0.3)[:, :clear]
+    rows[:, 5] = resting(n, 1e-3)[:, 5]
+    for c in range(6):
+        correlation = float(rows[1:, c] @ rows[:-1, c] / (rows[:, c] @ rows[:, c])) * math.sqrt(n)
+        assert correlation > 5.0 if c < clear else abs(correlation) < 2.0 if c == 5 else 2.0 < correlation < 5.0
+    model = estimate_noise(o, rows, 4, np.full(6, 1e-6))
+    assert model.coloured == tuple(c < clear or (others and c < 5) for c in range(6))
+
+
 def test_a_memory_of_noise_is_that_of_its_process() -> None:
     """x = 0.7 x- + e: the deviation of means over 4 and over 20 samples, and how well one block tells the next."""
     n, memory = 30_000, 0.7

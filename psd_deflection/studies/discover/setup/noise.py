@@ -28,6 +28,10 @@ BoolArray = npt.NDArray[np.bool_]
 ORDER = 2
 SIGNIFICANT = 5.0
 """Lag-1 correlation, in its standard errors, from which the noise is taken as coloured."""
+LIKE_MOST = 2.0
+"""The same, if that of most channels is: their amplifiers are alike."""
+LEAST_REST = 400
+"""More samples at rest than this tell a memory."""
 MOVING = 10.0
 """Coloured noise is at most so many times what neighbouring samples show; beyond, what is taken for rest moves."""
 
@@ -200,6 +204,26 @@ def _between_neighbours(values: FloatArray) -> float:
     return float(1.4826 * np.median(np.abs(bent)) / np.sqrt(6.0)) if len(bent) else 0.0
 
 
+def _memories(residual: FloatArray, rest: list[slice], floors: FloatArray) -> list[FloatArray | None]:
+    """Of each channel the autocovariance (ORDER + 1,) V² of what rests; None if its noise has no memory."""
+    pooled, significant = np.zeros((residual.shape[1], ORDER + 1)), np.zeros(residual.shape[1])
+    for c, floor in enumerate(floors.tolist()):
+        there = np.isfinite(residual[:, c])
+        filled = _filled(residual[:, c], there)
+        # A residual is 0 where a sample is missing, so that each product counts two that were measured.
+        rows = [strip_lines(detrend(filled[w])) * there[w] for w in rest]
+        seen = [there[w].astype(np.float64) for w in rest]
+        count = int(sum(s.sum() for s in seen))
+        if count > LEAST_REST:
+            pooled[c] = [_product(rows, k) / max(_product(seen, k), 1.0) for k in range(ORDER + 1)]
+            if pooled[c, 0] > floor**2:
+                significant[c] = abs(pooled[c, 1]) / pooled[c, 0] * np.sqrt(count)
+    most = 2 * int(np.sum(significant > SIGNIFICANT)) > len(significant)
+    return [
+        row if s > (LIKE_MOST if most else SIGNIFICANT) else None for row, s in zip(pooled, significant, strict=True)
+    ]
+
+
 def estimate_noise(observation: Observation, residual: FloatArray, fine: int, floors: FloatArray) -> NoiseModel:
     """Noise of ``residual`` (n, 3P) V, measured minus simulated; NaN where samples are lost.
 
@@ -212,6 +236,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
     sigma, innovation, block_sigma = np.empty(channels), np.empty(channels), np.empty(channels)
     ar = np.zeros((channels, ORDER))
     coloured = []
+    memories = _memories(residual, long, floors)
     frequency = np.asarray(np.fft.rfftfreq(n, 1.0), dtype=np.float64)
     upper = frequency > 0.2
     for c in range(channels):
@@ -221,17 +246,11 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
         level = _level(power[upper])
         floor = float(floors[c])
         white = max(np.sqrt(level), floor)
-        # A residual is 0 where a sample is missing, so that each product counts two that were measured.
-        rest = [strip_lines(detrend(filled[w])) * there[w] for w in long]
-        seen = [there[w].astype(np.float64) for w in long]
-        count = int(sum(s.sum() for s in seen))
         acov = np.zeros(max(block, (ORDER + 1) * fine))
         acov[0] = white**2
-        memory = False
-        if count > 400:
-            pooled = np.array([_product(rest, k) / max(_product(seen, k), 1.0) for k in range(ORDER + 1)])
-            memory = pooled[0] > floor**2 and abs(pooled[1]) > SIGNIFICANT / np.sqrt(count) * pooled[0]
-        if memory:
+        pooled = memories[c]
+        memory = pooled is not None
+        if pooled is not None:
             phi = solve_toeplitz(pooled[:-1], pooled[1:])
             scale = _level(power[upper] / _ar_density(phi, frequency[upper]))
             density = scale * _ar_density(phi, np.linspace(0.0, 1.0, 4096, endpoint=False))
