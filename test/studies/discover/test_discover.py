@@ -125,6 +125,32 @@ def test_a_size_that_the_recordings_leave_open_has_no_number_for_its_sd(rotated:
     assert '1.4e+04' not in left_open
 
 
+@pytest.mark.statistics
+@pytest.mark.parametrize(
+    'hidden',
+    [
+        # Beside a heavy tip all signatures are others than beside the rig as it is described.
+        {'tip_mass': {'mass': 0.036}, 'amplifier_lag': {'time_constant': 2e-5}},
+        # Of three axes of the clamp the right one shows beside the others only.
+        {
+            'mount_tilt': {'x': 7.7e-6, 'y': -1.4e-5},
+            'clamp_friction': {'axis': 1, 'width': 7.37e-6},
+            'thermal_drift': {'psd': 1, 'x': 7.6e-7, 'y': -1.3e-6},
+            'channel_skew': {'psd': 2, 'delay': 4.57e-5},
+        },
+    ],
+)
+def test_what_shows_beside_the_others_only_is_found(hidden: dict[str, dict[str, float]]) -> None:
+    values = {f'effects.{name}.{k}': v for name, e in hidden.items() for k, v in {'name': name, **e}.items()}
+    found = discover([observe(replace_values(RIG, values))], RIG, bank=BANK)
+    assert found.verdict == 'effects_found'
+    assert {e.active.effect.name for e in found.effects} == set(hidden)
+    for e in found.effects:
+        for p in e.active.effect.parameters:
+            if p.kind == 'choice':
+                assert e.active.values[p.name] == hidden[e.active.effect.name][p.name]
+
+
 def test_where_is_the_turned_sensor(rotated: Discovery) -> None:
     assert {c.channel for c in rotated.where.cells[:5]} <= {'x2', 'y2'}
     assert rotated.where.cells[0].p < 1e-6

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.limits import Limit, beyond, further_terms
 from psd_deflection.studies.discover.search.mistakes import RINGING, RINGS, frequency, mistake
-from psd_deflection.studies.discover.search.screen import Score
+from psd_deflection.studies.discover.search.screen import Score, promising
 from psd_deflection.studies.discover.search.trials import (
     MOST_CLOSED,
     NEAR,
@@ -35,6 +35,9 @@ PAIRS_OPEN = 15
 """Pairs that are refitted: more of them if the model of the machine is rough and its signatures are not small."""
 SWAP_REACH = 0.6
 """An alternative is refitted only if it explains this fraction of what the named effect explains."""
+
+CHOICES = 2
+"""Other choices of an effect that are refitted in its place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +62,8 @@ class Search(Trials):
     """One search over one comparison, which :meth:`run` gives with the noise that it estimated last."""
 
     _stopped = ''
+    _beside: tuple[str, ...] = ()
+    """Labels of the effects beside which the signatures are, as far as known."""
 
     def run(self, null: Fit, begun: Fit | None = None) -> tuple[Search, SearchResult]:
         """The search after it ran, and what it found: perhaps that nothing is missing. ``null``: the fit of no effect;
@@ -80,7 +85,7 @@ class Search(Trials):
         if self._much_closer(grown, current):
             # Beside the wrong effect nothing held that holds beside the right one; what that cost is not counted.
             self._begun = self.workspace.simulations
-            self.screen = self.screen_beside(current)
+            self._screen_anew(current)
             null, more = self._settled(null, current)
             if len(more.effects) > len(current.effects):
                 current, others = self.swap(null, more)
@@ -127,6 +132,8 @@ class Search(Trials):
                 self._stopped = f'{self.budget_of(current)} simulations for {counted(current)}'
                 break
             better = self._added(null, current)
+            if better is None and self._looks_closer(current):
+                better = self._added(null, current)
             if better is None:
                 break
             null, current = self.settle(null, better)
@@ -135,10 +142,24 @@ class Search(Trials):
                 current = self.renoise(current)
                 null = refit(self.workspace, ())
             if (far(current) or self.workspace.open_level) and self.spent < self.budget_of(current):
-                self.screen = self.screen_beside(current)
+                self._screen_anew(current)
             if len(current.effects) == 2 and self.spent < self.budget_of(current):
                 current = self._try_pairs(null, current)
         return null, current
+
+    def _screen_anew(self, current: Fit) -> None:
+        """With the signatures beside ``current``."""
+        self._beside = tuple(a.label for a in current.effects)
+        self.screen = self.screen_beside(current)
+
+    def _looks_closer(self, current: Fit) -> bool:
+        """Whether the signatures are new: those beside ``current``, if it leaves something that no other explains."""
+        known = self._beside == tuple(a.label for a in current.effects)
+        little = current.chi2 <= (1.0 + NEAR) * self.workspace.size
+        if known or little or self.spent >= self.budget_of(current):
+            return False
+        self._screen_anew(current)
+        return True
 
     def _added(self, null: Fit, current: Fit) -> Fit | None:
         """``current`` with the effect that passes best, or a better pair; None if nothing passes."""
@@ -176,7 +197,7 @@ class Search(Trials):
             for i in range(len(current.effects)):
                 fits = self.alternatives(null, current, i, gains[i])
                 others.append(fits)
-                best = min([best, *fits], key=self.bic)
+                best = min([best, *fits, *self._other_choices(null, current, i)], key=self.bic)
             spent = self.spent > 1.5 * self.budget_of(current)
             if swaps == 2 or spent or self.bic(best) > self.bic(current) - 2.0:
                 break
@@ -247,6 +268,25 @@ class Search(Trials):
             if name not in taken and s.gain >= least:
                 best.setdefault(name, s)
         return sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self.budget_of(current) else 2]
+
+    def _other_choices(self, null: Fit, current: Fit, index: int) -> list[Fit]:
+        """Refits with other choices of effect ``index``, another axis or PSD, if ``current`` leaves something."""
+        if self.workspace.open_level or current.chi2 <= (1.0 + NEAR) * self.workspace.size:
+            return []
+        named, rest = current.effects[index], [a for j, a in enumerate(current.effects) if j != index]
+        taken = {slot(a.effect, a.values) for a in rest}
+        without = self.without_each(current, null)[index]
+        others = [
+            s
+            for s in self.screen.score(without.residual, unbound(without))
+            if s.candidate.effect.name == named.effect.name
+            and s.candidate.variant != key_of(named)
+            and slot(s.candidate.effect, s.candidate.start) not in taken
+        ]
+        best = promising(others, self.penalty, SWAP_REACH, CHOICES)
+        return [
+            refit(self.workspace, [*rest, s.candidate.from_coefficients(s.coefficients)], iterations=8) for s in best
+        ]
 
     def alternatives(self, null: Fit, current: Fit, index: int, gain: float) -> list[Fit]:
         """Refits with effect ``index`` swapped for each plausible alternative, best first.
