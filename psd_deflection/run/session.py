@@ -58,6 +58,8 @@ MARKS_A_SECOND = 10
 
 _SIMULATED = {True: 'on which weights hang in turn', False: 'at rest: it hangs the loads that are noted'}
 
+ANEW = 'take the zero anew without load, or estimates will be of what was added to it'
+
 LONGEST_LINE = 2000
 """Characters of a line that is said."""
 
@@ -104,6 +106,7 @@ class Session:
         self.listeners: list[Say] = [say]
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
+        self._zeroed_ns = 0
         self.refused = Tally()
         self.why_refused: BoundedMap[str, str] = BoundedMap()
         say = self._tell
@@ -286,6 +289,11 @@ class Session:
             record = record._replace(t_ns=self.acquisition.now_ns())
         if isinstance(record, AppliedLoad):
             self.load = record
+            if any(record[1:]) and record.t_ns < self._zeroed_ns:
+                ago_s = (self.acquisition.now_ns() - self._zeroed_ns) / 1e9
+                # Once is enough of a stream of loads.
+                self._zeroed_ns = 0
+                self._tell(f'the load acted already when the zero was taken, {ago_s:.2f} s ago: {ANEW}', WARNING)
             if self._simulated is not None and self.hangs:
                 self._simulated.push(record[1:])
             if self.pipeline.motion_filter is not None:
@@ -430,8 +438,11 @@ class Session:
 
         taken = self.processing.request(change)
         if taken is not None:
+            self._zeroed_ns = self.acquisition.now_ns()
             self._tell(zero_text(self.rig))
             self._keep_zero()
+            if self.load is not None and any(self.load[1:]):
+                self._tell(f'the zero was taken under a load ({load_text(self.load)}): {ANEW}', WARNING)
         return taken
 
     def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:

@@ -72,6 +72,25 @@ def test_no_zero_is_taken_of_a_device_that_is_away(running: Running, device: Scr
         running.session.zero()
 
 
+def test_a_zero_that_was_taken_under_a_load_is_told(running: Running) -> None:
+    session = running.session
+    session.note_load(0.0, -10.0, 0.0)
+    assert session.zero() is not None
+    running.heard('the zero was taken under a load (load noted: Fx 0 N, Fy -10 N, Tz 0 N·m): take the zero anew')
+    # A minute ago it had hung as well: before the zero. Without a load there is nothing to tell.
+    session.load = None
+    session.note_load(0.0, -20.0, 0.0, ago_s=60.0)
+    running.heard('the load acted already when the zero was taken, ')
+    session.note_load(0.0, 0.0, 0.0)
+    assert session.zero() is not None
+    session.note_load(0.0, -30.0, 0.0)
+    session.refuse_input(LOAD, 'the end')
+    told = []
+    while 'refused: the end' not in (text := running.said.get(timeout=WAIT_S)):
+        told.append(text)
+    assert not [text for text in told if 'anew' in text]
+
+
 def test_metrics_count_what_came_was_lost_and_was_refused(running: Running) -> None:
     running.session.refuse_input(LOAD, 'a number is not finite')
     running.session.processing.request(lambda: None)
