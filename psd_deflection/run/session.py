@@ -288,21 +288,24 @@ class Session:
         if record.t_ns == 0:
             record = record._replace(t_ns=self.acquisition.now_ns())
         if isinstance(record, AppliedLoad):
-            self.load = record
-            if any(record[1:]) and record.t_ns < self._zeroed_ns:
-                ago_s = (self.acquisition.now_ns() - self._zeroed_ns) / 1e9
-                # Once is enough of a stream of loads.
-                self._zeroed_ns = 0
-                self._tell(f'the load acted already when the zero was taken, {ago_s:.2f} s ago: {ANEW}', WARNING)
-            if self._simulated is not None and self.hangs:
-                self._simulated.push(record[1:])
-            if self.pipeline.motion_filter is not None:
-                self.processing.later(partial(self._tell_filter, record))
-            if self.watcher is not None:
-                self.processing.later(partial(self.watcher.put, record))
+            self._held(record)
         for sink in self.input_sinks:
             sink.put(record)
         return record
+
+    def _held(self, load: AppliedLoad) -> None:
+        self.load = load
+        if any(load[1:]) and load.t_ns < self._zeroed_ns:
+            ago_s = (self.acquisition.now_ns() - self._zeroed_ns) / 1e9
+            # Once is enough of a stream of loads.
+            self._zeroed_ns = 0
+            self._tell(f'the load acted already when the zero was taken, {ago_s:.2f} s ago: {ANEW}', WARNING)
+        if self._simulated is not None and self.hangs:
+            self._simulated.push(load[1:])
+        if self.pipeline.motion_filter is not None:
+            self.processing.later(partial(self._tell_filter, load))
+        if self.watcher is not None:
+            self.processing.later(partial(self.watcher.put, load))
 
     def _tell_filter(self, load: AppliedLoad) -> None:
         told = self.pipeline.load(load)

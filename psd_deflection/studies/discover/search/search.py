@@ -12,15 +12,20 @@ import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.limits import Limit, beyond, further_terms
 from psd_deflection.studies.discover.search.mistakes import RINGING, RINGS, frequency, mistake
-from psd_deflection.studies.discover.search.screen import Score, promising
+from psd_deflection.studies.discover.search.screen import Score
 from psd_deflection.studies.discover.search.trials import (
+    BIC_ACCEPT,
     MOST_CLOSED,
     NEAR,
     STANDS_IN,
     Trials,
+    by_its_size,
     counted,
     far,
     key_of,
@@ -36,8 +41,8 @@ PAIRS_OPEN = 15
 SWAP_REACH = 0.6
 """An alternative is refitted only if it explains this fraction of what the named effect explains."""
 
-CHOICES = 2
-"""Other choices of an effect that are refitted in its place."""
+CHOICE_REACH = 0.5
+"""Another choice of an effect that is there is tried if it explains this fraction of what the best further one does."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,12 +86,14 @@ class Search(Trials):
         scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
         null, grown = self._settled(null, mistake(self, null, scores) if begun is None else begun)
+        grown = self._without_weak(grown)
         current, others = self.swap(null, grown)
         if self._much_closer(grown, current):
             # Beside the wrong effect nothing held that holds beside the right one; what that cost is not counted.
             self._begun = self.workspace.simulations
             self._screen_anew(current)
             null, more = self._settled(null, current)
+            more = self._without_weak(more)
             if len(more.effects) > len(current.effects):
                 current, others = self.swap(null, more)
         p, delta_bic, delta_chi2 = self.weigh(null, current)
@@ -107,6 +114,22 @@ class Search(Trials):
             # Noise that was estimated beside a large discrepancy may have hidden what is small.
             current = calmer
         return null, current
+
+    def _without_weak(self, current: Fit) -> Fit:
+        """``current`` without effects that explain less than what remains, the weakest first: stand-ins for that.
+
+        What is put in their places is much work for nothing, and the right one may show beside the others alone.
+        """
+        while len(current.effects) > 1 and not self.workspace.open_level:
+            left = current.chi2 - self.workspace.size
+            sizes = [by_its_size(self.workspace, current, i) for i in range(len(current.effects))]
+            weakest = int(np.argmin(sizes))
+            if left <= NEAR * self.workspace.size or sizes[weakest] >= left:
+                break
+            self.say(f'{current.effects[weakest].label} explains less than what remains')
+            rest = [a for i, a in enumerate(current.effects) if i != weakest]
+            current = refit(self.workspace, rest, iterations=6)
+        return current
 
     def _much_closer(self, before: Fit, current: Fit) -> bool:
         """Whether a swap closed most of what was open, and left something."""
@@ -165,11 +188,15 @@ class Search(Trials):
         """``current`` with the effect that passes best, or a better pair; None if nothing passes."""
         ws = self.workspace
         taken = {slot(a.effect, a.values) for a in current.effects}
+        screened = self.screen.score(current.residual, unbound(current))
         scores = [
             s
-            for s in self.screen.score(current.residual, unbound(current))
+            for s in screened
             if slot(s.candidate.effect, s.candidate.start) not in taken and s.candidate.effect.name not in ws.first
         ]
+        chosen = self._chosen_anew(current, screened, max((s.gain for s in scores), default=0.0))
+        if chosen is not None:
+            return chosen
         better = self.further(current, scores)
         passes = better is not None and self.passes(current, better, null)
         if better is not None and passes:
@@ -187,6 +214,28 @@ class Search(Trials):
         holds = better is not current and self.passes(current, better, null)
         return better if holds and not self.stands_in(current, better) else None
 
+    def _chosen_anew(self, current: Fit, screened: Sequence[Score], least: float) -> Fit | None:
+        """``current`` with another choice of one of its effects, another axis of the clamp, if that is the better one.
+
+        ``screened``: what each candidate explains beside it; ``least``: the best of an effect that is not there yet.
+        """
+        if self.workspace.open_level or current.chi2 <= (1.0 + NEAR) * self.workspace.size:
+            return None
+        known, best = {key_of(a) for a in current.effects}, current
+        others = [s for s in screened if s.gain >= CHOICE_REACH * least and s.candidate.variant not in known]
+        for i, active in enumerate(current.effects):
+            place = slot(active.effect, active.values)
+            mine = [s for s in others if self.may_pass(s) and slot(s.candidate.effect, s.candidate.start) == place]
+            for chosen in {s.candidate.variant: s.candidate for s in mine}.values():
+                choices = {p.name: chosen.start[p.name] for p in active.effect.parameters if p.kind == 'choice'}
+                moved = ActiveEffect(active.effect, {**active.values, **choices})
+                rest = [*current.effects[:i], *current.effects[i + 1 :]]
+                best = min(best, refit(self.workspace, [*rest, moved], iterations=8), key=self.bic)
+        if self.bic(best) > self.bic(current) - BIC_ACCEPT:
+            return None
+        self.say(f'choosing {best.effects[-1].label}')
+        return best
+
     def swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
         """Try to replace each effect by its alternatives and keep the better model; at most two rounds."""
         others: list[list[Fit]] = []
@@ -197,7 +246,7 @@ class Search(Trials):
             for i in range(len(current.effects)):
                 fits = self.alternatives(null, current, i, gains[i])
                 others.append(fits)
-                best = min([best, *fits, *self._other_choices(null, current, i)], key=self.bic)
+                best = min([best, *fits], key=self.bic)
             spent = self.spent > 1.5 * self.budget_of(current)
             if swaps == 2 or spent or self.bic(best) > self.bic(current) - 2.0:
                 break
@@ -268,25 +317,6 @@ class Search(Trials):
             if name not in taken and s.gain >= least:
                 best.setdefault(name, s)
         return sorted(best.values(), key=lambda s: -s.gain)[: 8 if self.spent < self.budget_of(current) else 2]
-
-    def _other_choices(self, null: Fit, current: Fit, index: int) -> list[Fit]:
-        """Refits with other choices of effect ``index``, another axis or PSD, if ``current`` leaves something."""
-        if self.workspace.open_level or current.chi2 <= (1.0 + NEAR) * self.workspace.size:
-            return []
-        named, rest = current.effects[index], [a for j, a in enumerate(current.effects) if j != index]
-        taken = {slot(a.effect, a.values) for a in rest}
-        without = self.without_each(current, null)[index]
-        others = [
-            s
-            for s in self.screen.score(without.residual, unbound(without))
-            if s.candidate.effect.name == named.effect.name
-            and s.candidate.variant != key_of(named)
-            and slot(s.candidate.effect, s.candidate.start) not in taken
-        ]
-        best = promising(others, self.penalty, SWAP_REACH, CHOICES)
-        return [
-            refit(self.workspace, [*rest, s.candidate.from_coefficients(s.coefficients)], iterations=8) for s in best
-        ]
 
     def alternatives(self, null: Fit, current: Fit, index: int, gain: float) -> list[Fit]:
         """Refits with effect ``index`` swapped for each plausible alternative, best first.
