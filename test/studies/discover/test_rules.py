@@ -517,6 +517,19 @@ def test_a_search_adds_what_passes_and_nothing_else() -> None:
     assert quiet.fit.effects == ()
 
 
+@pytest.mark.parametrize(('remains', 'kept'), [(200.0, ['a', 'c']), (420.0, ['a', 'c']), (1000.0, ['c'])])
+def test_what_explains_less_than_what_remains_is_dropped_before_others_are_tried_in_its_place(
+    remains: float, kept: list[str]
+) -> None:
+    shown = pictures(A, B, ('c', 'x'))
+    plant = Plant(shown, without_noise((shown[A], 500.0), (shown['c', 'x'], 4000.0), (shown[B], remains)) + noise())
+    found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'c')]
+    search = Search(plant, lambda workspace, _: Screen(workspace, found))
+    begun = refit(plant, [active('c', x=0.0), active('a', x=0.0)])
+    _, result = search.run(refit(plant, ()), begun)
+    assert sorted(a.effect.name for a in result.fit.effects) == kept
+
+
 # Load cases that a fit has not seen.
 
 
