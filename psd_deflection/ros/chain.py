@@ -32,7 +32,8 @@ from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN, HealthReporte
 from psd_deflection.run.fanout import subscribed
 from psd_deflection.run.realtime import Watchdog
 from psd_deflection.run.rig_publisher import RigPublisher
-from psd_deflection.run.session import Session, why_no_zero, zero_text
+from psd_deflection.run.session import Session
+from psd_deflection.run.session_texts import why_no_zero, zero_text
 from psd_deflection.run.signals import Signals, StopRequestedError
 
 NODE_NAME = 'chain'

@@ -32,7 +32,8 @@ from psd_deflection.run.fanout import subscribed
 from psd_deflection.run.monitor.start import Views, start_views
 from psd_deflection.run.realtime import Watchdog
 from psd_deflection.run.rig_publisher import RigPublisher
-from psd_deflection.run.session import Session, why_no_zero, zero_text
+from psd_deflection.run.session import Session
+from psd_deflection.run.session_texts import why_no_zero, zero_text
 from psd_deflection.run.signals import Signals, StopRequestedError
 
 if TYPE_CHECKING:

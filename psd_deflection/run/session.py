@@ -31,6 +31,7 @@ from psd_deflection.run.reading.acquisition import Acquisition
 from psd_deflection.run.realtime import lock_memory
 from psd_deflection.run.recorder import Recorder
 from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.session_texts import ANEW, load_text, mark_text, zero_text
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.run.watcher import Watcher, WatcherWire
 from psd_deflection.run.zero_store import ZeroStore
@@ -58,35 +59,8 @@ MARKS_A_SECOND = 10
 
 _SIMULATED = {True: 'on which weights hang in turn', False: 'at rest: it hangs the loads that are noted'}
 
-ANEW = 'take the zero anew without load, or estimates will be of what was added to it'
-
 LONGEST_LINE = 2000
 """Characters of a line that is said."""
-
-
-def zero_text(rig: Rig) -> str:
-    """The unloaded dots of ``rig``, as one line of text."""
-    zeros = enumerate((psd.zero for psd in rig.psds), start=1)
-    return 'unloaded dots (mm): ' + ', '.join(f'psd_{n} ({x * 1e3:z.4f}, {y * 1e3:z.4f})' for n, (x, y) in zeros)
-
-
-def load_text(load: AppliedLoad, ago_s: float = 0.0) -> str:
-    """A known load, as one line of text."""
-    since = f', since {ago_s:.2f} s ago' if ago_s > 0.0 else ''
-    return f'load noted: Fx {load.fx:.6g} N, Fy {load.fy:.6g} N, Tz {load.tz:.6g} N·m{since}'
-
-
-def mark_text(mark: Mark) -> str:
-    """A mark, as one line of text."""
-    return f'mark: {mark.text}'
-
-
-def why_no_zero(pipeline: Pipeline) -> str:
-    """Why :meth:`Pipeline.zero` took no zero, as text."""
-    if pipeline.zero_refused:
-        return pipeline.zero_refused
-    last = pipeline.last_spots
-    return f'no good block now: {last.reason}' if last is not None and last.reason else 'no good block yet'
 
 
 class Session:

@@ -37,7 +37,7 @@ from psd_deflection.records import (
     TipMotion,
 )
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.run.session import why_no_zero
+from psd_deflection.run.session_texts import why_no_zero
 
 STEP = 10.0 / 32768
 

@@ -30,7 +30,7 @@ from psd_deflection.run.diagnostics import ERROR, OK, WARN
 from psd_deflection.run.monitor.feed import QUEUE_ITEMS, Feed
 from psd_deflection.run.monitor.metrics import Family, of_pipeline
 from psd_deflection.run.monitor.shown import RefusedError
-from psd_deflection.run.session import why_no_zero, zero_text
+from psd_deflection.run.session_texts import why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
 """Longest wait for a pause in a recording, s."""
