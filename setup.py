@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Builds with colcon (ament_python) and with pip from the same tree.
 
 colcon installs console scripts where ``ros2 run`` looks (setup.cfg, ``install_scripts``); pip

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes the golden recordings and the truth beside them: ``make golden``.
 
 The bytes of the simulated device go through the same decoder, clock map, pipeline and bag writer as

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make bench``: the error of the estimates against the simulated truth, beside the lower bound for any method.
 
 The Cramér–Rao bound comes from the dots' own equation (m = R(-theta)(l - d) - c, differentiated by differences) and

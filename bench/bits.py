@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The bits of a recording on other processors: ``make bits``; under a minute on two cores.
 
 The golden recordings with today's defaults are recorded again and replayed in processes that are told to compute as

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make demo-compensate``: a simulated arm of two links with and without compensation and shapers, on one page.
 
 The arm of ``config/two_links.yaml`` takes up a payload, moves, loses its estimates for half a second, and puts the

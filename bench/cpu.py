@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the CPU time of the live node goes: by thread and part of the program, and by kind of native code.
 
     python -m bench.cpu [--seconds 20] [--no-native]

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One flexible link on a joint, in a loop with the product's filter and its damper.
 
 The link is that of the thesis. Its samples, with the rig's noise, go through the pipeline with ``filter: modal``; the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What shapers and active damping leave of a vibration: ``python -m bench.damping``.
 
 Shapers: the arm of ``config/two_links.yaml`` carries 20 N and moves both joints within 0.4 s. Its links ring at 12 Hz.

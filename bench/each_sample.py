@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An estimate of every sample, with other programs beside it: what is lost, what it costs, when it is there.
 
     python -m bench.each_sample [--seconds 600] [--busy 2] [--block 1] [--decimation 20]

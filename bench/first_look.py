@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Times from ``make run`` until the page is served, shows the dots, and the dots move.
 
     python -m bench.first_look [--times 3]

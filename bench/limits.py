@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make bench``, without a live line: frames, replay, conversion, simulation, discover beside peers and limits.
 
     python -m bench.limits [--only frames] [--minutes 10] [--times 5]

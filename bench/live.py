@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make bench``, the live path: its cost beside the minimum that ROS and MCAP allow.
 
 Every figure stands beside a peer's from the same run, as a ratio: machines differ and are shared.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compensator and shaper with the real controllers of ros2_control, on hardware that is mock_components/GenericSystem.
 
   python3 -m bench.mock_hardware

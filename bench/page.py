@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes docs/performance.md, and three rows of README, from bench/results.json and bench/cpu.json.
 
 ``python -m bench.page`` is the last step of ``make bench BENCH=--full``.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The live page left open on a live daemon: its heap every minute (``make page-soak``; PAGE_HOURS=4).
 
 Starts a daemon on the simulated rig (``--no-ros``) and headless Chromium on its page. The heap is read after a

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How many rigs at 1 kHz one process on one core takes without a lost sample: the curve of its CPU time.
 
     python -m bench.rigs [--most 64] [--seconds 10]

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the benchmarks find: rows of ours, peers and limits, measured in turns, kept in ``bench/results.json``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An arm whose links bend under a load at its end: what the compensator and the shaper are tried on.
 
 The links bend as ``chains`` composes them, statically, and swing about that as one damped mode. The joints follow

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The one criterion for whatever moves an arm: no step between two commands is larger than its rate times the time."""
 
 from __future__ import annotations

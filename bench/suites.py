@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The whole test suite on other processors and on busy ones: ``make suites``; about an hour on two idle cores.
 
 Each row is one run of every test, with another kernel of OpenBLAS, fewer of the instructions that numpy knows, fewer

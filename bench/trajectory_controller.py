@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What joint_trajectory_controller does with the trajectories that it gets, on a clock of the caller's.
 
 Its rules, as of ros2_controllers for Jazzy: a stamp of 0 begins when the trajectory arrives, another at that time.

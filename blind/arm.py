@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A two-link flexible arm: a plant for ``discover_in``.
 
 The data are nine steps measured by others (repository basta/quanser-2-dof-serial-flexible-link, MIT licence).

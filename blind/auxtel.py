@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Pointing of an altazimuth telescope, 44 stars of one night: a plant for ``discover_in``.
 
 The data are those of Rubin's auxiliary telescope, 2020-03-14 (technical note TSTN-014, CC-BY-4.0): azimuth and

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Balls that fall from a bridge, filmed: a plant for ``discover_in``.
 
 The data are those of de Silva and others 2020 (repository briandesilva/discovery-of-physics-from-data, MIT licence):

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A telescoping cantilever boom under tip forces, read with a ruler: a plant for ``discover_in``.
 
 The data are measurements by others (repository StanleyWang1/GIRAF, 52 readings at eight lengths). Their nominal model

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings of loads that a person hangs and notes: what hung there, what was noted, and which notes are wrong.
 
 Each design has its own weights and its own times; the name says the kind and the number: ``hand-late-7``.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether calibrate tells the truth: rigs with random misalignments, made by :mod:`blind.misaligned`.
 
     python -m blind.calibration --rigs 200 --jobs 2

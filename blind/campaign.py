@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every campaign shares: its options, its cases over several processes with a bar, and its end."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The cases of the suite: hidden effects, drawn from the case's own seed and scaled to a stated gap.
 
 The gap is the rms over x1 y1 x2 y2 of the block-mean dots, effect minus nominal, both without

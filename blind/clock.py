@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How well ``validate`` tells the offset between two clocks: ``python -m blind.clock --runs 200``.
 
 A link rings after two steps. Two detectors see it at 1 kHz, a camera at 30 frames a second whose clock is

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How often the truth is inside the intervals that are published: ``python -m blind.coverage --help``.
 
 Samples come from :mod:`blind.generator`, with noise that the rig file does not describe; the estimates

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A newcomer's day, by commands alone, on a device that is not ours: ``python -m blind.day [--turn 0.02]``.
 
 The device is a pseudo-terminal with frames made here and the physics of the second generator (:mod:`blind.generator`):

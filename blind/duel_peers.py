@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What other programs, and simple ways of fitting, say of the machines of ``blind.duels``.
 
 A peer that is not installed raises ImportError; the table says so. None of them is needed by this package.

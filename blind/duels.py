@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """discover_in beside other programs and published figures. ``python -m blind.duels [--only silverbox]``.
 
 The machines were measured by others and their data are no part of this repository: they are read from a folder. Each

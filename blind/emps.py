@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A positioning system driven by a voltage (EMPS): a plant for ``discover_in``.
 
 The data are the public benchmark of a drive (nonlinearbenchmark.org; repository wmkouw/NSI-EMPS, MIT licence). The

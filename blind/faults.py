@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One wrong reading after the other, and how far the estimates are off: ``python -m blind.faults``.
 
 Each reading is dead, stuck, or inverted, each PSD's axes are exchanged, under loads of 10 to 50 N.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """discover_in on machines that others measured. ``python -m blind.foreign [boom|emps|arm|auxtel|...]``.
 
 The boom lacks gravity and gives way at its root; the drive lacks its Coulomb friction and its offset; the arm is its

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A second rig simulation, written from docs/simulation.md alone; imports nothing of
 ``psd_deflection.model.simulation``.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Laws that no catalogue has, drawn by chance over stage, variable and form; formulas of their own.
 
 Everything is computed on the generator's fine grid, sample by sample where there is a memory. Nothing is taken from

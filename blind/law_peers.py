@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The drawn laws for other programs that find laws: the same residuals, SINDy (pysindy) and ADCD (adcd).
 
 ``python -m blind.law_peers export FOLDER --first 100 --laws 12`` writes one .npz a law; then, with a Python that has

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Laws beyond the catalogue: ``python -m blind.laws [--laws 12] [--nulls 12] [--first 0]``.
 
 Each law is drawn (:mod:`blind.law_forms`), scaled to a gap of 5 to 30 floors and recorded with noise; discover is given

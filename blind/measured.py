@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the data lie that others measured on their machines; nothing of them is in this repository."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Rigs that are not as their rig file says: every tolerance of docs/calibration.md drawn at once.
 
 The optics are written apart from the package: each leaning beam is intersected with each detector's surface in three

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Mistakes that people make with a rig, put into a recording of the second generator; and faultless oddities."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How well ``identify`` tells the modes of a link: ``python -m blind.modes --rigs 200``.
 
 Each rig has a frequency of 5 to 40 Hz and a damping ratio of 0.003 to 0.06, drawn at random, and noise of 2 µm. Its

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How well the filter of the motion does: ``python -m blind.motion --runs 20``.
 
 A link with the thesis's dimensions is at rest for three seconds. Then its load is switched at random times (steps),

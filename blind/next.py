@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Does ``discover --next`` plan recordings that settle what one recording leaves open? ``make blind-next``.
 
 The second generator hides one effect in a recording of a poor design. Where ``discover`` then says that several effects

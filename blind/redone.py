@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The thesis's experiment redone, with the product's own commands: camera, calibrate, validate, replay.
 
     python -m blind.redone --out build/thesis

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page of :mod:`blind.redone`: figures 5.12 to 5.29 and Table 5.1 of the thesis anew."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draws what a camera sees of the target on the tip plate: the judge of the detector, written apart from it.
 
 Coverage is anti-aliased by area: pixels on a rim are cut in 15 x 15 parts, each of which is followed back through the

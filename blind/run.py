@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run the blind suite: seal the truths, let discover answer, score. ``python -m blind.run --help``.
 
 Truths and thresholds are written and hashed before the first answer; discover is given volts, loads

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Scores of the blind suite: against thresholds that were fixed beforehand, with intervals."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The Silverbox, an electronic circuit that is a mass on a spring that stiffens: a plant for ``discover_in``.
 
 The data are the public benchmark of nonlinearbenchmark.org (Wigren and Schoukens 2013): input and output voltage at

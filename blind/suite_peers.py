@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Other ways of choosing effects, on the cases of the blind suite: ``python -m blind.run --peer stlsq --out DIR``.
 
 A peer gets all that discover's own search begins with: the recordings made ready, what the rig as it is described

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The thesis's own discrepancies, analysed with the simulation. ``python -m blind.thesis``.
 
 Table B1 has an experimental row (60 N on the sidebar: bending 3.38 mm, twist 0.022 rad, point D

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Does the watch see what happens to a rig, and is it silent while nothing does? ``make blind-watch``.
 
 The second generator makes the readings; the pipeline makes the records from them, and the watch reads these. Each run

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // What the theme makes while the page loads, named for screen readers and reachable by keyboard.
 new MutationObserver(() => {
   for (const box of document.querySelectorAll(':is(.md-typeset__scrollwrap, pre > code):not([tabindex])')) box.tabIndex = 0;

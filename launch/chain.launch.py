@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A chain of links: ``ros2 launch psd_deflection chain.launch.py chain:=my_arm.yaml record:=recordings``.
 
 ``/end_effector/deflection``, the topics of each link below its name, and ``/tf`` from the base to the end effector.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The compensator: ``ros2 launch psd_deflection compensator.launch.py urdf:=arm.urdf tip:=tool0 drive:=true``.
 
 It is silent until ``/compensator/enable`` is called. For ``forward_position_controller``::

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The estimator: ``ros2 launch psd_deflection estimator.launch.py port:=/dev/ttyACM0 record:=true``.
 
 Parameters that are not given here come from ``params_file``. Two rigs on one graph::

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The shaper: ``ros2 launch psd_deflection shaper.launch.py params_file:=modes/rig.yaml shaped:=/arm/trajectory``.
 
 Trajectories on ``given`` come out on ``shaped``, which no link rings after.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Converts records to dicts of message fields and back, one file per message; used by rclpy and MCAP.
 
 :data:`TOPICS` says which record goes to which topics; the fields are plain dicts with the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/AccelStamped: acceleration of the link's base, in ``link_base``, without gravity; m/s^2 and rad/s^2."""
 
 from __future__ import annotations

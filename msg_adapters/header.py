@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """std_msgs/Header: a stamp in integer nanoseconds and the frame the numbers are in."""
 
 from __future__ import annotations

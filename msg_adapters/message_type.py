@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A message type: its name, its definition as text and its hash. Each adapter declares its own.
 
 The definitions are kept here as text because ROS need not be installed. A recording carries the

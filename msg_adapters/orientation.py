@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Quaternion of the tip's rotation R = Ry(omega) Rx(phi) Rz(theta), and back."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/PointCloud2: the raw samples of one block, one point per sample.
 
 Little-endian fields in this order: ``seq`` UINT32 (the sample number modulo 2^32), ``dt`` UINT32

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/PointStamped: the block mean of one dot, in its own PSD's axes; m."""
 
 from __future__ import annotations

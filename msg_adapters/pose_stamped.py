@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/PoseStamped: an estimate or a reference measurement of the tip, in ``link_tip_rest``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/PoseWithCovarianceStamped: the primary estimate, the filter's pose or a reference, with covariance."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """std_msgs/String: the rig as JSON, so that a recording of any recorder can be evaluated with it; and marks."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """sensor_msgs/Temperature: degrees Celsius; a variance of 0 says that it is not known."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/TwistStamped: the tip's velocity by the filter, in ``link_tip_rest``; m/s and rad/s."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/Vector3Stamped: one raw sample of one PSD as plain numbers, for plots; x, y and the sum as z, V."""
 
 from __future__ import annotations

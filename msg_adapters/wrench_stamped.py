@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """geometry_msgs/WrenchStamped: a load at the tip centroid, in ``link_tip_rest``; N and N m."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tip deflection and twist of a flexible link from two position sensing detectors.
 
     import psd_deflection as pd

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The records that the pipeline passes on: frozen, with shapes and units.
 
 A sample passes through them in this order: it arrives as counts in a :class:`RawChunk`. Its

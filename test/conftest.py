@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """No test asserts time, so hypothesis does not either; no test sees the effects of who runs it; shared judges."""
 
 import os

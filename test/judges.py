@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The judges: golden answers of an independent audit, and a ray/plane simulator that shares no code."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recorder that joins late: what it hears from then on, written as rosbag2 does, without metadata of ours."""
 
 from __future__ import annotations

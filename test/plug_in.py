@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Installs a made-up package into a folder that this process and those that it starts look into."""
 
 from __future__ import annotations

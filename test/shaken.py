@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``pytest --shaken``: every answer of LAPACK and of the optimisers is off by a last bit, another one at each call.
 
 Which bits LAPACK gives depends on the processor. A test that compares two of its answers exactly passes on the machine

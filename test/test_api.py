@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The functions at the top of the package, and the tables that they give."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The way to a .deb: the rows that rosdep lacks, what bloom says, the line of pip. No network, no root."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The golden recordings of ``bags/``: replayed on every run, held against their truth."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What lives long and can be made to grow by others has a bound.
 
 The rule: in the rooms that run, a map, set, list or queue that an object keeps, and that its code fills with what it

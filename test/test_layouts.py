@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The layouts of Foxglove, PlotJuggler and RViz and the SROS 2 policy name what there is."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Rigs of three and more PSDs from the rig file to the estimate: by truth, with one PSD failing, bit for bit again."""
 
 from __future__ import annotations

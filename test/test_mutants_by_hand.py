@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Each of the mutants made by hand is a change of one line that is there, and Python after it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The table of `make nodes`: no cell is empty, and a failure is seen."""
 
 from __future__ import annotations

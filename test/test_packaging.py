@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a wheel installs is what ``ros2 run`` looks for, and the tables in three places agree."""
 
 from __future__ import annotations
@@ -135,6 +137,24 @@ def test_every_dependency_is_justified() -> None:
     names = {re.split(r'[\[<>=]', line)[0] for line in asked.split()}
     listed = set(re.findall(r'^\| ([\w.-]+) \|', (ROOT / 'docs/dependencies.md').read_text(), re.M))
     assert names == listed - {'package'}
+
+
+def test_every_source_file_names_its_licence() -> None:
+    listed = subprocess.run(
+        ['git', 'ls-files', '*.py', '*.c', '*.h', '*.js', '*.css'],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if listed.returncode:
+        pytest.skip('not a git checkout')
+    sources = [ROOT / name for name in listed.stdout.splitlines() if '/vendor/' not in name]
+    written = [p for p in sources if p.is_file() and p.stat().st_size]
+    assert written
+    assert [
+        str(p) for p in written if 'SPDX-License-Identifier: Apache-2.0\n' not in p.read_text()[:200].replace(' */', '')
+    ] == []
 
 
 def rooms(package: Path) -> set[str]:

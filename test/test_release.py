@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a release must not have is noticed: each sabotage of a copy of the tree is one line of the check."""
 
 from __future__ import annotations

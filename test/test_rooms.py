@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rooms: their number, what their lines allow, and that no class name stands for two things."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A contract of import-linter that lists what each room may import, instead of what it may not.
 
 ``pure`` names the libraries that every module may import. A line of ``rooms`` is

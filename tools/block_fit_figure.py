@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw docs/figures/block_fit.png: what a block gives of a motion. ``python tools/block_fit_figure.py [FILE]``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Headless Chromium with its driver, for the page's tests, pictures and timing."""
 
 from __future__ import annotations

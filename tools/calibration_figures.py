@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes docs/figures/calibrate_1.png to _5.png for docs/calibration.md: ``python -m tools.calibration_figures``.
 
 The five commands are taken from the page and run in a folder of their own; the pictures are those that the commands

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make rerun``: converts recordings for Rerun, reads them with Rerun's own reader, and looks at the viewer's picture.
 
 Poses, bands, dots, sums and losses must equal those of the recording, and gaps must stay gaps.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Builds the action FollowJointTrajectory for a Python without ROS 2 from apt: control_msgs has no wheel.
 
   python -m tools.control_msgs

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From a plain Debian to the live page: by pip, and by the .deb of bloom's templates; both timed.
 
 ``python -m tools.deb FOLDER`` (``make deb ROSDISTRO=FOLDER``; root only, some minutes).

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes docs/gallery.md and its pictures: ``python -m tools.gallery``.
 
 Each case of :mod:`tools.gallery_cases` is a simulated rig with one fault. The command of the case is run on its

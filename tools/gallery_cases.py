@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The cases of the gallery: how each recording is made, which command is asked, and what a person does then.
 
 What the program says is written nowhere here: it is taken from the run.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Inserts text from the program into the pages when the site is built, so that the two agree.
 
 ``<!-- messages -->``: every error message, by exit status. ``<!-- commands -->``: every command's

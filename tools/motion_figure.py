@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw docs/figures/motion.png: a switched load and a lost laser. ``python -m tools.motion_figure [FILE]``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What ``make mutants`` breaks, and which tests should notice: a room each.
 
 Without cosmic-ray, so that the tests can ask whether each mutant made by hand lies in a room.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make mutants``: break the numerics one line at a time, and see whether a test notices.
 
 cosmic-ray makes the mutants: a sign, a number, a comparison, a truth value. Of each room so many are

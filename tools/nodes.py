@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Prints what every ROS node does alike: a row a check, a column a node.
 
   python -m tools.nodes [WORDS FOR PYTEST]

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Runs a program as a process and reads its output, for tests, campaigns and the check of documented commands.
 
 A thread reads all output, so that the program never blocks on it. :meth:`Program.until` waits for a line, not

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Puts Python for the browser beside the page "Try it in the browser": ``make docs`` calls it with the site's folder.
 
 Pyodide (MPL-2.0) is CPython compiled to WebAssembly. Its interpreter is the package ``pyodide`` of npm, pinned by the

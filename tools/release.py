@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Checks what a release would publish, and makes the files that repeat its facts.
 
 ``python -m tools.release files`` writes CHANGELOG.rst, CITATION.cff and .zenodo.json from CHANGELOG.md,

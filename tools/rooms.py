@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Counts the structure: the rooms of the package, and the imports between them.
 
   python -m tools.rooms [CHECKOUT]

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A checkout of ros/rosdistro, for rosdep and bloom on this machine; and our table of keys against it.
 
 ``python -m tools.rosdistro FOLDER`` asks the real rosdep how apt resolves each key of packaging/rosdep_keys.csv, and

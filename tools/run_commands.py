@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Runs the commands of README and docs as a reader would: ``make doc-commands``.
 
 What ends in a moment is run by test/docs/test_docs.py; what CI runs anyway is looked up in .ci/run. The rest is run

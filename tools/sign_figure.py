@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw docs/figures/sign_convention.png: the positive directions. ``python tools/sign_figure.py [FILE]``."""
 
 from __future__ import annotations

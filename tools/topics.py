@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Writes the table of topics in docs/topics.md from the rows that the nodes' publishers and subscriptions are made of.
 
 python -m tools.topics

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the page "Try it in the browser" computes: in the browser's own Python, by the functions of the package."""
 
 from __future__ import annotations

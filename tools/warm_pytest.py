@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Run pytest in one child after another of a process that has imported all libraries already.
 
 Arguments: the tests, a file or folder each, perhaps with "-k WORDS". At first all of them are run, to see which

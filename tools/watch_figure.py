@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw docs/figures/watch.png: three events and when they are seen. ``python -m tools.watch_figure [FILE]``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The action's part of :mod:`bench.campaign.hold`: goals of FollowJointTrajectory through the shaper, over real DDS.
 
 A stand-in of joint_trajectory_controller serves the action. While a goal is under way the controller dies or rejects, a

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The nodes that ``bench.campaign.messages`` attacks: each as it is used, what is right for it, and what is not.
 
 A node is made in this process. :data:`GOOD` has a good message of each input that any of them subscribes to; an input

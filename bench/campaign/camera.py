@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How true the camera is: rendered frames, 10,000 of them as bad as a laboratory makes them.
 
     python -m bench.campaign.camera --frames 10000

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make crash``: kill -9 at random instants while recording; what is left opens, and lacks less than a second.
 
 The daemon runs without ROS, forked from this process so that each round takes a moment only, and

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Many simulated recordings on a local Dask cluster: is the answer the serial one, byte for byte, with workers killed?
 
     python -m bench.campaign.fleet --recordings 1000

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make fuzz``: coverage-guided fuzzing (atheris) of everything that reads what strangers wrote.
 
 A target must answer any bytes with a result or with one of the package's own errors, in one line,

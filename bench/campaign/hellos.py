@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A million HELLOs of any words against the running daemon, between the samples: it measures on.
 
   python -m bench.campaign.hellos 1000000

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The faults: what each does to the line, when it is over, and which counter must have seen it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A device on a pseudo-terminal with every fault a line can have, and a ledger of what it did to which sample.
 
 Every sample carries its own number (its identity) in the counts of x1 and x2, so that a recording

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Messages of any content against every input of the five nodes: no end, no leak, and no step of what moves an arm.
 
   python -m bench.campaign.messages 1000000 --node compensator

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Work that fails or kills its process, for the tests of many recordings: processes import it by its name."""
 
 from __future__ import annotations

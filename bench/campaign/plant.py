@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A simulated arm on the graph, which may tell of its deflection and of its joints what is not so."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The shaper's part of :mod:`bench.campaign.hold`: what it does when something goes wrong, over real DDS.
 
 The shaper moves a stand-in of joint_trajectory_controller by trajectories that replace each other. A fault comes while

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``make soak``: the daemon for long, in real time and in simulated time.
 
 Real time: the node with recording and a subscriber, reading a device whose clock runs 30 ppm fast

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Messages of any content: a good one, of which some fields have any value that their type allows, and worse ones.
 
 What a field may get follows from its type alone, so that a message of any type can be made strange: numbers that are

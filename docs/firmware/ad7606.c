@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 /* AD7606 (Analog Devices): eight simultaneous inputs, 16 bits, +-10 V, on an SPI bus. Page and figure numbers are of
  * data sheet AD7606/AD7606-6/AD7606-4 Rev. F.
  *

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 /* What main.c needs of a board. board_mps2.c is one; for another microcontroller only that file (and the linker
  * script) is written anew. */
 #ifndef BOARD_H

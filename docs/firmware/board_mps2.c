@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 /* ARM MPS2 board with the AN385 image (Cortex-M3, 25 MHz), which qemu-system-arm has as `mps2-an385`.
  * Sources: ARM DAI 0385 (memory map, interrupts), ARM DDI 0479 (CMSDK timer and UART), ARMv7-M Architecture Reference
  * Manual (vector table, NVIC). */

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 /* Where samples come from: ad7606.c (the real converter) or synthetic.c (numbers, for qemu), chosen when linking. */
 #ifndef CONVERTER_H
 #define CONVERTER_H

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 #include "frames.h"
 
 uint32_t crc32_step(uint32_t crc, uint8_t byte)

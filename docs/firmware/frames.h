@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 /* Frames of docs/protocol.md: COBS( type | body | crc32 ) 00, little-endian. No I/O and no state of its own. */
 #ifndef FRAMES_H
 #define FRAMES_H

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 /* A PSD device: samples six channels at 1 kHz from a timer's interrupt and sends the frames of docs/protocol.md.
  *
  * Data flow. The timer's interrupt takes a sample, numbers and stamps it by the clock, and puts it into a ring. The

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 /* Numbers in place of a converter, to run in qemu: every count is a function of the sample's number, so the host can
  * check each one (check.py knows the same function). */
 #include "converter.h"

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // The form of try.html: what is hidden goes to the worker, what the worker tells is shown.
 const part = (name) => document.getElementById(`try-${name}`);
 const [form, effect, size, unit, state, steps, answer, hidden, report, box] =

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // Python in a thread of its own, so that the page stays alive. Everything comes from this site.
 const HERE = new URL('python/', self.location.href).href;
 

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What an arm's node may believe of a message: joint positions, a deflection. Each check gives the reason why not."""
 
 from __future__ import annotations

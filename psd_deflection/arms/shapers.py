@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Input shapers: a command split into a few impulses, so that the ringing of one ends that of the others.
 
 ZV and ZVD: Singer and Seering, J. Dyn. Syst. Meas. Control 112, 76 (1990). EI: Singhose, Seering and Singer, Proc. ASME

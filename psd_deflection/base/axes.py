@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The three axes of the tip as people read them: symbols, units, and the factor from SI to what is shown."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What others can make grow has a bound here: the bytes that wait for something, the words that are remembered."""
 
 from __future__ import annotations

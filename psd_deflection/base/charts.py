@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Charts of a report: curves over an axis are declared here, and the page's own script draws them with uPlot.
 
 A chart says values under the cursor, is looked at closer by dragging, and switches its curves on and off. Its

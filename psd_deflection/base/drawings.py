@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Drawings of a report, declared: charts, bars and matrices. The page and matplotlib draw the same declaration.
 
 Bars and matrices are text of the page in the page's own colours, right on dark pages without a script.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The errors a user can meet, each with the exit status that the command line gives it.
 
 Every message is one line: what is wrong, where, and how to fix it. Any other exception is a defect

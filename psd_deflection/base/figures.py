@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A declared drawing as a matplotlib figure, for a file or a notebook; pages draw the same declaration themselves."""
 
 from __future__ import annotations

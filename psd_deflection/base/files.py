@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Files that are written whole or not at all, and files that stay in the folder that they were made in."""
 
 from __future__ import annotations

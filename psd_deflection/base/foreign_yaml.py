@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads YAML that a stranger may have written: parameter files, ``metadata.yaml``, lists and inputs.
 
 Only plain types come out (maps, lists, text, numbers, dates), and only as much as was allowed for: a few hundred bytes

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """JSON of numbers that may not be finite."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Lines for people, each with its severity beside it: what formats a line cannot lose it.
 
 The severities are the numbers of :mod:`logging`, which are those of ROS too.

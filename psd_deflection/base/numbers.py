@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Numbers in the texts of others: files, options, tables. One reading of them, for every part."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every page of ours takes into itself: uPlot, the scripts of charts, arrays as text.
 
 The live page gets the files from its server; reports and the page of a recording have them inside, so that each is

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A self-contained web page: its style, its tables, its policy and the scripts of its charts, for the reports."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Loads code of other packages and of the user: whatever it does on import, the caller gets one error that names it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A stranger's words in one line that can be printed."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Extends sequence numbers beyond 32 bits and interprets jumps in them.
 
 The wire's ``seq`` wraps at 2^32 (49 days at 1 kHz). Blocks are cut by the extended number, which

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A hint for a name that is spelt nearly right."""
 
 from __future__ import annotations

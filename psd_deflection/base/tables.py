@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Columns with units, as text, a pandas DataFrame, an xarray Dataset or the HTML that a notebook shows."""
 
 from __future__ import annotations

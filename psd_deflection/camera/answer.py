@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What one frame gives: a pose with its covariance, or the reason why there is none."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Markers and their boards by OpenCV's ``cv2.aruco``: one way to ask for what 4.7 and 4.6 have under other names.
 
 4.6 (Ubuntu 24.04's) has them only where opencv_contrib was built with it, as Ubuntu does. Older ones have other axes.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """ChArUco and AprilTag boards by OpenCV: corners -> pose of the board, with covariance from their residuals.
 
 The board's middle is ``link_tip``'s origin; seen from its front, its columns run to the right. Corners are matched

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where a camera's frames come from: a folder of images, a video file, a device; and the camera's parameter file.
 
 A folder has ``frames.csv`` with ``file,t,exposure`` (s; ``t`` is the start of the exposure). Of a video or a device the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How large an image file says its image is, before any of it is unpacked: two megabytes can stand for gigabytes.
 
 Read are the headers of PNG, JPEG, BMP, TIFF, WebP, GIF and PNM. A file of another kind is left to OpenCV, which has

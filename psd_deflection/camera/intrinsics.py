@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The lens from images of a ChArUco board, by OpenCV's calibration (Zhang 2000), as ROS's ``camera_info`` YAML."""
 
 from __future__ import annotations

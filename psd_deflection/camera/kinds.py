@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The kinds of targets by their names; the module of a kind is imported when it is needed."""
 
 from __future__ import annotations

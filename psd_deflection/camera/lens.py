@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The lens: pixel <-> ray, with OpenCV's distortion model, solved to rounding.
 
 Pixel (0, 0) is the centre of the first pixel. A ray is (x, y) with the direction (x, y, 1) in the camera's axes:

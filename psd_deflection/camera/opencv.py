@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """OpenCV, imported when it is first needed: everything else of this package runs without it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A frame with what was found in it, as a picture: where the camera looks, and why a frame has no answer."""
 
 from __future__ import annotations

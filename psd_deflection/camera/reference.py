@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From the target in each image to the tip in ``link_tip_rest``: the rest is found, and taken off turn and place alike.
 
 The rest is the mean of the first good frames: as many as ``rest.frames`` says, or, if it says 0, those that do not

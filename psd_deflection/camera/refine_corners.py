@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Corners to the noise's own limit: a model of the grey levels around each, fitted to all corners at once.
 
 Two edges cross at a corner of a chessboard, or end there at a corner of a tag. With a1, a2 the distances from them in

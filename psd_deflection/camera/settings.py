@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The parameters of the camera and of its target: ``CAMERA.yaml``, or the parameters of the node."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A kind of target: how it is found in an image, how it is drawn on paper, and what describes it."""
 
 from __future__ import annotations

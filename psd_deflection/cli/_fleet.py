@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The same work on each of many recordings: options, engine, progress, table, and the exit status."""
 
 from __future__ import annotations

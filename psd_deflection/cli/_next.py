@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``discover --next`` and ``--run``: the limits in words, what to type, recordings of a simulated rig."""
 
 from __future__ import annotations

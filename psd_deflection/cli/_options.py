@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Checks of option values: a mistake ends with status 2, before anything is read or written."""
 
 from __future__ import annotations

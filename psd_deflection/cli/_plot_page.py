@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page of a recording: one file with its data, drawn by the scripts of the live page."""
 
 from __future__ import annotations

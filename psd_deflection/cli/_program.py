@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The name under which the user can call this program, for the commands that it suggests."""
 
 from __future__ import annotations

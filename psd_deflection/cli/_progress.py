@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Progress of work that may take longer than two seconds: only on a terminal, and removed at the end."""
 
 from __future__ import annotations

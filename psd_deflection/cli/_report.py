@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Columns that line up, JSON and figures on disk, for the commands that report."""
 
 from __future__ import annotations

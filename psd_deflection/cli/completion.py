@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Print a script with which your shell completes commands and options.
 
 Save the output where your shell looks for it. For bash this is the file

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``psd-deflection``: finds the command and turns our errors into one line and an exit status.
 
 Each command is a module of this package with ``add_arguments(parser)`` and ``run(args) -> int``; it is

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """List every parameter with unit, bounds, default and what it is for.
 
 With --short only those that a rig of one's own needs. With --params-file the values of that file are

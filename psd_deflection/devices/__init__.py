@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Devices: where samples come from, and their simulated twins.
 
 Everything that a plug-in needs is exported here; ``docs/devices/README.md`` shows how to write one. Importing

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Devices that speak our own frames (``docs/protocol.md``): firmware of ours, the simulated rig.
 
 They number their samples and have a clock. So every loss is detected, and times are regressed from the

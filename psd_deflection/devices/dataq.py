@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """DATAQ DI-1110, DI-2108 and DI-4108 in CDC mode: converters with a command line, no framing.
 
 Limits compared with our own frames, which ``describe`` reports too: the device neither numbers its

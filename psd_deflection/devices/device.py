@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The declaration of a device: how it is made, simulated and recognised on a port.
 
 A device is one file with its :class:`~psd_deflection.devices.source.Source`, its simulated twin and a

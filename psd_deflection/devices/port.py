@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An open port, whatever carries its bytes, and what all of them share: how they wait, and how a wait ends.
 
 Another thread may end every wait for a port, also while it is opened: by :meth:`OpenPort.give_up`, or by the event

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the parameter ``port`` may name: a serial port, or a port of the network by its scheme."""
 
 from __future__ import annotations

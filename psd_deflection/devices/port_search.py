@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Finds the ports where a device may be: ttyACM0 may become ttyACM1 when a cable is unplugged and plugged in again.
 
 ``port`` may be a pattern (``/dev/ttyACM*``). Otherwise every USB serial port of the machine is a candidate,

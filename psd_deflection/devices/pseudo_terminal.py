@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A pseudo-terminal: a port that pyserial can open, with one of our programs at the other end."""
 
 from __future__ import annotations

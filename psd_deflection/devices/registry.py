@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Maps the names that ``source:`` of a rig file may have to devices, including plug-ins of other packages.
 
 A plug-in declares an entry point of the group ``psd_deflection.sources``. Its object is a

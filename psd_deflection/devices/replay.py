@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recording as a device, in real time: ``source: replay`` with ``port`` naming a bag, .mcap or CSV.
 
 It lets you try the node, its subscribers and a new parameter file on measured data. Samples keep their

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``rfc2217://HOST:PORT``: a serial port of another machine, with its line speed, over Telnet (RFC 2217, ser2net).
 
 pyserial negotiates, and reads in a thread of its own. Every byte goes through a queue of it, which costs more than the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The simulated rig's converter readings one by one, for all simulated devices."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A serial port of this machine as a source of bytes: opened by pyserial, read from its descriptor.
 
 pyserial opens, locks and configures the port; reading one byte at a time through it would cost a

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Serves a simulated device on pseudo-terminals or on the network, in real time.
 
 Like a USB device it sends nothing while no one has its port open. A daemon starts

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where a simulated device is reached over the network, as real ones are: a TCP port, or datagrams that it sends."""
 
 from __future__ import annotations

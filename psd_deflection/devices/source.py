@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the reader thread needs from a device, for any protocol.
 
 A source turns its device's bytes into events with sample numbers and times. The reader does the rest, in

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Finds which device is on which port: sends the question of every device that has a probe, and listens.
 
 Nothing is started, stopped or set: the devices answer these questions in any state. (An Arduino

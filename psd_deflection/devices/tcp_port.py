@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``socket://HOST:PORT``: the bytes of a device over TCP, as a serial server, ser2net or an ESP32 gives them.
 
 A host that is cut off sends nothing, not even that it is gone. The reader tells the silence as it does of a serial

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Devices that send one line of text per sample (``devices.protocol.text_lines``), such as an Arduino with a short
 sketch.
 

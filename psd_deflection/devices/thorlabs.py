@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A pair of Thorlabs KPA101/TQD001 position aligners, one per PSD, each on its own port.
 
 They answer a question after about 2 ms, so 1 kHz is out of reach. The source asks both at once, in time

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``udp://HOST:PORT``: datagrams that a device sends to this machine, each with bytes of its stream.
 
 We take what comes to PORT on the address HOST of this machine. One sender at a time: the first whose bytes make

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Blocks of N by sequence number: which samples belong together, their mean and covariance.
 
 The block number is ``seq // block_size``, so a lost sample shortens one block and shifts none. A

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Corrects the dots for known errors of sensors and optics, so that the estimate improves too.
 
 A solver assumes the nominal rig. If the rig file lists effects of the detectors and the optics,

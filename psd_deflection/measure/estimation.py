@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The dots of one block -> the estimate with its covariance: by all detectors, by some of them, or by one.
 
 The primary solver answers first; the check of the readings too many says whether they belong together, and which

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Checks lasers and detectors from a block's samples, before the block is solved.
 
 A fault makes one detector unreliable (``faulty``). A finding is a warning that does not stop the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the parts of the pipeline remember from block to block, as numbers by name.
 
 A part says what the next block depends on besides its samples (:meth:`Part.memory`, which changes nothing), and goes

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From chunks of samples to records; the live run and replay use the same class.
 
 It owns no clock, thread or I/O. Its output depends only on the rig, the samples and the order of

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Converts device time to host time by regression; a sample's arrival time is never its stamp.
 
 Theory of operation. A byte cannot arrive before it was sent: host time minus device time is the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Watches the records of a run for the moment from which the rig is no longer what its model says.
 
 Three tests, each on means over windows of half a second that are not spoilt by motion:

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Converts message field dicts to CDR bytes and back.
 
 The node publishes and the recorder writes the same bytes (XCDR1, little-endian, header

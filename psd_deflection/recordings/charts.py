@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a recording shows over time, declared: its samples, and a series of estimates."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Converts a recording: copies its samples and what was recorded beside them, or writes what is computed of them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A series of deflections: those of one topic of a recording, or those that a replay gives."""
 
 from __future__ import annotations

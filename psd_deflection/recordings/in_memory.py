@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recording whose samples are in memory: simulated, or read by a format of another package."""
 
 from __future__ import annotations

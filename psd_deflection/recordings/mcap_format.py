@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The records of an MCAP file: those that describe it and its messages, as values and as bytes.
 
 The format: https://mcap.dev/spec. A record is ``opcode u8 | length u64 | content``, little-endian. Every

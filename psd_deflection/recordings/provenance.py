@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What computes: the versions and the processor on which the last digits of a number may depend.
 
 A recording keeps it, so that ``replay --compare`` can say why bits differ.

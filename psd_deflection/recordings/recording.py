@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Interface of all recordings: bags, single MCAP files and CSV."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Repairs a recording that a crash cut: index and summary for each file, ``metadata.yaml`` for the bag.
 
 Every intact record of a file is copied, byte for byte, into a new file beside it. Only then is the old file

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The samples of a recording as an array, and as a table with what was recorded beside them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether the link of a recording vibrates faster than a block can follow."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rig: the frozen sections that checked values make.
 
 :func:`rig_from_values` makes the frozen :class:`Rig` from flat values (``link.length``), which the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every parameter of a rig, declared once.
 
 Each field of a section declares one parameter: its type, default, unit, bounds and a sentence. The

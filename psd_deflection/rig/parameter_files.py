@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameter files of ROS 2 (``/**: ros__parameters:``), read and edited without ROS.
 
 What a file says comes out as flat values (``link.length``); :mod:`psd_deflection.rig.config` checks them.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a parameter is (name, type, default, unit, bounds, a sentence), how it is declared, how a value is checked.
 
 A field of a section declares one, once::

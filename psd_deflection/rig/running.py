@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameters that say how the node runs on one machine: its source and its recordings, and what viewers get.
 
 They describe no rig; those that do, and the table of all, are in

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which channel of the device carries which axis of which PSD, and with which sign.
 
 The samples that are recorded and published stay as the device sends them. Everything that judges or solves them

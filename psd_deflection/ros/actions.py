@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Action servers and clients of rclpy that no message can end.
 
 rclpy takes requests, answers and feedback in the executor, and what it cannot unpack would end the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node ``camera``: images in, ``/reference/deflection`` out, with its covariance and the reasons of refused frames.
 
 It subscribes to ``image`` (sensor_msgs/Image) and ``image/compressed``

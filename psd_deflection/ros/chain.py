@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node ``chain``: several rigs in one process, and the end effector composed of them.
 
 It publishes ``end_effector/deflection`` in the frame ``end_effector_rest``, each link's topics

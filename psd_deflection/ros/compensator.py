@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node ``compensator``: the end effector's deflection in, offsets of the joints out.
 
 It subscribes to ``end_effector/deflection`` and ``joint_states``, every 10 ms it publishes offsets

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The settings of a node as its ROS parameters: described, bounded, unknown ones refused; live ones may be set.
 
 A section of :mod:`psd_deflection.rig.parameters` declares them, once, for the command line, too. A value of

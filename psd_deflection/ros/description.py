@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The robot's description (URDF) as ROS 2 has it: latched on ``robot_description``, from
 robot_state_publisher."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes publishers from the rows of :mod:`psd_deflection.ros.topics`, and what subscriptions need
 of a row."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node ``estimator``: publishes the pipeline's records, from the pipeline's own thread.
 
 A message is encoded once; the same bytes are published and recorded. The executor in the main

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Goals of FollowJointTrajectory, passed on to the controller's action with their trajectories shaped.
 
 What the controller says of a goal is what its sender hears: feedback, result, that it is cancelled

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What other nodes send comes in through one gate: what cannot be used is refused, counted, and said once.
 
 A message is bounded in size before it is unpacked, and a topic in messages a second. A check gives the reason why a

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Why a message of another node cannot be used by a session: its frame, its stamp, its numbers, or what nobody can use.
 
 A load or a reference in a wrong frame would be a wrong truth for all that follows. Nothing is transformed here: rclpy's

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node's log: each line on the terminal, on ``/rosout`` and in the log file that rcl began for this process.
 
 The terminal's lines do not go through the ROS log, because the live line is among them. So the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Markers for RViz: link, plate, detectors, beams and dots.
 
 They are published if the parameter ``markers`` is on. Static parts (beams, lasers, link at rest)

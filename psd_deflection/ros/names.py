@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Names of frames and services of the nodes. It needs no rclpy, so any module may import it."""
 
 from __future__ import annotations

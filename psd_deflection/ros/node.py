@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every node of this package is, before it does anything of its own.
 
 A lifecycle node (REP-2002) with declared parameters, a log on ``/rosout``, a gate for what other nodes send, and

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rig's parameters as ROS parameters, with types, ranges and units.
 
 Values from the command line, a launch file or a parameter file reach the node as overrides.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """rclpy from its start to its end, for every node that runs until a signal stops it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The services ``~/zero`` and ``~/record`` of a node that has one rig or several."""
 
 from __future__ import annotations

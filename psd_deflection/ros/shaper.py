@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node ``shaper``: joint trajectories in, the same out, shaped so that they do not ring the link.
 
 It subscribes to ``~/trajectory`` and publishes ``~/shaped``, one for each. With the parameter

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every topic of the nodes: :data:`PUBLISHED` and :data:`HEARD` have a row for each, and
 :data:`SERVED` one for each action. It needs no rclpy.
 

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The frames of the messages as a tree for tf2: ``link_base``, ``link_tip_rest``, ``link_tip``, ``psd_1`` ...
 
 What the rig file fixes is static and latched. The tip moves with each estimate of the primary

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Connects a session to the graph: publishers of encoded messages, subscriptions that are recorded."""
 
 from __future__ import annotations

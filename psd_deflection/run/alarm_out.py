@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Hands each alarm of the watch on: to a command of the user's, and to a web address (webhook).
 
 Both get the same JSON object. A thread of its own does it, so that neither a command that hangs nor a network

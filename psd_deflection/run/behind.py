@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Why a thread does not keep up: this machine is too slow for it, or something holds it up; nothing is guessed."""
 
 from __future__ import annotations

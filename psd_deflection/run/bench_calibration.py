@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Calibrates at the bench: computes the calibration again and again from a recording that is still being written."""
 
 from __future__ import annotations

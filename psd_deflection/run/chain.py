@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Several rigs in one process: a session for each link, and the end effector composed of their estimates.
 
 Each session has its own reader and pipeline thread. The pipeline threads hand their estimates to one joiner, in

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The state of the run in numbers, once a second, for ``/diagnostics`` and for the terminal."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Encodes each record once and hands the bytes to every wire: ROS publishers and the recorder."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A guided check of a live rig: reads the device while a person (or the simulated hand) pushes the
 tip."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Runs a session or a chain without ROS, until a signal ends it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """When the link moved last, by the dots of the last minute: a weight is noted after it was hung."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The pipeline thread: takes chunks off the queue, runs the pipeline, gives its records to the sinks.
 
 It is the only thread that touches the pipeline. Requests from other threads (take the zero, attach

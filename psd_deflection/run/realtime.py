@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a daemon requests from the system: locked memory, real-time priority for the reader, a watchdog.
 
 None of it is needed to run. The log says once what the system granted and what it refused, with the reason

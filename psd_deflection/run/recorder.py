@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The recorder thread writes the published messages to a bag without delaying the pipeline.
 
 Each recording has its own thread, the only one that touches the disk. It opens the bag, asks the

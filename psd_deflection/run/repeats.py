@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Lines that may come again and again, said at once and then ever more seldom, with a count."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tells a wire what the rig is, and what the pipeline remembers: ``/link_tip/rig``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One run of the daemon: device, reader, pipeline, sinks and recorder.
 
 The ROS node and the command line both use it; neither is needed. Threads: ``reader`` (acquisition),

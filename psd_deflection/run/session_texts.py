@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a session says of its zero, its loads and its marks, a line each: the same from page, command and node."""
 
 from __future__ import annotations

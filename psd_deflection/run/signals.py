@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """SIGINT, SIGTERM and SIGHUP ask the program to end; they interrupt it only while it waits for a device.
 
 A signal that raised an exception anywhere would cut the last blocks off a recording. So the signal sets an

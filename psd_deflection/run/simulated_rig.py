@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Starts the simulated rig as a separate process, like a real device."""
 
 from __future__ import annotations

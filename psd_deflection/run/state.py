@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where programs keep what outlives a run: a folder of the user, and files named by the device's serial number."""
 
 from __future__ import annotations

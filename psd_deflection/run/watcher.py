@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The watch in a run: feeds it, says what it sees, and keeps the minutes around it as a recording.
 
 The samples and inputs of the last minutes are kept in memory as they were encoded, in segments; each begins with the

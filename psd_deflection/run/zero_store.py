@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Keeps the unloaded dots of the last ``~/zero`` from run to run: one small file per device.
 
 The file is below ``$XDG_STATE_HOME/psd_deflection``, named by the device's serial number, or is the file

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Two lasers over one beam splitter (thesis 5.4): its three rules for a rig, and what a failure does, simulated.
 
 Both lasers are made one beam, which a splitter halves, one half for each PSD. The rules:

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The shape of every study: recordings give a problem, steps solve it, the result says, shows and writes itself.
 
 A study is a folder. ``from_recordings.py`` reads the problem, which is frozen and has arrays alone. A function of

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the pages say of settings is what is declared, and bounds are round numbers."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Input shapers, against a mode that is simulated by scipy."""
 
 from __future__ import annotations

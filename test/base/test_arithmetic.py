@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The arithmetic in an order of its own: right, the same for floats and arrays, and used wherever bits are promised."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is shown of the axes of the tip."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a page gets of a declared chart: its arrays, thinned, each once; and the policy of the page."""
 
 from __future__ import annotations

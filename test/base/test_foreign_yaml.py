@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """YAML of a stranger: plain types, bounded, and no exception but the declared one."""
 
 from __future__ import annotations

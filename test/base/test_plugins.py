@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whatever a plug-in does on import ends in one error that names it, for every group of entry points."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The charts of a report in headless Chromium: cursor, zoom, switches, keys; nothing asked for, nothing complained."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sequence numbers past 32 bits: gaps, repeats, wraps, restarts."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The campaigns of ``bench/campaign``, a few rounds of each: they must be able to run, and to fail."""
 
 from __future__ import annotations

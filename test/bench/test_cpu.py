@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the CPU time goes: parts without what is inside them, threads without gaps, kinds of native code."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A slice of the blind suite, the second generator against integrators and the simulation, the scores."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A short form of ``python -m blind.coverage``: the truth is inside the published intervals as often as they say."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The newcomer's day on a device that is not ours: its frames, its recording's physics, and what counts as right."""
 
 from __future__ import annotations

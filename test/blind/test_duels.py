@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The duels: a made Silverbox whose spring is known, the measures by hand, the rows of what is not there."""
 
 from __future__ import annotations

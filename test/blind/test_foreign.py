@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """discover_in on machines that others measured; skipped where their data are not."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The cases of the blind suite as files, and the score of any tool's answers."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The laws of the blind suite: drawn as stated, scored as stated, and a short form of the campaign."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """ChArUco and AprilTag boards; the lens from images of one; targets on paper."""
 
 from __future__ import annotations

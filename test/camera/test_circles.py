@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The thesis's three discs: what is rendered is found again, within what is claimed."""
 
 from __future__ import annotations

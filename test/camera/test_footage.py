@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Frames from folders, videos and ROS images; the camera's parameter file."""
 
 from __future__ import annotations

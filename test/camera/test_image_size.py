@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sizes of images are read before anything is unpacked, and the work that one frame causes has a bound."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parts of the camera by themselves: headers, pixel formats, sectors of a rim, bounds of a fit, words."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parts of the fit of the rims by themselves, against geometry."""
 
 from __future__ import annotations

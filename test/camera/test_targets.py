@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every kind of target must do: its print, photographed, is found again; it says its own sizes and no other's."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A command joins by its module and one line of ``COMMANDS``, as docs/extending.md says."""
 
 from __future__ import annotations

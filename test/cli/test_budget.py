@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``psd-deflection budget``: what it prints, draws and refuses."""
 
 from __future__ import annotations

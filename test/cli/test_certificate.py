@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A certificate: its tables alone give every U again; what is refused."""
 
 from __future__ import annotations

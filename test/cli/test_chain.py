@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``chain`` without ROS, and what ``chain`` and ``compensator`` refuse."""
 
 from __future__ import annotations

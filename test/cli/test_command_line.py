@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The command line: help that teaches, and one clear line for what goes wrong."""
 
 from __future__ import annotations

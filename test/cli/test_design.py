@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``psd-deflection design``: what it prints and refuses."""
 
 from __future__ import annotations

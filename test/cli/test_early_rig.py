@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The simulated rig's process, started before its daemon is ready for it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``effects``: the catalogue as a list, and each effect with a command that shows it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The half that analyses recordings runs where there is no Unix: on Windows and macOS, in the workflow.
 
 Here it runs without what only Unix has: those modules cannot be imported, and those names are gone.

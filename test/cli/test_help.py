@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What ``--help`` says: as wide as the terminal, options with their defaults, examples that run."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a script relies on: exit status, one line of error, JSON alone on stdout, outputs whole or not there."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The commands that take many recordings: the same answers on every engine, failures listed, the rest done."""
 
 from __future__ import annotations

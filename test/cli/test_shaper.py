@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``shaper``: where it takes the mode from, and what it refuses."""
 
 from __future__ import annotations

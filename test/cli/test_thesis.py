@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``psd-deflection thesis compare-methods``: the tables, the figures, and that the page on methods has them all."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a recording, a file or a device says reaches the terminal in printable lines only."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulated devices on lines, pulled out and plugged in by the test.
 
 ``served``: on a pseudo-terminal, in real time. ``wired``: on a line of our own, in a time of our own

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A device written from ``docs/protocol.md`` alone: nothing of ``psd_deflection`` is imported here.
 
 It is the page's judge: where the daemon does not get on with it, page or daemon is wrong. Run it as a

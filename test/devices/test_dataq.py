@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """DATAQ converters: replies and scans written by hand, and the simulated device on a line of our own."""
 
 from __future__ import annotations

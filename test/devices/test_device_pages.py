@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the pages on devices print is what the code takes."""
 
 from __future__ import annotations

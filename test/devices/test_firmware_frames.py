@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The firmware's own COBS and CRC, compiled for this machine, against ours: byte for byte, both ways."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Ports of the network against real sockets on this machine."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A made-up device, as ``docs/devices/README.md`` says to add one: in a package of its own, found by its entry point.
 
 The page's own code and entry point are installed into a folder that this process and those that it starts look into.

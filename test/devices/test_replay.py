@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recording as a device: paced by a clock that the test owns."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The second emulator against the daemon, and the page's byte examples against the code."""
 
 from __future__ import annotations

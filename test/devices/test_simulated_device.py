@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The simulated rig as a device, with the test's own clock."""
 
 from __future__ import annotations

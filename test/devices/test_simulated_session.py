@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``source:`` without a port starts the rig behind the simulated device of that name, as a process."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sources by name, plug-ins included, and what the reader makes of a source's own kinds of time."""
 
 from __future__ import annotations

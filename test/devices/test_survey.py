@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``devices``: what answers on a port, from the simulated devices and from none."""
 
 from __future__ import annotations

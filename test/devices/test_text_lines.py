@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Lines of text: written by hand, and the simulated device on a pseudo-terminal."""
 
 from __future__ import annotations

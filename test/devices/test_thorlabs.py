@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Thorlabs aligners: messages written by hand, and the simulated pair on lines of our own."""
 
 from __future__ import annotations

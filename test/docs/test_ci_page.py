@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The workflow of docs/ci.md: valid for GitHub, and its lines run in a repository as the page describes it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """docs/deploy: the files that a reader installs as root are understood by the programs that read them."""
 
 from __future__ import annotations

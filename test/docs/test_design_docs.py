@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What docs/mechanics.md, docs/budget.md and docs/audit.md quote is what the commands print."""
 
 from __future__ import annotations

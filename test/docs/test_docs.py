@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The documents do what they say: every command is run, every link leads somewhere.
 
 What ends in a moment is run here; ``make doc-commands`` runs the rest (tools/run_commands.py), and CI runs both.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The gallery says what the program says: its cases are run again."""
 
 from __future__ import annotations

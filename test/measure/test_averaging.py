@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Blocks by sequence number: a loss shortens one block and shifts none."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The correction of dots by formulas written again: what stands for what is not given, order, passes."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The uncertainty of an estimate by rules of one line: a held twist, half the light, light from elsewhere."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Faults of the optics one by one, what the node makes of one detector alone, and that replay agrees."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the parts of the pipeline remember: each takes its own, and what fits none is said."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Device clock to host time: the figures of docs/robustness.md, on a simulated USB line."""
 
 from __future__ import annotations

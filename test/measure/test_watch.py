@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The watch: what it sees, what it passes over, and the short form of its campaign."""
 
 from __future__ import annotations

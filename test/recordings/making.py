@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Records of every kind, made up for the tests of recordings; files of them, and whether they came back."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Records to message fields and back, with rosbags' own message store as the judge of the bytes."""
 
 from __future__ import annotations

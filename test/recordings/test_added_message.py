@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A new message costs a record, a file of msg_adapters, a line in its ``__init__`` and whoever makes the record.
 
 The package is copied, the two are added to the copy, and a program of its own records with it.

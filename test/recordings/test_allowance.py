@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Small files that ask for a lot of work: they are answered with a line after little work.
 
 Work is counted, not timed: calls, bytes unpacked, bytes read.

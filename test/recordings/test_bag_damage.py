@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bags that were cut off or spoiled: what can be read comes back, the rest is told in a line."""
 
 from __future__ import annotations

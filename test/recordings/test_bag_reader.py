@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bags of ours and of others, whole and made up, as the reader gives them back."""
 
 from __future__ import annotations

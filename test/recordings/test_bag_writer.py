@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What we write, read by readers that are not ours: rosbags and mcap."""
 
 from __future__ import annotations

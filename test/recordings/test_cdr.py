@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Our bytes are those of an independent encoder, message by message."""
 
 from __future__ import annotations

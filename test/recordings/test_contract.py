@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The committed recordings, held against what other people's programs rely on, by readers not ours."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Plain lines of a CSV are read many at once: the same rows and the same errors as one by one."""
 
 from __future__ import annotations

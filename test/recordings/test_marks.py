@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Marks of a recording: read, listed, drawn, converted, and used as bounds of a part."""
 
 from __future__ import annotations

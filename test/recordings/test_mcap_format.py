@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """MCAP files, written and read: the package ``mcap`` is the judge."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings for Rerun, without Rerun: what is written row by row, and what is told where it is missing.
 
 ``make rerun`` reads the files with Rerun's own reader and looks at its picture.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bags of ``ros2 bag record`` or ``convert``: messages without our metadata, some topics, any namespace."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tables and series of a recording, row by row, by hand."""
 
 from __future__ import annotations

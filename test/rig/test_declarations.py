@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Declared parameters: a field is all that one costs, and each reaches its field."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A parameter is declared once and its value is checked in one place, for files, options and nodes alike."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameter files: what is none is refused by name, and a file of a user keeps its comments."""
 
 from __future__ import annotations

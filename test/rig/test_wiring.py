@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The wiring of a rig file: which channel is which axis, applied alike to live samples and recorded ones."""
 
 from __future__ import annotations

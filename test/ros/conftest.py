@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Real rclpy and real DDS: a domain of its own for each worker, and the daemon as a process."""
 
 from __future__ import annotations

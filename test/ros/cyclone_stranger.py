@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Another vendor's DDS sends goals that no client of ROS would send: text that is no text, or half a message.
 
 Run as ``python cyclone_stranger.py TOPIC text|half`` in ROS_DOMAIN_ID; it sends until it is killed. The type is written

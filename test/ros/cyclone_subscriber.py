@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Another vendor's DDS as judge: prints what it receives on one topic as JSON.
 
 Run as ``python cyclone_subscriber.py TOPIC COUNT`` in ROS_DOMAIN_ID; a row is stamp in ns, frame,

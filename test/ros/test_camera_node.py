@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node ``camera``: images in, references and diagnostics out."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Two simulated rigs in one node: the end effector and each link over real DDS."""
 
 from __future__ import annotations

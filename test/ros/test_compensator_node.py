@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The loop closed over real DDS: a simulated arm of two links, its deflection, and the offsets of its joints."""
 
 from __future__ import annotations

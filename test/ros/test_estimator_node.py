@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node as a process of its own, seen from a second participant with its own rclpy."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The filter's topics over real DDS, live, recorded and replayed."""
 
 from __future__ import annotations

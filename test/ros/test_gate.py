@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The gate: what is bounded before it is unpacked, and who is told that his messages do not come."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which messages of other nodes a session takes, and why it does not take the others."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recorder that joins a running node late, over real DDS: its bag replays bit for bit."""
 
 from __future__ import annotations

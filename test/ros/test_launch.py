@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The launch files: their arguments reach the node."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The node's states, its zero from run to run, and its end in every state."""
 
 from __future__ import annotations

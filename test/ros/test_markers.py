@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What RViz is given: latched geometry at rest, and what moves with the estimate."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The shaper's action over real DDS: goals in, the same to the controller, shaped, and what it says of them back."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The shaper over real DDS: a trajectory in, the shaped one out, played on the simulated arm."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The campaign of strange messages: what it sends, and that it can fail."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The table of topics is whole: nothing is published or heard beside it, and the page shows it."""
 
 from __future__ import annotations

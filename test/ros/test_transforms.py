@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The tree of frames: complete, true to scale, and one for each rig."""
 
 from __future__ import annotations

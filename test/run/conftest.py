@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A device whose every byte the test writes, on a pseudo-terminal that the daemon opens."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The reader against a device whose every byte the test writes."""
 
 from __future__ import annotations

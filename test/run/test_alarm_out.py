@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Alarms handed on: a real program and a real web server on this machine."""
 
 from __future__ import annotations

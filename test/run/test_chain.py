@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Two rigs in one process, and the end effector composed of them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the clock map is shown of a stream, with times that the test owns."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The guided check on a live rig: the simulated one on its pseudo-terminal, and a port where nothing is."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A disk that hangs: estimates flow on meanwhile, and every request gets a true answer."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """When the link moved last, as the daemon finds it in the last minute."""
 
 from __future__ import annotations

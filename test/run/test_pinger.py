@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Pings: when they are due, whose answer counts, and when they end."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The pipeline's thread: requests that come late, and how long blocks took."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is asked of the system, with a system that refuses; systemd's socket with ourselves behind it."""
 
 from __future__ import annotations

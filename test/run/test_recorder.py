@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The recorder against a disk that fills, refuses, or is slow."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A device that starts anew: the recording says so, and nobody who counts by numbers invents a loss."""
 
 from __future__ import annotations

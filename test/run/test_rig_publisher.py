@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What ``/link_tip/rig`` says of the pipeline's memory: enough for a recorder that joins at any block."""
 
 from __future__ import annotations

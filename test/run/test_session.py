@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is asked of a session while its device is there, away, or silent."""
 
 from __future__ import annotations

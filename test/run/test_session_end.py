@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How a run ends when a part of it hangs, or does not keep up: it is waited for, not for long, and losses are told."""
 
 from __future__ import annotations

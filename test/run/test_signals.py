@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """SIGINT, SIGTERM and SIGHUP without ROS: they end the waiting for a device at once, and nothing else at once."""
 
 from __future__ import annotations

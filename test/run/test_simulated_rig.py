@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The simulated rig is at rest until a load is noted, which it then hangs; a demo hangs weights in turn."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The watch in a run: what it says, and the recording that it keeps."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The kept zero: what is taken back, and what is passed over with a line."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Two lasers over one beam splitter: the rules of the thesis by hand, and what the pipeline does when one fails."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every result of a study draws itself, and is a table."""
 
 from __future__ import annotations

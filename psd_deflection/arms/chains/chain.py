@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Links in series: the end effector's rigid pose, its deflected pose, and their difference with covariance.
 
 A link is clamped in its frame ``link_base``; Z leads along it. ``mount`` places this frame in the tip of the link

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The file of a chain: its links with their rig files, ports, mounts and joints.
 
 ::

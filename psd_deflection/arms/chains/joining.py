@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Joins the estimates of several rigs, whose blocks do not coincide, at common times.
 
 The common times are the stamps of the first link's blocks. Each other link is interpolated linearly between the two of

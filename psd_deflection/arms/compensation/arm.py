@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The kinematics of an arm: the joints between two links of a URDF file, its pose and its Jacobian.
 
 Pinocchio would do the same. Its wheels take 0.35 GB with what they bring along, for one product of matrices a joint.

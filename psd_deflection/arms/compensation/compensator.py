@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Follows the measured deflection with joint offsets, within limits, and holds as soon as it cannot be trusted.
 
 With the joints at q + o, the rigid pose T(q + o) and the measured deflection D, the end effector is

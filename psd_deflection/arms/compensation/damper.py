@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Active damping: a joint moves against the velocity of its link's tip.
 
 The tip moves by q against the joint, which turns by o at the distance L: q'' + 2 zeta w q' + w^2 q = -L o''. The offset

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether a robot runs, by what its drivers and controllers tell: the offsets of one that does not run hold."""
 
 from __future__ import annotations

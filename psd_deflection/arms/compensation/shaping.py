@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The settings of the shaper of joint trajectories, and the shaper that they make."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Shapes a joint trajectory, so that the motion does not ring the link.
 
 Between its points a trajectory is what ros2_control's joint_trajectory_controller makes of it: a line if it has

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The arithmetic of the pipeline: the same bits on every processor, or as the libraries have it.
 
 BLAS and LAPACK choose their kernels by the processor. numpy's exponential, logarithm, powers, tangent and complex

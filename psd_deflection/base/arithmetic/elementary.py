@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sine, arc tangent, exponential and logarithm by + - * / and square roots, in an order that stands here.
 
 The elementary functions are series and rational reductions (Muller, Elementary Functions, 2016, chapters 3 and 11),

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The arithmetic in an order that stands in the source: sums in pairs, elimination, Jacobi's rotations."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sums and eliminations of small matrices, each in an order that stands here."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // What the live page and the page of a recording draw alike, with uPlot (vendor/uPlot.LICENSE): axes, bands,
 // marks, values under the cursor. Times are in s, on the plots in the units of the captions.
 

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // The charts of a report: each figure of class chart has its declaration and its arrays as JSON inside
 // (psd_deflection/base/charts.py). charts.js is put before this text.
 

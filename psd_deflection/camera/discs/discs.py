@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The thesis's target: three white discs in a line on black (section 5.2). Image -> pose of the target."""
 
 from __future__ import annotations

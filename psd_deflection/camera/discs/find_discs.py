@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Finds three white discs in a line on black: where to look closer, or why there is nothing to look at.
 
 Candidates are the bright regions whose outline is an ellipse. Three of them are the target if the middle one halves the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Fits the picture of three discs to the pixels at their rims: one least squares for the pose of the whole target.
 
 The model is that of :mod:`.rim_model`; :mod:`.rim_judge` decides whether the fit is an answer.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Judges a fitted picture: refuses one that is not of the target at rest or in plain motion; else its covariance."""
 
 from __future__ import annotations

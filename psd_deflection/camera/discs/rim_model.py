@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The model of three discs in a picture: its parameters, the equations of one least squares, their covariance.
 
 Every pixel near a rim has a signed distance s (px) from it: its ray meets the target's plane at a distance rho from

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Convert a recording to another format: samples, loads, reference poses and temperatures.
 
 The name OUT sets the format: X.csv is a CSV recording, X.mcap a single MCAP file, any other name a

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Summarise a recording: duration, samples, losses, topics, device and changed parameters.
 
 The whole recording is read, so that damage anywhere is found. Of several recordings you get a table. REC may also be

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Draw a recording: deflection and twist with their uncertainty, dots, sums, spectrum and losses.
 
 The estimates are computed as by `replay`, with the recorded parameters or those of --params-file. Known

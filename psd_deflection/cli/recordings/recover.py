@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Repair recordings that a crash or a power cut left without their end.
 
 For each damaged file a new one is written: all intact messages, an index and a summary. The damaged

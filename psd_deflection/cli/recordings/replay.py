@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute the estimates of a recording again, in the same way as the live node.
 
 With the recorded parameters (the default) the estimates are the published ones, bit for bit.

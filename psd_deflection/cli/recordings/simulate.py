@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Simulate the rig: write a recording (--out), or act as a device (--serve).
 
 The rig file describes the rig and its known effects. --effect adds a hidden effect: the samples

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measure the tip by a camera: a reference beside the PSDs, with the uncertainty of each frame.
 
 IN is a folder of images with frames.csv (file,t,exposure; s, t is the start of the exposure), a video, or a device

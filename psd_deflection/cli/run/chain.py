@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Several links in series, each with its own rig: the deflection of the end effector, in one process.
 
 CHAIN.yaml names each link with its rig file, port, mount and joint (docs/chains.md). A link without a port is a

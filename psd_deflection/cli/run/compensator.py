@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Offsets of an arm's joints that put the deflected end effector back on its rigid pose: a ROS node.
 
 It reads /end_effector/deflection (of `chain`) and /joint_states, and takes the kinematics from ARM.urdf, or without it

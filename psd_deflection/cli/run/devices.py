@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """List the serial ports, find out which device is on each, and print parameters for it.
 
 Without PORT it tries every port that the system lists; a pseudo-terminal or a port of the network

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Print what a running daemon measures, one line a block, without ROS. Ctrl-C ends it.
 
 The daemon must serve its page (`monitor`, `estimator --monitor`, `make run`). One that you run on this

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Acquire, estimate, publish on ROS 2 and record: the daemon.
 
 Without --port it starts a simulated rig, so that you can try everything without hardware. It is at rest

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Note a known load that acts on the tip from now on: forces FX, FY in N and the torque TZ in N m.
 
 The running daemon writes it into its recording as a message on /link_tip/load, where `discover` reads it.

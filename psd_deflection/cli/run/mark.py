@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Mark this moment: "bumped it here". The running daemon records it as a message on /link_tip/mark.
 
 The time is that at which the daemon hears of it. `info` lists the marks of a recording, plots show

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Serve a web page: both detectors, deflection and twist, spectrum, rates, losses, clock and health.
 
 Without REC it acquires, without ROS, from --port or from a simulated rig of its own, which hangs the loads

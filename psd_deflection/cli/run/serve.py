@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``simulate --serve``: the simulated rig as a device on a pseudo-terminal or on the network, in real time."""
 
 from __future__ import annotations

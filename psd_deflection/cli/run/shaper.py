@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Shapes joint trajectories, so that a motion does not ring the link: a ROS node.
 
 It reads trajectories on /shaper/trajectory and publishes them on /shaper/shaped, to which you remap your controller's

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Make a running daemon take the present dots as the unloaded ones, without ROS.
 
 The daemon must serve its page (`monitor`, `estimator --monitor`, `make run`). One that you run on this

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every study's command does with its result: print it, or its JSON, and write its files."""
 
 from __future__ import annotations

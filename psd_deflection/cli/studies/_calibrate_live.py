@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``calibrate --live``: records and calibrates at the bench, and shows what is determined and what is open."""
 
 from __future__ import annotations

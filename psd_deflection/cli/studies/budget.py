@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute the error budget of a rig: how much each cause adds to the error of ΔX, ΔY and θ.
 
 The causes are those of the thesis's Table 3.1, with corrected equations, and those that it leaves

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Estimate how the real rig differs from its rig file: turned or mis-scaled PSDs, centres, heights, tilt, noise.
 
 REC is a bag folder, an .mcap or a .csv with a reference (a camera, a stage, a tracker) or with known loads.

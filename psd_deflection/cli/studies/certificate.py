@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Write a calibration certificate: the expanded uncertainty of a calibrated rig at stated poses, with all its inputs.
 
 CALIBRATION is the folder that `psd-deflection calibrate --out` wrote, by a reference. DIR gets certificate.html (to be

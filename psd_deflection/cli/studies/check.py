@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Check a rig before you trust its numbers: is it wired as the rig file says, is it quiet, is there light?
 
 Without a recording it is a guide at the bench. It says "push the tip along +X", sees by itself that you push, hold

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compute the stiffness of a link and compare sensor placements.
 
 Without --params-file it recomputes Tables B1 and B2 of the thesis and explains every difference.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find the physical effect that the simulation of a recording lacks, and add it to the model.
 
 REC is a bag folder, an .mcap or a .csv that contains the loads (and the temperatures). You may give

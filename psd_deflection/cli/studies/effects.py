@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """List the effects that can be simulated, corrected and discovered; with a name, explain one.
 
 An effect is physics beyond the nominal rig: a turned detector, a soft clamp, hum. `simulate --effect` adds it,

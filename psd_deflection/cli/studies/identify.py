@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Find the modes of the link in a recording: frequencies, damping ratios, and the input shaper that does not ring them.
 
 Record a few seconds in which the link rings: release a load, or knock on the link. Stretches in which it

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What concerns the thesis alone: compare the errors of all methods, and explain its Table 5.1.
 
 A rig needs none of this. docs/audit.md has what is wrong in the thesis; `make demo-thesis` in a checkout repeats its

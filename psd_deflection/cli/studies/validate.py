@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compare the estimates of a recording with an independent reference: a camera, a stage, a laser tracker.
 
 The reference is in the recording (topic /reference/deflection, CSV columns ref_dx, ref_dy, ref_theta), or in a

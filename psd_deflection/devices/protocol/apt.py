@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """APT messages of the quad detector in Thorlabs KPA101/TQD001 position aligners; no I/O.
 
 Theory of operation. A message is a 6-byte header; a long message adds the data that the header

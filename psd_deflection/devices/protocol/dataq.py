@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Commands, replies and scans of DATAQ DI-1100/1110/2108/4108 converters; no I/O.
 
 Theory of operation. Commands are ASCII and end with a carriage return. While the device is not

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Encodes and decodes the serial frames of protocol version 1 (``docs/protocol.md``).
 
 Theory of operation. A frame on the wire is ``COBS(type u8 | body | crc32 u32) 00``, little-endian,

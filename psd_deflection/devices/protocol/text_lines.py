@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One sample per line of text, simple to send from an Arduino and readable; no I/O.
 
 Theory of operation. A line is ``seq,t_us,x1,y1,sum1,x2,y2,sum2`` and a newline (a carriage return

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a device says of itself, made harmless: text that can be printed, numbers that can be computed with.
 
 A device's JSON object comes from a stranger and goes to the log, ``/diagnostics``, recordings and a person's terminal.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What known accelerations of the link's base do to its tip.
 
 ``link_tip_rest`` moves with the base, and the tip lags behind by its inertia. With a the acceleration that the tip

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Loads that other nodes announce: what they do to the tip from their stamps on."""
 
 from __future__ import annotations

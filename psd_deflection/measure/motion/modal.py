@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How a mode moves from sample to sample, and what a block of samples says about it.
 
 Each of dX, dY and theta is a damped oscillator about the static deflection u of the load. The load wanders by steps, or

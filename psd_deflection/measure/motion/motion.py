@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The filter: block after block of poses in, pose and velocity of the tip out.
 
 How fast the load wanders is not known and changes: a link at rest, in operation, and one whose load

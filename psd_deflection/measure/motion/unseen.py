@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a load that nobody sees may do while no samples come, by what loads did lately.
 
 The process noise of the filter says how the load wanders at present. A load that is switched now and then wanders not

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the dots were at the stamp: a polynomial through one block, weighted by what is known of the motion.
 
 The mean of N samples is not the value in their middle while the link moves: 20 samples at 1 kHz take

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Orthogonal combinations of the readings: those that move with the link first, then those that do not.
 
 Of two PSDs: x and y of the plate's middle, its twist, and the length of the base line, exactly, which does not move

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The one reading too many: whether the four readings belong to one flat plate, and which one does not.
 
 Two PSDs give four readings for three unknowns. What is left is one number a block: how much longer

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The steps of the converter as the samples show them, whatever the rig file says.
 
 Volts of a converter lie on a lattice: their differences are multiples of its step. The greatest common divisor of the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The noise of the readings, measured in the stream: how they vary about a link at rest.
 
 What an estimate's covariance needs is the variance of a weighted mean over one block, so colour

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The readings too many of three and more PSDs: whether all belong to one pose, and which PSD does not.
 
 With residual r of the readings, their covariance C and slopes J by the p unknowns, what no pose explains has

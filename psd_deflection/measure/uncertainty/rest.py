@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether the link is at rest, as a zero needs it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The dots of one block at its stamp and how sure they are: by the rule that the rig asks for.
 
 Joins what is measured of the noise (:mod:`psd_deflection.measure.uncertainty.noise`), the fit through the block

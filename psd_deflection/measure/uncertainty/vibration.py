@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Vibration that a block cannot follow: tones of the readings that move together.
 
 A motion whose period is shorter than a block looks like noise to one block: it varies inside, and hardly from mean to

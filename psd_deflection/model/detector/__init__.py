@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Counts to volts to metres; the sensor types."""
 
 from psd_deflection.model.detector.sensors import (

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the edges of a detector's active area leave of a spot. A run needs none of it: nothing takes it back."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From the place of a dot on a detector to its reading, and back: the one model of what a detector does.
 
 What happens to a dot at (x, y), m from the detector's centre, in this order:

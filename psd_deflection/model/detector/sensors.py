@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From photocurrents to the place of the spot and back, with one class for each kind of sensor.
 
 Numbers such as 2.3 are equations of the thesis. A lateral sensor is one resistive sheet that divides

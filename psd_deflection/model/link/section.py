@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The tube's cross-section: the part of the stiffness that comes from geometry (thesis A-9 ... A-15, B-1, B-3)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Static deflection of the link tip under a load at the tip, both ways.
 
 The published wrench is the load that gives the measured deflection in this model. The inverse runs

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of a rig and a pose -> the four readings; the one model that calibration fits and propagates.
 
 Of PSD i with centre c and height h: the beam crosses the plate at q (:mod:`psd_deflection.model.plate.plate`, tilts

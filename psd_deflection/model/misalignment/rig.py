@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The parameters of a rig file as a vector with its uncertainty, and the values of a rig file from such a vector."""
 
 from __future__ import annotations

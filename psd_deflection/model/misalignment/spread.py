@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the uncertainty of a calibration adds to the covariance of an estimate.
 
 The readings are r = f(pose; p). The pipeline takes the effects of p off the dots, so an error of p moves the corrected

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """PSDs at the base under lasers on the plate: pose -> dots, with derivatives.
 
 Laser i sits at (l_x, l_y) on the plate and shines along the plate's normal; PSD i has its surface at height h_i over

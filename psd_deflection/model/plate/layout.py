@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the PSDs, the beams and the link are; an unsolvable layout is refused with the reason.
 
 Theory of operation. A dot reading m_i is where laser i falls on PSD i, from the PSD's centre c_i,

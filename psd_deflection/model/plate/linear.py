@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The linearised plate of the thesis's chapter 4, corrected: matrix, gain, condition, error bound.
 
 A b = m - m_0 with rows [-1, 0, l_iy] for x_i and [0, -1, -l_ix] for y_i. The thesis has absolute

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which sensor placement conditions the measurement best, and by how much.
 
 At rest the dots move by A (dX, dY, theta), A the design matrix (``linear``). For readings of equal

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The tip plate under parallel beams: pose -> dots with derivatives, and flat dots -> pose.
 
 Theory of operation. The beams are parallel to Z, beam i at l_i. PSD i has its surface at height h_i over the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Dots in space: beams that are not parallel to Z, surfaces that are turned and tilted on the plate.
 
 ``plate`` is the solvers' model, with parallel beams and surfaces parallel to the plate. This module covers,

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rig in numbers: load history to link, optics, detectors and electronics.
 
 The stages run in one direction, each vectorised over samples and without noise until the last:

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The list of effects, how an effect is loaded, and how a rig file switches it on.
 
 An effect is one file with one :class:`~psd_deflection.model.simulation.declaration.Effect` called

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The declaration of an effect, made by a file in ``effects/`` or by your own file.
 
 It holds everything that the simulation, the correction and the discovery know about an effect. None

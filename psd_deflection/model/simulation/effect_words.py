@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects in the notation of the command line, ``NAME,KEY=VALUE,...``, and as a map like that of a rig file."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The play operator y <- min(max(y, x - r), x + r) of half width r, which makes a loop.
 
 Each sample clamps the state, and a composition of clamps is a clamp. So a prefix scan computes the whole samples

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads the YAML file of a law: what is wrong with it is said with file, key, value and what is
 allowed."""
 

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the forms of a law do to a variable v (n,): of no memory, or following it with a state from block to block.
 
 ``shapes``: the numbers that shape the form, by name; ``period``: of the samples, s. A form that

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Empirical effects: a law written as a YAML file, which a person can read and edit.
 
 ``discover`` writes one where no effect of the catalogue fits. A law adds a sum of terms to one

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Load histories and temperatures in the notation of the command line."""
 
 from __future__ import annotations

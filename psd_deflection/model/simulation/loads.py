@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Load histories: the known load at the tip, sample by sample.
 
 The thesis hangs 10, 30 and 50 N on a sidebar, 0.585 m from the link on its +X side, and on the

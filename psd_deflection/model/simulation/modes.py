@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Exact sampled response of one mode to a load held between samples.
 
 q'' + 2 zeta w q' + w^2 q = w^2 u with u constant over each sample period T has the exact pulse

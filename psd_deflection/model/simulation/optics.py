@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the beams fall: on a plate that has moved, twisted and tilted, or from such a plate on PSDs at the base."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Consecutive samples on their way through the stages."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The forward model: from loads to converter counts, all at once or in steps of any size.
 
 Theory of operation. A :class:`SimulatedSamples` holds consecutive samples, one row per quantity, and passes

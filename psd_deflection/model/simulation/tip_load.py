@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From the tip's pose to the load that causes it, through the effects that the rig file lists; knows no effect by name.
 
 The inverse of the forward model at rest. Its order is: loads, effects on them, static pose (by the constants, as the

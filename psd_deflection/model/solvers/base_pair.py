@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``base_pair``: lasers at the tip, PSDs at the base, in two planes (the thesis's section 5.3).
 
 Here the tip's tilt turns the beams: PSD i, a distance L_i = -h_i below the tip, sees

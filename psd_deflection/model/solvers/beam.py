@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``beam``: flat-plate unknowns plus the tilts of a cantilever's tip, which follow from its deflection.
 
 Four readings cannot give five unknowns, but in a bending link the deflection determines the two

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``exact``: weighted rigid registration of the plate to the beams; the default.
 
 The flat plate's model, m_i = R(-theta)(l_i - d) - c_i, has no small angle in it. Minimise

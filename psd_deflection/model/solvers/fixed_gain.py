@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The driver of the linear methods: a gain matrix that does not depend on the noise."""
 
 from __future__ import annotations

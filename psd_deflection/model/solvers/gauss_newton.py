@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Gauss-Newton in floats for one block; several methods use it.
 
 A model gives predicted readings and their derivatives; the driver repeats x <- x + (J^T W J)^-1 J^T W r

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The inputs and outputs of every solver, for one block and for many.
 
 Theory of operation. A dot reading m_i is where laser i falls on PSD i, from the PSD's centre c_i,

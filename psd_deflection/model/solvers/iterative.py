@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``iterative``: the thesis's section 2.2, corrected.
 
 Turn both dots back about the tip's centroid by one trial angle theta; each PSD then gives a

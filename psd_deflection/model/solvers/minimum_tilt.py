@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``minimum_tilt``: the part of the thesis's section 2.3 that four readings can determine.
 
 Section 2.3 looks for two tilts besides dX, dY and theta. Four readings cannot give five unknowns:

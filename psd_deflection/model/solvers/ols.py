@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``ols``: ordinary least squares on the linearised plate, with the corrected design matrix.
 
 The thesis's section 4.2 (4.24, x = A+ b) with the corrected rows of ``model.plate.linear`` and the pre-load

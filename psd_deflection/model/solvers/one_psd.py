@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Translation from one detector, for the time in which the other cannot be believed.
 
 One dot gives two equations; three unknowns stay undetermined. With the twist *given* as

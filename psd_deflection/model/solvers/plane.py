@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Shared algebra of the flat plate: from motion to dots, and from dot noise to the estimate.
 
 With p_i = R(-theta)(l_i - d) the plate point under beam i and f = R(-theta) d, a small change of

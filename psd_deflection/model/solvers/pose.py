@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``pose``: three or more PSDs at different heights see the tilts themselves, without a beam theory.
 
 Coplanar surfaces under parallel beams see a tilt only through foreshortening: nothing at zero tilt, a

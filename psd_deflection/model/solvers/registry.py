@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The solver names that ``solver:`` and ``solvers:`` of a rig file may contain.
 
 To add a method, write a class (see :class:`~psd_deflection.model.solvers.interface.Solver`) and add a line here. The

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Methods for some of a rig's PSDs, while the others cannot be believed.
 
 A method takes what is left as it would take a rig that has no more. ``pose`` needs three PSDs at different heights to

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``wls_exact``: the linear answer of ``wls``, with the linearisation error removed exactly.
 
 On a flat plate b = m - m_0 = (R(-theta) - I) l_i - f, f = R(-theta) d. Put into the weighted linear

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A bag of ROS 2: a folder of MCAP files with ``metadata.yaml``."""
 
 from __future__ import annotations

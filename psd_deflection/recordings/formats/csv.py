@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """CSV: a row a sample; or the estimates, or the poses of a camera."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The declaration of a format: the names of its files, how one is read, and how one is written."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """All formats of recordings, ours and those of other packages; which of them a path means.
 
 A plug-in declares an entry point of the group ``psd_deflection.formats`` that has its name; the object is a

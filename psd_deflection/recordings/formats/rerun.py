@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Rerun: what is computed of a recording, to look at."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How much work a recording may cause: every bound on what an MCAP file declares is here.
 
 A few bytes of a compressed chunk can stand for millions of records. So one pass over a file gets an

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads bags (folders) and single MCAP files: our own and those of ``ros2 bag record`` and other programs.
 
 Sample numbers are recorded modulo 2^32. They are extended again, so that the blocks are those of the writer (2^32 is

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads the point clouds that hold the samples, faster than the generic decoder.
 
 The clouds of one recording differ only in stamp, width and points. So the bytes between these are parsed

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads CSV recordings: one sample per row, header first, also from other loggers.
 
 The file is read in passes and never held whole in memory (:mod:`.csv_rows`).

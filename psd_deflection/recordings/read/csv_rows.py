@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rows of a CSV file with a header and a column ``t``: many at once if they are plain, one by one if they are not.
 
 Times are read as decimals into integer nanoseconds, never through a float: a float cannot hold

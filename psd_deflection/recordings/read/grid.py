@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What readers of whole recordings share: values held on the grid of the samples, and the hash of a recording."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads one MCAP file from front to back, even if it is cut or damaged.
 
 If a file lost its end, or a chunk is damaged, everything else is read, with a warning. Every size that a file

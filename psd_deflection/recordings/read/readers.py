@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Opens a recording of any format: every command that reads one does it by this."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Independent measurements of the tip beside a recording: a table of a camera or a stage, or another recording.
 
 The table is a CSV with a header: ``t`` (s) and ``dx,dy,theta`` (m, m, rad); ``sd_dx,sd_dy,sd_theta`` and ``status`` if

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compares the messages of a replay with the recorded ones, byte by byte.
 
 Messages are matched by topic and stamp. A recording may be partial: topics that it does not have, and the time

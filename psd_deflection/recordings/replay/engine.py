@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Replay: a recording through the same pipeline as in the live node, block by block.
 
 Commands, the monitor and the benchmarks use it. ``source: replay`` is different: it is a device

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A simulated recording in memory: what :func:`psd_deflection.simulate` returns. It has no estimates: replay it."""
 
 from __future__ import annotations

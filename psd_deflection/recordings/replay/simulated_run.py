@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A simulated recording: the samples of the rig, and the estimates that the daemon computes from them."""
 
 from __future__ import annotations

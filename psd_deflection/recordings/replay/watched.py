@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The watch over a replay: it hears of loads and changes when the run did."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Metadata as rosbag2 Jazzy writes it beside the messages: ``metadata.yaml`` version 9 and QoS profiles.
 
 A bag holds the QoS of a topic twice, in ``metadata.yaml`` and in the MCAP channel. Some readers

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Writes recordings: rosbag2 bags (a folder with ``metadata.yaml`` and MCAP) and single MCAP files.
 
 A crash must cost at most a second. So chunks span less than half a second of log time and are

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Writes CSV: samples as a recording that can be read again, and estimates for a spreadsheet.
 
 Numbers are written with enough digits to read the same number back (float32 volts, float64

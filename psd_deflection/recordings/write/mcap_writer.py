@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Writes one MCAP file: chunks with the indexes of their messages, and the summary at the end.
 
 The format: https://mcap.dev/spec. The indexes of the chunks wait in a file until the end: a kilobyte per chunk,

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Writes a camera's poses as messages: ``/reference/deflection`` and the same with covariance."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Writes a Rerun recording that includes its layout (blueprint), so that the viewer shows it at once.
 
 Rerun can open our MCAP but shows no view of it. The units are those of ``plot``: µm, mdeg and mm. A block

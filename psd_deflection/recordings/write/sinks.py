@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Makes a recording of the format that its name says."""
 
 from __future__ import annotations

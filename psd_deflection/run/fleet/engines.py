@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where tasks run: in this process, in processes of this machine, or on a Dask cluster.
 
 All are used through :mod:`concurrent.futures`.

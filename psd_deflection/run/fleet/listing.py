@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings from the words of a command line: paths, patterns, and text files that list them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Rows of many recordings as one Parquet file."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One task for each recording; what comes out, in the order of the recordings."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The live page: shows the rig in a browser and loads nothing from outside hosts.
 
 ``feed`` takes records off the pipeline thread through a bounded queue, ``server`` serves the page and a

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Who may see the page and who may press its buttons.
 
 Any web page can make a browser send requests, also to 127.0.0.1. So a request must name this

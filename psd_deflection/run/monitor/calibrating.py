@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A calibration from the live page: ``psd-deflection calibrate --live`` as a process of its own, and what it says."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Speaks to a running daemon over its page: requests, and what it measures. For commands without ROS."""
 
 from __future__ import annotations

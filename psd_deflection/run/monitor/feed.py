@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Passes records from the pipeline thread to the page's thread; it never waits and never grows.
 
 Items that do not fit into the queue are dropped and counted. Publishing and recording are not affected.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Serves what is measured to Foxglove, without ROS: the messages of the graph, over Foxglove's WebSocket protocol.
 
 The protocol is ``foxglove.websocket.v1`` (https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md), as far as

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A web server in a thread of its own, with the gate that every view of the daemon has.
 
 A request must name this machine, and one that opens a websocket, asks for data or changes something must come from a

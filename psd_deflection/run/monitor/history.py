@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The last days in cells of a second, ten seconds and a minute, for the page's windows of hours.
 
 A cell has the least, the greatest and the mean of each quantity over the blocks that came in its time, the samples

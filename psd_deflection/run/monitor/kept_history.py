@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Keeps the page's history from run to run: an SQLite file per device, written by a thread of its own.
 
 The file has the cells of ten seconds of the last week and the marks, some megabytes at most. It is written once a

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The numbers of a run as OpenMetrics text, for Prometheus and whatever else reads it.
 
 Source: OpenMetrics 1.0 (2020). Counters end in ``_total``, a unit is the end of the family's name, and nothing

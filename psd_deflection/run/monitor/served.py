@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The pages that this user's daemons serve now, so that commands find them without an address.
 
 Each page has a small file below ``$XDG_STATE_HOME/psd_deflection`` while it is served. Only the user can

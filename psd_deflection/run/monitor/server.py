@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page's own thread: an aiohttp server with the page, a websocket and two buttons.
 
 All its buffers have a fixed size: the rows of the last minute, the cells of the last days (:mod:`.history`), the last

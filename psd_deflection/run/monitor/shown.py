@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The source of the page: what it has to give, and a running session."""
 
 from __future__ import annotations

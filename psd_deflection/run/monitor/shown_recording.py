@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recording played in real time, as the source of the page."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Amplitude spectral density of the dots from the last seconds of raw samples.
 
 Welch's method (P. D. Welch, IEEE Trans. Audio Electroacoust. 15, 1967): Hann windows, half

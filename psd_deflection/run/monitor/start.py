@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Starts the views of a session, for the node and the command line: the page, Foxglove."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The reader thread turns a source's samples into chunks with host times and puts them in a bounded queue.
 
 The reader owns the source, the sequence numbers and the clock. It hands over a chunk as soon as the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the reader puts on its queue, and the samples that wait to be put there."""
 
 from __future__ import annotations

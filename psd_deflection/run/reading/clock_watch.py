@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Follows the clock of a device: chooses the samples for the clock map, and detects jumps of the clock.
 
 It reads no clock: every time comes from the caller. Times of samples are device microseconds, times of reads are

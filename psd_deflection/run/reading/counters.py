@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Counters of everything that a device sent or lost.
 
 Every missing sample is counted once, under its cause if that is known.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The gate for what a device says of itself: whether it fits the rig, and whether it is still the same device."""
 
 from __future__ import annotations

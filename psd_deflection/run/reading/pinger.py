@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Asks the device for its time now and then, at random phase to its samples.
 
 It reads no clock: every time comes from the caller.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every source of error does to ΔX, ΔY and θ of one rig under one load."""
 
 from __future__ import annotations

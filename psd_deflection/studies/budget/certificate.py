@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The uncertainty of a calibrated rig at stated poses, with every input of it: the numbers of a certificate.
 
 What a calibration measured is known with its uncertainty: parameters p with a covariance, by the reference. An error

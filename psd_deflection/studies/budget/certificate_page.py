@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A certificate of calibration as a page, and its numbers as tables that a spreadsheet opens.
 
 The page's tables have every input, so that each U can be computed again from them alone: with g = u c of each input,

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The measuring chain with its imperfections, exact: from a pose of the tip to readings and stored zeros.
 
 Theory of operation. A sensor is at C = (c + error, h + error) on the plate, its axes turned and

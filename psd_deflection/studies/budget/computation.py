@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """E_C, the method's own error on perfect readings (last row of Table 3.1; 3.9, 3.10 corrected).
 
 For an exact method it is zero. The least squares of chapter 4 are linear: the result is sin theta

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Terms of the environment (second group of Table 3.1) and of the beams."""
 
 from __future__ import annotations

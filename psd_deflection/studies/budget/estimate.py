@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The estimators of the error budget, and their first-order response.
 
 Each takes readings and stored zeros, (n, P, 2) m, and gives (n, 3): dX, dY, theta. Its ``response`` is

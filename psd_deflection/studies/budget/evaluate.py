@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The budget: every cause at one situation, the totals, and the Monte Carlo that must agree with them."""
 
 from __future__ import annotations

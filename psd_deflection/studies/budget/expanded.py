@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The expanded uncertainty of a measurement as the GUM has it (JCGM 100:2008), and Monte Carlo beside it (JCGM 101).
 
 The standard uncertainty of an axis is u_c, u_c^2 the sum of the causes' variances u_i^2. Each u_i is known with its

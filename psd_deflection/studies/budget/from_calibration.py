@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads what a certificate is made from: the folder of a calibration, and the fields of the page."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The inputs of the budget besides the rig file, each with default, unit, bounds and source.
 
 A tolerance is the half-width of a uniform distribution (its standard deviation is the half-width

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Terms of the installation: where the sensors sit, how they are turned, and how the tip tilts (Table 3.1, 3.2)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The load at which a budget is computed if the user names none."""
 
 from __future__ import annotations

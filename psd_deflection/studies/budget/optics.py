@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The light between laser and detector: thesis equations 3.1 to 3.4, corrected.
 
 Each function states the error of the printed equation and its consequence. All values are plain floats, SI.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The bars of an error budget, for its page and for a file."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The answer of budget: each cause's error, the totals, the chart."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Terms of the sensor itself: the first group of Table 3.1, and the amplifier and converter behind it."""
 
 from __future__ import annotations

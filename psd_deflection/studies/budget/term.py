@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A term of the budget, and how it becomes deviations of dX, dY and theta.
 
 A term declares a few independent error parameters, each with a standard deviation, and how their

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Estimates how a real rig differs from its rig file, from recordings with a reference or with known loads.
 
 ``observation``: a recording as arrays, and the rows that are fitted. ``fit``: parameters with their covariance.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What recordings say of a rig: the fit, what it cannot determine, whether unseen motion agrees.
 
 A parameter is undetermined if its standard deviation stays above ``OPEN`` of its tolerance. It keeps the file's

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whether an old calibration still holds: which group of parameters moved, by how much, how sure.
 
 The rig file gives p with covariance P. New rows with normal matrix N = J^T C^-1 J and b = J^T C^-1 r(p) are, if nothing

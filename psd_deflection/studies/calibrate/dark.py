@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Dark levels: what each PSD reads with its laser off, and the share of the light that is not the laser's.
 
 Photocurrents add, and an amplifier that divides shows quotients. With laser light S at v_laser and other light b,

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parameters and their covariance from rows of readings and poses: Gauss-Newton with the tolerances as a prior.
 
 The reference y of row j is the pose with an error e (errors in variables). With the pose x_j that the readings m_j

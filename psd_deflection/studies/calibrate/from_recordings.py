@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads recordings for calibrate into arrays on a sample grid without gaps."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One recording as arrays, and the rows that a calibration fits: the dots at the times of the reference.
 
 A polynomial of degree 6 through 21 samples gives the dots at a time, their speed and their noise. It follows the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How far a calibration is: what the motion so far has determined, what is open, and what would determine it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The answer of calibrate: calibration.json, the page, and the rig file (docs/calibration.md)."""
 
 from __future__ import annotations

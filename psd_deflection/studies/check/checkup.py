@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The check of a rig: wiring, loads, noise and light against its rig file."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Leads a person through three pushes, and takes each when it is held: nobody needs a free hand for a key.
 
 Fed with the device's volts chunk by chunk, it says what to do next and sees for itself when the link rests, is pushed

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What check and discover both judge, once: noise, and what was noted of the loads, against file and recording."""
 
 from __future__ import annotations

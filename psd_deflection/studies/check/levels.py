@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Noise, hum and light of each channel, against what the rig file says."""
 
 from __future__ import annotations

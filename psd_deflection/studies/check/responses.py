@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How the dots of a recording answered to its loads, by linear regression on the dots that the simulation shows.
 
 The simulation has the plate's geometry and the ringing of both modes. So what is left of a regression on its dots is

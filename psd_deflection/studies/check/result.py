@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The answer of check: what the rig file has wrong, how sure that is, and the lines that put it
 right."""
 

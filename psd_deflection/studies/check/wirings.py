@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which of all wirings of a two-PSD rig explain how the dots answered to pushes.
 
 A push along +X moves both dots along -x, one along +Y both along -y, and a turn about +Z moves dot i by θ times

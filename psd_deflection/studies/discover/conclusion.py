@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a search concludes: sentences, result.json, model.yaml, the files of a law (docs/discover.md).
 
 ``report`` makes its page.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compare, localise, name, add, show: :func:`discover` runs all steps for the rig with its recordings.
 
 The default answer is "nothing missing". A discrepancy that no effect explains is described as unknown.

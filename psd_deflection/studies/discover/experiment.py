@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a rig can be asked to do, and how well it would tell two explanations apart.
 
 Criterion (T-optimality, Atkinson and Fedorov, Biometrika 62 (1975) 57): the chi-square that remains between what one

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The search with its verdict: beside the loads as noted, or beside free ones if they were noted wrong."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Reads recordings for discover into arrays on a sample grid without gaps, loads and temperatures held; and tables of
 readings.
 """

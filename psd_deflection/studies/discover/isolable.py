@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Which effects of the catalogue could be told apart, from the rig alone, before anything is recorded.
 
 The signature of each effect is simulated under loads that are planned, beside the noise of the rig. The chi-square of

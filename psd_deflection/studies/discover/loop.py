@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Search, plan, record, search again, until one explanation is left or no recording would help."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The next recording: the one that best tells apart the explanations that the recordings so far leave.
 
 ``named`` is the model of the answer, ``rivals`` are those that the data does not exclude. The value of a recording is

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The same search on any machine that can simulate itself: :func:`discover_in`.
 
 A real machine differs from its model by far more than sensor noise, and nobody knows by how much. So the level of what

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a machine that simulates itself tells of itself, so that :func:`discover_in` can ask it."""
 
 from __future__ import annotations

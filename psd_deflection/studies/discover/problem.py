@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the steps of discover know of a machine and of what its simulation lacks.
 
 A :class:`Problem` is frozen; each step takes one and gives the next. The rig with its recordings and a plant that

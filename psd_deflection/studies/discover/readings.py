@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A table of readings: one row for each load that was hung on the link and left until it was at rest.
 
 It is a plant for :func:`~psd_deflection.studies.discover.plant_search.discover_in`. Nobody knows how long each

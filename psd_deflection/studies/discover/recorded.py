@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The recordings made ready for the search: what is no measurement taken out, loads, wiring and units put right.
 
 :class:`Recorded` is frozen; each of the ``STEPS`` takes one and gives the next.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rig with its recordings, as the search sees it: what is compared, its signatures, and where it looks."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """References without samples, as a table of readings: a row for each time in which one load hung and the link rested.
 
 A camera or a stage measures the tip's pose while loads hang on the link; nobody recorded the PSDs. What the simulation

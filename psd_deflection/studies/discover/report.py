@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The sections of the page of discover, for readers who have not seen the experiment."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The answer of discover for the rig, with its page."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The steps of discover: search, weigh, name the alternatives, say where. Each gives the next problem.
 
 An effect is named only if all of these hold: library-wide p <= 1e-4 (0.01 of a plant), a BIC better by more

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a search found, as trees of result.json and as sizes for a person (docs/discover.md)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is found of one axis: its modes, and how they were seen."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What identify looks at: the poses of single samples of a recording."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Frequency and damping ratio of the modes of each axis, with their uncertainties.
 
 A link that is left alone rings down: after a step of the load, or a knock,

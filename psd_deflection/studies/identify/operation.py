@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The mode of a link that never rings alone: from the spectrum of its motion in operation.
 
 What drives the link was not measured, so the spectrum is fitted with that of a mode that noise of

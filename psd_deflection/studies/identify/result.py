@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The answer of identify: modes, lines for the rig file, input shapers."""
 
 from __future__ import annotations

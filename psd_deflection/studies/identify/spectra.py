@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the motion of an axis stands out of its noise: peaks of the spectrum, white noise and noise
 that remembers."""
 

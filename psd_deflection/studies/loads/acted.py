@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What hung on the link of a recording, of a rig that is nearly as its file says: check and calibrate ask here."""
 
 from __future__ import annotations

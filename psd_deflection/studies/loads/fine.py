@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Means of a few samples each: short enough for the motion of the link."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Loads that a load cell measured: their mean from one step to the next, and how exact that is."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """When noted loads began to act, by the motion of the dots: a person notes a weight some seconds after it was hung.
 
 Steps of the dots (:mod:`.steps`) and notes are matched in their order. If they agree, or all notes are late alike,

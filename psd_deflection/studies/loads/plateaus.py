@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What hung on the link, if it is not what was noted: three numbers for each time between two changes of the load.
 
 A movement of the plate that another constant load makes, from one change to the next, is a wrong note. An effect of the

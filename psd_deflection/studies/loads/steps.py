@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Steps of the dots that last: where they are, and when the load of each began to act.
 
 They are found without a model of the rig: the mean just after a moment against the mean just before it, over whole

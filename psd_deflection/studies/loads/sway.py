@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A weight that swayed while it hung: the link swings slowly in that time, and only there.
 
 What swings is the plate, at one frequency. The time in which it did is left out, until the link has come to rest.

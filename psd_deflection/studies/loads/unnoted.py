@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Times in which loads were hung and taken off, and none was noted: somebody stopped, or a file has zeros there.
 
 A load or two are found one by one (:mod:`.plateaus`). Where many are missing, nobody knows what hung: that time is left

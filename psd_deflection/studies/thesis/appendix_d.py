@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``appendix_d``: the thesis's MATLAB code for the iterative method, unchanged; for comparison only.
 
 It is kept to explain the thesis's published figures. The code has these faults:

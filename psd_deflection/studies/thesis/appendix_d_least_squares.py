@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``appendix_d_ols``, ``appendix_d_wls``: the thesis's MATLAB least squares; for comparison only.
 
 Its matrix (4.12 with theta_1 = -90, theta_2 = -180 degrees) has rows of two different rigs: with PSD 1

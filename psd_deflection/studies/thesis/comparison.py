@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The errors of each method, by condition, and the origin of the thesis's Table 5.1.
 
 Exact readings of a rig with the thesis's geometry go through every method. The result is the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The figures of docs/methods.md that the methods draw: ``thesis compare-methods --out DIR``."""
 
 from __future__ import annotations

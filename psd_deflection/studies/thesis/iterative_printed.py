@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``iterative_printed``: the thesis's section 2.2 as printed; for comparison only.
 
 Trial angles a = 0, 0.01, ... degree; both dots are rotated back clockwise, then counter-clockwise.

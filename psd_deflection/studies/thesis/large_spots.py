@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Figures 5.30 to 5.35 of the thesis: the same load with laser dots of 1 mm and of 2 mm.
 
 The thesis finds that dots twice as large make the computed deflection no worse. Here the rig of the thesis is simulated

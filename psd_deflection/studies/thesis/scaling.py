@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Appendix B: how two links, one carrying the other, deflect when they are scaled.
 
 A flexible link BC is clamped at B; a rigid link CD of the same length is attached at right angles

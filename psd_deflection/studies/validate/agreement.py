@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What two instruments that measured the same motion differ by.
 
 Bland and Altman (Lancet 327, 307, 1986): differences over means, the bias and the limits within which 95 % of the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The offset between the clock of a reference and that of the samples, with its uncertainty.
 
 First every offset on the grid of the samples is tried: the reference is regressed on the motion, axis by axis, by

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What validate compares: the motion of a recording as each solver has it, and a reference."""
 
 from __future__ import annotations

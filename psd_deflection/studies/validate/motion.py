@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The motion that the detectors saw, at any instant, from the samples around it.
 
 The dots of each channel are fitted with a polynomial over the samples near the instant (local least

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The answer of validate: what estimate and reference differ by, for each solver."""
 
 from __future__ import annotations

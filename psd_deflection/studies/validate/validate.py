@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Compare the motion that the detectors saw with an independent reference."""
 
 from __future__ import annotations

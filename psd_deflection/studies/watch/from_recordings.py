@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Runs the watch over a recording, by the records that its replay gives: the same as ``replay --watch``."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The answer of the watch over a recording: its alarms."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Composed deflections beside an independent finite-element frame (PyNite), and their covariance beside chance."""
 
 from __future__ import annotations

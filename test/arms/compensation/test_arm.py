@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The kinematics of a URDF file: beside those of the chain, and by finite differences."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Active damping: what it adds, its limits, and when it stops."""
 
 from __future__ import annotations

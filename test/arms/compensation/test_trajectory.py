@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Shaped trajectories: what they are between their points, their limits, and what is refused."""
 
 from __future__ import annotations

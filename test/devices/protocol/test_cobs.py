@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Consistent Overhead Byte Stuffing, judged by the package ``cobs``."""
 
 from __future__ import annotations

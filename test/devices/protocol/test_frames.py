@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The frames of docs/protocol.md. The bytes of the case table were written down, not encoded by us."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A device's words, made harmless, whatever they were."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The filter by itself: its covariances against sums over its own gains, and from when on what is told acts."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What known accelerations of the base do, against an integration of the equation of motion by scipy."""
 
 from __future__ import annotations

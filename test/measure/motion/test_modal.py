@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The tables of a block, against a Kalman filter written sample by sample, and the motion of one mode."""
 
 from __future__ import annotations

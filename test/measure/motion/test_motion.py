@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The filter in the pipeline: against the truth of a generator of its own, without samples, and in a replay."""
 
 from __future__ import annotations

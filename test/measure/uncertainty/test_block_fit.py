@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The fit through one block: exact on what it can follow, the mean where nothing moves, honest about its variance."""
 
 from __future__ import annotations

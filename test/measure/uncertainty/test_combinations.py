@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Combinations of the readings of more than two PSDs, against what linear algebra says of them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The reading too many, against generalised least squares with dense matrices of numpy."""
 
 from __future__ import annotations

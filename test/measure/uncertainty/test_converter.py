@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The converter's steps as the samples show them: found where they are coarse, never where they are not."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The parts of the noise estimate and of the fit, each against the definition written with dense matrices."""
 
 from __future__ import annotations

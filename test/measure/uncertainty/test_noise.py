@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Noise from the stream: right in size and colour, deaf to motion, never below the converter's steps."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the pipeline remembers of noise, motion and contradictions: told in memory(), and then no bit differs."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rest that a zero needs, by numbers that can be added up by hand."""
 
 from __future__ import annotations

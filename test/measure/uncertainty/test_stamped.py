@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What joins noise, fit and check: each part asked by itself, against what it should say."""
 
 from __future__ import annotations

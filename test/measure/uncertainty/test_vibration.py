@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What vibrates faster than a block: found by its tone, not taken for noise, and never seen where there is none."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where a block stops being good: each limit from both sides, in numbers worked out by hand."""
 
 from __future__ import annotations

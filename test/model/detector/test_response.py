@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One model of the detector: simulation, correction, calibration and budget give the same reading."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Counts to volts to metres; photocurrents to places and back; what not to believe."""
 
 from __future__ import annotations

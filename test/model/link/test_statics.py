@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Link statics both ways, and the cross-section they rest on."""
 
 from __future__ import annotations

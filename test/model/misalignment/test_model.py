@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The model of the readings against the optics of blind/, and its derivatives against differences of the whole."""
 
 from __future__ import annotations

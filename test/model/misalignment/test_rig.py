@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A rig file's effects as parameters of a calibration, and back."""
 
 from __future__ import annotations

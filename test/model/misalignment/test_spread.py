@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The covariance of a calibrated rig: against many rigs whose parameters are wrong by what the file says."""
 
 from __future__ import annotations

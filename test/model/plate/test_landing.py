@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Lasers on the plate, and beams that lean: against rays in space."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The bound that replaces 4.33 and 4.34 holds, for each component, and says something."""
 
 from __future__ import annotations

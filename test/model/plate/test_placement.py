@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Sensor placement: condition numbers, gains, spreads in closed form and by the matrix, and the search."""
 
 from __future__ import annotations

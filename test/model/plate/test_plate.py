@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Pose to dots and back, against a simulator in space that shares no code, and against golden readings."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the viewers draw: by hand for the thesis rig."""
 
 from __future__ import annotations

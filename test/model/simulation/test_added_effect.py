@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """An effect from outside the package: simulated, corrected and discovered like one of ours.
 
 The effect is the one of docs/simulation.md, "Add an effect", so that the page is tried as well.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The catalogue as rig files rely on it: names, order, bounds, defaults, choices; and where a search looks."""
 
 from __future__ import annotations

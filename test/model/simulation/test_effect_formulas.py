@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every effect against a second formula: that of the generator in ``blind/``, written from docs/simulation.md alone.
 
 The judge is how the volts differ from those of the nominal rig, sample by sample, at two lengths of

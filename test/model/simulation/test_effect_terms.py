@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Each term of each effect on samples of any values: formulas written here from docs/simulation.md and the equations.
 
 ``test_effect_formulas.py`` has whole simulations against a second generator; here one effect is called alone, at

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The catalogue: complete, declared, and each effect off when off, on when on, the same in pieces."""
 
 from __future__ import annotations

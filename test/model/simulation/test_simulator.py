@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The forward model against closed forms, an independent integrator, and itself in pieces."""
 
 from __future__ import annotations

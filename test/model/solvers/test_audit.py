@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Statements of the audit that are more than one number: how often, how much, which way."""
 
 from __future__ import annotations

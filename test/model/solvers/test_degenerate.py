@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Geometry that cannot be solved is refused, and the message names what is wrong with it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The shared driver: it converges, and says so if it does not."""
 
 from __future__ import annotations

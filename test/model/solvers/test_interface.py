@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What holds for every method: one block and many agree, names and geometry are checked."""
 
 from __future__ import annotations

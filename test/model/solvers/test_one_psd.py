@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One PSD alone: its covariance against matrices, at a twist at which every term counts."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Any pose in range comes back, through a simulator that shares no code; turning the rig turns the answer."""
 
 from __future__ import annotations

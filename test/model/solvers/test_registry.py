@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A method joins by its module and one line of the registry; what is for comparison only does not run live."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How an answer goes with each dot, by differences of the answers, is the judge of every stated gain and covariance."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The covariance that a solver gives is the one its answers have, and its 95 % intervals hold 95 %."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Pose, covariance, residual and gain of the smooth methods against weighted least squares written with numpy.
 
 The model is that of ``rays`` in space, its derivatives are differences, and the normal equations are dense.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every format must do, ours and the one that ``docs/recording.md`` says to add."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Headless Chromium, driven by its own driver."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A server whose source and clock are the test's."""
 
 from __future__ import annotations

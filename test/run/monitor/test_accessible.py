@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """No page of ours has a violation that axe-core finds: colours, names, labels, landmarks, order of headings."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page in headless Chromium, before the real daemon and the simulated rig."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A calibration that the page starts: a real process, which speaks to the page's server."""
 
 from __future__ import annotations

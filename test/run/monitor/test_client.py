@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The commands that speak to a running daemon without ROS."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Foxglove without ROS: a viewer written from the protocol's description, and messages decoded by mcap-ros2-support."""
 
 from __future__ import annotations

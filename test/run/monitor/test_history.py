@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Cells against the rows that they are made of, through wraps, gaps and clocks that are set."""
 
 from __future__ import annotations

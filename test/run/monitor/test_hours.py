@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The page's windows of hours in headless Chromium: what the daemon remembers, drawn."""
 
 from __future__ import annotations

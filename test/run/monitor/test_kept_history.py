@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the page's hours are after a restart, and what a bad file or disk does to them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """``/metrics`` as Prometheus reads it: its own parser is the judge."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The server as any client sees it: what it sends, whom it obeys."""
 
 from __future__ import annotations

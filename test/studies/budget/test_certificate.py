@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A certificate of a calibration written by hand: each input against the exact model, every sum written again."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The measuring chain with everything wrong at once, against independent golden readings and closed forms."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Each error parameter: its deviation by a formula written again, and the field of the chain that it moves."""
 
 from __future__ import annotations

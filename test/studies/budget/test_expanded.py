@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The expanded uncertainty: quantiles and degrees of freedom against tables and formulas written again."""
 
 from __future__ import annotations

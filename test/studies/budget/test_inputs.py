@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The inputs: defaults by the sources that they name, and bounds that hold on both sides."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The load that suits a rig, against the linear formula of a dot written by hand."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Equations 3.1 to 3.4, corrected: reference values, and that what is printed in the thesis is another thing."""
 
 from __future__ import annotations

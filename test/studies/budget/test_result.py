@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a budget says, shows and writes, against the numbers of its causes and sums by hand."""
 
 from __future__ import annotations

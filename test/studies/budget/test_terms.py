@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Every term: in the table, right where a closed form says what it must be, and as Monte Carlo has it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Calibration against rigs of the second generator in blind/, whose optics are not ours."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Parts of the check of an old calibration, against plain linear algebra."""
 
 from __future__ import annotations

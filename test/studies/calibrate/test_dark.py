@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Dark levels: what is measured with the lasers off, and what it takes off, against photocurrents that add."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One recording as rows: against polynomials that are known, and by count."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a calibration has determined so far, and what would determine the rest."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The check names every wrong wiring and accuses no right one; recordings come from the second generator."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The verdict, the findings and the notes of pushes, levels and drift that are made by hand."""
 
 from __future__ import annotations

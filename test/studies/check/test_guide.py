@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The guide at the bench: pushes are seen without a key, however clumsy the hand."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What check and discover both judge: the same recording gets the same words."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How dots answer to loads: least squares and means by hand."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The words, rows and charts of a checkup that is made by hand."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What discover proposes, names and writes, piece by piece: against counts by hand and sentences."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """discover: names what was hidden, keeps silent where nothing was, and leaves files that work."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The formulas of discover, piece by piece, against the same thing written in another way."""
 
 from __future__ import annotations

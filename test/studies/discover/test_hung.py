@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What hung instead of what was noted, found by a search, and what the fourth reading says."""
 
 from __future__ import annotations

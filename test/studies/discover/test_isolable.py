@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a rig could tell apart, beside what a search then answers."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The formulas behind a law, piece by piece: grids counted by hand, sums written out, states by brute force."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """discover describes what no effect explains as a law; nothing is adopted without the word."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Comparisons at their limits, guards and constants of discover: each from one side and from the other."""
 
 from __future__ import annotations

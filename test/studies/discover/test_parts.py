@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Cleaning, workspace, noise, starting values, plans: each function against sums, loops and limits written here."""
 
 from __future__ import annotations

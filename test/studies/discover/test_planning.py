@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The next recording: what the rig may be asked, which recording is chosen, and when the loop ends."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A plant's cases as vectors of one likelihood, and its answer: against sums, loops and least squares written here."""
 
 from __future__ import annotations

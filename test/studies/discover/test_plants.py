@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The search on a machine of one's own: a spring that is not straight."""
 
 from __future__ import annotations

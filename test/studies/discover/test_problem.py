@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The steps of discover: given a problem, the next one has what was found, and the first stays as it was."""
 
 from __future__ import annotations

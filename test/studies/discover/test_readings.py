@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tables of readings: one row for each load that was hung on the link."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A recording of loads and of a reference alone is searched as a table of what rests under each load."""
 
 from __future__ import annotations

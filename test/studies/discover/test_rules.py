@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The rules and the statistics of discover, against least squares of numpy on a plant that is linear.
 
 The plant shows the sum of its effects, each a fixed picture times its size, in noise of known level.

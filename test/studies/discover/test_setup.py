@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Mistakes of the set-up: each is named with its size and the line that puts it right, and nothing else is."""
 
 from __future__ import annotations

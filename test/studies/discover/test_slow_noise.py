@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Slow noise of the electronics, 1/f: nothing is missing from it, and the ± of what is found beside it covers."""
 
 from __future__ import annotations

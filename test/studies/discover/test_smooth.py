@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What remains without a name as one smooth function, found by discover_in on a table of readings."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The steps of a search and of its localisation, on the plant of ``test_rules``, whose answers are least squares."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A search on rigs of three and more PSDs: what is hidden is named on the PSD that has it."""
 
 from __future__ import annotations

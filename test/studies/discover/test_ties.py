@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """One cause of both stiffnesses, told with its size."""
 
 from __future__ import annotations

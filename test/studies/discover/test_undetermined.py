@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A parameter that the recording does not determine stays off, and excludes no effect."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The noise of a zero that was taken in the recording is no effect."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What is said of modes that are given: limits, words, tables. Numbers by hand."""
 
 from __future__ import annotations

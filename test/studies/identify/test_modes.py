@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Modes of links whose motion is computed elsewhere; links that do not move or are struck all the time."""
 
 from __future__ import annotations

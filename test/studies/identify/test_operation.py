@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The mode of a driven link: its likelihood written again, and spectra that no driven mode has."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """From a recording to the poses of single samples; from samples to the method that suits them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What of the modes reaches the rig file and the shaper."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The parts of the search for ring-downs, with motion that is known: dense least squares, limits and counts by hand."""
 
 from __future__ import annotations

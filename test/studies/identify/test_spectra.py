@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Peaks and noise of spectra that are known by hand or computed again with scipy."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Loads that a load cell measured: noise goes, motion stays."""
 
 from __future__ import annotations

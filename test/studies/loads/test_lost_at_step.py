@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Samples that were lost just as a load began to act."""
 
 from __future__ import annotations

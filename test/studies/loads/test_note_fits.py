@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Noted times piece by piece: the fit of one time, what it leaves, and which loads are mended."""
 
 from __future__ import annotations

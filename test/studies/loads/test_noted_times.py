@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Loads that a person noted some seconds late: the motion says when they were hung, and every study says so alike."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Readings taken apart, against the formulas of a plate and a dense least squares."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What hung on the link instead of what was noted: every study says so alike."""
 
 from __future__ import annotations

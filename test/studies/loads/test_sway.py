@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A weight that swayed: check, calibrate and discover tell it in the same words, and leave its time out."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Many loads that nobody noted: check, calibrate and discover tell it in the same words, and leave their time out."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The printed methods have the errors that the audit of the source found, cell by cell; so has Table 5.1."""
 
 from __future__ import annotations

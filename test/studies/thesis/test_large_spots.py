@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Dots of 2 mm beside those of 1 mm, and the errors that both have by hand."""
 
 from __future__ import annotations

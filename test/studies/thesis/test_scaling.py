@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Appendix B: every cell of both tables agrees with the thesis, or is an erratum that can be explained."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Section 2.3 of the thesis, corrected: four tilts explain the readings at any admissible twist."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bias, scale and noise of made-up differences, against figures written down beside them."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The offset between the clocks: right, as sure as it says, and not told if the motion does not tell it."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The pieces of the search for the offset, against sums by hand, dense least squares, integrals and scipy."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The fitted motion, against polynomials that numpy fits to each instant alone, and counts by hand."""
 
 from __future__ import annotations

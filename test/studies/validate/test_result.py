@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What validate says, prints and writes, against words and figures written down beside them."""
 
 from __future__ import annotations

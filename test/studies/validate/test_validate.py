@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The comparison as a whole, on a made-up motion whose every difference is known."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The watch as a function: the alarms of ``replay --watch``, as a result that shows and writes itself."""
 
 from __future__ import annotations

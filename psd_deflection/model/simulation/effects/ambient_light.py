@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Light that is not the laser pulls the reading to its own centroid (E_DC, stray light)."""
 
 from __future__ import annotations

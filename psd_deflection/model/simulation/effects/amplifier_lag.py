@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The amplifier is a first-order low-pass."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The amplifier clips before the converter does.
 
 If the signal is without noise (``samples.noise`` > 0), the result is the mean of the clipped noisy

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Each axis of a PSD reads a part of the other axis."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The link is stiffer or softer than the rig file says: EI."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The samples of one PSD are late.
 
 Volts between samples come from the model at that time, so a delay of any size is exact, just after a

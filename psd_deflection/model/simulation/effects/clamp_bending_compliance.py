@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The clamp gives way to the root moment and turns the whole link."""
 
 from __future__ import annotations

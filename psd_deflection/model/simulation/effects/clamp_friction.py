@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The clamp sticks: the deflection lags behind the load by half a loop, whichever way it moves."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The clamp gives way to torque and adds its own twist."""
 
 from __future__ import annotations

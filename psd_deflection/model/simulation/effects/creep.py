@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The deflection continues to grow after each change of load."""
 
 from __future__ import annotations

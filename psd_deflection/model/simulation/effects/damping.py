@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The modes lose energy faster or slower than the rig file says."""
 
 from __future__ import annotations

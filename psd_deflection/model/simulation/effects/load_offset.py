@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The load acts beside the centroid, so that a force also turns the tip."""
 
 from __future__ import annotations

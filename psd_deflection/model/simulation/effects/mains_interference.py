@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The mains hum on the channels (E_EMF)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The base is not square to the beams: the tip is displaced by a slope times the length."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The tip plate leans with the bending slope, so that the beams meet it at an angle (E_Tilt)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Air of another temperature bends both beams alike (E_RF)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A further bending mode rings on top of the first."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A PSD reads more (or less) the farther the dot is from its centre (E_R)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A PSD's axes are turned in its plane (E_Algn)."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Part of the spot leaves the active area, and the centroid of the rest is read (E_LP)."""
 
 from __future__ import annotations

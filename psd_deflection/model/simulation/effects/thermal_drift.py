@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The reading of one PSD moves with temperature (E_TH)."""
 
 from __future__ import annotations

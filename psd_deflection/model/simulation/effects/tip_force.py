@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A force that no reading of the load shows always pulls at the tip: the load cell's zero, or what hangs there."""
 
 from __future__ import annotations

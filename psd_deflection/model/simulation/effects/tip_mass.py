@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A mass at the tip that is missing from the rig file lowers the bending frequency."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // A calibration at the bench: its button, and a card with what is determined, what is open, and what to do next.
 
 const $ = (id) => document.getElementById(id);

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // The last hours and days: cells of the daemon's history, asked for while they are looked at. One answer is kept.
 
 import { clock, number } from '/page/charts.js';

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // One detector as it is looked at along the beam's arrival: active area, millimetre grid, trail, dot.
 
 const TRAIL_S = 2.0;

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // One plot or detector as large as the window, until its button or Escape is pressed.
 
 const LARGE = 'large';

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // Rates, losses, health and messages, as text.
 
 import { loadText } from '/page/charts.js';

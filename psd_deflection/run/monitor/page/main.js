@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // Connects, keeps the last minute, draws. Nothing here grows with time: the rows are a ring, the messages a list of
 // fifty, of the hours the last answer, and whatever is drawn is drawn into what is there.
 

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // The traces, of the last minute or of the daemon's history, and the spectrum.
 
 import { hours } from '/page/cells.js';

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // The page of a recording (`psd-deflection plot --out X.html`): the whole of it, drawn once, in a file that
 // needs no server. The plot command puts charts.js before this text.
 

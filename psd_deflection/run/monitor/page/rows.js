@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // The last rows, column by column, in arrays that never grow: each is twice as long as what it
 // keeps, and its newer half moves to the front when it is full. The arrays are of bare numbers, so
 // that the heap is as large when they are full as when they are empty; NaN stands for null.

@@ -1,3 +1,5 @@
+// Copyright 2026 psd_deflection maintainers
+// SPDX-License-Identifier: Apache-2.0
 // The dialog that notes a known load. `press` sets what a button does, `act` asks the daemon.
 
 const $ = (id) => document.getElementById(id);

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a law may be made of: terms, and how much of a residual each explains to first order.
 
 A law adds to one quantity of the chain. To first order the readings answer linearly: what is added to a pose moves the

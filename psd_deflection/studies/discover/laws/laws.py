@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A law for what no effect of the catalogue explains: where it acts, on what it depends, and how.
 
 Terms are scored on the residual to first order, the best are refitted as effects in the simulation together with the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Noise that follows a variable: the likelihood of whitened values whose variance grows with its square."""
 
 from __future__ import annotations

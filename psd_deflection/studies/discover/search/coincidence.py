@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects whose sizes agree too well to be independent: they stand in for one unknown cause.
 
 If the true cause is not in the catalogue, several effects together may explain the data so well that

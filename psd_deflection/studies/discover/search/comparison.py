@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measured against simulated, as whitened vectors of one likelihood: what the search asks of a rig or of another plant.
 
 :class:`~psd_deflection.studies.discover.search.workspace.Workspace` is the rig with its recordings,

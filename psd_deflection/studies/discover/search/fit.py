@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Full nonlinear refit of a set of effects: Levenberg-Marquardt on the whitened residual, bounded.
 
 It does not use scipy.optimize.least_squares for three reasons. Every simulation must be counted and

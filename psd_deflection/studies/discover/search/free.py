@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What nobody knows exactly, and the search therefore holds against no model: loads, their times, and the zero."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Tests a model on held-out load cases: whole load cases or recordings, never interleaved blocks.
 
 For each group of load cases the model is refitted without it, by one Gauss-Newton step from the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Limits that end a search before the evidence does, and what lies beyond them, to first order."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Where the simulation and the data differ: by channel, load case and frequency band.
 
 There are two kinds of statistics on a whitened residual. *Cells*: energy per channel, load case and

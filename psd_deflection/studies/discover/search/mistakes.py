@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Mistakes of the set-up that touch every channel: one that explains nearly all is taken before any effect."""
 
 from __future__ import annotations

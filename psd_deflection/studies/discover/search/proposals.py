@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Starting values that a search by derivatives cannot find: frequencies, limits, coarse steps."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What remains without a name, by the named variables that it follows."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Score tests: how much of a residual each effect's signature explains by itself.
 
 With whitened signatures M and residual r, g = M'r and F = M'M; the part that parameters already in

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Chooses the effects: add greedily, add pairs, drop, swap, with a full refit each time.
 
 The search scores every candidate on the residual (this takes milliseconds), refits the few most

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The signature of each effect: the change of these recordings by a small simulated dose."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What remains without a name as one smooth function of named variables, beside the named effects.
 
 A Gaussian process (Rasmussen and Williams 2006, chapter 2): a sum of one function for each variable, in each channel,

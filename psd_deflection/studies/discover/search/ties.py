@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Effects whose sizes one cause of the rig's geometry ties: a radius changes both stiffnesses by the same share.
 
 EI = E pi/4 (R^4 - r^4) and GJ = G pi/2 (R^4 - r^4) (Gere and Goodno, Mechanics of Materials): a section that is scaled

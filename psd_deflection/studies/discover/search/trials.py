@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What every step of a search does: refit from some starts, and hold the results against each other."""
 
 from __future__ import annotations

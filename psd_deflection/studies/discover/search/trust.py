@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """How far the simulation itself is believed: what it explains may be wrong by a small share, per channel and band.
 
 Two integrators of the same equations differ, sensors are not exactly what their formula says, a weight is not exactly

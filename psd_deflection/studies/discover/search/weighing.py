@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The parts of the verdict: named effects with their uncertainty and their rivals, gaps, and what remains unknown."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Recordings and simulations as whitened vectors of one common likelihood.
 
 Samples are first averaged over *fine blocks* of a few milliseconds (short enough for the link's

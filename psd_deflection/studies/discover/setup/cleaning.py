@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What of a recording is no measurement: outliers, a detector that is stuck, time before the first known load.
 
 These samples become NaN and cost precision, nothing else. What a person should know of them is a :class:`Finding`.

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What the search adjusts besides the catalogue's effects: mistakes of the set-up, and how a recording began.
 
 Each is declared as an effect is, so that one search weighs all of them against each other; none is in the catalogue or

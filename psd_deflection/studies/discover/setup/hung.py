@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Free loads of a search: what hung where another load was noted, and weights that sway.
 
 A movement of the plate that swings is a weight that sways. A few wrong notes stand out (:mod:`.loads.plateaus`) and are

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Estimates the noise from rest and from frequencies without effects, not from the discrepancy itself.
 
 The level comes from the upper half of the residual's spectrum (no link motion there), using the

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Two PSDs give four readings, a plate has three ways to move: the fourth reading, asked before any model of the link.
 
 P PSDs have 2P - 3 such numbers. They are taken in units of the noise and made orthonormal there, so that each is noise

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The recording is checked before the physics: wiring, signs and units of the loads, and what the search found besides.
 
 Signs, exchanged axes and exchanged PSDs make 128 wirings of two PSDs. Each is held against the whole recording: the

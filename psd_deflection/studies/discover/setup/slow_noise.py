@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Slow noise of the electronics, 1/f: every amplifier has it, as much as white noise at its corner frequency.
 
 It follows nothing and moves nothing, but over seconds it is more than white noise, so a search that expects white noise
