@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make demo-compensate``: a simulated arm of two links with and without compensation and shapers, on one page.
+"""``make demo NAME=compensate``: a simulated arm of two links with and without compensation and shapers, on one page.
 
 The arm of ``config/two_links.yaml`` takes up a payload, moves, loses its estimates for half a second, and puts the
 payload down. The estimates have noise and come 30 ms late. Each run is half a minute of the arm's time.

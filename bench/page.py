@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes docs/performance.md, and three rows of README, from bench/results.json and bench/cpu.json.
 
-``python -m bench.page`` is the last step of ``make bench BENCH=--full``.
+``python -m bench.page`` is the last step of ``make bench ARGS=--full``.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from bench.rows import RESULTS, ROOT, Figure, Row, read
 TEMPLATE = ROOT / 'bench' / 'performance_template.md'
 PAGE = ROOT / 'docs' / 'performance.md'
 README = ROOT / 'README.md'
-PRINTED_BY = '| `make bench BENCH=--full` |'
+PRINTED_BY = '| `make bench ARGS=--full` |'
 """How the rows of README end that are made here."""
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The live page left open on a live daemon: its heap every minute (``make page-soak``; PAGE_HOURS=4).
+"""The live page left open on a live daemon: its heap every minute (``make campaign NAME=page-soak``).
 
 Starts a daemon on the simulated rig (``--no-ros``) and headless Chromium on its page. The heap is read after a
 collection of garbage, with the number of DOM nodes, and written to a CSV file, so that a run that is stopped leaves

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Does ``discover --next`` plan recordings that settle what one recording leaves open? ``make blind-next``.
+"""Does ``discover --next`` plan recordings that settle what one leaves open? ``make campaign NAME=blind-next``.
 
 The second generator hides one effect in a recording of a poor design. Where ``discover`` then says that several effects
 explain it as well, the recording that it plans is made by the second generator, and so on. Where it says that no

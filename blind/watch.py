@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Does the watch see what happens to a rig, and is it silent while nothing does? ``make blind-watch``.
+"""Does the watch see what happens to a rig, and is it silent while nothing does? ``make campaign NAME=blind-watch``.
 
 The second generator makes the readings; the pipeline makes the records from them, and the watch reads these. Each run
 holds a load, and at an instant drawn by chance the bench is bumped (the readings of one PSD jump by 5 um in some

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The table of `make nodes`: no cell is empty, and a failure is seen."""
+"""The table of `make campaign NAME=nodes`: no cell is empty, and a failure is seen."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make firmware``: runs the firmware in qemu, joins its UART to the daemon, and checks every sample.
+"""``make demo NAME=firmware``: runs the firmware in qemu, joins its UART to the daemon, and checks every sample.
 
 The daemon opens the pseudo-terminal that qemu makes, as it opens any port. The synthetic converter's
 counts are a function of the sample's number, so that each is checked, not only counted.

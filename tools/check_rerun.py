@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make rerun``: converts recordings for Rerun, reads them with Rerun's own reader, and looks at the viewer's picture.
+"""Converts recordings for Rerun, reads them with its own reader and looks at its picture (``make demo NAME=rerun``).
 
 Poses, bands, dots, sums and losses must equal those of the recording, and gaps must stay gaps.
 Without a screen, the viewer gets a virtual one (xvfb-run, a software Vulkan: apt install xvfb mesa-vulkan-drivers).

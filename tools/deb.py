@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """From a plain Debian to the live page: by pip, and by the .deb of bloom's templates; both timed.
 
-``python -m tools.deb FOLDER`` (``make deb ROSDISTRO=FOLDER``; root only, some minutes).
+``python -m tools.deb FOLDER`` (``make release STEP=deb ARGS=FOLDER``; root only, some minutes).
 FOLDER: a checkout of ros/rosdistro.
 It makes the templates for Ubuntu noble and for Debian bookworm, as ``bloom-generate rosdebian`` does for Jazzy. In
 a chroot that debootstrap makes it runs the one line of docs/quickstart.md, then builds the .deb of noble, installs it

@@ -120,7 +120,7 @@ def page(said: dict[str, str]) -> str:
     """The whole page; ``said``: by the name of the case."""
     parts = [
         '# Gallery\n\nHow a good rig looks, and how typical faults look. Below each picture stand the words that the '
-        'program said, and what to do.\n\n`make gallery` makes this page: it simulates each rig, runs the '
+        'program said, and what to do.\n\n`make docs STEP=gallery` makes this page: it simulates each rig, runs the '
         'command, and copies what it says. The tests run them again.\n'
     ]
     for name, study in STUDIES.items():

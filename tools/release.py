@@ -3,7 +3,7 @@
 """Checks what a release would publish, and makes the files that repeat its facts.
 
 ``python -m tools.release files`` writes CHANGELOG.rst, CITATION.cff and .zenodo.json from CHANGELOG.md,
-package.xml and the version. ``python -m tools.release check`` (``make release-check``) looks at the tree, at the
+package.xml and the version. ``python -m tools.release check`` (``make release STEP=check``) looks at the tree, at the
 sdist and the wheel in ``dist``, and at the environment in which the wheel is installed. With ``RELEASE=1`` it also
 demands what only a release must have: real addresses, a date, keys that apt resolves. It ends with what it did not try.
 """
@@ -78,7 +78,7 @@ def changelog_rst(root: Path) -> str:
     """CHANGELOG.md in the form that bloom reads (REP 132): versions, and lists in lists."""
     title = 'Changelog for package psd_deflection'
     bar = '^' * len(title)
-    lines = [f'.. Made from CHANGELOG.md by `make release-files`.\n\n{bar}\n{title}\n{bar}']
+    lines = [f'.. Made from CHANGELOG.md by `make release STEP=files`.\n\n{bar}\n{title}\n{bar}']
     joined = re.sub(r'\n {2,}(?=\S)', ' ', (root / 'CHANGELOG.md').read_text())
     known = False
     for line in joined.splitlines():
@@ -102,7 +102,7 @@ def citation_cff(root: Path) -> str:
     """How to cite the software (Citation File Format 1.2.0)."""
     f = facts(root)
     lines = [
-        '# Made from package.xml, CHANGELOG.md and the version by `make release-files`.',
+        '# Made from package.xml, CHANGELOG.md and the version by `make release STEP=files`.',
         'cff-version: 1.2.0',
         'message: If you use this software, please cite it as below.',
         'type: software',
@@ -154,7 +154,7 @@ def check_facts(root: Path, release: bool) -> Iterator[str]:
         if name == 'CHANGELOG.rst' and not release and not path.exists():
             continue
         if not path.is_file() or path.read_text() != made(root):
-            yield f'{name}: stale or missing; `make release-files` makes it'
+            yield f'{name}: stale or missing; `make release STEP=files` makes it'
 
 
 def check_licence(root: Path, release: bool) -> Iterator[str]:
@@ -323,7 +323,7 @@ NEVER_HERE = (
     'publishing to PyPI, ros2-gbp, conda-forge and a registry of containers: only the maintainer does',
     'building the containers (packaging/Dockerfile): the workflow does, with a Docker engine',
     'the ROS distributions from apt (Jazzy, Lyrical, Rolling): the workflow does',
-    'rosdep with the whole of rosdistro, and the .deb in a plain Debian: `make rosdep` and `make deb` do',
+    'rosdep with the whole of rosdistro, and the .deb in a plain Debian: `make release` with STEP=rosdep and STEP=deb',
     'building the conda recipe (packaging/conda), which is rendered: no channel of conda is on a registry that we use',
 )
 

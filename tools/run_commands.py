@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the commands of README and docs as a reader would: ``make doc-commands``.
+"""Runs the commands of README and docs as a reader would: ``make docs STEP=commands``.
 
 What ends in a moment is run by test/docs/test_docs.py; what CI runs anyway is looked up in .ci/run. The rest is run
 here, block by block, in a copy of the checkout: a daemon or a page is started on the simulated device, seen to
@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tools.program import PSD_DEFLECTION, ROOT, Program
+from tools.tasks import SHORTEST_BENCH, TASKS
 
 WAIT_S = 1200.0
 PAGES = [ROOT / 'README.md', *sorted((ROOT / 'docs').rglob('*.md'))]
@@ -46,13 +47,14 @@ CI_RUNS = (
     (r'^make test$', '.ci/run', 'make test '),
     (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test: lint types contracts unit'),
     (r'^make docs$', '.ci/run', 'make docs '),
-    (r'^make axe$', '.ci/run', 'make axe '),
-    (r'^make try-page$', '.ci/run', 'make axe try-page '),
-    (r'^make try-page TRY=', 'Makefile', 'python -m tools.try_page build/site $(TRY)'),
+    (r'^make docs STEP=axe$', '.ci/run', 'make docs STEP=axe '),
+    (r'^make docs STEP=try-page$', '.ci/run', 'make docs STEP=try-page '),
+    (r'^make docs STEP=try-page ARGS=', 'tools/tasks.py', 'python -m tools.try_page build/site'),
     (r'^make colcon$', '.ci/run', 'make colcon '),
-    (r'^make release-check$', '.github/workflows/ci.yml', 'make release-check '),
-    (r'^make (rosdep|deb) ROSDISTRO=', '.github/workflows/ci.yml', 'make rosdep deb ROSDISTRO=../rosdistro'),
-    (r'^make demo-thesis$', 'test/blind/test_redone.py', "main(['--short', "),
+    (r'^make release STEP=check$', '.github/workflows/ci.yml', 'make release STEP=check '),
+    (r'^make release STEP=rosdep ', '.github/workflows/ci.yml', 'make release STEP=rosdep '),
+    (r'^make release STEP=deb ', '.github/workflows/ci.yml', 'make release STEP=deb '),
+    (r'^make demo NAME=thesis$', 'test/blind/test_redone.py', "main(['--short', "),
     (
         r'^psd-deflection thesis compare-methods --out ',
         'test/cli/test_thesis.py',
@@ -61,55 +63,32 @@ CI_RUNS = (
     (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
     (
         r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|dask|parquet)\]'$",
-        'Makefile',
-        "INSTALL,build/wheel/use) 'psd_deflection[",
+        'tools/tasks.py',
+        "pip install --quiet 'psd_deflection[",
     ),
-    (r'^make doc-commands\b', '.ci/run', 'make doc-commands '),
-    (r'^make wheel$|^pip install dist/\*\.whl', '.ci/run', 'make wheel '),
-    (r'^make rerun$', '.ci/run', 'make rerun '),
+    (r'^make docs STEP=commands\b', '.ci/run', 'make docs STEP=commands '),
+    (r'^make release STEP=wheel$|^pip install dist/\*\.whl', '.ci/run', 'make release STEP=wheel '),
+    (r'^make demo NAME=rerun$', '.ci/run', 'make demo NAME=rerun '),
     (r'^make shaken$', '.ci/run', 'make shaken '),
     (r'^make bits$', '.ci/run', 'make bits '),
-    (r"^pip install '\.\[rerun\]'$", 'Makefile', "'.[rerun]'"),
-    (r'^psd-deflection convert .*\.rrd$|^rerun ', 'Makefile', 'python -m tools.check_rerun bags/'),
+    (r"^pip install '\.\[rerun\]'$", 'tools/tasks.py', "'.[rerun]'"),
+    (r'^psd-deflection convert .*\.rrd$|^rerun ', 'tools/tasks.py', 'tools.check_rerun bags/'),
     (
         r"^pip install '\.\[ros,monitor\]'$",
         'Makefile',
         "INSTALL,$(VENV)) '.[ros,monitor]'",
     ),
-    (r'^python -m bench\.live$', 'Makefile', 'python -m bench.live'),
-    (r'^python bench/solvers\.py$', 'Makefile', 'python bench/solvers.py'),
-    (r'^python bench/accuracy\.py$', 'Makefile', 'python bench/accuracy.py'),
-    (r'^python -m blind\.run\b', 'Makefile', 'python -m blind.run --jobs'),
-    (r'^python -m blind\.laws\b', 'Makefile', 'python -m blind.laws --jobs'),
-    (r'^python -m bench\.campaign\.camera\b', 'Makefile', 'python -m bench.campaign.camera --frames'),
-    (r'^python -m bench\.campaign\.hellos$', 'Makefile', 'python -m bench.campaign.hellos '),
-    (r'^python -m bench\.campaign\.messages\b', 'Makefile', 'python -m bench.campaign.messages '),
-    (r'^python -m bench\.campaign\.fuzz\b', 'Makefile', 'python -m bench.campaign.fuzz $$target'),
+    (r'^python -m bench\.live$', 'tools/tasks.py', "('live', "),
+    (r'^python bench/solvers\.py$', 'tools/tasks.py', "('solvers', "),
+    (r'^python bench/accuracy\.py$', 'tools/tasks.py', "('accuracy', "),
+    (r'^python -m blind\.run\b', 'tools/tasks.py', 'python -m blind.run '),
+    (r'^python -m blind\.laws\b', 'tools/tasks.py', 'python -m blind.laws '),
+    (r'^python -m bench\.campaign\.camera\b', 'tools/tasks.py', 'python -m bench.campaign.camera'),
+    (r'^python -m bench\.campaign\.hellos$', 'bench/campaign/fuzz.py', "['hellos', "),
+    (r'^python -m bench\.campaign\.messages\b', 'bench/campaign/fuzz.py', "['messages', "),
+    (r'^python -m bench\.campaign\.fuzz\b', 'bench/campaign/fuzz.py', "['fuzz', target, "),
 )
 """What CI runs without us: pattern, file, and the text in it that does."""
-
-SHORTEST = {
-    'bench': 'BENCH_LIVE="--rounds 1 --seconds 2 --settle 1 --starts 0" BENCH_SOLVERS="--blocks 1000" '
-    'BENCH_ACCURACY="--blocks 100" BENCH_LIMITS="--times 1 --only frames" BENCH_RIGS="--most 1 --seconds 1" '
-    'BENCH_CPU="--seconds 2 --results build/bench/cpu.json"',
-    'faults': 'FAULT_TIMES=1 FAULTS="--only zero"',
-    'crash': 'CRASH_TIMES=1',
-    'fuzz': 'FUZZ_SECONDS=1 FUZZ_FRAMES=1000 FUZZ_HELLOS=1000 FUZZ_MINUTES=0.3',
-    'fleet': 'FLEET_RECORDINGS=8 FLEET="--seconds 0.2 --kills 1 --only-killed"',
-    'compensate-faults': 'HOLD_TIMES=1 HOLD="--only silent"',
-    'soak': 'SOAK_MINUTES=0.05 SOAK_HOURS=0.05',
-    'camera-campaign': 'CAMERA_FRAMES=20',
-    'blind': 'BLIND="--seeds 1 --nulls 0 --wrong 0 --pairs 0 --only sensor_rotation"',
-    'blind-calibration': 'RIGS=1',
-    'blind-laws': 'LAWS="--laws 1 --nulls 0"',
-    'blind-next': 'NEXT="--only quantisation --designs torque"',
-    'blind-watch': 'WATCH="--runs 1 --hours 0"',
-    'gallery': 'GALLERY="--only check_good --check"',
-    'shots': 'SHOT_SECONDS=2',
-    'page-soak': 'PAGE_HOURS=0.02',
-    'suites': 'SUITES="--rows 2 --tests test/base"',
-}
-"""Variables with which a ``make`` target takes only seconds."""
 
 SHORTER = {
     r'^python -m blind\.coverage$': '--rows 1 --losses 1',
@@ -129,22 +108,9 @@ SHORTER = {
 }
 """Additional arguments with which a command takes only seconds."""
 
-VERDICTS = {
-    'faults': r'between the faults +\d',
-    'crash': r'\d+ kills: ',
-    'soak': r'real time: \d+ samples lost',
-    'camera-campaign': r'adverse frames: ',
-    'blind-laws': r'right variables',
-    'blind-next': r'recordings needed: ',
-    'blind-watch': r'slip of ',
-    'page-soak': r'too short to tell',
-    'blind': r'failures \(\d+\)',
-}
-"""What a campaign says at its end: cut short, on a busy machine, it may come to another verdict than in full."""
-
 TOOLS = {
-    r'^make firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
-    r'^make (shots|page-soak)|first_look|tools\.shots': ('chromium', 'chromedriver'),
+    r'^make demo NAME=firmware': ('arm-none-eabi-gcc', 'qemu-system-arm'),
+    r'^make (docs STEP=shots|campaign NAME=page-soak)|first_look|tools\.shots': ('chromium', 'chromedriver'),
     r'^curl ': ('curl',),
     r'^ros2 ': ('ros2',),
 }
@@ -158,7 +124,7 @@ ADMINISTRATION = re.compile(
 HOURS = re.compile(r'^make mutants\b')
 """Campaigns whose shortest form says nothing: never run here."""
 
-FOREIGN = re.compile(r'^(python -m blind\.(foreign|duels)\b|make duels\b)')
+FOREIGN = re.compile(r'^(python -m blind\.(foreign|duels)\b|make campaign NAME=duels\b)')
 """Reads data of others, which are not in the repository: test_foreign.py and test_duels.py do, if they are there."""
 
 NO_CAMPAIGNS = '--no-campaigns'
@@ -249,19 +215,25 @@ def is_quick(line: str) -> bool:
     return QUICK.search(line) is not None and not slow and run_by_ci(line) is None
 
 
+def shortest(line: str) -> tuple[str, str, str]:
+    """The target, shortest arguments and verdict of a ``make`` line that has a short form; three '' otherwise."""
+    if line.startswith('make bench'):
+        return 'make bench', SHORTEST_BENCH, ''
+    named = re.match(r'make (\w+) (?:NAME|STEP)=(\S+)', line)
+    task = TASKS.get(named[1], {}).get(named[2]) if named else None
+    return (str(named and named[0]), task.shortest, task.verdict) if task and task.shortest else ('', '', '')
+
+
 def typed_as(line: str) -> str:
     """What tells a command from others: a campaign cut short is the same one with whatever numbers it is documented."""
-    target = re.match(r'make (\S+)', line)
-    if target is not None and target[1] in SHORTEST:
-        return target[0]
+    if shortest(line)[0]:
+        return shortest(line)[0]
     return next((pattern for pattern in SHORTER if re.search(pattern, line)), line)
 
 
 def is_campaign(line: str) -> bool:
     """Whether it takes minutes or hours unless it is cut short."""
-    target = re.match(r'make (\S+)', line)
-    by_name = target is not None and target[1] in SHORTEST
-    return by_name or (line.startswith('python') and typed_as(line) != line)
+    return shortest(line)[0] != '' or (line.startswith('python') and typed_as(line) != line)
 
 
 def blocks_to_run() -> list[list[Command]]:
@@ -300,7 +272,10 @@ def what_is_missing(line: str) -> str:
 def stale() -> list[str]:
     """Entries of the tables that no command of the documents needs any more."""
     lines = [c.line for c in commands()]
-    patterns = [p for p, *_ in CI_RUNS] + [f'^make {name}\\b' for name in SHORTEST]
+    patterns = [p for p, *_ in CI_RUNS]
+    patterns += [
+        f'^make {kind} (NAME|STEP)={name}\\b' for kind, tasks in TASKS.items() for name in tasks if name != 'site'
+    ]
     patterns += [*TOOLS, *SHORTER, ADMINISTRATION.pattern, HOURS.pattern, FOREIGN.pattern]
     return [p for p in patterns if not any(re.search(p, line) for line in lines)]
 
@@ -351,8 +326,8 @@ class Reader:
             self._serve()
             self._to_the_end(line)
         elif line.startswith('make '):
-            target = line.split()[1]
-            self._to_the_end(f'{line} {SHORTEST.get(target, "")}', VERDICTS.get(target, ''))
+            command, words, verdict = shortest(line)
+            self._to_the_end(f'{command} ARGS="{words}"' if command else line, verdict)
         else:
             if line.startswith(('ros2 topic ', 'ros2 service ', 'ros2 lifecycle ')) and not self._background:
                 self._background.append(self._start('psd-deflection estimator'))

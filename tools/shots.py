@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Makes the pictures of the live page in docs/figures: ``make shots``; needs Chromium and its driver.
+"""Makes the pictures of the live page in docs/figures: ``make docs STEP=shots``; needs Chromium and its driver.
 
 The page shows the simulated rig after all load cases, with 50 N on the sidebar; then a recording in which a laser
 goes out, and a rig whose cable was pulled. With ``--widths`` page and reports at every width, light and dark.

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Runs the page "Try it in the browser" of the built site as a visitor does: ``make try-page``; needs Chromium.
+"""Runs the page "Try it in the browser" of the site as a visitor does (``make docs STEP=try-page``); needs Chromium.
 
 The site is served as files, and the browser knows no other host. What is hidden must be named, nothing must be named
 if nothing is hidden, and axe-core must have nothing against the page with an answer.

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make crash``: kill -9 at random instants while recording; what is left opens, and lacks less than a second.
+"""Kill -9 at random instants while recording: the file opens, lacks less than a second (``make campaign NAME=crash``).
 
 The daemon runs without ROS, forked from this process so that each round takes a moment only, and
 reads a simulated rig in real time. A round: record, kill, read what is left with our reader,

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make faults``: a scripted campaign against the real node over a pseudo-terminal.
+"""``make campaign NAME=faults``: a scripted campaign against the real node over a pseudo-terminal.
 
 Each fault is injected again and again while the node runs, publishes and records. What it is judged
 by: did a counter in ``/diagnostics`` see it; did samples (or estimates) come again, and how soon

@@ -1,23 +1,27 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make fuzz``: coverage-guided fuzzing (atheris) of everything that reads what strangers wrote.
+"""``make campaign NAME=fuzz``: coverage-guided fuzzing (atheris) of everything that reads what strangers wrote.
 
 A target must answer any bytes with a result or with one of the package's own errors, in one line,
 within a second and 256 MB. Inputs that were found to break it become tests (``test/data/fuzz``).
 
+  python -m bench.campaign.fuzz all --seconds 600 --frames 10000000 --hellos 1000000
   python -m bench.campaign.fuzz frames -max_total_time=600
   python -m bench.campaign.fuzz corrupted 10000000
 
+``all``: every target so long, as many damaged frames and HELLOs, and messages of any content to every node as long.
 Targets: frames, hello, bag, records, csv, parameters, yaml; ``corrupted N`` counts damaged frames instead. In hello,
 records and yaml the input chooses among what a grammar allows, so that it gets past CRCs, lengths and syntax.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import random
 import struct
+import subprocess
 import sys
 import tempfile
 import time
@@ -430,8 +434,30 @@ def corrupted(count: int) -> int:
     return 1 if wrong else 0
 
 
+def everything(words: list[str]) -> int:
+    """All of it, one after the other; the exit status of the first that fails."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument('--seconds', type=float, default=600.0, help='of each target and of the messages')
+    parser.add_argument('--frames', type=int, default=10_000_000)
+    parser.add_argument('--hellos', type=int, default=1_000_000)
+    options = parser.parse_args(words)
+    runs = [
+        ['fuzz', 'corrupted', str(options.frames)],
+        ['hellos', str(options.hellos)],
+        ['messages', '--minutes', str(max(options.seconds, 20.0) / 60.0)],
+        *(['fuzz', target, f'-max_total_time={options.seconds:.0f}'] for target in TARGETS),
+    ]
+    for module, *arguments in runs:
+        status = subprocess.run([sys.executable, '-m', f'bench.campaign.{module}', *arguments], check=False).returncode
+        if status:
+            return status
+    return 0
+
+
 def main() -> int:
     """Fuzz one target until its time is over, or a fault is found."""
+    if sys.argv[1:2] == ['all']:
+        return everything(sys.argv[2:])
     if len(sys.argv) > 2 and sys.argv[1] == 'corrupted':
         return corrupted(int(sys.argv[2]))
     if len(sys.argv) < 2 or sys.argv[1] not in TARGETS:

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make compensate-faults``: what the compensator and the shaper do when something goes wrong, over real DDS.
+"""``make campaign NAME=hold``: what the compensator and the shaper do when something goes wrong, over real DDS.
 
 A simulated arm is on the graph. Its deflection comes through a process that stands for the
 estimator, the positions of its joints through one that stands for the robot's driver, and the real

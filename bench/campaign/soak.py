@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``make soak``: the daemon for long, in real time and in simulated time.
+"""``make campaign NAME=soak``: the daemon for long, in real time and in simulated time.
 
 Real time: the node with recording and a subscriber, reading a device whose clock runs 30 ppm fast
 over a line that is polled every millisecond, as USB is. Simulated time: the bytes of the same device

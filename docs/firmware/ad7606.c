@@ -12,7 +12,7 @@
  * (Figure "Serial Read"); six words are read, the rest is left there. SCLK may run at 17 MHz at 3.3 V; it runs at 12.5.
  *
  * The registers here are those of the MPS2 board's PL022 SPI (ARM DDI 0194) and CMSDK GPIO (ARM DDI 0479). This file is
- * compiled and linked by `make firmware`, but has no converter to talk to there: it was not tried on hardware.
+ * compiled and linked by `make demo NAME=firmware`, but has no converter to talk to there: it was not tried on hardware.
  */
 #include "converter.h"
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The short form of ``make demo-thesis``: 50 N, few frames, and the page."""
+"""The short form of ``make demo NAME=thesis``: 50 N, few frames, and the page."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Short form of ``make camera-campaign``: no answer is further off than five of its own standard deviations."""
+"""Short form of ``make campaign NAME=camera``: no answer is further off than five of its own standard deviations."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def test_the_lines_run(tmp_path: Path) -> None:
         (tmp_path / name).symlink_to(ROOT / name)
     (tmp_path / 'check_recording.py').write_text(BLOCKS['python'])
     lines = [step['run'] for step in STEPS if 'run' in step]
-    # `make wheel` builds it and installs it so.
+    # `make release STEP=wheel` builds it and installs it so.
     assert lines.pop(0) == 'pip install wheels/psd_deflection-*.whl'
     assert len(lines) == 3
     programs = f'{Path(sys.executable).parent}:/usr/bin:/bin'

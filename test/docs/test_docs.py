@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The documents do what they say: every command is run, every link leads somewhere.
 
-What ends in a moment is run here; ``make doc-commands`` runs the rest (tools/run_commands.py), and CI runs both.
+What ends in a moment is run here; ``make docs STEP=commands`` runs the rest (tools/run_commands.py), and CI runs both.
 """
 
 from __future__ import annotations
@@ -89,11 +89,22 @@ def test_every_command_is_run() -> None:
     assert run_commands.stale() == []
 
 
+def make_targets() -> set[str]:
+    """Of the Makefile."""
+    return set((ROOT / 'Makefile').read_text().partition('\n.PHONY: ')[2].partition('\n')[0].split())
+
+
+def test_make_has_few_targets_and_help_names_each() -> None:
+    head = (ROOT / 'Makefile').read_text().partition('\nPYTHON ')[0]
+    assert len(make_targets()) <= 22
+    assert len(head.splitlines()) <= 15
+    assert [target for target in make_targets() if not re.search(rf'\b{target}\b', head)] == []
+
+
 def test_ci_runs_what_it_is_said_to_run() -> None:
     for _, file, text in run_commands.CI_RUNS:
         assert text in (ROOT / file).read_text(), (file, text)
-    targets = set(re.findall(r'^([a-z-]+):', (ROOT / 'Makefile').read_text(), re.M))
-    assert set(run_commands.SHORTEST) <= targets
+    targets = make_targets()
     assert {c.line.split()[1] for c in ALL if c.line.startswith('make ')} <= targets
 
 
@@ -108,7 +119,7 @@ def test_a_command_is_understood(command: Command) -> None:
 
 @pytest.mark.parametrize(
     'line',
-    # The lines of a path need each other: ``make doc-commands`` types them in their order.
+    # The lines of a path need each other: ``make docs STEP=commands`` types them in their order.
     sorted({' '.join(words(c.line)) for c in OURS if run_commands.is_quick(c.line) and c.page not in JOURNEYS}),
     ids=lambda line: str(line)[:80],
 )

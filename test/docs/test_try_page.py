@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page that tries it in the browser, without a browser: what it computes, what it carries, what it refuses.
 
-``make try-page`` runs it in Chromium.
+``make docs STEP=try-page`` runs it in Chromium.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings for Rerun, without Rerun: what is written row by row, and what is told where it is missing.
 
-``make rerun`` reads the files with Rerun's own reader and looks at its picture.
+``make demo NAME=rerun`` reads the files with Rerun's own reader and looks at its picture.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What concerns the thesis alone: compare the errors of all methods, and explain its Table 5.1.
 
-A rig needs none of this. docs/audit.md has what is wrong in the thesis; `make demo-thesis` in a checkout repeats its
-experiment on a simulated rig, from the camera to the page.
+A rig needs none of this. docs/audit.md has what is wrong in the thesis; `make demo NAME=thesis` in a checkout repeats
+its experiment on a simulated rig, from the camera to the page.
 
 compare-methods: every method gets exact readings of the thesis's rig, without noise. The first table has the rms and
 the largest error over a grid of poses (flat plate, independent tilts, tilts of a cantilever). The

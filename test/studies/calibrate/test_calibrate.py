@@ -226,7 +226,7 @@ def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
 
 @pytest.mark.statistics
 def test_a_short_campaign_covers_the_truth() -> None:
-    """`make blind-calibration` in its shortest form: wide bounds, for it is one rig, and it is moved."""
+    """`make campaign NAME=blind-calibration` in its shortest form: wide bounds, for it is one rig, and it is moved."""
     found = campaign.summary([campaign.score(1)])
     assert found.parameters > 0.7
     assert found.poses > 0.5
