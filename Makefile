@@ -1,6 +1,8 @@
 # make setup     the environment .venv with all that the targets below need (Python 3.11 to 3.14)
 # make run       the daemon on the simulated rig, recorded below recordings/ (PORT=/dev/ttyACM0 for a real one)
-# make test      lint, types, import contracts and every test; each alone: lint, types, contracts, unit
+# make test      lint, types, import contracts, the quick tests; each alone: lint, types, contracts, unit
+#                (ROOM=measure: the tests of a room alone, in seconds)
+# make test-all  the same with the slow tests
 # make mutants   whether the tests notice broken numerics; shaken, bits: whether answers depend on the processor
 # make bench     what it costs, beside peers measured in the same run (ARGS=--full: docs/performance.md)
 # make campaign  faults, crashes, fuzzing, hidden effects: lists them; NAME=faults runs one
@@ -33,13 +35,16 @@ UV ?= $(shell command -v uv)
 INSTALL = $(if $(UV),$(UV) pip install --python $(1)/bin/python,$(1)/bin/python -m pip install --disable-pip-version-check) --quiet
 # Further words for pytest, e.g. PYTEST='-m "not browser"'.
 PYTEST ?=
-# Tests that run at a time; many of them wait.
-WORKERS ?= 2
+# Tests that run at a time: they wait for ports, discs and DDS, and three keep two cores busy.
+WORKERS ?= 3
+# Which of the tests of tools/tiers.py: quick, slow, all.
+TIER ?= quick
+ROOM ?=
 BIN := $(VENV)/bin
 # A run needs the first of these, all the others need both.
 READY := $(VENV)/.installed $(VENV)/.for_tests
 
-.PHONY: help setup run test lint types contracts unit mutants shaken bits bench campaign demo docs release golden colcon clean
+.PHONY: help setup run test test-all lint types contracts unit mutants shaken bits bench campaign demo docs release golden colcon clean
 
 help:
 	@sed -n '/^#/!q;s/^# //p' Makefile
@@ -69,7 +74,10 @@ $(VENV)/.for_tests: $(VENV)/.requirements | $(VENV)/.installed
 
 setup: $(READY)
 
-test: lint types contracts unit
+test: $(if $(ROOM),,lint types contracts) unit
+
+test-all: TIER = all
+test-all: lint types contracts unit
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -82,7 +90,7 @@ contracts: $(READY)
 	$(BIN)/lint-imports --no-cache
 
 unit: $(READY)
-	$(BIN)/python -m pytest -n $(WORKERS) $(PYTEST)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup --tier $(TIER) $(if $(ROOM),--room $(ROOM)) $(PYTEST)
 
 run: $(VENV)/.installed
 	$(BIN)/psd-deflection estimator --monitor --record recordings $(if $(PORT),--port $(PORT),--demo) $(ARGS)
@@ -95,7 +103,7 @@ mutants: $(READY)
 # The rooms of the numerics. The kernel: one that any processor of these ten years runs, and that is no machine's own.
 NUMERICS := arms base camera measure model recordings rig studies
 shaken: $(READY)
-	OPENBLAS_CORETYPE=$${KERNEL:-Nehalem} $(BIN)/python -m pytest --shaken -n $(WORKERS) -m 'not browser and not statistics' $(PYTEST) $(NUMERICS:%=test/%) test/blind test/test_*.py
+	OPENBLAS_CORETYPE=$${KERNEL:-Nehalem} $(BIN)/python -m pytest --shaken -n $(WORKERS) --dist loadgroup --tier quick -m 'not browser' $(PYTEST) $(NUMERICS:%=test/%) test/test_*.py
 
 bits: $(READY)
 	$(BIN)/python -m bench.bits

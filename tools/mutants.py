@@ -35,8 +35,8 @@ from cosmic_ray.ast import ast_nodes, get_ast
 from cosmic_ray.mutating import mutate_code
 from cosmic_ray.plugins import get_operator
 
-from tools.mutant_rooms import ROOMS, Room
 from tools.mutants_by_hand import BY_HAND, HandMade, hand_made
+from tools.tiers import ROOMS, Room
 
 ROOT = Path(__file__).parent.parent
 EQUIVALENT = Path(__file__).with_name('mutants_equivalent.txt')
@@ -137,13 +137,13 @@ def function_at(text: str, line: int) -> int:
 
 
 @contextmanager
-def warm(python: str, folder: Path, tests: Sequence[str]) -> Iterator[Callable[[str, int], bool]]:
-    """Says whether the ``tests`` that enter a function pass in a copy of the checkout: its file and first line.
+def warm(python: str, folder: Path, tier: str, tests: Sequence[str]) -> Iterator[Callable[[str, int], bool]]:
+    """Says whether those of ``tests`` that enter a function pass in a copy of the checkout: its file and first line.
 
     Raises RuntimeError if they do not pass as it is.
     """
     environment = {**os.environ, 'PYTHONPATH': str(folder), 'PYTHONDONTWRITEBYTECODE': '1'}
-    command = [python, str(ROOT / 'tools' / 'warm_pytest.py'), *tests]
+    command = [python, str(ROOT / 'tools' / 'warm_pytest.py'), tier, *tests]
     with subprocess.Popen(command, cwd=folder, env=environment, stdin=-1, stdout=-1, text=True) as process:
         if process.stdin is None or process.stdout is None:
             raise RuntimeError('the process that runs the tests has no pipes')
@@ -167,6 +167,8 @@ def warm(python: str, folder: Path, tests: Sequence[str]) -> Iterator[Callable[[
 
 
 STAGES = ('quick', 'slow')
+TIER_OF = {'quick': 'quick', 'slow': 'all'}
+"""The quick tests of a room are those that `make test` runs."""
 
 
 def tried(
@@ -192,7 +194,7 @@ def tried(
             if not left:
                 break
             left, these = [], left
-            with warm(python, folder, tests) as passed:
+            with warm(python, folder, TIER_OF[stage], tests) as passed:
                 for mutant in these:
                     file = folder / mutant.file
                     text = file.read_text()

@@ -44,8 +44,9 @@ CUT = 'recordings/cut'
 """A recording that a crash left without its end."""
 
 CI_RUNS = (
-    (r'^make test$', '.ci/run', 'make test '),
-    (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test: lint types contracts unit'),
+    (r'^make test( ROOM=measure)?$', '.ci/run', 'make test '),
+    (r'^make test-all$', '.ci/run', 'make unit TIER=slow '),
+    (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test-all: lint types contracts unit'),
     (r'^make docs$', '.ci/run', 'make docs '),
     (r'^make docs STEP=axe$', '.ci/run', 'make docs STEP=axe '),
     (r'^make docs STEP=try-page$', '.ci/run', 'make docs STEP=try-page '),

@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run pytest in one child after another of a process that has imported all libraries already.
 
-Arguments: the tests, a file or folder each, perhaps with "-k WORDS". At first all of them are run, to see which
-functions of the checkout each test enters and how long it takes; the first line of the output is 1 if all passed, 0 if
+Arguments: a tier of tools/tiers.py, and the tests, a file or folder each, perhaps with "-k WORDS". At first all of
+them are run, to see which functions of the checkout each test enters and how long it takes; the first line of the output is 1 if all passed, 0 if
 not. Then each line of the input is a file of the checkout and the first line of a function in it, 0 for what is in no
 function. The tests that enter it are run, the quickest first, as many as take ``MOST`` seconds together, and a line of
 the output is 1 if all passed, 0 if not. Every child imports the program again.
@@ -133,21 +133,24 @@ def tested(tests: Sequence[str]) -> int:
     return int(pytest.main([*OPTIONS, *tests]))
 
 
-def watched(tests: Sequence[str], answer: Path) -> int:
+def watched(tier: str, tests: Sequence[str], answer: Path) -> int:
     """Run ``tests`` and write what they enter into ``answer``; the exit code of pytest."""
     watch = Watch()
-    code = pytest.main([*OPTIONS, *tests], plugins=[watch])
+    code = pytest.main([*OPTIONS, '--tier', tier, *tests], plugins=[watch])
     answer.write_text(watch.seen())
     return int(code)
 
 
-def known(tests: Sequence[str]) -> dict[str, Test] | None:
-    """The tests by name, all that ``tests`` (the arguments) choose; None if one fails or is not found by its name."""
+def known(tier: str, tests: Sequence[str]) -> dict[str, Test] | None:
+    """Those of a tier that ``tests`` (the arguments) choose, by name.
+
+    None if one fails or is not found by its name.
+    """
     out: dict[str, Test] = {}
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, 'seen.json')
         for words in tests:
-            if not passed(functools.partial(watched, words.split(' ', 2), answer), LONGEST):
+            if not passed(functools.partial(watched, tier, words.split(' ', 2), answer), LONGEST):
                 return None
             for name, (seconds, entered) in json.loads(answer.read_text()).items():
                 out[name] = Test(seconds, frozenset((file, line) for file, line in entered))
@@ -172,8 +175,9 @@ def main() -> None:
     os.environ['PYTEST_DISABLE_PLUGIN_AUTOLOAD'] = '1'
     # test/conftest.py reads it.
     os.environ['PSD_DEFLECTION_MUTANTS'] = '1'
-    warm_up(sys.argv[1:])
-    tests = known(sys.argv[1:])
+    tier, *arguments = sys.argv[1:]
+    warm_up(arguments)
+    tests = known(tier, arguments)
     print(int(tests is not None), flush=True)
     if tests is None:
         return

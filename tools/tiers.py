@@ -1,21 +1,25 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What ``make mutants`` breaks, and which tests should notice: a room each.
+"""The two tiers of the tests, and the rooms that ``make mutants`` breaks: one table for both.
 
-Without cosmic-ray, so that the tests can ask whether each mutant made by hand lies in a room.
+``make test`` runs the quick tier, ``make test-all`` both. A test is slow if it is marked ``statistics``, or if an entry
+of ``SLOW`` or of a room's ``slow`` chooses it and no room counts on it (``tests``). So what ``make mutants`` says of a
+room's quick tests holds for ``make test``. An entry is a path, perhaps with "-k WORDS" as of pytest.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import ast
+from collections.abc import Callable, Iterable, Mapping
+from functools import cache
 from typing import NamedTuple
 
 
 class Room(NamedTuple):
     """``code``: files and folders that are broken. ``tests``: what should notice, in seconds.
 
-    ``leave``: files that only draw or word what others computed. ``slow``: what else CI runs; it takes minutes, and
-    tries what the ``tests`` do not notice.
+    ``leave``: files that only draw or word what others computed. ``slow``: what tries those that the ``tests`` do not
+    notice.
     """
 
     code: tuple[str, ...]
@@ -266,3 +270,66 @@ ROOMS: Mapping[str, Room] = {
         ),
     ),
 }
+
+SLOW: Mapping[str, tuple[str, ...]] = {
+    'campaigns, and their tests': ('test/blind', 'test/bench'),
+    'packaging and release': ('test/test_deb.py', 'test/test_release.py'),
+    'pages that are made': (
+        'test/docs/test_try_page.py',
+        'test/docs/test_gallery.py',
+        'test/docs/test_design_docs.py',
+        'test/docs/test_docs.py -k notebook',
+    ),
+    'a copy of the package in a process': ('test/cli/test_elsewhere.py',),
+}
+"""Entries by reason: what is slow and tries no room, or what a room's quick tests notice as well."""
+
+
+@cache
+def _words_of(entry: str) -> tuple[str, Callable[[str], bool]]:
+    """The path of an entry, and whether its words choose a name."""
+    path, _, words = entry.partition(' -k ')
+
+    def holds(node: ast.expr, name: str) -> bool:
+        match node:
+            case ast.Name(word):
+                return word.lower() in name
+            case ast.UnaryOp(ast.Not(), inner):
+                return not holds(inner, name)
+            case ast.BoolOp(ast.And(), parts):
+                return all(holds(part, name) for part in parts)
+            case ast.BoolOp(ast.Or(), parts):
+                return any(holds(part, name) for part in parts)
+        raise ValueError(f'{entry}: words, and, or, not, brackets')
+
+    if not words:
+        return path, lambda name: True
+    tree = ast.parse(words, mode='eval').body
+    return path, lambda name: holds(tree, name.lower())
+
+
+def chooses(entry: str, test: str) -> bool:
+    """Whether an entry chooses a test, named as pytest does. Raises ValueError if its words cannot be read."""
+    path, words = _words_of(entry)
+    file, _, name = test.partition('::')
+    return (file == path or file.startswith(f'{path}/')) and words(name)
+
+
+def _any(entries: Iterable[str], test: str) -> bool:
+    return any(chooses(entry, test) for entry in entries)
+
+
+SLOW_ENTRIES = (*(e for entries in SLOW.values() for e in entries), *(e for r in ROOMS.values() for e in r.slow))
+QUICK_ENTRIES = tuple(e for room in ROOMS.values() for e in room.tests)
+TIERS = ('quick', 'slow')
+
+
+def tier_of(test: str, statistics: bool) -> str:
+    """The tier of a test, named as pytest does; ``statistics``: whether it is so marked."""
+    slow = statistics or (_any(SLOW_ENTRIES, test) and not _any(QUICK_ENTRIES, test))
+    return TIERS[slow]
+
+
+def entries_of(name: str) -> tuple[str, ...]:
+    """What ``make test ROOM=name`` runs: the tests of a folder of test/, the quick tests of a room of the mutants."""
+    return (f'test/{name}', *(ROOMS[name].tests if name in ROOMS else ()))
