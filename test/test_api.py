@@ -142,9 +142,10 @@ def test_a_simulated_recording_is_a_recording() -> None:
     # The flat plate of the simulation is what the method assumes; the rest is the step inside a block.
     settled = np.abs(estimates.t - 1.5) > 0.05
     assert np.abs(estimates.pose - truth)[settled].max() < 1e-5
-    assert np.array_equal(
-        psd_deflection.simulate(rig, 'thesis:0.5').pose, psd_deflection.simulate(rig, 'thesis:0.5').pose
-    )
+    # The noise too is that of the seed.
+    one, again, other = (psd_deflection.simulate(rig, 'thesis:0.5', seed=seed).samples['y1'] for seed in (1, 1, 2))
+    assert np.array_equal(one, again)
+    assert not np.array_equal(one, other)
 
 
 def test_hidden_effects_are_not_named(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -17,7 +18,7 @@ from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.recordings import cdr
-from psd_deflection.records import RawChunk
+from psd_deflection.records import DeflectionEstimate, RawChunk, Record
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.rig_publisher import RigPublisher
@@ -25,12 +26,15 @@ from test.late import Heard, written
 
 MODAL = {'filter': 'modal', 'degraded': 'hold', 'solvers': ['exact', 'wls']}
 BLOCKS = 1150
+ZEROED = (100, 700)
+"""Blocks after which a zero is taken."""
 
 
 class Running:
     """A session without threads: blocks go through its pipeline, messages to ``heard``."""
 
     def __init__(self, rig: Rig, first: int) -> None:
+        self.rig = rig
         self.heard: list[Heard] = []
         self.pipeline = Pipeline(rig)
         session = SimpleNamespace(pipeline=self.pipeline, rig=rig, acquisition=SimpleNamespace(hello=None))
@@ -40,21 +44,13 @@ class Running:
         self._fanout.wires.append(self)
         self._fanout.change_wires.append(self.told)
         self.told.tell()
-        counts = RigSimulator(rig, 1).step(loads()).counts
-        for block in range(BLOCKS):
-            seq = np.arange(20 * block, 20 * block + 20)
-            kept = seq % 977 != 0
-            chunk = RawChunk(
-                seq[kept] + 20 * first,
-                (seq[kept] + 1) * 1_000_000,
-                counts[seq[kept]],
-                np.zeros(int(kept.sum()), np.uint8),
-                rig.converter.volts_per_count,
-            )
+        self.records: list[Record] = []
+        for block, chunk in enumerate(chunks(rig, first)):
             for record in self.pipeline.process(chunk):
+                self.records.append(record)
                 self._fanout.put(record)
                 self.told.put(record)
-            if block in (100, 700):
+            if block in ZEROED:
                 change = self.pipeline.zero()
                 assert change is not None
                 session.rig = self.pipeline.rig
@@ -78,6 +74,21 @@ class Running:
         return [m._replace(t_ns=max(m.t_ns, self.heard[number].t_ns)) for m in later]
 
 
+def chunks(rig: Rig, first: int) -> Iterator[RawChunk]:
+    """A block each, with a sample lost now and then."""
+    counts = RigSimulator(rig, 1).step(loads()).counts
+    for block in range(BLOCKS):
+        seq = np.arange(20 * block, 20 * block + 20)
+        kept = seq % 977 != 0
+        yield RawChunk(
+            seq[kept] + 20 * first,
+            (seq[kept] + 1) * 1_000_000,
+            counts[seq[kept]],
+            np.zeros(int(kept.sum()), np.uint8),
+            rig.converter.volts_per_count,
+        )
+
+
 def loads() -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     out = np.zeros((20 * BLOCKS, 3))
     out[6000:9000], out[17000:] = (10.0, -30.0, -10.0), (0.0, -20.0, 5.0)
@@ -96,8 +107,18 @@ def test_memory_is_told_before_the_first_block_soon_and_then_every_ten_seconds(r
     assert all('state.noise' in text['memory'] for text in told[1:])
     # Bounded: between two segments of the noise it is small.
     assert max(len(json.dumps(text)) for text in told) < 150_000
-    # It changes nothing: told at any time, it is the same twice.
-    assert running.pipeline.memory(running.pipeline.rig) == running.pipeline.memory(running.pipeline.rig)
+
+
+def test_telling_the_memory_changes_no_record(running: Running) -> None:
+    silent = Pipeline(running.rig)
+    records: list[Record] = []
+    for block, chunk in enumerate(chunks(running.rig, 4000)):
+        records += silent.process(chunk)
+        if block in ZEROED:
+            silent.zero()
+    without, told = ([r for r in found if isinstance(r, DeflectionEstimate)] for found in (records, running.records))
+    assert len(without) > BLOCKS - 10
+    assert without == told
 
 
 @pytest.mark.parametrize(('seconds', 'start'), [(2.3, 550), (10.99, 550), (11.5, 1050)])
