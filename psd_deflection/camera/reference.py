@@ -157,8 +157,7 @@ def relative_covariance(rest: TargetPose, pose: TargetPose) -> FloatArray:
     scale = 1.0 / (r[1, 0] ** 2 + r[1, 1] ** 2)
     by = np.array([r[1, 1], -r[1, 0], 0.0]) * scale
     of_pose[2, :3] = -_cross(r[1]) @ by
-    of_rest[2, :3] = [-by @ r[2], 0.0, by @ r[0]]
-    of_rest[2, [0, 2]] *= -1.0
+    of_rest[2, :3] = [by @ r[2], 0.0, -by @ r[0]]
     total = of_rest @ rest.covariance @ of_rest.T + of_pose @ pose.covariance @ of_pose.T
     if pose.planar:
         # A plate that left the plane of the rest moves in the image by that share of its distance from the middle.
