@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """The tip against its rest: pose and covariance of made targets, by finite differences and by hand."""
 
 from __future__ import annotations

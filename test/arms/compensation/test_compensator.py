@@ -134,14 +134,16 @@ def test_offsets_stay_within_their_limits(arm: Arm) -> None:
     assert command.limited
 
 
-def test_a_joint_is_not_sent_beyond_its_limit(arm: Arm) -> None:
+@pytest.mark.parametrize('limit', [-2.0, 2.0])
+@pytest.mark.parametrize('up', [1.0, -1.0])
+def test_a_joint_is_not_sent_beyond_its_limit(arm: Arm, limit: float, up: float) -> None:
+    """Under a weight and under a lift: one of them is made up for by a turn beyond the limit."""
     loop = Loop(arm)
-    loop.plant.force = PAYLOAD
-    at_limit = np.array([-2.0, 0.3])
+    loop.plant.force = up * PAYLOAD
     loop.compensator.enable(True)
-    loop.run(1.0, at_limit)
-    assert loop.offsets[0] > -1e-4
-    assert loop.plant.angles[0] > -2.0 - 1e-4
+    limited = loop.run(1.0, np.array([limit, 0.3])).limited
+    assert max(abs(loop.plant.angles[0]), abs(limit + loop.offsets[0])) < 2.0 + 1e-4
+    assert limited == (up < 0.0)
 
 
 def following(arm: Arm, **chosen: Any) -> Loop:

@@ -50,6 +50,15 @@ def test_channels_that_never_change_tell_by_their_levels() -> None:
     assert not fed(np.full((1000, 6), 2.5, np.float32)).steps.any()
 
 
+@pytest.mark.parametrize('noise', [1.0, 0.0])
+def test_what_is_coarser_than_the_coarsest_converter_is_no_step(noise: float) -> None:
+    """Volts that lie on multiples of 20 V / 2^7, and toggle or stand still."""
+    for step, found in ((2.0 * COARSEST, 0.0), (COARSEST, COARSEST)):
+        steps = ConverterSteps.of_rig(load_rig())
+        steps.add(volts(step, noise))
+        np.testing.assert_allclose(steps.steps, found, rtol=1e-5)
+
+
 def test_a_coarse_channel_beside_fine_ones_is_that_channel() -> None:
     samples = volts(FILE, 2e-3)
     samples[:, 4] = volts(TEN, 0.05)[:, 4]

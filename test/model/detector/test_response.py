@@ -109,6 +109,18 @@ def test_the_calibration_reads_what_the_simulation_does_and_finds_the_place_agai
     assert response.slopes(np.array(x), np.array(y))[:, 0] == pytest.approx(slope, abs=1e-3)
 
 
+@pytest.mark.parametrize('k', [-3000.0, -9000.0])
+def test_beyond_the_fold_the_inverse_is_a_straight_line(k: float) -> None:
+    """r (1 + k r^2) has a slope of a tenth at sqrt(0.3/-k), where it reads 0.7 r; farther out it would fold back."""
+    farthest = (0.3 / -k) ** 0.5
+    response = DetectorResponse(0.0, 0.0, 0.0, 0.0, 0.0, k)
+    there = response.reading(np.array(0.6 * farthest), np.array(-0.8 * farthest))
+    assert np.hypot(*there) == pytest.approx(0.7 * farthest)
+    for times in (1.0, 1.01, 2.0, 100.0):
+        found = response.place(times * there[0], times * there[1])
+        assert found == pytest.approx((0.6 * times * farthest, -0.8 * times * farthest))
+
+
 @given(place, st.floats(0.0, 5.0), place)
 def test_light_is_taken_off_again(x: float, level: float, center: float) -> None:
     read = pulled(np.array(x), SUM, level, center)

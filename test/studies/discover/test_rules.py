@@ -48,7 +48,7 @@ from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.trials import by_its_size
-from psd_deflection.studies.discover.search.weighing import tied, unknown_of
+from psd_deflection.studies.discover.search.weighing import covariance_of, tied, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.noise import (
     NoiseModel,
@@ -266,6 +266,21 @@ def test_a_model_that_is_not_exact_has_the_sd_of_its_scatter_over_load_cases() -
     result = result_of(search_of(exact), [active('a', x=0.0)], [[]])
     (named,) = alternatives(problem_of(search_of(exact), result, [HeldOut(9.0, 1.0)])).named
     assert named.sd['x'] == pytest.approx(SIGMA / np.linalg.norm(shown[A]), rel=1e-6)
+
+
+def test_covariance_has_the_stated_sd_and_the_fits_correlation() -> None:
+    """The scatter over load cases widens what is stated beyond the fit: the covariance is as wide."""
+    shown = pictures(A, B)
+    shown['b', 'x'] += 0.5 * shown['a', 'x']
+    search = search_of(Plant(shown, 3e-3 * shown['a', 'x'] - 2e-3 * shown['b', 'x'] + noise()))
+    result = result_of(search, [active('a', x=0.0), active('b', x=0.0)], [[], []])
+    named = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)] * 2)).named
+    wide = [dataclasses.replace(n, sd={'x': factor * n.sd['x']}) for n, factor in zip(named, (3.0, 7.0), strict=True)]
+    names, covariance = covariance_of(result.fit, wide)
+    matrix = columns(shown, A, B)
+    want = np.linalg.inv(matrix.T @ matrix) * np.outer([3.0, 7.0], [3.0, 7.0])
+    assert names == ('a.x', 'b.x')
+    np.testing.assert_allclose(covariance, want, rtol=1e-6)
 
 
 def test_four_recordings_are_left_out_one_by_one() -> None:
