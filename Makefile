@@ -10,7 +10,7 @@
 # make docs      the web site in build/site; STEP=commands, axe, gallery ... (STEP=list lists them)
 # make release   the steps of a release: lists them; STEP=check builds, tries and checks all of it
 # make golden    the golden recordings in bags/ anew
-# make colcon    colcon build and colcon test in an environment of its own
+# make colcon    colcon build and colcon test, and every executable started
 # make clean     removes what the others made
 # Further words for any of them: ARGS='--help'.
 PYTHON ?= python3
@@ -117,16 +117,8 @@ docs: $(READY)
 golden: $(READY)
 	$(BIN)/python bags/make.py
 
-# colcon from PyPI wants an older setuptools than ours: a virtual environment of its own.
-colcon:
-	test -x $(VENV)-colcon/bin/colcon || ($(PYTHON) -m venv $(VENV)-colcon && $(call INSTALL,$(VENV)-colcon) colcon-core colcon-ros colcon-python-setup-py colcon-package-information colcon-recursive-crawl colcon-package-selection colcon-output colcon-defaults colcon-library-path)
-	rm -rf build/colcon && mkdir -p build/colcon
-	cd build/colcon && ../../$(VENV)-colcon/bin/colcon --log-base log build --base-paths ../.. --build-base build --install-base install
-	test -x build/colcon/install/psd_deflection/lib/psd_deflection/estimator
-	test -x build/colcon/install/psd_deflection/lib/psd_deflection/replay
-	test -f build/colcon/install/psd_deflection/share/ament_index/resource_index/packages/psd_deflection
-	test -f build/colcon/install/psd_deflection/share/psd_deflection/package.xml
-	test -f build/colcon/install/psd_deflection/share/psd_deflection/launch/estimator.launch.py
+colcon: $(READY)
+	@$(BIN)/python -m tools.tasks colcon $(ARGS)
 
 clean:
-	rm -rf build dist install log *.egg-info $(VENV) $(VENV)-colcon
+	rm -rf build dist install log *.egg-info $(VENV)

@@ -31,7 +31,6 @@ NEEDED = (
     'LICENSE',
     'CHANGELOG.md',
     'CITATION.cff',
-    '.zenodo.json',
     '.github',
     'packaging',
     'psd_deflection/__init__.py',
@@ -61,7 +60,7 @@ def change(file: Path, old: str, new: str) -> None:
 
 def ready(root: Path) -> None:
     """What the maintainer does before a release: addresses, a date, rows of rosdep, the files that repeat them."""
-    for file in [root / 'package.xml', root / 'SECURITY.md', *(root / '.github').rglob('*.yml')]:
+    for file in [root / 'package.xml', *(root / '.github').rglob('*.yml')]:
         if file.is_file():
             file.write_text(file.read_text().replace('.invalid', '.org'))
     change(root / 'CHANGELOG.md', '(unreleased)', '(2026-12-01)')
@@ -100,6 +99,7 @@ def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None
             lambda root: change(root / 'package.xml', 'https://psd-deflection.org/<', 'https://psd-deflection.invalid/<'),
             'package.xml: an address ends with .invalid',
         ),
+        (lambda root: change(root / 'setup.cfg', 'url = https', 'url = ftp'), 'setup.cfg: stale'),
         (lambda root: change(root / 'CITATION.cff', 'version: 0', 'version: 9'), 'CITATION.cff: stale'),
         (lambda root: change(root / 'CHANGELOG.rst', 'Measuring', 'Measured'), 'CHANGELOG.rst: stale'),
         (lambda root: change(root / 'package.xml', '<version>', '<version>9'), 'package.xml: version 9'),
@@ -112,7 +112,8 @@ def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None
     ],
     ids=[
         'a key of pip', 'an action that can be moved', 'no licence', 'no licence of what is not ours',
-        'an address that leads nowhere', 'a stale citation', 'a stale changelog', 'another version', 'no date',
+        'an address that leads nowhere', 'another address',
+        'a stale citation', 'a stale changelog', 'another version', 'no date',
         'no entry', 'a key without a row',
     ],
 )  # fmt: skip

@@ -52,7 +52,7 @@ equivs-build control >/dev/null 2>&1
 INSTALL = 'cd /root && apt-get install -qq --no-install-recommends ./stand-in*.deb ./ros-jazzy-*.deb >/dev/null 2>&1'
 START = (
     'cd /root && PYTHONPATH=$(echo /opt/ros/jazzy/lib/python3*/site-packages) '
-    'exec /opt/ros/jazzy/lib/psd_deflection/psd-deflection monitor'
+    'exec /opt/ros/jazzy/bin/psd-deflection monitor'
 )
 LEFT = (
     'the tests of the package in its build (nocheck): Debian has no ROS',

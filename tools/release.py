@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks what a release would publish, and makes the files that repeat its facts.
 
-``python -m tools.release files`` writes CHANGELOG.rst, CITATION.cff and .zenodo.json from CHANGELOG.md,
+``python -m tools.release files`` writes CHANGELOG.rst, CITATION.cff and the addresses of setup.cfg from CHANGELOG.md,
 package.xml and the version. ``python -m tools.release check`` (``make release STEP=check``) looks at the tree, at the
 sdist and the wheel in ``dist``, and at the environment in which the wheel is installed. With ``RELEASE=1`` it also
 demands what only a release must have: real addresses, a date, keys that apt resolves. It ends with what it did not try.
@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).parent.parent
-GENERATED = ('CHANGELOG.rst', 'CITATION.cff', '.zenodo.json')
+GENERATED = ('CHANGELOG.rst', 'CITATION.cff', 'setup.cfg')
 PINNED = re.compile(r'[\w.-]+/[\w./-]+@[0-9a-f]{40}')
 VERSION_LINE = re.compile(r'^## (\d+\.\d+\.\d+) \((unreleased|\d{4}-\d\d-\d\d)\)$')
 LICENCE = 'Apache-2.0'
-WITH_ADDRESSES = ('package.xml', *GENERATED, 'SECURITY.md', 'CONTRIBUTING.md', 'packaging', '.github')
+WITH_ADDRESSES = ('package.xml', *GENERATED, 'packaging', '.github')
 COPYLEFT = re.compile(r'\b(A?GPL|GNU (Affero )?General Public)', re.I)
 TITLE = 'psd_deflection: tip deflection and twist of a flexible link from position sensing detectors'
 
@@ -119,22 +119,17 @@ def citation_cff(root: Path) -> str:
     return '\n'.join(lines) + '\n'
 
 
-def zenodo_json(root: Path) -> str:
-    """What Zenodo takes for the record of a release."""
+def setup_cfg(root: Path) -> str:
+    """setup.cfg with the addresses of package.xml."""
     f = facts(root)
-    record = {
-        'title': TITLE,
-        'description': f.description,
-        'upload_type': 'software',
-        'version': f.version,
-        'license': LICENCE.lower(),
-        'creators': [{'name': 'psd_deflection maintainers'}],
-        'keywords': ['ROS 2', 'position sensing detector', 'flexible link', 'model discrepancy'],
-    }
-    return json.dumps(record, indent=2) + '\n'
+    text = (root / 'setup.cfg').read_text()
+    text = re.sub(r'(?m)^author_email = .*$', f'author_email = {f.email}', text)
+    for key, kind in (('url', 'website'), ('    Repository', 'repository'), ('    Issues', 'bugtracker')):
+        text = re.sub(rf'(?m)^{key} = .*$', f'{key} = {f.urls.get(kind, "")}', text)
+    return text
 
 
-MAKERS: dict[str, Callable[[Path], str]] = dict(zip(GENERATED, (changelog_rst, citation_cff, zenodo_json), strict=True))
+MAKERS: dict[str, Callable[[Path], str]] = dict(zip(GENERATED, (changelog_rst, citation_cff, setup_cfg), strict=True))
 
 
 def check_facts(root: Path, release: bool) -> Iterator[str]:

@@ -61,7 +61,7 @@ CI_RUNS = (
         'test/cli/test_thesis.py',
         "main(['thesis', 'compare-methods', '--out', ",
     ),
-    (r'^colcon build$', 'Makefile', 'bin/colcon --log-base log build '),
+    (r'^colcon (build|test)\b', 'tools/tasks.py', '\ncolcon build '),
     (
         r"^pip install 'psd_deflection\[(ros|monitor|pandas|camera|dask|parquet)\]'$",
         'tools/tasks.py',

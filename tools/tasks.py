@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import sysconfig
 from pathlib import Path
 from typing import NamedTuple
 
@@ -199,7 +200,7 @@ RELEASE = {
         ),
         environment='build/release',
     ),
-    'files': Task('python -m tools.release files', 'CHANGELOG.rst, CITATION.cff, .zenodo.json from what they repeat'),
+    'files': Task('python -m tools.release files', 'CHANGELOG.rst, CITATION.cff and the addresses of setup.cfg'),
     'rosdep': Task(
         'python -m tools.rosdistro',
         'how apt resolves each key of package.xml (ARGS=../rosdistro)',
@@ -213,6 +214,33 @@ RELEASE = {
         environment='build/bloom',
     ),
 }
+
+# colcon from PyPI wants an older setuptools than ours: an environment of its own, which finds our libraries here.
+COLCON = f"""set -e
+rm -rf build/colcon && mkdir -p build/colcon && cd build/colcon
+bases='--base-paths ../.. --build-base build --install-base install'
+shopt -s expand_aliases
+alias colcon='../colcon-use/bin/colcon --log-base log'
+colcon build $bases
+test "$(grep -c WARN log/latest_build/logger_all.log)" = 0
+. install/setup.sh
+export PYTHONPATH="$PYTHONPATH:{sysconfig.get_path('purelib')}"
+for each in ../../resource/ros2_run/*; do
+  install/psd_deflection/lib/psd_deflection/"$(basename "$each")" --help | head -n 1
+done
+test "$(ls install/psd_deflection/lib/psd_deflection)" = "$(ls ../../resource/ros2_run)"
+test -f install/psd_deflection/share/ament_index/resource_index/packages/psd_deflection
+test -f install/psd_deflection/share/psd_deflection/package.xml
+test -f install/psd_deflection/share/psd_deflection/launch/estimator.launch.py
+colcon test $bases --return-code-on-test-failure --event-handlers console_direct+ --pytest-args"""
+COLCON_PACKAGES = tuple(
+    f'colcon-{name}'
+    for name in (
+        *('core', 'ros', 'python-setup-py', 'package-information', 'recursive-crawl', 'package-selection'),
+        *('output', 'defaults', 'library-path', 'test-result'),
+    )
+)
+COLCON_TESTS = ['test/rig', 'test/test_packaging.py']
 
 TASKS = {'campaign': CAMPAIGNS, 'demo': DEMOS, 'docs': DOCS, 'release': RELEASE}
 
@@ -279,6 +307,8 @@ def main(kind: str, words: list[str]) -> int:
     """Run ``kind`` NAME; without a name, or with another one, print the names."""
     if kind == 'bench':
         return bench(words)
+    if kind == 'colcon':
+        return run(Task(COLCON, '', packages=COLCON_PACKAGES, environment='build/colcon-use'), words or COLCON_TESTS)
     tasks = TASKS[kind]
     name, *more = words or ['']
     if name not in tasks:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every node does alike: a row a check, a column a node. ``make campaign NAME=nodes`` prints the table.
 
-The nodes are those executables of setup.py whose command uses rclpy. A new one has no profile, and fails every check.
+The nodes are those executables of `ros2 run` whose command uses rclpy. A new one has no profile, and fails every check.
 A profile says what a node is asked with; a text in its place says why the check does not apply, and is in the table.
 """
 
@@ -60,13 +60,8 @@ ROS_OWN = ('use_sim_time', 'qos_overrides.', 'start_type_description_service')
 
 
 def nodes_of_setup() -> list[str]:
-    """The executables of setup.py whose command imports our ROS room."""
-    tree = ast.parse((ROOT / 'setup.py').read_text())
-    (names,) = (
-        ast.literal_eval(statement.value)
-        for statement in tree.body
-        if isinstance(statement, ast.Assign) and ast.unparse(statement.targets[0]) == 'EXECUTABLES'
-    )
+    """The executables of `ros2 run` whose command imports our ROS room."""
+    names = sorted(path.name for path in (ROOT / 'resource' / 'ros2_run').iterdir())
     files = {path.stem: path for path in (ROOT / 'psd_deflection' / 'cli').rglob('*.py')}
     return [name for name in names if 'psd_deflection.ros' in files[name].read_text()]
 
