@@ -12,7 +12,7 @@ import html
 import itertools
 import json
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -34,6 +34,8 @@ MOST_POINTS = 4000
 ONE_AFTER_ANOTHER = '(recordings one after another)'
 MOST_WORDS = 20
 """So many marks have their words beside them, the first; the others are lines only."""
+GAP = 1.5
+"""Median steps of time from which on a line breaks: the next value is missing."""
 CELLS = (600, 200)
 """Points of a cloud that share one of so many cells (across, up) lie on each other: one is kept."""
 
@@ -43,6 +45,8 @@ class Series:
     """One curve: ``x`` and ``y`` (k,) in the units of its panel, NaN: no value.
 
     ``name``: in the legend; curves of one name are switched together. ``spread`` (k,): ± of each value.
+    ``after_gap`` (k,): True where values are missing before a point; over time None: after each step of more than
+    ``GAP`` medians.
     """
 
     name: str
@@ -52,6 +56,20 @@ class Series:
     style: Style = 'line'
     spread: FloatArray | None = None
     bold: bool = False
+    after_gap: npt.NDArray[np.bool_] | None = None
+
+    def broken(self) -> Series:
+        """The same curve with a point without a value inside each gap, so that no line is drawn across it."""
+        steps = np.diff(self.x)
+        if self.style != 'line' or len(steps) == 0:
+            return self
+        wide = steps > GAP * np.nanmedian(steps) if self.after_gap is None else self.after_gap[1:]
+        at = np.flatnonzero(wide) + 1
+        if len(at) == 0:
+            return self
+        spread = None if self.spread is None else np.insert(self.spread, at, np.nan)
+        x = np.insert(self.x, at, 0.5 * (self.x[at - 1] + self.x[at]))
+        return replace(self, x=x, y=np.insert(self.y, at, np.nan), spread=spread, after_gap=None)
 
 
 class Rule(NamedTuple):
@@ -65,7 +83,7 @@ class Rule(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TimeAxis:
-    """An axis of time, s. ``since``: where it is 0, in words. ``marks``: drawn in every panel over it.
+    """An axis of time, s, on which lines break at gaps. ``since``: where it is 0, in words. ``marks``: drawn in every panel over it.
 
     The only way to an axis of time, so no chart can leave out what somebody marked. ``name``: stands before the label
     of a panel whose axis is its own.
@@ -101,6 +119,12 @@ class Panel:
         """That of the axis."""
         return str(self.over)
 
+    @property
+    def curves(self) -> list[Series]:
+        """``series`` as they are drawn: over time a line breaks where values are missing."""
+        timed = isinstance(self.over, TimeAxis)
+        return [one.broken() if timed or one.after_gap is not None else one for one in self.series]
+
     def marked(self, words: bool) -> list[Rule]:
         """``rules``, and the marks of the axis of time among the points; with their ``words``, if these are wanted."""
         if not isinstance(self.over, TimeAxis) or not self.over.marks:
@@ -135,7 +159,7 @@ def drawn(chart: Chart) -> str:
     notes: dict[str, None] = {}
     panels = []
     for panel, rules in zip(chart.panels, chart.rules(), strict=True):
-        series, said = thinned(panel.series)
+        series, said = thinned(panel.curves)
         notes |= dict.fromkeys(said)
         panels.append(
             {
@@ -248,4 +272,4 @@ def _cells(values: FloatArray, count: int) -> FloatArray:
 
 def _of(one: Series, at: npt.NDArray[np.intp]) -> Series:
     spread = None if one.spread is None else one.spread[at]
-    return Series(one.name, one.x[at], one.y[at], one.colour, one.style, spread, one.bold)
+    return replace(one, x=one.x[at], y=one.y[at], spread=spread)

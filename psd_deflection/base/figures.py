@@ -116,7 +116,7 @@ def _chart(chart: Chart) -> ShownFigure:
 
 
 def _draw(axis: Any, panel: Panel, rules: list[Rule]) -> None:
-    series, _ = thinned(panel.series)
+    series, _ = thinned(panel.curves)
     for one in series:
         _curve(axis, one)
     for i, rule in enumerate(rules):

@@ -25,9 +25,11 @@ def moments(marks: Iterable[Mark], start_ns: int) -> tuple[Moment, ...]:
 def samples_chart(samples: npt.NDArray[np.void], psds: int, marks: Sequence[Moment]) -> Chart:
     """x, y and sum of each PSD, V, over time, with the marks. ``samples``: of ``Recording.samples``."""
     along = TimeAxis(FROM_FIRST, marks)
+    after_gap = np.diff(samples['seq'], prepend=samples['seq'][:1]) > 1
     panels = []
     for i, name in enumerate(channel_names(psds)):
-        curve = Series('', samples['t'], samples[name].astype(np.float64), TONES[i // 3 % len(TONES)])
+        values = samples[name].astype(np.float64)
+        curve = Series('', samples['t'], values, TONES[i // 3 % len(TONES)], after_gap=after_gap)
         panels.append(Panel((curve,), along, f'{name} / V'))
     return Chart('samples', panels)
 

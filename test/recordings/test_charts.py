@@ -18,6 +18,7 @@ def test_every_channel_is_drawn_with_the_marks() -> None:
     samples = np.zeros(3, sample_dtype(2))
     samples['t_ns'] = [5_000_000_000, 5_500_000_000, 6_000_000_000]
     samples['t'] = [0.0, 0.5, 1.0]
+    samples['seq'] = [0, 1, 2]
     samples['y2'] = [1.0, 2.0, 3.0]
     chart = samples_chart(samples, 2, moments([Mark(5_250_000_000, 'bump')], 5_000_000_000))
     assert [panel.y_label for panel in chart.panels] == [f'{n} / V' for n in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')]
@@ -44,3 +45,32 @@ def test_a_recording_draws_itself(part: str) -> None:
     figure = recording.plot() if part == 'samples' else psd_deflection.replay(recording).plot()
     assert len(figure.axes) == {'samples': 6, 'estimates': 3}[part]
     assert figure._repr_png_()[:4] == b'\x89PNG'
+
+
+def _spans(x: np.ndarray, y: np.ndarray) -> list[tuple[float, float]]:
+    """From where to where a line is drawn."""
+    ends = np.flatnonzero(np.diff(np.concatenate(([False], np.isfinite(y), [False])).astype(int)))
+    return [(float(x[a]), float(x[b - 1])) for a, b in ends.reshape(-1, 2)]
+
+
+@pytest.mark.parametrize('drawing', ['samples', 'estimates'])
+@pytest.mark.parametrize('bag', ['lost_samples', 'laser_off'])
+def test_a_figure_draws_no_line_over_a_gap(drawing: str, bag: str) -> None:
+    recording = psd_deflection.open(ROOT / 'bags' / bag)
+    estimates = psd_deflection.replay(recording)
+    samples = drawing == 'samples'
+    figure = recording.plot() if samples else estimates.plot()
+    t, steps = (
+        (recording.samples['t'], np.diff(recording.samples['seq']))
+        if samples
+        else (estimates.t, np.diff(estimates.t) / np.median(np.diff(estimates.t)))
+    )
+    gaps = np.flatnonzero(steps > 1.5)
+    expected = list(zip(t[np.concatenate(([0], gaps + 1))], t[np.concatenate((gaps, [len(t) - 1]))], strict=True))
+    assert len(expected) > 1 or (samples and bag == 'laser_off')
+    for axes in figure.axes:
+        (line,) = [one for one in axes.lines if len(one.get_xdata()) > 2]
+        drawn = _spans(np.asarray(line.get_xdata()), np.asarray(line.get_ydata()))
+        # Of many points, those at the ends of a stretch may be thinned.
+        assert len(drawn) == len(expected)
+        assert np.allclose(drawn, expected, atol=0.01)
