@@ -80,6 +80,9 @@ MOST_MEMORIES = 4
 MAX_RESTARTS = 10_000
 """Restarts of one recording that are counted."""
 
+LEAP_NS = 10_000_000_000
+"""A recorder that does not keep up is late by less."""
+
 _BATCH = 50
 """Number of messages whose samples are decoded at once: numpy's cost is per call."""
 
@@ -96,6 +99,7 @@ class BagRecording(Recording):
     def __init__(self, path: Path, block_size: int | None = None, namespace: str | None = None) -> None:
         super().__init__(path, block_size)
         self._own_warnings = Warnings()
+        self._leapt = False
         files = self._files_of(path) if path.is_dir() else [path]
         self._sources = [McapReader(f) for f in files]
         bare = None if namespace is None else namespace.strip('/')
@@ -125,8 +129,12 @@ class BagRecording(Recording):
             return found
         information = read_information(meta_file)
         storage = information.get('storage_identifier')
-        if storage != 'mcap':
-            raise RecordingError(f'{folder}: is a bag with {storage} storage; only mcap is read (see ros2 bag convert)')
+        # `ros2 bag reindex` leaves it empty; the file says itself what it is.
+        if storage not in ('mcap', '', None):
+            raise RecordingError(
+                f'{folder}: is a bag with {storage} storage; only mcap is read: `mcap convert IN.db3 OUT.mcap` or '
+                '`ros2 bag convert` make it'
+            )
         if information.get('compression_mode') in ('file', 'FILE', 'message', 'MESSAGE'):
             raise RecordingError(
                 f'{folder}: is compressed by rosbag2 (compression_mode {information["compression_mode"]}); '
@@ -141,6 +149,11 @@ class BagRecording(Recording):
             if not file.is_file():
                 raise RecordingError(
                     f'{file}: is named by metadata.yaml and is not there; `psd-deflection recover` makes that one anew'
+                )
+        for file in found:
+            if file not in files:
+                self._own_warnings.add(
+                    f'{file}: is not listed in metadata.yaml and is not read; `psd-deflection recover` lists all files'
                 )
         return files
 
@@ -325,12 +338,21 @@ class BagRecording(Recording):
         decoder = CloudDecoder()
         batch: list[tuple[int, npt.NDArray[np.void]]] = []
         first_time = 0
+        late: int | None = None
         for channel, log_time, message in self.messages([SAMPLES]):
             self._check_type(channel.type, channel.encoding, SAMPLES)
             try:
                 stamp, points = decoder.decode(message)
             except ValueError as error:
                 raise RecordingError(f'{self.path}: {SAMPLES} at log time {log_time} ns: {error}') from None
+            if late is not None and abs(log_time - stamp - late) > LEAP_NS and not self._leapt:
+                self._leapt = True
+                leap = (log_time - stamp - late) / 1e9
+                self._warn(
+                    f"the recorder's clock leapt by {leap:+.3f} s at log time {log_time} ns; samples keep their own "
+                    'times, marks and inputs without a stamp do not'
+                )
+            late = log_time - stamp
             if batch and (len(batch) == _BATCH or points.dtype != batch[0][1].dtype):
                 yield first_time, batch
                 batch = []
