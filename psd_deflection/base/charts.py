@@ -83,7 +83,7 @@ class Rule(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class TimeAxis:
-    """An axis of time, s, on which lines break at gaps. ``since``: where it is 0, in words. ``marks``: drawn in every panel over it.
+    """An axis of time, s, on which lines break at gaps. ``since``: where it is 0. ``marks``: drawn in every panel.
 
     The only way to an axis of time, so no chart can leave out what somebody marked. ``name``: stands before the label
     of a panel whose axis is its own.

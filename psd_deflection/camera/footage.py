@@ -8,8 +8,6 @@ exposure is not known: ``camera.exposure`` says it.
 
 from __future__ import annotations
 
-import csv
-import math
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -17,9 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from psd_deflection.base.csv_table import CsvTable, Row
 from psd_deflection.base.errors import ConfigError, DeviceError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_text
-from psd_deflection.base.numbers import plain_number
 from psd_deflection.camera.answer import NoPoseError
 from psd_deflection.camera.image_size import MOST_BYTES, MOST_PIXELS, checked
 from psd_deflection.camera.opencv import opencv
@@ -159,38 +157,25 @@ def _listed(folder: Path) -> list[tuple[Path, int, int]]:
     if not path.is_file():
         raise RecordingError(f'{folder}: has no {FRAMES}; write one with the columns file,t,exposure (s)')
     out: list[tuple[Path, int, int]] = []
-    try:
-        with path.open(encoding='utf-8', newline='') as stream:
-            rows = csv.DictReader(stream)
-            missing = {'file', 't', 'exposure'} - set(rows.fieldnames or ())
-            if missing:
-                raise RecordingError(f'{path}: has no column {", ".join(sorted(missing))}')
-            for row in rows:
-                where = f'{path}:{rows.line_num}'
-                name = row['file'] or ''
-                if not name or Path(name).name != name:
-                    raise RecordingError(f'{where}: file {name!r}: must be the name of an image in {folder}')
-                t, exposure = _seconds(row['t'], where, 't'), _seconds(row['exposure'], where, 'exposure')
-                if exposure < 0 or (out and t <= out[-1][1]):
-                    wrong = 'exposure is negative' if exposure < 0 else 't does not increase'
-                    raise RecordingError(f'{where}: {wrong}')
-                out.append((folder / name, t, exposure))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise RecordingError(f'{path}: cannot be read ({error})') from None
+    table = CsvTable(path)
+    table.require(('file', 't', 'exposure'), 'a list of frames has file,t,exposure (s)')
+    for row in table.table_rows():
+        name = row.text('file')
+        if not name or Path(name).name != name:
+            raise row.refuse(f'file {name!r}: must be the name of an image in {folder}')
+        t, exposure = _seconds(row, 't'), _seconds(row, 'exposure')
+        if exposure < 0 or (out and t <= out[-1][1]):
+            raise row.refuse('exposure is negative' if exposure < 0 else 't does not increase')
+        out.append((folder / name, t, exposure))
     if not out:
         raise RecordingError(f'{path}: lists no frame')
     return out
 
 
-def _seconds(text: str | None, where: str, column: str) -> int:
+def _seconds(row: Row, column: str) -> int:
     """Seconds as ns, exactly for as many decimals as there are. Raises RecordingError."""
-    try:
-        value = plain_number(text or '')
-    except ValueError:
-        value = math.nan
-    if not abs(value) < _MOST_SECONDS:
-        raise RecordingError(f'{where}: column {column} holds {text!r}, which is not a number of seconds')
-    whole, point, part = (text or '').strip().partition('.')
+    value = row.number(column, _MOST_SECONDS)
+    whole, point, part = row.text(column).partition('.')
     if point and whole.lstrip('-').isdecimal() and part.isdecimal():
         sign = -1 if whole.startswith('-') else 1
         return sign * (abs(int(whole)) * 1_000_000_000 + int(part[:9].ljust(9, '0')))

@@ -39,7 +39,7 @@ def test_a_folder_gives_the_middles_of_its_exposures(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('table', 'complaint'),
     [
-        ('file,t\na.png,0\n', 'has no column exposure'),
+        ('file,t\na.png,0\n', 'the header lacks exposure'),
         ('file,t,exposure\na.png,x,0\n', "frames.csv:2: column t holds 'x'"),
         ('file,t,exposure\na.png,0,nan\n', 'column exposure'),
         ('file,t,exposure\na.png,0,-1\n', 'exposure is negative'),

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings.read import csv_rows
-from psd_deflection.recordings.read.csv_rows import CsvTable
+from psd_deflection.recordings.read.csv_rows import SampleRows
 
 TIMES = st.lists(
     st.one_of(
@@ -29,7 +29,7 @@ ODD = st.sampled_from(['', '1.0', '1.0,2,3,4', '#', ' '])
 def told(path: Path, lines: list[str], ending: str, last: str) -> tuple[list[tuple[int, int, list[str]]], str]:
     """(line, t_ns, cells) of each row before the error, and the error without its file."""
     path.write_bytes((ending.join(lines) + last).encode())
-    table = CsvTable(path)
+    table = SampleRows(path)
     found = []
     try:
         for lines_, t_ns, cells in table.rows():
@@ -76,7 +76,7 @@ def test_plain_rows_come_together_and_keep_their_nanoseconds(tmp_path: Path) -> 
     path = tmp_path / 'a.csv'
     count = 20_000
     path.write_text('t,x1\n' + ''.join(f'1700000000.{i:09d},{i}\n' for i in range(count)))
-    parts = list(CsvTable(path).rows())
+    parts = list(SampleRows(path).rows())
     assert len(parts) < 20
     assert [t for part in parts for t in part.t_ns] == [1_700_000_000 * 10**9 + i for i in range(count)]
     assert [line for part in parts for line in part.lines] == list(range(2, count + 2))
@@ -86,12 +86,12 @@ def test_plain_rows_come_together_and_keep_their_nanoseconds(tmp_path: Path) -> 
 def test_a_blank_line_ends_the_plain_rows_and_not_the_reading(tmp_path: Path) -> None:
     path = tmp_path / 'a.csv'
     path.write_text('t,x1\n0.1,1\n\n0.2,2\n')
-    assert [(list(r.lines), list(r.t_ns)) for r in CsvTable(path).rows()] == [([2, 4], [100_000_000, 200_000_000])]
+    assert [(list(r.lines), list(r.t_ns)) for r in SampleRows(path).rows()] == [([2, 4], [100_000_000, 200_000_000])]
 
 
 def test_a_line_without_an_end_is_refused_before_it_is_held(tmp_path: Path) -> None:
     path = tmp_path / 'a.csv'
     path.write_text('t,x1\n0.1,1\n0.2,' + '1' * 200_000)
-    table = CsvTable(path)
+    table = SampleRows(path)
     with pytest.raises(RecordingError, match=r':3: is longer than 10000 characters'):
         list(table.rows())

@@ -57,13 +57,13 @@ def test_a_csv_recording_has_its_own(tmp_path: Path) -> None:
     ('text', 'message'),
     [
         ('t,dx,dy\n0,0,0\n', r'camera\.csv:1: the header lacks theta'),
-        ('t,dx,dy,theta\n0,0,zero,0\n', r"camera\.csv:2: 'zero' is no finite number"),
-        ('t,dx,dy,theta\n0,0,nan,0\n', r"camera\.csv:2: 'nan' is no finite number"),
-        ('t,dx,dy,theta\n1e300,0,0,0\n', r"camera\.csv:2: '1e300' is no finite number below 2\^31"),
-        ('t,dx,dy,theta\n0,0,0\n', r'camera\.csv:2: has 3 cells: must be 4'),
+        ('t,dx,dy,theta\n0,0,zero,0\n', r"camera\.csv:2: column dy holds 'zero', which is not a number"),
+        ('t,dx,dy,theta\n0,0,nan,0\n', r"camera\.csv:2: column dy holds 'nan', which is not finite"),
+        ('t,dx,dy,theta\n1e300,0,0,0\n', r"camera\.csv:2: column t holds '1e300', which is beyond"),
+        ('t,dx,dy,theta\n0,0,0\n', r'camera\.csv:2: has 3 cells, the header has 4'),
         ('t,dx,dy,theta,status\n0,,,,blurred\n', r'camera\.csv: holds no measurement with the status ok'),
         ('t,dx,dy,theta\n0,"0,0,0\n', r'camera\.csv:2: is no row of a CSV'),
-        ('t,dx,dy,theta\n0,0,0,\xe9\n', r"'é' is no finite number"),
+        ('t,dx,dy,theta\n0,0,0,\xe9\n', r"column theta holds 'é', which is not a number"),
     ],
 )
 def test_a_fault_is_named(tmp_path: Path, text: str, message: str) -> None:

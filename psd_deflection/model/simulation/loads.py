@@ -9,14 +9,12 @@ Tz = -F * 0.585 m (a weight at +X turns clockwise in (x, y), so theta is negativ
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.base.errors import RecordingError
-from psd_deflection.base.numbers import plain_number
+from psd_deflection.base.csv_table import CsvTable
 from psd_deflection.records import FloatArray
 
 SIDEBAR_ARM = 0.585
@@ -118,37 +116,19 @@ def from_csv(path: str | Path, rate: float = 1000.0) -> LoadHistory:
 
     Raises RecordingError naming file, line and column.
     """
-    path = Path(path)
+    table = CsvTable(Path(path))
+    names = ('t', 'load_fx', 'load_fy', 'load_tz')
+    table.require(names, f'a load history has {",".join(names)}')
     times: list[float] = []
     rows: list[list[float]] = []
-    names = ('t', 'load_fx', 'load_fy', 'load_tz')
-    try:
-        with path.open(newline='', encoding='utf-8') as stream:
-            reader = csv.DictReader(stream)
-            missing = [n for n in names if n not in (reader.fieldnames or ())]
-            if missing:
-                raise RecordingError(f'{path}:1: no column {missing[0]}; a load history has {", ".join(names)}')
-            for row in reader:
-                numbers = []
-                for name in names:
-                    try:
-                        numbers.append(plain_number(row[name]))
-                    except (TypeError, AttributeError, ValueError):
-                        raise RecordingError(
-                            f'{path}:{reader.line_num}: column {name} holds {row[name]!r}, which is not a number'
-                        ) from None
-                if not np.all(np.isfinite(numbers)):
-                    raise RecordingError(f'{path}:{reader.line_num}: holds a number that is not finite')
-                if times and numbers[0] <= times[-1]:
-                    raise RecordingError(f'{path}:{reader.line_num}: column t does not rise')
-                times.append(numbers[0])
-                rows.append(numbers[1:])
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read as a load history ({error.strerror or error})') from None
-    except UnicodeDecodeError:
-        raise RecordingError(f'{path}: cannot be read as a load history (it is not text in UTF-8)') from None
+    for row in table.table_rows():
+        t, *load = (row.number(name) for name in names)
+        if times and t <= times[-1]:
+            raise row.refuse('column t does not rise')
+        times.append(t)
+        rows.append(load)
     if not rows:
-        raise RecordingError(f'{path}: no rows below the header')
+        raise table.refuse('no rows below the header')
     t = np.asarray(times) - times[0]
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     wanted = np.arange(_count(float(t[-1]) + step, rate)) / rate

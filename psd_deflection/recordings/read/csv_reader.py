@@ -16,9 +16,10 @@ import numpy as np
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.foreign_tables import why_no_number, why_rate
 from psd_deflection.base.numbers import NUMBER
 from psd_deflection.recordings.estimates import EstimateSeries
-from psd_deflection.recordings.read.csv_rows import CsvRows, CsvTable
+from psd_deflection.recordings.read.csv_rows import CsvRows, SampleRows
 from psd_deflection.recordings.read.mcap_reader import RawMessage
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.sample_table import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
@@ -51,7 +52,7 @@ class CsvRecording(Recording):
     def __init__(self, path: Path, block_size: int | None = None, sample_rate_hz: float | None = None) -> None:
         super().__init__(path, block_size)
         self._warnings: list[str] = []
-        self._source = CsvTable(self.path)
+        self._source = SampleRows(self.path)
         self._refuse = self._source.refuse
         self._columns = self._read_header()
         self._channels = channel_names(self.psds)
@@ -69,28 +70,20 @@ class CsvRecording(Recording):
         return self._warnings
 
     def _read_header(self) -> dict[str, int]:
-        names, number = self._source.header, self._source.header_line
-        columns = {name: i for i, name in enumerate(names)}
-        self._refuse_missing(columns, number)
-        for name in KNOWN:
-            if names.count(name) > 1:
-                raise self._refuse(f'column {name} is there twice', number)
+        names, number, columns = self._source.header, self._source.header_line, self._source.columns
+        form = f'a recording begins with {",".join(REQUIRED)}'
+        if 't' not in columns and ('mass' in columns or LOAD_COLUMNS[0] in columns):
+            form += '; discover and info take a table of readings without times'
+        self._source.require(REQUIRED, form, [name for name in KNOWN if name not in REQUIRED])
+        self._refuse_parts(columns, number)
         self.psds = self._count_psds(columns, number)
         unknown = [n for n in names if n not in KNOWN]
         if unknown:
             self._warnings.append(f'{self.path}:{number}: columns that are not read: {", ".join(unknown)}')
         return columns
 
-    def _refuse_missing(self, columns: Collection[str], number: int) -> None:
-        """Refuse a header without the columns of a recording, or with a part of a group."""
-        missing = [n for n in REQUIRED if n not in columns]
-        if missing:
-            hint = ', between commas' if len(columns) == 1 else ''
-            if 't' in missing and ('mass' in columns or LOAD_COLUMNS[0] in columns):
-                hint += '; discover and info take a table of readings without times'
-            raise self._refuse(
-                f'the header lacks {", ".join(missing)}; a recording begins with {",".join(REQUIRED)}{hint}', number
-            )
+    def _refuse_parts(self, columns: Collection[str], number: int) -> None:
+        """Refuse a header with a part of a group."""
         for group in (LOAD_COLUMNS, REFERENCE_COLUMNS):
             there = [n for n in group if n in columns]
             if there and len(there) < len(group):
@@ -109,7 +102,7 @@ class CsvRecording(Recording):
     def _number(self, cells: list[str], name: str, line: int, largest: float = math.inf) -> float:
         cell = cells[self._columns[name]].strip()
         if NUMBER.fullmatch(cell) is None:
-            raise self._refuse(f'column {name} holds {cell!r}, which is not a number', line)
+            raise self._refuse(f'column {name} holds {cell!r}, which is not a number{why_no_number(name, cell)}', line)
         value = float(cell)
         if not math.isfinite(value):
             raise self._refuse(f'column {name} holds {cell!r}, which is not finite', line)
@@ -134,7 +127,10 @@ class CsvRecording(Recording):
         median = float(np.median(steps))
         near = steps[(steps > 0.5 * median) & (steps < 1.5 * median)]
         # If the steps differ very much, the median may be close to none of them.
-        return float(near.mean()) if len(near) else float(steps.min())
+        step = float(near.mean()) if len(near) else float(steps.min())
+        if why := why_rate(self.path, self._columns['t'], 1e9 / step, times[0] / 1e9):
+            raise self._refuse(why)
+        return step
 
     def _chunks(self) -> Iterator[RawChunk]:
         """The samples; the first has seq 0.

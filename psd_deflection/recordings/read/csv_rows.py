@@ -8,19 +8,16 @@ nanoseconds since the epoch. The file is read in passes and never held whole in 
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterator, Sequence
 from decimal import Decimal
 from operator import lt
-from pathlib import Path
-from typing import BinaryIO, NamedTuple, TextIO
+from typing import BinaryIO, NamedTuple
 
+from psd_deflection.base.csv_table import MAX_LINE, CsvTable
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.foreign_tables import why_beyond, why_falling, why_no_number
 from psd_deflection.base.numbers import NUMBER
-
-MAX_LINE = 10_000
-"""Maximum characters of a line; a longer line is not a row of samples."""
 
 MAX_SECONDS = 2**31
 """A ROS stamp has 31 bits of seconds."""
@@ -48,20 +45,8 @@ class CsvRows(NamedTuple):
     cells: list[str]
 
 
-class CsvTable:
-    """The lines of one file. The calls raise RecordingError naming file, line and column of a fault."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        first = next(self._cells(None, 0), None)
-        if first is None:
-            raise self.refuse('is empty')
-        self.header_line, names = first
-        self.header = [name.strip() for name in names]
-
-    def refuse(self, why: str, line: int | None = None) -> RecordingError:
-        """The error that says so of this file."""
-        return RecordingError(f'{self.path}{"" if line is None else f":{line}"}: {why}')
+class SampleRows(CsvTable):
+    """The rows of one file with a column ``t``."""
 
     def rows(self) -> Iterator[CsvRows]:
         """All rows behind the header, which has a column ``t``; before an error, those before the bad row."""
@@ -140,12 +125,10 @@ class CsvTable:
         try:
             for number, cells in self._cells(begin, line):
                 if len(cells) != width:
-                    raise self.refuse(f'has {len(cells)} cells, the header has {width}', number)
-                t_ns = self._nanoseconds(cells[at], number)
+                    raise self.refuse_width(len(cells), number)
+                t_ns = self._nanoseconds(cells[at], number, last)
                 if t_ns <= last:
-                    raise self.refuse(
-                        f'column t holds {cells[at].strip()!r}, which is not after the row before', number
-                    )
+                    raise self._refuse_falling(last, cells, number)
                 last = t_ns
                 lines.append(number)
                 times.append(t_ns)
@@ -162,53 +145,30 @@ class CsvTable:
         if lines:
             yield CsvRows(lines, times, together)
 
-    def _cells(self, begin: int | None, line: int) -> Iterator[tuple[int, list[str]]]:
-        """(line number, cells) of every line that is not blank, from byte ``begin`` on, behind line number ``line``.
+    def _refuse_falling(self, last: int, cells: Sequence[str], line: int) -> RecordingError:
+        cell = cells[self.columns['t']].strip()
+        why = why_falling(self.path, self.columns['t'], line, last / 1e9, float(cell))
+        if not why and any(not cells[self.columns[n]].strip() for n in self.header if n == 'sum1'):
+            why = ': cells are empty; did the program that wrote it split one sample into two rows?'
+        return self.refuse(f'column t holds {cell!r}, which is not after the row before{why}', line)
 
-        ``begin`` None: with the header; 0: behind the header, wherever it ends.
-        """
-        lines = self._lines(begin or 0, line)
-        reader = csv.reader(lines, strict=True, skipinitialspace=True)
-        skip = begin == 0
-        try:
-            for cells in reader:
-                if len(cells) > 1 or (cells and cells[0].strip()):
-                    if skip:
-                        skip = False
-                        continue
-                    yield line + reader.line_num, cells
-        except csv.Error as error:
-            raise self.refuse(f'is no row of a CSV ({error})', line + reader.line_num) from None
-
-    def _lines(self, begin: int, line: int) -> Iterator[str]:
-        try:
-            with self._opened(begin) as stream:
-                while text := stream.readline(MAX_LINE + 1):
-                    line += 1
-                    if len(text) > MAX_LINE:
-                        raise self.refuse(f'is longer than {MAX_LINE} characters', line)
-                    yield text
-        except OSError as error:
-            raise self.refuse(f'cannot be read ({error.strerror or error})') from None
-        except UnicodeDecodeError:
-            raise self.refuse('is not text in UTF-8') from None
-
-    def _opened(self, begin: int) -> TextIO:
-        stream = self.path.open(encoding='utf-8' if begin else 'utf-8-sig', newline=None)
-        if begin:
-            stream.seek(begin)
-        return stream
-
-    def _nanoseconds(self, cell: str, line: int) -> int:
+    def _nanoseconds(self, cell: str, line: int, last: int = -1) -> int:
+        """The time of a cell, ns; ``last``: that of the row before, for the message."""
         text = cell.strip()
         plain = _SECONDS.fullmatch(text)
         if plain is not None:
             return int(plain[1] + plain[2].ljust(9, '0'))
         if NUMBER.fullmatch(text) is None:
-            raise self.refuse(f'column t holds {text!r}, which is not a number', line)
+            raise self.refuse(f'column t holds {text!r}, which is not a number{why_no_number("t", text)}', line)
         seconds = Decimal(text)
         finite = seconds.is_finite() and 0 <= seconds < MAX_SECONDS
         t_ns = int((seconds * 1_000_000_000).to_integral_value()) if finite else -1
         if not 0 <= t_ns < MAX_SECONDS * 1_000_000_000:
-            raise self.refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read', line)
+            why = ''
+            at = self.columns['t']
+            if seconds.is_finite() and seconds < 0 <= last:
+                why = why_falling(self.path, at, line, last / 1e9, float(seconds))
+            elif seconds.is_finite():
+                why = why_beyond(self.path, at, float(seconds))
+            raise self.refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read{why}', line)
         return t_ns

@@ -7,7 +7,9 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
+from psd_deflection.base.csv_table import head_of
 from psd_deflection.base.errors import RecordingError
+from psd_deflection.base.foreign_tables import what_of_file
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.recordings.formats.format import ReadOptions
 from psd_deflection.recordings.formats.registry import format_of_content, formats
@@ -51,7 +53,9 @@ def _open(path: Path, options: ReadOptions) -> Recording:
         raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
     if form is None or form.read is None:
         *others, last = reversed([f.help for f in formats() if f.read is not None])
-        raise RecordingError(f'{path}: is no recording: {", ".join(others)} or {last} is read')
+        raise RecordingError(
+            f'{path}: is no recording: {", ".join(others)} or {last} is read{what_of_file(path, head_of(path))}'
+        )
     return form.read(path, options)
 
 

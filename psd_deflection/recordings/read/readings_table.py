@@ -7,15 +7,14 @@ It has no column ``t``, by which it is told from a recording; or it has one, and
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from psd_deflection.base.csv_table import CsvTable
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.base.numbers import plain_number
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.sample_table import LOAD_COLUMNS, REFERENCE_COLUMNS, TEMPERATURE_COLUMN
 from psd_deflection.records import MOST_PSDS, FloatArray, dot_names
@@ -57,16 +56,11 @@ def is_table(source: Recording | str | Path) -> bool:
     if path.suffix.lower() != '.csv' or not path.is_file():
         return False
     try:
-        with path.open(encoding='utf-8-sig', newline='') as stream:
-            names = _names(next(csv.reader([stream.readline(10_000)], skipinitialspace=True), []))
-    except (OSError, UnicodeDecodeError, csv.Error):
+        names = CsvTable(path).header
+    except RecordingError:
         return False
     alone = TIMES not in names or ('x1' not in names and bool(set(REFERENCE_COLUMNS) & set(names)))
     return alone and (MASS in names or bool(set(LOAD_COLUMNS) & set(names)))
-
-
-def _names(cells: Sequence[str]) -> list[str]:
-    return [c.strip() for c in cells]
 
 
 class ReadingsTable:
@@ -75,51 +69,25 @@ class ReadingsTable:
     def __init__(self, path: Path) -> None:
         self.path = path
         try:
-            if path.stat().st_size > MAX_BYTES:
-                raise RecordingError(f'{path}: is larger than {MAX_BYTES // 1_000_000} MB: no table of readings')
-            text = path.read_text(encoding='utf-8-sig')
+            large = path.stat().st_size > MAX_BYTES
         except OSError as error:
             raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-        except UnicodeDecodeError:
-            raise RecordingError(f'{path}: is not text in UTF-8') from None
-        reader = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
-        try:
-            rows = [(reader.line_num, cells) for cells in reader if any(c.strip() for c in cells)]
-        except csv.Error as error:
-            raise RecordingError(f'{path}:{reader.line_num}: is no row of a CSV ({error})') from None
-        if len(rows) < 2:
-            raise RecordingError(f'{path}: holds no row of readings')
-        (self.head, cells), *rows = rows
-        self.names = _names(cells)
-        for name in self.names:
-            if self.names.count(name) > 1 and name in KNOWN:
-                raise self.refuse(self.head, f'column {name} is there twice')
-        for line, cells in rows:
-            if len(cells) != len(self.names):
-                raise self.refuse(line, f'has {len(cells)} cells, the header has {len(self.names)}')
-        self.rows = rows
+        if large:
+            raise RecordingError(f'{path}: is larger than {MAX_BYTES // 1_000_000} MB: no table of readings')
+        self._table = CsvTable(path)
+        self.names, self.head = self._table.header, self._table.header_line
+        self._table.require((), FORM, KNOWN)
+        self.rows = list(self._table.table_rows())
+        if not self.rows:
+            raise self._table.refuse('holds no row of readings')
 
     def refuse(self, line: int, why: str) -> RecordingError:
         """The error for a line."""
-        return RecordingError(f'{self.path}:{line}: {why}')
+        return self._table.refuse(why, line)
 
     def column(self, name: str, *, empty: bool = False) -> FloatArray:
         """The numbers of a column; ``empty``: a cell without one is NaN, else an error."""
-        at = self.names.index(name)
-        out = []
-        for line, cells in self.rows:
-            cell = cells[at].strip()
-            if not cell and empty:
-                out.append(math.nan)
-                continue
-            try:
-                value = plain_number(cell)
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value):
-                raise self.refuse(line, f'column {name} holds {cell!r}, which is not a finite number')
-            out.append(value)
-        return np.array(out)
+        return np.array([math.nan if empty and not row.text(name) else row.number(name) for row in self.rows])
 
     def columns(self, names: Sequence[str], *, empty: bool = False) -> FloatArray:
         """The same of several columns (n, columns)."""
@@ -134,9 +102,7 @@ class ReadingsTable:
             weight = GRAVITY * self.column(MASS)
             arm = self.column(ARM) if ARM in self.names else np.zeros(len(weight))
             return np.column_stack((np.zeros(len(weight)), -weight, -weight * arm))
-        lacking = [n for n in LOAD_COLUMNS if n not in self.names]
-        if lacking:
-            raise self.refuse(self.head, f'the header lacks {", ".join(lacking)}; {FORM}')
+        self._table.require(LOAD_COLUMNS, FORM)
         return self.columns(LOAD_COLUMNS)
 
     def values(self) -> tuple[str, ...]:

@@ -8,8 +8,6 @@ there are any. A row whose status is not ``ok`` has no measurement. ``psd-deflec
 
 from __future__ import annotations
 
-import csv
-import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -17,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
+from psd_deflection.base.csv_table import CsvTable
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.printable import printable
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.recordings.read.csv_rows import MAX_LINE, MAX_SECONDS
+from psd_deflection.recordings.read.csv_rows import MAX_SECONDS
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.replay.engine import replayed
@@ -96,8 +94,8 @@ def references_in(recording: Recording) -> References | None:
 def read_references(path: str | Path) -> References:
     """The references of a table, or of a recording. Raises RecordingError naming file, line and column of a fault."""
     path = Path(path)
-    if path.suffix.lower() == '.csv' and (columns := _columns(path)) is not None:
-        return _table(path, columns)
+    if path.suffix.lower() == '.csv' and 'x1' not in (table := CsvTable(path)).columns:
+        return _of_table(table)
     return references_of(open_recording(path))
 
 
@@ -106,64 +104,25 @@ def _in_order(t_ns: IntArray, poses: FloatArray, sd: FloatArray | None, refused:
     return References(t_ns[order], poses[order], None if sd is None else sd[order], refused)
 
 
-def _columns(path: Path) -> dict[str, int] | None:
-    """Columns of the table by name; None if the file is a recording."""
-    try:
-        with path.open(encoding='utf-8-sig', newline='') as stream:
-            names = [name.strip() for name in stream.readline(MAX_LINE).split(',')]
-    except OSError as error:
-        raise RecordingError(f'{path}: cannot be read ({error.strerror or error})') from None
-    except UnicodeDecodeError:
-        raise RecordingError(f'{path}: is not text in UTF-8') from None
-    if 'x1' in names:
-        return None
-    missing = [name for name in ('t', *POSE) if name not in names]
-    if missing:
-        raise RecordingError(f'{path}:1: the header lacks {", ".join(missing)}; a table has t,{",".join(POSE)}')
-    return {name: i for i, name in enumerate(names)}
-
-
-def _table(path: Path, columns: Mapping[str, int]) -> References:
-    wanted = [columns[name] for name in ('t', *POSE)]
-    deviations = [columns[name] for name in DEVIATIONS] if all(name in columns for name in DEVIATIONS) else []
-    status = columns.get('status')
+def _of_table(table: CsvTable) -> References:
+    wanted = ('t', *POSE)
+    table.require(wanted, f'a table has {",".join(wanted)}', (*DEVIATIONS, 'status'))
+    deviations = DEVIATIONS if all(name in table.columns for name in DEVIATIONS) else ()
     rows: list[list[float]] = []
     refused: Counter[str] = Counter()
-    with path.open(encoding='utf-8-sig', newline='') as stream:
-        reader = csv.reader(stream, strict=True, skipinitialspace=True)
-        try:
-            next(reader)
-            for cells in reader:
-                if not any(cell.strip() for cell in cells):
-                    continue
-                if len(rows) >= MAX_ROWS:
-                    raise RecordingError(f'{path}:{reader.line_num}: has more than {MAX_ROWS} rows')
-                if len(cells) < len(columns):
-                    raise RecordingError(f'{path}:{reader.line_num}: has {len(cells)} cells: must be {len(columns)}')
-                word = 'ok' if status is None else cells[status].strip()
-                if word != 'ok':
-                    refused[printable(word, LONGEST_STATUS)] += 1
-                    continue
-                rows.append([_number(path, reader.line_num, cells[i]) for i in (*wanted, *deviations)])
-        except csv.Error as error:
-            raise RecordingError(f'{path}:{reader.line_num}: is no row of a CSV ({error})') from None
-        except UnicodeDecodeError:
-            raise RecordingError(f'{path}: is not text in UTF-8') from None
+    for row in table.table_rows():
+        if len(rows) >= MAX_ROWS:
+            raise row.refuse(f'has more than {MAX_ROWS} rows')
+        word = row.text('status') if 'status' in table.columns else 'ok'
+        if word != 'ok':
+            refused[printable(word, LONGEST_STATUS)] += 1
+            continue
+        rows.append([row.number(name, MAX_SECONDS) for name in (*wanted, *deviations)])
     if not rows:
-        raise RecordingError(f'{path}: holds no measurement with the status ok')
+        raise table.refuse('holds no measurement with the status ok')
     values = np.array(rows)
     t_ns = np.rint(values[:, 0] * 1e9).astype(np.int64)
     return _in_order(t_ns, values[:, 1:4], values[:, 4:7] if deviations else None, dict(refused))
-
-
-def _number(path: Path, line: int, cell: str) -> float:
-    try:
-        value = plain_number(cell)
-    except ValueError:
-        value = math.nan
-    if not abs(value) < MAX_SECONDS:
-        raise RecordingError(f'{path}:{line}: {printable(cell, LONGEST_STATUS)!r} is no finite number below 2^31')
-    return value
 
 
 def read_run(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock] | None = None) -> TrustedSamples:

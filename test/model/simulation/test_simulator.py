@@ -117,8 +117,8 @@ def test_load_file_is_held_between_rows(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ('text', 'said'),
     [
-        ('', 'no column t'),
-        ('t,load_fx,load_fy\n0,1,2\n', 'no column load_tz'),
+        ('', 'is empty'),
+        ('t,load_fx,load_fy\n0,1,2\n', 'the header lacks load_tz'),
         ('t,load_fx,load_fy,load_tz\n', 'no rows'),
         ('t,load_fx,load_fy,load_tz\n0,1,2,abc\n', ':2: column load_tz'),
         ('t,load_fx,load_fy,load_tz\n0,1,2,nan\n', ':2: '),
