@@ -69,7 +69,7 @@ def test_a_figure_draws_no_line_over_a_gap(drawing: str, bag: str) -> None:
     expected = list(zip(t[np.concatenate(([0], gaps + 1))], t[np.concatenate((gaps, [len(t) - 1]))], strict=True))
     assert len(expected) > 1 or (samples and bag == 'laser_off')
     for axes in figure.axes:
-        (line,) = [one for one in axes.lines if len(one.get_xdata()) > 2]
+        (line,) = [one for one in axes.lines if np.size(one.get_xdata()) > 2]
         drawn = _spans(np.asarray(line.get_xdata()), np.asarray(line.get_ydata()))
         # Of many points, those at the ends of a stretch may be thinned.
         assert len(drawn) == len(expected)

@@ -223,13 +223,14 @@ def test_a_file_of_another_program_is_named(tmp_path: Path, name: str, head: byt
 
 @pytest.mark.parametrize('reader', ['recording', 'references', 'readings', 'loads', 'frames'])
 def test_every_reader_of_a_csv_says_the_same(tmp_path: Path, reader: str) -> None:
-    form, read = {
+    readers: dict[str, tuple[str, Callable[[Path], object]]] = {
         'recording': (HEADER, open_recording),
         'references': ('t,dx,dy,theta', read_references),
         'readings': ('load_fx,load_fy,load_tz,dx,dy,theta', lambda path: ReadingsTable(path).loads()),
         'loads': ('t,load_fx,load_fy,load_tz', from_csv),
         'frames': ('file,t,exposure', lambda path: Footage(str(path.parent), 0.0)),
-    }[reader]
+    }
+    form, read = readers[reader]
     names = form.split(',')
     path = tmp_path / 'frames.csv'
 

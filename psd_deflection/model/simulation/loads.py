@@ -122,11 +122,11 @@ def from_csv(path: str | Path, rate: float = 1000.0) -> LoadHistory:
     times: list[float] = []
     rows: list[list[float]] = []
     for row in table.table_rows():
-        t, *load = (row.number(name) for name in names)
-        if times and t <= times[-1]:
+        numbers = [row.number(name) for name in names]
+        if times and numbers[0] <= times[-1]:
             raise row.refuse('column t does not rise')
-        times.append(t)
-        rows.append(load)
+        times.append(numbers[0])
+        rows.append(numbers[1:])
     if not rows:
         raise table.refuse('no rows below the header')
     t = np.asarray(times) - times[0]
