@@ -281,6 +281,23 @@ SLOW: Mapping[str, tuple[str, ...]] = {
         'test/docs/test_docs.py -k notebook',
     ),
     'a copy of the package in a process': ('test/cli/test_elsewhere.py',),
+    'processes that are killed, hang, or start again and again; another vendor': (
+        'test/ros/test_estimator_node.py -k another_vendors or a_disk_that_hangs or a_dump_of or the_log_file or '
+        'signals_end_it',
+        'test/ros/test_lifecycle.py -k a_signal_ends or the_zero_holds',
+        'test/ros/test_late_recorder.py',
+        'test/ros/test_filter_topics.py',
+        'test/ros/test_running.py',
+        'test/ros/test_transforms.py -k the_node_publishes or without_tf2_msgs',
+        'test/ros/test_markers.py -k a_late_rviz',
+        'test/ros/test_chain_node.py -k the_frames_lead or a_prefix',
+        'test/ros/test_camera_node.py -k a_parameter_that',
+        'test/ros/test_description.py -k a_signal_ends',
+        'test/ros/test_compensator_node.py -k with_offsets_that_stay or that_hangs or killed_and or after_an_error or '
+        'that_does_not_run or a_signal_ends or lets_the_offsets',
+        'test/ros/test_shaper_action.py -k not (is_shaped or is_refused)',
+        'test/ros/test_shaper_node.py -k the_limits_come',
+    ),
 }
 """Entries by reason: what is slow and tries no room, or what a room's quick tests notice as well."""
 

@@ -187,14 +187,14 @@ def peer(domain: int) -> Iterator[Peer]:
     one.close()
 
 
-@pytest.fixture
-def simulated_port(domain: int, tmp_path: Path) -> Iterator[str]:
+@pytest.fixture(scope='session')
+def simulated_port(domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The port of ``psd-deflection simulate --serve``, run alone: a rig at rest, however late a test looks at it.
 
     A link: the number of its terminal is given to the next one that anybody opens, and a daemon that has lost its
     device asks for it again by name.
     """
-    link = str(tmp_path / 'simulated_port')
+    link = str(tmp_path_factory.mktemp('rig') / 'simulated_port')
     rig = Program([*PSD_DEFLECTION, 'simulate', '--serve', '--link', link, '--loads', 'constant:0,0,0:1'])
     rig.until('port: ')
     yield link

@@ -327,10 +327,10 @@ def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callabl
     peer.until(lost, 'the lost laser in /diagnostics')
     assert put('sum_min', 2.5).successful
     peer.until_of_now(poses, 'estimates again')
+    each_parameter_says_what_it_takes(peer)
 
 
-def test_each_parameter_says_what_it_takes(start: Callable[..., Any], peer: Any) -> None:
-    start('--ros-args', '-p', 'autostart:=false')
+def each_parameter_says_what_it_takes(peer: Any) -> None:
     names = [p.name for p in PARAMETERS]
     request = DescribeParameters.Request(names=names)
     told = peer.call(DescribeParameters, '/estimator/describe_parameters', request).descriptors
@@ -508,33 +508,24 @@ def test_signals_end_it_and_leave_a_whole_recording(
     assert not any('Traceback' in line for line in daemon.lines)
 
 
-@pytest.mark.parametrize(
-    ('arguments', 'status', 'said'),
-    [
+def test_what_cannot_run_says_why_in_one_line(domain: int, capfd: pytest.CaptureFixture[str]) -> None:
+    for words, status, said in (
+        ('-p link.lenght:=1.0', 3, 'link.lenght = 1.0: no parameter of that name; did you mean'),
+        ('-p amplifier.noise:=-1.0', 3, 'amplifier.noise = -1.0 V: must be above 0'),
+        ('-p solver:=magic', 3, 'magic'),
+        ('-p solver:=appendix_d', 3, "solver = 'appendix_d': a method as printed"),
+        ('-p solvers:=[]', 3, 'is an empty list'),
         (
-            ['--ros-args', '-p', 'link.lenght:=1.0'],
-            3,
-            'link.lenght = 1.0: no parameter of that name; did you mean',
-        ),
-        (['--ros-args', '-p', 'amplifier.noise:=-1.0'], 3, 'amplifier.noise = -1.0 V: must be above 0'),
-        (['--ros-args', '-p', 'solver:=magic'], 3, 'magic'),
-        (['--ros-args', '-p', 'solver:=appendix_d'], 3, "solver = 'appendix_d': a method as printed"),
-        (['--ros-args', '-p', 'solvers:=[]'], 3, 'is an empty list'),
-        (
-            ['--ros-args', '-p', 'qos_overrides./psd/samples.publisher.reliability:=best_efort'],
+            '-p qos_overrides./psd/samples.publisher.reliability:=best_efort',
             3,
             'qos_overrides: Unexpected QoS override for policy `reliability`: `best_efort`',
         ),
-        (['--port', '/dev/nothing_here'], 5, '/dev/nothing_here: no such port'),
-        (['--params-file', '/nowhere/rig.yaml'], 3, '/nowhere/rig.yaml: no such parameter file'),
-        (['--ros-args', '--params-file', '/nowhere/rig.yaml'], 3, '/nowhere/rig.yaml'),
-    ],
-)
-def test_what_cannot_run_says_why_in_one_line(
-    start: Callable[..., Any], arguments: list[str], status: int, said: str
-) -> None:
-    daemon = start(*arguments)
-    assert daemon.wait() == status
-    (line,) = [line for line in daemon.lines if said in line]
-    assert line.startswith('psd-deflection estimator: ')
-    assert not any('Traceback' in line for line in daemon.lines)
+        ('--params-file /nowhere/rig.yaml', 3, '/nowhere/rig.yaml'),
+    ):
+        assert main(['estimator', '--ros-args', *words.split()]) == status, words
+        (line,) = [line for line in capfd.readouterr().err.splitlines() if said in line]
+        assert line.startswith('psd-deflection estimator: '), line
+    assert main(['estimator', '--port', '/dev/nothing_here']) == 5
+    assert '/dev/nothing_here: no such port' in capfd.readouterr().err
+    assert main(['estimator', '--params-file', '/nowhere/rig.yaml']) == 3
+    assert '/nowhere/rig.yaml: no such parameter file' in capfd.readouterr().err
