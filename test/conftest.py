@@ -6,6 +6,7 @@ No test asserts time, so hypothesis does not either; no test sees the effects of
 """
 
 import os
+import random
 from pathlib import Path
 
 import pytest
@@ -37,9 +38,10 @@ ROOT = Path(__file__).parents[1]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--shaken``, ``--tier`` and ``--room``."""
+    """``--shaken``, ``--tier``, ``--order`` and ``--room``."""
     parser.addoption('--shaken', action='store_true', help='LAPACK answers a last bit off (test/shaken.py)')
     parser.addoption('--tier', choices=(*TIERS, 'all'), default='all', help='of tools/tiers.py (default all)')
+    parser.addoption('--order', type=int, metavar='SEED', help='shuffle the tests: none may depend on another')
     parser.addoption('--room', help='the tests of this folder of test/, or of this room of tools/tiers.py, alone')
 
 
@@ -76,6 +78,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     }
     config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in chosen])
     items[:] = [item for item in items if item.nodeid in chosen]
+    if config.getoption('--order') is not None:
+        random.Random(config.getoption('--order')).shuffle(items)
     # xdist says so in its workers.
     grouped = items if getattr(config.option, 'loadgroup', False) else []
     for item in grouped:

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tools.allow_contract import broken_by
-from tools.rooms import Measured, circles, large_functions, measured
+from tools.rooms import Measured, circles, large_functions, measured, private_names
 
 ROOT = Path(__file__).resolve().parents[1]
 PURE = {'math', 'numpy'}
@@ -75,6 +75,7 @@ def test_the_house_is_one_that_a_person_keeps_in_mind() -> None:
     assert rooms <= 22
     assert arrows <= 150
     assert (files, lines) > (100, 10_000)
+    assert re.fullmatch(r'make targets: \d+; private names in test: \d+', said[-4])
     assert said[-1] == 'circles of rooms: none; circles of modules: none'
 
 
@@ -129,6 +130,13 @@ def test_forks_and_parameters_are_counted() -> None:
     assert not Measured(20, 8).is_large
     assert Measured(21, 0).is_large
     assert Measured(1, 9).is_large
+
+
+def test_private_names_are_counted(tmp_path: Path) -> None:
+    (tmp_path / 'test_it.py').write_text(
+        'module._part(self._own, cls._own)\na.b._cut = Other._D = __name__ + one._two()\n'
+    )
+    assert private_names(tmp_path) == ['module._part', 'b._cut', 'one._two']
 
 
 def test_no_function_is_large() -> None:

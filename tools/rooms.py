@@ -1,19 +1,21 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Counts the structure: the rooms of the package, and the imports between them.
+"""Counts the structure: the rooms of the package with their tests, the imports between them, and what lies beside.
 
   python -m tools.rooms [CHECKOUT]
 
 A room is a folder or a file at the top of ``psd_deflection``, or ``msg_adapters``. An arrow leads
 from a room to another one that it imports, however often. The package's own ``__init__`` is a door
 for users and no room. A circle is a group of rooms, or of modules, that lead to each other. A
-function is large if its complexity (McCabe's, as radon counts it) or its number of parameters is.
+function is large if its complexity (McCabe's, as radon counts it) or its number of parameters is. A private name in
+test/ is an attribute with an underscore of anything but ``self`` and ``cls``.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
@@ -119,6 +121,26 @@ def large_functions(root: Path) -> dict[str, Measured]:
     }
 
 
+def lines_of(folder: Path) -> list[int]:
+    """The lines of each Python file below ``folder``."""
+    return [len(path.read_text(encoding='utf-8').splitlines()) for path in folder.rglob('*.py')]
+
+
+def private_names(folder: Path) -> list[str]:
+    """The uses of private names in the files below ``folder``, as ``name._private``."""
+    found = (n for path in folder.rglob('*.py') for n in re.findall(r'[a-z_]+\._[a-z]\w+', path.read_text('utf-8')))
+    return [name for name in found if not name.startswith(('self.', 'cls.'))]
+
+
+def beside(root: Path) -> Iterator[str]:
+    """What lies beside the package, a line each."""
+    for folders in (('psd_deflection',), ('test',), ('bench', 'blind', 'tools')):
+        every = [n for folder in folders for n in lines_of(root / folder)]
+        yield f'{", ".join(folders)}: {sum(every)} lines in {len(every)} files'
+    (targets,) = re.findall(r'^\.PHONY: (.*)', (root / 'Makefile').read_text(), re.M)
+    yield f'make targets: {len(targets.split())}; private names in test: {len(private_names(root / "test"))}'
+
+
 def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(
@@ -143,15 +165,17 @@ def main() -> int:
             name = '.'.join(path.relative_to(root).with_suffix('').parts).removesuffix('.__init__')
             if room_of(name):
                 files[room_of(name)].append(len(path.read_text(encoding='utf-8').splitlines()))
-    print('| room | files | lines | imports rooms | is imported by rooms |\n|---|---|---|---|---|')
+    print('| room | files | lines | lines of tests | imports rooms | is imported by rooms |\n|---|---|---|---|---|---|')
     for room, lengths in sorted(files.items()):
         out, into = (sum(pair[side] == room for pair in between) for side in (0, 1))
-        print(f'| `{room}` | {len(lengths)} | {sum(lengths)} | {out} | {into} |')
+        tests = sum(lines_of(root / 'test' / room))
+        print(f'| `{room}` | {len(lengths)} | {sum(lengths)} | {tests} | {out} | {into} |')
     every = [n for lengths in files.values() for n in lengths]
     large = large_functions(root)
     print(f'\n{len(large)} large functions')
     for name, one in sorted(large.items(), key=lambda item: item[1], reverse=True):
         print(f'  {name}: complexity {one.complexity}, {one.parameters} parameters')
+    print('', *beside(root), sep='\n')
     print(f'\n{len(files)} rooms, {len(every)} files, {sum(every)} lines, {len(between)} arrows')
     of_rooms, of_modules = circles(between) or 'none', circles(modules) or 'none'
     print(f'circles of rooms: {of_rooms}; circles of modules: {of_modules}')
