@@ -115,7 +115,7 @@ docs: $(READY)
 	@$(BIN)/python -m tools.tasks docs $(or $(STEP),site) $(ARGS)
 
 golden: $(READY)
-	$(BIN)/python bags/make.py
+	PYTHONPATH=. $(BIN)/python bags/make.py
 
 colcon: $(READY)
 	@$(BIN)/python -m tools.tasks colcon $(ARGS)

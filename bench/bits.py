@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The bits of a recording on other processors: ``make bits``; under a minute on two cores.
 
-The golden recordings with today's defaults are recorded again and replayed in processes that are told to compute as
+The golden recordings are recorded again and replayed in processes that are told to compute as
 other processors would: four kernels of OpenBLAS, numpy with less and less of the instructions that this processor has,
 and the C library without fused multiply-add. What each setting recorded is replayed under each other one. The table
 counts the messages that differ. Ends with status 1 if one does.
@@ -25,7 +25,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BAGS = ROOT / 'bags'
-NAMES = ('defaults', 'motion', 'calibrated', 'three_psds')
+NAMES = ('clean', 'lost_samples', 'laser_off', 'motion', 'calibrated', 'three_psds')
 KERNELS = {'Haswell': 'avx2', 'SkylakeX': 'avx512f', 'Zen': 'avx2', 'Nehalem': 'sse4_2'}
 """Kernels of OpenBLAS, each with the instructions that it needs, as /proc/cpuinfo names them."""
 

@@ -51,7 +51,7 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.recordings.replay.simulated_recording import SimulatedRecording
 from psd_deflection.records import CHANNELS, FloatArray, RawChunk
-from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.from_recordings import read_observation
 
@@ -126,11 +126,9 @@ def replay(times: int, minutes: float) -> list[Row]:
         (file,) = path.glob('*.mcap')
         rig = rig_at_start(open_recording(path))
 
-        quicker = replace_values(rig, {'arithmetic': 'library'})
-
-        def ours(by: Rig = rig) -> None:
+        def ours() -> None:
             recording = open_recording(path)
-            pipeline = Pipeline(by)
+            pipeline = Pipeline(rig)
             for _records in replayed(recording, pipeline):
                 pass
             if pipeline.counters.samples != n:
@@ -163,7 +161,6 @@ def replay(times: int, minutes: float) -> list[Row]:
                 1.0,
                 times,
                 ('psd_deflection replay', 'ours', ours, None),
-                ('with arithmetic: library, whose bits depend on the processor', 'peer', partial(ours, quicker), None),
                 ('the pipeline fed by rosbags', 'peer', by_rosbags, 1.0),
                 ('the pipeline fed by mcap-ros2-support', 'peer', by_mcap_ros2, 1.0),
                 ('bare mcap iteration of the file', 'limit', limit, 1.3),

@@ -13,7 +13,7 @@ Every figure stands beside a peer's from the same run, as a ratio: machines diff
 The rows go into ``bench/results.json``, unless the node is that of ``--checkout``, another version of this repository:
 
     python -m bench.live --checkout ../before --starts 0
-    python -m bench.live --parameters block_fit:=mean covariance:=file consistency:=report --starts 0
+    python -m bench.live --parameters consistency:=report --starts 0
 """
 
 from __future__ import annotations

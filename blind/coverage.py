@@ -343,10 +343,10 @@ def bound(row: Row) -> Array:
 def over_the_bound(
     row: Row, solvers: Sequence[str], rest_s: int = 400, seed: int = 1, **more: object
 ) -> dict[str, Array]:
-    """rms error (3,) of each solver on a link at rest over :func:`bound`; the thesis's mean of a block."""
+    """rms error (3,) of each solver on a link at rest over :func:`bound`."""
     n = rest_s * 1000
     volts = volts_of(row, optics_of(np.zeros((n * generator.FINER, 3))), seed).astype(np.float32)
-    chosen = {'block_fit': 'mean', 'solver': solvers[0], 'solvers': list(solvers), **more}
+    chosen = {'solver': solvers[0], 'solvers': list(solvers), **more}
     seq = np.arange(n)
     chunk = RawChunk(seq, seq * 1_000_000, volts, np.zeros(n, np.uint8))
     poses: dict[str, list[tuple[float, float, float]]] = {name: [] for name in solvers}
@@ -441,9 +441,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if cost is not None and whole:
         print('\nrms error at rest over the Cramér–Rao bound, dX, dY, theta:')
         print(f'- white, no loss: {_three(cost)}')
-        for fit in ('mean', 'poly'):
-            for name, ratio in over_the_bound(UNEQUAL, ('wls', 'exact', 'ols'), block_fit=fit).items():
-                print(f'- unequal channels, block_fit: {fit}, {name}: {_three(ratio)}')
+        for name, ratio in over_the_bound(UNEQUAL, ('wls', 'exact', 'ols')).items():
+            print(f'- unequal channels, {name}: {_three(ratio)}')
         print()
         vibrations(VIBRATION_SEEDS)
     return 0

@@ -38,7 +38,7 @@ def truth(name: str) -> npt.NDArray[np.float64]:
 
 
 @pytest.mark.parametrize('name', sorted(WITHOUT_ESTIMATE))
-def test_a_golden_recording_gives_its_estimates_and_they_are_true(name: str) -> None:
+def test_a_golden_recording_gives_its_estimates_and_refusals(name: str) -> None:
     recording = open_recording(BAGS / name)
     assert recording.complete
     assert recording.hello is not None
@@ -53,21 +53,6 @@ def test_a_golden_recording_gives_its_estimates_and_they_are_true(name: str) -> 
     assert set(best) == set(spots) - set(WITHOUT_ESTIMATE[name])
     lost = sum(s.lost for s in spots.values()) + 20 * len(GONE[name])
     assert lost == (len(LOST) if name == 'lost_samples' else 0)
-    # Against the truth. Where the link still rings, the mean of a block whose samples are not all
-    # there is not the block's mean; whole blocks are.
-    expected = truth(name)
-    whole = [i for i in best if spots[i].present == 20]
-    error = np.array([best[i][3:6] for i in whole]) - expected[whole]
-    sd = np.sqrt([np.array(best[i].covariance)[[0, 4, 8]] for i in whole])
-    # While it rings, the mean dots are not the dots of the mean pose: a turn that varies by 6 mrad
-    # within a block, with a shift that varies by 1 mm, leaves some micrometres.
-    assert (abs(error) < 5.0 * sd + [4e-6, 4e-6, 1.7e-5]).all()
-    # At rest, in the first second, noise alone is left.
-    quiet = [k for k, i in enumerate(whole) if i < 50]
-    assert len(quiet) > 40
-    ratio = np.sqrt((error[quiet] ** 2).mean(axis=0)) / sd[0]
-    assert (ratio < 1.3).all()
-    assert (ratio > 0.7).all()
     # What was recorded is what comes out; to the last bits, which another processor may round elsewhere.
     for topic, solver in (('/link_tip/deflection', 'exact'), ('/link_tip/wls/deflection', 'wls')):
         recorded = recording.estimates()[topic]
@@ -140,15 +125,13 @@ def test_csv_out_has_the_contracts_columns(tmp_path: Path) -> None:
     np.testing.assert_allclose([float(r['dy']) for r in rows], estimates[:, 1], rtol=0, atol=1e-12)
 
 
-# Those with today's defaults (bags/make.py).
-TODAY = {'defaults': LOST, 'motion': set(), 'calibrated': set(), 'three_psds': set()}
+LOSES = {'clean': 0, 'lost_samples': len(LOST), 'laser_off': 0, 'motion': 0, 'calibrated': 0, 'three_psds': 0}
 
 
-@pytest.mark.parametrize('name', sorted(TODAY))
-def test_a_golden_recording_of_today_replays_bit_for_bit(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize('name', sorted(LOSES))
+def test_a_golden_recording_replays_bit_for_bit(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     """On every processor; with another numpy to rounding."""
     recording = open_recording(BAGS / name)
-    assert recording.parameters['arithmetic'] == 'fixed'
     if recording.made_with['numpy'] == np.__version__:
         assert main(['replay', str(BAGS / name), '--compare']) == 0
         assert 'no bit differs' in capsys.readouterr().out
@@ -157,13 +140,13 @@ def test_a_golden_recording_of_today_replays_bit_for_bit(name: str, capsys: pyte
     np.testing.assert_allclose(recording.estimates()['/link_tip/deflection'].pose, again, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize('name', sorted(TODAY))
-def test_a_golden_recording_of_today_is_true(name: str) -> None:
+@pytest.mark.parametrize('name', sorted(LOSES))
+def test_a_golden_recording_is_true_at_the_middle_of_its_blocks(name: str) -> None:
     recording = open_recording(BAGS / name)
     records = [r for step in replayed(recording, Pipeline(rig_at_start(recording))) for r in step]
     best = {r.block: r for r in records if isinstance(r, DeflectionEstimate) and r.primary}
     spots = {r.index: r for r in records if isinstance(r, SpotMeans)}
-    assert 4000 - sum(s.present for s in spots.values()) == len(TODAY[name])
+    assert 4000 - sum(s.present for s in spots.values()) == LOSES[name]
     expected = truth(name)
     # A load that is switched inside a block has no value at its middle: the block and the next are left out.
     whole = [i for i in best if spots[i].present == 20 and i % 50 > 1]

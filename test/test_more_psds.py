@@ -301,10 +301,9 @@ def test_a_stuck_psd_tells_on_itself_where_the_check_cannot(three: Rig) -> None:
     assert [s.left_out for s in spots_of(records)].count((2,)) > 70
 
 
-@pytest.mark.parametrize('rule', [{}, {'block_fit': 'mean', 'covariance': 'file'}], ids=['fit', 'mean'])
-def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: Rig, rule: dict[str, object]) -> None:
+def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: Rig) -> None:
     """At rest PSD 1 is 1 mm off; PSD 3 does not move by a bit, as a quiet one may."""
-    rig = with_solver(three, 'exact', **LEVEL, **rule)
+    rig = with_solver(three, 'exact', **LEVEL)
     counts = at_rest(rig, np.array([1e-3, 0.0, 0.0, 0.0, 0.0, 0.0]), 200, 1)
     counts[:, 6:] = np.rint(np.array([0.0, 0.0, 5.0]) / STEP)
     pipeline = Pipeline(rig)
@@ -343,7 +342,7 @@ def test_with_one_psd_left_the_rule_for_one_holds(three: Rig) -> None:
 @pytest.mark.parametrize('psd', [0, 1, 2])
 def test_each_of_three_may_be_the_last(three: Rig, psd: int) -> None:
     """The tip is 1 mm off and not turned: so are the dots, the other way."""
-    rig = with_solver(three, 'exact', degraded='zero', block_fit='mean', covariance='file', **LEVEL)
+    rig = with_solver(three, 'exact', degraded='zero', **LEVEL)
     counts = at_rest(rig, np.tile([-1e-3, 2e-3], 3), 20, 1)
     for other in {0, 1, 2} - {psd}:
         counts[:, 3 * other : 3 * other + 3] = 0

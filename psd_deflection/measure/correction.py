@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.memory import Memory, Value, misfit
 from psd_deflection.model.plate.plate import flat_poses
@@ -82,7 +82,7 @@ class Correction:
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         self._nominal, self._true = Physics.of(rig), Physics.of(rig)
-        self._by = self._nominal.by = self._true.by = ARITHMETICS[rig.estimator.arithmetic]
+        self._by = self._nominal.by = self._true.by = FIXED
         # The solvers take every beam as parallel to Z.
         self._nominal.slopes = np.zeros_like(self._nominal.slopes)
         self._psds = len(rig.psds)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import ARITHMETICS, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.measure.health import FROZEN_BLOCKS, OpticsHealth, Verdict
 from psd_deflection.measure.memory import Memory, Value, numbers
 from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck, widened
@@ -122,7 +122,7 @@ class Estimation:
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         config = rig.estimator
-        self._by = ARITHMETICS[config.arithmetic]
+        self._by = FIXED
         variances = dot_noise_variances(rig)
         self.variances = [tuple(float(v) / n for v in variances) for n in range(1, config.block_size + 1)]
         self.zero_variances: tuple[float, ...] = ()
@@ -200,13 +200,12 @@ class Estimation:
         verdict = block.verdict
         whole = BlockReadings(block.means, self._variances_of(block))
         if verdict.status is BlockStatus.OK:
-            if self.stamped.active:
-                fitted = self.stamped.fit(block.slots, block.samples)
-                whole = whole._replace(dots=fitted.dots, spread=self._spread_of(block, fitted.covariance))
+            fitted = self.stamped.fit(block.slots, block.samples)
+            whole = whole._replace(dots=fitted.dots, spread=self._spread_of(block, fitted.covariance))
             return self._agreed(block, whole, whole)
         if not verdict.sound:
             return BlockSolution(whole.dots)
-        if self._rig.estimator.covariance != 'file' and self.stamped.flat:
+        if self.stamped.flat:
             whole = whole._replace(variances=self.stamped.mean_variances(len(block.slots)))
         others = self._some(verdict.sound, block, whole) if len(verdict.sound) > 1 else None
         if others is not None:
@@ -282,8 +281,6 @@ class Estimation:
         at = some.columns
         dots = tuple(whole.dots[i] for i in at)
         readings = BlockReadings(dots, tuple(whole.variances[i] for i in at), kept=kept, some=some)
-        if not self.stamped.active:
-            return readings
         fitted = self.stamped.fit_some(some, block.slots, block.samples)
         return readings._replace(dots=fitted.dots, spread=self._spread_of(block, fitted.covariance, at))
 

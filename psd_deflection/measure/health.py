@@ -17,7 +17,7 @@ from operator import gt, neg
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock, channel_names, dot_names
@@ -143,7 +143,7 @@ class OpticsHealth:
 
     def __init__(self, rig: Rig) -> None:
         config = rig.estimator
-        self._by = ARITHMETICS[config.arithmetic]
+        self._by = FIXED
         self._psds = len(rig.psds)
         self._size = config.block_size
         self._min_samples = min(config.min_samples, config.block_size)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.averaging import BlockCutter, block_middle_ns, covariance
 from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
@@ -90,7 +90,7 @@ class Pipeline:
         self.last_estimate: DeflectionEstimate | None = None
         self.last_spots: SpotMeans | None = None
         config = rig.estimator
-        self._by = ARITHMETICS[config.arithmetic]
+        self._by = FIXED
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
         self.zero_refused = ''
@@ -101,7 +101,7 @@ class Pipeline:
     def _begin(self, rig: Rig) -> None:
         """Remember nothing."""
         self._effects = effects_of_rig(rig)
-        self.tip_loads = TipLoads(rig, self._effects if rig.estimator.wrench == 'effects' else ())
+        self.tip_loads = TipLoads(rig, self._effects)
         self._recent: list[Dots] = []
         self._surroundings = Surroundings()
         self._stillness = Stillness(len(rig.psds))

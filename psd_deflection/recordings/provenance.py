@@ -19,9 +19,9 @@ from types import MappingProxyType
 from psd_deflection import __version__
 from psd_deflection.base.printable import printable
 
-PROCESSOR = ('machine', 'processor', 'kernel', 'C library')
-"""Entries that the last digits depend on only with ``arithmetic: library``."""
-NAMES = ('psd_deflection', 'python', 'numpy', 'scipy', *PROCESSOR)
+COMPUTES = ('psd_deflection', 'python', 'numpy', 'scipy')
+"""Entries that the last digits of an estimate may depend on."""
+NAMES = (*COMPUTES, 'machine', 'processor', 'kernel', 'C library')
 _LONGEST = 120
 _OVERRIDES = ('OPENBLAS_CORETYPE', 'NPY_DISABLE_CPU_FEATURES', 'GLIBC_TUNABLES')
 """Environment variables that choose other instructions than the processor's best."""
@@ -44,14 +44,14 @@ def provenance() -> Mapping[str, str]:
     return MappingProxyType(found)
 
 
-def differences(then: Mapping[str, str], now: Mapping[str, str], *, processor: bool) -> list[str]:
-    """The differences in words: "numpy 2.3.1, now 2.4.0". ``processor``: also what belongs to the processor."""
+def differences(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """The differences of what computes in words: "numpy 2.3.1, now 2.4.0"."""
     if not then:
         return ['a version that does not say what computed it']
     return [
         f'{name} {printable(then.get(name, "not stated"), _LONGEST)}, now {now.get(name, "not stated")}'
-        for name in NAMES
-        if then.get(name) != now.get(name) and (processor or name not in PROCESSOR)
+        for name in COMPUTES
+        if then.get(name) != now.get(name)
     ]
 
 

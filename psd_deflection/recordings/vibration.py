@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.uncertainty.combinations import combinations_of
 from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS
@@ -16,7 +16,7 @@ from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch, rms_o
 from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.records import FloatArray, IntArray, SampleBlock
-from psd_deflection.rig.config import Rig, rig_as_recorded
+from psd_deflection.rig.config import Rig, rig_from_values
 
 _LEAST_SHARE = 0.5
 """A second of which fewer samples are present, with the light on, tells nothing."""
@@ -28,7 +28,7 @@ class RecordedVibration:
     def __init__(self, rig: Rig) -> None:
         self._rate = rig.converter.sample_rate_hz
         self._size = rig.estimator.block_size
-        by = ARITHMETICS[rig.estimator.arithmetic]
+        by = FIXED
         self._by = by
         self._calibration = VoltsToDots.from_rig(rig)
         self._combinations = combinations_of(rig.centers, rig.centers + rig.zeros, by=by)
@@ -84,7 +84,7 @@ class RecordedVibration:
 def vibration_of(recording: Recording) -> RecordedVibration | None:
     """What judges the blocks of ``recording``; None if its PSDs do not move with the tip, or are not described."""
     try:
-        rig = rig_as_recorded(recording.parameters, str(recording.path))
+        rig = rig_from_values(recording.parameters, str(recording.path))
     except ConfigError:
         return None
     if rig.psds_at_base or recording.psds != len(rig.psds) or recording.block_size != rig.estimator.block_size:

@@ -175,16 +175,6 @@ def rig_from_values(values: Mapping[str, object], source: str = 'parameters') ->
     return _rig({p.name: p.default for p in PARAMETERS}, {}, values, source)
 
 
-def rig_as_recorded(values: Mapping[str, object], source: str) -> Rig:
-    """The rig of a recording's parameters: one that they do not name was not there yet, and what held before it holds.
-
-    A recording names every parameter of its time; one that names none (CSV) has today's defaults.
-    Raises ConfigError as :func:`rig_from_values` does.
-    """
-    then = {p.name: p.before for p in PARAMETERS if p.before is not None} if values else {}
-    return rig_from_values({**then, **values}, source)
-
-
 def replace_values(rig: Rig, changes: Mapping[str, object], source: str = 'override') -> Rig:
     """The same rig with some values changed; they are checked like any others. Raises ConfigError."""
     return _rig(rig.values, rig.effects, changes, source)

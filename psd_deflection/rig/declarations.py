@@ -210,74 +210,19 @@ class EstimatorConfig:
         maximum=100.0,
         live=True,
     )
-    block_fit: str = parameter(
-        'poly',
-        '',
-        'what a block gives: its mean, or a polynomial at the stamp (poly), which follows motion inside the block',
-        choices=('poly', 'mean'),
-        before='mean',
-    )
     covariance: str = parameter(
         'total',
         '',
         'what the covariances hold: the noise measured in the stream after 100 blocks and what calibration.* leaves '
-        "open (total), that noise alone (measured, or noise), or the rig file's noise alone (file)",
-        choices=('total', 'measured', 'file'),
+        'open (total), or that noise alone (measured, or noise)',
+        choices=('total', 'measured'),
         synonyms=(('noise', 'measured'),),
-        before='file',
     )
     consistency: str = parameter(
         'widen',
         '',
         'when the readings contradict each other: widen the covariance, refuse the block, or only report it',
         choices=('widen', 'refuse', 'report'),
-        before='report',
-    )
-    contradiction_memory: str = parameter(
-        'lasting',
-        '',
-        'of three and more PSDs: whether the covariance is widened by large contradictions of late alone (recent), or '
-        'besides by small ones that last, as with two PSDs (lasting)',
-        choices=('lasting', 'recent'),
-        before='recent',
-    )
-    motion_memory: str = parameter(
-        'lasting',
-        '',
-        'how long the fit of a block remembers motion: a quarter of a second (recent), or besides for as long as it '
-        'goes on alike, so that a steady vibration of some micrometres is told from noise (lasting)',
-        choices=('lasting', 'recent'),
-        before='recent',
-    )
-    vibration: str = parameter(
-        'widen',
-        '',
-        'what vibrates faster than a block can follow: widen the covariance by it and say so, or ignore it',
-        choices=('widen', 'ignore'),
-        before='ignore',
-    )
-    converter_steps: str = parameter(
-        'seen',
-        '',
-        'steps of the converter that the covariance has: those that the samples show if they are coarser than '
-        "converter.bits says (seen), or the rig file's (file)",
-        choices=('seen', 'file'),
-        before='file',
-    )
-    arithmetic: str = parameter(
-        'fixed',
-        '',
-        'how the pipeline computes: in an order of its own, with the same bits on every processor (fixed), or by the '
-        'matrix and C libraries, whose last digits depend on the processor (library)',
-        choices=('fixed', 'library'),
-        before='library',
-    )
-    wrench: str = parameter(
-        'effects',
-        '',
-        'link behind /link_tip/wrench: with the effects of the rig file (stiffness, clamp, load ...), or nominal',
-        choices=('effects', 'nominal'),
-        before='nominal',
     )
     splitter: bool = parameter(
         False, '', 'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums'
@@ -345,7 +290,6 @@ class EstimatorConfig:
         "what minimum_tilt publishes: twist and tilts of one rotation, or the base line's azimuth as the twist",
         name='minimum_tilt.angles',
         choices=('rotation', 'azimuth'),
-        before='azimuth',
     )
     filter: str = parameter(
         'none',
@@ -365,14 +309,6 @@ class EstimatorConfig:
     )
     filter_coast: float = parameter(
         0.5, 's', 'the filter goes on without samples for at most so long', minimum=0.0, maximum=60.0
-    )
-    filter_growth: str = parameter(
-        'seen',
-        '',
-        'how the covariance of the filter grows without samples: also by what loads were seen to do in the last half '
-        'minute (seen), or by the process noise alone (model)',
-        choices=('seen', 'model'),
-        before='model',
     )
     filter_load_walk: tuple[float, float, float] = parameter(
         (0.0, 0.0, 0.0),

@@ -47,8 +47,7 @@ class Parameter:
     """One parameter. ``minimum`` and ``maximum`` apply to each element of an array.
 
     ``above``: an exclusive lower bound. ``synonyms``: other words, each with the one of ``choices`` that it means.
-    ``live``: the parameter may be changed while the node runs. ``before``: the value for recordings that were made
-    before this parameter existed and do not name it; None: the default.
+    ``live``: the parameter may be changed while the node runs.
     """
 
     name: str
@@ -63,7 +62,6 @@ class Parameter:
     choices: tuple[str, ...] | None = None
     synonyms: tuple[tuple[str | bool, str], ...] = ()
     live: bool = False
-    before: Any = None
 
     def bound_text(self) -> str:
         """The bounds or the choices in words, for an error message or ``--help``; '' if there are none."""
@@ -101,7 +99,6 @@ def parameter(
     *,
     name: str = '',
     live: bool = False,
-    before: T | None = None,
     **allowed: Unpack[Allowed],
 ) -> T:
     """Declare a parameter as a field of a dataclass; the field's type is its type.
@@ -109,7 +106,7 @@ def parameter(
     ``name``: its name in a parameter file, below the section's prefix, if it differs from the
     field's name. :class:`Parameter` explains the rest.
     """
-    declared = {'unit': unit, 'description': description, 'name': name, 'live': live, 'before': before}
+    declared = {'unit': unit, 'description': description, 'name': name, 'live': live}
     anything = Allowed(minimum=None, maximum=None, above=None, choices=None, synonyms=())
     declaration: T = field(default=default, metadata={**declared, **anything, **allowed})
     return declaration

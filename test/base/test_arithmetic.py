@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.base.arithmetic import ARITHMETICS, FIXED, LIBRARY, Arithmetic, FixedArithmetic, in_pairs
+from psd_deflection.base.arithmetic import FIXED, LIBRARY, Arithmetic, FixedArithmetic, in_pairs
 from psd_deflection.base.arithmetic.elementary import FixedFunctions
 from psd_deflection.base.arithmetic.matrices import pivots, surely_positive
 from psd_deflection.records import FloatArray
@@ -32,7 +32,6 @@ def test_every_operation_has_an_order_of_its_own() -> None:
     ours = {name for name in vars(Arithmetic) if not name.startswith('_')}
     own = vars(FixedArithmetic) | vars(FixedFunctions)
     assert {name for name in own if not name.startswith('_')} == ours
-    assert {name: type(by) for name, by in ARITHMETICS.items()} == {'fixed': FixedArithmetic, 'library': Arithmetic}
 
 
 def test_sine_and_cosine_are_right_to_two_units_in_the_last_place() -> None:

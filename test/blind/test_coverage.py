@@ -39,17 +39,10 @@ def test_the_truth_is_inside_on_a_moving_base() -> None:
 
 
 @pytest.mark.statistics
-@pytest.mark.parametrize('fit', ['mean', 'poly'])
-def test_weights_from_the_stated_noise_reach_the_bound(fit: str) -> None:
-    ratios = over_the_bound(UNEQUAL, ('wls', 'ols'), rest_s=160, block_fit=fit)
+def test_weights_from_the_stated_noise_reach_the_bound() -> None:
+    ratios = over_the_bound(UNEQUAL, ('wls', 'ols'), rest_s=160)
     assert (ratios['wls'] < 1.02).all()
     assert ratios['ols'][0] > 1.4
-
-
-def test_what_was_published_before_was_not_inside() -> None:
-    """The judge can say no: the mean of a block with the rig file's noise, while the link rings."""
-    s = score(ROWS[0], 'none', rest_s=8, steps=2, seed=3, block_fit='mean', covariance='file', consistency='report')
-    assert s.ringing.joint < 0.5
 
 
 @pytest.mark.parametrize(('kind', 'channel'), [('dead', 1), ('stuck', 3), ('inverted', 0), ('swapped', 1)])

@@ -346,16 +346,18 @@ def strict(text: str) -> Any:
 
 
 def odd_recording(folder: Path) -> Path:
-    """A foreign .mcap without samples, whose metadata holds numbers that JSON has not."""
+    """A foreign .mcap without samples, whose rig holds numbers that JSON has not."""
     path = folder / 'odd.mcap'
     with path.open('wb') as stream:
         writer = Writer(stream)
         writer.start(profile='ros2')
-        writer.add_metadata('psd_deflection.parameters', {'link.length': 'NaN', 'psd_1.center': '[Infinity, 0.0]'})
-        channel = writer.register_channel(
-            '/chatter', 'cdr', writer.register_schema('std_msgs/msg/String', 'ros2msg', b'string data')
-        )
-        writer.add_message(channel, 1, b'\0\1\0\0\2\0\0\0a\0', 1)
+        parameters = '{"link.length": NaN, "psd_1.center": [Infinity, 0.0]}'
+        rig = f'{{"version": "1", "t_ns": 0, "block": 0, "parameters": {parameters}, "changed": {{}}}}'
+        schema = writer.register_schema('std_msgs/msg/String', 'ros2msg', b'string data')
+        for topic, text in (('/link_tip/rig', rig), ('/chatter', 'a')):
+            words = text.encode() + b'\0'
+            message = b'\0\1\0\0' + len(words).to_bytes(4, 'little') + words
+            writer.add_message(writer.register_channel(topic, 'cdr', schema), 1, message, 1)
         writer.finish()
     return path
 

@@ -18,11 +18,11 @@ from rosbags.rosbag2 import Writer as RosbagsWriter
 from rosbags.typesys import Stores, get_typestore
 
 import psd_deflection
-from msg_adapters import LOAD, MESSAGE_TYPES, SAMPLES, to_messages
+from msg_adapters import LOAD, MESSAGE_TYPES, RIG, SAMPLES, to_messages
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.read.readers import open_recording
-from psd_deflection.recordings.write.bag_writer import META_CHANGE, BagWriter, McapFile
+from psd_deflection.recordings.write.bag_writer import BagWriter, McapFile
 from psd_deflection.records import (
     CHANNELS,
     AppliedLoad,
@@ -176,26 +176,28 @@ def test_changes_of_parameters_come_back(tmp_path: Path) -> None:
     ]
     path = write_mcap(tmp_path / 'a.mcap', [block(0), *changes, block(1)])
     assert repr(open_recording(path).changes) == repr(changes)
-    assert open_recording(path).topics() == {SAMPLES: 2}
+    assert open_recording(path).topics() == {SAMPLES: 2, RIG: 2}
+
+
+def with_state(folder: Path, text: str) -> Path:
+    """A file with one message of the rig."""
+    with McapFile(folder / 'a.mcap', rig_values={}) as out:
+        out.write_encoded(RIG, 'std_msgs/msg/String', cdr.encode('std_msgs/msg/String', {'data': text}), 1)
+    return folder / 'a.mcap'
 
 
 @pytest.mark.parametrize(
-    'entry',
+    'text',
     [
-        {},
-        {'t_ns': 'x', 'block': '1', 'values': '{}'},
-        {'t_ns': '1', 'block': '1', 'values': '[1]'},
-        {'t_ns': '1', 'block': '1', 'values': '{"a": {}}'},
-        {'t_ns': '1', 'block': '1', 'values': '[' * 100_000},
+        '{}',
+        '{"version": "1", "t_ns": "x", "block": 1, "parameters": {}, "changed": {}}',
+        '{"version": "1", "t_ns": 1, "block": 1, "parameters": {}, "changed": [1]}',
+        '{"version": "1", "t_ns": 1, "block": 1, "parameters": {}, "changed": {"a": {}}}',
+        '[' * 100_000,
     ],
 )
-def test_a_change_that_is_not_readable_is_left_out(tmp_path: Path, entry: dict[str, str]) -> None:
-    with (tmp_path / 'a.mcap').open('wb') as stream:
-        writer = Writer(stream)
-        writer.start('ros2')
-        writer.add_metadata(META_CHANGE + '000001', entry)
-        writer.finish()
-    recording = open_recording(tmp_path / 'a.mcap')
+def test_a_change_that_is_not_readable_is_left_out(tmp_path: Path, text: str) -> None:
+    recording = open_recording(with_state(tmp_path, text))
     assert list(recording.changes) == []
     assert 'is left out' in recording.warnings[0]
 
@@ -236,13 +238,9 @@ def test_numbers_left_out_at_a_restart_are_not_lost(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize('value', ['[1]', '[5, 4]', '[0.5, 7]', '[1, 1e300]', '"x"', '[-1, 3]', f'[1, {2**70}]'])
 def test_a_restart_that_makes_no_sense_is_none(tmp_path: Path, value: str) -> None:
-    entry = {'t_ns': '0', 'block': '0', 'values': f'{{"device.restart": {value}}}'}
-    with (tmp_path / 'a.mcap').open('wb') as stream:
-        writer = Writer(stream)
-        writer.start('ros2')
-        writer.add_metadata(META_CHANGE + '000001', entry)
-        writer.finish()
-    recording = open_recording(tmp_path / 'a.mcap')
+    changed = f'{{"device.restart": {value}}}'
+    text = f'{{"version": "1", "t_ns": 0, "block": 0, "parameters": {{}}, "changed": {changed}}}'
+    recording = open_recording(with_state(tmp_path, text))
     assert recording.restarts == set()
     assert recording.lost(0, 9, 8) == 2
 

@@ -8,7 +8,6 @@ import collections
 import errno
 import gc
 import io
-import json
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +19,12 @@ from mcap.records import Chunk, ChunkIndex
 from mcap.stream_reader import StreamReader
 from rosbags.rosbag2 import Reader
 
-from msg_adapters import RIG, TOPIC_TYPES, spot_topics, to_messages
+from msg_adapters import RIG, TOPIC_TYPES, spot_topics, string, to_messages
 from psd_deflection import __version__
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder
 from psd_deflection.recordings import cdr
-from psd_deflection.recordings.write.bag_writer import META_HELLO, META_PARAMETERS, META_SOFTWARE, BagWriter, McapFile
+from psd_deflection.recordings.write.bag_writer import META_SOFTWARE, BagWriter, McapFile
 from psd_deflection.records import MOST_PSDS
 from psd_deflection.rig.config import load_rig
 
@@ -156,11 +155,11 @@ def test_a_late_message_does_not_stretch_a_chunk(tmp_path: Path) -> None:
 
 def test_parameters_version_and_hello_are_inside(tmp_path: Path) -> None:
     folder = record(tmp_path / 'run', 1)
-    metadata = metadata_of(folder / 'run_0.mcap')
-    assert metadata[META_SOFTWARE]['version'] == __version__
-    parameters = {k: json.loads(v) for k, v in metadata[META_PARAMETERS].items()}
-    assert parameters == dict(load_rig().values)
-    assert {k: json.loads(v) for k, v in metadata[META_HELLO].items()} == HELLO
+    assert metadata_of(folder / 'run_0.mcap')[META_SOFTWARE]['version'] == __version__
+    with (folder / 'run_0.mcap').open('rb') as f:
+        ((_, _, message),) = make_reader(f).iter_messages([RIG])
+    state = string.to_rig(cdr.decode('std_msgs/msg/String', message.data))
+    assert (state.parameters, state.hello, state.version) == (dict(load_rig().values), HELLO, __version__)
 
 
 def test_an_empty_bag_opens(tmp_path: Path) -> None:

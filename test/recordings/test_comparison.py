@@ -101,22 +101,6 @@ def test_rounding_of_the_same_version_is_a_failure(
     assert 'rounding differs although the same versions recorded it: please report this' in capsys.readouterr().out
 
 
-def test_a_processor_explains_rounding_only_if_the_libraries_compute(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from psd_deflection.recordings.provenance import provenance
-
-    rig = tmp_path / 'rig.yaml'
-    rig.write_text('/**:\n  ros__parameters:\n    arithmetic: library\n')
-    for words, status in (((), 1), (('--params-file', str(rig)), 0)):
-        folder = tmp_path / f'of_{status}'
-        folder.mkdir()
-        with monkeypatch.context() as patch:
-            name = recorded(folder, patch, {**provenance(), 'processor': 'another'}, *words)
-            disturbed(patch, 3e-16)
-            assert main(['replay', name, '--compare']) == status
-
-
 def test_another_difference_of_another_version_is_a_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -18,7 +18,7 @@ from psd_deflection.model.detector import VoltsToDots
 from psd_deflection.model.simulation.loads import constant
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import DeflectionEstimate, RawChunk, SampleBlock
-from psd_deflection.rig.config import Rig, load_rig, rig_as_recorded, rig_from_values
+from psd_deflection.rig.config import Rig, load_rig, rig_from_values
 from psd_deflection.rig.wiring import Wiring
 
 PAIRS = list(itertools.product(('x', '-x'), ('y', '-y')))
@@ -76,11 +76,6 @@ def test_a_dark_detector_is_dark_on_the_input_that_it_is_wired_to() -> None:
     feed = RigFeed(rig, lambda first, n: np.zeros((n, 3)), dark=[(1, 0, 10)])
     _, _, sum1, _, _, sum2 = feed.next()
     assert abs(sum2) < 20 < sum1
-
-
-def test_a_recording_from_before_means_the_nominal_wiring() -> None:
-    assert Wiring.from_rig(rig_as_recorded({'link.length': 0.4}, 'old bag')).nominal
-    assert Wiring.from_rig(load_rig()).nominal
 
 
 @pytest.mark.parametrize(

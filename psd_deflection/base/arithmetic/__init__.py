@@ -6,8 +6,7 @@ BLAS and LAPACK choose their kernels by the processor. numpy's exponential, loga
 products use other instructions where there are wider registers, and the C library's sine and cosine where there is a
 fused multiply-add. Each choice rounds differently in the last digit. :data:`FIXED` does the same work by sums,
 products, quotients and square roots of single numbers in an order that stands in the source. IEEE 754 says how each
-of these is rounded, so there is nothing left to choose. :data:`LIBRARY` calls numpy and the C library; recordings from
-before the parameter ``arithmetic`` was there are replayed with it.
+of these is rounded, so there is nothing left to choose. :data:`LIBRARY` calls numpy and the C library, for studies.
 
 numpy adds and multiplies element by element alike everywhere, and its Fourier transform has no variants for
 processors; so both are used. Its sums along an axis are not: their order is numpy's affair.
@@ -17,15 +16,11 @@ Functions with ``_many`` take arrays, the others floats.
 
 from __future__ import annotations
 
-from types import MappingProxyType
-
 from psd_deflection.base.arithmetic.fixed import FixedArithmetic
 from psd_deflection.base.arithmetic.library import Arithmetic
 from psd_deflection.base.arithmetic.matrices import in_pairs
 
 LIBRARY = Arithmetic()
 FIXED = FixedArithmetic()
-ARITHMETICS: MappingProxyType[str, Arithmetic] = MappingProxyType({'fixed': FIXED, 'library': LIBRARY})
-"""By the value of the parameter ``arithmetic``."""
 
-__all__ = ['ARITHMETICS', 'FIXED', 'LIBRARY', 'Arithmetic', 'FixedArithmetic', 'in_pairs']
+__all__ = ['FIXED', 'LIBRARY', 'Arithmetic', 'FixedArithmetic', 'in_pairs']

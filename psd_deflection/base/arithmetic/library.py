@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The arithmetic of numpy and the C library; replays of recordings from before the parameter use it."""
+"""The arithmetic of numpy and the C library."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.measure.motion.inertia import Forced, Inertia
@@ -109,7 +109,7 @@ class ModalFilter:
             raise ConfigError(f'filter = {config.filter}: needs a block_size of {LARGEST} at most, not {size}')
         self._size = size
         self._period = 1.0 / rig.converter.sample_rate_hz
-        by = self._by = ARITHMETICS[config.arithmetic]
+        by = self._by = FIXED
         bending = Oscillator(dynamics.bending_frequency, dynamics.bending_damping_ratio, by)
         torsion = Oscillator(dynamics.torsion_frequency, dynamics.torsion_damping_ratio, by)
         self._modes = (bending, bending, torsion)
@@ -121,7 +121,7 @@ class ModalFilter:
         self._longest = config.filter_coast
         self._unseen = (
             UnseenLoads(self._modes, size * self._period, self._longest + self._ahead)
-            if config.filter_growth == 'seen' and not any(config.filter_load_walk)
+            if not any(config.filter_load_walk)
             else None
         )
         self._compliance = np.array(compliance)

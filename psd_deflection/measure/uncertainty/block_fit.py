@@ -153,20 +153,16 @@ class BlockFit:
         size: int,
         centers: FloatArray,
         beams: FloatArray,
-        poly: bool = True,
         slopes: FloatArray | None = None,
         by: Arithmetic = FIXED,
-        lasting: bool = False,
     ) -> None:
         """``size``: N samples of a whole block. ``centers``, ``beams`` (P, 2) m, C = 2P.
 
-        ``poly``: False gives the mean. ``slopes``: as :func:`combinations_of` takes them. ``lasting``: motion that
-        goes on alike is remembered besides, so that little of it is enough.
+        ``slopes``: as :func:`combinations_of` takes them.
         """
         self._size = size
         self._by = by
-        self._poly = poly
-        self._q = basis(size, by) if poly else basis(size, by)[:, :1]
+        self._q = basis(size, by)
         self._orders = self._q.shape[1]
         self._fft = 1 << (2 * size - 1).bit_length()
         self._middle = _at_middle(self._q, by)
@@ -176,7 +172,6 @@ class BlockFit:
         # Until motion is seen there was none.
         self._weight = np.ones((self._count, self._orders))
         self._gaps = False
-        self._lasting = lasting and poly
         self._long = np.zeros((self._count, self._orders))
         self._blocks = np.full((self._count, self._orders), 1.0 / _FORGET)
         self._folds = np.full(self._fft // 2 + 1, 2.0 / self._fft)
@@ -197,7 +192,7 @@ class BlockFit:
         whole[:, :, self._fft - self._size + 1 :] = turned.transpose(1, 0, 2)[:, :, :0:-1]
         self._spectrum = np.fft.fft(whole)[:, :, : self._fft // 2 + 1] * self._folds
         own = turned[self._diagonal, self._diagonal]
-        self._precision = _precision(own, white=not self._poly or self._size > LARGEST)
+        self._precision = _precision(own, white=self._size > LARGEST)
         self._whole = _terms(self._q, self._precision, self._middle, True, by)
         self._bias, self._least = _BIAS * self._whole.v, 1e-9 * self._whole.v
         self._long_bias = _LASTING_BIAS * self._whole.v
@@ -266,19 +261,17 @@ class BlockFit:
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
-        own = (self._squares, self._weight, *((self._long, self._blocks) if self._lasting else ()))
+        own = (self._squares, self._weight, self._long, self._blocks)
         return tuple(v for one in own for v in one.ravel().tolist())
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
-        wanted = (4 if self._lasting else 2) * self._squares.size
+        wanted = 4 * self._squares.size
         if len(values) != wanted:
             raise ValueError(f'a fit of {self._size} samples a block has {wanted} values, not {len(values)}')
         parts = np.array(values).reshape(-1, self._count, self._orders)
-        self._squares, self._weight = parts[0].copy(), parts[1].copy()
+        self._squares, self._weight, self._long, self._blocks = (part.copy() for part in parts)
         self._gaps, self._before = True, None
-        if self._lasting:
-            self._long, self._blocks = parts[2].copy(), parts[3].copy()
 
     def _without(self, slots: IntArray) -> FloatArray:
         """The precision (C, n, n) of the samples that are present: a block of a matrix's inverse, inverted."""
@@ -315,8 +308,7 @@ class BlockFit:
             weight += _FORGET * (sure - weight)
             self._gaps = True
         late = self._late()
-        if self._lasting:
-            self._remember(excess, sure, late[:, :told])
+        self._remember(excess, sure, late[:, :told])
         self._before = self._usual(late)
         tau = self._before.copy()
         sudden = square > _SUDDEN * (v + before[:, :told])
@@ -356,7 +348,7 @@ class BlockFit:
     def _usual(self, late: FloatArray) -> FloatArray:
         """tau^2 (C, K) by the blocks so far; ``late``: by those of late."""
         usual = np.maximum(late - self._bias, self._least)
-        return np.asarray(np.maximum(usual, self._long - self._long_bias) if self._lasting else usual)
+        return np.asarray(np.maximum(usual, self._long - self._long_bias))
 
     def _spread(self, weights: FloatArray) -> FloatArray:
         """Covariance (C, C) of the weighted sums; ``weights`` (C, N)."""

@@ -232,9 +232,9 @@ class StreamNoise:
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
-        # Recordings from before averages were as measured have no more.
-        if len(values) not in (4, self._wanted, self._wanted + self._size):
-            raise ValueError(f'noise of {self._size} samples a block has {self._wanted} values, not {len(values)}')
+        wanted = self._wanted + self._size
+        if len(values) not in (4, wanted):
+            raise ValueError(f'noise of {self._size} samples a block has {wanted} values, not {len(values)}')
         self._seen, self._count, self._louder = (int(v) for v in values[:3])
         self.at_rest = bool(values[3])
         average = np.array(values[4 : self._wanted])

@@ -45,11 +45,8 @@ _UNSEEN = 4e-4
 class Redundancy:
     """Checks the readings of block after block. It remembers who was wrong lately, and by how much."""
 
-    def __init__(self, psds: int, unknowns: int, by: Arithmetic = FIXED, lasting: bool = False) -> None:
-        """``psds``: P. ``unknowns``: p; with as many readings or fewer nothing is redundant.
-
-        ``lasting``: whether a small residual that lasts widens, too.
-        """
+    def __init__(self, psds: int, unknowns: int, by: Arithmetic = FIXED) -> None:
+        """``psds``: P. ``unknowns``: p; with as many readings or fewer nothing is redundant."""
         self._psds = psds
         self._by = by
         self.freedom = max(2 * psds - unknowns, 0)
@@ -62,7 +59,6 @@ class Redundancy:
         self._wrong = 0
         self._left = 0
         self._held = np.zeros(2 * psds)
-        self._lasts = lasting
         self._mean, self._lasting = np.zeros(2 * psds), np.zeros(2 * psds)
 
     def agrees(self, residual: tuple[float, ...], slopes: FloatArray, covariance: FloatArray, times: float) -> bool:
@@ -107,8 +103,7 @@ class Redundancy:
         elif self._wrong:
             self._left -= 1
             self._wrong = self._wrong if self._left > 0 and agree_without(self._wrong) else 0
-        if self._lasts:
-            self._last(q, r, times)
+        self._last(q, r, times)
         possible = self._possible(q, errors, suspects, chi_square, contradict and not self._wrong, times)
         if self._wrong:
             return ConsistencyCheck(chi_square, True, tuple(errors), none, self._wrong, self.freedom)
@@ -164,21 +159,16 @@ class Redundancy:
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
-        more = (*self._mean.tolist(), *self._lasting.tolist()) if self._lasts else ()
-        return (float(self._wrong), float(self._left), *self._held.tolist(), *more)
+        arrays = (self._held, self._mean, self._lasting)
+        return (float(self._wrong), float(self._left), *(v for array in arrays for v in array.tolist()))
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError if it is of another number of PSDs."""
         wrong, left, *arrays = values
-        many = 3 if self._lasts else 1
-        if len(arrays) != many * 2 * self._psds or not 0 <= wrong <= self._psds:
-            raise ValueError(
-                f'the check of {self._psds} PSDs has {2 + many * 2 * self._psds} values, not {len(values)}'
-            )
+        if len(arrays) != 6 * self._psds or not 0 <= wrong <= self._psds:
+            raise ValueError(f'the check of {self._psds} PSDs has {2 + 6 * self._psds} values, not {len(values)}')
         self._wrong, self._left = int(wrong), int(left)
-        self._held, *rest = np.reshape(arrays, (many, -1))
-        if rest:
-            self._mean, self._lasting = rest
+        self._held, self._mean, self._lasting = np.reshape(arrays, (3, -1))
 
 
 def survival(chi_square: float, freedom: int) -> float:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, Fitted
 from psd_deflection.measure.uncertainty.combinations import Left
@@ -47,7 +47,7 @@ class PlateModel:
     def __init__(self, rig: Rig, kept: Sequence[int], tilts: Tilts) -> None:
         """``kept``: PSDs (from 0). ``tilts``: what the method says of the plate's tilts."""
         at = list(kept)
-        self._by = ARITHMETICS[rig.estimator.arithmetic]
+        self._by = FIXED
         self._centers, self._heights = rig.centers[at], rig.heights[at]
         self.beams = self._centers + rig.zeros[at]
         self._tilts: Tilts = tilts
@@ -90,18 +90,17 @@ class SomePsds:
     ``columns``: of their readings among all.
     """
 
-    def __init__(self, rig: Rig, kept: Sequence[int], tilts: Tilts, poly: bool) -> None:
+    def __init__(self, rig: Rig, kept: Sequence[int], tilts: Tilts) -> None:
         """``kept``: PSDs (from 0), two or more. ``tilts``: what the method says that solves them."""
         at = list(kept)
         self.columns = [2 * psd + axis for psd in at for axis in (0, 1)]
         self._model = PlateModel(rig, at, tilts)
         rest = self._model.slopes_at((0.0,) * 5)
-        by = ARITHMETICS[rig.estimator.arithmetic]
-        lasting = rig.estimator.motion_memory == 'lasting'
-        self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, poly, rest, by, lasting)
+        by = FIXED
+        self.fit = BlockFit(rig.estimator.block_size, rig.centers[at], self._model.beams, rest, by)
         # Of a plate whose tilt is not known, dots may contradict each other.
         unknowns = 2 * len(at) if tilts == 'bounded' else rest.shape[1]
-        self._redundancy = Redundancy(len(at), unknowns, by, _lasts(rig))
+        self._redundancy = Redundancy(len(at), unknowns, by)
 
     def set_noise(self, noise: StreamNoise) -> None:
         """Use their part of what is known of all readings."""
@@ -148,10 +147,10 @@ class SomePsds:
 class StampedDots:
     """Dots at the stamp of block after block.
 
-    ``active``: whether it says more than the mean of the samples and the rig file's noise. ``contradictions``: blocks
-    whose readings contradict each other. ``misfits``: blocks with motion that the fit cannot follow. ``chi_square``:
-    of the last block's readings, of ``freedom`` degrees. ``left_out``: PSDs (from 1) without which the last block was
-    solved. ``vibrates``: what is faster than a block can follow, such as "14 um rms near 87 Hz"; '' if nothing is.
+    ``contradictions``: blocks whose readings contradict each other. ``misfits``: blocks with motion that the fit cannot
+    follow. ``chi_square``: of the last block's readings, of ``freedom`` degrees. ``left_out``: PSDs (from 1) without
+    which the last block was solved. ``vibrates``: what is faster than a block can follow, such as "14 um rms near
+    87 Hz"; '' if nothing is.
     """
 
     part = 'the fit and the noise of the dots'
@@ -165,29 +164,25 @@ class StampedDots:
         config = rig.estimator
         self._rig = rig
         self.flat = flat
-        by = self._by = ARITHMETICS[config.arithmetic]
-        poly = config.block_fit == 'poly'
+        by = self._by = FIXED
         # What does not move with the link tells the noise.
-        self._measures = flat and config.covariance != 'file'
-        self.active = poly or self._measures
+        self._measures = flat
         self._beams = rig.centers + rig.zeros
         variances = dot_noise_variances(rig)
         steps = rig.converter.volts_per_count * rig.sensitivities.ravel()
         self._tilts: Tilts = tilts
-        self._poly = poly
         self._all: PlateModel | None = None
         slopes = self._rest_slopes(rig)
         self.noise = StreamNoise(config.block_size, rig.centers, self._beams, variances, steps, slopes, self._left, by)
         self._volt: FloatArray | None = None
-        if self._measures and config.vibration == 'widen':
+        if self._measures:
             self._volt = 0.5 * (rig.sensitivities[:, 0] + rig.sensitivities[:, 1])
             self.noise.look_for_tones(len(rig.psds))
         self._converter: ConverterSteps | None = None
-        if self._measures and config.converter_steps == 'seen':
+        if self._measures:
             self._converter = ConverterSteps.of_rig(rig)
         self._stated_sd = np.sqrt(variances)
-        lasting = config.motion_memory == 'lasting'
-        self._fit = BlockFit(config.block_size, rig.centers, self._beams, poly, slopes, by, lasting)
+        self._fit = BlockFit(config.block_size, rig.centers, self._beams, slopes, by)
         self._fit.set_noise(self.noise.gamma)
         self._consistency = Consistency(self._by)
         self._suspect = Suspect(rig.centers, self._beams)
@@ -220,7 +215,7 @@ class StampedDots:
 
     def _check_of(self, slopes: FloatArray) -> Redundancy:
         psds, unknowns = len(self._rig.psds), slopes.shape[1]
-        return Redundancy(psds, unknowns, self._by, _lasts(self._rig))
+        return Redundancy(psds, unknowns, self._by)
 
     @property
     def _left(self) -> Left | None:
@@ -237,7 +232,7 @@ class StampedDots:
         """The fit and the check of the PSDs ``kept`` (from 0), two or more; ``tilts``: as of :class:`SomePsds`."""
         found = self._some.get(kept)
         if found is None:
-            found = self._some[kept] = SomePsds(self._rig, kept, tilts, self._poly)
+            found = self._some[kept] = SomePsds(self._rig, kept, tilts)
             found.set_noise(self.noise)
             if kept in self._told:
                 found.set_state(self._told.pop(kept))
@@ -415,8 +410,7 @@ class StampedDots:
                     out[SUMS] = sums
         if self._converter is not None and (steps := self._converter.state()):
             out[STEPS] = steps
-        if self.active:
-            out[FIT] = self._fit.state()
+        out[FIT] = self._fit.state()
         said = self._consistency
         residual = (said.held, said.mean, said.lasting) if self._rig.estimator.consistency == 'widen' else (said.held,)
         if any(residual):
@@ -453,7 +447,7 @@ class StampedDots:
         for name in values:
             if name.startswith(SOME):
                 kept = self._kept_of(name)
-                own = (6 if _lasts(self._rig) else 2) + len(self._fit.state()) // len(self._beams)
+                own = 6 + len(self._fit.state()) // len(self._beams)
                 count = 3 + own * len(kept)
                 # They need the method that solves them, so that they begin when they are first asked for.
                 self._told[kept] = numbers(values, name, 'the fit of these PSDs', count) or ()
@@ -465,11 +459,6 @@ class StampedDots:
         if len(kept) < 2 or max(kept) >= len(self._beams):
             raise ValueError(f'{name}: expected two or more of {len(self._beams)} PSDs')
         return kept
-
-
-def _lasts(rig: Rig) -> bool:
-    """Whether small contradictions of three and more PSDs are remembered."""
-    return rig.estimator.contradiction_memory == 'lasting'
 
 
 def _tones(values: tuple[float, ...], count: int) -> tuple[Tone, ...]:

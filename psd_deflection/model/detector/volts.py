@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.model.detector.sensors import Quadrant, Sensor, make_sensor
 from psd_deflection.records import Counts, FloatArray, IntArray, dot_channels
 from psd_deflection.rig.config import Rig
@@ -113,6 +113,6 @@ def dot_noise_variances(rig: Rig) -> FloatArray:
     """
     step = rig.converter.volts_per_count
     channels = zip(rig.sensitivities.ravel().tolist(), rig.noises[:, :2].ravel().tolist(), strict=True)
-    by = ARITHMETICS[rig.estimator.arithmetic]
+    by = FIXED
     rounding = by.square(step) / 12.0
     return np.array([by.square(sensitivity) * (by.square(noise) + rounding) for sensitivity, noise in channels])

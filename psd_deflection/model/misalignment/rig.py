@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.model.misalignment.model import (
@@ -99,7 +99,7 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
         center = v[INDEX[f'psd_{i + 1}.center_x']], v[INDEX[f'psd_{i + 1}.center_y']]
         # A laser that was not aimed at the true centre stands where the rig file has it.
         x, y = (z - (1.0 - aimed[i]) * (c - f) for z, c, f in zip(psd.zero, center, psd.center, strict=True))
-        by = ARITHMETICS[rig.estimator.arithmetic]
+        by = FIXED
         v[ZERO + 2 * i : ZERO + 2 * i + 2] = response_of(v, i).reading(np.array(x), np.array(y), by)
     return RigVector(v, clamp, others, frozenset(listed), tilts)
 
@@ -162,7 +162,7 @@ def known_of_rig(rig: Rig) -> Known:
         below = np.tril_indices(n, -1)
         correlation[below] = given
         correlation.T[below] = given
-        by = ARITHMETICS[rig.estimator.arithmetic]
+        by = FIXED
         values, vectors = by.eigen(correlation)
         if values[0] < -1e-6 * n:
             raise ConfigError('calibration.correlations: contradict each other; take them from a calibration unchanged')

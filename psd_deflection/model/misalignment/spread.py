@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import ARITHMETICS, FIXED, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.model.misalignment.model import ZERO, by_parameters, readings, response_of
 from psd_deflection.model.misalignment.rig import is_calibrated, known_of_rig, vector_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
@@ -64,7 +64,7 @@ class ParameterSpread:
         if zero_variances:
             covariance[ZERO:] = covariance[:, ZERO:] = 0.0
             covariance[ZERO:, ZERO:] = np.diag(zero_variances)
-        by = ARITHMETICS[rig.estimator.arithmetic]
+        by = FIXED
         return cls(vector_of_rig(rig, effects).as_used, covariance, rig.link.length, by)
 
     def factor(self, dx: float, dy: float, theta: float) -> FloatArray:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import ARITHMETICS, LIBRARY, Arithmetic
+from psd_deflection.base.arithmetic import FIXED, LIBRARY, Arithmetic
 from psd_deflection.base.errors import SolverError
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
@@ -50,7 +50,7 @@ class Geometry:
             rig.heights,
             rig.link.length,
             rig.link.slope_ratio,
-            ARITHMETICS[rig.estimator.arithmetic],
+            FIXED,
         )
 
     @property

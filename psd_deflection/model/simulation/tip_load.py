@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from psd_deflection.base.arithmetic import ARITHMETICS
+from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import POINTS, ActiveEffect, Traced
 from psd_deflection.model.simulation.physics import Physics
@@ -36,7 +36,7 @@ class TipLoads:
         self.zeroed = False
         self._seconds = rig.estimator.block_size / rig.converter.sample_rate_hz
         self._physics = Physics.of(rig)
-        self._physics.by = ARITHMETICS[rig.estimator.arithmetic]
+        self._physics.by = FIXED
         for active in effects:
             if active.effect.configure is not None:
                 active.effect.configure(self._physics, active.values)

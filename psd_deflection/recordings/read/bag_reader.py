@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import json
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path, PurePath
@@ -50,15 +49,7 @@ from psd_deflection.recordings.read.allowance import Warnings
 from psd_deflection.recordings.read.clouds import CloudDecoder, joined_points
 from psd_deflection.recordings.read.mcap_reader import McapReader, RawMessage
 from psd_deflection.recordings.recording import Recording
-from psd_deflection.recordings.write.bag_writer import (
-    META_CHANGE,
-    META_DROPPED,
-    META_HELLO,
-    META_MADE_WITH,
-    META_NODE,
-    META_PARAMETERS,
-    META_SOFTWARE,
-)
+from psd_deflection.recordings.write.bag_writer import META_DROPPED, META_NODE, META_SOFTWARE
 from psd_deflection.records import (
     AppliedLoad,
     BaseAcceleration,
@@ -107,15 +98,11 @@ class BagRecording(Recording):
         metadata: dict[str, dict[str, str]] = {}
         for source in self._sources:
             metadata.update(source.metadata)
-        self.parameters = _from_json(metadata.get(META_PARAMETERS, {}))
-        self.hello = _from_json(metadata[META_HELLO]) if META_HELLO in metadata else None
         software = metadata.get(META_SOFTWARE, {})
+        self.own = META_SOFTWARE in metadata
         self.version, self.node = software.get('version', ''), software.get(META_NODE, '')
-        self.made_with = metadata.get(META_MADE_WITH, {})
         self.dropped_here = _dropped(metadata.get(META_DROPPED, {}))
-        self.changes = self._changes_in(metadata)
-        if META_PARAMETERS not in metadata:
-            self._take_rig_of_messages()
+        self._take_rig()
         self.restarts = self._noted_restarts()
 
     def _files_of(self, folder: Path) -> list[Path]:
@@ -174,20 +161,8 @@ class BagRecording(Recording):
         if len(self.restarts) < MAX_RESTARTS:
             self.restarts.add((last, first))
 
-    def _changes_in(self, metadata: Mapping[str, Mapping[str, str]]) -> list[ParameterChange]:
-        out = []
-        for name in sorted(n for n in metadata if n.startswith(META_CHANGE)):
-            try:
-                entry = metadata[name]
-                change = _to_change(int(entry['t_ns']), int(entry['block']), json.loads(entry['values']))
-            except (KeyError, ValueError, TypeError, AttributeError, RecursionError):
-                self._warn(f'the change of parameters {name!r} is not readable and is left out')
-            else:
-                out.append(change)
-        return sorted(out, key=lambda change: change.block)
-
-    def _take_rig_of_messages(self) -> None:
-        """Parameters, hello and changes as the topic of the rig has them: rosbag2 keeps messages, and no metadata."""
+    def _take_rig(self) -> None:
+        """Parameters, hello and changes as the topic of the rig has them."""
         changes: dict[ParameterChange, None] = {}
         present: dict[str, object] = {}
         for channel, log_time, message in self.messages([RIG]):
@@ -203,7 +178,6 @@ class BagRecording(Recording):
             if not self.parameters:
                 self.parameters, self.version = state.parameters, state.version
                 self.made_with = state.made_with
-                self.rig_from_messages = True
                 present = dict(state.parameters)
             if self.hello is None:
                 self.hello = state.hello
@@ -495,14 +469,3 @@ def _dropped(entry: Mapping[str, str]) -> tuple[int, int]:
     counts = [entry.get(name, '0') for name in ('samples', 'messages')]
     samples, messages = (int(c) if c.isascii() and c.isdecimal() and len(c) < 16 else 0 for c in counts)
     return samples, messages
-
-
-def _from_json(values: Mapping[str, str]) -> dict[str, Any]:
-    """Metadata values parsed as JSON; other values stay text."""
-    out: dict[str, Any] = {}
-    for key, text in values.items():
-        try:
-            out[key] = json.loads(text)
-        except (ValueError, RecursionError):
-            out[key] = text
-    return out

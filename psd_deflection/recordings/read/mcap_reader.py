@@ -11,6 +11,7 @@ The format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import contextlib
+import struct
 import zlib
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -30,6 +31,9 @@ from psd_deflection.recordings.mcap_format import (
     parsed_chunk,
 )
 from psd_deflection.recordings.read.allowance import MAX_CHUNK_BYTES, Allowance, DamagedError, SpentError, Warnings
+
+_INDEX_HEAD = struct.Struct('<BQH')
+"""Head of a record and the channel that an index of messages is of."""
 
 
 class RecordedChannel(NamedTuple):
@@ -149,14 +153,21 @@ class McapReader:
                 type_name = type_name.replace('/', '/msg/')
             self._channels[record.id] = RecordedChannel(record.topic, type_name, record.encoding)
 
-    def _parts(self, opcodes: Collection[int], allowance: Allowance) -> Iterator[tuple[int, bytes]]:
-        """(offset, records) of each chunk, unpacked, and of each record outside of any, as in a chunk."""
+    def _parts(
+        self, opcodes: Collection[int], allowance: Allowance, wanted: Collection[int] | None = None
+    ) -> Iterator[tuple[int, bytes]]:
+        """(offset, records) of each chunk, unpacked, and of each record outside of any, as in a chunk.
+
+        ``wanted``: numbers of channels; a chunk whose index names none of them is left out.
+        """
         try:
             with self.path.open('rb') as stream:
                 for opcode, at, length in self._records(stream, allowance):
                     if opcode == Opcode.DATA_END:
                         return
                     if opcode not in opcodes:
+                        continue
+                    if opcode == Opcode.CHUNK and wanted is not None and self._lacks(wanted, stream, at + length):
                         continue
                     if length > MAX_CHUNK_BYTES:
                         self.warn(f'the record at byte {at} has {length} bytes and is left out')
@@ -170,6 +181,22 @@ class McapReader:
                         yield at, _unpacked(content, allowance)
         except OSError as error:
             raise self._refuse(f'cannot be read ({error.strerror or error})') from None
+
+    def _lacks(self, wanted: Collection[int], stream: BinaryIO, at: int) -> bool:
+        """Whether the index behind a chunk, from byte ``at`` on, names known channels and none of ``wanted``."""
+        named = 0
+        while True:
+            stream.seek(at)
+            head = stream.read(_INDEX_HEAD.size)
+            if len(head) < _INDEX_HEAD.size:
+                return False
+            opcode, length, number = _INDEX_HEAD.unpack(head)
+            if opcode != Opcode.MESSAGE_INDEX:
+                return named > 0
+            if number in wanted or number not in self._channels:
+                return False
+            named += 1
+            at += RECORD_HEAD.size + length
 
     @contextlib.contextmanager
     def _damage_told(self, at: int) -> Iterator[None]:
@@ -188,7 +215,8 @@ class McapReader:
         """
         allowance = Allowance(self._size)
         wanted = {n: c for n, c in self._channels.items() if topics is None or c.topic in topics}
-        for at, records in self._parts((Opcode.CHUNK, Opcode.MESSAGE), allowance):
+        only = None if topics is None else wanted
+        for at, records in self._parts((Opcode.CHUNK, Opcode.MESSAGE), allowance, only):
             with self._damage_told(at):
                 yield from self._messages_in(records, topics, wanted, allowance)
 

@@ -69,8 +69,7 @@ class ReplayComparison:
         self.equal = 0
         self.different = 0
         self.rounded = 0
-        by_library = recording.parameters.get('arithmetic', 'library') == 'library'
-        self.changed = differences(recording.made_with, provenance(), processor=by_library)
+        self.changed = differences(recording.made_with, provenance())
         self.only_recorded = 0
         self.only_replayed = 0
         self.missing = 0
@@ -78,7 +77,7 @@ class ReplayComparison:
         # Last stamp of each topic before that.
         self._before: dict[str, int] = {}
         # A recorder of ours writes every message, or counts it; another one may lose some on the way.
-        self._gapless = recording.version != '' and not recording.rig_from_messages
+        self._gapless = recording.own
         self._between: dict[str, int] = {}
         self._recording = recording
         self._frame_prefix = str(recording.parameters.get(FRAME_PREFIX, ''))

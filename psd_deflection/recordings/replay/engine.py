@@ -34,13 +34,13 @@ from psd_deflection.records import (
     SampleBlock,
     TipLoad,
 )
-from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_as_recorded
+from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_from_values
 from psd_deflection.rig.declarations import BY_NAME, ZEROS
 
 
 def rig_at_start(recording: Recording) -> Rig:
     """The rig at the start of the recording; the thesis rig if the recording holds none. Raises ConfigError."""
-    return rig_as_recorded(recording.parameters, f'{recording.path} (recorded parameters)')
+    return rig_from_values(recording.parameters, f'{recording.path} (recorded parameters)')
 
 
 def rig_at_end(recording: Recording) -> Rig:
@@ -201,7 +201,7 @@ def _with_memory(recording: Recording, first: int, changes: list[ParameterChange
     if memory is not None:
         before = [change for change in changes if change.block < memory.block]
         return [*before, memory, *changes[len(before) :]]
-    told = (*recording.memories[:1], *recording.changes[:1]) if recording.rig_from_messages else ()
+    told = () if recording.own else (*recording.memories[:1], *recording.changes[:1])
     if any(0 < one.block < first for one in told):
         recording.warn(
             f'{recording.path}: starts in mid-run, and ends before the pipeline said what it remembers (it does every '

@@ -28,8 +28,7 @@ class WatchedReplay:
         raised: Callable[[Alarm], None] = lambda alarm: None,
         part: RecordingWindow | None = None,
     ) -> None:
-        effects = effects_of_rig(rig) if rig.estimator.wrench == 'effects' else ()
-        self.watch = Watch(rig, TipLoads(rig, effects).compliance)
+        self.watch = Watch(rig, TipLoads(rig, effects_of_rig(rig)).compliance)
         self.alarms: list[Alarm] = []
         self._rig, self._raised = rig, raised
         self._loads = (recording if part is None else part).loads()[::-1]

@@ -3,8 +3,8 @@
 """Writes recordings: rosbag2 bags (a folder with ``metadata.yaml`` and MCAP) and single MCAP files.
 
 A crash must cost at most a second. So chunks span less than half a second of log time and are
-handed to the operating system when they end (``durable``: written to the disk). Parameters, version
-and hello are at the front of every file. After a crash,
+handed to the operating system when they end (``durable``: written to the disk). The rig is the first
+message of every file. After a crash,
 :mod:`psd_deflection.recordings.read.bag_reader` reads the file up to the cut, and
 :mod:`psd_deflection.recordings.repair` repairs it.
 """
@@ -47,26 +47,10 @@ CHUNK_NS = 500_000_000
 
 META_SOFTWARE = 'psd_deflection'
 META_NODE = 'node'
-META_MADE_WITH = 'psd_deflection.made_with'
-META_PARAMETERS = 'psd_deflection.parameters'
-META_HELLO = 'psd_deflection.device_hello'
 META_DROPPED = 'psd_deflection.dropped_here'
-META_CHANGE = 'psd_deflection.change.'
-"""Names of the MCAP metadata records, and of a value in the first; those of parameters, hello and
-change are JSON."""
+"""Names of the MCAP metadata records, which say who recorded and what is missing, and of a value in the first."""
 
 CUSTOM = {'psd_deflection_version': __version__}
-
-
-def _json_values(values: Mapping[str, object]) -> dict[str, str]:
-    def plain(value: object) -> object:
-        if isinstance(value, Mapping):
-            return dict(value)
-        if isinstance(value, tuple):
-            return list(value)
-        raise TypeError(f'{type(value).__name__} {value!r} has no JSON')
-
-    return {key: json.dumps(value, default=plain) for key, value in values.items()}
 
 
 class _RecordSink(abc.ABC):
@@ -140,8 +124,6 @@ class McapFile(_RecordSink):
         self._untold = [self._state(0, 0, {})] if rig_values else []
         self._stream: BinaryIO | None = None
         self._spool: BinaryIO | None = None
-        parameters = _json_values(rig_values)
-        hello = None if device_hello is None else _json_values(device_hello)
         with creating(path), HeldFolder(path.parent) if folder is None else contextlib.nullcontext(folder) as held:
             self._stream = held.create(path.name)
             with contextlib.suppress(OSError):
@@ -150,10 +132,6 @@ class McapFile(_RecordSink):
         with self._guard():
             self._writer = McapWriter(self._stream, spool, library=f'psd_deflection {__version__}')
             self._writer.add_metadata(META_SOFTWARE, {'version': __version__, **({META_NODE: node} if node else {})})
-            self._writer.add_metadata(META_MADE_WITH, dict(provenance()))
-            self._writer.add_metadata(META_PARAMETERS, parameters)
-            if hello is not None:
-                self._writer.add_metadata(META_HELLO, hello)
             self._flush()
 
     @property
@@ -207,21 +185,17 @@ class McapFile(_RecordSink):
                     one.close()
 
     def _change(self, change: ParameterChange) -> None:
-        with self._guard():
-            self.changes.append(change)
-            head = {'t_ns': str(change.t_ns), 'block': str(change.block)}
-            self._writer.add_metadata(
-                f'{META_CHANGE}{len(self.changes):06d}', {**head, 'values': json.dumps(dict(change.values))}
-            )
-        if self._present:
-            self._present |= {name: value for name, value in change.values if name in self._present}
-            self._untold.append(self._state(change.t_ns, change.block, dict(change.values)))
+        if self._stream is None:
+            raise self._closed()
+        self.changes.append(change)
+        self._present |= {name: value for name, value in change.values if name in self._present}
+        self._untold.append(self._state(change.t_ns, change.block, dict(change.values)))
 
     def _state(self, t_ns: int, block: int, changed: Mapping[str, object]) -> RigState:
         return RigState(t_ns, block, dict(self._present), self._hello, changed, __version__, provenance())
 
     def _tell_rig(self, t_ns: int) -> None:
-        """The rig as messages beside the metadata records: rosbag2 drops these when it converts a bag."""
+        """The rig as messages: what rosbag2 makes of a bag keeps them, and no metadata."""
         untold, self._untold = self._untold, []
         for state in untold:
             for message in to_messages(state):

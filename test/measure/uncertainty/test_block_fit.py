@@ -24,8 +24,8 @@ def white(size: int = SIZE, sigma: float = SIGMA) -> FloatArray:
     return gamma
 
 
-def fitter(poly: bool = True, gamma: FloatArray | None = None) -> BlockFit:
-    out = BlockFit(SIZE, PLACES, PLACES, poly)
+def fitter(gamma: FloatArray | None = None) -> BlockFit:
+    out = BlockFit(SIZE, PLACES, PLACES)
     out.set_noise(white() if gamma is None else gamma)
     return out
 
@@ -68,26 +68,6 @@ def test_the_last_combination_is_the_length_of_the_base_line_wherever_the_beams_
         np.testing.assert_allclose(of.fixed(dots), of.of(dots)[3], atol=1e-15)
         for row, z in zip(dots, of.of(dots).T, strict=True):
             np.testing.assert_allclose(of.back(z.tolist(), np.eye(4))[0], row, atol=1e-15)
-
-
-def test_a_fit_follows_motion_unless_it_is_told_to_keep_the_mean() -> None:
-    def followed(fit: BlockFit) -> float:
-        fit.set_noise(white())
-        moving = 1e-4 * ((ALL - 9.5) / 9.5) ** 2
-        for _ in range(30):
-            got = fit.fit(ALL, np.outer(moving, [1.0, 0.0, 1.0, 0.0])).dots[0]
-        return got
-
-    assert followed(BlockFit(SIZE, PLACES, PLACES)) == followed(BlockFit(SIZE, PLACES, PLACES, True))
-    assert followed(BlockFit(SIZE, PLACES, PLACES, False)) == pytest.approx(1e-4 * np.mean(((ALL - 9.5) / 9.5) ** 2))
-    assert abs(followed(BlockFit(SIZE, PLACES, PLACES))) < 1e-6
-    # A mean cannot misfit: it does not try to follow, with gaps either.
-    mean = fitter(poly=False)
-    for slots in 5 * GAPS:
-        dots = np.outer(1e-5 * slots**2, [1.0, 0.5, 1.0, -0.5])
-        got = mean.fit(slots, dots)
-        assert not got.misfit
-        np.testing.assert_allclose(got.dots, dots.mean(axis=0), atol=2e-6)
 
 
 def test_inverses_of_positive_definite_matrices() -> None:
@@ -140,12 +120,13 @@ def test_coloured_and_common_noise_is_in_the_covariance() -> None:
     lags = 0.9 ** np.arange(SIZE)
     gamma = np.tile(lags * SIGMA**2, (4, 4, 1))
     gamma[range(4), range(4), 0] += 0.01 * SIGMA**2
-    fitted = fitter(poly=False, gamma=gamma).fit(ALL, np.zeros((SIZE, 4)))
+    fitted = fitter(gamma).fit(ALL, np.zeros((SIZE, 4)))
     toeplitz = 0.9 ** abs(ALL[:, None] - ALL)
+    # Weights by the colour make it somewhat less than that of the mean.
     expected = SIGMA**2 * toeplitz.mean()
-    np.testing.assert_allclose(fitted.covariance[0, 2], expected, rtol=1e-9)
+    assert 0.85 * expected < fitted.covariance[0, 2] <= expected
     difference = np.array([1.0, 0.0, -1.0, 0.0])
-    assert difference @ fitted.covariance @ difference < 0.01 * expected
+    assert difference @ fitted.covariance @ difference < 0.011 * expected
 
 
 def test_a_load_that_is_switched_inside_the_block_widens_it() -> None:
@@ -200,7 +181,7 @@ def test_another_fit_goes_on_from_the_state_to_the_bit() -> None:
     a, b = one.fit(GAPS[1], dots[GAPS[1]]), other.fit(GAPS[1], dots[GAPS[1]])
     assert a.dots == b.dots
     assert (a.covariance == b.covariance).all()
-    with pytest.raises(ValueError, match='40 values, not 3'):
+    with pytest.raises(ValueError, match='80 values, not 3'):
         other.set_state((1.0, 2.0, 3.0))
 
 
@@ -240,6 +221,7 @@ class Dense:
         self.size, self.orders = size, orders
         self.usual_v = np.array([np.diag(self.information(a, np.arange(size), orders)) for a in range(4)])
         self.squares, self.weight = np.zeros((4, orders)), np.ones((4, orders))
+        self.long, self.blocks = np.zeros((4, orders)), np.full((4, orders), 12.0)
 
     def information(self, a: int, slots: IntArray, told: int) -> FloatArray:
         """Covariance (told, told) of the coefficients by generalised least squares."""
@@ -247,8 +229,22 @@ class Dense:
         return np.asarray(np.linalg.inv(q.T @ np.linalg.inv(self.spread[a, a][np.ix_(slots, slots)]) @ q))
 
     def usual(self) -> FloatArray:
-        weight = np.maximum(self.weight, 1e-3)
-        return np.asarray(np.maximum(self.squares / weight - 0.5 * self.usual_v, 1e-9 * self.usual_v))
+        usual = np.maximum(self.late() - 0.5 * self.usual_v, 1e-9 * self.usual_v)
+        return np.asarray(np.maximum(usual, self.long - 0.03 * self.usual_v))
+
+    def late(self) -> FloatArray:
+        return np.asarray(self.squares / np.maximum(self.weight, 1e-3))
+
+    def last(self, a: int, excess: FloatArray, sure: FloatArray) -> None:
+        """The mean of what goes on alike; where that is over, it begins anew."""
+        told, v = slice(len(excess)), self.usual_v[a, : len(excess)]
+        self.blocks[a, told] = np.minimum(self.blocks[a, told] + sure, 250.0)
+        self.long[a, told] += sure * (excess - self.long[a, told]) / self.blocks[a, told]
+        late = self.late()[a, told]
+        least = (0.35 + self.blocks[a, told] * 0.65 / 250.0) * (v + np.maximum(late, 0.0))
+        over = self.long[a, told] - late > least
+        self.long[a, told] = np.where(over, late, self.long[a, told])
+        self.blocks[a, told] = np.where(over, 12.0, self.blocks[a, told])
 
     def fit(self, slots: IntArray, dots: FloatArray) -> tuple[tuple[float, ...], FloatArray, bool]:
         z, n = self.of.of(dots), len(slots)
@@ -263,6 +259,7 @@ class Dense:
             sure = np.minimum(self.usual_v[a, :told] / np.diag(spread), 1.0) ** 2
             self.squares[a, :told] += (sure * excess - self.squares[a, :told]) / 12.0
             self.weight[a, :told] += (sure - self.weight[a, :told]) / 12.0
+            self.last(a, excess, sure)
             tau = self.usual()[a]
             sudden = c * c > 16.0 * (np.diag(spread) + before[a, :told])
             tau[:told] = np.where(sudden, np.maximum(excess, tau[:told]), tau[:told])
@@ -327,12 +324,12 @@ def test_the_fit_is_the_posterior_of_gaussian_coefficients(size: int) -> None:
 def test_motion_is_believed_at_once_from_four_standard_deviations_on(
     combination: int, square: float, sudden: bool
 ) -> None:
-    """Before, a twelfth of what is beyond the noise, less half of it; the weight is tau^2/(tau^2 + v)."""
+    """Before, a thirteenth of what is beyond the noise, less 0.03 of it; the weight is tau^2/(tau^2 + v)."""
     fit, turn, q = fitter(), combinations(PLACES), basis(SIZE)
     fitted = fit.fit(ALL, square**0.5 * SIGMA * q[:, 2:3] * turn[combination])
     at_the_stamp = float(turn[combination] @ fitted.dots)
     followed = square**0.5 * SIGMA * _middle_of(q[:, 2])
-    tau = square - 1.0 if sudden else (square - 1.0) / 12.0 - 0.5
+    tau = square - 1.0 if sudden else (square - 1.0) / 13.0 - 0.03
     assert at_the_stamp / followed == pytest.approx(tau / (tau + 1.0), rel=1e-4)
 
 
@@ -370,50 +367,34 @@ def shaken(fit: BlockFit, hz: float, amplitude: float, blocks: int, seed: int = 
     return np.array(errors) / np.array(sds), np.array(sds)
 
 
-def remembering(lasting: bool = True) -> BlockFit:
-    out = BlockFit(SIZE, PLACES, PLACES, lasting=lasting)
-    out.set_noise(white())
-    return out
-
-
 @pytest.mark.statistics
 @pytest.mark.parametrize(('hz', 'amplitude'), [(5.0, 15e-6), (20.0, 15e-6), (30.0, 10e-6)])
 def test_a_steady_motion_that_bends_a_block_by_as_much_as_its_noise_is_in_the_variance(
     hz: float, amplitude: float
 ) -> None:
-    z, _ = shaken(remembering(), hz, amplitude, 4000)
-    lately, _ = shaken(remembering(False), hz, amplitude, 4000)
-    settled, before = np.abs(z[500:]), np.abs(lately[500:])
-    assert 0.94 < np.mean(settled < 1.959964) < 0.97
-    # What the last blocks alone say is too little, and was what was stated.
-    assert np.mean(before < 1.959964) < np.mean(settled < 1.959964) - 0.005
+    z, _ = shaken(fitter(), hz, amplitude, 4000)
+    assert 0.94 < np.mean(np.abs(z[500:]) < 1.959964) < 0.97
 
 
 @pytest.mark.statistics
-def test_at_rest_the_longer_memory_adds_less_than_a_percent_of_noise() -> None:
-    z, sds = shaken(remembering(), 5.0, 0.0, 4000)
-    recent, recent_sds = shaken(remembering(False), 5.0, 0.0, 4000)
-    assert np.std(z * sds) < 1.01 * np.std(recent * recent_sds)
+def test_at_rest_the_memory_of_motion_adds_little_noise() -> None:
+    z, sds = shaken(fitter(), 5.0, 0.0, 4000)
+    assert np.std(z * sds) < 1.04 * SIGMA / SIZE**0.5 / 2.0**0.5 * 2.0**0.5
     assert np.mean(np.abs(z) < 1.959964) == pytest.approx(0.955, abs=0.012)
 
 
-def test_motion_that_is_over_is_stated_hardly_longer_than_the_short_memory_does() -> None:
-    """A motion of 0.1 mm is some 10^4 times its noise: the short memory, too, forgets it after ten times its length."""
-    stated = []
-    for lasting in (True, False):
-        fit = remembering(lasting)
-        shaken(fit, 10.0, 1e-4, 300)
-        stated.append(shaken(fit, 10.0, 0.0, 250)[1])
-    ratio = stated[0] / stated[1]
-    assert stated[0][0] > 1.15 * stated[0][-1]
-    assert ratio.max() < 1.15
-    # A second and a half after that it is over for both, but for four per cent.
-    assert np.median(ratio[200:]) < 1.07
+def test_motion_that_is_over_is_not_stated_for_long() -> None:
+    """A motion of 0.1 mm is some 10^4 times its noise: the memory forgets it after ten times its length."""
+    fit = fitter()
+    shaken(fit, 10.0, 1e-4, 300)
+    stated = shaken(fit, 10.0, 0.0, 250)[1]
+    assert stated[0] > 1.15 * stated[-1]
+    assert np.median(stated[200:]) < 1.07 * stated[-1]
 
 
 def test_a_mean_of_blocks_that_lasts_is_that_mean() -> None:
     """Of the same coefficient in each block: 12 blocks of nothing, then n of c^2 - v, over 12 + n."""
-    fit = remembering()
+    fit = fitter()
     bend = 1e-6 * basis(SIZE)[:, 2]
     blocks = 40
     for _ in range(blocks):
@@ -430,7 +411,7 @@ def test_a_mean_of_blocks_that_lasts_is_that_mean() -> None:
 
 
 def test_what_lasted_begins_with_what_is_of_late_where_it_is_over() -> None:
-    fit = remembering()
+    fit = fitter()
     bend = 1e-5 * basis(SIZE)[:, 2]
     for _ in range(200):
         fit.fit(ALL, np.outer(bend, [1.0, 0.0, 1.0, 0.0]))
@@ -446,7 +427,7 @@ def test_what_lasted_begins_with_what_is_of_late_where_it_is_over() -> None:
 
 def test_a_fit_with_the_longer_memory_goes_on_from_its_state_to_the_bit() -> None:
     rng = np.random.default_rng(8)
-    first, second = remembering(), remembering()
+    first, second = fitter(), fitter()
     for _ in range(30):
         first.fit(ALL, rng.normal(0.0, 3e-6, (SIZE, 4)))
     second.set_state(first.state())
@@ -457,4 +438,4 @@ def test_a_fit_with_the_longer_memory_goes_on_from_its_state_to_the_bit() -> Non
         assert (one.covariance == two.covariance).all()
     assert first.state() == second.state()
     with pytest.raises(ValueError, match='80 values, not 40'):
-        second.set_state(remembering(False).state())
+        second.set_state(first.state()[:40])

@@ -8,12 +8,12 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from blind.coverage import ROWS, Row, coarse, motion, rig, volts_of
+from blind.coverage import Row, coarse, motion, volts_of
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.converter import ConverterSteps
 from psd_deflection.measure.uncertainty.stamped import STEPS
 from psd_deflection.records import DeflectionEstimate, RawChunk
-from psd_deflection.rig.config import load_rig, rig_as_recorded
+from psd_deflection.rig.config import load_rig
 
 FILE, COARSEST = 20.0 / 2**16, 20.0 / 2**8
 TEN = 20.0 / 2**10
@@ -117,21 +117,6 @@ def test_ten_bits_untold_are_in_the_intervals() -> None:
     s = coarse(24, told=False)
     assert min(s.axes) > 0.93
     assert s.joint > 0.93
-    assert min(coarse(24, told=False, converter_steps='file').axes) < 0.93
-    assert rig_as_recorded({'block_size': 20}, 'an old recording').estimator.converter_steps == 'file'
-
-
-@pytest.mark.parametrize('label', ['white', '12 bit', '24 bit', 'hum 5 mV'])
-def test_a_told_converter_is_as_before(label: str) -> None:
-    row = next(r for r in ROWS if r.label == label)
-    samples = volts_of(row, motion(4, 1)[0], 1).astype(np.float32)
-    seq = np.arange(len(samples))
-    chunk = RawChunk(seq, seq * 1_000_000, samples, np.zeros(len(seq), np.uint8))
-    seen, told = (
-        [r for r in Pipeline(rig(row, converter_steps=how)).process(chunk) if isinstance(r, DeflectionEstimate)]
-        for how in ('seen', 'file')
-    )
-    assert seen == told
 
 
 def test_diagnostics_name_them_and_a_recording_begun_later_replays_to_the_bit() -> None:

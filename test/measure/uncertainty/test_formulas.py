@@ -231,7 +231,7 @@ def test_half_a_segment_says_something_less_does_not() -> None:
 def test_in_motion_a_block_is_the_least_squares_polynomial_at_its_middle(slots: IntArray) -> None:
     """So much motion that nothing is known of the coefficients: weights by dense least squares of order 4."""
     gamma = white(1.0)
-    fit = BlockFit(SIZE, PLACES, PLACES, True)
+    fit = BlockFit(SIZE, PLACES, PLACES)
     fit.set_noise(gamma)
     rng = np.random.default_rng(5)
     u = (ALL - 9.5) / 9.5
@@ -248,22 +248,6 @@ def test_in_motion_a_block_is_the_least_squares_polynomial_at_its_middle(slots: 
     np.testing.assert_allclose(moving @ got.dots, moving @ (w @ dots), atol=2e-8)
     want = SIGMA**2 * float(w @ w)
     np.testing.assert_allclose((moving @ got.covariance @ moving.T).diagonal(), 2.0 * want, rtol=5e-3)
-
-
-@pytest.mark.parametrize('slots', [ALL, np.delete(ALL, [3, 11, 12])], ids=['all', 'gaps'])
-def test_the_mean_has_the_variance_of_the_samples_that_are_present(slots: IntArray) -> None:
-    lags = 0.7**ALL * SIGMA**2
-    gamma = np.zeros((4, 4, SIZE))
-    gamma[range(4), range(4)] = lags
-    gamma[0, 1] = gamma[1, 0] = 0.3 * lags
-    fit = BlockFit(SIZE, PLACES, PLACES, False)
-    fit.set_noise(gamma)
-    dots = SIGMA * np.random.default_rng(6).normal(size=(SIZE, 4))[slots]
-    got = fit.fit(slots, dots)
-    np.testing.assert_allclose(got.dots, dots.mean(axis=0), rtol=0.0, atol=1e-11)
-    mean = lags[np.abs(np.subtract.outer(slots, slots))].mean()
-    np.testing.assert_allclose(got.covariance.diagonal(), mean, rtol=1e-5)
-    assert got.covariance[0, 1] == pytest.approx(0.3 * mean, rel=1e-4)
 
 
 def steps_of(stated: float, step: float) -> FloatArray:

@@ -24,7 +24,7 @@ from psd_deflection.records import (
     SpotMeans,
     TipLoad,
 )
-from psd_deflection.rig.config import Rig, load_rig, rig_as_recorded
+from psd_deflection.rig.config import Rig, load_rig
 
 
 def volts(seconds: int, seed: int, dead: int | None = None) -> generator.Array:
@@ -181,18 +181,6 @@ def test_a_memory_of_another_length_is_left_out_and_said(name: str, value: tuple
     assert pipeline.estimation.zero_variances == ()
     samples = chunk(volts(1, 1)[:200])
     assert list(map(str, pipeline.process(samples))) == list(map(str, fresh.process(samples)))
-
-
-def test_a_recording_from_before_has_the_mean_and_the_rig_files_noise() -> None:
-    named = dict(load_rig().values)
-    for name in ('block_fit', 'covariance', 'consistency', 'wrench', 'minimum_tilt.angles'):
-        del named[name]
-    then = rig_as_recorded(named, 'test').estimator
-    assert (then.block_fit, then.covariance, then.consistency) == ('mean', 'file', 'report')
-    assert (then.wrench, then.minimum_tilt_angles) == ('nominal', 'azimuth')
-    # What it does name stays, and a recording that names nothing has today's defaults.
-    assert rig_as_recorded({**named, 'covariance': 'measured'}, 'test').estimator.covariance == 'measured'
-    assert rig_as_recorded({}, 'test').estimator == load_rig().estimator
 
 
 def run(rig: Rig, samples: generator.Array) -> tuple[Pipeline, list[Record]]:

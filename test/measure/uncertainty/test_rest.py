@@ -40,14 +40,13 @@ def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts:
 
 
 @pytest.mark.parametrize(
-    ('covariance', 'words'),
-    [('file', 'noise of the rig file'), ('measured', 'noise of the rig file until it is measured')],
+    ('flat', 'words'), [(False, 'noise of the rig file'), (True, 'noise of the rig file until it is measured')]
 )
-def test_diagnostics_say_whose_noise_it_is(covariance: str, words: str) -> None:
-    stamped = StampedDots(load_rig(overrides={'covariance': covariance}))
+def test_diagnostics_say_whose_noise_it_is(flat: bool, words: str) -> None:
+    stamped = StampedDots(load_rig(), flat)
     assert dict(stamped.words())['covariance from'] == words
     # The noise of each reading is told if it is measured.
-    assert len(stamped.words()) == (5 if covariance == 'file' else 6 + len(stamped.noise_words()))
+    assert len(stamped.words()) == (6 + len(stamped.noise_words()) if flat else 5)
     assert len(stamped.noise_words()) >= 4
 
 

@@ -133,12 +133,9 @@ def test_some_of_the_psds_have_their_own_noise() -> None:
     np.testing.assert_allclose(np.sqrt(variances / variances[0]), [1.0, 2.0, 3.0, 5.0], rtol=1e-3)
 
 
-@pytest.mark.parametrize(('covariance', 'times'), [('file', 1.0), ('measured', 16.0)])
 @pytest.mark.parametrize('psds', [2, 3])
-def test_while_noise_is_unknown_readings_may_contradict_each_other_more(
-    covariance: str, times: float, psds: int
-) -> None:
-    stamped = StampedDots(rig_of(psds, covariance=covariance))
+def test_while_noise_is_unknown_readings_may_contradict_each_other_more(psds: int) -> None:
+    stamped, times = StampedDots(rig_of(psds)), 16.0
     spread = 1e-12 * np.eye(2 * psds)
     limit = 25.0 if psds == 2 else float(stamped._redundancy._limit)  # type: ignore[union-attr]
     wrong = np.zeros(2 * psds)
@@ -187,7 +184,7 @@ def contradicts(of: StampedDots, error: tuple[float, ...]) -> bool:
 
 def test_a_contradiction_is_forgotten_with_a_new_zero() -> None:
     for psds in (2, 3):
-        stamped = StampedDots(rig_of(psds, covariance='file'))
+        stamped = StampedDots(rig_of(psds))
         wrong, right = (1e-4, *(0.0,) * (2 * psds - 1)), (0.0,) * (2 * psds)
         assert contradicts(stamped, wrong)
         assert contradicts(stamped, right)
@@ -212,18 +209,7 @@ def test_the_first_blocks_of_a_second_change_no_noise_and_the_last_does() -> Non
     assert np.sqrt(np.diag(whole.covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
     assert np.sqrt(np.diag(part.covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
     assert len(part.dots) == 4
-    assert not StampedDots(rig_of(covariance='file')).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])
-
-
-def test_what_says_no_more_than_the_mean_is_not_active() -> None:
-    for fit, covariance, flat, active in (
-        ('mean', 'file', True, False),
-        ('poly', 'file', True, True),
-        ('mean', 'measured', True, True),
-        ('mean', 'measured', False, False),
-        ('poly', 'measured', False, True),
-    ):
-        assert StampedDots(rig_of(block_fit=fit, covariance=covariance), flat).active == active
+    assert not StampedDots(rig_of(), flat=False).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])
 
 
 def test_misfits_are_counted() -> None:
@@ -250,9 +236,8 @@ def test_what_of_a_contradiction_is_remembered_goes_with_the_rule() -> None:
         other.restore(memory)
         said = other._consistency
         assert (said.held, said.mean, said.lasting) == (*kept, 0.0, 0.0)[:3]
-    assert set(StampedDots(rig_of(covariance='file')).memory()) == {'state.block_fit'}
-    assert set(StampedDots(rig_of(covariance='file', block_fit='mean')).memory()) == set()
-    assert set(StampedDots(rig_of(block_fit='mean')).memory()) == {'state.noise', 'state.block_fit'}
+    assert set(StampedDots(rig_of(), flat=False).memory()) == {'state.block_fit'}
+    assert set(StampedDots(rig_of()).memory()) == {'state.noise', 'state.block_fit'}
 
 
 def test_the_fit_of_some_psds_goes_on_from_the_memory() -> None:
@@ -320,7 +305,7 @@ def test_noise_and_fit_go_on_from_the_memory(psds: int) -> None:
 
 def test_the_base_line_is_between_the_places_of_the_dots() -> None:
     """Its direction and with it each reading's part: of centres that differ in both axes, and dots of centimetres."""
-    stamped = StampedDots(rig_of(2, {'psd_1.center': [0.02, 0.07], 'psd_2.center': [-0.1, 0.03]}, covariance='file'))
+    stamped = StampedDots(rig_of(2, {'psd_1.center': [0.02, 0.07], 'psd_2.center': [-0.1, 0.03]}))
     dots = np.array([0.03, -0.01, -0.02, 0.015])
     residual = np.array([1e-6, -2e-6, 3e-6, 5e-6])
     spread = np.diag([1.0, 2.0, 3.0, 4.0]) * 1e-12

@@ -19,7 +19,7 @@ from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
 from psd_deflection.measure.uncertainty.stamped import VIBRATION
 from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch, rms_of, words_of
 from psd_deflection.records import DeflectionEstimate, FloatArray, IntArray, RawChunk, Record, SpotMeans, TipMotion
-from psd_deflection.rig.config import Rig, load_rig, rig_as_recorded
+from psd_deflection.rig.config import Rig, load_rig
 
 SIZE, RATE = 20, 1000.0
 N = SIZE * SEGMENT_BLOCKS
@@ -125,14 +125,6 @@ def test_a_vibration_is_counted_and_named(hz: float) -> None:
     assert s.inside.rms[1] > s.sd[1] / 1.2
     assert s.named == 1.0
     assert s.words == f'vibrates: 14 µm rms near {hz:g} Hz'
-
-
-def test_without_it_nothing_is_as_before() -> None:
-    """The finding: 14 µm off at +- 0.4 um, and nothing said."""
-    s = shaken(87.0, seconds=8, vibration='ignore')
-    assert s.inside.three < 0.2
-    assert s.named == 0.0
-    assert rig_as_recorded({'block_size': 20}, 'an old recording').estimator.vibration == 'ignore'
 
 
 @pytest.mark.parametrize('label', [row.label for row in ROWS])

@@ -68,13 +68,12 @@ def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
 
 
 def test_noise_alone_on_request() -> None:
-    total, noise, file = (
+    total, noise = (
         estimates([*Pipeline(rig).process(chunk_of(still(rig, POSE, 20)))])['exact'].covariance[0] ** 0.5
-        for rig in (calibrated(), calibrated(covariance='noise'), calibrated(covariance='file'))
+        for rig in (calibrated(), calibrated(covariance='noise'))
     )
     assert total > 4e-6
     assert noise < 1e-6
-    assert file < 1e-6
 
 
 def test_a_rig_that_was_not_calibrated_has_no_spread() -> None:
@@ -159,7 +158,7 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
 @pytest.mark.parametrize('blocks', [1, 2, 25])
 def test_the_variance_of_a_zero_is_that_of_its_blocks_over_their_number(blocks: int) -> None:
     """What scatters by more than the noise says is believed; of one block there is only what the noise says."""
-    rig = calibrated(block_fit='mean')
+    rig = calibrated()
     places = np.random.default_rng(4).normal(0.0, [1e-6, 1e-9, 1e-6, 1e-9], (blocks, 4))
     pipeline = Pipeline(rig)
     list(pipeline.process(chunk_of(np.repeat(places, 20, axis=0))))

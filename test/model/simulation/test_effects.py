@@ -22,7 +22,7 @@ from psd_deflection.model.simulation.hysteresis import play
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray, RawChunk, TipLoad
-from psd_deflection.rig.config import Rig, load_rig, replace_values, rig_from_values
+from psd_deflection.rig.config import Rig, load_rig, rig_from_values
 
 NAMES = {
     *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
@@ -204,7 +204,7 @@ def wrenches(rig: Rig, volts: FloatArray) -> FloatArray:
 @pytest.mark.parametrize('active', STRONG)
 def test_the_wrench_is_the_load(active: ActiveEffect) -> None:
     """Within 0.1 % of it, once the link rests; where the effect displaces the tip, only if it is traced back."""
-    calm = {'block_fit': 'mean', 'covariance': 'file', 'solvers': ['exact']}
+    calm = {'solvers': ['exact']}
     known = load_rig(overrides={**calm, **rig_values([active])})
     volts, nominal = (
         ForwardModel(load_rig(), effects).run(loads.steps(list(LOADS), HELD_S).loads).volts.T
@@ -215,7 +215,6 @@ def test_the_wrench_is_the_load(active: ActiveEffect) -> None:
     assert (np.abs(found - LOADS) < 1e-3 * size).all()
     moved = np.abs(volts[-1] - nominal[-1]).max() > 0.05
     assert not moved or (np.abs(blind - LOADS) > 1e-3 * size).any()
-    assert (wrenches(replace_values(known, {'wrench': 'nominal'}), volts) == blind).all()
 
 
 def test_a_rig_without_effects_corrects_nothing() -> None:
