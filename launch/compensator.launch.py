@@ -27,7 +27,7 @@ ARGUMENTS: dict[str, str] = {
 
 TOPICS = {
     name: f'compensator/{name}'
-    for name in ('offsets', 'commands', 'applied', 'robot_running', 'speed_scaling', 'controller_state')
+    for name in ('offsets', 'commands', 'applied', 'reference', 'robot_running', 'speed_scaling', 'controller_state')
 }
 """Topics with their names in the namespace."""
 TOPIC_OF = {'controller_state': 'controller_state_topic'}

@@ -58,6 +58,7 @@ from psd_deflection.ros.topics import (
     OFFSETS,
     PROPOSED,
     PUBLISHED,
+    REFERENCE_COMMAND,
     ROBOT_DESCRIPTION,
     RUNNING,
     SCALING,
@@ -149,8 +150,10 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         listen(SCALING, _scaling_fault, self._scaled)
         if state := self.settings.controller_state:
             _check_installed(state)
-            listen(CONTROLLER, _nothing_wrong, self._controlled, type_name=state)
-        if not self._sums:
+            listen(CONTROLLER, self._controlled_fault, self._controlled, type_name=state)
+        if self._sums:
+            listen(REFERENCE_COMMAND, self._reference_fault, self._reference)
+        else:
             listen(APPLIED, self._applied_fault, self._applied)
 
     def _changed(self, settings: CompensatorSettings) -> None:
@@ -223,7 +226,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         with self._lock:
             if self.compensator.enabled:
                 self.compensator.enable(False)
-            sends, owes = self.compensator.enabled or self.command.sends, bool(np.any(self.compensator.left))
+            sends, owes = self.compensator.enabled or self.command.sends, self.compensator.owed
         if self._failed is not None:
             sends, owes = not self._ramped.is_set(), False
         self._owed_t = (self._owed_t or now) if owes and not sends else None
@@ -297,7 +300,21 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         offsets = np.empty(len(self._names))
         offsets[self._order] = message.data
         with self._lock:
-            self.compensator.applied(time.monotonic(), offsets)
+            self.compensator.controller_has(time.monotonic(), offsets)
+
+    def _reference_fault(self, message: Any) -> str:
+        return joints_fault(message.name, message.position, self._names)
+
+    def _reference(self, message: Any) -> None:
+        self._commanded(list(message.name), message.position)
+
+    def _commanded(self, names: list[str], positions: Sequence[float]) -> None:
+        """Take the command that the controller has, if it is one of all our joints."""
+        if not set(self._names) <= set(names) or len(names) != len(positions):
+            return
+        command = np.array([positions[names.index(name)] for name in self._names], dtype=np.float64)
+        with self._lock:
+            self.compensator.controller_has(time.monotonic(), command)
 
     def _runs(self, message: Any) -> None:
         self._robot.runs(bool(message.data))
@@ -309,6 +326,13 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
 
     def _controlled(self, message: Any) -> None:
         self._robot.controlled(time.monotonic())
+        if self._sums and hasattr(message, 'joint_names') and hasattr(message, 'reference'):
+            self._commanded(list(message.joint_names), message.reference.positions)
+
+    def _controlled_fault(self, message: Any) -> str:
+        if not self._sums or not (hasattr(message, 'joint_names') and hasattr(message, 'reference')):
+            return ''
+        return joints_fault(message.joint_names, message.reference.positions, self._names)
 
     def _check_robot(self) -> None:
         """Hold while the robot does not run, or while another node publishes what we publish."""
@@ -365,8 +389,12 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._check_robot()
         command = self.command
         before, self._told = self._told, command
-        if before.state is not command.state or (command.state is State.HOLDING and before.why != command.why):
-            level = WARNING if command.state is State.HOLDING else INFO
+        told = command.foreign != before.foreign
+        if command.state in (State.HOLDING, State.FOLLOWING):
+            told = before.why != command.why
+        if before.state is not command.state or told:
+            warns = command.foreign or (command.why and command.state is not State.OFF)
+            level = WARNING if warns and command.state is not State.RELEASING else INFO
             self._repeats.tell(str(command.state), command.text, level, time.monotonic(), NEWS)
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
@@ -383,12 +411,23 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         """State and offsets."""
         command = self.command
         level, text = _LEVELS[command.state], command.text
+        if command.foreign or (command.state is State.FOLLOWING and command.why):
+            level = WARN
         if self._failed is not None:
             level, text = ERROR, f'{type(self._failed).__name__}: {self._failed}: the offsets go back to zero'
         elif command.limited:
             level, text = WARN, f'{text}: a limit keeps the offsets from what the deflection asks for'
         values = [(f'offset {name}', f'{v:.6f}') for name, v in zip(self._names, command.offsets, strict=True)]
-        return (Health('offsets', level, text, (*values, ('residual (m)', f'{command.residual:.6f}'))),)
+        values.append((f'residual{"" if self._drive else " if it were applied"} (m)', f'{command.residual:.6f}'))
+        if self._drive:
+            with self._lock:
+                response = self.compensator.response
+                measured = zip(self._names, response.slopes.tolist(), response.half_widths.tolist(), strict=True)
+                told = self.compensator.told_text(time.monotonic())
+            slopes = [(f'moves by, of its offset: {n}', f'{s:.2f} ± {w:.2f} (measured)') for n, s, w in measured]
+            values += [(name, text if 'nan' not in text else 'not yet measured') for name, text in slopes]
+            values.append(('the controller has, as it tells', told))
+        return (Health('offsets', level, text, tuple(values)),)
 
 
 def _ns(stamp: Any) -> int:

@@ -91,7 +91,8 @@ MARKERS_AT_REST = '/link_tip/markers_at_rest'
 JOINT_STATES = 'joint_states'
 ROBOT_DESCRIPTION = 'robot_description'
 OFFSETS, COMMANDS, PROPOSED = '~/offsets', '~/commands', '~/proposed'
-APPLIED, RUNNING, SCALING = '~/applied', '~/robot_running', '~/speed_scaling'
+APPLIED, REFERENCE_COMMAND = '~/applied', '~/reference'
+RUNNING, SCALING = '~/robot_running', '~/speed_scaling'
 CONTROLLER = '~/controller_state'
 TRAJECTORY, SHAPED = '~/trajectory', '~/shaped'
 FOLLOW = '~/follow_joint_trajectory'
@@ -251,6 +252,13 @@ _IN = (
         _INPUT,
     ),
     GraphTopic(APPLIED, _ARRAY, _COMPENSATOR, 'the offsets that the controller applies, rad or m', _INPUT),
+    GraphTopic(
+        REFERENCE_COMMAND,
+        'sensor_msgs/msg/JointState',
+        _COMPENSATOR,
+        'with `output: commands`: the command that the controller has, rad or m, by the names of the joints',
+        _INPUT,
+    ),
     # One of them hears a driver that said it once, before we came; the other a driver that does not
     # keep it.
     *(

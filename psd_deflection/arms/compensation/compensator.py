@@ -12,10 +12,13 @@ the offsets begin where the controller has them. They hold (they keep their last
 deflection is stale, not finite, too uncertain, too large or jumping, the joints are not known, leap
 or do not follow, the robot does not run, or somebody else commands it. They move again after some
 good estimates in a row, and go back to zero if that takes long or when the compensation is switched
-off. A controller that does not tell what it applies, or is elsewhere than it was sent, hears
+off. A controller that does not tell what it has, or is elsewhere than it was sent, hears
 nothing until that is mended; if the compensation was switched off meanwhile, the offsets that it
 still has go back to zero then. Whatever happens, what is sent moves by no more than ``max_rate``
 times the time since something was sent.
+
+What a controller tells is where the offsets begin, and never how well they do: that is measured, by
+the joints' positions (:class:`JointResponse`) and the deflection.
 """
 
 from __future__ import annotations
@@ -28,6 +31,7 @@ import numpy as np
 
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.compensation.arm import Arm
+from psd_deflection.arms.compensation.response import JointResponse
 from psd_deflection.arms.compensation.settings import AXES, COMMANDS, CompensatorSettings
 from psd_deflection.arms.inputs import LARGEST_POSITION
 from psd_deflection.records import FloatArray
@@ -42,7 +46,15 @@ LEAST_SD = 1e-10
 """Nobody measures a deflection to better than this, m or rad: one that says so does not know its
 uncertainty."""
 UNTOLD = 'the controller does not tell the offsets that it applies'
+UNKNOWN_COMMAND = 'the controller does not tell the command that it has'
 AWAITED = 'good deflections are awaited'
+UNVERIFIED = 'not yet verified, the offsets have not been seen to move the joints of an arm at rest'
+UNSEEN_SHARE = 0.1
+"""Of what all offsets do to the end effector, what those of unverified joints may do."""
+FOREIGN = 1e-6
+"""An offset that the controller tells is one from here on, rad or m."""
+FOREIGN_S = 1.0
+"""Age of what the controller tells, from which on nobody knows what it has, s."""
 
 
 class State(StrEnum):
@@ -67,12 +79,14 @@ class Observed(NamedTuple):
 
 
 class Command(NamedTuple):
-    """``offsets`` (n,) of the joints, rad or m; ``why``: of a state that is not ``following``, else ''.
+    """``offsets`` (n,) of the joints, rad or m; ``why``: reason for the state, '' if it follows, as was verified.
 
-    ``residual``: distance of the joints, as measured, from the rigid pose on the axes that are
-    corrected, m; NaN if it is not known. ``limited``: whether a limit keeps the offsets from what
+    ``residual``: distance of the end effector, by measured joints and deflection, from the rigid
+    pose on the axes that are corrected, m; NaN until the joints were seen to follow. Of a dry one it
+    is what would be left if they did. ``limited``: whether a limit keeps the offsets from what
     the deflection asks for. ``positions`` (n,): of the joints with the offsets, None if the output
-    is offsets. ``sends``: whether the controller is to get it.
+    is offsets. ``sends``: whether the controller is to get it. ``foreign``: nothing is sent, and the
+    controller tells offsets.
     """
 
     offsets: FloatArray
@@ -82,6 +96,7 @@ class Command(NamedTuple):
     limited: bool = False
     positions: FloatArray | None = None
     sends: bool = False
+    foreign: bool = False
 
     @property
     def text(self) -> str:
@@ -112,12 +127,16 @@ class Compensator:
         self._joints: FloatArray | None = None
         self._joints_t = -math.inf
         self._last_move = self._offsets
-        # What the offsets were when positions of the joints, and when the applied offsets came last.
-        self._at_joints = self._at_applied = self._offsets
+        # What the offsets were when positions of the joints came last, and what was sent when the
+        # controller told what it has.
+        self._at_joints = self._at_has = self._offsets
+        self.response = JointResponse(len(arm.names))
+        self._verified, self._foreign = dry, ''
         # Output of commands: where the joints would be without offsets.
         self._pose: FloatArray | None = None
-        self._applied: FloatArray | None = None
-        self._applied_t = -math.inf
+        # What the controller has, as it tells: its offsets, or its command with an output of commands.
+        self._has: FloatArray | None = None
+        self._has_t = -math.inf
         self._anchor: tuple[FloatArray, FloatArray] | None = None
         self._away_t: float | None = None
         self._stop = self._broken = ''
@@ -141,19 +160,35 @@ class Compensator:
     @property
     def left(self) -> FloatArray:
         """(n,): the offsets that the controller may still have, as far as one knows, rad or m."""
-        if self._owed and not self._speaks and self._applied is not None:
-            return self._applied.copy()
+        if not self._speaks and not self._sums and self._has is not None:
+            return self._has.copy()
         return self._offsets.copy()
+
+    @property
+    def owed(self) -> bool:
+        """Whether offsets that the controller has are to be taken back as soon as it tells them."""
+        return self._owed and not self._speaks and bool(np.any(self.left))
+
+    def told_text(self, now: float) -> str:
+        """What the controller tells that it has, rad or m, in words."""
+        if self._has is None or now - self._has_t > FOREIGN_S:
+            return 'nothing'
+        return ', '.join(f'{v:.6f}' for v in self._has.tolist())
 
     def enable(self, wanted: bool) -> None:
         """Let the offsets follow from where the controller has them, or let them go back to zero.
 
-        Joints that did not follow keep the offsets held until this is called again.
+        Joints that did not follow keep the offsets held until this is called again. Offsets that the controller has
+        from before, whoever sent them, go back as well.
         """
+        self._owed = self._owed or (not wanted and bool(self._foreign))
         if wanted == self.enabled and not self._broken:
             return
         self.enabled = wanted
-        self._broken = ''
+        if self._broken:
+            self._broken = ''
+            self.response, self._verified = JointResponse(len(self._offsets)), self._dry
+            self.response.begin(self._offsets)
         self._anchor = self._away_t = self._held_t = None
 
     def stop(self, why: str, *, rival: bool = False) -> None:
@@ -166,10 +201,10 @@ class Compensator:
             self._fault = AWAITED
         self._stop, self._rival = why, rival
 
-    def applied(self, now: float, offsets: FloatArray) -> None:
-        """The offsets that the controller says it applies: where ours begin when they are enabled."""
-        self._applied, self._applied_t = np.array(offsets, dtype=np.float64), now
-        self._at_applied = self._offsets
+    def controller_has(self, now: float, values: FloatArray) -> None:
+        """What the controller tells, where ours begin: the offsets that it applies, or its command (n,), rad or m."""
+        self._has, self._has_t = np.array(values, dtype=np.float64), now
+        self._at_has = self._offsets if self._pose is None else self._pose + self._offsets
 
     def joints(self, now: float, positions: FloatArray, age: float = 0.0) -> None:
         """Where the joints are, offsets included unless ``dry``, in the order of the arm; ``age``, s, of the positions.
@@ -182,6 +217,9 @@ class Compensator:
         before, then = self._joints, self._joints_t
         self._joints, self._joints_t = seen, now - max(age, 0.0)
         self._at_joints = self._offsets
+        wrong = self.response.add(now, seen, self._offsets, self.settings.follow_error)
+        if wrong is not None and self._speaks and not self._dry:
+            self._broken = self._broken or self.response.wrong(self.arm.names, wrong)
         if before is None:
             return
         move, settings = seen - before, self.settings
@@ -229,7 +267,8 @@ class Compensator:
         if not self._speaks and self.enabled:
             self._unready = '' if self._fault else self._begin(now)
         elif not self._speaks and self._owed and not self._rival:
-            self._begin(now)
+            self._unready = self._begin(now)
+        self._foreign = self._look_for_foreign(now)
         self._give_up(now)
         elapsed = 0.0 if self._moved_t is None else min(max(now - self._moved_t, 0.0), LONGEST_S)
         self._moved_t = now
@@ -261,31 +300,48 @@ class Compensator:
         if not self.enabled:
             if self._speaks and np.any(offsets):
                 return out._replace(state=State.RELEASING, why='going back to zero', residual=math.nan, limited=False)
-            return out._replace(state=State.OFF, why=self._fault, residual=math.nan, limited=False)
+            why, foreign = self._foreign or self._fault, bool(self._foreign)
+            return out._replace(state=State.OFF, why=why, residual=math.nan, limited=False, foreign=foreign)
         why = self._fault or ('' if self._speaks else self._unready)
         if why or not self._speaks:
             return out._replace(state=State.HOLDING, why=why, residual=math.nan, limited=False)
-        return out
+        return out if self._verified else out._replace(why=UNVERIFIED)
+
+    def _look_for_foreign(self, now: float) -> str:
+        """Offsets that the controller tells while nothing is sent, in words; '' if there are none."""
+        if self._speaks or self._sums or self._dry or self._has is None or now - self._has_t > FOREIGN_S:
+            return ''
+        worst = int(np.abs(self._has).argmax())
+        # What we sent last may still be on its way back to us.
+        if abs(self._has[worst]) <= FOREIGN or (self._sent is not None and self._has_t - self._sent[1] <= FOLLOW_S):
+            return ''
+        what = f'the controller applies {self._has[worst]:.3g} at {self.arm.names[worst]}'
+        return f'{what}: {self._unready}' if self._owed else f'{what}, which is not sent from here'
 
     def _begin(self, now: float) -> str:
         """Begin to speak, from where the controller is; the reason why not, or ''."""
-        settings = self.settings
+        settings, has = self.settings, self._has
         offsets, pose = np.zeros(len(self._offsets)), None
-        if self._sums:
-            pose = self._joints
-        elif settings.takeover:
-            if self._applied is None or now - self._applied_t > settings.stale:
-                return UNTOLD
-            offsets = self._applied
-            worst = int(np.abs(offsets).argmax())
-            if abs(offsets[worst]) > settings.max_offset:
-                return f'the controller applies {offsets[worst]:.3g} at {self.arm.names[worst]}: beyond max_offset'
+        known = has is not None and now - self._has_t <= settings.stale
+        if not known and (self._sums or settings.takeover):
+            return self._untold
+        if has is not None and known and not self._sums:
+            offsets, worst = has, int(np.abs(has).argmax())
+            if abs(has[worst]) > settings.max_offset:
+                return f'the controller applies {has[worst]:.3g} at {self.arm.names[worst]}: beyond max_offset'
+        elif has is not None and known:
+            pose, away = has, np.abs(has - self._joints) if self._joints is not None else np.zeros(len(has))
+            worst = int(away.argmax())
+            if away[worst] > settings.follow_error:
+                return f'{self.arm.names[worst]} is {away[worst]:.3g} from the command of the controller: follow_error'
         if self._sent is not None:
             sent, then = self._sent
             if np.abs((offsets if pose is None else pose) - sent).max() > settings.max_rate * (now - then):
                 return 'the controller is elsewhere than it was sent last: the rate allows for it soon'
-        self._offsets = self._wanted = self._at_joints = self._at_applied = offsets
-        self._pose, self._speaks, self._owed = pose, True, False
+        self._offsets = self._wanted = self._at_joints = offsets
+        self._at_has = offsets if pose is None else pose
+        self._pose, self._speaks, self._owed, self._verified = pose, True, False, self._dry
+        self.response.begin(offsets)
         self._anchor = self._away_t = self._held_t = None
         return ''
 
@@ -305,20 +361,26 @@ class Compensator:
 
     def _not_followed(self, now: float) -> str:
         """Why the joints or the controller do not do what was sent; '' if they do, as far as one can tell."""
-        if self._sums:
-            if self._pose is None or self._joints is None:
-                return ''
-            return self._away(now, self._pose + self._at_joints, self._joints)
-        if self.settings.takeover and now - self._applied_t > self.settings.stale:
-            # It may come back with none, so it hears nothing from us until it tells what it has.
+        told: list[tuple[FloatArray, FloatArray]] = []
+        known = self._has is not None and now - self._has_t <= self.settings.stale
+        if not known and (self._sums or self.settings.takeover):
+            # It may come back with something else, so it hears nothing until it tells what it has.
             self._fall_silent()
-            return UNTOLD
-        away = '' if self._applied is None else self._away(now, self._at_applied, self._applied)
-        return away or self._stands_still()
+            return self._untold
+        if self._has is not None and known:
+            told.append((self._at_has, self._has))
+        if self._pose is not None and self._joints is not None:
+            told.append((self._pose + self._at_joints, self._joints))
+        return self._away(now, told) or self._stands_still()
 
-    def _away(self, now: float, asked: FloatArray, seen: FloatArray) -> str:
-        """Why what is ``seen`` is not what was ``asked``. For ``FOLLOW_S`` it may be late; then nothing is sent."""
-        away = np.abs(seen - asked)
+    @property
+    def _untold(self) -> str:
+        return UNKNOWN_COMMAND if self._sums else UNTOLD
+
+    def _away(self, now: float, pairs: list[tuple[FloatArray, FloatArray]]) -> str:
+        """Why what was asked is not what there is, of pairs of both. For ``FOLLOW_S`` it may be late; then nothing is
+        sent."""
+        away = np.max([np.abs(there - asked) for asked, there in pairs] or [np.zeros(len(self._offsets))], axis=0)
         worst = int(away.argmax())
         if away[worst] <= self.settings.follow_error:
             self._away_t = None
@@ -363,7 +425,7 @@ class Compensator:
             return self._joints
         if self._sums:
             return self._pose
-        return self._joints - (self._offsets if self._applied is None else self._applied)
+        return self._joints - self._at_joints
 
     def _refusal(self, now: float, seen: Observed) -> str:
         settings = self.settings
@@ -396,9 +458,10 @@ class Compensator:
         settings, rows = self.settings, self._rows
         wanted = self.arm.pose(nominal)
         error = _vector(wanted.inverse() @ self.arm.pose(nominal + self._offsets) @ deflection)[rows]
-        self._residual = float(np.linalg.norm(self._measured_error(wanted, deflection, error)))
         jacobian = self.arm.jacobian(nominal + self._offsets)
         in_wanted = np.vstack([wanted.rotation.T @ jacobian[:3], wanted.rotation.T @ jacobian[3:]])[rows]
+        self._verified = (self._verified and not self.response.suspects) or self._seen_to_follow(in_wanted)
+        self._residual = float(np.linalg.norm(self._measured_error(deflection, error)))
         square = in_wanted.T @ in_wanted + settings.damping**2 * np.eye(len(self._offsets))
         step = -np.linalg.solve(square, in_wanted.T @ error) * -math.expm1(-elapsed / settings.time_constant)
         # A joint that is beyond its limit by itself is not pulled back by us.
@@ -408,13 +471,23 @@ class Compensator:
         beyond = np.abs(self._offsets + step - self._wanted).max() > 1e-12
         self._limited = bool(beyond or np.abs(step).max() > settings.max_rate * elapsed * (1.0 + 1e-9))
 
-    def _measured_error(self, wanted: Transform, deflection: Transform, error: FloatArray) -> FloatArray:
-        """The difference with the joints where they were measured; not known if nobody tells what is applied."""
+    def _seen_to_follow(self, jacobian: FloatArray) -> bool:
+        """Whether the joints whose offsets count were seen to move with them."""
+        known = self.response.known()
+        doubtful = np.linalg.norm(jacobian @ np.where(known, 0.0, self._offsets))
+        return bool(known.any() and doubtful <= UNSEEN_SHARE * np.linalg.norm(jacobian @ self._offsets))
+
+    def _measured_error(self, deflection: Transform, error: FloatArray) -> FloatArray:
+        """The difference with the joints where they were measured; NaN until they were seen to follow."""
         if self._dry or self._joints is None:
             return error
-        if not self._sums and self._applied is None:
+        if not self._verified:
             return np.full(1, math.nan)
-        return _vector(wanted.inverse() @ self.arm.pose(self._joints) @ deflection)[self._rows]
+        pose = self._pose
+        if pose is None:
+            slopes = np.where(self.response.known(), self.response.slopes, 1.0)
+            pose = self._joints - slopes * self._at_joints
+        return _vector(self.arm.pose(pose).inverse() @ self.arm.pose(self._joints) @ deflection)[self._rows]
 
 
 def _vector(pose: Transform) -> FloatArray:

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from bench.steps import largest_step
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import IDENTITY, Transform, shift
 from psd_deflection.arms.compensation.arm import Arm, read_arm
-from psd_deflection.arms.compensation.compensator import Command, Compensator, Observed, State
+from psd_deflection.arms.compensation.compensator import UNVERIFIED, Command, Compensator, Observed, State
 from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.records import FloatArray
@@ -40,12 +41,17 @@ def arm() -> Arm:
 class Loop:
     """A compensator that sees a simulated arm through estimates of noise; ``offsets`` are those the controller has.
 
-    ``tells``: the controller tells them. ``sent``: when what was sent. ``whys``: why it held, and ''.
+    ``tells``: the controller tells them, or with commands its command. ``applies``: the share of them that it adds.
+    ``droop``: how far the joints stand below their command. ``measured``: what encoders make of angles. ``sent``:
+    when what was sent. ``whys``: why it held, and ''.
     """
 
-    def __init__(self, arm: Arm, dry: bool = False, **chosen: float) -> None:
+    def __init__(self, arm: Arm, dry: bool = False, applies: float = 1.0, **chosen: Any) -> None:
         given: dict[str, Any] = {'takeover': False, **chosen}
-        self.tells = bool(given['takeover'])
+        self.commands = given.get('output') == 'commands'
+        self.tells = bool(given['takeover']) or self.commands
+        self.applies, self.droop = applies, 0.0
+        self.measured: Callable[[FloatArray], FloatArray] = lambda angles: angles
         self.sent: list[tuple[float, FloatArray]] = []
         self.whys: set[str] = set()
         self.compensator = Compensator(arm, CompensatorSettings(axes=('x', 'z'), **given), dry)
@@ -59,11 +65,16 @@ class Loop:
         """Let the arm be moved to ``wanted`` at once, and the compensator act."""
         for n in range(round(seconds / PERIOD)):
             self.t += PERIOD
-            self.plant.step(wanted + (0.0 if self.dry else self.offsets), PERIOD)
+            if self.commands and not self.sent:
+                self.has = wanted
+            there = wanted + (0.0 if self.dry else self.applies * self.offsets)
+            if self.commands:
+                there = wanted + self.applies * (self.has - wanted)
+            self.plant.step(there - self.droop, PERIOD)
             if n % told_every == 0:
-                self.compensator.joints(self.t, self.plant.angles)
+                self.compensator.joints(self.t, self.measured(self.plant.angles))
             if self.tells and n % told_every == 0:
-                self.compensator.applied(self.t, self.offsets)
+                self.compensator.controller_has(self.t, self.has if self.commands else self.offsets)
             at = self.plant.end().deflection
             noisy = Transform(at.rotation, at.position + self.noise.normal(size=3) * 1e-6)
             self.compensator.observe(self.t, Observed(self.t, noisy, CERTAIN))
@@ -77,7 +88,8 @@ class Loop:
         if command.sends:
             self.compensator.sent(now, command)
             self.offsets = command.offsets
-            self.sent.append((now, command.offsets if command.positions is None else command.positions))
+            self.has = command.offsets if command.positions is None else command.positions
+            self.sent.append((now, self.has))
         return command
 
     def step(self) -> float:
@@ -451,7 +463,7 @@ def test_a_controller_that_applies_something_else_is_not_sent_more(arm: Arm) -> 
     before = loop.offsets
     for n in range(1, 30):
         loop.compensator.joints(loop.t + PERIOD * n, loop.plant.angles)
-        loop.compensator.applied(loop.t + PERIOD * n, before + 0.02)
+        loop.compensator.controller_has(loop.t + PERIOD * n, before + 0.02)
         loop.compensator.observe(loop.t + PERIOD * n, seen(loop, t=loop.t + PERIOD * n))
         command = loop.send(loop.t + PERIOD * n)
         assert command.state is State.HOLDING
@@ -536,12 +548,90 @@ def test_offsets_of_the_controller_that_cannot_be_ours_are_not_taken_over(arm: A
     assert not loop.sent
 
 
-def test_without_word_of_what_is_applied_the_residual_is_not_known(arm: Arm) -> None:
-    assert math.isnan(following(arm).run(0.2).residual)
+def noisy(sd: float, step: float = 0.0) -> Callable[[FloatArray], FloatArray]:
+    """Encoders with noise (rad) and steps."""
+    noise = np.random.default_rng(1)
+
+    def measured(angles: FloatArray) -> FloatArray:
+        read = angles + noise.normal(size=len(angles)) * sd
+        return np.round(read / step) * step if step else read
+
+    return measured
+
+
+@pytest.mark.parametrize('how', [{}, {'takeover': True}, {'output': 'commands'}], ids=repr)
+@pytest.mark.parametrize('encoder', [(0.0, 0.0), (1e-4, 0.0), (0.0, 3e-4), (2e-5, 1e-4)], ids=repr)
+@pytest.mark.parametrize('applies', [-1.0, 0.0, 0.3, 0.7, 1.0, 1.35, 2.0])
+def test_a_controller_of_another_sign_or_scale_holds(
+    arm: Arm, applies: float, encoder: tuple[float, float], how: dict[str, Any]
+) -> None:
+    """It tells what it was sent, whatever it does."""
+    loop = Loop(arm, applies=applies, **how)
+    loop.measured = noisy(*encoder)
+    loop.plant.force = PAYLOAD
+    loop.run(0.4)
+    loop.compensator.enable(True)
+    command = loop.run(PERIOD)
+    assert math.isnan(command.residual)
+    command = loop.run(2.5)
+    if applies == 1.0:
+        assert (command.state, command.why) == (State.FOLLOWING, '')
+        assert command.residual == pytest.approx(loop.error(), abs=1e-3)
+    else:
+        assert command.state is State.HOLDING
+        assert math.isnan(command.residual)
+        words = command.why.split()
+        if 'of its offset' in command.why:
+            slope, half_width = float(words[3]), float(words[5])
+            assert slope == pytest.approx(applies, abs=half_width)
+        else:
+            assert applies == 0.0 or how.get('output') == 'commands'
+
+
+@pytest.mark.parametrize(('applies', 'after'), [(1.0, State.FOLLOWING), (2.0, State.HOLDING)])
+def test_until_offsets_move_the_joints_nothing_is_verified(arm: Arm, applies: float, after: State) -> None:
+    loop = Loop(arm, takeover=True, applies=applies)
+    loop.measured = noisy(5e-5)
+    loop.compensator.enable(True)
+    command = loop.run(3.0)
+    assert (command.state, command.why) == (State.FOLLOWING, UNVERIFIED)
+    assert math.isnan(command.residual)
+    loop.plant.force = PAYLOAD
+    assert loop.run(2.5).state is after
+
+
+def test_a_controller_that_changes_its_scale_holds(arm: Arm) -> None:
+    loop = telling(arm)
+    assert loop.run(1.0).why == ''
+    loop.applies = 1.5
+    loop.run(1.0)
+    loop.plant.force = -PAYLOAD
+    loop.run(4.0)
+    loop.plant.force = PAYLOAD
+    command = loop.run(4.0)
+    assert 'of its offset, must be 1' in command.why
+    assert math.isnan(command.residual)
+
+
+@pytest.mark.parametrize('delayed', [0.0, 0.02, 0.3])
+def test_an_arm_that_moves_by_itself_is_not_blamed(arm: Arm, delayed: float) -> None:
+    """Motions begin with the loads that they cause, of all sizes; then the slope is as it was."""
+    loop = telling(arm)
+    rng, at = np.random.default_rng(7), ELBOW
+    for n in range(40):
+        to = at + rng.normal(size=2) * rng.choice([0.03, 0.1, 0.5])
+        begun = loop.t
+        while loop.t < begun + 1.0:
+            share = min((loop.t - begun) / 0.6, 1.0)
+            if loop.t - begun >= delayed:
+                loop.plant.force = PAYLOAD * (0.7 + 0.3 * math.cos(n))
+            loop.run(PERIOD, at + (to - at) * share**2 * (3.0 - 2.0 * share))
+        at = to
+    assert not [why for why in loop.whys if 'of its offset' in why]
 
 
 def test_with_commands_the_arm_keeps_the_pose_that_it_had(arm: Arm) -> None:
-    loop = Loop(arm, output='commands')  # type: ignore[arg-type]
+    loop = Loop(arm, output='commands')
     compensator = loop.compensator
     loop.plant.force = PAYLOAD
     assert loop.run(0.2).positions is None
@@ -554,9 +644,56 @@ def test_with_commands_the_arm_keeps_the_pose_that_it_had(arm: Arm) -> None:
     assert loop.step() <= 1.0 + 1e-9
 
 
+@pytest.mark.parametrize('droop', [0.0, 0.005])
+def test_with_commands_it_begins_at_the_command_of_the_controller(arm: Arm, droop: float) -> None:
+    """However far the servos leave the joints below it, and however often it is enabled."""
+    loop = Loop(arm, output='commands')
+    loop.droop = droop
+    loop.plant.force = PAYLOAD
+    for _ in range(5):
+        loop.run(0.4)
+        before, count = loop.has, len(loop.sent)
+        loop.compensator.enable(True)
+        loop.run(0.6)
+        assert np.array_equal(loop.sent[count][1], before)
+        loop.compensator.enable(False)
+        loop.run(0.4)
+        assert loop.has == pytest.approx(ELBOW, abs=1e-12)
+    assert loop.step() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize(
+    ('tells', 'away', 'why'),
+    [(False, 0.0, 'does not tell the command that it has'), (True, 0.05, 'is 0.05 from the command of the controller')],
+)
+def test_with_commands_an_unknown_or_far_command_is_refused(arm: Arm, tells: bool, away: float, why: str) -> None:
+    loop = Loop(arm, output='commands')
+    loop.tells, loop.droop = tells, away
+    loop.compensator.enable(True)
+    command = loop.run(1.0)
+    assert (command.state, command.sends, loop.sent) == (State.HOLDING, False, [])
+    assert why in command.why
+
+
+def test_offsets_of_before_are_reported_and_taken_back_on_request(arm: Arm) -> None:
+    loop = following(arm)
+    held = loop.offsets.copy()
+    loop.compensator, loop.tells, count = Compensator(arm, CompensatorSettings(axes=('x', 'z'))), True, len(loop.sent)
+    command = loop.run(0.6)
+    worst = int(np.abs(held).argmax())
+    assert (command.state, command.foreign, len(loop.sent)) == (State.OFF, True, count)
+    assert command.why == f'the controller applies {held[worst]:.3g} at {arm.names[worst]}, which is not sent from here'
+    assert np.array_equal(loop.compensator.left, held)
+    loop.compensator.enable(False)
+    command = loop.run(float(np.abs(held).max()) / 0.1 + 0.6)
+    assert not loop.offsets.any()
+    assert not command.foreign
+    assert loop.step() <= 1.0 + 1e-9
+
+
 def test_with_commands_an_arm_that_stops_holds_and_one_that_was_moved_is_left_alone(arm: Arm) -> None:
     """Commands of before would move it back at once when its controller runs again."""
-    loop = Loop(arm, output='commands')  # type: ignore[arg-type]
+    loop = Loop(arm, output='commands')
     loop.plant.force = PAYLOAD
     loop.compensator.enable(True)
     before = loop.run(1.0).offsets
@@ -564,6 +701,7 @@ def test_with_commands_an_arm_that_stops_holds_and_one_that_was_moved_is_left_al
     for n in range(1, 40):
         loop.t = start + PERIOD * n
         loop.compensator.joints(loop.t, stopped)
+        loop.compensator.controller_has(loop.t, loop.has)
         loop.compensator.observe(loop.t, seen(loop, t=loop.t))
         command = loop.send(loop.t)
         # At once, and not when it has asked for much more.
@@ -614,7 +752,7 @@ def test_whatever_comes_no_step_is_larger_than_the_rate_allows(
     good = CompensatorSettings(axes=('x', 'z'), output=output, good=2, takeover=takeover)
     compensator = Compensator(arm, good)
     compensator.enable(True)
-    now, clock, has = 0.0, 0.0, np.zeros(2)
+    now, clock, has = 0.0, 0.0, ELBOW if output == 'commands' else np.zeros(2)
     sent: list[tuple[float, FloatArray]] = []
     good_ones: list[tuple[str, Any]] = [('good', None)] * 3
     for kind, value in [one for event in events for one in (event, *good_ones)]:
@@ -643,12 +781,12 @@ def test_whatever_comes_no_step_is_larger_than_the_rate_allows(
             elif kind == 'age':
                 age = value
             compensator.joints(now, joints)
-            compensator.applied(now, applied)
+            compensator.controller_has(now, applied)
             compensator.observe(now, Observed(now + clock, deflection, covariance, age))
             command = compensator.watch(now)
         if command.sends:
-            has = command.offsets
+            has = command.offsets if command.positions is None else command.positions
             now += late
-            sent.append((now, has if command.positions is None else command.positions))
+            sent.append((now, has))
             compensator.sent(now, command)
     assert largest_step([t for t, _ in sent], [v for _, v in sent], 0.1) <= 1.0 + 1e-6
