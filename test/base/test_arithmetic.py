@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from psd_deflection.base.arithmetic import FIXED, LIBRARY, Arithmetic, FixedArithmetic, in_pairs
 from psd_deflection.base.arithmetic.elementary import FixedFunctions
 from psd_deflection.base.arithmetic.matrices import pivots, surely_positive
+from psd_deflection.base.arithmetic.spectra import lagged_products, transform
 from psd_deflection.records import FloatArray
 
 PACKAGE = Path(__file__).parents[2] / 'psd_deflection'
@@ -231,15 +232,36 @@ def test_a_column_that_depends_on_others_counts_for_nothing() -> None:
     assert FIXED.least_squares(a, np.array([[3.0], [3.0], [1.0]]))[:, 0].tolist() == pytest.approx([3.0, 0.0])
 
 
-def test_spectra() -> None:
-    rng = np.random.default_rng(4)
-    f = np.fft.rfft(rng.normal(size=(4, 3, 64)))
-    whole = rng.normal(size=(4, 4, 33)) + 1j * rng.normal(size=(4, 4, 33))
-    turned = f.transpose(0, 2, 1)
-    want = LIBRARY.hermitian('afk,abf,bfj->akbj', turned, whole)
-    assert FIXED.hermitian('afk,abf,bfj->akbj', turned, whole) == pytest.approx(want, rel=1e-12, abs=1e-9)
+@pytest.mark.parametrize('length', [1, 2, 7, 50, 600, 1000])
+@pytest.mark.parametrize('count', [1, 2, 5])
+def test_a_transform_is_that_of_numpy(length: int, count: int) -> None:
+    series = np.random.default_rng(length).normal(size=(length, count))
+    want = np.fft.rfft(series, axis=0)
+    np.testing.assert_allclose(transform(series), want, rtol=0.0, atol=3e-15 * np.abs(want).max() * count)
+
+
+def test_parts_of_a_spectrum() -> None:
+    f = transform(np.random.default_rng(4).normal(size=(64, 12))).reshape(33, 4, 3)
     assert FIXED.times_conjugate(f[:1], f) == pytest.approx(np.conj(f[:1]) * f)
     assert FIXED.power_spectrum(f) == pytest.approx(np.abs(f) ** 2)
+
+
+@pytest.mark.parametrize('length', [20, 1000, 50_000])
+def test_products_with_what_is_later_are_whole_numbers_that_no_order_of_the_sum_changes(length: int) -> None:
+    rng = np.random.default_rng(length)
+    series = np.column_stack((rng.normal(0.0, 3e-6, length), 1e-3 + rng.normal(0.0, 1e-6, length), np.zeros(length)))
+    got = lagged_products(series, 3)
+    want = [[[series[: length - lag, c] @ series[lag:, d] for lag in range(3)] for d in range(3)] for c in range(3)]
+    size = np.sqrt(np.diagonal(got[:, :, 0]))
+    np.testing.assert_allclose(got, want, rtol=0.0, atol=1e-5 * float(size.max()) ** 2)
+    order = rng.permutation(length)
+    assert (lagged_products(series[order], 1) == got[:, :, :1]).all()
+    units = np.array(
+        [2.0 ** (np.frexp(np.abs(column).max())[1] - (52 - length.bit_length()) // 2) for column in series.T]
+    )
+    whole = np.rint(series[:, :2] / units[:2]).astype(int)
+    exact = sum(int(a) * int(b) for a, b in zip(whole[:-1, 0].tolist(), whole[1:, 1].tolist(), strict=True))
+    assert got[0, 1, 1] == exact * units[0] * units[1]
 
 
 @pytest.mark.parametrize('count', [1, 2, 8, 12])
@@ -298,7 +320,7 @@ NOT_OF_A_BLOCK = {
     ('measure/uncertainty/consistency.py', 'add'): 'the suspect is told in /diagnostics alone',
     ('measure/uncertainty/stamped.py', 'noise_words'): 'told in /diagnostics alone',
 }
-MATRICES = {'linalg', 'einsum', 'dot', 'vdot', 'inner', 'matmul', 'tensordot', 'trace', 'polyfit', 'convolve'}
+MATRICES = {'linalg', 'fft', 'einsum', 'dot', 'vdot', 'inner', 'matmul', 'tensordot', 'trace', 'polyfit', 'convolve'}
 FUNCTIONS = {
     'sin', 'cos', 'tan', 'arcsin', 'arccos', 'arctan', 'arctan2', 'exp', 'expm1', 'log', 'log1p', 'log2', 'log10',
     'power', 'float_power', 'hypot', 'sinh', 'cosh', 'tanh', 'cbrt', 'exp2', 'legendre',

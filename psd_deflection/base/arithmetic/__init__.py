@@ -8,8 +8,9 @@ fused multiply-add. Each choice rounds differently in the last digit. :data:`FIX
 products, quotients and square roots of single numbers in an order that stands in the source. IEEE 754 says how each
 of these is rounded, so there is nothing left to choose. :data:`LIBRARY` calls numpy and the C library, for studies.
 
-numpy adds and multiplies element by element alike everywhere, and its Fourier transform has no variants for
-processors; so both are used. Its sums along an axis are not: their order is numpy's affair.
+numpy adds and multiplies element by element alike everywhere, so that is used. Its sums along an axis are not: their
+order is numpy's affair. Its Fourier transform is compiled with multiply-adds on some machines:
+:mod:`psd_deflection.base.arithmetic.spectra` has one of our own.
 
 Functions with ``_many`` take arrays, the others floats.
 """

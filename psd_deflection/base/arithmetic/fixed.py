@@ -144,9 +144,3 @@ class FixedArithmetic(FixedFunctions):
     def power_spectrum(self, a: ComplexArray) -> FloatArray:
         """See :class:`Arithmetic`."""
         return np.asarray(a.real * a.real + a.imag * a.imag)
-
-    def hermitian(self, spec: str, f: ComplexArray, middle: ComplexArray) -> FloatArray:
-        """See :class:`Arithmetic`."""
-        fr, fi, mr, mi = (np.ascontiguousarray(part) for part in (f.real, f.imag, middle.real, middle.imag))
-        out = self.einsum(spec, fr, mr, fr) + self.einsum(spec, fr, mi, fi)
-        return out + (self.einsum(spec, fi, mr, fi) - self.einsum(spec, fi, mi, fr))

@@ -167,7 +167,3 @@ class Arithmetic:
     def power_spectrum(self, a: ComplexArray) -> FloatArray:
         """Squares of the sizes of ``a``."""
         return np.asarray(np.abs(a) ** 2)
-
-    def hermitian(self, spec: str, f: ComplexArray, middle: ComplexArray) -> FloatArray:
-        """Real part of :meth:`einsum` of ``f``, ``middle`` and the conjugate of ``f``."""
-        return np.asarray(np.einsum(spec, f, middle, np.conj(f)).real)

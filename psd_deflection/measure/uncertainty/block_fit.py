@@ -164,7 +164,6 @@ class BlockFit:
         self._by = by
         self._q = basis(size, by)
         self._orders = self._q.shape[1]
-        self._fft = 1 << (2 * size - 1).bit_length()
         self._middle = _at_middle(self._q, by)
         self._count = 2 * len(centers)
         self._diagonal = np.arange(self._count)
@@ -174,8 +173,6 @@ class BlockFit:
         self._gaps = False
         self._long = np.zeros((self._count, self._orders))
         self._blocks = np.full((self._count, self._orders), 1.0 / _FORGET)
-        self._folds = np.full(self._fft // 2 + 1, 2.0 / self._fft)
-        self._folds[[0, -1]] = 1.0 / self._fft
         self.set_geometry(centers, beams, slopes)
 
     def set_geometry(self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> None:
@@ -184,21 +181,19 @@ class BlockFit:
 
     def set_noise(self, gamma: FloatArray, tones: Sequence[Tone] = ()) -> None:
         """Use the autocovariance ``gamma`` (C, C, N) m^2 of the readings, and what vibrates."""
-        by, turn, count = self._by, self._combinations.turn, self._count
+        by, turn = self._by, self._combinations.turn
         turned = by.einsum('ac,cdl,bd->abl', turn, gamma, turn)
-        whole = np.zeros((count, count, self._fft))
-        whole[:, :, : self._size] = turned
         # The covariance with an earlier sample is the transposed one with a later.
-        whole[:, :, self._fft - self._size + 1 :] = turned.transpose(1, 0, 2)[:, :, :0:-1]
-        self._spectrum = np.fft.fft(whole)[:, :, : self._fft // 2 + 1] * self._folds
+        both = np.concatenate((turned.transpose(1, 0, 2)[:, :, :0:-1], turned), axis=2)
+        self._between = np.lib.stride_tricks.sliding_window_view(both, self._size, axis=2)[:, :, :, ::-1]
         own = turned[self._diagonal, self._diagonal]
         self._precision = _precision(own, white=self._size > LARGEST)
         self._whole = _terms(self._q, self._precision, self._middle, True, by)
         self._bias, self._least = _BIAS * self._whole.v, 1e-9 * self._whole.v
         self._long_bias = _LASTING_BIAS * self._whole.v
         self._before: FloatArray | None = None
-        f = np.fft.rfft(self._whole.u, self._fft, axis=1)
-        self._of_whole = by.hermitian('afk,abf,bfj->akbj', f, self._spectrum)
+        u = self._whole.u
+        self._of_whole = by.einsum('ask,absj->akbj', u, by.einsum('abts,btj->absj', self._between, u))
         self._vibrations = [self._vibration(tone) for tone in tones]
 
     def _vibration(self, tone: Tone) -> _Vibration:
@@ -352,8 +347,8 @@ class BlockFit:
 
     def _spread(self, weights: FloatArray) -> FloatArray:
         """Covariance (C, C) of the weighted sums; ``weights`` (C, N)."""
-        f = np.fft.rfft(weights, self._fft)
-        return self._by.hermitian('af,abf,bf->ab', f, self._spectrum)
+        by = self._by
+        return by.einsum('as,abs->ab', weights, by.einsum('abts,bt->abs', self._between, weights))
 
 
 def inverse(matrices: FloatArray) -> FloatArray:

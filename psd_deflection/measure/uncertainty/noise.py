@@ -29,6 +29,7 @@ from math import pi
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic.spectra import lagged_products
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, basis, inverse
 from psd_deflection.measure.uncertainty.combinations import Left, combinations_of
 from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch
@@ -378,16 +379,13 @@ def _autocovariance(
     centred -= at[:, None] * (by.einsum('t,tc->c', at, centred) / float(by.sum(at * at, 0)))
     count = series.shape[1]
     far = _FAR * lags
-    padded = np.zeros((count + 1, 1 << (length + far - 1).bit_length()))
-    padded[:count, places] = centred.T
-    padded[count, places] = 1.0
-    spectra = np.fft.rfft(padded)
-    own = spectra[:count]
-    # Series by series: memory for all pairs at once would be asked of the system anew each time, page by page.
-    pairs = np.stack([np.fft.irfft(by.times_conjugate(one, own))[:, :far] for one in own])
-    present = np.fft.irfft(by.power_spectrum(spectra[count]))[:far]
+    padded = np.zeros((length, count + 1))
+    padded[places, :count] = centred
+    padded[places, count] = 1.0
+    products = lagged_products(padded, far)
+    present = products[count, count]
     # Where two samples are never that far apart, nothing is known: taken as independent.
-    each = np.where(present > 0.5, pairs / np.maximum(present, 1.0), 0.0)
+    each = np.where(present > 0.5, products[:count, :count] / np.maximum(present, 1.0), 0.0)
     # Mean and slope were taken off: 2 of length / far degrees of freedom of what is slower than that.
     slow = by.einsum('cdl,l->cd', each, _mean_weights(far))
     taken = (slow + slow.T)[:, :, None] / (length / far - 2)

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic.spectra import transform
 from psd_deflection.records import FloatArray, IntArray
 
 SIGNIFICANT = 40.0
@@ -89,7 +90,7 @@ class ToneSearch:
             return ()
         count = moving.shape[1]
         series = _filled(places, np.column_stack((moving, still)), self._length)
-        spectrum = np.fft.rfft(series * self._window[:, None], axis=0)
+        spectrum = transform(series * self._window[:, None])
         power = self._by.power_spectrum(spectrum)
         above = power / self._floor(power)
         free = np.zeros(len(power), dtype=bool)
