@@ -66,8 +66,8 @@ def test_the_container(folder: Path) -> None:
         reader = make_reader(stream, validate_crcs=True)
         assert reader.get_header().profile == 'ros2'
         names = {m.name for m in reader.iter_metadata()}
-        assert {'psd_deflection', 'psd_deflection.parameters', 'psd_deflection.device_hello', 'rosbag2'} <= names
-        assert sum(1 for _ in reader.iter_messages()) > 0
+        assert names == {'psd_deflection', 'rosbag2'}
+        assert len(list(reader.iter_messages(['/link_tip/rig']))) == 1
     with file.open('rb') as stream:
         for record in StreamReader(stream, emit_chunks=True).records:
             if isinstance(record, Chunk):

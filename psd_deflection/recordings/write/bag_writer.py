@@ -121,7 +121,7 @@ class McapFile(_RecordSink):
         self._present = dict(rig_values)
         self._hello = device_hello
         # Written with the next message, whose time is then known.
-        self._untold = [self._state(0, 0, {})] if rig_values else []
+        self._untold = [self._state(0, 0, {})] if rig_values or device_hello else []
         self._stream: BinaryIO | None = None
         self._spool: BinaryIO | None = None
         with creating(path), HeldFolder(path.parent) if folder is None else contextlib.nullcontext(folder) as held:
