@@ -4,9 +4,10 @@
 
 Arguments: a tier of tools/tiers.py, and the tests, a file or folder each, perhaps with "-k WORDS". At first all of
 them are run, to see which functions of the checkout each test enters and how long it takes; the first line of the
-output is 1 if all passed, 0 if not. Then each line of the input is a file of the checkout and the first line of a function in it, 0 for what is in no
-function. The tests that enter it are run, the quickest first, as many as take ``MOST`` seconds together, and a line of
-the output is 1 if all passed, 0 if not. Every child imports the program again.
+output is 1 if all passed, 0 if not. Then each line of the input is a file of the checkout and the first line of a
+function in it, 0 for what is in no function. The tests that enter it are run, the quickest first, as many as take
+``MOST`` seconds together, and a line of the output is 1 if all passed, 0 if not. Every child imports the program
+again.
 """
 
 from __future__ import annotations

@@ -9,9 +9,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from psd_deflection.base.errors import DaemonError
-from psd_deflection.cli._options import given_as_option
 from psd_deflection.cli._report import show
-from psd_deflection.run.monitor.start import need_server
+from psd_deflection.cli._values import given_as_option
 
 if TYPE_CHECKING:
     from psd_deflection.run.monitor.client import Daemon
@@ -27,13 +26,14 @@ def url_option(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def request(args: argparse.Namespace, path: str, body: Mapping[str, object]) -> int:
-    """Ask the daemon of ``args`` for something, and print its answer. Raises DaemonError."""
-    need_server()
-    # Imported here: only these commands and the page need aiohttp.
+def request(args: argparse.Namespace, path: str, body: Mapping[str, object], *, timed: bool = False) -> int:
+    """Ask the daemon of ``args`` for something, and print its answer. Raises DaemonError.
+
+    ``timed``: it is of the time at which the command was started.
+    """
     from psd_deflection.run.monitor.client import ask
 
-    show(ask(daemon_of(args), path, body))
+    show(ask(daemon_of(args), path, body, timed=timed))
     return 0
 
 

@@ -14,7 +14,8 @@ from typing import Any
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
-from psd_deflection.cli._options import given_as_option, in_the_world, refuse, whole, world_option
+from psd_deflection.cli._options import in_the_world, refuse, world_option
+from psd_deflection.cli._values import given_as_option, whole
 from psd_deflection.model.simulation.effect_words import with_effects
 from psd_deflection.recordings.replay.simulated_run import SimulatedRun
 from psd_deflection.recordings.write.sinks import open_sink

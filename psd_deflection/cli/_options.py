@@ -7,10 +7,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,6 +17,7 @@ from typing import Any, TypeVar
 from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.foreign_yaml import YamlError, parse_yaml
 from psd_deflection.base.numbers import plain_number
+from psd_deflection.cli._values import given_as_option
 from psd_deflection.recordings.formats.registry import formats
 from psd_deflection.recordings.spans import MARK_WORD, WHOLE, Bound
 from psd_deflection.rig.config import Rig, replace_values, rig_from_values
@@ -40,35 +40,6 @@ S = TypeVar('S')
 LONGEST_SPAN_S = 1e8
 """Bound of --from and --to, s: three years."""
 PICTURES = ('.png', '.svg', '.pdf')
-
-
-def seed(text: str) -> int:
-    """A value of --seed; raises UsageError."""
-    return whole('--seed', 0)(text)
-
-
-def whole(option: str, least: int, most: int | None = None) -> Callable[[str], int]:
-    """Reads a whole number within bounds; what it gives raises UsageError."""
-    bounds = f'at least {least}' + ('' if most is None else f' and at most {most}')
-    return functools.partial(
-        _within, option, int, f'a whole number of {bounds}', least, math.inf if most is None else most
-    )
-
-
-def number(option: str, least: float, most: float) -> Callable[[str], float]:
-    """Reads a number within bounds; what it gives raises UsageError."""
-    return functools.partial(
-        _within, option, float, f'a number of at least {least:g} and at most {most:g}', least, most
-    )
-
-
-def _within(option: str, kind: Callable[[str], N], words: str, least: float, most: float, text: str) -> N:
-    with contextlib.suppress(ValueError):
-        value = kind(text)
-        # NaN fails every comparison.
-        if least <= value <= most:
-            return value
-    raise UsageError(f'{option} {text}: must be {words}')
 
 
 def parameter_option(parser: argparse._ActionsContainer, option: str, name: str, *older: str) -> None:
@@ -318,29 +289,8 @@ def make_writable(out: str) -> Path:
     return folder
 
 
-@contextlib.contextmanager
-def given_as_option(*parameters: str) -> Iterator[None]:
-    """Turn a refused value inside into a UsageError: it came as an option (status 2), not from a file (3).
-
-    ``parameters``: those with their own option; in the message ``keep_out = ...`` becomes ``--keep-out = ...``.
-    """
-    try:
-        yield
-    except ConfigError as error:
-        text = str(error)
-        for name in parameters:
-            text = re.sub(rf'\b{name}(?= = )', f'--{name.replace("_", "-")}', text)
-        raise UsageError(text) from None
-
-
 def refuse(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -> None:
     """Raise UsageError if one of the options ``defaults`` has another value: it would be ignored silently."""
     for name, default in defaults.items():
         if getattr(args, name) != default:
             raise UsageError(f'--{name.replace("_", "-")} {why}')
-
-
-def need_finite(option: str, values: tuple[float, ...]) -> None:
-    """Raise UsageError unless all are finite."""
-    if not all(map(math.isfinite, values)):
-        raise UsageError(f'{option} {" ".join(f"{v:g}" for v in values)}: must be finite')

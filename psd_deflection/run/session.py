@@ -312,8 +312,8 @@ class Session:
         for sink in self.input_sinks:
             sink.put(record)
 
-    def note_mark(self, text: str) -> Mark:
-        """Mark this moment, as if ``text`` had come on ``/link_tip/mark``.
+    def note_mark(self, text: str, late_s: float = 0.0) -> Mark:
+        """Mark the moment ``late_s`` s ago, as if ``text`` had come on ``/link_tip/mark``.
 
         Raises ValueError if it is no mark, or comes too soon after others; that is counted.
         """
@@ -322,10 +322,11 @@ class Session:
         except ValueError as error:
             self.refuse_input(MARK, str(error))
             raise
-        return self._take_mark(cdr.encode(TOPIC_TYPES[MARK], fields))
+        return self._take_mark(cdr.encode(TOPIC_TYPES[MARK], fields), late_s)
 
-    def _take_mark(self, message: bytes) -> Mark:
-        """Unlike another input it is recorded only if it can be used: it is all text. Its time is its arrival."""
+    def _take_mark(self, message: bytes, late_s: float = 0.0) -> Mark:
+        """Unlike another input it is recorded only if it can be used: it is all text. Its time is its arrival, less
+        ``late_s``."""
         try:
             mark = string.to_mark(cdr.decode(TOPIC_TYPES[MARK], message))
             if not self._mark_rate.allows(time.monotonic()):
@@ -333,7 +334,7 @@ class Session:
         except ValueError as error:
             self.refuse_input(MARK, str(error))
             raise
-        mark = mark._replace(t_ns=self.acquisition.now_ns())
+        mark = mark._replace(t_ns=self.acquisition.now_ns() - round(1e9 * late_s))
         self.recorder.put(MARK, TOPIC_TYPES[MARK], message, mark.t_ns)
         if self.watcher is not None:
             self.watcher.put_message(MARK, TOPIC_TYPES[MARK], message, mark.t_ns)
@@ -356,12 +357,15 @@ class Session:
         """Let what was counted of refused messages be said when it is due; to be called now and then."""
         self.processing.later(lambda: self._repeats.settle(time.monotonic()))
 
-    def note_load(self, fx: float, fy: float, tz: float, *, add: bool = False, ago_s: float = 0.0) -> AppliedLoad:
+    def note_load(
+        self, fx: float, fy: float, tz: float, *, add: bool = False, ago_s: float = 0.0, late_s: float = 0.0
+    ) -> AppliedLoad:
         """Take down that this load (N, N, N m) acts at the tip, as if it had come on ``/link_tip/load``.
 
         ``add``: it acts beside the one that is held. ``ago_s``: for how long it has acted already; the recording has
-        that time as the stamp, and the time at which it was told as that of the message. Raises ValueError if another
-        load was noted since, and on a simulated rig that hangs a load when it is noted.
+        that time as the stamp, and the time at which it was told as that of the message. ``late_s``: for how long the
+        request was under way; a load that was noted meanwhile comes before it. Raises ValueError if another load was
+        noted since ``ago_s``, and on a simulated rig that hangs a load when it is noted.
         """
         if ago_s > 0.0 and self.hangs:
             raise ValueError('the simulated rig hangs a load when it is noted, so no load has hung before')
@@ -372,6 +376,9 @@ class Session:
             raise ValueError(
                 f'another load is noted since {held_s:.2f} s ago, this one would be since {ago_s:.2f} s ago'
             )
+        if not self.hangs:
+            held_ns = 0 if self.load is None else self.load.t_ns
+            since_ns = max(since_ns - round(1e9 * late_s), min(held_ns + 1, since_ns))
         if add and (held := self.load) is not None:
             fx, fy, tz = held.fx + fx, held.fy + fy, held.tz + tz
         load = AppliedLoad(since_ns, fx, fy, tz)

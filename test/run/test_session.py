@@ -202,15 +202,35 @@ def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_told_now(
     shown = ShownSession(session)
     assert shown.step() == ''
     with pytest.raises(RefusedError, match='not noted: the dots have not stepped in the last 60 s'):
-        shown.load(0.0, -20.0, 0.0, False, None)
+        shown.load(0.0, -20.0, 0.0, False, None, 0.0)
     with pytest.raises(RefusedError, match='not noted: another load is noted'):
-        shown.load(0.0, -20.0, 0.0, False, 9.0)
+        shown.load(0.0, -20.0, 0.0, False, 9.0, 0.0)
     device.send_frames(*(sample(seq) for seq in range(200, 300)))
     assert session.record(False).result(WAIT_S) == folder
     recording = open_recording(folder)
     assert recording.loads() == [first]
     (message,) = recording.messages([LOAD])
     assert message.log_time >= asked_ns
+
+
+def test_a_request_that_came_late_is_of_the_time_it_was_made(running: Running) -> None:
+    session = running.session
+    shown = ShownSession(session)
+    seen = Seen()
+    session.input_sinks.append(seen)
+    before = session.acquisition.now_ns()
+    shown.mark('bumped it', 8.0)
+    shown.load(0.0, -10.0, 0.0, False, 0.0, 6.0)
+    # Made before the load above and heard after it: it comes after it all the same.
+    shown.load(0.0, 0.0, 0.0, False, 0.0, 7.0)
+    passed = session.acquisition.now_ns() - before
+    mark, load, later = seen.records
+    assert isinstance(mark, Mark)
+    assert isinstance(load, AppliedLoad)
+    assert isinstance(later, AppliedLoad)
+    assert 0 <= mark.t_ns - (before - 8_000_000_000) <= passed
+    assert 0 <= load.t_ns - (before - 6_000_000_000) <= passed
+    assert later.t_ns == load.t_ns + 1
 
 
 @pytest.mark.parametrize(

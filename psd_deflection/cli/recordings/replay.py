@@ -39,16 +39,10 @@ from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import texts
 from psd_deflection.base.tables import Column
 from psd_deflection.cli._fleet import absolute, executor_option, recordings_argument, run_each, several, tell_each
-from psd_deflection.cli._options import (
-    given_as_option,
-    namespace_option,
-    parameter_option,
-    recording_name,
-    refuse,
-    span_options,
-)
+from psd_deflection.cli._options import namespace_option, parameter_option, recording_name, refuse, span_options
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, show_text, warn
+from psd_deflection.cli._values import given_as_option
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.formats.format import Sink

@@ -26,8 +26,9 @@ from tqdm import tqdm
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
-from psd_deflection.cli._options import given_as_option, in_the_world, recording_name, refuse, seed, world_option
+from psd_deflection.cli._options import in_the_world, recording_name, refuse, world_option
 from psd_deflection.cli._report import print_json, show
+from psd_deflection.cli._values import given_as_option, seed
 from psd_deflection.cli.run import serve
 from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.effect_words import with_effects

@@ -45,8 +45,9 @@ from psd_deflection.camera.reference import CameraReference
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.camera.targets import target_of
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import need_folder, picture_name, recording_name, whole
+from psd_deflection.cli._options import need_folder, picture_name, recording_name
 from psd_deflection.cli._report import print_json, show, warn
+from psd_deflection.cli._values import whole
 from psd_deflection.recordings.write.sinks import open_reference_file
 
 PREVIEW_S = 1.0

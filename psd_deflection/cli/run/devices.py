@@ -19,9 +19,9 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.cli._options import given_as_option
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, show, show_text
+from psd_deflection.cli._values import given_as_option
 from psd_deflection.devices.device import Device
 from psd_deflection.devices.registry import known_devices
 from psd_deflection.devices.survey import Port, suggestions, survey

@@ -26,9 +26,9 @@ from typing import TYPE_CHECKING, Any
 from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import DaemonError
 from psd_deflection.cli._daemon import daemon_of, url_option
-from psd_deflection.cli._options import whole
 from psd_deflection.cli._report import print_json, show
-from psd_deflection.run.monitor.start import need_server
+from psd_deflection.cli._values import whole
+from psd_deflection.run.monitor.served import need_server
 
 if TYPE_CHECKING:
     from psd_deflection.run.monitor.client import Daemon

@@ -3,9 +3,9 @@
 """Note a known load that acts on the tip from now on: forces FX, FY in N and the torque TZ in N m.
 
 The running daemon writes it into its recording as a message on /link_tip/load, where `discover` reads it.
-It holds until the next one; a recording that begins later starts with it. The load acts at the tip's
-centroid, in the axes of link_tip_rest. The daemon must serve its page (`monitor`, `estimator --monitor`,
-`make run`); one that you run on this machine is found by itself.
+It holds from the start of this command until the next one; a recording that begins later starts with it.
+The load acts at the tip's centroid, in the axes of link_tip_rest. The daemon must serve its page
+(`monitor`, `estimator --monitor`, `make run`); one that you run on this machine is found by itself.
 
   psd-deflection load 0 -10 0           10 N downwards, if Y points up
   psd-deflection load --add 0 -10 0     10 N more than before
@@ -21,16 +21,15 @@ from __future__ import annotations
 
 import argparse
 
-from psd_deflection.base.numbers import plain_number
 from psd_deflection.cli._daemon import request, url_option
-from psd_deflection.cli._options import need_finite, number
+from psd_deflection.cli._values import need_finite, number, plain
 from psd_deflection.run.monitor.served import MAX_AGO_S, SINCE_STEP
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     for name, unit in (('FX', 'N'), ('FY', 'N'), ('TZ', 'N m')):
-        parser.add_argument(name.lower(), metavar=name, type=plain_number, help=unit)
+        parser.add_argument(name.lower(), metavar=name, type=plain(name), help=unit)
     parser.add_argument('--add', action='store_true', help='this load acts beside the one that was noted last')
     parser.add_argument(
         '--ago',
@@ -49,4 +48,5 @@ def _ago(text: str) -> float | str:
 def run(args: argparse.Namespace) -> int:
     """Tell the daemon."""
     need_finite('FX FY TZ:', (args.fx, args.fy, args.tz))
-    return request(args, 'api/load', {'fx': args.fx, 'fy': args.fy, 'tz': args.tz, 'add': args.add, 'ago': args.ago})
+    body = {'fx': args.fx, 'fy': args.fy, 'tz': args.tz, 'add': args.add, 'ago': args.ago}
+    return request(args, 'api/load', body, timed=True)

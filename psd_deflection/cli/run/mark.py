@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Mark this moment: "bumped it here". The running daemon records it as a message on /link_tip/mark.
 
-The time is that at which the daemon hears of it. `info` lists the marks of a recording, plots show
+The time is that at which the command was started. `info` lists the marks of a recording, plots show
 them, and they bound a part of it (--from 'mark:bumped the table'). The daemon must serve its page
 (`monitor`, `estimator --monitor`, `make run`); one that you run on this machine is found by itself.
 
@@ -27,4 +27,4 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Tell the daemon."""
-    return request(args, 'api/mark', {'text': ' '.join(args.text)})
+    return request(args, 'api/mark', {'text': ' '.join(args.text)}, timed=True)

@@ -49,8 +49,9 @@ from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.declarations import MONITOR
 from psd_deflection.run.headless import run_headless
 from psd_deflection.run.monitor.feed import Feed
+from psd_deflection.run.monitor.served import need_server
 from psd_deflection.run.monitor.shown_recording import ShownRecording
-from psd_deflection.run.monitor.start import need_server, start_views
+from psd_deflection.run.monitor.start import start_views
 from psd_deflection.run.simulated_rig import simulates, started_early
 
 

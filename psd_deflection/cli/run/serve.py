@@ -10,8 +10,9 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from psd_deflection.cli._options import given_as_option, in_the_world, number, refuse, whole
+from psd_deflection.cli._options import in_the_world, refuse
 from psd_deflection.cli._program import program
+from psd_deflection.cli._values import given_as_option, number, whole
 from psd_deflection.devices.device import PowerUp
 from psd_deflection.devices.pseudo_terminal import PORT_LINE, link_names, open_terminals
 from psd_deflection.devices.registry import SIMULATED

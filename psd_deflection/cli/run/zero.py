@@ -20,7 +20,7 @@ import time
 
 from psd_deflection.base.errors import DaemonError
 from psd_deflection.cli._daemon import request, url_option
-from psd_deflection.cli._options import number
+from psd_deflection.cli._values import number
 
 ASK_AGAIN_S = 0.25
 MOVES = 'the link moves'

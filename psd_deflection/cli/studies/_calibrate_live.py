@@ -19,7 +19,7 @@ from psd_deflection.base.printable import printable
 from psd_deflection.cli._daemon import daemon_of
 from psd_deflection.cli._report import LONGEST_LINE, print_json, show, warn
 from psd_deflection.run.bench_calibration import BenchStep, follow
-from psd_deflection.run.monitor.start import need_server
+from psd_deflection.run.monitor.served import need_server
 from psd_deflection.run.signals import Signals
 from psd_deflection.studies.calibrate.from_recordings import CalibrationOptions
 from psd_deflection.studies.calibrate.progress import CalibrationProgress, Need, ParameterProgress

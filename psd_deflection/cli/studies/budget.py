@@ -26,18 +26,9 @@ from tqdm import tqdm
 from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
-from psd_deflection.cli._options import (
-    PICTURES,
-    given_as_option,
-    make_writable,
-    need_finite,
-    need_folder,
-    picture_or_folder,
-    refuse,
-    seed,
-    whole,
-)
+from psd_deflection.cli._options import PICTURES, make_writable, need_folder, picture_or_folder, refuse
 from psd_deflection.cli._report import save_figure, show, show_text
+from psd_deflection.cli._values import given_as_option, need_finite, seed, whole
 from psd_deflection.cli.studies._answer import answer, print_answer
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig

@@ -52,9 +52,10 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import make_writable, namespace_option, number, refuse, span_options
+from psd_deflection.cli._options import make_writable, namespace_option, refuse, span_options
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
+from psd_deflection.cli._values import number
 from psd_deflection.cli.studies._calibrate_live import calibrate_live
 from psd_deflection.model.misalignment.rig import is_calibrated
 from psd_deflection.model.simulation.catalogue import effects_of_rig

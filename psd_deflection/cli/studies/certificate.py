@@ -22,7 +22,8 @@ import argparse
 from pathlib import Path
 
 from psd_deflection.base.numbers import plain_number
-from psd_deflection.cli._options import given_as_option, make_writable, need_finite
+from psd_deflection.cli._options import make_writable
+from psd_deflection.cli._values import given_as_option, need_finite
 from psd_deflection.cli.studies._answer import answer
 from psd_deflection.cli.studies.budget import settings_of
 from psd_deflection.studies.budget.certificate import CertificateProblem, certify

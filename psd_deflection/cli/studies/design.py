@@ -28,8 +28,9 @@ from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.tables import columns
-from psd_deflection.cli._options import PICTURES, given_as_option, need_folder, picture_name, refuse
+from psd_deflection.cli._options import PICTURES, need_folder, picture_name, refuse
 from psd_deflection.cli._report import print_json, save_figure, show, show_text
+from psd_deflection.cli._values import given_as_option
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.link.section import TubeSection
 from psd_deflection.model.plate import placement

@@ -55,9 +55,10 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import given_as_option, make_writable, namespace_option, refuse, seed, span_options
+from psd_deflection.cli._options import make_writable, namespace_option, refuse, span_options
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save_all, show, warn
+from psd_deflection.cli._values import given_as_option, seed
 from psd_deflection.cli.studies._answer import print_answer
 from psd_deflection.model.simulation.catalogue import effect_folders, effect_names
 from psd_deflection.model.simulation.load_words import load_history

@@ -18,8 +18,8 @@ from __future__ import annotations
 
 import argparse
 
-from psd_deflection.cli._options import number
 from psd_deflection.cli._progress import told
+from psd_deflection.cli._values import number
 from psd_deflection.cli.studies._answer import answer, answer_arguments, counted, opened_recording, recording_arguments
 from psd_deflection.model.solvers.registry import SOLVERS
 from psd_deflection.studies.validate.from_recordings import ALL, read_validate

@@ -2,13 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """One sample per line of text, simple to send from an Arduino and readable; no I/O.
 
-Theory of operation. A line is ``seq,t_us,x1,y1,sum1,x2,y2,sum2`` and a newline (a carriage return
-before it is ignored): ``seq`` and ``t_us`` whole numbers modulo 2^32, the six readings decimal. A device with more
+Theory of operation. A line is ``seq,t_us,x1,y1,sum1,x2,y2,sum2`` and a newline (a carriage return before it is
+ignored): ``seq`` and ``t_us`` whole numbers modulo 2^32, signed or not, the six readings decimal. A device with more
 PSDs sends three readings of each further one. Where the electrodes themselves are converted, four readings of each
 PSD take their place. A line that begins with ``#`` describes the device: a JSON object with ``sample_rate_hz``,
-``psds`` if there are more than two, and, if the
-readings are converter counts, ``volts_per_count``. Without ``volts_per_count`` the readings are
-volts. The device sends this line at power-up and once a second.
+``psds`` if there are more than two, and, if the readings are converter counts, ``volts_per_count``. Without
+``volts_per_count`` the readings are volts. The device sends this line at power-up and once a second.
 
 A line may end in ``*hh``, the exclusive-or of all bytes before the ``*`` in hexadecimal (as in NMEA
 0183). Lines without it are accepted unchecked. Without the checksum, a corrupted digit goes
@@ -34,9 +33,11 @@ READINGS = 3
 ELECTRODES = 4
 """Readings of one PSD."""
 _COUNTS = frozenset(of * n for n in range(2, MOST_PSDS + 1) for of in (READINGS, ELECTRODES))
-_WHOLE = re.compile(rb'\d{1,10}')
+_WHOLE = re.compile(rb'-?\d{1,10}')
 _DECIMAL = re.compile(rb'[+-]?(\d{1,9}(\.\d{0,9})?|\.\d{1,9})')
 MAX_VOLTS = 1e3
+LEAST = -WRAP // 2
+"""Of a counter of 32 bits that is printed as a signed one."""
 
 
 class Line(NamedTuple):
@@ -85,11 +86,11 @@ def parse(line: bytes) -> Item | None:
     if not (_WHOLE.fullmatch(fields[0]) and _WHOLE.fullmatch(fields[1])):
         return BadFrame('seq or t_us is no whole number', size)
     seq, t_us = int(fields[0]), int(fields[1])
-    if seq >= WRAP or t_us >= WRAP:
+    if not (LEAST <= seq < WRAP and LEAST <= t_us < WRAP):
         return BadFrame('seq or t_us is over 32 bits', size)
     if not all(_DECIMAL.fullmatch(f) for f in fields[2:]):
         return BadFrame('a reading is no number', size)
-    return Line(seq, t_us, tuple(float(f) for f in fields[2:]))
+    return Line(seq % WRAP, t_us % WRAP, tuple(float(f) for f in fields[2:]))
 
 
 def _description(text: bytes, size: int) -> Item:

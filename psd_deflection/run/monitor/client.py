@@ -6,17 +6,19 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import http.client
 import json
 import os
+import time
 from collections.abc import AsyncGenerator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qs, urlsplit
 
-import aiohttp
-
 from psd_deflection.base.errors import ConfigError, DaemonError
-from psd_deflection.run.monitor.served import served_pages
-from psd_deflection.run.monitor.server import TOKEN_HEADER, TOKEN_VARIABLE
+from psd_deflection.run.monitor.served import MAX_AGO_S, TOKEN_HEADER, TOKEN_VARIABLE, served_pages
+
+_IMPORTED_S = time.monotonic()
 
 DEFAULT_URL = 'http://127.0.0.1:8790/'
 ANSWER_S = 10.0
@@ -63,21 +65,31 @@ def find_daemon(url: str | None) -> Daemon:
     return Daemon(DEFAULT_URL, os.environ.get(TOKEN_VARIABLE, ''))
 
 
-def ask(daemon: Daemon, path: str, body: Mapping[str, object]) -> str:
-    """Send a request such as ``api/zero``; return the answer's message. Raises DaemonError."""
-    return asyncio.run(_ask(daemon, path, body))
-
-
-async def _ask(daemon: Daemon, path: str, body: Mapping[str, object]) -> str:
-    headers = {TOKEN_HEADER: daemon.token} if daemon.token else {}
-    limit = aiohttp.ClientTimeout(total=ANSWER_S)
+def since_start_s() -> float:
+    """Seconds since this program was started; since this module was imported where the system does not say it."""
     try:
-        async with (
-            aiohttp.ClientSession(timeout=limit) as session,
-            session.post(daemon.url + path, json=body, headers=headers, allow_redirects=False) as answer,
-        ):
-            status, text = answer.status, (await answer.content.read(10_000)).decode(errors='replace')
-    except (aiohttp.ClientError, OSError, TimeoutError, ValueError) as error:
+        ticks = int(Path('/proc/self/stat').read_text(encoding='utf-8').rpartition(')')[2].split()[19])
+        return max(time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf('SC_CLK_TCK'), 0.0)
+    except (OSError, ValueError, IndexError, AttributeError):
+        return time.monotonic() - _IMPORTED_S
+
+
+def ask(daemon: Daemon, path: str, body: Mapping[str, object], *, timed: bool = False) -> str:
+    """Send a request such as ``api/zero``; return the answer's message. Raises DaemonError.
+
+    ``timed``: it is of the time at which this program was started, and says how long ago that is.
+    """
+    parts = urlsplit(daemon.url)
+    kind = http.client.HTTPSConnection if parts.scheme == 'https' else http.client.HTTPConnection
+    headers = {'Content-Type': 'application/json', **({TOKEN_HEADER: daemon.token} if daemon.token else {})}
+    try:
+        with contextlib.closing(kind(parts.netloc, timeout=ANSWER_S)) as connection:
+            connection.connect()
+            late = {'late': min(since_start_s(), MAX_AGO_S)} if timed else {}
+            connection.request('POST', parts.path + path, json.dumps({**body, **late}), headers)
+            answer = connection.getresponse()
+            status, text = answer.status, answer.read(10_000).decode(errors='replace')
+    except (http.client.HTTPException, OSError, ValueError) as error:
         raise _unreachable(daemon, error) from None
     message: Any = None
     with contextlib.suppress(ValueError, RecursionError, TypeError, KeyError):
@@ -92,6 +104,9 @@ async def _ask(daemon: Daemon, path: str, body: Mapping[str, object]) -> str:
 
 async def messages(daemon: Daemon) -> AsyncGenerator[dict[str, Any], None]:
     """The messages of the page: ``hello`` first, then new rows as they come. Raises DaemonError, also at the end."""
+    # Imported here: requests do without it, and it takes longer than they do.
+    import aiohttp
+
     limit = aiohttp.ClientTimeout(total=None, sock_connect=ANSWER_S)
     try:
         async with (

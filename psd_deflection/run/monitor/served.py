@@ -10,19 +10,27 @@ next look.
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
+import importlib.util
 import json
 import os
+import re
 from pathlib import Path
 from typing import NamedTuple
 
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.run.state import state_folder
 
 MAX_BYTES = 10_000
 
 MAX_AGO_S = 600.0
-"""A load may have hung for so long before it is noted, s."""
+"""A load may have hung for so long before it is noted, and a request may come so late, s."""
 SINCE_STEP = 'step'
 """In place of that time: since the last step of the dots."""
+
+
+TOKEN_VARIABLE = 'PSD_DEFLECTION_MONITOR_TOKEN'
+TOKEN_HEADER = 'X-Monitor-Token'
 
 
 class Served(NamedTuple):
@@ -79,3 +87,18 @@ def _read(path: Path) -> Served | None:
     except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError):
         return None
     return page
+
+
+def need_server() -> None:
+    """Raise ConfigError, with the fix, if aiohttp is not installed, or so old that it would not answer."""
+    if importlib.util.find_spec('aiohttp') is None:
+        raise ConfigError(
+            "the live page and Foxglove need aiohttp: `pip install 'psd_deflection[monitor]'` or "
+            '`apt install python3-aiohttp`, or run without monitor and foxglove'
+        )
+    found = importlib.metadata.version('aiohttp')
+    if tuple(int(n) for n in re.findall(r'\d+', found)[:2]) < (3, 9):
+        raise ConfigError(
+            f"the live page needs aiohttp 3.9 or later, {found} is installed: `pip install 'psd_deflection[monitor]'` "
+            'in a virtual environment, or run without monitor'
+        )

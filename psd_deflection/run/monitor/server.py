@@ -17,7 +17,7 @@ import os
 import secrets
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -44,14 +44,20 @@ from psd_deflection.run.monitor.feed import BlockResult, Feed, mark_json, refere
 from psd_deflection.run.monitor.gated import HEARTBEAT_S, GatedServer
 from psd_deflection.run.monitor.history import AskedError, History, asked
 from psd_deflection.run.monitor.kept_history import HistoryKeeper
-from psd_deflection.run.monitor.served import MAX_AGO_S, SINCE_STEP, Served, announce, withdraw
+from psd_deflection.run.monitor.served import (
+    MAX_AGO_S,
+    SINCE_STEP,
+    TOKEN_HEADER,
+    TOKEN_VARIABLE,
+    Served,
+    announce,
+    withdraw,
+)
 from psd_deflection.run.monitor.shown import RefusedError, Shown
 from psd_deflection.run.monitor.spectrum import Spectrum, density_json, line_entry
 from psd_deflection.run.recorder import new_folder
 
 PAGE = Path(__file__).parent / 'page'
-TOKEN_VARIABLE = 'PSD_DEFLECTION_MONITOR_TOKEN'
-TOKEN_HEADER = 'X-Monitor-Token'
 
 PUMP_S = 0.03
 SPECTRUM_EVERY_S = 0.5
@@ -389,17 +395,19 @@ class MonitorServer(GatedServer):
     async def _load(self, request: web.Request) -> web.StreamResponse:
         def load(body: dict[str, Any]) -> Awaitable[str]:
             values: list[Any] = [body.get(name) for name in ('fx', 'fy', 'tz')]
-            add = body.get('add', False)
-            ago = body.get('ago', 0.0)
-            good = all(map(_is_number, values)) and all(abs(v) <= MAX_FORCE for v in values) and isinstance(add, bool)
-            good = good and (ago == SINCE_STEP or (_is_number(ago) and 0.0 <= ago <= MAX_AGO_S))
+            add, ago, late = body.get('add', False), body.get('ago', 0.0), _late(body)
             _need(
-                good,
-                f'{{"fx": N, "fy": N, "tz": N m, "add": false, "ago": s or "{SINCE_STEP}"}}, '
-                f'each of at most {MAX_FORCE:g}, ago of at most {MAX_AGO_S:g}',
+                all(map(_is_number, values)) and isinstance(add, bool) and (ago == SINCE_STEP or _is_number(ago)),
+                f'{{"fx": N, "fy": N, "tz": N m, "add": false, "ago": s or "{SINCE_STEP}", "late": s}}',
             )
+            for name, value, unit in zip(('Fx', 'Fy', 'Tz'), values, ('N', 'N', 'N·m'), strict=True):
+                if abs(value) > MAX_FORCE:
+                    raise _BadBodyError(f'not noted: {name} of more than {MAX_FORCE:g} {unit}')
+            if ago != SINCE_STEP and not 0.0 <= ago <= MAX_AGO_S:
+                raise _BadBodyError(f'not noted: a load has hung for 0 to {MAX_AGO_S:g} s when it is noted')
             fx, fy, tz = map(float, values)
-            return asyncio.to_thread(self._shown.load, fx, fy, tz, add, None if ago == SINCE_STEP else float(ago))
+            ago_s = None if ago == SINCE_STEP else float(ago)
+            return asyncio.to_thread(self._shown.load, fx, fy, tz, add, ago_s, late)
 
         return await self._act(request, 'load', load)
 
@@ -412,9 +420,9 @@ class MonitorServer(GatedServer):
 
     async def _mark(self, request: web.Request) -> web.StreamResponse:
         def mark(body: dict[str, Any]) -> Awaitable[str]:
-            text = body.get('text')
-            _need(isinstance(text, str), '{"text": "what happened"}')
-            return asyncio.to_thread(self._shown.mark, str(text))
+            text, late = body.get('text'), _late(body)
+            _need(isinstance(text, str), '{"text": "what happened", "late": s}')
+            return asyncio.to_thread(self._shown.mark, str(text), late)
 
         return await self._act(request, '', mark)
 
@@ -447,7 +455,7 @@ class MonitorServer(GatedServer):
             _need(isinstance(body, dict), 'a JSON object')
             text = await action(body)
         except _BadBodyError as error:
-            return _answer(400, f'refused: expected {error}')
+            return _answer(400, str(error))
         except RefusedError as error:
             return _answer(409, str(error))
         if name:
@@ -459,12 +467,19 @@ class MonitorServer(GatedServer):
 
 
 class _BadBodyError(Exception):
-    """The body of a request is not what it should be; the message says what that is."""
+    """The body of a request is not what it should be; the message says so."""
 
 
 def _need(good: bool, expected: str) -> None:
     if not good:
-        raise _BadBodyError(expected)
+        raise _BadBodyError(f'refused: expected {expected}')
+
+
+def _late(body: Mapping[str, Any]) -> float:
+    """For how long the request was under way already, s: from the click or the start of the command."""
+    late = body.get('late', 0.0)
+    _need(_is_number(late) and 0.0 <= late <= MAX_AGO_S, f'"late": 0 to {MAX_AGO_S:g} s')
+    return float(late)
 
 
 def _is_number(value: object) -> bool:

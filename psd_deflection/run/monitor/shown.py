@@ -48,17 +48,18 @@ class Shown(Protocol):
     async def record(self, wanted: bool) -> str:
         """Start or stop a recording; return the result as a line once the disk has answered. Raises RefusedError."""
 
-    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None, late_s: float) -> str:
         """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RefusedError.
 
-        ``ago_s``: s for which it has acted already; None: since the last step of the dots.
+        ``ago_s``: s for which it has acted already; None: since the last step of the dots. ``late_s``: s for which
+        the request was under way.
         """
 
     def step(self) -> str:
         """How long ago the dots stepped last, s; empty if they did not in the last minute. Raises RefusedError."""
 
-    def mark(self, text: str) -> str:
-        """Mark this moment; return the mark as a line. Raises RefusedError."""
+    def mark(self, text: str, late_s: float) -> str:
+        """Mark the moment ``late_s`` s ago; return the mark as a line. Raises RefusedError."""
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Pause or resume, go to a time from the start; None leaves it. Raises RefusedError."""
@@ -124,14 +125,14 @@ class ShownSession:
             return 'no recording runs'
         return f'recording to {folder}' if wanted else f'recording ended: {folder}'
 
-    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None, late_s: float) -> str:
         """Take down a load that acts from now on, or has acted for some time."""
         if ago_s is None:
-            ago_s = self._step_s()
+            ago_s, late_s = self._step_s(), 0.0
         if ago_s is None:
             raise RefusedError(f'not noted: the dots have not stepped in the last {REACH_S:g} s')
         try:
-            return load_text(self._session.note_load(fx, fy, tz, add=add, ago_s=ago_s), ago_s)
+            return load_text(self._session.note_load(fx, fy, tz, add=add, ago_s=ago_s, late_s=late_s), ago_s)
         except ValueError as error:
             raise RefusedError(f'not noted: {error}') from None
 
@@ -144,10 +145,10 @@ class ShownSession:
         step_ns = self._recent.step_ns()
         return None if step_ns is None else max((self._session.acquisition.now_ns() - step_ns) / 1e9, 0.0)
 
-    def mark(self, text: str) -> str:
+    def mark(self, text: str, late_s: float) -> str:
         """Set a mark; say so if no recording has it."""
         try:
-            mark = self._session.note_mark(text)
+            mark = self._session.note_mark(text, late_s)
         except ValueError as error:
             raise RefusedError(f'not marked: {error}') from None
         unkept = '' if self._session.recorder.folder is not None else ' (nothing is recorded now)'

@@ -200,7 +200,7 @@ class ShownRecording:
         """Refuse: a recording is not recorded again."""
         raise RefusedError('a recording is not recorded again; the command replay writes its answers')
 
-    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None, late_s: float) -> str:
         """Refuse: what is recorded is not changed."""
         raise RefusedError('a recording is played: its loads are those that were recorded')
 
@@ -208,7 +208,7 @@ class ShownRecording:
         """Refuse: nothing is noted here."""
         raise RefusedError('a recording is played: its loads are those that were recorded')
 
-    def mark(self, text: str) -> str:
+    def mark(self, text: str, late_s: float) -> str:
         """Refuse: what is recorded is not changed."""
         raise RefusedError('a recording is played: its marks are those that were recorded')
 

@@ -4,17 +4,14 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import importlib.util
-import re
 import threading
 from typing import TYPE_CHECKING
 
-from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import Say
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.monitor.feed import Feed
+from psd_deflection.run.monitor.served import need_server
 from psd_deflection.run.monitor.shown import ShownSession
 from psd_deflection.run.processing import RecordSink
 from psd_deflection.run.rig_publisher import RigPublisher
@@ -23,21 +20,6 @@ from psd_deflection.run.session import Session
 if TYPE_CHECKING:
     from psd_deflection.run.monitor.foxglove import FoxgloveServer
     from psd_deflection.run.monitor.server import MonitorServer
-
-
-def need_server() -> None:
-    """Raise ConfigError, with the fix, if aiohttp is not installed, or so old that it would not answer."""
-    if importlib.util.find_spec('aiohttp') is None:
-        raise ConfigError(
-            "the live page and Foxglove need aiohttp: `pip install 'psd_deflection[monitor]'` or "
-            '`apt install python3-aiohttp`, or run without monitor and foxglove'
-        )
-    found = importlib.metadata.version('aiohttp')
-    if tuple(int(n) for n in re.findall(r'\d+', found)[:2]) < (3, 9):
-        raise ConfigError(
-            f"the live page needs aiohttp 3.9 or later, {found} is installed: `pip install 'psd_deflection[monitor]'` "
-            'in a virtual environment, or run without monitor'
-        )
 
 
 class Views:

@@ -39,6 +39,7 @@ class StillShown:
         self.zeros = 0
         self.loads: list[tuple[float, float, float, bool]] = []
         self.agos: list[float | None] = []
+        self.lates: list[float] = []
         self.stepped = '3.40'
         self.marks: list[str] = []
         self.played: list[tuple[bool | None, float | None]] = []
@@ -74,11 +75,12 @@ class StillShown:
         self.recordings.append(self.folder if wanted else None)
         return 'recording' if wanted else 'recording ended'
 
-    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None) -> str:
+    def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None, late_s: float) -> str:
         if self.refusal:
             raise RefusedError(self.refusal)
         self.loads.append((fx, fy, tz, add))
         self.agos.append(ago_s)
+        self.lates.append(late_s)
         return 'load noted'
 
     def step(self) -> str:
@@ -86,10 +88,11 @@ class StillShown:
             raise RefusedError(self.refusal)
         return self.stepped
 
-    def mark(self, text: str) -> str:
+    def mark(self, text: str, late_s: float) -> str:
         if self.refusal:
             raise RefusedError(self.refusal)
         self.marks.append(text)
+        self.lates.append(late_s)
         return f'mark: {text}'
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:

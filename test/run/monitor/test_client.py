@@ -260,6 +260,51 @@ def test_without_a_daemon_the_error_says_how_to_start_one(
     assert said.count('\n') == 1
 
 
+def started(program: str, *words: str) -> subprocess.CompletedProcess[str]:
+    """A program of Python that has ended well."""
+    command = [sys.executable, '-c', program, *words]
+    return subprocess.run(command, cwd=ROOT, text=True, capture_output=True, timeout=WAIT_S, check=True)
+
+
+HEAVY = ('scipy', 'aiohttp', 'matplotlib', 'ruamel')
+
+
+@pytest.mark.parametrize('command', [['zero'], ['record'], ['load', '0', '0', '0'], ['mark', 'x'], ['echo', '--help']])
+def test_a_client_starts_without_what_it_does_not_need(serve: Serve, command: list[str]) -> None:
+    serving = serve()
+    program = (
+        'import os, sys\nfrom psd_deflection.cli.main import main\n'
+        'try:\n    status = main(sys.argv[1:])\nexcept SystemExit as end:\n    status = end.code\n'
+        f'found = [name for name in {HEAVY!r} if name in sys.modules]\n'
+        'print(status, found, os.times().user + os.times().system)'
+    )
+    url = [] if '--help' in command else ['--url', serving.url]
+    done = started(program, *command, *url)
+    status, found, cpu_s = done.stdout.splitlines()[-1].replace('[]', 'none').split()
+    assert (status, found) == ('0', 'none')
+    # Of a processor that others use too; alone it takes a fifth.
+    assert float(cpu_s) < 1.0
+
+
+def test_a_mark_and_a_load_say_how_long_ago_they_were_typed(serve: Serve) -> None:
+    serving = serve()
+    program = (
+        'import sys, time; time.sleep(0.5); from psd_deflection.cli.main import main; sys.exit(main(sys.argv[1:]))'
+    )
+    for words in (['mark', 'x'], ['load', '0', '0', '0']):
+        started(program, *words, '--url', serving.url)
+    assert all(0.5 <= late < WAIT_S for late in serving.shown.lates)
+    assert len(serving.shown.lates) == 2
+
+
+@pytest.mark.parametrize('text', ['-1,5', '1_0', 'ten'])
+def test_a_load_that_is_no_number_says_so(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['load', '0', text, '0']) == 2
+    said = capsys.readouterr().err
+    assert f'FY {text}: must be a number' in said
+    assert ('decimals have a point' in said) == (',' in text)
+
+
 @pytest.mark.parametrize('url', ['ftp://rig/', 'http://', 'http://rig:99999/', 'http://[::1/'])
 def test_an_address_that_is_none_is_a_mistake_of_the_command_line(url: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['zero', '--url', url]) == 2

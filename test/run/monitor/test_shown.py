@@ -163,9 +163,9 @@ def test_a_recording_can_be_paused_and_sought() -> None:
     assert feed.times[before] == start
     source.close()
     with pytest.raises(RefusedError, match='those that were recorded'):
-        source.load(0.0, 0.0, 0.0, False, 0.0)
+        source.load(0.0, 0.0, 0.0, False, 0.0, 0.0)
     with pytest.raises(RefusedError, match='those that were recorded'):
-        source.mark('x')
+        source.mark('x', 0.0)
     with pytest.raises(RefusedError, match='those that were recorded'):
         source.step()
 
@@ -193,6 +193,6 @@ def test_what_cannot_be_is_one_line(
 def test_without_aiohttp_the_error_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr('psd_deflection.run.monitor.start.importlib.util.find_spec', lambda name: None)
+    monkeypatch.setattr('psd_deflection.run.monitor.served.importlib.util.find_spec', lambda name: None)
     assert main(['monitor']) == 3
     assert "pip install 'psd_deflection[monitor]'" in capsys.readouterr().err

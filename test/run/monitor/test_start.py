@@ -7,7 +7,7 @@ from __future__ import annotations
 import pytest
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.run.monitor.start import need_server
+from psd_deflection.run.monitor.served import need_server
 
 
 @pytest.mark.parametrize('version', ['3.9.0', '3.14.5', '4.0.0a1', '10.0'])

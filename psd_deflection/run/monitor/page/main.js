@@ -379,6 +379,8 @@ function showPosition() {
   }
 }
 
+const TIMED = ['/api/mark', '/api/load'];
+
 function notice(text, bad = false) {
   $('notice').textContent = text;
   $('notice').className = bad ? 'bad' : '';
@@ -387,13 +389,15 @@ function notice(text, bad = false) {
   notice.timer = setTimeout(() => { $('notice').hidden = true; }, 8000);
 }
 
+// A mark or a load is of the moment of its click, however long the token and the network take.
 async function act(path, content, quiet = false) {
+  const clicked = performance.now();
   if (hello.needs_token && !token && !(token = await askToken())) return null;
   try {
     const answer = await fetch(path, {
       method: 'POST',
       headers: { 'Content-Type': 'application/json', ...(token ? { 'X-Monitor-Token': token } : {}) },
-      body: JSON.stringify(content),
+      body: JSON.stringify(TIMED.includes(path) ? { ...content, late: (performance.now() - clicked) / 1000 } : content),
     });
     const result = await answer.json();
     if (answer.status === 401) {

@@ -3,6 +3,8 @@
 // The dialog that notes a known load. `press` sets what a button does, `act` asks the daemon.
 
 const $ = (id) => document.getElementById(id);
+// A field takes a decimal comma; `pattern` refuses one before three digits, which may be thousands.
+const typed = (id) => Number($(id).value.trim().replace(',', '.'));
 
 export function weighing(press, act) {
   // When the link moved last, on the clock of this page; null if that is not known, or not chosen.
@@ -35,8 +37,8 @@ export function weighing(press, act) {
   $('weigh').onclose = () => {
     const how = $('weigh').returnValue;
     if (!how) return;
-    const [fx, fy, tz] = ['fx', 'fy', 'tz'].map((id) => $(id).valueAsNumber);
-    const ago = since === null ? $('ago').valueAsNumber : secondsSince(since);
+    const [fx, fy, tz] = ['fx', 'fy', 'tz'].map(typed);
+    const ago = since === null ? typed('ago') : secondsSince(since);
     act('/api/load', { fx, fy, tz, add: how === 'add', ago });
   };
   $('weigh_cancel').onclick = () => $('weigh').close('');
