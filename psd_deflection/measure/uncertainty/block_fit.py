@@ -77,8 +77,11 @@ class Fitted(NamedTuple):
 
 
 def basis(size: int, by: Arithmetic = FIXED) -> FloatArray:
-    """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples."""
-    orders = min(ORDER, (size - 1) // 4) + 1
+    """Orthonormal polynomials (N, K) over the places 0 ... N - 1; at most one order for each four samples.
+
+    Of 5 to 11 samples it is one for each two: a motion of 14 Hz and 0.3 mm bends them by more than their noise.
+    """
+    orders = min(ORDER, (size - 1) // (2 if 5 <= size < 12 else 4)) + 1
     u = np.asarray((np.arange(size) - 0.5 * (size - 1)) / max(0.5 * (size - 1), 0.5), dtype=np.float64)
     columns: list[FloatArray] = []
     column: FloatArray
@@ -128,7 +131,7 @@ class _Terms(NamedTuple):
 
 def _terms(q: FloatArray, precision: FloatArray, middle: FloatArray, whole: bool, by: Arithmetic) -> _Terms:
     samples, orders = q.shape
-    told = min(orders, max(samples // 2, 1))
+    told = min(orders, (samples + 1) // 2)
     u = by.einsum('ast,tk->ask', precision, q)
     information = by.einsum('sj,ask->ajk', q, u)
     inverted = inverse(information[:, :told, :told])
@@ -321,7 +324,7 @@ class BlockFit:
         if not self._gaps:
             # All weights are 1.
             return self._squares
-        return np.asarray(self._squares / np.maximum(self._weight, 1e-3))
+        return np.asarray(self._squares / np.maximum(self._weight, 1e-12))
 
     def _remember(self, excess: FloatArray, sure: FloatArray | None, late: FloatArray) -> None:
         """Take a block into the mean of what goes on alike; where that is over, begin with what is of ``late``."""

@@ -187,7 +187,7 @@ def test_another_fit_goes_on_from_the_state_to_the_bit() -> None:
 
 @pytest.mark.parametrize('present', [8, 9, 10, 11])
 def test_so_few_samples_that_they_cannot_tell_all_orders_have_errors_as_large_as_stated(present: int) -> None:
-    """Polynomials of order 4 with coefficients by chance; 8 or 9 samples tell four of the five, 10 tell all."""
+    """Polynomials of order 4 with coefficients by chance; 8 samples tell four of the five, 9 tell all."""
     rng = np.random.default_rng(4)
     powers = np.vander((ALL - 9.5) / 9.5, 5, increasing=True)
     fit = fitter()
@@ -201,7 +201,7 @@ def test_so_few_samples_that_they_cannot_tell_all_orders_have_errors_as_large_as
         fitted = fit.fit(slots, (powers @ coefficients)[slots])
         errors.append((fitted.dots - coefficients[0]) / np.sqrt(fitted.covariance.diagonal()))
     rms = float(np.sqrt(np.mean(np.square(errors))))
-    assert (0.5 if present < 10 else 0.0) < rms < 1.0
+    assert (0.5 if present < 9 else 0.0) < rms < 1.0
 
 
 class Dense:
@@ -233,7 +233,7 @@ class Dense:
         return np.asarray(np.maximum(usual, self.long - 0.03 * self.usual_v))
 
     def late(self) -> FloatArray:
-        return np.asarray(self.squares / np.maximum(self.weight, 1e-3))
+        return np.asarray(self.squares / np.maximum(self.weight, 1e-12))
 
     def last(self, a: int, excess: FloatArray, sure: FloatArray) -> None:
         """The mean of what goes on alike; where that is over, it begins anew."""
@@ -248,7 +248,7 @@ class Dense:
 
     def fit(self, slots: IntArray, dots: FloatArray) -> tuple[tuple[float, ...], FloatArray, bool]:
         z, n = self.of.of(dots), len(slots)
-        told = min(self.orders, max(n // 2, 1))
+        told = min(self.orders, (n + 1) // 2)
         before, q = self.usual(), self.q[slots]
         weights, more, value, misfit = np.zeros((4, self.size)), np.zeros(4), np.zeros(4), False
         for a in range(4):

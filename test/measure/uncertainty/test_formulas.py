@@ -7,10 +7,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty import noise
 from psd_deflection.measure.uncertainty.block_fit import BlockFit, basis
 from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import DeflectionEstimate, FloatArray, IntArray, RawChunk
+from psd_deflection.rig.config import load_rig
 
 PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
 SIZE = 20
@@ -413,3 +415,30 @@ def test_noise_is_measured_from_the_second_segment_on() -> None:
         of.add(block, ALL, SIGMA * rng.normal(size=(SIZE, 4)))
         said.append(of.measured)
     assert said == [False] * 99 + [True] * 51
+
+
+def swaying(size: int, lost: tuple[int, ...] = ()) -> FloatArray:
+    """Errors of ΔY over their standard deviations: 14 Hz of 0.3 mm, blocks of ``size``, of which slots are ``lost``."""
+    rng, n = np.random.default_rng(1), 30_000
+    seq = np.arange(n)
+    volts = np.tile([0.0, 0.0, 5.0], (n, 2))
+    volts[:, 1::3] -= 0.6 * np.sin(88.0 * 1e-3 * seq + 0.3)[:, None]
+    volts += 2e-3 * rng.normal(size=volts.shape)
+    seq = seq[~np.isin(seq % size, lost)]
+    pipeline = Pipeline(load_rig(overrides={'block_size': size, 'min_samples': 5, 'solvers': ['exact']}))
+    chunk = RawChunk(seq, seq * 1_000_000, volts[seq].astype(np.float32), np.zeros(len(seq), np.uint8))
+    found = [r for r in pipeline.process(chunk) if isinstance(r, DeflectionEstimate) and r.t_ns > 5_000_000_000]
+    return np.array([(r.dy - 3e-4 * np.sin(88.0e-9 * r.t_ns + 0.3)) / r.covariance[4] ** 0.5 for r in found])
+
+
+@pytest.mark.parametrize('size', [5, 6, 8, 11])
+def test_small_blocks_follow_motion_and_say_how_well(size: int) -> None:
+    """With one order for four samples 0.31 of the intervals of blocks of 8 held the truth."""
+    z = np.abs(swaying(size))
+    assert np.mean(z < 1.959964) == pytest.approx(0.95, abs=0.02)
+    assert np.mean(z < 3.0) > 0.99
+
+
+def test_blocks_that_always_lose_their_end_say_how_little_they_tell() -> None:
+    """Weights of some 1e-5 a block are weights: 0.93 were within three deviations, and the rms error was 6 um."""
+    assert np.mean(np.abs(swaying(20, tuple(range(12, 20)))) < 3.0) > 0.99
