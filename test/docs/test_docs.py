@@ -215,7 +215,7 @@ def named(tree: Any) -> list[str]:
 
 
 def test_every_page_is_once_in_the_menu() -> None:
-    menu = named(yaml.safe_load((ROOT / 'mkdocs.yml').read_text())['nav'])
+    menu = named(yaml.safe_load((ROOT / 'packaging/mkdocs.yml').read_text())['nav'])
     assert sorted(menu) == sorted(
         str(page.relative_to(ROOT / 'docs')) for page in PAGES if page.name != 'README.md' or page.parent != ROOT
     )
@@ -492,9 +492,9 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
 
 
 def test_the_navigation_has_every_page() -> None:
-    nav = (ROOT / 'mkdocs.yml').read_text().partition('\nnav:')[2]
+    nav = (ROOT / 'packaging/mkdocs.yml').read_text().partition('\nnav:')[2]
     listed = set(re.findall(r'(\S+\.md)$', nav, re.M))
     docs = ROOT / 'docs'
     missing = {str(p.relative_to(docs)) for p in docs.rglob('*.md')} - listed
-    assert not missing, f'to be put into nav of mkdocs.yml: {missing}'
+    assert not missing, f'to be put into nav of packaging/mkdocs.yml: {missing}'
     assert all((docs / name).exists() for name in listed)
