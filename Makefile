@@ -55,7 +55,7 @@ $(VENV)/.requirements: setup.cfg
 	$(PYTHON) -c 'import sys; sys.exit(0 if (3, 11) <= sys.version_info[:2] <= (3, 14) else f"Python 3.11 to 3.14 is needed, this is {sys.version.split()[0]}: make PYTHON=python3.12")'
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	@echo 'setting up $(VENV), once: a minute or so, 0.6 GB'
-	$(call INSTALL,$(VENV)) '.[ros,monitor]' $(if $(WITH),'$(WITH)')
+	$(call INSTALL,$(VENV)) '.[ros,monitor,plot]' $(if $(WITH),'$(WITH)')
 	touch $@
 
 # Installed as a user has it (a wheel, not a link to the checkout), so that `ros2 run` finds it.

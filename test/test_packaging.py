@@ -17,6 +17,8 @@ from pathlib import Path
 import pytest
 
 from psd_deflection import __version__
+from psd_deflection.base import optional
+from psd_deflection.cli.main import main
 
 ROOT = Path(__file__).parent.parent
 BESIDE_THE_PACKAGE = {'bench', 'blind', 'data', 'docs'}
@@ -82,16 +84,12 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert f'## {__version__}' in (ROOT / 'CHANGELOG.md').read_text()
 
 
-FROM_PYPI = {
-    'ruamel': 'python3-ruamel.yaml',
-}
-"""Imported name to the key by which rosdep knows it. The key of any other is ``python3-NAME``."""
+KEYS = {'ruamel': 'python3-ruamel.yaml'}
+"""Imported name to rosdep key. The key of any other is ``python3-NAME``."""
 
 ROS_PACKAGES = {'rclpy', 'rcl_interfaces', 'launch', 'launch_ros'}
 
 UNNAMED = {
-    **dict.fromkeys(('rerun', 'pandas', 'xarray', 'distributed', 'pyarrow', 'cv2'), 'an extra'),
-    'shtab': 'completion in the shell, which says that it is missing; not in rosdep',
     **dict.fromkeys(('cobs', 'mcap', 'mcap_ros2'), 'frames, files and messages as judges; from PyPI'),
     'cyclonedds': 'another DDS as judge; not in rosdep',
     'rosbags': 'another reader as judge; from PyPI, so not forced on whoever builds the workspace',
@@ -99,7 +97,30 @@ UNNAMED = {
     'prometheus_client': 'the judge of /metrics; not tested in a build of ROS',
     **dict.fromkeys(('psd_deflection', 'msg_adapters', 'test', 'tools', 'bench', 'blind'), 'ours'),
 }
-"""What the sources import and package.xml does not name."""
+"""What the sources import and no list of dependencies names."""
+
+IMPORTED_AS = {'opencv-python-headless': 'cv2', 'rerun-sdk': 'rerun', 'pyserial': 'serial', 'PyYAML': 'yaml'}
+
+
+def requirements() -> tuple[set[str], dict[str, str]]:
+    """Of setup.cfg: what is always installed, and the extra of each further package."""
+    setup = configparser.ConfigParser()
+    setup.read(ROOT / 'setup.cfg')
+    always = {re.split(r'[\[<>=]', line)[0] for line in setup['options']['install_requires'].split()}
+    extras = {
+        re.split(r'[\[<>=]', line)[0]: extra
+        for extra, lines in setup['options.extras_require'].items()
+        if extra not in ('test', 'docs')
+        for line in lines.split()
+    }
+    return always, extras
+
+
+def tables() -> tuple[dict[str, str], dict[str, str]]:
+    """Of docs/dependencies.md: the rosdep key of what is always installed, and the extra of the rest."""
+    always, _, rest = (ROOT / 'docs/dependencies.md').read_text().partition('## By extras')
+    keys = dict(re.findall(r'^\| ([\w.-]+) \| (python3-[\w.]+|none yet)', always, re.M))
+    return keys, dict(re.findall(r'^\| ([\w.-]+) \| [^|]+ \| `(\w+)` \|', rest, re.M))
 
 
 def imported(*folders: str) -> set[str]:
@@ -114,9 +135,13 @@ def imported(*folders: str) -> set[str]:
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and 'test' not in folders:
                 found = re.fullmatch(r'(\w+)(?:/(?:msg|action)/\w+|\.msg)', node.value)
                 names |= {found[1]} if found else set()
-    names -= {*sys.stdlib_module_names, *UNNAMED}
+    always, extras = requirements()
+    keyless = {name for name, key in tables()[0].items() if not key.startswith('python3-')}
+    names -= {*sys.stdlib_module_names, *UNNAMED, *(IMPORTED_AS.get(n, n) for n in (*extras, *keyless))}
     ros = {n for n in names if n in ROS_PACKAGES or n.endswith(('_msgs', '_srvs'))}
-    return ros | {FROM_PYPI.get(n, f'python3-{n}') for n in names - ros}
+    if 'test' not in folders:
+        assert names - ros == {IMPORTED_AS.get(n, n.partition('.')[0]) for n in always - keyless}
+    return ros | {KEYS.get(n, f'python3-{n}') for n in names - ros}
 
 
 def test_package_xml_names_what_the_sources_import() -> None:
@@ -130,34 +155,37 @@ def test_package_xml_names_what_the_sources_import() -> None:
     assert all(e.get('email') for e in root.iter('maintainer'))
 
 
-def test_every_dependency_is_justified() -> None:
-    """docs/dependencies.md has a row for each package that a user installs."""
-    setup = configparser.ConfigParser()
-    setup.read(ROOT / 'setup.cfg')
-    extras = dict(setup['options.extras_require'])
-    del extras['test'], extras['docs']
-    asked = '\n'.join([setup['options']['install_requires'], *extras.values()])
-    names = {re.split(r'[\[<>=]', line)[0] for line in asked.split()}
-    listed = set(re.findall(r'^\| ([\w.-]+) \|', (ROOT / 'docs/dependencies.md').read_text(), re.M))
-    assert names == listed - {'package'}
+def test_the_three_lists_of_dependencies_agree() -> None:
+    """setup.cfg, package.xml and docs/dependencies.md."""
+    always, extras = requirements()
+    keys, documented_extras = tables()
+    assert set(keys) == always
+    assert documented_extras == extras
+    root = xml.etree.ElementTree.parse(ROOT / 'package.xml').getroot()
+    named = {e.text for e in root.iter('exec_depend') if (e.text or '').startswith('python3-')}
+    assert named == {key for key in keys.values() if key != 'none yet'}
 
 
-def test_every_source_file_names_its_licence() -> None:
-    listed = subprocess.run(
-        ['git', 'ls-files', '*.py', '*.c', '*.h', '*.js', '*.css'],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if listed.returncode:
-        pytest.skip('not a git checkout')
-    sources = [ROOT / name for name in listed.stdout.splitlines() if '/vendor/' not in name]
-    written = [p for p in sources if p.is_file() and p.stat().st_size]
-    assert written
-    assert [
-        str(p) for p in written if 'SPDX-License-Identifier: Apache-2.0\n' not in p.read_text()[:200].replace(' */', '')
-    ] == []
+@pytest.mark.parametrize('name', sorted(optional.EXTRAS))
+def test_a_missing_package_is_named_with_what_brings_it(name: str) -> None:
+    error = optional.not_installed(ModuleNotFoundError(f'No module named {name}', name=f'{name}.inside'))
+    extra, apt = optional.EXTRAS[name]
+    always, extras = requirements()
+    assert (extra == extras[name]) if extra else name in always
+    assert str(error).startswith(f'{name} is not installed: `pip install ')
+    assert apt in str(error)
+    assert '\n' not in str(error)
+
+
+def test_a_command_whose_extra_is_missing_says_so(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    hidden = {m: None for m in [*sys.modules, 'matplotlib'] if m.partition('.')[0] == 'matplotlib'}
+    with pytest.MonkeyPatch.context() as patch:
+        for module in hidden:
+            patch.setitem(sys.modules, module, None)
+        assert main(['plot', str(ROOT / 'bags/clean'), '--out', str(tmp_path / 'plot.png')]) == 3
+    said = capsys.readouterr().err
+    assert "psd-deflection plot: matplotlib is not installed: `pip install 'psd_deflection[plot]'`" in said
+    assert not list(tmp_path.iterdir())
 
 
 def rooms(package: Path) -> set[str]:

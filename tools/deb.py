@@ -49,7 +49,10 @@ names=$(dpkg-deb -f ros-jazzy-psd-deflection_*.deb Depends | tr , '\\n' | grep -
 printf 'Package: stand-in-for-ros\\nVersion: 1\\nProvides: %s\\nDescription: nothing\\n' "$names" >control
 equivs-build control >/dev/null 2>&1
 """
-INSTALL = 'cd /root && apt-get install -qq --no-install-recommends ./stand-in*.deb ./ros-jazzy-*.deb >/dev/null 2>&1'
+INSTALL = (
+    'cd /root && apt-get install -qq --no-install-recommends ./stand-in*.deb ./ros-jazzy-*.deb '
+    'python3-zstandard python3-aiohttp >/dev/null 2>&1'
+)
 START = (
     'cd /root && PYTHONPATH=$(echo /opt/ros/jazzy/lib/python3*/site-packages) '
     'exec /opt/ros/jazzy/bin/psd-deflection monitor'

@@ -75,9 +75,9 @@ CI_RUNS = (
     (r"^pip install '\.\[rerun\]'$", 'tools/tasks.py', "'.[rerun]'"),
     (r'^psd-deflection convert .*\.rrd$|^rerun ', 'tools/tasks.py', 'tools.check_rerun bags/'),
     (
-        r"^pip install '\.\[ros,monitor\]'$",
+        r"^pip install '\.\[ros,monitor,plot\]'$",
         'Makefile',
-        "INSTALL,$(VENV)) '.[ros,monitor]'",
+        "INSTALL,$(VENV)) '.[ros,monitor,plot]'",
     ),
     (r'^python -m bench\.live$', 'tools/tasks.py', "('live', "),
     (r'^python bench/solvers\.py$', 'tools/tasks.py', "('solvers', "),

@@ -145,7 +145,8 @@ DEMOS = {
 }
 
 SITE = (
-    'python -m mkdocs build --config-file packaging/mkdocs.yml --strict --quiet --site-dir "$PWD/build/site" && python -m tools.pyodide_site build/site && '
+    'python -m mkdocs build --config-file packaging/mkdocs.yml --strict --quiet --site-dir "$PWD/build/site" && '
+    'python -m tools.pyodide_site build/site && '
     'echo open build/site/index.html, its search needs: python -m http.server --directory build/site'
 )
 MKDOCS = ('.[docs]',)

@@ -12,11 +12,9 @@ Save the output where your shell looks for it. For bash this is the file
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from collections.abc import Sequence
 from typing import Any
 
-from psd_deflection.base.errors import ConfigError
 from psd_deflection.devices.port_names import SCHEMES
 
 SHELLS = ('bash', 'zsh', 'tcsh')
@@ -66,8 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the script."""
-    if importlib.util.find_spec('shtab') is None:
-        raise ConfigError('completion needs shtab: `pip install shtab`')
     import shtab
 
     # Only here: the parser of all commands, which imports all of them.

@@ -34,6 +34,7 @@ from psd_deflection.base.errors import (
     SomeFailedError,
     UsageError,
 )
+from psd_deflection.base.optional import not_installed
 from psd_deflection.base.printable import printable
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.cli._report import LONGEST_LINE
@@ -280,7 +281,10 @@ def _run(argv: list[str]) -> int:
         # The others are done, and their output is complete.
         _tell(f'psd-deflection {args.command}: {error}')
         return error.exit_status
-    except PsdDeflectionError as error:
+    except (PsdDeflectionError, ModuleNotFoundError) as raised:
+        error = not_installed(raised) if isinstance(raised, ModuleNotFoundError) else raised
+        if error is None:
+            raise
         aside = set_aside(Path(out)) if out is not None and fresh else ''
         _tell(f'psd-deflection {args.command}: {error}{aside}')
         return error.exit_status

@@ -303,19 +303,23 @@ def _decompress(packed: bytes, compression: str, size: int) -> bytes:
         return packed
     if size == 0:
         return b''
-    # In a browser neither is there, and no chunk is read.
-    import lz4.frame  # type: ignore[import-untyped]
-    import zstandard
+    # Imported where they are needed: in a browser neither is there, and lz4 is an extra.
+    if compression == 'zstd':
+        import zstandard
 
-    try:
-        if compression == 'zstd':
+        try:
             declared = zstandard.frame_content_size(packed)
             if declared > size:
                 raise DamagedError(f'its frame declares {declared} bytes and the chunk {size}')
             return zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-        if compression == 'lz4':
+        except (zstandard.ZstdError, ValueError) as error:
+            raise DamagedError(str(error)) from None
+    if compression == 'lz4':
+        import lz4.frame  # type: ignore[import-untyped]
+
+        try:
             plain: bytes = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size)
             return plain
-    except (zstandard.ZstdError, RuntimeError, EOFError, ValueError) as error:
-        raise DamagedError(str(error)) from None
+        except (RuntimeError, EOFError, ValueError) as error:
+            raise DamagedError(str(error)) from None
     raise DamagedError(f'compression {compression!r} is not known')
