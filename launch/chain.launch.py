@@ -5,10 +5,13 @@
 ``/end_effector/deflection``, the topics of each link below its name, and ``/tf`` from the base to the end effector.
 """
 
-from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from typing import Any
+
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction
+from launch.conditions import IfCondition
+from launch.substitutions import EqualsSubstitution, LaunchConfiguration, NotEqualsSubstitution
+from launch_ros.actions import Node, SetParameter
 from launch_ros.substitutions import FindPackageShare
 
 ARGUMENTS: dict[str, str] = {
@@ -21,6 +24,14 @@ ARGUMENTS: dict[str, str] = {
 
 def generate_launch_description() -> LaunchDescription:
     """One node for all links."""
+    chain, record, slopes = (LaunchConfiguration(name) for name in ('chain', 'record', 'slopes'))
+    node: dict[str, Any] = {
+        'package': 'psd_deflection',
+        'executable': 'chain',
+        'name': 'chain',
+        'namespace': LaunchConfiguration('namespace'),
+        'output': 'screen',
+    }
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -29,25 +40,16 @@ def generate_launch_description() -> LaunchDescription:
                 description='chain file with the links; default: two simulated links',
             ),
             *(DeclareLaunchArgument(name, default_value='', description=what) for name, what in ARGUMENTS.items()),
-            OpaqueFunction(function=chain),
+            GroupAction(
+                [
+                    SetParameter('slopes', slopes, condition=IfCondition(NotEqualsSubstitution(slopes, ''))),
+                    Node(**node, arguments=[chain], condition=IfCondition(EqualsSubstitution(record, ''))),
+                    Node(
+                        **node,
+                        arguments=[chain, '--record', record],
+                        condition=IfCondition(NotEqualsSubstitution(record, '')),
+                    ),
+                ]
+            ),
         ]
     )
-
-
-def chain(context: LaunchContext) -> list[Node]:
-    """The node, with the arguments that were given."""
-    arguments = [LaunchConfiguration('chain')]
-    for name in ('slopes', 'record'):
-        value = LaunchConfiguration(name).perform(context)
-        if value:
-            arguments += [f'--{name}', value]
-    return [
-        Node(
-            package='psd_deflection',
-            executable='chain',
-            name='chain',
-            namespace=LaunchConfiguration('namespace'),
-            output='screen',
-            arguments=arguments,
-        )
-    ]

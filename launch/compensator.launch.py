@@ -1,29 +1,30 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The compensator: ``ros2 launch psd_deflection compensator.launch.py urdf:=arm.urdf tip:=tool0 drive:=true``.
+"""The compensator: ``ros2 launch psd_deflection compensator.launch.py tip:=tool0 drive:=true``.
 
-It is silent until ``/compensator/enable`` is called. For ``forward_position_controller``::
+The arm comes from ``robot_description``. It is silent until ``/compensator/enable`` is called. For
+``forward_position_controller``::
 
-    ros2 launch psd_deflection compensator.launch.py urdf:=arm.urdf tip:=tool0 drive:=true \
+    ros2 launch psd_deflection compensator.launch.py tip:=tool0 drive:=true \
         output:=commands commands:=/forward_position_controller/commands
 """
 
-from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from typing import Any
 
-ARGUMENTS: dict[str, str] = {
-    'urdf': 'kinematics of the arm (empty: the topic robot_description)',
-    'tip': 'link of the end effector',
-    'base': 'link from which on joints count (empty: the root)',
-    'axes': "axes of the end effector's pose that are corrected, of x,y,z,rx,ry,rz (empty: x,y,z)",
-    'output': 'offsets, which your controller adds, or commands, position plus offset (empty: offsets)',
-    'max_offset': 'largest offset of a joint, rad or m (empty: 0.05)',
-    'max_rate': 'largest rate of an offset, rad/s or m/s (empty: 0.1)',
-    'controller_state': 'type of what an active controller tells on controller_state (empty: not listened to)',
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction
+from launch.conditions import IfCondition, UnlessCondition
+from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
+from launch_ros.actions import Node, SetParameter, SetParametersFromFile
+from launch_ros.parameter_descriptions import ParameterValue
+
+PARAMETERS: dict[str, tuple[type, str]] = {
+    'output': (str, 'offsets, which your controller adds, or commands, position plus offset (empty: offsets)'),
+    'max_offset': (float, 'largest offset of a joint, rad or m (empty: 0.05)'),
+    'max_rate': (float, 'largest rate of an offset, rad/s or m/s (empty: 0.1)'),
+    'controller_state': (str, 'type of what an active controller reports on controller_state (empty: not used)'),
 }
-"""Options of the command with their descriptions; the default of each is empty."""
+"""Parameters of the node that may be given as arguments, with their types; the others stand in ``params_file``."""
 
 TOPICS = {
     name: f'compensator/{name}'
@@ -36,39 +37,43 @@ TOPIC_OF = {'controller_state': 'controller_state_topic'}
 
 def generate_launch_description() -> LaunchDescription:
     """One node."""
+    drive, tip, file = (LaunchConfiguration(name) for name in ('drive', 'tip', 'params_file'))
+    node: dict[str, Any] = {
+        'package': 'psd_deflection',
+        'executable': 'compensator',
+        'name': 'compensator',
+        'namespace': LaunchConfiguration('namespace'),
+        'output': 'screen',
+        'remappings': [(f'~/{name}', LaunchConfiguration(TOPIC_OF.get(name, name))) for name in TOPICS],
+    }
     return LaunchDescription(
         [
+            DeclareLaunchArgument('tip', description='link of the end effector'),
             DeclareLaunchArgument('namespace', default_value='', description='namespace of the node and its topics'),
             DeclareLaunchArgument('drive', default_value='false', description='publish for a controller'),
             DeclareLaunchArgument('params_file', default_value='', description='ROS parameters of the node'),
-            *(DeclareLaunchArgument(name, default_value='', description=what) for name, what in ARGUMENTS.items()),
+            *(
+                DeclareLaunchArgument(name, default_value='', description=what)
+                for name, (_, what) in PARAMETERS.items()
+            ),
             *(
                 DeclareLaunchArgument(TOPIC_OF.get(name, name), default_value=topic, description=f'topic of the {name}')
                 for name, topic in TOPICS.items()
             ),
-            OpaqueFunction(function=compensator),
+            GroupAction(
+                [
+                    SetParametersFromFile(file, condition=IfCondition(NotEqualsSubstitution(file, ''))),
+                    *(
+                        SetParameter(
+                            name,
+                            ParameterValue(LaunchConfiguration(name), value_type=kind),
+                            condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration(name), '')),
+                        )
+                        for name, (kind, _) in PARAMETERS.items()
+                    ),
+                    Node(**node, arguments=['--tip', tip, '--drive'], condition=IfCondition(drive)),
+                    Node(**node, arguments=['--tip', tip], condition=UnlessCondition(drive)),
+                ]
+            ),
         ]
     )
-
-
-def compensator(context: LaunchContext) -> list[Node]:
-    """The node, with the arguments that were given."""
-    given = {name: LaunchConfiguration(name).perform(context) for name in (*ARGUMENTS, 'drive', 'params_file')}
-    arguments = [given['urdf']] if given['urdf'] else []
-    for name in ARGUMENTS:
-        if name != 'urdf' and given[name]:
-            arguments += ['--' + name.replace('_', '-'), given[name]]
-    if given['drive'].lower() in ('true', '1'):
-        arguments.append('--drive')
-    return [
-        Node(
-            package='psd_deflection',
-            executable='compensator',
-            name='compensator',
-            namespace=LaunchConfiguration('namespace'),
-            output='screen',
-            arguments=arguments,
-            parameters=[given['params_file']] if given['params_file'] else [],
-            remappings=[(f'~/{name}', LaunchConfiguration(TOPIC_OF.get(name, name))) for name in TOPICS],
-        )
-    ]

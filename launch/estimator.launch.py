@@ -10,10 +10,11 @@ Parameters that are not given here come from ``params_file``. Two rigs on one gr
 ``autostart:=false`` leaves the transitions to you or to a lifecycle manager.
 """
 
-from launch import LaunchContext, LaunchDescription
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, GroupAction
+from launch.conditions import IfCondition
+from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
+from launch_ros.actions import Node, SetParameter
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
@@ -36,6 +37,20 @@ PARAMETERS: dict[str, tuple[type, str]] = {
 
 def generate_launch_description() -> LaunchDescription:
     """One node; an argument that is not given leaves the parameter as params_file or its default has it."""
+    node = Node(
+        package='psd_deflection',
+        executable='estimator',
+        name='estimator',
+        namespace=LaunchConfiguration('namespace'),
+        output='screen',
+        # Not under `parameters`: launch_ros passes over a file that is not there with a warning.
+        ros_arguments=[
+            '--params-file',
+            LaunchConfiguration('params_file'),
+            '--log-level',
+            LaunchConfiguration('log_level'),
+        ],
+    )
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -50,39 +65,21 @@ def generate_launch_description() -> LaunchDescription:
                 description='least severity that is logged: debug, info, warn, error, fatal',
             ),
             *(
-                DeclareLaunchArgument(
-                    name,
-                    default_value='',
-                    description=f'{what} (empty: as params_file says)',
-                )
+                DeclareLaunchArgument(name, default_value='', description=f'{what} (empty: as params_file says)')
                 for name, (_, what) in PARAMETERS.items()
             ),
-            OpaqueFunction(function=estimator),
+            GroupAction(
+                [
+                    *(
+                        SetParameter(
+                            name,
+                            ParameterValue(LaunchConfiguration(name), value_type=kind),
+                            condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration(name), '')),
+                        )
+                        for name, (kind, _) in PARAMETERS.items()
+                    ),
+                    node,
+                ]
+            ),
         ]
     )
-
-
-def estimator(context: LaunchContext) -> list[Node]:
-    """The node, with the arguments that were given."""
-    given = {
-        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
-        for name, (kind, _) in PARAMETERS.items()
-        if LaunchConfiguration(name).perform(context)
-    }
-    return [
-        Node(
-            package='psd_deflection',
-            executable='estimator',
-            name='estimator',
-            namespace=LaunchConfiguration('namespace'),
-            output='screen',
-            # Not under `parameters`: launch_ros passes over a file that is not there with a warning.
-            ros_arguments=[
-                '--params-file',
-                LaunchConfiguration('params_file'),
-                '--log-level',
-                LaunchConfiguration('log_level'),
-            ],
-            parameters=[given] if given else [],
-        )
-    ]

@@ -55,7 +55,9 @@ class AcquisitionConfig:
         '',
         'file in which the zero is kept; empty: by serial number below $XDG_STATE_HOME/psd_deflection',
     )
-    realtime: bool = parameter(True, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted')
+    realtime: bool = parameter(
+        False, '', 'ask for SCHED_FIFO (reader) and locked memory; the log says what was granted'
+    )
     thorlabs_x_sign: float = parameter(
         1.0,
         '',

@@ -14,8 +14,9 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.cli.main import make_parser
-from psd_deflection.rig.declarations import BY_NAME
+from psd_deflection.arms.chains import chain_file
+from psd_deflection.arms.compensation import settings, shaping
+from psd_deflection.rig.declarations import BY_NAME, Parameter
 
 LAUNCH = Path(__file__).parent.parent.parent / 'launch'
 FILE = LAUNCH / 'estimator.launch.py'
@@ -28,56 +29,76 @@ class Configuration:
     def __init__(self, name: str) -> None:
         self.name = name
 
-    def perform(self, context: dict[str, str]) -> str:
-        return context[self.name]
+
+def keep(*words: object, **named: object) -> SimpleNamespace:
+    return SimpleNamespace(words=words, **{'condition': lambda given: True, **named})
+
+
+STAND_INS: dict[str, dict[str, Any]] = {
+    'launch': {'LaunchDescription': list},
+    'launch.actions': {'DeclareLaunchArgument': keep, 'GroupAction': list},
+    'launch.conditions': {
+        'IfCondition': lambda of: of if callable(of) else lambda given: given[of.name] == 'true',
+        'UnlessCondition': lambda of: lambda given: given[of.name] != 'true',
+    },
+    'launch.substitutions': {
+        'LaunchConfiguration': Configuration,
+        'EqualsSubstitution': lambda a, b: lambda given: given[a.name] == b,
+        'NotEqualsSubstitution': lambda a, b: lambda given: given[a.name] != b,
+    },
+    'launch_ros': {},
+    'launch_ros.actions': {'Node': keep, 'SetParameter': keep, 'SetParametersFromFile': keep},
+    'launch_ros.parameter_descriptions': {'ParameterValue': lambda value, value_type: (value.name, value_type)},
+    'launch_ros.substitutions': {'FindPackageShare': keep},
+}
+
+
+class Launched:
+    """What a launch file declares, and what it starts with the arguments that are given."""
+
+    def __init__(self, names: dict[str, Any]) -> None:
+        self.names = names
+        self._parts = names['generate_launch_description']()
+        declared = [part for part in self._parts if not isinstance(part, list)]
+        assert all(part.description for part in declared)
+        self.arguments = {part.words[0] for part in declared}
+
+    def start(self, **given: str) -> tuple[list[Any], Any]:
+        """What is set before the node, and the node."""
+        values = {**dict.fromkeys(self.arguments, ''), **given}
+        (group,) = (part for part in self._parts if isinstance(part, list))
+        *before, node = [part for part in group if part.condition(values)]
+        return [part.words for part in before], node
+
+    def check_types(self, declared: dict[str, Parameter]) -> None:
+        """Every argument that is a parameter of the node has its type."""
+        for name, (kind, text) in self.names['PARAMETERS'].items():
+            assert KINDS[declared[name].kind] is kind, name
+            assert text, name
+            before, _ = self.start(**{name: '1'})
+            assert before == [(name, (name, kind))]
 
 
 @pytest.fixture
-def launch_modules(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stand-ins for launch and launch_ros that keep their arguments."""
-
-    def keep(*words: object, **named: object) -> SimpleNamespace:
-        return SimpleNamespace(words=words, **named)
-
-    modules: dict[str, dict[str, Any]] = {
-        'launch': {'LaunchContext': object, 'LaunchDescription': list},
-        'launch.actions': {'DeclareLaunchArgument': keep, 'OpaqueFunction': keep},
-        'launch.substitutions': {'LaunchConfiguration': Configuration},
-        'launch_ros': {},
-        'launch_ros.actions': {'Node': keep},
-        'launch_ros.parameter_descriptions': {'ParameterValue': lambda value, value_type: (value.name, value_type)},
-        'launch_ros.substitutions': {'FindPackageShare': keep},
-    }
-    for module, names in modules.items():
+def launched(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> Launched:
+    for module, names in STAND_INS.items():
         made = ModuleType(module)
         vars(made).update(names)
         monkeypatch.setitem(sys.modules, module, made)
+    return Launched(runpy.run_path(str(LAUNCH / f'{request.param}.launch.py')))
 
 
-@pytest.fixture
-def launch_file(launch_modules: None) -> dict[str, Any]:
-    """The names of the estimator's launch file."""
-    return runpy.run_path(str(FILE))
+def of(name: str) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize('launched', [name], indirect=True)
 
 
-def test_every_argument_is_a_parameter_of_its_type(launch_file: dict[str, Any]) -> None:
-    arguments = launch_file['PARAMETERS']
-    assert {'port', 'solver', 'autostart', 'record', 'frame_prefix', 'publish_tf'} <= arguments.keys()
-    for name, (kind, text) in arguments.items():
-        assert KINDS[BY_NAME[name].kind] is kind, name
-        assert text, name
-
-
-def test_what_is_given_reaches_the_node_and_nothing_else_does(launch_file: dict[str, Any]) -> None:
-    declared = {a.words[0]: a for a in launch_file['generate_launch_description']() if hasattr(a, 'description')}
-    assert {'params_file', 'namespace', 'log_level', *launch_file['PARAMETERS']} == declared.keys()
-    assert all(a.description for a in declared.values())
-    context = dict.fromkeys(declared, '')
-    (plain,) = launch_file['estimator'](context)
-    assert plain.parameters == []
-    given = {'solver': 'wls', 'autostart': 'false'}
-    (node,) = launch_file['estimator']({**context, **given})
-    assert node.parameters == [{'solver': ('solver', str), 'autostart': ('autostart', bool)}]
+@of('estimator')
+def test_arguments_reach_the_estimator_and_nothing_else_does(launched: Launched) -> None:
+    assert {'params_file', 'namespace', 'log_level', *launched.names['PARAMETERS']} == launched.arguments
+    assert {'port', 'solver', 'autostart', 'record', 'frame_prefix', 'publish_tf'} <= launched.arguments
+    launched.check_types(BY_NAME)
+    before, node = launched.start()
+    assert before == []
     assert node.namespace.name == 'namespace'
     assert [w if isinstance(w, str) else w.name for w in node.ros_arguments] == [
         *('--params-file', 'params_file'),
@@ -85,47 +106,44 @@ def test_what_is_given_reaches_the_node_and_nothing_else_does(launch_file: dict[
     ]
 
 
-def test_the_chain_is_launched_with_its_file(launch_modules: None) -> None:
-    names = runpy.run_path(str(LAUNCH / 'chain.launch.py'))
-    declared = {a.words[0]: a for a in names['generate_launch_description']() if hasattr(a, 'description')}
-    assert declared.keys() == {'chain', *names['ARGUMENTS']}
-    assert all(a.description for a in declared.values())
-    (plain,) = names['chain'](dict.fromkeys(declared, ''))
-    assert [a.name for a in plain.arguments] == ['chain']
-    (node,) = names['chain'](dict.fromkeys(declared, '') | {'slopes': 'end_force', 'record': 'bags'})
-    assert node.arguments[1:] == ['--slopes', 'end_force', '--record', 'bags']
+def told(node: Any) -> list[str]:
+    return [w if isinstance(w, str) else w.name for w in node.arguments]
+
+
+@of('chain')
+def test_the_chain_is_launched_with_its_file(launched: Launched) -> None:
+    assert launched.arguments == {'chain', *launched.names['ARGUMENTS']}
+    before, node = launched.start()
+    assert (before, told(node)) == ([], ['chain'])
     assert (node.executable, node.namespace.name) == ('chain', 'namespace')
+    before, node = launched.start(slopes='end_force', record='bags')
+    assert told(node) == ['chain', '--record', 'record']
+    ((name, value),) = before
+    assert name in chain_file.SETTINGS.parameters
+    assert value.name == 'slopes'
 
 
-def test_the_shaper_is_launched_with_its_options(launch_modules: None) -> None:
-    names = runpy.run_path(str(LAUNCH / 'shaper.launch.py'))
-    declared = {a.words[0]: a for a in names['generate_launch_description']() if hasattr(a, 'description')}
-    assert declared.keys() == {'namespace', *names['ARGUMENTS'], *names['TOPICS']}
-    assert all(a.description for a in declared.values())
-    options = make_parser(['shaper']).parse_args(['shaper'])
-    assert set(names['ARGUMENTS']) <= vars(options).keys()
-    (node,) = names['shaper'](dict.fromkeys(declared, '') | {'frequency': '14', 'damping_ratio': '0.02'})
-    assert node.arguments == ['--frequency', '14', '--damping-ratio', '0.02']
+@of('shaper')
+def test_arguments_reach_the_shaper(launched: Launched) -> None:
+    assert launched.arguments == {'namespace', *launched.names['PARAMETERS'], *launched.names['TOPICS']}
+    launched.check_types(shaping.SHAPING.parameters)
+    _, node = launched.start()
     assert [(a, b.name) for a, b in node.remappings] == [('~/trajectory', 'given'), ('~/shaped', 'shaped')]
 
 
-def test_the_compensator_is_launched_with_its_options(launch_modules: None) -> None:
-    names = runpy.run_path(str(LAUNCH / 'compensator.launch.py'))
-    declared = {a.words[0]: a for a in names['generate_launch_description']() if hasattr(a, 'description')}
-    topics = [names['TOPIC_OF'].get(name, name) for name in names['TOPICS']]
-    assert declared.keys() == {'namespace', 'drive', 'params_file', *names['ARGUMENTS'], *topics}
-    assert all(a.description for a in declared.values())
-    options = make_parser(['compensator']).parse_args(['compensator', 'arm.urdf', '--tip', 'tool'])
-    assert set(names['ARGUMENTS']) <= vars(options).keys()
-    given = {'urdf': 'arm.urdf', 'tip': 'tool', 'drive': 'true', 'max_rate': '0.05', 'params_file': 'p.yaml'}
-    (node,) = names['compensator'](dict.fromkeys(declared, '') | given)
-    assert node.arguments == ['arm.urdf', '--tip', 'tool', '--max-rate', '0.05', '--drive']
-    assert node.parameters == ['p.yaml']
-    assert [(a, b.name) for a, b in node.remappings] == [
-        (f'~/{name}', topic) for name, topic in zip(names['TOPICS'], topics, strict=True)
-    ]
-    (dry,) = names['compensator'](dict.fromkeys(declared, '') | {'urdf': 'arm.urdf', 'tip': 'tool'})
-    assert dry.arguments == ['arm.urdf', '--tip', 'tool']
+@of('compensator')
+def test_arguments_reach_the_compensator(launched: Launched) -> None:
+    topics = {launched.names['TOPIC_OF'].get(name, name) for name in launched.names['TOPICS']}
+    assert launched.arguments == {'tip', 'namespace', 'drive', 'params_file', *launched.names['PARAMETERS'], *topics}
+    launched.check_types(settings.SETTINGS.parameters)
+    before, node = launched.start(drive='true', params_file='p.yaml')
+    assert [words[0].name for words in before] == ['params_file']
+    assert told(node) == ['--tip', 'tip', '--drive']
+    assert {(a, b.name) for a, b in node.remappings} == {
+        (f'~/{name}', launched.names['TOPIC_OF'].get(name, name)) for name in launched.names['TOPICS']
+    }
+    before, node = launched.start(drive='false')
+    assert (before, told(node)) == ([], ['--tip', 'tip'])
 
 
 @pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 launch comes with a ROS installation')
