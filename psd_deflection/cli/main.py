@@ -3,7 +3,9 @@
 """``psd-deflection``: finds the command and turns our errors into one line and an exit status.
 
 Each command is a module of this package with ``add_arguments(parser)`` and ``run(args) -> int``; it is
-imported only when it is asked for, so that ``--help`` stays quick. Its docstring is its help.
+imported only when it is asked for, so that ``--help`` stays quick. Its docstring is its help. Another package adds such
+a module by an entry point of the group ``psd_deflection.commands``, or a study, a function of
+``psd_deflection.studies.study.Opened`` that returns a ``StudyResult``, by one of ``psd_deflection.studies``.
 """
 
 from __future__ import annotations
@@ -20,14 +22,16 @@ import signal
 import sys
 import textwrap
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import ModuleType
+from types import MappingProxyType, ModuleType
+from typing import TYPE_CHECKING, Any
 
 from psd_deflection import __version__
 from psd_deflection.base.errors import (
     EXIT_STATUSES,
     INTERRUPTED,
+    ConfigError,
     MachineError,
     PsdDeflectionError,
     RecordingError,
@@ -35,9 +39,13 @@ from psd_deflection.base.errors import (
     UsageError,
 )
 from psd_deflection.base.optional import not_installed
+from psd_deflection.base.plugins import loaded
 from psd_deflection.base.printable import printable
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.cli._report import LONGEST_LINE
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 # Our matrices are small, or tall and narrow: more threads spin more than they compute. Before numpy is imported.
 os.environ.setdefault('OMP_NUM_THREADS', '1')
@@ -76,18 +84,18 @@ COMMANDS: dict[str, str] = {
 }
 """Command name to one-line summary; the module is ``NAME.py`` (``-`` as ``_``) in ``cli`` or one of ``FOLDERS``."""
 
-OLDER_NAMES: dict[str, tuple[str, ...]] = {'compare-methods': ('thesis', 'compare-methods')}
-"""What commands were called once, which still works and is listed nowhere, and what they are called now."""
-
 GROUPS: dict[str, tuple[str, ...]] = {
-    'run: measure, look on, note': ('estimator', 'monitor', 'chain', 'echo', 'zero', 'load', 'mark', 'record'),
-    'rig: describe it, wire it, know what to expect': ('devices', 'check', 'params', 'design', 'budget'),
-    'recording: compute again, draw, convert': ('replay', 'plot', 'info', 'convert', 'recover'),
-    'truth: an independent measurement': ('camera', 'validate', 'calibrate', 'certificate'),
-    'model: simulate, find what is missing': ('simulate', 'discover', 'effects', 'thesis'),
-    'motion: what rings, and an arm that moves': ('identify', 'compensator', 'shaper'),
+    'run': ('estimator', 'monitor', 'chain', 'echo', 'zero', 'load', 'mark', 'record'),
+    'rig': ('devices', 'check', 'params', 'design', 'budget'),
+    'recording': ('replay', 'plot', 'info', 'convert', 'recover'),
+    'truth': ('camera', 'validate', 'calibrate', 'certificate'),
+    'model': ('simulate', 'discover', 'effects', 'thesis'),
+    'motion': ('identify', 'compensator', 'shaper'),
 }
 """Commands by what one wants to do, in the order of the help; those of no group come last."""
+
+PLUG_INS = ('psd_deflection.commands', 'psd_deflection.studies')
+"""Groups of entry points by which other packages add a command: a module, or the function of a study."""
 
 FOLDERS = ('run', 'recordings', 'studies')
 """Where commands lie, beside ``cli`` itself."""
@@ -95,14 +103,15 @@ FOLDERS = ('run', 'recordings', 'studies')
 ROS_OPTIONS = ('-p', '--param', '-r', '--remap')
 """What ROS 2 takes behind --ros-args and people type without it."""
 
-EPILOG = """\
-where to begin:
-  psd-deflection estimator                    try it without hardware
-  psd-deflection replay RECORDING --compare   compute it again, compare
-  psd-deflection COMMAND --help               options and examples of a command
+STATUS_WORDS = ('done', 'differs', 'command line', 'parameter or package', 'recording', 'device', 'geometry', 'daemon')
+STATUS_WORDS += ('some failed', 'samples dropped', 'machine', 'Ctrl-C')
+"""Each exit status in two words, in the order of ``EXIT_STATUSES``."""
 
-exit status:
-""" + '\n'.join(f'  {status:<5}{meaning}' for status, meaning in EXIT_STATUSES.items())
+EPILOG = """\
+  psd-deflection estimator --demo    try it without hardware
+  psd-deflection COMMAND --help      what a command does, its options, examples
+
+exit status: """ + ', '.join(f'{n} {words}' for n, words in zip(EXIT_STATUSES, STATUS_WORDS, strict=True))
 
 _NEGATIVE = re.compile(r'^-[\d.][\d.,eE+-]*$')
 _WIDEST = 100
@@ -120,18 +129,20 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 
     def _format_action(self, action: argparse.Action) -> str:
         """The commands in their groups; everything else as argparse has it."""
-        subactions = {sub.dest: sub for sub in self._iter_indented_subactions(action)}
-        if not subactions:
+        names = [sub.dest for sub in self._iter_indented_subactions(action)]
+        if not names:
             return super()._format_action(action)
-        grouped = {name for names in GROUPS.values() for name in names}
-        parts = []
-        for title, names in (*GROUPS.items(), ('shell', tuple(name for name in subactions if name not in grouped))):
-            parts.append(f'\n  {title}\n')
-            self._indent()
-            for name in names:
-                parts.append(super()._format_action(subactions[name]))
-            self._dedent()
-        return ''.join(parts)
+        grouped = {name for group in GROUPS.values() for name in group}
+        others = {
+            'shell': [name for name in names if name in COMMANDS and name not in grouped],
+            'plug-ins': [name for name in names if name not in COMMANDS],
+        }
+        wide = max(map(len, GROUPS)) + 4
+        lines = [(f'  {title}'.ljust(wide), group) for title, group in {**GROUPS, **others}.items() if group]
+        return ''.join(
+            textwrap.fill(', '.join(g), self._width, initial_indent=t, subsequent_indent=' ' * wide) + '\n'
+            for t, g in lines
+        )
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         out = []
@@ -145,24 +156,39 @@ class _Help(argparse.RawDescriptionHelpFormatter):
         return '\n'.join(out)
 
 
-def make_parser(chosen: Collection[str], value: type[argparse.Action] | None = None) -> argparse.ArgumentParser:
-    """The parser of all commands; only the ``chosen`` ones have arguments, so that other modules are not imported."""
+def plugged_in() -> dict[str, EntryPoint]:
+    """The commands of other packages by their names; one that has the name of ours is left out."""
+    from importlib.metadata import entry_points
+
+    found = (point for group in PLUG_INS for point in entry_points(group=group))
+    return {point.name: point for point in sorted(found, key=lambda p: p.name) if point.name not in COMMANDS}
+
+
+def make_parser(
+    chosen: Collection[str],
+    value: type[argparse.Action] | None = None,
+    others: Mapping[str, EntryPoint] = MappingProxyType({}),
+) -> argparse.ArgumentParser:
+    """The parser of all commands; only the ``chosen`` ones have arguments, so that other modules are not imported.
+
+    ``others``: see :func:`plugged_in`. Raises ConfigError if one that is chosen cannot be loaded.
+    """
     parser = argparse.ArgumentParser(
         prog='psd-deflection',
-        description='Tip deflection and twist of a flexible link from two position sensing detectors.',
+        description='Tip deflection and twist of a flexible link from position sensing detectors.',
         epilog=EPILOG,
         formatter_class=_Help,
     )
     parser.add_argument('--version', action='version', version=f'psd-deflection {__version__}')
     commands = parser.add_subparsers(title='commands', dest='command', metavar='COMMAND', required=True)
-    for name, summary in COMMANDS.items():
+    for name, summary in {**COMMANDS, **{name: f'of {point.value}' for name, point in others.items()}}.items():
         sub = commands.add_parser(name, help=summary, description=summary, formatter_class=_Help)
         # `-5,20` and `-2.9e1` are values, which argparse takes for options; it has no public way to be told.
         sub._negative_number_matcher = _NEGATIVE  # noqa: SLF001
         if value is not None:
             sub.register('action', None, value)
         if name in chosen:
-            module = module_of(name)
+            module = _plug_in(others[name]) if name in others else module_of(name)
             sub.description = module.__doc__
             module.add_arguments(sub)
             options = tuple(sub._option_string_actions)  # noqa: SLF001
@@ -181,6 +207,19 @@ def module_of(name: str) -> ModuleType:
             if error.name != path:
                 raise
     return importlib.import_module(f'psd_deflection.cli.{file}')
+
+
+def _plug_in(point: EntryPoint) -> Any:
+    """The command of another package. Raises ConfigError if it cannot be loaded or is none."""
+    at = f'command {point.name!r}: {point.value}'
+    found: Any = loaded(f'{at} cannot be loaded', point.load)
+    if point.group == 'psd_deflection.studies' and callable(found):
+        from psd_deflection.cli.studies._answer import study_command
+
+        return study_command(found)
+    if not (callable(getattr(found, 'add_arguments', None)) and callable(getattr(found, 'run', None))):
+        raise ConfigError(f'{at}: has no add_arguments(parser) and run(args)')
+    return found
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -247,17 +286,22 @@ def _discard_output() -> None:
 
 
 def _run(argv: list[str]) -> int:
-    argv = _renamed(argv)
     chosen = [a for a in argv if a and not a.startswith('-')][:1]
     # `ros2 run` and `ros2 launch` add arguments for rclpy, which argparse must not see.
     own, ros_arguments = _split_ros_arguments(argv)
     try:
         _refuse_empty(own)
-        if chosen and chosen[0] not in COMMANDS:
-            hint = did_you_mean(chosen[0], COMMANDS) or '; `psd-deflection --help` lists them'
+        # Looked for only if they may be meant: it takes longer than a short command of ours.
+        others = {} if chosen and chosen[0] in COMMANDS else plugged_in()
+        if chosen and chosen[0] not in {*COMMANDS, *others}:
+            hint = did_you_mean(chosen[0], {*COMMANDS, *others}) or '; `psd-deflection --help` lists them'
             raise UsageError(f'no command {chosen.pop()!r}{hint}')
-        args, unknown = make_parser(chosen).parse_known_args(own)
-    except UsageError as error:
+        parser = make_parser(chosen, others=others)
+        if not argv:
+            parser.print_help()
+            return 0
+        args, unknown = parser.parse_known_args(own)
+    except (UsageError, ConfigError) as error:
         _tell(f'{" ".join(["psd-deflection", *chosen])}: {error}')
         return error.exit_status
     if unknown:
@@ -288,12 +332,6 @@ def _run(argv: list[str]) -> int:
         aside = set_aside(Path(out)) if out is not None and fresh else ''
         _tell(f'psd-deflection {args.command}: {error}{aside}')
         return error.exit_status
-
-
-def _renamed(argv: list[str]) -> list[str]:
-    """``argv`` with today's name of its command."""
-    at = next((n for n, a in enumerate(argv) if a and not a.startswith('-')), len(argv))
-    return [*argv[:at], *OLDER_NAMES.get(argv[at], argv[at : at + 1]), *argv[at + 1 :]] if at < len(argv) else argv
 
 
 @contextlib.contextmanager

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A command joins by its module and one line of ``COMMANDS``, as docs/extending.md says."""
+"""Another package adds a command and a study: `psd-deflection NAME` runs them."""
 
 from __future__ import annotations
 
@@ -8,52 +8,94 @@ from pathlib import Path
 
 import pytest
 
-import psd_deflection.cli
 from psd_deflection.cli.main import COMMANDS, main
-from tools import hooks
+from test.plug_in import install_plug_in
 
-MODULE = '''"""Print the square of a number.
+BAGS = Path(__file__).parent.parent.parent / 'bags'
+CODE = """
+'''Count the letters of a word.'''
 
-  psd-deflection made-up --size 3
-"""
 
-from psd_deflection.base.errors import ConfigError
+from psd_deflection.studies.study import StudyResult
 
 
 def add_arguments(parser):
-    parser.add_argument('--size', type=float, metavar='SIZE', required=True, help='what is squared')
+    parser.add_argument('word')
 
 
 def run(args):
-    if args.size < 0:
-        raise ConfigError(f'--size = {args.size}: must be at least 0')
-    print(args.size**2)
+    print(len(args.word))
     return 0
-'''
+
+
+class Length(StudyResult):
+    study, title, json_name = 'length', 'How long', 'length.json'
+
+    def __init__(self, seconds):
+        self.seconds = seconds
+
+    def tree(self):
+        return {'length': self.seconds}
+
+    def sentences(self):
+        return [f'{self.seconds:.2f} s of samples.']
+
+    def sections(self):
+        return []
+
+    def table(self):
+        raise NotImplementedError
+
+
+def length(opened):
+    '''Measure how long a recording is.'''
+    blocks = list(opened.recording.blocks())
+    return Length((blocks[-1].t_ns[-1] - blocks[0].t_ns[0]) / 1e9)
+"""
+POINTS = """
+[psd_deflection.commands]
+letters = my_package.extra
+absent = my_package.nowhere
+hollow = my_package
+
+[psd_deflection.studies]
+length = my_package.extra:length
+"""
 
 
 @pytest.fixture(autouse=True)
-def made_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / 'made_up.py').write_text(MODULE)
-    monkeypatch.setattr(psd_deflection.cli, '__path__', [*psd_deflection.cli.__path__, str(tmp_path)])
-    monkeypatch.setitem(COMMANDS, 'made-up', 'print the square of a number')
+def added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    install_plug_in(tmp_path, monkeypatch, 'extra', CODE, POINTS)
 
 
-def test_it_runs_and_its_errors_have_a_status(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(['made-up', '--size', '3']) == 0
-    assert capsys.readouterr().out == '9.0\n'
-    assert main(['made-up', '--size', '-3e0']) == 3
-    assert capsys.readouterr().err == 'psd-deflection made-up: --size = -3.0: must be at least 0\n'
-    with pytest.raises(SystemExit) as usage:
-        main(['made-up', '--sise', '3'])
-    assert usage.value.code == 2
-    assert '--size' in capsys.readouterr().err
+def test_a_command_of_another_package_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(['letters', 'tip']) == 0
+    assert capsys.readouterr().out == '3\n'
 
 
-def test_help_site_and_completion_know_it(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(['--help'])
-    assert 'print the square of a number' in capsys.readouterr().out
-    assert 'usage: psd-deflection made-up' in hooks.command_help()
-    assert main(['completion', 'bash']) == 0
-    assert 'made-up' in capsys.readouterr().out
+def test_a_study_of_another_package_answers_and_writes_its_page(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(['length', str(BAGS / 'clean'), '--out', str(tmp_path / 'out')]) == 0
+    assert ' s of samples.' in capsys.readouterr().out
+    assert sorted(p.name for p in (tmp_path / 'out').iterdir()) == ['length.json', 'report.html']
+
+
+def test_help_lists_what_is_added_and_of_which_package(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert '\n  plug-ins   absent, hollow, length, letters\n' in capsys.readouterr().out
+
+
+@pytest.mark.parametrize('name', ['absent', 'hollow'])
+def test_an_added_command_that_is_none_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([name]) == 3
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"command '{name}': my_package" in line
+
+
+def test_a_command_of_ours_cannot_be_replaced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    points = tmp_path / 'my_package-1.0.dist-info' / 'entry_points.txt'
+    points.write_text('[psd_deflection.commands]\ninfo = my_package.extra\n')
+    assert main([]) == 0
+    assert 'plug-ins' not in capsys.readouterr().out
+    assert 'info' in COMMANDS

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.base.errors import EXIT_STATUSES
-from psd_deflection.cli.main import COMMANDS, GROUPS, OLDER_NAMES, main, make_parser
+from psd_deflection.cli.main import COMMANDS, GROUPS, main, make_parser
 from psd_deflection.cli.params import NEEDED
 
 ROOT = Path(__file__).parent.parent.parent
@@ -63,20 +63,28 @@ def test_it_is_no_wider_than_the_terminal(
 
 
 def test_it_tells_the_exit_statuses(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    text = help_of('', capsys, monkeypatch, 80)
-    told = re.findall(r'^  (\d+) +\S', text[text.index('exit status:') :], re.MULTILINE)
+    text = ' '.join(help_of('', capsys, monkeypatch, 80).split())
+    told = re.findall(r'(\d+) [a-zC]', text.partition('exit status: ')[2])
     assert [int(status) for status in told] == list(EXIT_STATUSES)
 
 
-def test_every_command_is_in_one_group(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    grouped = [name for names in GROUPS.values() for name in names]
-    assert sorted([*grouped, 'completion']) == sorted(COMMANDS)
+def test_help_fits_one_screen_with_each_command_in_one_group(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = help_of('', capsys, monkeypatch, 80)
-    listed = re.findall(r'^ {4}([a-z-]+)(?: |$)', text[text.index('commands:') : text.index('where to begin')], re.M)
-    assert listed == [*grouped, 'completion']
-    assert [text.index(f'\n  {title}\n') for title in GROUPS] == sorted(
-        text.index(f'\n  {title}\n') for title in GROUPS
-    )
+    assert len(text.splitlines()) < 24
+    listed = re.findall(r'^  ([a-z]+) +([a-z-]+(?:, [a-z-]+)*)$', text, re.M)
+    assert [(title, tuple(names.split(', '))) for title, names in listed] == [
+        *GROUPS.items(),
+        ('shell', ('completion',)),
+    ]
+    assert sorted(name for _, names in listed for name in names.split(', ')) == sorted(COMMANDS)
+
+
+def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    told = help_of('', capsys, monkeypatch, 80)
+    assert main([]) == 0
+    assert capsys.readouterr().out == told
 
 
 def test_the_short_list_of_parameters_is_short(capsys: pytest.CaptureFixture[str]) -> None:
@@ -85,18 +93,6 @@ def test_the_short_list_of_parameters_is_short(capsys: pytest.CaptureFixture[str
     assert set(named) == set(NEEDED)
     assert main(['params', '--short', '--json']) == 0
     assert set(json.loads(capsys.readouterr().out)) == set(NEEDED)
-
-
-def test_an_older_name_of_a_command_works_and_is_listed_nowhere(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert 'compare-methods' not in help_of('', capsys, monkeypatch, 80)
-    for older, now in OLDER_NAMES.items():
-        assert older not in COMMANDS
-        assert main([*now, '--json']) == 0
-        said = capsys.readouterr().out
-        assert main([older, '--json']) == 0
-        assert capsys.readouterr().out == said
 
 
 def options_of(command: str) -> set[str]:

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from psd_deflection.cli.main import COMMANDS, make_parser
+from psd_deflection.rig.declarations import BY_NAME
 from tools.program import ROOT
 
 UNIT = ROOT / 'docs' / 'deploy' / 'psd-deflection.service'
@@ -52,7 +53,10 @@ def test_the_unit_asks_for_what_the_daemon_uses() -> None:
     program, command, *arguments = service['ExecStart'].split()
     assert program.endswith('/psd-deflection')
     assert command in COMMANDS
-    make_parser([command]).parse_args([command, *arguments])
+    ours = arguments[: arguments.index('--ros-args')]
+    make_parser([command]).parse_args([command, *ours])
+    assert arguments[len(ours) :] == ['--ros-args', '-p', 'realtime:=true']
+    assert not BY_NAME['realtime'].default
 
 
 def test_the_paths_of_the_unit_are_those_that_the_page_makes() -> None:

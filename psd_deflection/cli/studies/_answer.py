@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable
+from types import SimpleNamespace
 
 from psd_deflection.cli._options import make_writable, namespace_option, span_options
 from psd_deflection.cli._progress import progress_of, told
@@ -53,6 +54,19 @@ def answer(args: argparse.Namespace, result: StudyResult) -> int:
         *others, last = files
         show(f'wrote {", ".join(others)} and {last} into {folder}', aside=args.json)
     return 0
+
+
+def study_command(study: Callable[[Opened], StudyResult]) -> SimpleNamespace:
+    """The command of a study of another package: its docstring is the help, a recording with its rig its input."""
+
+    def add_arguments(parser: argparse.ArgumentParser) -> None:
+        recording_arguments(parser)
+        answer_arguments(parser, 'the answer as page and JSON')
+
+    def run(args: argparse.Namespace) -> int:
+        return answer(args, study(opened_recording(args)))
+
+    return SimpleNamespace(add_arguments=add_arguments, run=run, __doc__=study.__doc__)
 
 
 def print_answer(args: argparse.Namespace, result: StudyResult) -> None:
