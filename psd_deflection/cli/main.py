@@ -325,13 +325,13 @@ def _run(argv: list[str]) -> int:
         # The others are done, and their output is complete.
         _tell(f'psd-deflection {args.command}: {error}')
         return error.exit_status
-    except (PsdDeflectionError, ModuleNotFoundError) as raised:
-        error = not_installed(raised) if isinstance(raised, ModuleNotFoundError) else raised
-        if error is None:
+    except (PsdDeflectionError, ModuleNotFoundError) as error:
+        refused = not_installed(error) if isinstance(error, ModuleNotFoundError) else error
+        if refused is None:
             raise
         aside = set_aside(Path(out)) if out is not None and fresh else ''
-        _tell(f'psd-deflection {args.command}: {error}{aside}')
-        return error.exit_status
+        _tell(f'psd-deflection {args.command}: {refused}{aside}')
+        return refused.exit_status
 
 
 @contextlib.contextmanager
