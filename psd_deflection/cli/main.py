@@ -103,8 +103,10 @@ FOLDERS = ('run', 'recordings', 'studies')
 ROS_OPTIONS = ('-p', '--param', '-r', '--remap')
 """What ROS 2 takes behind --ros-args and people type without it."""
 
-STATUS_WORDS = ('done', 'differs', 'command line', 'parameter or package', 'recording', 'device', 'geometry', 'daemon')
-STATUS_WORDS += ('some failed', 'samples dropped', 'machine', 'Ctrl-C')
+STATUS_WORDS = (
+    *('done', 'differs', 'command line', 'parameter or package', 'recording', 'device', 'geometry', 'daemon'),
+    *('some failed', 'samples dropped', 'machine', 'Ctrl-C'),
+)
 """Each exit status in two words, in the order of ``EXIT_STATUSES``."""
 
 EPILOG = """\

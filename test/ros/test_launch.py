@@ -8,6 +8,7 @@ import runpy
 import shutil
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ import pytest
 
 from psd_deflection.arms.chains import chain_file
 from psd_deflection.arms.compensation import settings, shaping
-from psd_deflection.rig.declarations import BY_NAME, Parameter
+from psd_deflection.rig.declarations import BY_NAME
 
 LAUNCH = Path(__file__).parent.parent.parent / 'launch'
 FILE = LAUNCH / 'estimator.launch.py'
@@ -70,7 +71,7 @@ class Launched:
         *before, node = [part for part in group if part.condition(values)]
         return [part.words for part in before], node
 
-    def check_types(self, declared: dict[str, Parameter]) -> None:
+    def check_types(self, declared: Mapping[str, Any]) -> None:
         """Every argument that is a parameter of the node has its type."""
         for name, (kind, text) in self.names['PARAMETERS'].items():
             assert KINDS[declared[name].kind] is kind, name
