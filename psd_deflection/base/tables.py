@@ -15,6 +15,7 @@ import numpy.typing as npt
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.printable import printable
+from psd_deflection.base.spelling import did_you_mean
 
 if TYPE_CHECKING:
     import pandas
@@ -57,12 +58,24 @@ class Table:
     columns: Sequence[Column]
     attributes: Mapping[str, object] = field(default_factory=dict)
 
-    def to_pandas(self) -> pandas.DataFrame:
+    def column(self, name: str) -> npt.NDArray[Any]:
+        """The values of a column, or of the index. Raises KeyError with the names that there are."""
+        for one in (self.index, *self.columns):
+            if one.name == name:
+                return one.values
+        names = [one.name for one in (self.index, *self.columns)]
+        raise KeyError(f'no column {name!r}{did_you_mean(name, names)}; there are {", ".join(names)}')
+
+    def to_pandas(self, *, clock: bool = False) -> pandas.DataFrame:
         """The columns over the index; ``.attrs['units']`` has the unit of each by name.
 
+        ``clock``: over the times of the column ``t_ns`` (UTC) instead.
         Raises ConfigError if pandas is not installed.
         """
         pd = _library('pandas')
+        if clock:
+            times = pd.to_datetime(self.column('t_ns'), unit='ns', utc=True).rename('time')
+            return self.to_pandas().set_index(times)
         frame = pd.DataFrame(
             {c.name: np.ascontiguousarray(c.values) for c in self.columns},
             index=pd.Index(self.index.values, name=self.index.name),

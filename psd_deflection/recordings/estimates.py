@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -64,8 +64,19 @@ class EstimateSeries:
     def __len__(self) -> int:
         return len(self.t_ns)
 
-    def __getitem__(self, part: slice) -> EstimateSeries:
-        """Those of a part of time: ``estimates[1.0:2.0]``, s; times stay as they are."""
+    @overload
+    def __getitem__(self, part: str) -> npt.NDArray[Any]: ...
+
+    @overload
+    def __getitem__(self, part: slice) -> EstimateSeries: ...
+
+    def __getitem__(self, part: str | slice) -> npt.NDArray[Any] | EstimateSeries:
+        """Those of a part of time, ``estimates[1.0:2.0]``, s, whose times stay as they are; or a column of the table.
+
+        Raises KeyError for a column that is not there.
+        """
+        if isinstance(part, str):
+            return self.table().column(part)
         if not isinstance(part, slice) or part.step is not None:
             raise ConfigError(f'estimates[{part!r}]: must be a part of time, as estimates[1.0:2.0]')
         t = self.t
@@ -126,12 +137,17 @@ class EstimateSeries:
             columns.append(Column('chi_square', self.chi_square, '', 'of the one redundant reading'))
         return Table(Column('t', self.t, 's', 'time'), columns, {'topic': self.topic})
 
-    def to_pandas(self) -> pandas.DataFrame:
-        """One row an estimate over ``t`` (s); ``.attrs['units']`` has the units.
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last estimate."""
+        return float(self.t_ns[-1] - self.t_ns[0]) * 1e-9 if len(self) else 0.0
+
+    def to_pandas(self, *, clock: bool = False) -> pandas.DataFrame:
+        """One row an estimate over ``t`` (s), or over the time of day in UTC if ``clock``; ``.attrs['units']``: units.
 
         Raises ConfigError if pandas is not installed.
         """
-        return self.table().to_pandas()
+        return self.table().to_pandas(clock=clock)
 
     def to_xarray(self) -> xarray.Dataset:
         """One variable a quantity over ``t`` (s), with ``units`` and ``long_name``.
@@ -150,7 +166,7 @@ class EstimateSeries:
     def _summary(self) -> list[tuple[str, str]]:
         rows = [('estimates', str(len(self)))]
         if len(self):
-            rows.append(('duration', f'{(self.t_ns[-1] - self.t_ns[0]) * 1e-9:.2f} s'))
+            rows.append(('duration', f'{self.duration:.2f} s'))
             rows += ranges(self.pose)
         return rows
 

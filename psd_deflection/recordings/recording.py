@@ -9,8 +9,9 @@ import copy
 import functools
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +51,8 @@ if TYPE_CHECKING:
 
 DEFAULT_BLOCK_SIZE = 20
 LONGEST_REPR = 2000
+EPOCH_FROM_NS = 10**18
+"""September 2001; smaller times do not count from the epoch."""
 
 Held = TypeVar('Held', AppliedLoad, TemperatureReading)
 
@@ -121,8 +124,38 @@ class Recording(abc.ABC):
         """
         return RecordingWindow(self, first, last)
 
-    def __getitem__(self, part: slice) -> Recording:
-        """``recording[2.0:5.0]`` is ``recording.crop(2.0, 5.0)``."""
+    def __len__(self) -> int:
+        """Number of samples."""
+        return len(self.samples)
+
+    def __bool__(self) -> bool:
+        """True: it is there, and need not be read for that."""
+        return True
+
+    @property
+    def start(self) -> datetime | None:
+        """The time of the first sample, UTC; None if its times do not count from the epoch."""
+        first_ns = int(self.samples['t_ns'][0])
+        return datetime.fromtimestamp(first_ns / 1e9, UTC) if first_ns >= EPOCH_FROM_NS else None
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first to the last sample, by their stamps."""
+        return float(self.samples['t'][-1])
+
+    @overload
+    def __getitem__(self, part: str) -> npt.NDArray[Any]: ...
+
+    @overload
+    def __getitem__(self, part: slice) -> Recording: ...
+
+    def __getitem__(self, part: str | slice) -> npt.NDArray[Any] | Recording:
+        """``recording[2.0:5.0]`` is ``recording.crop(2.0, 5.0)``; ``recording['x1']`` a column of its table.
+
+        Raises KeyError for a column that is not there.
+        """
+        if isinstance(part, str):
+            return self._table().column(part)
         if not isinstance(part, slice) or part.step is not None:
             raise ConfigError(f'recording[{part!r}]: must be a part of time, as recording[2.0:5.0]')
         return self.crop(part.start, part.stop)
@@ -277,14 +310,14 @@ class Recording(abc.ABC):
         beside = (self.loads(), self.temperatures(), self.references())
         return samples_table(self.samples, self.psds, *beside, str(self.path))
 
-    def to_pandas(self) -> pandas.DataFrame:
-        """One row a sample over ``t`` (s), in volts, with the columns of a CSV recording.
+    def to_pandas(self, *, clock: bool = False) -> pandas.DataFrame:
+        """One row a sample, in volts, with the columns of a CSV, over ``t`` (s), or over the UTC if ``clock``.
 
         Loads and temperatures are held; they are NaN before the first, which is unknown. A reference is in the first
         row at or after its time. ``.attrs['units']`` has the units.
         Raises RecordingError if there are no samples, ConfigError if pandas is not installed.
         """
-        return self._table().to_pandas()
+        return self._table().to_pandas(clock=clock)
 
     def to_xarray(self) -> xarray.Dataset:
         """The same as a dataset over ``t`` (s); every variable has ``units`` and ``long_name``.
@@ -312,7 +345,7 @@ class Recording(abc.ABC):
         rows.append(('parameters', len(self.parameters) or 'none recorded'))
         if 'samples' in self.__dict__:
             samples = self.samples
-            rows += [('samples', len(samples)), ('duration', f'{samples["t"][-1]:.3f} s')]
+            rows += [('samples', len(samples)), ('duration', f'{self.duration:.3f} s')]
         if 'sample_rate_hz' in self.__dict__:
             rows.append(('sample rate', f'{self.sample_rate_hz:g} Hz'))
         return rows

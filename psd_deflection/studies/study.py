@@ -23,6 +23,7 @@ from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import replace_file
 from psd_deflection.base.json_text import json_text
 from psd_deflection.base.pages import page, table
+from psd_deflection.base.printable import printable
 from psd_deflection.base.tables import Table
 from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
@@ -41,6 +42,10 @@ if TYPE_CHECKING:
 
 Tell = Callable[[str], None]
 """Takes a warning."""
+
+GIVEN_RIG = 'the rig that was given'
+NOMINAL_RIG = 'the nominal rig: there is none in'
+LONGEST_REPR = 2000
 
 
 def warn_caller(warning: str) -> None:
@@ -77,6 +82,9 @@ class StudyResult(abc.ABC):
     @abc.abstractmethod
     def table(self) -> Table:
         """The answer as columns with units, a row for each thing that was found."""
+
+    def __repr__(self) -> str:
+        return f'<{type(self).__name__}: {printable(" ".join(self.sentences()), LONGEST_REPR)}>'
 
     def page_sentences(self) -> list[str]:
         """Those of :meth:`sentences` that stand above the sections of the page; a section may have the others."""
@@ -154,18 +162,24 @@ class StudyResult(abc.ABC):
 class Opened(NamedTuple):
     """A recording, cut into the rig's blocks, and its rig.
 
-    ``params_file``: of the rig, if it has one. ``tell``: takes warnings.
+    ``params_file``: of the rig, if it has one. ``tell``: takes warnings. ``given``: whether the caller gave the rig.
     """
 
     recording: Recording
     rig: Rig
     params_file: Path | None
     tell: Tell = warn_caller
+    given: bool = False
 
     @property
     def sources(self) -> dict[str, str]:
         """See :attr:`StudyResult.sources`."""
-        rig = 'the parameters in the recording' if self.params_file is None else str(self.params_file)
+        if self.params_file is not None:
+            rig = str(self.params_file)
+        elif self.given:
+            rig = GIVEN_RIG
+        else:
+            rig = 'the parameters in the recording' if self.recording.parameters else f'{NOMINAL_RIG} the recording'
         return {'recording': str(self.recording.path), 'rig': rig}
 
 
@@ -191,7 +205,7 @@ def opened(
         known = rig_at_end(recording)
     else:
         known = rig if isinstance(rig, Rig) else load_rig(rig)
-    return Opened(recording.with_block_size(known.estimator.block_size), known, params_file, tell)
+    return Opened(recording.with_block_size(known.estimator.block_size), known, params_file, tell, isinstance(rig, Rig))
 
 
 def named(recording: str, digest: str, digits: int = 16) -> str:

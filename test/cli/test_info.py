@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.cli.main import main
+from psd_deflection.cli.recordings.info import _lines_of_parameters
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import SampleBlock
@@ -112,3 +113,19 @@ def test_an_older_word_for_a_default_is_no_change(tmp_path: Path, capsys: pytest
         out.put(block(0))
     assert main(['info', str(tmp_path / 'old')]) == 0
     assert 'all parameters at their defaults' in capsys.readouterr().out
+
+
+def test_a_memory_of_the_pipeline_is_one_short_line() -> None:
+    found = {
+        'parameters': {},
+        'changed_parameters': {},
+        'as_in_the_thesis': [],
+        'changes': [
+            {'block': 1258, 'values': {'state.noise': (23.0,) * 60, 'state.whole': 1.0}},
+            {'block': 1300, 'values': {'sum_min': 2.0}},
+        ],
+    }
+    assert _lines_of_parameters(found) == [
+        '  from block 1258 on: 2 values of the state',
+        '  from block 1300 on: sum_min = 2.0',
+    ]

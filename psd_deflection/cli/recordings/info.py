@@ -38,12 +38,10 @@ from psd_deflection.cli._report import print_json, show
 from psd_deflection.recordings.provenance import NAMES
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.readings_table import described, is_table
+from psd_deflection.recordings.recording import EPOCH_FROM_NS
 from psd_deflection.recordings.spans import Span
 from psd_deflection.recordings.summary import summary
 from psd_deflection.run.fleet.parquet import Field, ParquetFile
-
-_EPOCH_FROM_NS = 10**18
-"""September 2001; smaller times do not count from the epoch."""
 
 FIELDS = (
     ERROR,
@@ -187,7 +185,7 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
     if not samples:
         return [row('samples', 'none')]
     when = f'{start * 1e-9:.9f} s'
-    if start >= _EPOCH_FROM_NS:
+    if start >= EPOCH_FROM_NS:
         second = datetime.fromtimestamp(start // 1_000_000_000, UTC).strftime('%Y-%m-%d %H:%M:%S')
         when = f'{second}.{start % 1_000_000_000:09d} UTC'
     share = f'{100.0 * lost / (samples + lost):.3g} %'
@@ -226,8 +224,9 @@ def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
     if found['as_in_the_thesis']:
         out.append('  parameters as in the thesis rig, unless they were measured to be the same')
         out += [f'    {text}' for text in found['as_in_the_thesis']]
-    out += [
-        f'  from block {c["block"]} on: ' + ', '.join(f'{k} = {v}' for k, v in c['values'].items())
-        for c in found['changes']
-    ]
+    # What the pipeline remembered at the start is for a replay, and for --json.
+    for c in found['changes']:
+        values = {k: v for k, v in c['values'].items() if not k.startswith('state.')}
+        told = ', '.join(f'{k} = {v}' for k, v in values.items()) or f'{len(c["values"])} values of the state'
+        out.append(f'  from block {c["block"]} on: {told}')
     return out

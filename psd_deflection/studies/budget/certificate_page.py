@@ -61,7 +61,7 @@ _OPEN = '. . . . . . . . . . . . . . . .'
 """What nobody filled in is for a pen."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Certified(StudyResult):
     """``found``: the numbers of ``problem``."""
 

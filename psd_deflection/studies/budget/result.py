@@ -28,7 +28,7 @@ SHOWN = np.array(FACTORS)
 UNITS = tuple(f'{symbol} {unit}' for symbol, unit in zip(SYMBOLS, SHOWN_UNITS, strict=True))
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Budgeted(StudyResult):
     """``budget``: every cause at ``load`` (Fx N, Fy N, Tz N m). ``sampled``: of ``draws`` random draws with ``seed``.
 

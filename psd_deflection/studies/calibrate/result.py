@@ -27,7 +27,7 @@ from psd_deflection.studies.calibrate.progress import progress_of
 from psd_deflection.studies.study import PageSection, StudyResult, Tell, described, edited_rig_file, named, warn_caller
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibrated(StudyResult):
     """``found``: the fit and what it means. ``rig``: as it was known, with the parameter file it has, if any.
 

@@ -87,7 +87,7 @@ def finding_tree(finding: Finding) -> dict[str, Any]:
     }
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Checkup(StudyResult):
     """``findings``: what is wrong. ``values``: parameters for the rig file. ``sizes``: movement of
     each push over the expected one, NaN if it was not seen. ``found``: the wirings that explain the

@@ -46,7 +46,7 @@ from psd_deflection.studies.discover.trees import (
     parameters_of,
     size_of,
 )
-from psd_deflection.studies.study import StudyResult, Tell, described, edited_rig_file, named, warn_caller
+from psd_deflection.studies.study import GIVEN_RIG, StudyResult, Tell, described, edited_rig_file, named, warn_caller
 
 SHOWN = 1e-3
 """µm and µrad: a smaller change of an estimate is none."""
@@ -233,6 +233,7 @@ class RigConclusion(Conclusion):
     params_file: str | Path | None = None
     adopted: str = ''
     tell: Tell = warn_caller
+    rig_source: str = GIVEN_RIG
 
     @property
     def active_effects(self) -> list[ActiveEffect]:
@@ -249,7 +250,7 @@ class RigConclusion(Conclusion):
     @property
     def sources(self) -> Mapping[str, str]:
         """Version, recordings, rig."""
-        rig = 'the parameters in the recording' if self.params_file is None else str(self.params_file)
+        rig = self.rig_source if self.params_file is None else str(self.params_file)
         return {**super().sources, 'rig': rig}
 
     def sentences(self) -> list[str]:

@@ -37,7 +37,7 @@ from psd_deflection.studies.discover.plant_search import PlantDiscovery, discove
 from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
 from psd_deflection.studies.discover.reference_readings import Resting, resting_in, resting_rows
 from psd_deflection.studies.discover.result import Discovery
-from psd_deflection.studies.study import Tell, warn_caller
+from psd_deflection.studies.study import GIVEN_RIG, Tell, warn_caller
 
 
 def read_observation(
@@ -357,7 +357,8 @@ class DiscoverOptions:
     ) -> Discovery:
         """The answer; ``tell`` gets a warning if the rig file cannot be edited."""
         found = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
-        return replace(found, params_file=self.params_file, tell=tell)
+        source = GIVEN_RIG if self.known else 'the parameters in each recording, the nominal rig if it has none'
+        return replace(found, params_file=self.params_file, tell=tell, rig_source=source)
 
     def discovered_in_tables(self, tables: Sequence[Readings], tell: Tell = warn_caller) -> PlantDiscovery:
         """The answer of tables of readings; ``tell`` gets a warning if the rig file cannot be edited.

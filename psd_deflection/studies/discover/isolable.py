@@ -75,7 +75,7 @@ class Isolable:
 HEAD = ('effect', 'size', 'seen from', 'named from', 'most like')
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Isolability(StudyResult):
     """``found``: each effect that shows under ``loads``, in words. ``hidden``: the others, and what each needs.
 

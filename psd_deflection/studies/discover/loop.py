@@ -22,7 +22,7 @@ SCRIPT, LISTED = 'next_loads.csv', 'next.yaml'
 """Files of the loads that are planned, and of the list for the next search."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Settled(StudyResult):
     """``found``: the last answer. ``plans``: those that were carried out. ``open``: the one that was not, if rivals
     are left. ``outcome``: one explanation is left; no recording within the limits tells the rest apart; or no more

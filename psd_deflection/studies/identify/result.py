@@ -36,7 +36,7 @@ KNOWN = (0.01, 0.34)
 what it has."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Identified(StudyResult):
     """``axes``: the modes of dX, dY, theta in ``problem.poses``."""
 
@@ -225,7 +225,7 @@ class Identified(StudyResult):
 
     def rig_yaml(self) -> str:
         """The user's parameter file with the modes, comments kept; without one what describes the rig."""
-        recording, rig, params_file, tell = self.problem.opened
+        recording, rig, params_file, tell, _ = self.problem.opened
         date = datetime.now(UTC).date().isoformat()
         recorded = named(recording.name, recording.digest)
         source = f'Identified by psd-deflection {__version__}, {date}, from {recorded}'

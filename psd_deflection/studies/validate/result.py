@@ -18,7 +18,7 @@ from psd_deflection.studies.validate.clock import Offset
 from psd_deflection.studies.validate.from_recordings import ValidateProblem
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Validated(StudyResult):
     """The answer of :func:`~psd_deflection.studies.validate.validate.validate`.
 

@@ -19,7 +19,7 @@ from psd_deflection.records import Moment
 from psd_deflection.studies.study import PageSection, StudyResult
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class WatchedRun(StudyResult):
     """The alarms of a recording, the first first. ``start_ns``: of its first sample.
 
