@@ -108,13 +108,19 @@ def test_ci_runs_what_it_is_said_to_run() -> None:
     assert {c.line.split()[1] for c in ALL if c.line.startswith('make ')} <= targets
 
 
-@pytest.mark.parametrize('command', OURS, ids=lambda c: f'{c.page}: {c.line}'[:90])
-def test_a_command_is_understood(command: Command) -> None:
-    argv = words(command.line)
-    assert argv[0] in COMMANDS
-    arguments = argv[: argv.index('--ros-args')] if '--ros-args' in argv else argv
-    if '--help' not in arguments:
-        make_parser([argv[0]]).parse_args(arguments)
+def test_commands_that_are_not_run_here_are_understood() -> None:
+    wrong = []
+    for command in OURS:
+        argv = words(command.line)
+        arguments = argv[: argv.index('--ros-args')] if '--ros-args' in argv else argv
+        try:
+            if '--help' not in arguments:
+                make_parser([argv[0]]).parse_args(arguments)
+        except (KeyError, errors.UsageError, SystemExit) as error:
+            wrong.append((command, error))
+        if argv[0] not in COMMANDS:
+            wrong.append((command, KeyError(argv[0])))
+    assert wrong == []
 
 
 @pytest.mark.parametrize(
@@ -198,13 +204,14 @@ QUESTIONS = {
 """What newcomers looked for, and the words that answer it."""
 
 
-@pytest.mark.parametrize('question', QUESTIONS)
-def test_what_newcomers_ask_is_answered_on_a_page_two_steps_from_the_readme(question: str) -> None:
-    page, words = QUESTIONS[question]
+def test_what_newcomers_ask_is_answered_two_steps_from_the_readme() -> None:
     first = linked(ROOT / 'README.md')
-    second = set().union(*(linked(near) for near in first if near.suffix == '.md'))
-    assert ROOT / 'docs' / page in first | second
-    assert words in (ROOT / 'docs' / page).read_text()
+    near = first.union(*(linked(page) for page in first if page.suffix == '.md'))
+    docs = ROOT / 'docs'
+    answered = {
+        q for q, (name, words) in QUESTIONS.items() if docs / name in near and words in (docs / name).read_text()
+    }
+    assert set(QUESTIONS) - answered == set()
 
 
 def named(tree: Any) -> list[str]:
@@ -221,23 +228,24 @@ def test_every_page_is_once_in_the_menu() -> None:
     )
 
 
-@pytest.mark.parametrize('name', re.findall(r'^::: (\S+)$', (ROOT / 'docs' / 'api.md').read_text(), re.M))
-def test_what_the_page_of_python_shows_is_there(name: str) -> None:
-    assert pydoc.locate(name) is not None
+def test_what_the_page_of_python_shows_is_there() -> None:
+    names = re.findall(r'^::: (\S+)$', (ROOT / 'docs' / 'api.md').read_text(), re.M)
+    assert len(names) > 10
+    assert [name for name in names if pydoc.locate(name) is None] == []
 
 
 def test_the_readme_is_short() -> None:
     assert len((ROOT / 'README.md').read_text().splitlines()) <= 120
 
 
-@pytest.mark.parametrize('page', PAGES, ids=lambda p: p.name)
-def test_links_lead_somewhere(page: Path) -> None:
-    for target in links(page):
+def test_links_lead_somewhere() -> None:
+    dead = []
+    for page, target in [(p, t) for p in PAGES for t in links(p)]:
         name, _, anchor = target.partition('#')
         path = (page.parent / name).resolve() if name else page
-        assert path.exists(), f'{page.name}: {target}'
-        if anchor and path.suffix == '.md':
-            assert anchor in anchors(path), f'{page.name}: {target}'
+        if not path.exists() or (anchor and path.suffix == '.md' and anchor not in anchors(path)):
+            dead.append(f'{page.name}: {target}')
+    assert dead == []
 
 
 def test_the_recordings_that_a_beginner_plays_raise_no_alarm() -> None:
@@ -489,12 +497,3 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
         'TEXT', 'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'W', 'WEBHOOK', 'WHERE', 'X', 'X,Y', 'XY,THETA', "('W', 'W')",
         "('FX', 'FY', 'TZ')", "('DX', 'DY', 'THETA')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip
-
-
-def test_the_navigation_has_every_page() -> None:
-    nav = (ROOT / 'packaging/mkdocs.yml').read_text().partition('\nnav:')[2]
-    listed = set(re.findall(r'(\S+\.md)$', nav, re.M))
-    docs = ROOT / 'docs'
-    missing = {str(p.relative_to(docs)) for p in docs.rglob('*.md')} - listed
-    assert not missing, f'to be put into nav of packaging/mkdocs.yml: {missing}'
-    assert all((docs / name).exists() for name in listed)
