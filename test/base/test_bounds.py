@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 
 from psd_deflection.base.bounds import OTHERS, BoundedMap, ByteBudget, RateLimit, Tally
@@ -20,6 +22,24 @@ def test_a_budget_holds_no_more_than_its_bytes() -> None:
     assert (budget.held, budget.holders) == (0, 0)
     assert budget.take(100)
     assert not budget.take(1)
+
+
+def test_two_threads_do_not_take_the_same_bytes() -> None:
+    class Size(int):
+        """While it is added, another thread asks for bytes: it gets none before the first has its own."""
+
+        def __radd__(self, held: int) -> int:
+            if not other.is_alive() and not answers:
+                other.start()
+                other.join(0.05)
+            return held + int(self)
+
+    budget, answers = ByteBudget(1), list[bool]()
+    other = threading.Thread(target=lambda: answers.append(budget.take(1)))
+    assert budget.take(Size(1))
+    other.join()
+    assert answers == [False]
+    assert budget.held == 1
 
 
 @pytest.mark.parametrize('way', ['item', 'setdefault', 'update'])

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from psd_deflection.base.log import INFO, WARNING
+from psd_deflection.base.log import ERROR, INFO, WARNING
 from psd_deflection.rig.config import Rig, load_rig, replace_values
 from psd_deflection.run.zero_store import ZeroStore
+from test.heard import WAIT_S
 
 ZERO = {'psd_1.zero': [1e-4, -2e-4], 'psd_2.zero': [3e-5, 0.0]}
 
@@ -109,3 +110,13 @@ def test_unwritable_zero_file_is_reported(tmp_path: Path) -> None:
     named = load_rig(overrides={'zero_file': str(tmp_path / 'zero.json')})
     assert ZeroStore(named, 'A').save(named) == ''
     assert json.loads((tmp_path / 'zero.json').read_text())['serial'] == 'A'
+
+
+def test_a_zero_that_cannot_be_kept_in_the_background_is_said(tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    rig = load_rig(overrides={'zero_file': str(tmp_path / 'file' / 'zero.json')})
+    store = ZeroStore(rig, 'A')
+    said: list[tuple[str, int]] = []
+    store.keep(rig, lambda text, level: said.append((text, level)))
+    assert store.join(WAIT_S)
+    assert said == [(store.save(rig), ERROR)]
