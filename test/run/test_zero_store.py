@@ -117,6 +117,10 @@ def test_a_zero_that_cannot_be_kept_in_the_background_is_said(tmp_path: Path) ->
     rig = load_rig(overrides={'zero_file': str(tmp_path / 'file' / 'zero.json')})
     store = ZeroStore(rig, 'A')
     said: list[tuple[str, int]] = []
-    store.keep(rig, lambda text, level: said.append((text, level)))
+
+    def say(text: str, level: int = INFO, /) -> None:
+        said.append((text, level))
+
+    store.keep(rig, say)
     assert store.join(WAIT_S)
     assert said == [(store.save(rig), ERROR)]
