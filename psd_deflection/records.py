@@ -282,6 +282,10 @@ now.
 
 
 RESTART = 'device.restart'
+CLOCK_STEP = 'clock.step'
+"""A step of the time map, s: samples before it were stamped so much too late (negative) or too early."""
+CLOCK_SQUEEZED = 'clock.squeezed'
+"""Samples after a step back, whose stamps are 1 ns apart, so that time does not go back."""
 """Recorded with the block in which a restarted device went on: the last sample number before, the first after.
 The numbers between belong to no sample.
 """

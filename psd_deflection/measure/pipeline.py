@@ -35,6 +35,8 @@ from psd_deflection.model.simulation.catalogue import effects_of_rig
 from psd_deflection.model.simulation.tip_load import TipLoads
 from psd_deflection.model.solvers.interface import SolverStatus
 from psd_deflection.records import (
+    CLOCK_SQUEEZED,
+    CLOCK_STEP,
     ENVIRONMENT,
     KNOWN_LOAD,
     RESTART,
@@ -209,8 +211,9 @@ class Pipeline:
         value that fits no part of this rig; it is left out.
         """
         told = dict(change.values)
-        # It says which numbers belong to no sample; no estimate depends on it.
-        told.pop(RESTART, None)
+        # They say which numbers belong to no sample, and how the time map stepped; no estimate depends on them.
+        for name in (RESTART, CLOCK_STEP, CLOCK_SQUEEZED):
+            told.pop(name, None)
         load = {name: told.pop(name) for name in (KNOWN_LOAD,) if name in told}
         memory = {name: told.pop(name) for name in tuple(told) if name in ENVIRONMENT or name.startswith(STATE)}
         if memory.pop(WHOLE, None) is not None:

@@ -19,7 +19,8 @@ shortest round trip (``ClockState.round_trip_ns``). If it is known, ``latency_of
 
 The map from device to host time does not jump to a better fit. It stays continuous and strictly
 rising, and approaches the fit with a bounded slope, so stamps stay evenly spaced. Only if the
-device's clock itself jumped (a restart, a step) does the map start again; such resets are counted.
+device's clock itself jumped (a restart, a step) does the map start again; such resets are counted. A step that the
+sample numbers reveal shifts the map by as much (:meth:`ClockMap.shift`), and what it has learnt stays.
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ from psd_deflection.records import IntArray
 
 SECOND_NS = 1_000_000_000
 WINDOW_S = 300
+ASKED_WINDOW_S = 50
+"""With answers to pings, which do not beat, fewer seconds are enough, and a rate that wanders is followed: 50 ppm in
+300 s cost 0.3 ms at most."""
 FIT_AFTER_S = 10
 SETTLING_S = 10
 STEER_SETTLING = 2e-3
@@ -71,6 +75,8 @@ class ClockMap:
 
     def __init__(self) -> None:
         self.resets = 0
+        # By how much stamps of one device time became later when the map started again, ns.
+        self.stepped_ns = 0
         self._started = False
         self._start(0, 0)
 
@@ -114,6 +120,7 @@ class ClockMap:
                 and early > EARLY_NS
             )
             self.resets += not steady
+            self.stepped_ns = -early if steady else 0
             self._start(device, t_host_ns)
             self._bucket_min = (device, delay)
             return not steady
@@ -121,7 +128,7 @@ class ClockMap:
         if bucket != self._bucket:
             if self._bucket_min is not None:
                 self._minima.append(self._bucket_min)
-                del self._minima[:-WINDOW_S]
+                del self._minima[: -(WINDOW_S if self._round_trip is None else ASKED_WINDOW_S)]
             self._bucket, self._bucket_min = bucket, None
             self._refit(device)
         if self._bucket_min is None or delay < self._bucket_min[1]:
@@ -136,6 +143,21 @@ class ClockMap:
         self.resets += 1
         self._start(device, t_host_ns)
         self._bucket_min = (device, t_host_ns - device)
+
+    def shift(self, by_us: int, before_us: int) -> None:
+        """The device's clock jumped ahead by ``by_us`` after it was ``before_us``: host times go on as before.
+
+        What was observed since then is forgotten.
+        """
+        by, before = by_us * 1000, before_us * 1000
+        self._origin += by
+        self._anchor_device += by
+        self._mapped += by if self._mapped <= before else 0
+        self._minima = [(device + by, delay - by) for device, delay in self._minima if device <= before]
+        if self._bucket_min is not None:
+            device, delay = self._bucket_min
+            self._bucket_min = (device + by, delay - by) if device <= before else None
+        self.stepped_ns = -by
 
     def host_ns(self, t_device_us: int) -> int:
         """Where the map has this device time now."""

@@ -53,6 +53,8 @@ DEFAULT_BLOCK_SIZE = 20
 LONGEST_REPR = 2000
 EPOCH_FROM_NS = 10**18
 """September 2001; smaller times do not count from the epoch."""
+SQUEEZED_NS = 100
+"""Samples whose stamps are no further apart have no times of their own, ns."""
 
 Held = TypeVar('Held', AppliedLoad, TemperatureReading)
 
@@ -272,15 +274,25 @@ class Recording(abc.ABC):
     @functools.cached_property
     def sample_rate_hz(self) -> float:
         """Samples a second, from the sample numbers and times of the first thousand or so."""
-        first = last = None
+        before: tuple[int, int] | None = None
+        steps: list[tuple[int, int]] = []
+        counted = 0
         for block in self.blocks():
-            first = first if first is not None else (int(block.seq[0]), int(block.t_ns[0]))
-            last = (int(block.seq[-1]), int(block.t_ns[-1]))
-            if last[0] - first[0] >= 1000:
+            for n, t_ns in ((int(block.seq[i]), int(block.t_ns[i])) for i in (0, -1)):
+                # Stamps 1 ns apart are those after a step of the time map: no rate.
+                if before is not None and t_ns - before[1] > SQUEEZED_NS * (n - before[0]) > 0:
+                    steps.append((n - before[0], t_ns - before[1]))
+                    counted += n - before[0]
+                before = n, t_ns
+            if counted >= 1000:
                 break
-        if first is None or last is None or last[1] <= first[1]:
+        if not steps:
             return 0.0
-        return (last[0] - first[0]) * 1e9 / (last[1] - first[1])
+        # Across a step, stamps and numbers disagree.
+        period = float(np.median([t_ns / n for n, t_ns in steps]))
+        even = [(n, t_ns) for n, t_ns in steps if abs(t_ns - period * n) <= 0.5 * period * n]
+        count, lasted = np.sum(even if 2 * len(even) > len(steps) else steps, axis=0).tolist()
+        return float(count * 1e9 / lasted)
 
     @property
     def has_samples(self) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 from msg_adapters import DEFLECTION, LOAD, SAMPLES
 from psd_deflection.recordings.recording import Recording
 from psd_deflection.recordings.vibration import RecordedVibration, vibration_of
-from psd_deflection.records import SampleBlock
+from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, ParameterChange, SampleBlock
 from psd_deflection.rig.config import left_as_in_the_thesis
 from psd_deflection.rig.declarations import BY_NAME
 
@@ -23,6 +23,12 @@ _BREAK = 0.5
 def changed_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
     """Parameters that differ from their defaults, and those that this version does not know."""
     return {k: v for k, v in parameters.items() if k not in BY_NAME or BY_NAME[k].default != BY_NAME[k].meant(v)}
+
+
+def _noted(recording: Recording, name: str) -> list[tuple[ParameterChange, float]]:
+    """The changes that note ``name``, a number."""
+    noted = [(change, dict(change.values).get(name)) for change in recording.changes]
+    return [(change, float(value)) for change, value in noted if isinstance(value, float | int)]
 
 
 def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
@@ -83,6 +89,8 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'lost': recording.lost(first[0], last[0], samples) if samples else 0,
         'dropped_here': {'samples': recording.dropped_here[0], 'messages': recording.dropped_here[1]},
         'restarts': len(recording.restarts),
+        'clock_steps': [{'t_ns': c.t_ns, 'step_s': s} for c, s in _noted(recording, CLOCK_STEP)],
+        'squeezed': sum(int(n) for _, n in _noted(recording, CLOCK_SQUEEZED)),
         'flagged': flagged,
         'sample_rate_hz': counted * 1e9 / lasted if lasted else 0.0,
         'vibration': vibration.found() if vibration is not None else None,

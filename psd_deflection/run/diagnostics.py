@@ -28,6 +28,9 @@ OFF_NS = 1_000_000
 BEYOND = 6.0
 """Standard deviations that the mean NIS of a second may be above 1: chance and a switched load explain that."""
 
+LATE_NS = 5_000_000
+"""A shortest round trip to the device above which stamps are uncertain, ns."""
+
 LATE_SHARE = 0.25
 """Share of the base's accelerations that may be late: those of the end of a block are, if they come as they act."""
 
@@ -157,7 +160,17 @@ class HealthReporter:
         ]
         if clock.round_trip_ns is not None:
             values.append(('least round trip (us)', f'{clock.round_trip_ns / 1e3:.0f}'))
+        # A stamp cannot be later than that by a constant delay of the line; without answers nobody knows.
+        late = 'not known, no ping is answered' if clock.round_trip_ns is None else f'{clock.round_trip_ns / 1e6:.3f}'
+        values += [
+            ('stamps late by at most (ms)', late),
+            ('steps of the time map', str(wire.map_steps)),
+            ('samples with stamps 1 ns apart', str(wire.squeezed)),
+        ]
         level, message = OK, f'skew {clock.skew_ppm:z.1f} ppm'
+        if clock.round_trip_ns is not None and clock.round_trip_ns > LATE_NS:
+            level = WARN
+            message = f'the line is slow: stamps may be late by up to {clock.round_trip_ns / 1e6:.1f} ms'
         if new.clock_jumps:
             level = WARN
             message = (

@@ -22,7 +22,7 @@ from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
 from psd_deflection.run.behind import why_behind
-from psd_deflection.run.reading.arrivals import Arrival, Item, Restarted
+from psd_deflection.run.reading.arrivals import Arrival, Item, Noted, Restarted
 
 T = TypeVar('T')
 
@@ -189,6 +189,8 @@ class Processing:
                     if self.give(self.pipeline.process(item.raw)):
                         self._note_latency(item.read_ns)
                         self._tell_refusals()
+                elif isinstance(item, Noted):
+                    self.give([item.change])
                 elif isinstance(item, Restarted):
                     self.give(self.pipeline.flush())
                     if item.change is not None:

@@ -145,6 +145,21 @@ def test_pings_at_random_phase_take_off_what_beats() -> None:
     assert plain.state().round_trip_ns is None
 
 
+@pytest.mark.parametrize('ppm', [50.0, -50.0])
+def test_a_rate_that_wanders_costs_less_than_300_us(ppm: float) -> None:
+    """By 50 ppm in 300 s, on a polled line, with three answers to pings a second."""
+    rng, clock, errors, true = np.random.default_rng(8), ClockMap(), [], 0.0
+    for k in range(500 * 50):
+        true += 20 * MS * (1.0 + ppm * 1e-6 * min(max(k / 50 - 100, 0.0) / 300, 1.0))
+        device_us, host = 20_000 * k, round(true)
+        clock.observe(device_us, -(-host // MS) * MS + 200_000 + int(rng.exponential(50_000)))
+        if k % 16 == 0:
+            phase = int(rng.integers(0, 900))
+            clock.observe_reply(device_us + phase, host, host + 1000 * phase + 200_000)
+        errors.append(int(clock.to_host_ns(np.array([device_us], np.int64))[0]) - host)
+    assert np.ptp(errors[90 * 50 :]) < 300_000
+
+
 def test_while_warming_up_a_clock_that_runs_away_is_followed() -> None:
     rng = np.random.default_rng(7)
     clock = ClockMap()

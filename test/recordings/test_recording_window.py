@@ -10,6 +10,7 @@ import itertools
 import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -296,3 +297,12 @@ def test_the_page_plays_a_part_of_a_recording_and_no_part_of_a_rig(capsys: pytes
     assert make_parser(['monitor']).parse_args(['monitor', 'run', '--from', '1', '--to', '3']).span == (1.0, 3.0)
     assert main(['monitor', '--from', '1']) == 2
     assert '--from and --to are for a recording' in capsys.readouterr().err
+
+
+def test_the_rate_is_that_of_the_samples_whose_stamps_are_even() -> None:
+    """After a step back of the time map 2,900 samples have stamps 1 ns apart."""
+    seq = np.arange(4000)
+    t_ns = np.select([seq < 100, seq < 3000], [seq * 10**6, 10**9 + seq], 10**9 + (seq - 2990) * 10**6)
+    blocks = [SimpleNamespace(seq=seq[n : n + 20], t_ns=t_ns[n : n + 20]) for n in range(0, 4000, 20)]
+    late = SimpleNamespace(blocks=lambda: iter(blocks))
+    assert vars(Recording)['sample_rate_hz'].func(late) == pytest.approx(1000.0, rel=1e-6)

@@ -23,11 +23,11 @@ from psd_deflection.devices import contract_frames, port_source
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
 from psd_deflection.devices.serial_port import SerialPort
 from psd_deflection.devices.source import Clock, Event, Received, Sample, Source, SourceEndedError
-from psd_deflection.records import RESTART
+from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, RESTART
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.reading import acquisition as module
 from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival, Ended, Item, Restarted
+from psd_deflection.run.reading.arrivals import Arrival, Ended, Item, Noted, Restarted
 from psd_deflection.run.reading.pinger import UNANSWERED
 from test.heard import WAIT_S
 
@@ -342,6 +342,37 @@ def test_a_device_clock_jump_is_reported_and_stamps_increase(
     assert t[-1] - t[0] < 8 * 10**9
     assert run.acquisition.counters.clock_jumps == 1
     assert numbers(items) == list(range(80))
+
+
+@pytest.mark.parametrize('late_s', [0.1, 1.5])
+def test_a_line_that_is_late_at_first_is_reported_and_recorded(late_s: float, sample: Any) -> None:
+    """All bytes of the first three seconds come late. No sample is missing, and each stamp is right or noted."""
+    lines: list[str] = []
+    acquisition = Acquisition(load_rig(), lambda text, _level=0: lines.append(text))
+    ends_ms = 3000 + round(late_s * 1000)
+    given: dict[int, int] = {}
+    noted: dict[str, list[float]] = {}
+    fed = 0
+    for now_ms in range(round(late_s * 1000) + 10, 9000, 10):
+        # What was sent when the line recovers comes with the first that is in time.
+        sent = now_ms - round(late_s * 1000) if now_ms < ends_ms else now_ms
+        acquisition.feed([sample(k, t_us=10**6 + 1000 * k) for k in range(fed, sent)], now_ms * 10**6)
+        fed = sent
+        while not acquisition.queue.empty():
+            item = acquisition.queue.get()
+            if isinstance(item, Arrival):
+                times = item.raw.t_ns - acquisition.to_ros_ns
+                given |= dict(zip(item.raw.seq.tolist(), times.tolist(), strict=True))
+            elif isinstance(item, Noted):
+                noted.setdefault(item.change.values[0][0], []).append(float(item.change.values[0][1]))  # type: ignore[arg-type]
+    assert list(given) == list(range(min(given), max(given) + 1))
+    assert noted[CLOCK_STEP] == [pytest.approx(-late_s, abs=0.011)]
+    assert sum(noted[CLOCK_SQUEEZED]) == pytest.approx(1000 * late_s, abs=25)
+    wrong = [k for k, t_ns in given.items() if abs(t_ns - k * 10**6) > 5_000_000]
+    assert wrong == list(range(min(given), max(wrong) + 1))
+    assert max(wrong) == pytest.approx(3000 + 1000 * late_s, abs=25)
+    assert any(f'{1000 * late_s:.0f}' in line and 'too late' in line for line in lines), lines
+    assert any(f'{sum(noted[CLOCK_SQUEEZED]):.0f} samples have stamps 1 ns apart' in line for line in lines)
 
 
 class Clockwork(Source):

@@ -73,6 +73,34 @@ def test_a_jump_is_seen_sample_by_sample() -> None:
     assert not watched.torn(6, 10**9 + 1000)
 
 
+@pytest.mark.parametrize('jump_us', [2000, 5000, 30_000, 45_000, -2000, -5000])
+@pytest.mark.parametrize('rate', [1.0, 1.0 + 500e-6])
+def test_a_jump_of_two_milliseconds_is_followed_within_a_second(jump_us: int, rate: float) -> None:
+    watched, rng, late, steps = watch(), np.random.default_rng(1), {}, []
+    for k in range(24_000):
+        t_us = round(k * 1000 * rate) + (jump_us if k >= 20_507 else 0)
+        now = BOOT + k * MS + 200_000 + int(rng.exponential(50_000))
+        if k % 10 == 0:
+            assert not watched.newest([sample(k, t_us)], now)
+        assert not watched.torn(k, t_us)
+        if step := watched.stepped(k, t_us):
+            steps.append((k, step))
+        late[k] = host_of(watched, t_us) - BOOT - k * MS
+    ((k, step),) = steps
+    assert k < 21_000
+    assert step == pytest.approx(jump_us, abs=100)
+    assert watched.take_step_ns() == -1000 * step
+    assert max(abs(late[n] - late[20_500]) for n in range(k, 24_000)) < 800_000
+    assert abs(late[23_999] - late[20_500]) < 500_000
+
+
+def test_stamps_that_jitter_show_no_step() -> None:
+    watched, rng = watch(), np.random.default_rng(2)
+    for k in range(5000):
+        watched.torn(k, k * 1000)
+        assert not watched.stepped(k, k * 1000 + int(rng.choice([0, 3000])))
+
+
 def test_a_gap_in_the_numbers_is_not_a_clock_jump() -> None:
     watched = watch()
     assert not watched.torn(0, 0)

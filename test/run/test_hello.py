@@ -240,7 +240,8 @@ def test_a_clock_that_stands_still_is_told_and_stamps_follow_the_host(monkeypatc
     assert max(late) < 80_000_000
     assert acquisition.counters.clock_jumps > 100
     assert any('clock stands still' in line for line in said)
-    assert len(said) <= module.NEWS + 3
+    # And as often that stamps are squeezed.
+    assert len(said) <= 2 * (module.NEWS + 3)
 
 
 def test_the_kept_words_are_the_same_for_a_port_of_bytes(device: Any, rig: Rig) -> None:

@@ -53,6 +53,8 @@ FIELDS = (
     Field('lost', int),
     Field('flagged', int),
     Field('restarts', int),
+    Field('clock_steps', str),
+    Field('squeezed', int),
     Field('sample_rate_hz', float, 'Hz'),
     Field('blocks', int),
     Field('block_size', int),
@@ -204,6 +206,12 @@ def _lines_of_samples(found: Mapping[str, Any]) -> list[str]:
         )
     if found['restarts']:
         out.append(row('restarts', f'{found["restarts"]} of the device'))
+    if found['clock_steps']:
+        worst = max((step['step_s'] for step in found['clock_steps']), key=abs)
+        text = f'{len(found["clock_steps"])}, the largest {worst * 1e3:+.1f} ms: stamps before it are off by as much'
+        out.append(row('clock steps', text))
+    if found['squeezed']:
+        out.append(row('squeezed', f'{found["squeezed"]} samples have stamps 1 ns apart after a step back'))
     out.append(row('rate', f'{found["sample_rate_hz"]:.6g} samples/s'))
     if (moved := found['vibration']) is not None:
         size, hz, share = moved['rms_m'] * 1e6, moved['hz'], moved['share']

@@ -27,10 +27,18 @@ from psd_deflection.devices.protocol.frames import BadFrame, BadReason, HelloFra
 from psd_deflection.devices.registry import make_source
 from psd_deflection.devices.source import Clock, Event, Notice, Sample, Source, SourceEndedError
 from psd_deflection.measure.timing import ClockState
-from psd_deflection.records import FLAG_DEVICE_DROPPED, RESTART, IntArray, ParameterChange, RawChunk
+from psd_deflection.records import (
+    CLOCK_SQUEEZED,
+    CLOCK_STEP,
+    FLAG_DEVICE_DROPPED,
+    RESTART,
+    IntArray,
+    ParameterChange,
+    RawChunk,
+)
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.behind import SLOW
-from psd_deflection.run.reading.arrivals import Arrival, Ended, Gathered, Item, Restarted
+from psd_deflection.run.reading.arrivals import Arrival, Ended, Gathered, Item, Noted, Restarted
 from psd_deflection.run.reading.clock_watch import ClockWatch
 from psd_deflection.run.reading.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
@@ -53,7 +61,11 @@ NEWS = 3
 """Events of one kind that are told one by one, before they are counted and told together."""
 
 RECORDED_RESTARTS = 10_000
-"""Restarts of one run that are recorded: a device that does nothing else must not fill the disk."""
+"""Restarts of one run that are recorded, and steps of its time map: a device that does nothing else must not fill the
+disk."""
+
+MAP_STEP_NS = 1_000_000
+"""A step of the time map from here on is logged and recorded."""
 
 GATHER_S = 0.018
 GATHER_SAMPLES = 36
@@ -104,6 +116,8 @@ class Acquisition:
         self._first_number = 0
         self._last_number = -1
         self._last_t_ns = 0
+        # Samples whose stamps were raised since the last that was not; how often that was.
+        self._squeezed = self._squeezes = 0
 
         # What tells the cause of the next gap.
         self._bad_since_sample = 0
@@ -321,6 +335,7 @@ class Acquisition:
         good = False
         if self._clock.newest(events, now):
             self._jumped(now)
+        self._note_step(now)
         for frame in events:
             if type(frame) is SampleFrame or type(frame) is Sample:
                 good = True
@@ -342,6 +357,7 @@ class Acquisition:
                     self._hand_over(now)
                     if self._clock.observe(seq, t, now):
                         self._jumped(now)
+                    self._note_step(now)
                 elif self._clock.lags(number, t, now):
                     self._hand_over(now)
                     self._clock.lay_anew(number, seq, t, now)
@@ -354,6 +370,9 @@ class Acquisition:
                         now / 1e9,
                         NEWS,
                     )
+                elif step_us := self._clock.stepped(number, t):
+                    self._hand_over(now)
+                    self._stepped(step_us, now)
                 elif waiting and number // self._block_size != waiting[0] // self._block_size:
                     self._hand_over(now)
                 self._gathered.add(number, t, readings, flags)
@@ -373,6 +392,41 @@ class Acquisition:
         self._repeats.tell(
             'jump', f"{self._name}: the device's clock jumped; the time map starts again", WARNING, now / 1e9, NEWS
         )
+
+    def _stepped(self, step_us: int, now: int) -> None:
+        self.counters.clock_jumps += 1
+        text = f"{self._name}: the device's clock jumped by {step_us / 1e3:+.1f} ms; the time map follows"
+        self._repeats.tell('jump', text, WARNING, now / 1e9, NEWS)
+        self._note_step(now)
+
+    def _note_step(self, now: int) -> None:
+        """Log and record a step of the time map."""
+        step_ns = self._clock.take_step_ns()
+        if abs(step_ns) < MAP_STEP_NS:
+            return
+        self.counters.map_steps += 1
+        off = f'{abs(step_ns) / 1e6:.1f} ms too {"late" if step_ns < 0 else "early"}'
+        text = f'{self._name}: samples were stamped {off} (the line or the clock): the time map steps'
+        self._repeats.tell('step', text, WARNING, now / 1e9, NEWS)
+        self._record(CLOCK_STEP, step_ns / 1e9, self.counters.map_steps)
+
+    def _record(self, name: str, value: float, count: int) -> None:
+        """Put a note of the time map into the recording, unless there are many."""
+        if count <= RECORDED_RESTARTS:
+            block = max(self._last_number, 0) // self._block_size
+            self.queue.put(Noted(ParameterChange(self._last_t_ns, block, ((name, value),))))
+
+    def _note_squeezed(self, squeezed: int, now: int) -> None:
+        """Count samples whose stamps had to be raised; log and record them when there are no more."""
+        self._squeezed += squeezed
+        if squeezed or not self._squeezed:
+            return
+        count, self._squeezed = self._squeezed, 0
+        self.counters.squeezed += count
+        self._squeezes += 1
+        text = f'{self._name}: {count} samples have stamps 1 ns apart, so that time does not go back'
+        self._repeats.tell('squeezed', text, WARNING, now / 1e9, NEWS)
+        self._record(CLOCK_SQUEEZED, float(count), self._squeezes)
 
     def _unusual(self, number: int, step: Step, missing: int, flags: int, now: int) -> bool:
         """Count a sample that does not directly follow the last one; False if it is to be skipped."""
@@ -432,9 +486,12 @@ class Acquisition:
         self._gathered = Gathered()
         t_ns = self._ros_time_ns(np.array(gathered.t, np.int64))
         # A restarted clock map may give times before the last stamp: time must not go back.
+        squeezed = 0
         if t_ns[0] <= self._last_t_ns or bool((t_ns[1:] <= t_ns[:-1]).any()):
             steps = np.arange(1, len(t_ns) + 1)
-            t_ns = np.maximum.accumulate(np.maximum(t_ns - steps, self._last_t_ns)) + steps
+            raised = np.maximum.accumulate(np.maximum(t_ns - steps, self._last_t_ns)) + steps
+            squeezed, t_ns = int((raised > t_ns).sum()), raised
+        self._note_squeezed(squeezed, now)
         self._last_t_ns = int(t_ns[-1])
         if self.queue.qsize() >= self._rig.acquisition.queue_blocks:
             self.counters.queue_dropped += len(gathered.seq)

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from psd_deflection.records import ParameterChange, RawChunk
 
@@ -32,11 +33,17 @@ class Restarted:
     change: ParameterChange | None
 
 
+class Noted(NamedTuple):
+    """On the queue: something that the recording is to have, and no estimate depends on."""
+
+    change: ParameterChange
+
+
 class Ended:
     """On the queue: nothing follows."""
 
 
-Item = Arrival | Restarted | Ended
+Item = Arrival | Restarted | Noted | Ended
 
 
 @dataclass(slots=True)

@@ -23,8 +23,63 @@ TORN_US = 50_000
 LAG_WINDOW_S = 10.0
 """Time over which sample numbers and device time are compared."""
 
+LEVEL_S = 0.1
+"""Device time less sample numbers is averaged over this time; two such levels show a step of the clock."""
+FLAT_US = 1_000
+"""A level over which device time and numbers disagree by more than this shows no step: the stamps jitter, or the step
+is in it."""
+STEP_US = 1_500
+"""A step of the clock from here on is one."""
+
 PONG_SLACK = 2.0
 """Periods by which an answer to a ping may lie outside the two samples that it came between."""
+
+
+class _Levels:
+    """Finds steps of a clock in device time less sample numbers, whose levels rise or fall evenly without one.
+
+    ``before_us``: device time before the last step.
+    """
+
+    before_us = 0
+
+    def __init__(self, period_us: float) -> None:
+        self._period_us = period_us
+        self._most = max(round(LEVEL_S * 1e6 / period_us), 4)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget the levels: what comes next has nothing to do with them."""
+        self._first: tuple[int, int] | None = None
+        self._sum = self._least = self._largest = 0.0
+        self._count = 0
+        # Flat levels: number and device time of the last sample, mean.
+        self._flat: list[tuple[int, int, float]] = []
+
+    def add(self, number: int, t_us: int) -> int:
+        """Take a sample; the step that it completes, us, or 0."""
+        if self._first is None:
+            self._first = number, t_us
+        off = t_us - self._first[1] - (number - self._first[0]) * self._period_us
+        self._least, self._largest = (min(self._least, off), max(self._largest, off)) if self._count else (off, off)
+        self._sum += off
+        self._count += 1
+        if self._count < self._most:
+            return 0
+        mean, flat = self._sum / self._count, self._largest - self._least < FLAT_US
+        self._sum, self._count = 0.0, 0
+        if not flat:
+            return 0
+        self._flat = [*self._flat[-2:], (number, t_us, mean)]
+        if len(self._flat) < 3 or number - self._flat[0][0] > 4.5 * self._most:
+            return 0
+        (n0, _, m0), (n1, before_us, m1), (n2, _, m2) = self._flat
+        step = round(m2 - m1 - (m1 - m0) * (n2 - n1) / (n1 - n0))
+        if abs(step) < STEP_US:
+            return 0
+        self.clear()
+        self.before_us = before_us
+        return step
 
 
 class ClockWatch:
@@ -41,6 +96,7 @@ class ClockWatch:
         self._taken: tuple[int, int] | None = None
         # A sample of the last LAG_WINDOW_S: extended number, device time.
         self._past = (0, 0)
+        self._levels = _Levels(period_us)
         # An answer to a ping that waits for the sample after it: device time, sent, read.
         self._reply: tuple[int, int, int] | None = None
 
@@ -98,7 +154,21 @@ class ClockWatch:
                 self._map.observe_reply(*reply)
         if last is None or torn:
             self._past = self._taken
+            self._levels.clear()
         return torn
+
+    def stepped(self, number: int, t_us: int) -> int:
+        """By how much the device's clock jumped ahead shortly before this sample, us, and the map with it; else 0."""
+        step_us = self._levels.add(number, t_us) if self.regressed else 0
+        if step_us:
+            self._map.shift(step_us, self._levels.before_us)
+            self._past = number, t_us
+        return step_us
+
+    def take_step_ns(self) -> int:
+        """By how much later the same device time is stamped since this was asked last, ns: a step of the map."""
+        step, self._map.stepped_ns = self._map.stepped_ns, 0
+        return step
 
     def lags(self, number: int, t_us: int, now: int) -> bool:
         """Whether device time has fallen behind the numbers of the samples, and by that behind the host as well.

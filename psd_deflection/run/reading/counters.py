@@ -22,6 +22,7 @@ UNSEEN = 'on the wire, without a trace'
 class AcquisitionCounters:
     """Samples and frames received and lost. Only the reader writes; any thread may read.
 
+    ``map_steps``: of the time map, by more than a millisecond; ``squeezed``: samples with stamps 1 ns apart after one.
     ``queue_dropped``: samples that were read, and for which there was no room to wait; ``abandoned``: those that still
     waited at the end of the run; ``dropped_why``: the last reason of either.
     """
@@ -41,6 +42,8 @@ class AcquisitionCounters:
     silences: int = 0
     refused_reopenings: int = 0
     clock_jumps: int = 0
+    map_steps: int = 0
+    squeezed: int = 0
     pings: int = 0
     pongs: int = 0
     bad_frames: Tally = field(default_factory=Tally)
