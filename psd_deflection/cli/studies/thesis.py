@@ -6,10 +6,10 @@ A rig needs none of this. docs/audit.md has what is wrong in the thesis; `make d
 its experiment on a simulated rig, from the camera to the page.
 
 compare-methods: every method gets exact readings of the thesis's rig, without noise. The first table has the rms and
-the largest error over a grid of poses (flat plate, independent tilts, tilts of a cantilever). The
-others have noise, condition number and error bound of the linear methods, and what each possible
-cause adds to Table 5.1. The last has dots of 2 mm beside those of 1 mm. --out also draws the figures of
-docs/methods.md.
+the largest error over a grid of poses (flat plate, independent tilts, tilts of a cantilever), the next the equations
+of section 2.3 as printed and corrected. The others have noise, condition number and error bound of the linear methods,
+and what each possible cause adds to Table 5.1. The last has dots of 2 mm beside those of 1 mm. --out also draws the
+figures of docs/methods.md.
 
   psd-deflection thesis compare-methods
   psd-deflection thesis compare-methods --out figures
@@ -51,6 +51,7 @@ from psd_deflection.studies.thesis.comparison import (
     thesis_geometry,
 )
 from psd_deflection.studies.thesis.large_spots import spot_changes
+from psd_deflection.studies.thesis.tilt_compensation import compared, mismatch
 
 _UNITS = (1e6, 1e6, MDEG)
 
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print_json(errors_json())
     else:
-        show(*error_table(), '', *linear_table(), '', *cause_table(), '', *spot_table())
+        show(*error_table(), '', *tilt_table(), '', *linear_table(), '', *cause_table(), '', *spot_table())
     if args.out is not None:
         # matplotlib takes a second to import; who only reads the tables need not wait for it.
         from psd_deflection.studies.thesis.figures import drawn
@@ -144,6 +145,28 @@ def _short(value: float) -> str:
     if value < 1e-6:
         return '0'
     return f'{value:.0f}' if value >= 100.0 else f'{value:.3g}'
+
+
+def tilt_table() -> list[str]:
+    """Lines of section 2.3 as printed and corrected, at one tilted pose."""
+    geometry = thesis_geometry()
+    pose = np.array([1e-3, -2e-3, *np.radians([1.0, 0.5, -0.3])])
+    lines = [
+        'Section 2.3 at ΔX 1 mm, ΔY -2 mm, θ 1, φ 0.5, ω -0.3 deg, each equation given the corrected ones before it',
+        f'{"":28}{"as printed":>14}{"corrected":>14}{"true":>14}',
+    ]
+    for row in compared(geometry, pose):
+        scale, unit = (180.0 / np.pi, 'deg') if row.unit == 'rad' else (1e6, 'µm')
+        values = (row.printed, row.corrected, row.true)
+        cells = ['imaginary' if np.isnan(v) else f'{scale * v:.6g}' for v in values]
+        lines.append(f'{f"{row.equation}, {unit}":28}' + ''.join(f'{cell:>14}' for cell in cells))
+    dots = tuple(dots_of(geometry, pose[None])[0].tolist())
+    tried = (-0.001, 0.0, 1.0, 20.0)
+    worst = max(mismatch(geometry, dots, pose[2] + np.radians(off)) for off in tried)
+    return [
+        *lines,
+        f'2.46-2.49 at trial angles {", ".join(f"{v:g}" for v in tried)} deg off: within {worst:.0e} m, selects none',
+    ]
 
 
 def linear_table() -> list[str]:
