@@ -239,8 +239,8 @@ ROOMS: Mapping[str, Room] = {
         slow=('test/cli/test_budget.py',),
     ),
     'thesis': Room(
-        ('psd_deflection/studies/thesis',),
-        ('test/studies/thesis',),
+        ('psd_deflection/studies/thesis', 'psd_deflection/studies/splitter.py'),
+        ('test/studies/thesis', 'test/studies/test_splitter.py'),
         leave=('psd_deflection/studies/thesis/figures.py',),
         slow=('test/cli/test_thesis.py',),
     ),

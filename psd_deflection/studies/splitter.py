@@ -8,6 +8,10 @@ Both lasers are made one beam, which a splitter halves, one half for each PSD. T
 2. If one laser fails, half of the other's power is enough for both PSDs.
 3. They need not run together: the second one may be a cold spare, which is switched on when the first one fails.
 
+Two lenses (Fig. 5.11) do not make two parallel beams one: they leave the second lens side by side, so the dots of the
+two lasers lie apart on each PSD (:func:`dots_apart`). Beside the zero that was taken before, a change of the light is
+then a displacement of the tip that it has not made.
+
 The gain of the amplifier is the one that makes the light of every day ``sum_nominal``: of both lasers, or of the first
 one if the second is a spare. What an amplifier puts on a reading goes with one over the sum signal.
 """
@@ -37,12 +41,14 @@ LOAD = (0.0, -10.0, 1.0)
 class Lasers:
     """Powers of the two lasers, W; what one PSD is ``allowed`` to get, W; until a spare has its power, s: ``warm_up``.
 
-    Raises ConfigError for a value that cannot be.
+    ``apart``: along X, from the dot of laser 1 to that of laser 2 on each PSD, m. Raises ConfigError for a value that
+    cannot be.
     """
 
     powers: tuple[float, float]
     allowed: float
     warm_up: float = 1.0
+    apart: float = 1e-3
 
     def __post_init__(self) -> None:
         for name, value in (*(('splitter', power) for power in self.powers), ('allowed', self.allowed)):
@@ -50,6 +56,21 @@ class Lasers:
                 raise ConfigError(f'{name} = {value} W: must be above 0 and below 1000')
         if not 0.0 <= self.warm_up <= 60.0:
             raise ConfigError(f'warm_up = {self.warm_up} s: must be at least 0 and at most 60')
+        if not abs(self.apart) <= 5e-3:
+            raise ConfigError(f'apart = {self.apart} m: must be at least -0.005 and at most 0.005')
+
+
+def dots_apart(separation: float, focal: tuple[float, float], between: float | None = None, path: float = 0.0) -> float:
+    """How far apart, m, two parallel beams land that enter a lens ``separation`` apart and leave a second one.
+
+    ``focal``: of the focusing lens and of the collimator; ``between`` the lenses: the sum of both unless given, so
+    that the beams leave parallel. ``path``: from the collimator to the PSD. Thin lenses; below 0: on the other side.
+    """
+    first, second = focal
+    gap = first + second if between is None else between
+    at_second = separation * (1.0 - gap / first)
+    slope = -separation / first - at_second / second
+    return at_second + path * slope
 
 
 class SplitterRule(NamedTuple):
@@ -66,13 +87,16 @@ class LightPhase(NamedTuple):
     """What a simulated rig does in one phase.
 
     ``estimates``: share of blocks with one; ``status`` of most blocks; ``deviations`` (3,): stated, m, m, rad;
-    ``largest``: largest error, in stated deviations (0 without estimates); ``said``: the finding, or ''.
+    ``off``, ``scatter`` (3,): mean and standard deviation of the errors, m, m, rad; ``largest``: largest error about
+    their mean, in stated deviations (0 without estimates); ``said``: the finding, or ''.
     """
 
     name: str
     estimates: float
     status: BlockStatus
     deviations: FloatArray
+    off: FloatArray
+    scatter: FloatArray
     largest: float
     said: str
 
@@ -99,38 +123,44 @@ def rules(rig: Rig, lasers: Lasers) -> list[SplitterRule]:
 
 
 def simulated(rig: Rig, lasers: Lasers, seed: int = 1) -> list[LightPhase]:
-    """Both lasers; one out; the first alone; its spare cold; the spare warm: each as the pipeline sees it."""
+    """Both lasers; one out; the first alone; its spare cold; the spare warm: each as the pipeline sees it.
+
+    The zero is that of the first phase: of both dots, or of the first one.
+    """
     rig = replace_values(rig, {'splitter': True})
-    both = sum(lasers.powers)
-    spare = lasers.powers[1] / lasers.powers[0]
-    together = _run(rig, (('both lasers', BEFORE_S, 1.0), ('laser 1 out', AFTER_S, lasers.powers[1] / both)), seed)
-    cold = [('laser 1 out, its spare cold', lasers.warm_up, 0.0)] if lasers.warm_up else []
-    alone = (('laser 1 alone', BEFORE_S, 1.0), *cold, ('its spare', AFTER_S, spare))
+    first, second = lasers.powers
+    both = first + second
+    # Two lasers are read at the centroid of their light.
+    left = lasers.apart * first / both
+    together = _run(rig, (('both lasers', BEFORE_S, 1.0, 0.0), ('laser 1 out', AFTER_S, second / both, left)), seed)
+    cold = [('laser 1 out, its spare cold', lasers.warm_up, 0.0, 0.0)] if lasers.warm_up else []
+    alone = (('laser 1 alone', BEFORE_S, 1.0, 0.0), *cold, ('its spare', AFTER_S, second / first, lasers.apart))
     return [*together, *_run(rig, alone, seed + 1)]
 
 
-def _run(rig: Rig, phases: Sequence[tuple[str, float, float]], seed: int) -> Iterator[LightPhase]:
-    """Of phases with a name, so many seconds, and that share of the nominal light."""
+def _run(rig: Rig, phases: Sequence[tuple[str, float, float, float]], seed: int) -> Iterator[LightPhase]:
+    """Of phases with a name, so many seconds, that share of the nominal light, and so far along X from the zero, m."""
     rate, size = rig.converter.sample_rate_hz, rig.estimator.block_size
-    counts = [round(seconds * rate) for _, seconds, _ in phases]
-    share = np.repeat([s for _, _, s in phases], counts)
+    counts = [round(phase[1] * rate) for phase in phases]
+    share, aside = (np.repeat([phase[i] for phase in phases], counts) for i in (2, 3))
     made = RigSimulator(rig, seed).step(np.tile(LOAD, (len(share), 1)))
     read = np.asarray(made.counts * rig.converter.volts_per_count, np.float64)
-    volts = _lit(rig, read, share, np.random.default_rng(seed))
+    read[:, 0::3] += aside[:, None] / rig.sensitivities[:, 0]
+    volts = lit(rig, read, share, np.random.default_rng(seed))
     seq = np.arange(len(share))
     t_ns = np.round(seq * 1e9 / rate).astype(np.int64)
     chunk = RawChunk(seq, t_ns, volts.astype(np.float32), np.zeros(len(seq), np.uint8))
     records = list(Pipeline(rig).process(chunk))
     begin = 0
-    for (name, _, _), count in zip(phases, counts, strict=True):
+    for (name, *_), count in zip(phases, counts, strict=True):
         # Without the blocks in which the light changes, and those in which the noise is not measured yet.
         first = -(-begin // size) + 1 if begin else count // size // 2
         begin += count
         yield _phase(name, range(first, begin // size), records, made.pose, size)
 
 
-def _lit(rig: Rig, volts: FloatArray, share: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """``volts`` (n, 3P), V, of which the PSDs get the ``share`` (n,) of the nominal light."""
+def lit(rig: Rig, volts: FloatArray, share: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Volts (n, 3P) of PSDs that get the ``share`` (n,) of the light by which ``volts``, V, were read."""
     out, dark = volts.copy(), share <= 0.0
     more = np.sqrt(np.maximum(1.0 / np.where(dark, 1.0, share) ** 2 - 1.0, 0.0))
     drawn = rng.standard_normal(volts.shape)
@@ -151,10 +181,14 @@ def _phase(name: str, blocks: range, records: Sequence[Record], pose: FloatArray
     status = max(set(statuses), key=statuses.count)
     said = next((s.findings[0] for s in spots if s.findings), '')
     if not found:
-        return LightPhase(name, 0.0, status, np.full(3, np.nan), 0.0, next((s.reason for s in spots if s.reason), said))
+        none = np.full(3, np.nan)
+        why = next((s.reason for s in spots if s.reason), said)
+        return LightPhase(name, 0.0, status, none, none, none, 0.0, why)
     sds = np.sqrt([r.variances for r in found])
     middle = np.array([size * r.block + (size - 1) // 2 for r in found])
-    # Half a sample later; the link hardly moves any more.
-    there = 0.5 * (pose[middle] + pose[middle + 1])
-    largest = float((np.abs(np.array([r.pose for r in found]) - there) / sds).max())
-    return LightPhase(name, len(found) / len(blocks), status, np.median(sds, axis=0), largest, said)
+    # Between two samples if their number is even.
+    there = 0.5 * (pose[middle] + pose[middle + 1 - size % 2])
+    errors = np.array([r.pose for r in found]) - there
+    off, scatter = errors.mean(axis=0), errors.std(axis=0)
+    largest = float((np.abs(errors - off) / sds).max())
+    return LightPhase(name, len(found) / len(blocks), status, np.median(sds, axis=0), off, scatter, largest, said)

@@ -14,7 +14,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
 from psd_deflection.records import BlockStatus
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.splitter import Lasers, rules, simulated
+from psd_deflection.studies.splitter import Lasers, dots_apart, lit, rules, simulated
 
 RIG = load_rig()
 FILE = str(Path(__file__).parents[2] / 'config' / 'thesis_rig.yaml')
@@ -44,6 +44,16 @@ def test_the_numbers_of_the_rules() -> None:
     assert spare.value == pytest.approx(5.0 / 1.5)
 
 
+def test_two_lenses_leave_two_parallel_beams_apart() -> None:
+    """Separation times the ratio of the focal lengths, on the other side; nothing there makes them one."""
+    assert dots_apart(0.010, (0.100, 0.010), path=0.585) == pytest.approx(-1e-3)
+    # Where they cross, at the first focus, the collimator has no hold on them: a path of f1 has them apart as before.
+    assert dots_apart(0.010, (0.100, 0.010), between=0.100) == pytest.approx(0.0, abs=1e-15)
+    assert dots_apart(0.010, (0.100, 0.010), between=0.100, path=0.100) == pytest.approx(-0.010)
+    # In touch they are one lens of 1/f1 + 1/f2: the beams cross at its focus.
+    assert dots_apart(0.010, (0.100, 0.025), between=0.0, path=0.020) == pytest.approx(0.0, abs=1e-15)
+
+
 @pytest.mark.statistics
 def test_one_that_fails_costs_certainty_and_a_cold_spare_its_warm_up() -> None:
     both, out, alone, cold, spare = simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.5))
@@ -55,8 +65,25 @@ def test_one_that_fails_costs_certainty_and_a_cold_spare_its_warm_up() -> None:
     assert np.all(out.deviations > 1.9 * both.deviations)
     assert spare.deviations == pytest.approx(alone.deviations, rel=0.3)
     assert max(p.largest for p in (both, out, alone, spare)) < 5.0
+    # Where the dots leap, the tip seems to: half a dot's distance if both shone, all of it for a spare.
+    assert [p.off[0] for p in (both, out, alone, spare)] == pytest.approx([0.0, -5e-4, 0.0, -1e-3], abs=1e-6)
     # A spare that is on at once loses nothing.
     assert [p.name for p in simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.0))][-2:] == ['laser 1 alone', 'its spare']
+
+
+def test_half_the_light_halves_the_sum_and_doubles_the_noise() -> None:
+    """An amplifier's noise goes with one over the sum; in the dark there is nothing else."""
+    rng = np.random.default_rng(3)
+    noise = RIG.noises.ravel()
+    level = np.tile([1.0, -2.0, 5.0], 2)
+    volts = level + noise * rng.standard_normal((20_000, 6))
+    half, dark = (lit(RIG, volts, np.full(len(volts), share), rng) for share in (0.5, 0.0))
+    places, sums = [0, 1, 3, 4], [2, 5]
+    np.testing.assert_allclose(half[:, places].std(axis=0), 2.0 * noise[places], rtol=0.03)
+    np.testing.assert_allclose(half[:, places].mean(axis=0), level[places], atol=1e-4)
+    np.testing.assert_allclose(half[:, sums], 0.5 * volts[:, sums])
+    np.testing.assert_allclose(dark[:, places].std(axis=0), noise[places], rtol=0.03)
+    np.testing.assert_allclose(dark.mean(axis=0), 0.0, atol=1e-4)
 
 
 def test_the_command_says_which_rule_is_broken(capsys: pytest.CaptureFixture[str]) -> None:
@@ -88,5 +115,7 @@ def test_what_cannot_be_is_refused(words: list[str], message: str, capsys: pytes
 
 
 def test_lasers_are_checked() -> None:
+    with pytest.raises(ConfigError, match=r'apart = 0\.006 m: must be at least'):
+        Lasers((1e-3, 1e-3), 1e-3, apart=0.006)
     with pytest.raises(ConfigError, match='allowed = nan'):
         Lasers((1e-3, 1e-3), float('nan'))

@@ -81,6 +81,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--warm-up', type=plain_number, metavar='S', help='until a cold spare has its power, s (default 1)'
     )
+    parser.add_argument(
+        '--apart', type=plain_number, metavar='M', help="from laser 1's dot to laser 2's on each PSD, m (default 0.001)"
+    )
     parser.add_argument('--out', type=picture_name(*PICTURES), metavar='FILE.png|svg|pdf', help='draw the placements')
     parser.add_argument('--json', action='store_true', help='print link and placements as JSON in SI units')
 
@@ -89,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the tables or the study."""
     if args.splitter is not None:
         return splitter_of(args)
-    refuse(args, {'allowed': None, 'warm_up': None}, 'is of two lasers: give --splitter W W')
+    refuse(args, {'allowed': None, 'warm_up': None, 'apart': None}, 'is of two lasers: give --splitter W W')
     if args.params_file is None:
         placing = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None, 'json': False}
         refuse(args, placing, 'is for the placement of a rig: give --params-file RIG.yaml')
@@ -136,13 +139,17 @@ def splitter_of(args: argparse.Namespace) -> int:
     if args.allowed is None:
         raise UsageError('--splitter: give --allowed W too, the power that one PSD is allowed to get')
     rig = load_rig(args.params_file)
-    with given_as_option('splitter', 'allowed', 'warm_up'):
-        warm_up = {} if args.warm_up is None else {'warm_up': args.warm_up}
-        lasers = splitter.Lasers(tuple(args.splitter), args.allowed, **warm_up)
+    with given_as_option('splitter', 'allowed', 'warm_up', 'apart'):
+        chosen = {name: value for name in ('warm_up', 'apart') if (value := getattr(args, name)) is not None}
+        lasers = splitter.Lasers(tuple(args.splitter), args.allowed, **chosen)
     rules = splitter.rules(rig, lasers)
     phases = splitter.simulated(rig, lasers)
     if args.json:
-        shown = [{**p._asdict(), 'status': p.status.name, 'deviations': p.deviations.tolist()} for p in phases]
+        lists = ('deviations', 'off', 'scatter')
+        shown = [
+            {**p._asdict(), 'status': p.status.name, **{name: getattr(p, name).tolist() for name in lists}}
+            for p in phases
+        ]
         print_json({'rules': [rule._asdict() for rule in rules], 'phases': shown})
     else:
         show_text(rules_text(rules))
@@ -161,11 +168,11 @@ def rules_text(rules: Sequence[splitter.SplitterRule]) -> str:
 
 def phases_text(phases: Sequence[splitter.LightPhase]) -> str:
     """A row for each phase of the simulation, and what is said in it."""
-    rows = [['simulated', 'blocks with an estimate', 'ΔX ± µm', 'ΔY ± µm', 'θ ± mdeg', 'largest error, in ±']]
+    rows = [['simulated', 'blocks', 'ΔX ± µm', 'ΔY ± µm', 'θ ± mdeg', 'ΔX off µm', 'largest, in ±']]
     for p in phases:
         sds = (p.deviations * np.array([1e6, 1e6, MDEG])).tolist()
-        numbers = [f'{v:.3f}' for v in sds] if p.estimates else ['–'] * 3
-        rows.append([p.name, f'{p.estimates:.0%}', *numbers, f'{p.largest:.1f}' if p.estimates else '–'])
+        numbers = [*(f'{v:.3f}' for v in sds), f'{1e6 * p.off[0]:.1f}', f'{p.largest:.1f}']
+        rows.append([p.name, f'{p.estimates:.0%}', *(numbers if p.estimates else ['–'] * 5)])
     said = [f'{p.name}: {p.said}' for p in phases if p.said]
     return '\n'.join([columns(rows), *(['', *said] if said else [])])
 
