@@ -53,7 +53,7 @@ AT_PLUS_X = Geometry(np.array([[0.0, 0.07], [0.1, 0.0]]), np.zeros((2, 2)), np.z
 
 
 def degrees(*values: float) -> list[float]:
-    return np.radians(values).tolist()
+    return [float(v) for v in np.radians(values)]
 
 
 @pytest.mark.parametrize(
