@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench import damping
+from bench import shapers
 from bench.simulated_arm import SimulatedArm
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.chains.transform import Transform
@@ -141,13 +141,10 @@ def main(argv: list[str] | None = None) -> int:
         before, after = rms(without, window), rms(ran, window)
         rows.append((name, f'{before * 1e3:.4f}', f'{after * 1e3:.4f}', f'{100.0 * after / before:.2f} %'))
         print(f'{name:34}{before * 1e3:10.4f} mm{after * 1e3:10.4f} mm{100.0 * after / before:8.2f} %')
-    links = damping.moved_links()
-    compensated, moves = chart(without, ran), damping.chart(links)
-    print(f'vibration after a quick move without a shaper: {1e3 * damping.unshaped():.2f} mm')
-    shapers, moved, knocks = damping.rows(), damping.moved_rows(links), damping.knock_rows()
-    heads = damping.SHAPER_HEAD, damping.MOVED_HEAD, damping.KNOCK_HEAD
-    for titles, rows_of in zip(heads, (shapers, moved, knocks), strict=True):
-        damping.printed(titles, rows_of)
+    compensated = chart(without, ran)
+    print(f'vibration after a quick move without a shaper: {1e3 * shapers.unshaped():.2f} mm')
+    left = shapers.rows()
+    shapers.printed(shapers.SHAPER_HEAD, left)
     head = ('rms distance from the rigid pose', 'without, mm', 'with, mm', 'left')
     body = [
         '<h1>A payload on a flexible arm, with and without compensation</h1>',
@@ -155,20 +152,13 @@ def main(argv: list[str] | None = None) -> int:
         'deflection 30 ms late and with noise, and moves both joints.</p>',
         table(head, rows),
         drawn(compensated),
-        '<h1>A quick move, with and without a shaper and active damping</h1>',
+        '<h1>A quick move, with and without a shaper</h1>',
         '<p>What each shaper leaves of the vibration of the arm. The frequency is right, or 5 % wrong.</p>',
-        table(damping.SHAPER_HEAD, shapers),
-        '<p>One link, of which the shaper has a frequency that is 10 % wrong, as with another payload. Active damping '
-        'takes the velocity from the filter of the motion.</p>',
-        table(damping.MOVED_HEAD, moved),
-        drawn(moves),
-        '<p>The same link, knocked.</p>',
-        table(damping.KNOCK_HEAD, knocks),
+        table(shapers.SHAPER_HEAD, left),
     ]
     args.out.mkdir(parents=True, exist_ok=True)
     (args.out / 'report.html').write_text(page('Compensation', body), encoding='utf-8')
     figure_of(compensated).savefig(args.out / 'compensation.png', dpi=90)
-    figure_of(moves).savefig(args.out / 'damping.png', dpi=90)
     print(f'the page: {args.out / "report.html"}')
     return 0
 

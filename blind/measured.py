@@ -7,5 +7,5 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-DATA = Path(os.environ.get('PSD_FOREIGN_DATA', Path(__file__).resolve().parent.parent.parent / 'shared' / 'data'))
-"""A folder for each machine: that of the environment variable, or ``../shared/data`` beside the checkout."""
+DATA = Path(os.environ.get('PSD_FOREIGN_DATA', 'PSD_FOREIGN_DATA is not set'))
+"""A folder for each machine, which the environment variable names; a name that says so if it does not."""

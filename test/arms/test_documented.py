@@ -5,14 +5,12 @@
 from __future__ import annotations
 
 import re
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
 
 from psd_deflection.arms.chains import chain_file
 from psd_deflection.arms.compensation import settings, shaping
-from psd_deflection.arms.compensation.damper import DamperSettings
 from psd_deflection.rig.parameters import Section
 
 DOCS = Path(__file__).parents[2] / 'docs'
@@ -34,13 +32,6 @@ def test_the_page_has_the_defaults_of_the_compensator() -> None:
     numbers = {p.name: p.default for p in declared.values() if p.live}
     assert {name: float(said[name]) for name in numbers} == numbers
     assert (said['takeover'], declared['takeover'].default) == ('true', True)
-
-
-def test_the_page_has_the_defaults_of_the_damper() -> None:
-    said = stated('shaping.md')
-    shown = {f.name: f.default for f in fields(DamperSettings) if f.name in said and f.name != 'lag'}
-    assert set(shown) == {'added', 'max_offset', 'max_rate', 'stale', 'max_sd', 'max_speed'}
-    assert {name: float(said[name]) for name in shown} == shown
 
 
 def test_what_may_be_set_while_a_node_runs_is_what_the_pages_say() -> None:

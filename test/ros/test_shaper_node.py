@@ -23,7 +23,7 @@ from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint  # noqa: E402
 
-from bench.damping import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played  # noqa: E402
+from bench.shapers import END, FREQUENCY, MOVE_S, NAMES, RATIO, START, move, played  # noqa: E402
 from psd_deflection.arms.compensation.trajectory import checked  # noqa: E402
 from test.ros.conftest import WARNINGS, stamp  # noqa: E402
 from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402

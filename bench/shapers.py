@@ -1,0 +1,101 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""What shapers leave of a vibration: ``python -m bench.shapers``.
+
+Shapers: the arm of ``config/two_links.yaml`` carries 20 N and moves both joints within 0.4 s. Its links ring at 12 Hz.
+The shapers are made for that frequency, and for one that is 5 % below or above. Judged is the amplitude when the joints
+have arrived.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from bench.simulated_arm import LAG_S, SimulatedArm
+from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.arms.compensation.trajectory import Trajectory, TrajectoryShaper, checked
+from psd_deflection.arms.inputs import standing
+from psd_deflection.arms.shapers import KINDS, Shaper, shaper
+from tools.program import ROOT
+
+FREQUENCY, RATIO = 12.0, 0.02
+GRAVITY = 9.81
+PAYLOAD = np.array([0.0, 0.0, -20.0])
+NAMES = ('shoulder', 'elbow')
+START, END = np.array([1.2, 0.6]), np.array([0.9, 1.0])
+MOVE_S = 0.4
+STEP_S = 0.002
+SETTLED_S = 6.0 * LAG_S
+"""After the last point the joints have arrived, s."""
+WRONG = (0.95, 1.0, 1.05)
+"""The frequency that the shaper is made for, over the true one."""
+
+
+def move() -> Trajectory:
+    """From rest to rest: two points with velocities."""
+    points = [[at.tolist(), [0.0, 0.0], []] for at in (START, END)]
+    return checked(NAMES, [0.0, MOVE_S], points)
+
+
+def played(trajectory: Trajectory) -> float:
+    """Amplitude of the end effector's vibration after the trajectory, m."""
+    arm = SimulatedArm(
+        read_chain(ROOT / 'config' / 'two_links.yaml').chain,
+        START,
+        frequency=FREQUENCY,
+        damping=RATIO,
+        mass=float(np.linalg.norm(PAYLOAD)) / GRAVITY,
+    )
+    arm.force = PAYLOAD
+    arm.settle()
+    times = np.arange(0.0, trajectory.duration + SETTLED_S, STEP_S)
+    for wanted in trajectory.at(times)[:, 0]:
+        arm.step(wanted, STEP_S)
+    return arm.vibration()
+
+
+@functools.cache
+def unshaped() -> float:
+    """Amplitude after the move as it is, m."""
+    return played(move())
+
+
+def left(by: Shaper) -> float:
+    """Amplitude after the shaped move over that after the move as it is."""
+    return (
+        played(TrajectoryShaper(by).shape(0, move(), standing(dict(zip(NAMES, START.tolist(), strict=True)))))
+        / unshaped()
+    )
+
+
+SHAPER_HEAD = ('shaper', 'longer by', '5 % too low', 'right', '5 % too high')
+
+
+def rows() -> list[tuple[str, ...]]:
+    """Shaper, what it adds to the move, and what is left for each of ``WRONG``."""
+    out = []
+    for kind in KINDS:
+        shares = [left(shaper(kind, FREQUENCY * wrong, RATIO)) for wrong in WRONG]
+        longer = shaper(kind, FREQUENCY, RATIO).duration
+        out.append((kind.upper(), f'{1e3 * longer:.0f} ms', *(f'{100.0 * share:.1f} %' for share in shares)))
+    return out
+
+
+def printed(head: Sequence[str], body: Sequence[Sequence[str]]) -> None:
+    """Print a table in Markdown."""
+    print('\n| ' + ' | '.join(head) + ' |\n' + '|---' * len(head) + '|')
+    for row in body:
+        print('| ' + ' | '.join(row) + ' |')
+
+
+def main() -> None:
+    """Print the table."""
+    print(f'without a shaper: {1e3 * unshaped():.2f} mm')
+    printed(SHAPER_HEAD, rows())
+
+
+if __name__ == '__main__':
+    main()
