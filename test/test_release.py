@@ -194,7 +194,7 @@ def test_the_changelog_of_bloom_has_the_text_of_the_other(tree: Path) -> None:
     ready(tree)
     made = changelog_rst(tree)
     assert f'\n{facts(tree).version} (2026-12-01)\n------------------\n' in made
-    assert '\n  * ``estimator``: samples at 1 kHz' in made
+    assert '\n  * ``estimator``: 1 kHz samples' in made
     entries = sum(line.startswith('- ') for line in (tree / 'CHANGELOG.md').read_text().splitlines())
     assert sum(line.startswith('  * ') for line in made.splitlines()) == entries
     assert '](' not in made
