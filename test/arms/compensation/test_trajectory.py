@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.interpolate import BPoly
 
-from bench import damping
+from bench import shapers
 from bench.steps import largest_step_in_time
 from bench.trajectory_controller import TrajectoryController
 from psd_deflection.arms.compensation.arm import JointLimits, read_limits
@@ -263,7 +263,7 @@ def test_shapers_in_series_end_both_modes() -> None:
 
 @pytest.mark.parametrize(('kind', 'wrong'), [('zv', 1.0), ('mzv', 1.0), ('zvd', 0.95), ('ei', 1.05)])
 def test_after_a_shaped_move_of_the_arm_five_percent_of_the_vibration_are_left(kind: str, wrong: float) -> None:
-    assert damping.left(shaper(kind, wrong * damping.FREQUENCY, damping.RATIO)) < 0.05
+    assert shapers.left(shaper(kind, wrong * shapers.FREQUENCY, shapers.RATIO)) < 0.05
 
 
 @pytest.mark.parametrize('orders', [1, 2, 3])
