@@ -103,7 +103,8 @@ class Session:
             )
         same = left_as_in_the_thesis(rig.values)
         if same:
-            say(f'as in the thesis rig, unless you measured the same: {"; ".join(same)}')
+            more = f' and {len(same) - 1} more (`psd-deflection params` lists them)' if len(same) > 1 else ''
+            say(f'as in the thesis rig, unless you measured the same: {same[0]}{more}')
         try:
             self.acquisition = Acquisition(rig, say)
             self.acquisition.open()

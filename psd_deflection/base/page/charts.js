@@ -11,10 +11,17 @@ export function clock(seconds, digits = 0) {
   return digits ? `${text}.${String(ticks % 10 ** digits).padStart(digits, '0')}` : text;
 }
 
-// As many digits as tell neighbouring labels apart.
+// As many decimals as a step between ticks has: with fewer, a label would be of another time than its tick.
+export function decimals(step) {
+  for (let digits = 0; digits < 6; digits++) {
+    const scaled = step * 10 ** digits;
+    if (Math.abs(scaled - Math.round(scaled)) < 1e-6 * scaled) return digits;
+  }
+  return 6;
+}
+
 function times(u, ticks) {
-  const step = ticks.length > 1 ? ticks[1] - ticks[0] : 1;
-  const digits = Math.min(6, Math.max(0, -Math.floor(Math.log10(step) + 1e-6)));
+  const digits = decimals(ticks.length > 1 ? ticks[1] - ticks[0] : 1);
   return ticks.map((t) => whole(u, t, digits));
 }
 

@@ -193,6 +193,23 @@ def _made(name: str, values: Mapping[str, object], source: str, places: Mapping[
     return ActiveEffect(effect, out)
 
 
+MEANT = {
+    'hum': 'mains_interference',
+    'mains': 'mains_interference',
+    'drift': 'laser_pointing_drift',
+    'tilt': 'plane_tilt',
+    'light': 'ambient_light',
+    'stray_light': 'ambient_light',
+    'clipping': 'spot_clipping',
+    'saturation': 'amplifier_saturation',
+    'hysteresis': 'clamp_friction',
+    'stiffness': 'bending_stiffness',
+    'temperature': 'thermal_drift',
+    'rotation': 'sensor_rotation',
+}
+"""What people call an effect, and its name."""
+
+
 def _effect(name: str, values: Mapping[str, object], source: str, places: Mapping[str, Place]) -> Effect:
     """The effect that ``values`` have the law of, or the one that is in its place."""
     if LAW in values:
@@ -201,7 +218,12 @@ def _effect(name: str, values: Mapping[str, object], source: str, places: Mappin
             raise ConfigError(f'{source}.{LAW}: name = {effect.name!r}: must be {name!r}, as in {source}.name')
         return effect
     if name not in places:
-        hint = did_you_mean(name, places) or f'; there are: {", ".join(sorted(places))}'
+        meant = MEANT.get(name.lower())
+        hint = (
+            f'; did you mean {meant}?'
+            if meant
+            else did_you_mean(name, places) or f'; there are: {", ".join(sorted(places))}'
+        )
         folders = ', '.join(str(folder) for folder in effect_folders())
         yours = f' (one of your own is {name}.py or {name}.yaml in {folders}, see {FOLDERS})' if folders else ''
         raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}{yours}')

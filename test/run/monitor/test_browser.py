@@ -545,3 +545,33 @@ def test_half_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[...,
     assert page.nodes() == nodes
     assert serving.feed.dropped == 0
     assert page.complaints() == []
+
+
+def test_a_label_of_the_time_axis_has_every_decimal_of_its_step(page: Page, serve: Callable[..., Serving]) -> None:
+    page.open(serve().url)
+    page.live()
+    digits = page.later(
+        "import('/page/charts.js').then((charts) => [60, 5, 2.5, 1, 0.25, 0.05, 0.002].map(charts.decimals))"
+    )
+    assert digits == [0, 0, 1, 0, 2, 2, 3]
+
+
+@pytest.mark.parametrize(
+    ('typed', 'noted'),
+    [('-1,5', -1.5), ('-1.5', -1.5), ('-1e1', -10.0), ('1,500', None), ('1,500.5', None), ('ten', None), ('', None)],
+)
+def test_a_load_of_the_page_takes_a_decimal_comma_or_refuses(
+    page: Page, serve: Callable[..., Serving], typed: str, noted: float | None
+) -> None:
+    serving = serve()
+    page.open(serving.url)
+    page.live()
+    page.driver.find_element(By.ID, 'load').click()
+    field = page.driver.find_element(By.ID, 'fy')
+    field.clear()
+    field.send_keys(typed)
+    assert page.js('document.getElementById("fy").checkValidity()') is (noted is not None)
+    page.driver.find_element(By.CSS_SELECTOR, '#weigh button.main').click()
+    if noted is not None:
+        page.until('!document.getElementById("notice").hidden')
+    assert [load[1] for load in serving.shown.loads] == ([] if noted is None else [noted])
