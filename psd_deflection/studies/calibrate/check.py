@@ -118,7 +118,7 @@ def check(
     groups = [_moved(name, at, left, m, scale) for name in dict.fromkeys(d.group for d in PARAMETERS)]
     seen = [g for g in groups if g.freedom]
     seen.sort(key=lambda g: -g.evidence)
-    overall = min([1.0, *(len(seen) * g.p for g in seen)])
+    overall = overall_p([g.p for g in seen])
     if overall < LEVEL:
         # A shift of several tolerances is beyond the linear: the likely ones are fitted in full.
         null = explained(rows, rig, told, kind, free, best)[0]
@@ -134,6 +134,11 @@ def check(
         best.values[zeros] - vector.values[zeros],
         np.sqrt(np.diag(best.covariance)[zeros]),
     )
+
+
+def overall_p(each: Sequence[float]) -> float:
+    """p that nothing moved, from that of ``each`` group (Bonferroni); below ``LEVEL`` for at most its share of rigs."""
+    return min([1.0, *(len(each) * p for p in each)])
 
 
 def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> MovedGroup:

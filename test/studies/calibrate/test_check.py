@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.misalignment.model import INDEX, PARAMETERS, ZERO
@@ -16,7 +17,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.studies.calibrate import check as checking
 from psd_deflection.studies.calibrate.calibrate import _with_clamp, undetermined
-from psd_deflection.studies.calibrate.check import MovedGroup, _fitted, _moved
+from psd_deflection.studies.calibrate.check import LEVEL, MovedGroup, _fitted, _moved, overall_p
 from psd_deflection.studies.calibrate.fit import (
     CLAMP_AT,
     CalibrationFit,
@@ -71,6 +72,18 @@ def test_a_group_is_fitted_as_if_it_may_have_moved_by_three_tolerances(monkeypat
     # Against nothing moved; and what it moved by.
     assert found.evidence == pytest.approx(4.0)
     assert [v for v, _ in found.shifts.values()] == pytest.approx([0.5] * len(names))
+
+
+@pytest.mark.parametrize(('shared', 'least', 'most'), [(0.0, 0.042, 0.055), (0.9, 0.005, 0.055)])
+def test_at_most_five_per_cent_of_rigs_are_said_to_have_moved(shared: float, least: float, most: float) -> None:
+    """20,000 rigs in which nothing moved, of as many groups as there are, independent or with a common part."""
+    groups = len({p.group for p in PARAMETERS[:ZERO]})
+    rng = np.random.default_rng(8)
+    common, own = rng.standard_normal((20_000, 1, 2)), rng.standard_normal((20_000, groups, 2))
+    z = np.sqrt(shared) * common + np.sqrt(1.0 - shared) * own
+    each = chi2.sf(np.sum(z**2, axis=2), 2)
+    assert least < np.mean([overall_p(rig) < LEVEL for rig in each.tolist()]) < most
+    assert (LEVEL, overall_p([]), overall_p([0.4, 0.9])) == (0.05, 1.0, 0.8)
 
 
 def test_what_no_row_tells_is_undetermined_alone_or_as_a_combination() -> None:

@@ -17,6 +17,7 @@ from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.studies.calibrate.fit import (
+    CLAMP_AT,
     SIZE,
     Kind,
     Linear,
@@ -50,6 +51,15 @@ def test_a_noisy_reading_weighs_less_in_the_pose() -> None:
         best = minimize(of, np.zeros(3), method='Nelder-Mead', options={'xatol': 1e-4, 'fatol': 1e-9})
         np.testing.assert_allclose(best.x, 0.0, atol=0.02)
         assert misfit(pose, row) == pytest.approx(best.fun, abs=1e-3)
+
+
+def test_a_clamp_may_give_way_by_a_fifth_of_the_links_own_compliance() -> None:
+    """In the deflection by a tip force, L^3/3EI, and in the twist by a moment, L/GJ."""
+    rig = rig_from_values({})
+    bends, twists = prior_of_rig(rig).sd[CLAMP_AT : CLAMP_AT + 2]
+    length = rig.link.length
+    assert bends * length**2 == pytest.approx(0.2 * length**3 / (3.0 * rig.link.bending_stiffness))
+    assert twists == pytest.approx(0.2 * length / rig.link.torsional_stiffness)
 
 
 def test_rows_that_are_worth_fewer_weigh_less() -> None:
