@@ -54,7 +54,10 @@ ROOMS: Mapping[str, Room] = {
             'test/model/simulation/test_simulator.py',
         ),
     ),
-    'averaging': Room(('psd_deflection/measure/averaging.py',), ('test/measure/test_averaging.py', _GOLDEN)),
+    'averaging': Room(
+        ('psd_deflection/measure/averaging.py', 'psd_deflection/measure/measures.py'),
+        ('test/measure/test_averaging.py', 'test/measure/test_measures.py', _GOLDEN),
+    ),
     'timing': Room(
         ('psd_deflection/measure/timing.py',),
         ('test/measure/test_timing.py', 'test/run/test_clock_watch.py'),

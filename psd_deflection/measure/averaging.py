@@ -10,12 +10,10 @@ not filled in.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
 
 import numpy as np
 
-from psd_deflection.base.arithmetic import FIXED, Arithmetic
-from psd_deflection.records import FloatArray, RawChunk, SampleBlock
+from psd_deflection.records import RawChunk, SampleBlock
 
 
 class BlockCutter:
@@ -80,15 +78,6 @@ class BlockCutter:
             np.concatenate([p.volts for p in parts]),
             np.concatenate([p.flags for p in parts]),
         )
-
-
-def covariance(values: FloatArray, means: Sequence[float], by: Arithmetic = FIXED) -> FloatArray:
-    """Unbiased sample covariance (c, c) of ``values`` (n, c) about their ``means`` (c,); zeros if n < 2."""
-    n, c = values.shape
-    if n < 2:
-        return np.zeros((c, c))
-    centred = values - np.array(means)
-    return np.asarray(by.product(centred.T, centred) / (n - 1))
 
 
 def block_middle_ns(block: SampleBlock, block_size: int, period_ns: float) -> int:

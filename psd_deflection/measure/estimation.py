@@ -47,8 +47,8 @@ class SeenBlock:
     """What is solved: the good samples of a block.
 
     ``t_ns``: middle of the block, stream time. ``slots`` (n,): places of the samples in the block. ``samples`` (n, 2P):
-    their dots, m; ``means`` (2P,): of all. ``sums`` (n, P): sum signals, V. ``frozen`` (P,): for how many blocks each
-    detector's values have not changed. ``due``: whether it has more than its estimate and its samples.
+    their dots, m; ``means`` (2P,): of all. ``mean_sums`` (P,): of the sum signals, V. ``frozen`` (P,): for how many
+    blocks each detector's values have not changed. ``due``: whether it has more than its estimate and its samples.
     """
 
     t_ns: int
@@ -56,7 +56,7 @@ class SeenBlock:
     slots: IntArray
     samples: FloatArray
     means: Dots
-    sums: FloatArray
+    mean_sums: tuple[float, ...]
     verdict: Verdict
     frozen: tuple[int, ...]
     due: bool
@@ -387,7 +387,7 @@ class Estimation:
         """:meth:`_variances_of` for the fit's own covariance (C, C), of the readings ``columns`` or of all."""
         if not block.verdict.findings:
             return covariance
-        background = np.repeat(self._optics.background_variance(block.sums), 2)
+        background = np.repeat(self._optics.background_variance(block.mean_sums), 2)
         more = 4.0 if block.verdict.half_light else 1.0
         return more * covariance + np.diag(background if columns is None else background[list(columns)])
 
@@ -396,7 +396,7 @@ class Estimation:
         variances = self.variances[len(block.slots) - 1]
         if not block.verdict.findings:
             return variances
-        background = np.repeat(self._optics.background_variance(block.sums), 2).tolist()
+        background = np.repeat(self._optics.background_variance(block.mean_sums), 2).tolist()
         # The noise behind the divider grows as the inverse of the light.
         more = 4.0 if block.verdict.half_light else 1.0
         return tuple(more * v + b for v, b in zip(variances, background, strict=True))

@@ -15,12 +15,12 @@ from dataclasses import dataclass
 from operator import gt, neg
 
 import numpy as np
-import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
+from psd_deflection.measure.measures import BlockMeasures
 from psd_deflection.measure.memory import Memory, Value, misfit, numbers
-from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, FloatArray, SampleBlock, channel_names, dot_names
+from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock, channel_names, dot_names
 from psd_deflection.rig.config import Rig
 
 FROZEN_BLOCKS = 5
@@ -43,9 +43,6 @@ QUIET_BLOCKS = 10
 
 HALF_LIGHT = (0.35, 0.65)
 """Fraction of ``sum_nominal`` on all detectors if one of the splitter's two lasers fails."""
-
-_THIRD_DIFFERENCE = 20.0
-"""Variance of the third difference of white noise of variance 1: 1 + 9 + 9 + 1."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,25 +160,14 @@ class OpticsHealth:
         self._moves = [bool((own > step).any()) for own in rig.noises]
         self._noise = (NOISY * np.sqrt(rig.noises**2 + step**2 / 12.0)).tolist()
 
-    def still(self, volts: npt.NDArray[np.float32]) -> tuple[bool, ...]:
+    def still(self, measures: BlockMeasures) -> tuple[bool, ...]:
         """For each PSD: whether x, y and sum are identical in all samples."""
-        if len(volts) < max(self._min_samples, 2):
+        if len(measures.volts) < max(self._min_samples, 2):
             return (False,) * self._psds
-        # Nearly always two samples tell.
-        one, two = volts[0].tolist(), volts[1].tolist()
-        if not any([one[at : at + 3] == two[at : at + 3] for at in range(0, len(one), 3)]):
-            return (False,) * self._psds
-        same = (volts == volts[0]).all(axis=0)
-        return tuple(m and bool(same[3 * i : 3 * i + 3].all()) for i, m in enumerate(self._moves))
+        return tuple([moves and same for moves, same in zip(self._moves, measures.same, strict=True)])
 
-    def judge(
-        self,
-        block: SampleBlock,
-        volts: npt.NDArray[np.float32],
-        dots: tuple[float, ...],
-        frozen: tuple[int, ...],
-    ) -> Verdict:
-        """The block's verdict, causes before consequences. ``volts`` (n, 3P): of the PSDs, x y sum of each.
+    def judge(self, block: SampleBlock, measures: BlockMeasures, frozen: tuple[int, ...]) -> Verdict:
+        """The block's verdict, causes before consequences.
 
         ``frozen``: blocks in a row without change, per PSD. ``x1`` in a reason is PSD 1's x, whatever channel it is on.
         """
@@ -192,7 +178,7 @@ class OpticsHealth:
                 faults.setdefault(psd, (status, reason))
 
         present = len(block.seq)
-        least, most = np.minimum.reduce(volts).tolist(), np.maximum.reduce(volts).tolist()
+        least, most, dots = measures.least, measures.most, measures.means
         low, high = least[2::3], most[2::3]
         add(self._dark(low))
         add(saturated := self._saturated(least, most))
@@ -263,7 +249,7 @@ class OpticsHealth:
         return tuple(out)
 
     def late_findings(
-        self, volts: npt.NDArray[np.float32], verdict: Verdict, frozen: tuple[int, ...], loudness: Loudness
+        self, measures: BlockMeasures, verdict: Verdict, frozen: tuple[int, ...], loudness: Loudness
     ) -> tuple[str, ...]:
         """Findings computed after the estimate: a noisy detector, a detector whose values do not change.
 
@@ -271,14 +257,9 @@ class OpticsHealth:
         """
         faulty = verdict.faults
         out = []
-        if len(volts) == self._size >= 10:
-            # Third differences almost remove the link's own motion.
-            rough = volts
-            for _ in range(3):
-                rough = rough[1:] - rough[:-1]
-            level = np.sqrt(self._by.einsum('ij,ij->j', rough, rough) / (len(rough) * _THIRD_DIFFERENCE)).tolist()
+        if len(measures.volts) == self._size >= 10:
             for psd in range(1, self._psds + 1):
-                own = level[3 * psd - 3 : 3 * psd]
+                own = measures.rough[3 * psd - 3 : 3 * psd]
                 noisy = psd not in faulty and any(map(gt, own, self._noise[psd - 1]))
                 usual = loudness.take(psd, own, noisy)
                 if noisy:
@@ -287,15 +268,15 @@ class OpticsHealth:
             out += [reason for psd, reason in _long(frozen) if psd not in faulty]
         return tuple(out)
 
-    def background_variance(self, sums: FloatArray) -> tuple[float, ...]:
+    def background_variance(self, sums: Sequence[float]) -> tuple[float, ...]:
         """Variance (m^2) that other light may have added to a dot of each PSD; 0 if there is none.
 
         Background light of fraction b shifts a reading by b (x_b - x). Its centre x_b is unknown. If
-        x_b is uniform over the active area, the shift has a variance of (b L/2)^2 / 3.
+        x_b is uniform over the active area, the shift has a variance of (b L/2)^2 / 3. ``sums`` (P,): means, V.
         """
         out = []
         for psd in range(self._psds):
-            total = float(self._by.sum(sums[:, psd], 0)) / len(sums)
+            total = sums[psd]
             share = max(total - self._nominal, 0.0) / total if total > self._sum_max else 0.0
             out.append(self._by.square(share * max(self._half[2 * psd : 2 * psd + 2])) / 3.0)
         return tuple(out)

@@ -14,7 +14,7 @@ recording starts, it is written as a record (:meth:`Pipeline.memory`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -22,10 +22,11 @@ import numpy.typing as npt
 
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.averaging import BlockCutter, block_middle_ns, covariance
+from psd_deflection.measure.averaging import BlockCutter, block_middle_ns
 from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
 from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, SeenBlock
 from psd_deflection.measure.health import CalibratedRange, Loudness, OpticsHealth, Stillness, Verdict
+from psd_deflection.measure.measures import BlockMeasures, measured, of_one_length
 from psd_deflection.measure.memory import STATE, WHOLE, Memory, Part, Value, numbers, restore
 from psd_deflection.measure.motion.known import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
@@ -98,6 +99,7 @@ class Pipeline:
         self.zero_refused = ''
         self._end_ns: int | None = None
         self.misfits: list[str] = []
+        self._changes = 0
         self._begin(rig)
 
     def _begin(self, rig: Rig) -> None:
@@ -159,15 +161,13 @@ class Pipeline:
             raise ConfigError(
                 f'the samples are of {volts.shape[1] // 3} PSDs, the rig file has {len(self.rig.psds)} (psd_N.center)'
             )
-        for block in self._cutter.add(chunk, volts):
-            if self._correction.uses_time and START not in self._surroundings.known:
-                yield self._environment_change(block.index, {START: float(block.t_ns[0])})
-            yield from self._block(block)
+        for blocks in of_one_length(self._cutter.add(chunk, volts)):
+            yield from self._together(blocks)
 
     def flush(self) -> Iterator[Record]:
         """The records of the unfinished block; call it when the stream ended or restarts."""
         for block in self._cutter.flush():
-            yield from self._block(block)
+            yield from self._together([block])
 
     def zero(self) -> ParameterChange | None:
         """Use the mean dots of the last blocks as the unloaded dots, from the next block on.
@@ -210,6 +210,7 @@ class Pipeline:
         Raises ConfigError if a parameter is out of bounds; then nothing has changed. ``misfits`` has a line for each
         value that fits no part of this rig; it is left out.
         """
+        self._changes += 1
         told = dict(change.values)
         # They say which numbers belong to no sample, and how the time map stepped; no estimate depends on them.
         for name in (RESTART, CLOCK_STEP, CLOCK_SQUEEZED):
@@ -326,9 +327,25 @@ class Pipeline:
             return samples
         return self._corrected(block, samples, volts[:, 2::3].astype(np.float64))
 
-    def _block(self, block: SampleBlock) -> Iterator[Record]:
-        volts = self._calibration.seen(block.volts)
-        seen = self._judged(block, volts)
+    def _together(self, blocks: Sequence[SampleBlock]) -> Iterator[Record]:
+        """The records of ``blocks`` of one length; a change in between holds from the next block on."""
+        while blocks:
+            first = blocks[0]
+            if self._correction.uses_time and START not in self._surroundings.known:
+                yield self._environment_change(first.index, {START: float(first.t_ns[0])})
+            changes = self._changes
+            volts = [self._calibration.seen(block.volts) for block in blocks]
+            samples = [self._dots(block, own) for block, own in zip(blocks, volts, strict=True)]
+            done = 0
+            for block, measures in zip(blocks, measured(volts, samples), strict=True):
+                yield from self._block(block, measures)
+                done += 1
+                if self._changes != changes:
+                    break
+            blocks = blocks[done:]
+
+    def _block(self, block: SampleBlock, measures: BlockMeasures) -> Iterator[Record]:
+        seen = self._judged(block, measures)
         verdict = seen.verdict
         solvable = verdict.status is BlockStatus.OK or verdict.sound
         answer = self.estimation.solve(seen) if solvable else BlockSolution(seen.means)
@@ -338,13 +355,13 @@ class Pipeline:
         self._count(status, verdict, answer)
         yield from self._estimates(seen, answer, status)
         # The estimates are out: the rest is not urgent.
-        findings = self._findings(volts, seen, answer, status)
+        findings = self._findings(measures, seen, answer, status)
         self.last_spots = SpotMeans(
             t_ns=seen.t_ns,
             index=seen.index,
             dots=answer.dots,
-            sums=tuple((self._by.sum(seen.sums, 0) / len(seen.slots)).tolist()),
-            covariance=covariance(seen.samples, seen.means, self._by),
+            sums=measures.mean_sums,
+            covariance=measures.covariance,
             present=len(seen.slots),
             lost=self._cutter.block_size - len(seen.slots),
             status=status,
@@ -356,24 +373,21 @@ class Pipeline:
         yield self.last_spots
         yield block
 
-    def _judged(self, block: SampleBlock, volts: npt.NDArray[np.float32]) -> SeenBlock:
-        """The dots of a block, and whether lasers and detectors are sound. ``volts`` (n, 3P): of each PSD in turn."""
+    def _judged(self, block: SampleBlock, measures: BlockMeasures) -> SeenBlock:
+        """The dots of a block, and whether lasers and detectors are sound."""
         self.counters.samples += len(block.seq)
         self._end_ns = int(block.t_ns[-1])
-        sums = volts[:, 2::3].astype(np.float64)
-        samples = self._dots(block, volts)
-        means: Dots = tuple((self._by.sum(samples, 0) / len(samples)).tolist())
         if self._optics.refuses_frozen:
-            self._stillness.count(self._optics.still(volts))
+            self._stillness.count(self._optics.still(measures))
         frozen = self._stillness.blocks
         return SeenBlock(
             t_ns=block_middle_ns(block, self._cutter.block_size, self._period_ns),
             index=block.index,
             slots=block.seq - block.index * self._cutter.block_size,
-            samples=samples,
-            means=means,
-            sums=sums,
-            verdict=self._optics.judge(block, volts, means, frozen),
+            samples=measures.samples,
+            means=measures.means,
+            mean_sums=measures.mean_sums,
+            verdict=self._optics.judge(block, measures, frozen),
             frozen=frozen,
             due=block.index % self.rig.estimator.decimation == 0,
         )
@@ -418,7 +432,7 @@ class Pipeline:
         self._recent = [*self._recent[1 - ZERO_BLOCKS :], answer.used.dots]
 
     def _findings(
-        self, volts: npt.NDArray[np.float32], seen: SeenBlock, answer: BlockSolution, status: BlockStatus
+        self, measures: BlockMeasures, seen: SeenBlock, answer: BlockSolution, status: BlockStatus
     ) -> tuple[str, ...]:
         """What is odd about a block; of one that is not, the noise is learnt."""
         findings, used = seen.verdict.findings, answer.used
@@ -427,14 +441,14 @@ class Pipeline:
         sound = status is BlockStatus.OK and not findings
         # Of this block: what it has to say counts from the next one on.
         vibrates = self.stamped.vibrates
-        changed = sound and self.stamped.learn(seen.index, seen.slots, seen.samples, volts)
+        changed = sound and self.stamped.learn(seen.index, seen.slots, seen.samples, measures.volts)
         if changed and self.motion_filter is not None:
             self.motion_filter.set_noise(self.stamped.noise.gamma)
         if answer.complete and used is not None and used.checked is not None:
             self.stamped.suspect(seen.index, used.dots, used.checked)
         if not self._optics.refuses_frozen:
-            self._stillness.count(self._optics.still(volts))
-        findings += self._optics.late_findings(volts, seen.verdict, self._stillness.blocks, self._loudness)
+            self._stillness.count(self._optics.still(measures))
+        findings += self._optics.late_findings(measures, seen.verdict, self._stillness.blocks, self._loudness)
         if vibrates:
             findings += (f'vibrates: {vibrates}',)
         if answer.estimate is not None:

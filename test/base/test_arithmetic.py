@@ -275,6 +275,7 @@ def test_nodes_and_weights_of_gauss_and_legendre(count: int) -> None:
 # What a block or a rig goes through on its way to an estimate. Rooms whole, but for what the table below names.
 PIPELINE = (
     'measure/averaging.py',
+    'measure/measures.py',
     'measure/pipeline.py',
     'measure/estimation.py',
     'measure/correction.py',

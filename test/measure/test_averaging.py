@@ -11,7 +11,7 @@ import numpy.typing as npt
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.measure.averaging import BlockCutter, block_middle_ns, covariance
+from psd_deflection.measure.averaging import BlockCutter, block_middle_ns
 from psd_deflection.records import RawChunk, SampleBlock
 
 
@@ -85,14 +85,6 @@ def test_the_middle_of_a_block_does_not_depend_on_which_samples_are_there(slots:
     seq = np.array(slots, np.int64) + 20 * index
     block = SampleBlock(index, seq, seq * 1_000_000, np.zeros((len(seq), 6), np.float32), np.zeros(len(seq), np.uint8))
     assert block_middle_ns(block, 20, 1e6) == (20 * index) * 1_000_000 + 9_500_000
-
-
-def test_the_covariance_is_numpys() -> None:
-    values = np.random.default_rng(0).normal(size=(20, 4))
-    for n in (2, 3, 20):
-        means = values[:n].mean(axis=0).tolist()
-        np.testing.assert_allclose(covariance(values[:n], means), np.cov(values[:n].T), rtol=1e-12)
-    assert not covariance(values[:1], values[0].tolist()).any()
 
 
 def test_a_repeat_in_the_first_chunk_is_passed_over_too() -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from msg_adapters import DEFLECTION
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.estimation import ZERO_VARIANCES
+from psd_deflection.measure.measures import AT_ONCE
 from psd_deflection.measure.pipeline import Pipeline, zero_variances
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.readers import open_recording
@@ -131,13 +132,38 @@ def _steps(
 ) -> Iterator[list[Record]]:
     """The records of each step, up to the first block that begins at ``end_ns`` or later."""
     beside = _BesideSamples(recording, pipeline)
+    waiting: list[SampleBlock] = []
     for block in recording.blocks() if blocks is None else blocks:
-        yield from beside.until(block)
-        yield list(pipeline.process(RawChunk(block.seq, block.t_ns, block.volts, block.flags)))
-        if block.t_ns[0] >= end_ns:
+        if beside.due(block):
+            yield from _processed(pipeline, waiting)
+            yield from beside.until(block)
+        waiting.append(block)
+        ended = block.t_ns[0] >= end_ns
+        if ended or len(waiting) == AT_ONCE:
+            yield from _processed(pipeline, waiting)
+        if ended:
             # The blocks of the part are complete, as they were in the run.
             return
+    yield from _processed(pipeline, waiting)
     yield list(pipeline.flush())
+
+
+def _processed(pipeline: Pipeline, waiting: list[SampleBlock]) -> Iterator[list[Record]]:
+    """The records of the blocks that wait, block by block; none waits any more."""
+    if not waiting:
+        return
+    columns = zip(*[(b.seq, b.t_ns, b.volts, b.flags) for b in waiting], strict=True)
+    seq, t_ns, volts, flags = (np.concatenate(column) for column in columns)
+    chunk = RawChunk(seq, t_ns, volts, flags)
+    waiting.clear()
+    records: list[Record] = []
+    for record in pipeline.process(chunk):
+        records.append(record)
+        if isinstance(record, SampleBlock):
+            yield records
+            records = []
+    if records:
+        yield records
 
 
 def _is_in(part: RecordingWindow, record: Record) -> bool:
@@ -165,6 +191,17 @@ class _BesideSamples:
         self._accelerations = recording.accelerations() if filtered else iter(())
         self._acceleration = next(self._accelerations, None)
         self._begun = False
+
+    def due(self, block: SampleBlock) -> bool:
+        """Whether something takes effect before the end of ``block``."""
+        first, last = block.t_ns[0], block.t_ns[-1]
+        return bool(
+            not self._begun
+            or (self._temperatures and self._temperatures[0].t_ns <= first)
+            or (self._changes and self._changes[0].block <= block.index)
+            or (self._acceleration is not None and self._acceleration[0] <= last)
+            or (self._loads and self._loads[-1].t_ns <= last)
+        )
 
     def until(self, block: SampleBlock) -> Iterator[list[Record]]:
         """The records of what takes effect before the end of ``block``."""

@@ -8,15 +8,23 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from psd_deflection.measure.health import Loudness, OpticsHealth, Verdict
+from psd_deflection.measure.measures import BlockMeasures, measured
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock
 from psd_deflection.rig.config import load_rig
 
 STEP = 10.0 / 32768
 GOOD = (0.5, -0.5, 5.0, 0.25, -0.25, 5.0)
 DOTS = (2.5e-4, -2.5e-4, 1.25e-4, -1.25e-4)
+
+
+def of(volts: npt.NDArray[np.float32], dots: tuple[float, ...] = ()) -> BlockMeasures:
+    """The measures of a block with these ``dots`` as its means."""
+    samples = np.zeros((len(volts), volts.shape[1] // 3 * 2))
+    return measured([volts.astype(np.float32)], [samples])[0]._replace(means=dots)
 
 
 def judge(
@@ -38,7 +46,7 @@ def judge(
     flags[3] = flag
     seq = np.arange(present)
     block = SampleBlock(0, seq, seq * 1_000_000, rows, flags)
-    return OpticsHealth(rig).judge(block, rows, dots, frozen)
+    return OpticsHealth(rig).judge(block, of(rows, dots), frozen)
 
 
 def changed(i: int, value: float) -> tuple[float, ...]:
@@ -93,7 +101,7 @@ def judge_frozen(frozen: tuple[int, int]) -> Verdict:
     rig = dataclasses.replace(rig, estimator=dataclasses.replace(rig.estimator, frozen='refuse'))
     rows = np.tile(np.array(GOOD, np.float32), (20, 1))
     block = SampleBlock(0, np.arange(20), np.arange(20) * 1_000_000, rows, np.zeros(20, np.uint8))
-    return OpticsHealth(rig).judge(block, rows, DOTS, frozen)
+    return OpticsHealth(rig).judge(block, of(rows, DOTS), frozen)
 
 
 @pytest.mark.parametrize('axis', range(4))
@@ -161,8 +169,8 @@ def test_other_light_moves_a_dot_toward_its_own_centre_wherever_that_is() -> Non
     rig = load_rig(overrides={'sum_max': 6.0, 'psd_2.active_area': [6e-3, 8e-3]})
     health = OpticsHealth(rig)
     nominal = rig.amplifier.sum_nominal
-    assert health.background_variance(np.full((20, 2), 5.9)) == (0.0, 0.0)
-    first, second = health.background_variance(np.column_stack((np.full(20, 5.0), np.full(20, 6.5))))
+    assert health.background_variance((5.9,) * 2) == (0.0, 0.0)
+    first, second = health.background_variance((5.0, 6.5))
     assert first == 0.0
     rng = np.random.default_rng(0)
     off = (6.5 - nominal) / 6.5 * rng.uniform(-4e-3, 4e-3, 400_000)
@@ -180,14 +188,14 @@ def test_noise_is_told_whatever_the_link_does_slowly(order: int) -> None:
         for _ in range(200):
             volts = np.tile(np.array(GOOD, np.float32), (20, 1))
             volts[:, 4] += (3.0 * t**order + times * 2e-3 * rng.standard_normal(20)).astype(np.float32)
-            found = OpticsHealth(rig).late_findings(volts, Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness())
+            found = OpticsHealth(rig).late_findings(of(volts), Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness())
             assert len(found) <= 1
             assert all(f.startswith('psd_2 is noisy') for f in found)
             told[times] += len(found)
     assert told[4.0] < 30
     assert told[10.0] > 190
     blamed = OpticsHealth(rig).late_findings(
-        volts, Verdict(BlockStatus.OK, '', 0, faults=frozenset({2})), (0, 0), Loudness()
+        of(volts), Verdict(BlockStatus.OK, '', 0, faults=frozenset({2})), (0, 0), Loudness()
     )
     assert blamed == ()
 
@@ -196,7 +204,7 @@ def test_what_is_exactly_at_its_limit_is_still_good() -> None:
     assert judge(changed(2, 2.0), sum_min=2.0).status is BlockStatus.OK
     assert judge(changed(5, 6.0), sum_max=6.0).findings == ()
     health = OpticsHealth(load_rig(overrides={'sum_max': 6.0}))
-    assert health.background_variance(np.full((20, 2), 6.0)) == (0.0, 0.0)
+    assert health.background_variance((6.0,) * 2) == (0.0, 0.0)
     # One step below the last one.
     assert judge(one=changed(0, 32766 * STEP)).status is BlockStatus.OK
     # Half of 2^-6 m, and a spot of 2^-10 m that touches the edge: doubles without rounding.
@@ -232,33 +240,33 @@ def test_the_sound_detectors_are_those_without_a_fault_if_samples_are_enough() -
 
 def test_light_below_what_the_laser_gives_is_no_other_light() -> None:
     rig = load_rig(overrides={'sum_max': 4.0})
-    assert OpticsHealth(rig).background_variance(np.full((20, 2), 4.5)) == (0.0, 0.0)
+    assert OpticsHealth(rig).background_variance((4.5,) * 2) == (0.0, 0.0)
 
 
 @pytest.mark.parametrize('channel', range(6))
 def test_a_detector_is_still_if_x_y_and_sum_are(channel: int) -> None:
     health = OpticsHealth(load_rig())
     volts = np.tile(np.array(GOOD, np.float32), (10, 1))
-    assert health.still(volts) == (True, True)
-    assert health.still(volts[:9]) == (False, False)
+    assert health.still(of(volts)) == (True, True)
+    assert health.still(of(volts[:9])) == (False, False)
     for row in (0, 1, 9):
         moved = volts.copy()
         moved[row, channel] += np.float32(STEP)
-        assert health.still(moved) == ((False, True) if channel < 3 else (True, False))
+        assert health.still(of(moved)) == ((False, True) if channel < 3 else (True, False))
 
 
 def test_two_samples_can_be_still_and_one_cannot() -> None:
     health = OpticsHealth(load_rig(overrides={'min_samples': 1}))
     volts = np.tile(np.array(GOOD, np.float32), (2, 1))
-    assert health.still(volts) == (True, True)
-    assert health.still(volts[:1]) == (False, False)
+    assert health.still(of(volts)) == (True, True)
+    assert health.still(of(volts[:1])) == (False, False)
 
 
 def test_a_detector_whose_noise_is_below_a_step_may_stand_still() -> None:
     """One axis that moves is enough."""
     quiet = {'psd_1.noise': [1e-5, 1e-5], 'psd_2.noise': [1e-5, 1e-3]}
     volts = np.tile(np.array(GOOD, np.float32), (20, 1))
-    assert OpticsHealth(load_rig(overrides={'amplifier.noise': 1e-5, **quiet})).still(volts) == (False, True)
+    assert OpticsHealth(load_rig(overrides={'amplifier.noise': 1e-5, **quiet})).still(of(volts)) == (False, True)
 
 
 @pytest.mark.parametrize('channel', range(6))
@@ -272,7 +280,7 @@ def test_noise_is_told_from_five_times_what_amplifier_and_converter_have(channel
         volts = np.zeros((size, 6))
         volts[:, channel] = share * limit * np.sqrt(20.0) / 8.0 * (-1.0) ** np.arange(size)
         found = OpticsHealth(rig).late_findings(
-            volts.astype(np.float32), Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness()
+            of(volts.astype(np.float32)), Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness()
         )
         assert found == (f'psd_{1 + channel // 3} is noisy: {share * limit * 1e3:.1f} mV a sample',) * told
 
@@ -282,7 +290,8 @@ def test_blocks_of_nine_samples_and_blocks_with_gaps_tell_no_noise() -> None:
     for size, present in ((9, 9), (20, 19)):
         rig = load_rig(overrides={'block_size': size, 'min_samples': 4})
         assert (
-            OpticsHealth(rig).late_findings(volts[:present], Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness()) == ()
+            OpticsHealth(rig).late_findings(of(volts[:present]), Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness())
+            == ()
         )
 
 
@@ -291,11 +300,11 @@ def test_a_frozen_detector_is_a_finding_unless_it_is_a_fault() -> None:
     health, ok = OpticsHealth(load_rig()), Verdict(BlockStatus.OK, '', 0)
     blamed = Verdict(BlockStatus.LASER_LOST, '', 2, faults=frozenset({2}))
     said = ('psd_1 stands still: no bit has moved for 5 blocks', 'psd_2 stands still: no bit has moved for 7 blocks')
-    assert health.late_findings(volts, ok, (5, 7), Loudness()) == said
-    assert health.late_findings(volts, ok, (4, 7), Loudness()) == said[1:]
-    assert health.late_findings(volts, blamed, (5, 7), Loudness()) == said[:1]
+    assert health.late_findings(of(volts), ok, (5, 7), Loudness()) == said
+    assert health.late_findings(of(volts), ok, (4, 7), Loudness()) == said[1:]
+    assert health.late_findings(of(volts), blamed, (5, 7), Loudness()) == said[:1]
     refuses = OpticsHealth(load_rig(overrides={'frozen': 'refuse'}))
-    assert refuses.late_findings(volts, ok, (5, 7), Loudness()) == ()
+    assert refuses.late_findings(of(volts), ok, (5, 7), Loudness()) == ()
 
 
 def test_a_dot_outside_is_told_in_millimetres() -> None:
@@ -308,14 +317,14 @@ def test_each_of_three_detectors_is_still_by_itself() -> None:
     for channel in range(9):
         moved = volts.copy()
         moved[3, channel] += np.float32(STEP)
-        assert health.still(moved) == tuple(psd != channel // 3 for psd in range(3))
+        assert health.still(of(moved)) == tuple(psd != channel // 3 for psd in range(3))
 
 
 @pytest.mark.parametrize('sides', [[8e-3, 6e-3], [6e-3, 8e-3]])
 @pytest.mark.parametrize('psd', [1, 2])
 def test_other_light_counts_over_the_larger_side(psd: int, sides: list[float]) -> None:
     rig = load_rig(overrides={'sum_max': 6.0, f'psd_{psd}.active_area': sides})
-    found = OpticsHealth(rig).background_variance(np.full((20, 2), 8.0))
+    found = OpticsHealth(rig).background_variance((8.0,) * 2)
     share = (8.0 - rig.amplifier.sum_nominal) / 8.0
     assert found[psd - 1] == pytest.approx((share * 4e-3) ** 2 / 3.0)
     assert found[2 - psd] == pytest.approx((share * 5e-3) ** 2 / 3.0)
@@ -324,7 +333,7 @@ def test_other_light_counts_over_the_larger_side(psd: int, sides: list[float]) -
 def test_noise_of_just_a_step_may_stand_still() -> None:
     volts = np.tile(np.array(GOOD, np.float32), (20, 1))
     for noise, moves in ((20.0 / 65536.0, False), (20.1 / 65536.0, True)):
-        assert OpticsHealth(load_rig(overrides={'amplifier.noise': noise})).still(volts) == (moves, moves)
+        assert OpticsHealth(load_rig(overrides={'amplifier.noise': noise})).still(of(volts)) == (moves, moves)
 
 
 def test_other_light_counts_over_each_detectors_own_area() -> None:
@@ -333,4 +342,4 @@ def test_other_light_counts_over_each_detectors_own_area() -> None:
     rig = load_rig(overrides={'sum_max': 6.0, 'psd_3.center': [0.08, -0.06], **areas})
     share = (8.0 - rig.amplifier.sum_nominal) / 8.0
     want = [(share * half) ** 2 / 3.0 for half in (3e-3, 4e-3, 5e-3)]
-    assert OpticsHealth(rig).background_variance(np.full((20, 3), 8.0)) == pytest.approx(want)
+    assert OpticsHealth(rig).background_variance((8.0,) * 3) == pytest.approx(want)
