@@ -111,6 +111,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._sender: threading.Thread | None = None
         self._ended, self._ramped = threading.Event(), threading.Event()
         self._failed: BaseException | None = None
+        self._alone: BaseException | None = None
         self._rest_t: float | None = None
         self._release_until = math.inf
         # Since when only offsets that the controller does not tell are left.
@@ -191,12 +192,18 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._fall_silent()
 
     def _come_to_rest(self) -> None:
-        while not (self.at_rest() or self._hurried()) and time.monotonic() < self._release_until:
-            time.sleep(PERIOD_S)
-            # The executor waits for this transition. Offsets go back only while the controller
-            # and the joints are heard.
-            self.gate.take_in()
-            self._tell()
+        try:
+            while not (self.at_rest() or self._hurried()) and time.monotonic() < self._release_until:
+                time.sleep(PERIOD_S)
+                # The executor waits for this transition. Offsets go back only while the controller
+                # and the joints are heard.
+                self.gate.take_in()
+                self._tell()
+        except BaseException as error:
+            # Whatever failed, the sender's thread takes the offsets back alone.
+            self._alone = error
+            if self._sender is not None:
+                self._ramped.wait(RELEASE_S)
 
     def _fall_silent(self) -> None:
         if self._sender is None:
@@ -349,6 +356,8 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         due = time.monotonic()
         try:
             while not self._ended.wait(max(due - time.monotonic(), 0.0)):
+                if self._alone is not None:
+                    raise self._alone
                 self._send()
                 due = max(due + PERIOD_S, time.monotonic())
         except BaseException as error:
@@ -380,8 +389,11 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         pose = None if command.positions is None else command.positions - offsets
         step = self.settings.max_rate * PERIOD_S
         while command.sends and np.any(offsets) and not self._ended.wait(PERIOD_S):
-            offsets = offsets - np.clip(offsets, -step, step)
-            self._publish(command._replace(offsets=offsets, positions=None if pose is None else pose + offsets))
+            # Without memory for a step, it is tried again.
+            with contextlib.suppress(MemoryError):
+                less = offsets - np.clip(offsets, -step, step)
+                self._publish(command._replace(offsets=less, positions=None if pose is None else pose + less))
+                offsets = less
         self.command = command._replace(offsets=offsets, sends=False)
 
     def _tell(self) -> None:

@@ -362,6 +362,32 @@ def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(domain: int, peer
         node.end()
 
 
+OUT_OF_MEMORY = """
+import sys
+from psd_deflection.cli.main import main
+from psd_deflection.ros.gate import InputGate
+def take_in(self):
+    raise MemoryError
+InputGate.take_in = take_in
+sys.exit(main())
+"""
+"""Our program, whose gate has no memory on the way out."""
+
+
+def test_a_gate_that_fails_on_the_way_out_leaves_no_offset(domain: int, peer: Any) -> None:
+    plant = Plant(peer.node)
+    node = Program([sys.executable, '-c', OUT_OF_MEMORY, *ARGUMENTS, '--stale', STALE])
+    try:
+        peer.until(lambda: plant.error() > 2e-3, 'a deflection')
+        assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success
+        peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
+        changed_state(peer, Transition.TRANSITION_DEACTIVATE)
+        peer.until(lambda: not np.any(plant.offsets[-1]), 'no offset')
+        assert plant.step() <= WITHIN
+    finally:
+        node.end()
+
+
 def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> None:
     """The controller keeps the offsets that it had, and says so; ours begin there. Two at once hold."""
     command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE]
