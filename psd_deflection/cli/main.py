@@ -288,17 +288,11 @@ def _discard_output() -> None:
 
 
 def _run(argv: list[str]) -> int:
-    chosen = [a for a in argv if a and not a.startswith('-')][:1]
     # `ros2 run` and `ros2 launch` add arguments for rclpy, which argparse must not see.
     own, ros_arguments = _split_ros_arguments(argv)
+    chosen = [a for a in argv if a and not a.startswith('-')][:1]
     try:
-        _refuse_empty(own)
-        # Looked for only if they may be meant: it takes longer than a short command of ours.
-        others = {} if chosen and chosen[0] in COMMANDS else plugged_in()
-        if chosen and chosen[0] not in {*COMMANDS, *others}:
-            hint = did_you_mean(chosen[0], {*COMMANDS, *others}) or '; `psd-deflection --help` lists them'
-            raise UsageError(f'no command {chosen.pop()!r}{hint}')
-        parser = make_parser(chosen, others=others)
+        parser = _parser_of(own, chosen)
         if not argv:
             parser.print_help()
             return 0
@@ -311,14 +305,32 @@ def _run(argv: list[str]) -> int:
         hint = _ros_hint(unknown) or _option_hint(unknown, args.known_options)
         args.refuse(f'unrecognized arguments: {" ".join(unknown)}{hint}')
     args.ros_arguments = ros_arguments
+    return _answer(args)
+
+
+def _parser_of(own: list[str], chosen: list[str]) -> argparse.ArgumentParser:
+    """The parser that knows the command ``chosen``, which is none or one. Raises UsageError for an unknown command."""
+    _refuse_empty(own)
+    # Looked for only if they may be meant: it takes longer than a short command of ours.
+    others = {} if chosen and chosen[0] in COMMANDS else plugged_in()
+    names = {*COMMANDS, *others}
+    if chosen and chosen[0] not in names:
+        hint = did_you_mean(chosen[0], names) or '; `psd-deflection --help` lists them'
+        raise UsageError(f'no command {chosen.pop()!r}{hint}')
+    return make_parser(chosen, others=others)
+
+
+def _answer(args: argparse.Namespace) -> int:
+    """Run the command; its exit status. An output that is not finished is set aside."""
     out: str | None = getattr(args, 'out', None)
     # An output that existed before belongs to another run; this one has not written to it.
     fresh = out is not None and not os.path.lexists(out)
+    unfinished = Path(out) if out is not None and fresh else None
     try:
         with _ended_like_ctrl_c() if fresh else contextlib.nullcontext():
             return int(args.run(args))
     except KeyboardInterrupt:
-        aside = set_aside(Path(out)) if out is not None and fresh else ''
+        aside = set_aside(unfinished) if unfinished else ''
         if not aside:
             raise
         _tell(f'psd-deflection {args.command}: interrupted{aside}')
@@ -331,7 +343,7 @@ def _run(argv: list[str]) -> int:
         refused = not_installed(error) if isinstance(error, ModuleNotFoundError) else error
         if refused is None:
             raise
-        aside = set_aside(Path(out)) if out is not None and fresh else ''
+        aside = set_aside(unfinished) if unfinished else ''
         _tell(f'psd-deflection {args.command}: {refused}{aside}')
         return refused.exit_status
 

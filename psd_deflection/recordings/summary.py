@@ -47,32 +47,50 @@ def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
     return found
 
 
+class _Counted:
+    """What the blocks of a recording hold. ``first``, ``last``: number and time (ns) of a sample."""
+
+    def __init__(self, recording: Recording, blocks: Iterable[SampleBlock]) -> None:
+        self.blocks = self.samples = self.flagged = 0
+        self.first = self.last = (0, 0)
+        self.vibration: RecordedVibration | None = None
+        self._steps = self._lasted_ns = 0
+        self._expected_ns = 0.0
+        for block in blocks:
+            if not self.blocks:
+                self.vibration = vibration_of(recording)
+                rate = recording.sample_rate_hz
+                self._expected_ns = 1e9 / rate if rate > 0.0 else 0.0
+            if self.vibration is not None:
+                self.vibration.add(block)
+            self._count(block)
+
+    @property
+    def rate_hz(self) -> float:
+        """Samples a second, without the pauses of the device."""
+        return self._steps * 1e9 / self._lasted_ns if self._lasted_ns else 0.0
+
+    def _count(self, block: SampleBlock) -> None:
+        begin, end = ((int(block.seq[i]), int(block.t_ns[i])) for i in (0, -1))
+        if not self.blocks:
+            self.first = self.last = begin
+        # From the end of the block before, so that a pause of the device counts neither as samples nor as time.
+        for n, dt in ((begin[0] - self.last[0], begin[1] - self.last[1]), (end[0] - begin[0], end[1] - begin[1])):
+            if abs(dt - n * self._expected_ns) <= _BREAK * n * self._expected_ns:
+                self._steps, self._lasted_ns = self._steps + n, self._lasted_ns + dt
+        self.last = end
+        self.blocks += 1
+        self.samples += len(block.seq)
+        self.flagged += int((block.flags != 0).sum())
+
+
 def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Iterable[SampleBlock]) -> dict[str, Any]:
     """What ``info --json`` prints: times in s and ns, counts, metadata.
 
     ``topics``: from ``recording.topics()``; ``blocks_of_it``: its blocks, for a caller that counts them.
     """
-    blocks = samples = flagged = 0
-    first = last = (0, 0)
-    counted, lasted = 0, 0
-    vibration: RecordedVibration | None = None
-    if topics.get(SAMPLES):
-        expected_ns = 1e9 / recording.sample_rate_hz if recording.sample_rate_hz > 0.0 else 0.0
-        vibration = vibration_of(recording)
-        for block in blocks_of_it:
-            if vibration is not None:
-                vibration.add(block)
-            begin, end = ((int(block.seq[i]), int(block.t_ns[i])) for i in (0, -1))
-            if blocks == 0:
-                first = last = begin
-            # From the end of the block before, so that a pause of the device counts neither as samples nor as time.
-            for n, dt in ((begin[0] - last[0], begin[1] - last[1]), (end[0] - begin[0], end[1] - begin[1])):
-                if abs(dt - n * expected_ns) <= _BREAK * n * expected_ns:
-                    counted, lasted = counted + n, lasted + dt
-            last = end
-            blocks += 1
-            samples += len(block.seq)
-            flagged += int((block.flags != 0).sum())
+    counted = _Counted(recording, blocks_of_it if topics.get(SAMPLES) else ())
+    first, last, samples = counted.first, counted.last, counted.samples
     path = recording.path
     files = [f for f in path.iterdir() if f.is_file()] if path.is_dir() else [path]
     return {
@@ -91,10 +109,10 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'restarts': len(recording.restarts),
         'clock_steps': [{'t_ns': c.t_ns, 'step_s': s} for c, s in _noted(recording, CLOCK_STEP)],
         'squeezed': sum(int(n) for _, n in _noted(recording, CLOCK_SQUEEZED)),
-        'flagged': flagged,
-        'sample_rate_hz': counted * 1e9 / lasted if lasted else 0.0,
-        'vibration': vibration.found() if vibration is not None else None,
-        'blocks': blocks,
+        'flagged': counted.flagged,
+        'sample_rate_hz': counted.rate_hz,
+        'vibration': counted.vibration.found() if counted.vibration is not None else None,
+        'blocks': counted.blocks,
         'block_size': recording.block_size,
         'topics': topics,
         'marks': [{'t_ns': m.t_ns, 't_s': (m.t_ns - first[1]) * 1e-9, 'text': m.text} for m in recording.marks()],
