@@ -44,7 +44,7 @@ CUT = 'recordings/cut'
 """A recording that a crash left without its end."""
 
 CI_RUNS = (
-    (r'^make test( ROOM=measure)?$', '.ci/run', 'make test '),
+    (r"^make test( ROOM=measure| PYTEST='--order 3')?$", '.ci/run', 'make test '),
     (r'^make test-all$', '.ci/run', 'make unit TIER=slow '),
     (r'^make (lint|types|contracts|unit)$', 'Makefile', 'test-all: lint types contracts unit'),
     (r'^make docs$', '.ci/run', 'make docs '),
@@ -118,7 +118,7 @@ TOOLS = {
 """Programs without which a command is skipped with a message."""
 
 ADMINISTRATION = re.compile(
-    r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|ssh|sudo|systemctl|udevadm|useradd) '
+    r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|rosdep|ssh|sudo|systemctl|udevadm|useradd) '
 )
 """Lines for root or for another machine: never typed here. test/docs/test_deploy.py checks the files they install."""
 
