@@ -30,6 +30,7 @@ from psd_deflection.studies.discover.laws.laws import WRITTEN, FoundLaw
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.localise import Localisation
+from psd_deflection.studies.discover.search.predictive import Predictive
 from psd_deflection.studies.discover.search.remainder import Remainder
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.ties import ties
@@ -58,7 +59,7 @@ class Conclusion(StudyResult):
 
     ``per_channel``: before and after; ``heldout_per_channel``: after, on load cases that the fit has not seen.
     ``nuisance``: what every model has, each with the standard deviations of its parameters. ``remainder``: what is
-    unknown as a function of named variables.
+    unknown as a function of named variables. ``prediction``: the model that predicts best, None if none was looked for.
     """
 
     study, json_name = 'discover', 'result.json'
@@ -78,6 +79,7 @@ class Conclusion(StudyResult):
     heldout_per_channel: Mapping[str, float]
     waterfall: tuple[tuple[str, float], ...]
     remainder: Remainder | None
+    prediction: Predictive | None
     simulations: int
     search: SearchResult
     fit: Fit
@@ -109,7 +111,22 @@ class Conclusion(StudyResult):
 
     def sentences(self) -> list[str]:
         """What is missing, or that nothing is, and which effects may have one cause."""
-        return [_missing(self), *(t.sentence for t in ties(self.effects))]
+        return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.beyond]
+
+    @property
+    def remains(self) -> bool:
+        """Whether more terms would lower the error on unseen cases than the named effects do."""
+        return self.prediction is not None and self.prediction.remains
+
+    @property
+    def beyond(self) -> list[str]:
+        """What small terms beyond the named effects do together, in a sentence; nothing if they do nothing."""
+        return [self.prediction.sentence(self.workspace)] if self.prediction is not None and self.remains else []
+
+    @property
+    def predicting(self) -> tuple[ActiveEffect, ...]:
+        """The effects of the model that predicts best: at least the nuisance and the named ones."""
+        return self.fit.whole if self.prediction is None else self.prediction.effects
 
     def lines(self) -> list[str]:
         """The sentences in one line, then what is unknown."""
@@ -139,6 +156,8 @@ class Conclusion(StudyResult):
             'remainder': None if self.remainder is None else self.remainder.tree(),
             'setup': [],
             'moves': None,
+            'remains': self.remains,
+            'predictive': None if self.prediction is None else self.prediction.tree(),
             'remaining': {'rms': self.gap_after, 'floors': self.floors},
             'gap': self._gap(),
             'nuisance': [{'name': a.effect.name, 'parameters': fitted(a, sd)} for a, sd in self.nuisance],
@@ -241,6 +260,14 @@ class RigConclusion(Conclusion):
         return [*self.known, *(e.active for e in self.effects)]
 
     @property
+    def predictive(self) -> dict[str, object]:
+        """The effects of the model that predicts best, as a rig file has them below ``effects:`` and ``simulate`` takes
+        them; mistakes of the set-up are no effects.
+        """
+        names = effect_names()
+        return dict(effects_to_values([*self.known, *(a for a in self.predicting if a.effect.name in names)]))
+
+    @property
     def model_of_law(self) -> Law | None:
         """The law by the name that it gets; None if there is none, or if it leaves too much to be a model."""
         if self.law is None or self.law.heldout_gap > WRITTEN * self.gap_floor:
@@ -257,7 +284,7 @@ class RigConclusion(Conclusion):
         """What is wrong with the set-up, what is missing besides, what that does to an estimate, the law."""
         missing = _missing(self, ' besides' if self.setup else '')
         tied = [t.sentence for t in ties(self.effects)]
-        return [s for s in (_setup(self), missing, *tied, _moved(self), _law(self)) if s]
+        return [s for s in (_setup(self), missing, *tied, _moved(self), _law(self), *self.beyond) if s]
 
     def lines(self) -> list[str]:
         """The sentences in one line, what puts the set-up right, what would decide, what is unknown."""
@@ -422,8 +449,11 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
     before = f'{ws.scale_shown[0] * discovery.gap_before:{ws.digits}}'
     if discovery.verdict == 'nothing_missing':
         if not math.isfinite(discovery.gap_floor):
-            # Without a stated noise nobody knows whether what remains is noise.
-            return f'Nothing in the library helps{besides}; {left} remains, and no noise is stated to hold it against.'
+            # Without a stated noise nobody knows how large what remains should be.
+            return (
+                f'Nothing is missing{besides} as far as these readings show: {left} remains and follows nothing, '
+                'as noise does. How exact the readings are is not stated.'
+            )
         return f'Nothing is missing{besides}: the gap is {left}.'
     parts = []
     for e in discovery.effects:

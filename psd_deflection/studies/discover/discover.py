@@ -34,7 +34,7 @@ from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS, SETUP
 from psd_deflection.studies.discover.setup.hung import told
 from psd_deflection.studies.discover.setup.setup import noise_of, said
-from psd_deflection.studies.discover.steps import alternatives, fields_of, solve, where, without_one
+from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, solve, where, without_one
 from psd_deflection.studies.loads.plate_motion import dots_of
 
 
@@ -56,7 +56,7 @@ def discover(
     """
     known = recordings[0].rig if rig is None else rig
     machine = RecordedRig.of(recordings, known, without, bank, progress)
-    problem = solve(machine, (searched, law, alternatives, set_up, where, noise_level), seed, progress)
+    problem = solve(machine, (searched, law, alternatives, set_up, where, predict, noise_level), seed, progress)
     return Discovery(
         **fields_of(problem),
         setup=problem.setup,

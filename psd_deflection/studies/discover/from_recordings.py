@@ -250,9 +250,8 @@ def read_readings(
         channels[:, dot_channels(psds)] = values
         scale = 1e-3 if names[0].endswith(IN_MILLIMETRES) else rig.sensitivities.ravel()
         values = Wiring.from_rig(rig).to_psds(channels)[:, dot_channels(psds)] * scale
-    for name, column in zip(names, values.T, strict=True):
-        if np.count_nonzero(np.isfinite(column)) < 2:
-            raise RecordingError(f'{path}: column {name} has less than 2 readings')
+    if np.isfinite(values).sum(axis=0).max() < 2:
+        raise RecordingError(f'{path}: columns {", ".join(names)} have less than 2 readings each')
     unknown = [n for n in table.names if n not in KNOWN]
     if unknown and warn is not None:
         warn(f'{path}:{table.head}: columns that are not read: {", ".join(unknown)}')

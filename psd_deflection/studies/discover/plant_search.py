@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import ndtri, stdtrit
 from scipy.stats import chi2 as chi2_law
 
@@ -23,24 +24,40 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.conclusion import Conclusion
-from psd_deflection.studies.discover.plants import Plant, check_plant, measured_by, table_of
+from psd_deflection.studies.discover.plants import Model, Plant, check_plant, measured_by, table_of
 from psd_deflection.studies.discover.problem import Machine, Progress
 from psd_deflection.studies.discover.report import sections
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_tables
 from psd_deflection.studies.discover.search.localise import Cell, Localisation, dependences
+from psd_deflection.studies.discover.search.predictive import as_model
 from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.signatures import candidates, signatures_beside
 from psd_deflection.studies.discover.search.smooth import Smooth, smooth_of
 from psd_deflection.studies.discover.search.weighing import UNSAID, sd_of
-from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where
+from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, search, solve, weigh, where
 from psd_deflection.studies.study import PageSection
 
 BUDGET = 4000
+ROUNDING, TINY = 1e-9, 1e-100
+"""Least level of what remains: of the largest reading of a channel, and at all."""
+ALIKE = 0.2
+"""Independent values, as a share of all: of noise it is hardly less."""
 SAME = 0.02
 """Relative change of the level up to which it counts as the same."""
+
+
+def _exact(plant: Plant, measured: Sequence[FloatArray]) -> npt.NDArray[np.bool_]:
+    """Channels (c,) of which every reading is exactly as simulated, if others are not."""
+    simulated = plant.simulate_effects([])
+    same = np.ones(len(plant.channels), dtype=bool)
+    for m, s in zip(measured, simulated, strict=False):
+        if np.shape(m) == np.shape(s):
+            same &= np.all(~np.isfinite(m) | (m == s), axis=1)
+    seen = np.sum([np.isfinite(m).sum(axis=1) for m in measured], axis=0) > 0
+    return np.asarray(same & seen) if not same[seen].all() else np.zeros(len(same), dtype=bool)
 
 
 class PlantComparison(Comparison):
@@ -60,10 +77,14 @@ class PlantComparison(Comparison):
         self.nuisance = tuple(ActiveEffect(e, e.off_values(plant.physics, next(e.variants()))) for e in plant.nuisance)
         self.measured = measured_by(plant)
         check_plant(plant)
+        exact = _exact(plant, self.measured)
+        # Readings that are the simulation's to the last digit are no measurement: nothing can be held against them.
+        self.measured = [np.where(exact[:, None], np.nan, m) for m in self.measured]
+        self.exact = tuple(name for name, e in zip(plant.channels, exact.tolist(), strict=True) if e)
         self.there = [np.isfinite(m) for m in self.measured]
         self.total = np.sum([t.sum(axis=1) for t in self.there], axis=0)
         for name, count in zip(plant.channels, self.total.tolist(), strict=True):
-            if count < 2:
+            if count < 2 and name not in self.exact and self.total.max() < 2:
                 raise ConfigError(f'measured: {name} has {count} values in all: must be at least 2')
         self.case: list[IntArray] = []
         for part in plant.parts():
@@ -75,6 +96,7 @@ class PlantComparison(Comparison):
         self.level = np.ones(len(plant.channels))
         self.independent = np.ones(len(plant.channels))
         self.level, self.independent = self._noise_beside(self.nuisance)
+        self.correlated = self._alike(self.independent)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -99,7 +121,7 @@ class PlantComparison(Comparison):
     @property
     def scale(self) -> FloatArray:
         """(channels,): by what a residual is divided. The squares of N independent values then add up to N."""
-        return np.asarray(self.level * np.sqrt(self.total / self.independent))
+        return np.asarray(self.level * np.sqrt(np.maximum(self.total, 1) / self.independent))
 
     def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
         """The plant's own simulation. Raises ConfigError if it does not fit what was measured or is not finite."""
@@ -128,7 +150,11 @@ class PlantComparison(Comparison):
         """Level (channels,) and number of independent values (channels,) of what remains with ``effects``."""
         difference = [m - s for m, s in zip(self.measured, self.simulate(effects), strict=True)]
         squares = np.sum([np.where(t, d**2, 0.0).sum(axis=1) for d, t in zip(difference, self.there, strict=True)], 0)
-        level = np.maximum(np.sqrt(squares / self.total), np.maximum(self.known, 1e-300))
+        level = np.sqrt(squares / np.maximum(self.total, 1))
+        # What is left of an exact simulation is rounding: no level is below that.
+        tables = np.concatenate([np.nan_to_num(m) for m in self.measured], axis=1)
+        size = np.abs(tables).max(axis=1, initial=0.0)
+        level = np.maximum(np.maximum(level, self.known), np.maximum(ROUNDING * size, TINY))
         independent = np.array([self._independent(difference, c) for c in range(len(self.channels))])
         return level, independent
 
@@ -140,12 +166,16 @@ class PlantComparison(Comparison):
             np.allclose(a, b, rtol=SAME, atol=0.0) for a, b in ((level, self.level), (independent, self.independent))
         ):
             return self
-        return self.replaced(level=level, independent=independent)
+        return self.replaced(level=level, independent=independent, correlated=self._alike(independent))
+
+    def _alike(self, independent: FloatArray) -> bool:
+        """Whether what remains is alike from one value to the next, and no noise is stated."""
+        return not self.plant.noise and float(independent.sum()) < ALIKE * float(self.total.sum())
 
     def _independent(self, difference: Sequence[FloatArray], channel: int) -> float:
         """Values over the integrated correlation time, which ends at its first zero."""
         if self.plant.period <= 0.0:
-            return float(self.total[channel])
+            return max(float(self.total[channel]), 1.0)
         count = 0.0
         for d, there in zip(difference, self.there, strict=True):
             seen = there[channel]
@@ -207,7 +237,7 @@ class PlantComparison(Comparison):
             np.add.at(squares, (rows, cases), vector**2)
             squares *= self.total[:, None] / self.independent[:, None] / np.maximum(count, 1.0)
             gained += sign * self._loss(squares)
-        return np.asarray((gained * count * (self.independent / self.total)[:, None]).sum(axis=0))
+        return np.asarray((gained * count * (self.independent / np.maximum(self.total, 1))[:, None]).sum(axis=0))
 
     def unwhitened(self, white: FloatArray) -> list[FloatArray]:
         """A vector in the units of the channels."""
@@ -220,11 +250,11 @@ class PlantComparison(Comparison):
     def gap_per_channel(self, residual: Sequence[FloatArray]) -> FloatArray:
         """rms of each channel, in its unit."""
         squares = [np.where(t, d, 0.0) ** 2 for d, t in zip(residual, self.there, strict=True)]
-        return np.asarray(np.sqrt(np.sum([s.sum(axis=1) for s in squares], axis=0) / self.total))
+        return np.asarray(np.sqrt(np.sum([s.sum(axis=1) for s in squares], axis=0) / np.maximum(self.total, 1)))
 
     def _joined(self, gaps: FloatArray) -> float:
         if self.shares:
-            return float(np.sqrt(np.mean((gaps / self.whole) ** 2)))
+            return float(np.sqrt(np.mean((gaps / self.whole)[self.total > 0] ** 2)))
         return float(np.sqrt(np.sum(self.total * (self.levers * gaps) ** 2) / self.total.sum()))
 
     def gap(self, residual: Sequence[FloatArray]) -> float:
@@ -298,6 +328,17 @@ class PlantDiscovery(Conclusion):
     def files(self) -> dict[str, str]:
         """The page, the JSON, and what the plant itself writes of the effects."""
         return {**self.workspace.plant.files([e.active for e in self.effects]), **super().files()}
+
+    @property
+    def predictive(self) -> Model:
+        """Effect to values of the model that predicts best: named effects and nuisance, and what helps beyond them."""
+        return as_model(self.predicting)
+
+    def predict(self, plant: Plant) -> list[FloatArray]:
+        """What the model that predicts best says of ``plant``, of each case (channels, n): the same machine, perhaps in
+        cases that the search has not seen.
+        """
+        return [np.asarray(rows, dtype=np.float64) for rows in plant.simulate_effects(self.predicting)]
 
 
 def _powers(name: str, values: Sequence[FloatArray]) -> dict[str, Sequence[FloatArray]]:
@@ -409,7 +450,7 @@ def discover_in(plant: Plant, *, seed: int = 0, progress: Progress = lambda _: N
     rng = np.random.default_rng(seed)
     progress('simulating the plant as it is described')
     machine = SimulatedPlant.of(plant)
-    problem = solve(machine, (search, weigh, alternatives, where), seed, progress, rng)
+    problem = solve(machine, (search, weigh, alternatives, where, predict), seed, progress, rng)
     ws, fit = problem.comparison, problem.fit
     return PlantDiscovery(
         **fields_of(problem)

@@ -21,6 +21,7 @@ from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import NOWHERE, Localisation
+from psd_deflection.studies.discover.search.predictive import Predictive
 from psd_deflection.studies.discover.search.remainder import Remainder, Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
@@ -73,6 +74,7 @@ class Problem:
     so far; ``heldout``: the gain of each of its effects on unseen load cases. ``null``: the model as described, against
     which gaps count. ``before``, ``left``: where ``null`` and ``fit`` leave structure. ``named``: the effects of
     ``fit`` that are told. ``remainder``: what is unknown as a function of named variables.
+    ``predictive``: the model that predicts best, None if none was looked for.
     ``setup``: what is wrong with the set-up, with ``values`` that put the rig file right.
     ``rivals``: whole models in place of ``fit``; ``unsettled``: names of what explains as much. ``law``: for what is
     unknown. ``stated_gap``: before the wiring was put right, 0 if that was right. ``rng``: draws of the steps.
@@ -92,6 +94,7 @@ class Problem:
     named: tuple[NamedEffect, ...] = ()
     unknown: tuple[Unknown, ...] = ()
     remainder: Remainder | None = None
+    predictive: Predictive | None = None
     setup: tuple[Finding, ...] = ()
     values: Mapping[str, object] = field(default_factory=dict)
     rivals: tuple[Fit, ...] = ()

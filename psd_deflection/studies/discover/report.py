@@ -23,6 +23,7 @@ from psd_deflection.studies.discover.laws.law_features import known_values
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit
+from psd_deflection.studies.discover.search.predictive import Predictive
 from psd_deflection.studies.discover.search.screen import Score
 from psd_deflection.studies.discover.search.smooth import Smooth
 from psd_deflection.studies.discover.search.trust import BANDS
@@ -283,6 +284,8 @@ def sections(discovery: Conclusion) -> list[PageSection]:
     effects = [_effect_section(e) for e in discovery.effects] or ['<p>No effect is named.</p>']
     out.append(PageSection('What', (*effects, *_nuisance(discovery))))
     law = [] if of_rig is None or of_rig.law is None else _law_section(of_rig, of_rig.law)
+    if discovery.remains and discovery.prediction is not None:
+        out.append(PageSection('What predicts', tuple(_predicts(discovery, discovery.prediction))))
     if discovery.unknown or law:
         function = None if discovery.remainder is None else discovery.remainder.function
         shown = [] if function is None else [_function_chart(discovery, function)]
@@ -290,6 +293,13 @@ def sections(discovery: Conclusion) -> list[PageSection]:
     out.append(PageSection('Before and after', tuple(_before_and_after(discovery))))
     out.append(PageSection('How it was found', tuple(_how(discovery))))
     return out
+
+
+def _predicts(discovery: Conclusion, prediction: Predictive) -> list[str]:
+    ws = discovery.workspace
+    rows = [(t.name, f'{t.value:.4g}', t.unit, f'{t.weight:.2f}') for t in prediction.terms]
+    words = f'<p>{html.escape(prediction.sentence(ws))} Terms and sizes were chosen anew without each unseen part.</p>'
+    return [words, table(('term', 'value, shrunk', 'unit', 'weight, 0 to 1'), rows)]
 
 
 def _nuisance(discovery: Conclusion) -> list[str]:

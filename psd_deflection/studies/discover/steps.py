@@ -8,6 +8,7 @@ than 10, a gain of more than two standard errors on held-out load cases, and par
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -19,6 +20,7 @@ from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldout_tables
+from psd_deflection.studies.discover.search.predictive import predictive_of
 from psd_deflection.studies.discover.search.remainder import Remainder, remainder_of
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, by_its_size, unphysical
@@ -29,7 +31,9 @@ from psd_deflection.studies.discover.search.weighing import (
     UNSAID,
     NamedEffect,
     Rival,
+    Unknown,
     heldout_per_channel_of,
+    no_noise,
     per_channel_of,
     sd_of,
     tied,
@@ -38,6 +42,8 @@ from psd_deflection.studies.discover.search.weighing import (
     waterfall_of,
 )
 
+LEAST_SDS = 3.0
+"""An effect whose size is not so many standard deviations away from none is not named."""
 LITTLE = 0.1
 """A fit that leaves less than this share of the gap is of the right effects, or nearly so."""
 
@@ -104,12 +110,21 @@ def accepted(problem: Problem) -> Problem:
                 or unphysical(ws, fit, i)
                 or found.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
                 or bic <= BIC_ACCEPT
+                or _in_sds(ws, fit, i) < LEAST_SDS
             ):
                 fails.append((bic, i))
         problem = replace(problem, heldout=tuple(heldout))
         if not fails:
             return problem
         problem = without_one(problem, min(fails)[1], 'fails the joint rule')
+
+
+def _in_sds(ws: Comparison, fit: Fit, index: int) -> float:
+    """The largest size of effect ``index``, in its own standard deviations; infinite if none is no number."""
+    effect, sds = fit.effects[index], sd_of(ws, fit, index)
+    sizes = [p for p in effect.effect.parameters if p.kind == 'amplitude' and p.name in sds]
+    apart = [(abs(effect.values[p.name] - p.off(ws.physics)), sds[p.name]) for p in sizes]
+    return max((math.inf if not a < math.inf else a / max(sd, 1e-300) for a, sd in apart), default=math.inf)
 
 
 def _gain(ws: Comparison, fit: Fit, index: int, chi2: float) -> float:
@@ -220,6 +235,7 @@ def where(problem: Problem) -> Problem:
     unknown = (
         unknown_of(left, explained, gap_after, ws.floor(), ws.most_by_noise(), steps, ws.worded)
         or unsaid(ws, problem.gap_before, gap_after)
+        or (() if fit.effects else no_noise(ws, left, problem.gap_before, gap_after))
         or tied(coincidences(fit, ws.physics), fit, problem.result, before)
     )
     remainder = remainder_of(ws, fit, left, problem.machine.regressors(ws, fit)) if unknown else None
@@ -229,6 +245,23 @@ def where(problem: Problem) -> Problem:
         share = min((remainder.rms / problem.gap_before) ** 2, 1.0)
         unknown = (*unknown, remainder.unknown(ws, share))
     return replace(problem, before=before, unknown=unknown, remainder=remainder)
+
+
+def predict(problem: Problem) -> Problem:
+    """The model that predicts best beside the named effects; what it explains beyond them is unknown."""
+    ws, fit, found = problem.comparison, problem.fit, problem.search
+    little = not ws.open_level and ws.gap(fit.difference) <= UNSAID * ws.floor()
+    if little and not problem.unknown and not problem.result.limits:
+        return problem
+    problem.progress('predicting')
+    predictive = predictive_of(ws, fit, found.screen, problem.rng)
+    problem = replace(problem, predictive=predictive)
+    if predictive is None or not predictive.remains or problem.unknown:
+        return problem
+    before = max(problem.gap_before, 1e-300)
+    rms = float(np.sqrt(max(predictive.unseen_named**2 - predictive.unseen**2, 0.0)))
+    signature = f'many small terms together, {ws.worded(rms)} rms on unseen cases, none of which stands out'
+    return replace(problem, unknown=(Unknown(signature, (), float(min((rms / before) ** 2, 1.0)), rms=rms),))
 
 
 def fields_of(problem: Problem) -> dict[str, Any]:
@@ -250,6 +283,7 @@ def fields_of(problem: Problem) -> dict[str, Any]:
         'heldout_per_channel': heldout_per_channel_of(ws, held),
         'waterfall': waterfall_of(ws, fit, problem.gap_before, after),
         'remainder': problem.remainder,
+        'prediction': problem.predictive,
         'simulations': ws.simulations,
         'search': problem.result,
         'fit': fit,

@@ -861,9 +861,10 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
 
     assert sentence(verdict='nothing_missing', effects=()) == f'Nothing is missing: the gap is {left}.'
     # Without a stated noise nothing says that nothing is missing.
-    remains = f'{1e6 * found.gap_after:.3f} µm remains, and no noise is stated to hold it against.'
+    remains = f'{1e6 * found.gap_after:.3f} µm remains and follows nothing, as noise does.'
     without = sentence(verdict='nothing_missing', effects=(), gap_floor=math.inf)
-    assert without == f'Nothing in the library helps; {remains}'
+    said = 'Nothing is missing as far as these readings show'
+    assert without == f'{said}: {remains} How exact the readings are is not stated.'
     assert sentence(verdict='unknown_effect', effects=(), unknown=(Unknown('', (), 1.0),)) == (
         f'An effect that is not in the catalogue: the gap is {left}.'
     )

@@ -219,3 +219,28 @@ def test_a_plant_that_contradicts_itself_is_refused(change: Mapping[str, object]
 def test_an_effect_of_a_plant_has_no_bounds_of_a_rig() -> None:
     with pytest.raises(ConfigError, match='of_rig'):
         plant_effect('stiff', EffectParameter('ei', '', 0.0, 9.0, 1.0, '', of_rig='bending_stiffness'))
+
+
+def test_what_swings_on_is_no_noise_though_none_is_stated() -> None:
+    """The verdict says what the sentence says."""
+    plant = Spring(0.0)
+    plant.period = 0.01
+    plant.library = (LIMIT,)
+    plant.seen = [rows + 0.05 * np.sin(np.linspace(0.0, 9.0, 50)) for rows in plant.seen]
+    found = psd_deflection.discover_in(plant)
+    assert (found.verdict, found.effects) == ('unknown_effect', ())
+    assert 'remain, which is no noise' in found.unknown[0].signature or 'follows' in found.unknown[0].signature
+
+
+def test_sizes_of_unlike_units_do_not_tie() -> None:
+    """An angle and a share that agree to the last digit are no common cause."""
+    plant = Spring(0.1)
+    angle = plant_effect('angle', EffectParameter('turn', 'rad', -9.0, 9.0, 0.1, 'of u^2'))
+    plant.library = (STIFFNESS, angle)
+    simulate = plant.simulate
+    plant.simulate = lambda model: simulate(  # type: ignore[method-assign]
+        {**model, 'square': {'c': model.get('angle', {'turn': 0.0})['turn']}}
+    )
+    plant.seen = [r + 0.1 * (u + u**2) - 0.1 * u**3 for r, u in zip(plant.seen, plant.u, strict=True)]
+    found = psd_deflection.discover_in(plant)
+    assert (found.verdict, sorted(e.name for e in found.effects)) == ('effects_found', ['angle', 'stiffness'])

@@ -165,7 +165,7 @@ def test_a_table_has_the_wiring_of_the_rig(tmp_path: Path) -> None:
         ('mass,dx,dy,theta\n1,1,1,1_0\n', r":2: column theta holds '1_0', which is not a number"),
         ('mass,dx,dy,theta\n,1,1,1\n', r":2: column mass holds '', which is not"),
         ('mass,dx,dy,theta\n1,1,1,inf\n', r":2: column theta holds 'inf', which is not"),
-        ('mass,dx,dy,theta\n1,1,1,1\n2,1,1,\n', r'column theta has less than 2 readings'),
+        ('mass,dx,dy,theta\n1,1,1,1\n2,,,\n', r'columns dx, dy, theta have less than 2 readings each'),
         ('mass,dx,dy,theta\n1,1,1,1\n2,1,1,1\n3,1,1,1\n', r'3 different loads: discover needs at least 4'),
         ('mass,dx,dy,theta\n', r'holds no row of readings'),
         ('mass,dx,dy,theta\n"1,1,1,1\n', r'is no row of a CSV'),
@@ -213,3 +213,15 @@ def test_info_tells_of_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert part in text
     assert main(['info', str(table), '--json']) == 0
     assert dict(json.loads(capsys.readouterr().out)['table'])['rows'] == '12, of 11 different loads'
+
+
+@pytest.mark.parametrize('rest', ['0', ''])
+def test_one_dial_gauge_is_searched_whether_other_columns_are_zero_or_empty(tmp_path: Path, rest: str) -> None:
+    """Readings that are exactly as simulated are no measurement; nothing is held against them."""
+    masses = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0, 1.2, 1.4, 1.6)
+    rows = [f'{m},{rest},{min(-31.6e-3 * m, 0.0) if m < 1.4 else -31.6e-3 * 1.2:.6f},{rest}' for m in masses]
+    (tmp_path / 'beam.csv').write_text('\n'.join(['mass,ref_dx,ref_dy,ref_theta', *rows]) + '\n')
+    found = discover_in(ReadingsPlant(read_tables([tmp_path / 'beam.csv'])))
+    assert found.verdict in ('effects_found', 'unknown_effect')
+    assert 0.0 < found.gap_before < 0.1 * 1e6
+    assert found.per_channel['ref_dx'][0] == 0.0

@@ -154,5 +154,8 @@ def test_sizes_that_channels_share_are_left_out_of_the_likelihood_once() -> None
         return -float(multivariate_normal(cov=across.T @ whole @ across).logpdf(across.T @ values))
 
     first, second = np.log([[0.5, 1.0, 0.7], [0.3, 2.0, 1.5]]), np.log([[0.2, 1.5, 0.4], [0.9, 0.7, 0.9]])
-    told = [smoothing._surprise(s.ravel(), parts, ('place',)) for s in (first, second)]
-    assert told[1] - told[0] == pytest.approx(exact(second) - exact(first))
+    (one, _), (other, gradient) = (smoothing._surprise(s.ravel(), parts, ('place',)) for s in (first, second))
+    assert other - one == pytest.approx(exact(second) - exact(first))
+    steps = 1e-5 * np.eye(6).reshape(6, 2, 3)
+    numeric = [(exact(second + h) - exact(second - h)) / 2e-5 for h in steps]
+    np.testing.assert_allclose(gradient, numeric, rtol=1e-4, atol=1e-6)

@@ -6,7 +6,7 @@ If the true cause is not in the catalogue, several effects together may explain 
 nothing unknown remains. But then their sizes are tied: a lag of the amplifiers becomes two delays of
 equal length, a rotated load becomes two detectors rotated by the same angle, a mass at the tip a
 softer link and two detectors that read as much too little. Two hypotheses about the ratios of two or
-three amplitudes are compared. Under "one cause" they are 1 within the uncertainty of the fit. Under
+three amplitudes of one unit are compared. Under "one cause" they are 1 within the uncertainty of the fit. Under
 "independent" each may be anywhere within two decades (Jeffreys's prior for a scale).
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,7 +32,6 @@ independent effects reach odds of N at most once in N searches.
 """
 EXACT = 0.003
 """Relative; no ratio is trusted to better, because a stand-in matches the true cause only approximately."""
-_SAME_UNIT: Mapping[str, str] = {'rad': ''}
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +54,7 @@ def _amplitudes(fit: Fit, physics: Physics | None, covariance: FloatArray) -> li
         size = fit.effects[i].values[name] - p.off(physics)
         clear = abs(size) > 5.0 * math.sqrt(covariance[column, column])
         if p.kind == 'amplitude' and clear and not fit.effects[i].effect.finite:
-            out.append((column, size, _SAME_UNIT.get(p.unit, p.unit)))
+            out.append((column, size, p.unit))
     return out
 
 

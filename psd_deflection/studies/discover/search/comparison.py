@@ -44,7 +44,8 @@ class Comparison(ABC):
     fitted too, because nobody knows how exact the model of the machine is. ``budget``: forward simulations for each
     effect of the model after which nothing more is added; the alternatives end at twice as many. ``most_budgets``:
     more effects share the budgets of so many. ``p_accept``: largest library-wide p of an accepted
-    effect. ``digits``: format of a gap in the sentence.
+    effect. ``digits``: format of a gap in the sentence. ``correlated``: what remains is alike from one value
+    to the next, as noise that nobody stated is not.
     """
 
     physics: Physics | None
@@ -61,6 +62,7 @@ class Comparison(ABC):
     # At 1e-3, where BIC alone ends in a recording of minutes, one of 1000 without fault has an effect by chance.
     p_accept: float = 1e-4
     digits: str = '.4g'
+    correlated: bool = False
 
     @property
     def simulations(self) -> int:

@@ -21,31 +21,54 @@ from psd_deflection.studies.discover.search.fit import Fit
 BOOTSTRAPS = 400
 
 
-def _steps(workspace: Comparison, fit: Fit) -> Iterator[tuple[npt.NDArray[np.bool_], FloatArray]]:
-    """For each fold its elements (D,), and by how much the parameters (p,) move if it is left out of the fit."""
+RIDGE = 1e-6
+"""Of the squared length of a signature: so little of it on the cases of a fit does not tell its size."""
+
+
+def _steps(workspace: Comparison, fit: Fit, home: bool = False) -> Iterator[tuple[npt.NDArray[np.bool_], FloatArray]]:
+    """For each fold its elements (D,), and by how much the parameters (p,) move if it is left out of the fit.
+
+    What only this fold shows, the zero of a run, stays where it is, or with ``home`` goes back to where it is off.
+    """
     folds = workspace.folds()[workspace.row_cases()]
     lengths = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-150)
     j = fit.jacobian / lengths
     whole_f, whole_g = j.T @ j, j.T @ fit.residual
     # A parameter at its bound stays there: a step knows no bounds.
     free = np.array([name not in fit.at_bound for name in fit.free])
+    away = _from_off(workspace, fit) if home else np.zeros(len(lengths))
     for fold in np.unique(folds):
         test = folds == fold
         jt, rt = j[test], fit.residual[test]
         f = whole_f - jt.T @ jt
-        # A ridge of one prior standard deviation: parameters that only this fold shows do not move.
-        f[np.diag_indices_from(f)] += 1e-6
+        f[np.diag_indices_from(f)] += RIDGE
         step = np.zeros(len(lengths))
-        step[free] = np.linalg.lstsq(f[np.ix_(free, free)], (whole_g - jt.T @ rt)[free], rcond=1e-9)[0]
+        asked = whole_g - jt.T @ rt + RIDGE * away * lengths
+        step[free] = np.linalg.lstsq(f[np.ix_(free, free)], asked[free], rcond=1e-9)[0]
         yield test, step / lengths
 
 
-def heldout_residual(workspace: Comparison, fit: Fit) -> FloatArray:
-    """Whitened residual (D,), each element predicted by a fit that has not seen its load case."""
+def _from_off(workspace: Comparison, fit: Fit) -> FloatArray:
+    """By how much the parameters (p,) would move to where they are off; 0 for those that are off at no number."""
+    effects, start = (*fit.effects, *fit.nuisance), workspace.nuisance
+    out = np.zeros(len(fit.free))
+    for j, (i, name) in enumerate(fit.free):
+        p = effects[i].effect.parameter(name)
+        # The nuisance of the rig is what was known before the search.
+        off = start[i].values[name] if i < 0 and start else p.off(workspace.physics)
+        if p.kind == 'amplitude' and np.isfinite(off):
+            out[j] = off - effects[i].values[name]
+    return out
+
+
+def heldout_residual(workspace: Comparison, fit: Fit, home: bool = True) -> FloatArray:
+    """Whitened residual (D,), each element predicted by a fit that has not seen its load case; ``home``: what only that
+    case shows is off.
+    """
     if not fit.free:
         return fit.residual
     out = fit.residual.copy()
-    for test, step in _steps(workspace, fit):
+    for test, step in _steps(workspace, fit, home):
         out[test] -= fit.jacobian[test] @ step
     return out
 
@@ -79,7 +102,7 @@ def unseen_gap(workspace: Comparison, fit: Fit, columns: FloatArray) -> float:
     moved = columns @ (np.linalg.lstsq(columns / lengths, fit.residual, rcond=1e-9)[0] / lengths)
     free = tuple((0, str(j)) for j in range(columns.shape[1]))
     linear = replace(fit, residual=fit.residual - moved, jacobian=columns, free=free, at_bound=())
-    change = workspace.unwhitened(heldout_residual(workspace, linear) - fit.residual)
+    change = workspace.unwhitened(heldout_residual(workspace, linear, False) - fit.residual)
     return workspace.gap([d + c for d, c in zip(fit.difference, change, strict=True)])
 
 
@@ -100,9 +123,10 @@ def heldout_gain(workspace: Comparison, without: Fit, fit: Fit, rng: np.random.G
     """Gain of ``fit`` over ``without`` on unseen load cases.
 
     The standard error is the smaller of the block bootstrap's and that of the likelihood ratio
-    itself, because the former is meaningless for an effect that shows only in a few short intervals.
+    itself, because the former is meaningless for an effect that shows only in a few short intervals. No other case can
+    speak for or against what one case alone shows: that keeps its size here, and BIC decides.
     """
-    piece = workspace.pieces(heldout_residual(workspace, without), heldout_residual(workspace, fit))
+    piece = workspace.pieces(heldout_residual(workspace, without, False), heldout_residual(workspace, fit, False))
     draws = rng.integers(0, len(piece), size=(BOOTSTRAPS, len(piece)))
     spread = float(np.std(piece[draws].sum(axis=1)))
     gain = float(piece.sum())

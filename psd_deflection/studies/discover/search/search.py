@@ -325,8 +325,6 @@ class Search(Trials):
 
         ``gain``: what the named effect explains, in chi-square; ``null``: the fit of no effect.
         """
-        if self.spent > 2 * self.budget_of(current):
-            return []
         rest = [a for j, a in enumerate(current.effects) if j != index]
         without = self.without_each(current, null)[index]
         ranked = self._in_its_place(current, index, without, gain)

@@ -16,7 +16,7 @@ from functools import partial
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cholesky
 from scipy.optimize import Bounds, minimize
 
 from psd_deflection.records import FloatArray, IntArray
@@ -136,8 +136,8 @@ def _shaped(remains: _Remains, names: Sequence[str], start: FloatArray | None = 
     bounds = Bounds(np.tile(low, len(channels)), np.tile(high, len(channels)))
     basis = _span(remains.sizes)
     parts = [(remains.part(own), basis[own]) for own in (remains.channel == c for c in channels)]
-    surprise: Callable[[FloatArray], float] = partial(_surprise, parts=parts, names=names)
-    found = minimize(surprise, begin.ravel(), method='L-BFGS-B', bounds=bounds, options={'maxiter': 60})
+    surprise: Callable[[FloatArray], tuple[float, FloatArray]] = partial(_surprise, parts=parts, names=names)
+    found = minimize(surprise, begin.ravel(), jac=True, method='L-BFGS-B', bounds=bounds, options={'maxiter': 60})
     return np.reshape(found.x, begin.shape), -float(found.fun)
 
 
@@ -147,23 +147,41 @@ def _span(columns: FloatArray) -> FloatArray:
     return np.asarray(left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
 
 
-def _surprise(shapes: FloatArray, parts: Sequence[tuple[_Remains, FloatArray]], names: Sequence[str]) -> float:
-    """Minus the restricted log-likelihood, up to a constant. ``parts``: each channel, with what the effects can do
-    there (d, p), of an orthonormal basis over all of them.
+def _surprise(
+    shapes: FloatArray, parts: Sequence[tuple[_Remains, FloatArray]], names: Sequence[str]
+) -> tuple[float, FloatArray]:
+    """Minus the restricted log-likelihood, up to a constant, and its gradient. ``parts``: each channel, with what the
+    effects can do there (d, p), of an orthonormal basis over all of them.
     """
-    white, logs = list[FloatArray](), 0.0
-    for shape, (own, basis) in zip(np.reshape(shapes, (len(parts), -1)), parts, strict=True):
+    rows = np.reshape(shapes, (len(parts), -1))
+    known, inverses, logs = list[FloatArray](), list[FloatArray](), 0.0
+    for shape, (own, _) in zip(rows, parts, strict=True):
+        known.append(_covariance(shape, own, names))
         noise = np.exp(2.0 * shape[0]) * np.eye(len(own.values))
         try:
-            lower = cholesky(_covariance(shape, own, names) + noise, lower=True)
+            lower = cholesky(known[-1] + noise, lower=True)
         except LinAlgError:
-            return 1e12
-        white.append(solve_triangular(lower, np.column_stack((basis, own.values)), lower=True))
+            return 1e12, np.zeros(shapes.size)
+        inverses.append(cho_solve((lower, True), np.eye(len(lower))))
         logs += float(np.log(np.diag(lower)).sum())
-    table = np.concatenate(white)
-    q, r = np.linalg.qr(table[:, :-1])
-    rest = table[:, -1] - q @ (q.T @ table[:, -1])
-    return float(0.5 * rest @ rest + logs + np.log(np.abs(np.diag(r))).sum())
+    weighed = [inverse @ basis for inverse, (_, basis) in zip(inverses, parts, strict=True)]
+    pulls = [inverse @ own.values for inverse, (own, _) in zip(inverses, parts, strict=True)]
+    f = np.sum([basis.T @ w for w, (_, basis) in zip(weighed, parts, strict=True)], axis=0)
+    sizes = np.linalg.pinv(f, hermitian=True)
+    moved = sizes @ np.sum([basis.T @ p for p, (_, basis) in zip(pulls, parts, strict=True)], axis=0)
+    logs += 0.5 * float(np.linalg.slogdet(f)[1])
+    loss, gradient = logs, np.zeros_like(rows)
+    for i, (shape, (own, _)) in enumerate(zip(rows, parts, strict=True)):
+        pull = pulls[i] - weighed[i] @ moved
+        loss += 0.5 * float(own.values @ pull)
+        # The derivative by a covariance V is half of P - (P y)(P y)', with P the inverse beside the effects.
+        by = 0.5 * (inverses[i] - weighed[i] @ sizes @ weighed[i].T - np.outer(pull, pull))
+        gradient[i, 0] = 2.0 * np.exp(2.0 * shape[0]) * np.trace(by)
+        for k, name in enumerate(names):
+            part = _covariance(np.array([shape[0], *shape[1 + 2 * k : 3 + 2 * k]]), own, (name,))
+            gradient[i, 1 + 2 * k] = 2.0 * float(np.sum(by * part))
+            gradient[i, 2 + 2 * k] = float(np.exp(-2.0 * shape[2 + 2 * k]) * np.sum(by * part * own.apart[name]))
+    return loss, gradient.ravel()
 
 
 def _covariance(shape: FloatArray, own: _Remains, names: Sequence[str]) -> FloatArray:

@@ -29,6 +29,10 @@ fits as well.
 """
 UNKNOWN_P = 1e-4
 UNKNOWN_EXCESS = 60.0
+FOLLOWS_P = 0.01
+"""Where nobody states a noise, what remains is none if it follows something as clearly as this."""
+MOST_OF_IT = 0.8
+"""The same, by the share of what remains that it makes up: a few readings reach no small p."""
 STEPS_SHARE = 0.02
 """Coarse steps cause noise that varies with the signal; up to this share of what they explain it is nothing else."""
 UNSAID = 1.5
@@ -162,6 +166,20 @@ def unsaid(workspace: Comparison, before: float, after: float) -> tuple[Unknown,
     size = _beyond(after, floor)
     words = f'{workspace.worded(size)} remain, {after / floor:.1f} times the noise, in no single place or band'
     return (Unknown(words, (), float(min((after / before) ** 2, 1.0)), rms=size),)
+
+
+def no_noise(workspace: Comparison, left: Localisation, before: float, after: float) -> tuple[Unknown, ...]:
+    """What remains where nobody states a noise, if it follows something or one value is like the next."""
+    if not workspace.open_level or np.isfinite(workspace.floor()) or after <= 0.0:
+        return ()
+    most = MOST_OF_IT * workspace.size
+    follows = [d for d in left.dependences if d.p < FOLLOWS_P or d.gain > most][:3]
+    if not follows and not workspace.correlated:
+        return ()
+    names = tuple(dict.fromkeys(d.regressor for d in follows))
+    how = f'it follows {", ".join(names)}' if names else 'one value is like the next'
+    words = f'{workspace.worded(after)} remain, which is no noise: {how}'
+    return (Unknown(words, names, float(min((after / max(before, 1e-300)) ** 2, 1.0)), rms=after),)
 
 
 def unknown_of(

@@ -1,0 +1,449 @@
+"""What predicts, beside what is named: the terms of the library weighed together, each by how likely it is.
+
+Names need proof, a prediction does not: of many small terms none may stand out, and together they still lower the error
+on unseen cases. Each subset of the terms is a model of normal sizes (Zellner and others' spike and slab, George and
+McCulloch 1993), noise and number of terms being free. The tempered Gibbs sampler (Zanella and Roberts 2019) walks over
+the subsets; the mean of their sizes is the predictive model, which so is shrunk. The error on unseen cases is nested:
+terms and sizes are chosen anew without the cases that judge them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from psd_deflection.model.simulation.declaration import ActiveEffect
+from psd_deflection.records import FloatArray
+from psd_deflection.studies.discover.search.comparison import Comparison
+from psd_deflection.studies.discover.search.fit import STEP, Fit
+from psd_deflection.studies.discover.search.screen import Screen
+from psd_deflection.studies.discover.search.signatures import Candidate
+from psd_deflection.studies.discover.search.trials import slot, unbound
+
+MOST_FOLDS = 11
+"""Parts are joined to so many groups, each left out in turn."""
+WALK = (200, 8, 1000)
+"""Steps of the sampler: at least, for each term, at most; a fifth of them is not counted."""
+SLABS = np.geomspace(0.02, 20.0, 10)
+"""Precisions of a size against that of the noise, terms being of unit rms; the sampler draws one."""
+LEAST_LENGTH = 1e-6
+"""A term that keeps less of its squared length beside what is always there is already explained."""
+ELSEWHERE = 0.1
+"""Relative rms by which the simulation may differ from the straight line to it, before another line is drawn."""
+ROUNDS = 4
+LOWERS = 0.05
+"""Share by which the unseen error must fall at least before anything is said to remain."""
+NEGLIGIBLE = 0.003
+"""A term that moves less than this share of what remains is left out of the list and of the model."""
+MOST_VALUES = 4e7
+"""Values of all signatures together: more would need more than 0.3 GB."""
+
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """``name``: effect with its choices, and its parameter if it has several. ``value`` in ``unit``; ``weight``: how
+    likely it takes part, from 0 to 1.
+    """
+
+    name: str
+    value: float
+    unit: str
+    weight: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Predictive:
+    """``effects``: the model that predicts best, nuisance first. ``terms``: beyond the named effects, the largest
+    first. ``unseen``: the gap on cases for which terms and sizes were chosen without them; ``unseen_named``: that of
+    the named effects, refitted without them. ``remains``: whether the difference is beyond chance.
+    """
+
+    effects: tuple[ActiveEffect, ...]
+    terms: tuple[Term, ...]
+    unseen: float
+    unseen_named: float
+    remains: bool
+
+    def tree(self) -> dict[str, Any] | None:
+        """As result.json has it; None if nothing remains."""
+        if not self.remains:
+            return None
+        terms = [{'name': t.name, 'value': t.value, 'unit': t.unit, 'weight': t.weight} for t in self.terms]
+        return {'terms': terms, 'unseen': self.unseen, 'unseen_named': self.unseen_named, 'nested': True}
+
+    def sentence(self, ws: Comparison) -> str:
+        """What more there is, in words."""
+        likely = [t for t in self.terms if t.weight >= 0.5]
+        listed = likely or self.terms[:3]
+        names = ', '.join(f'{t.name} {t.value:.3g} {t.unit}'.rstrip() for t in listed[:8])
+        more = len(self.terms) - min(len(listed), 8)
+        rest = f' and {more} smaller' if more > 0 else ''
+        count = f'{len(self.terms)} small term{"" if len(self.terms) == 1 else "s"}'
+        return (
+            f'Beyond the named effects, {count} together lower the unseen error from {ws.worded(self.unseen_named)} to '
+            f'{ws.worded(self.unseen)} ({names}{rest}); none of them is proven by itself.'
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Place:
+    """A number of the model: parameter ``name`` of effect ``index``; ``off``: its value without effect."""
+
+    index: int
+    name: str
+    off: float
+    low: float
+    high: float
+    scale: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Library:
+    """``effects``, of which the first ``fixed`` are the nuisance. ``places``: numbers that may move; the first
+    ``always`` of them are in every model.
+    """
+
+    ws: Comparison
+    effects: tuple[ActiveEffect, ...]
+    fixed: int
+    places: tuple[_Place, ...]
+    always: int
+
+    def at(self, x: FloatArray) -> list[ActiveEffect]:
+        """The effects with the numbers ``x``; those that are off are left out."""
+        values = [dict(a.values) for a in self.effects]
+        on = [i < self.fixed for i in range(len(values))]
+        for place, v in zip(self.places, x.tolist(), strict=True):
+            values[place.index][place.name] = v
+            on[place.index] = on[place.index] or v != place.off
+        return [ActiveEffect(a.effect, v) for a, v, o in zip(self.effects, values, on, strict=True) if o]
+
+    def residual(self, x: FloatArray) -> tuple[FloatArray, list[FloatArray]]:
+        """Whitened, and in the units of the channels."""
+        return self.ws.residual([*self.ws.base, *self.at(x)])
+
+    def jacobian(self, x: FloatArray) -> FloatArray:
+        """Whitened (D, p), per unit of each number."""
+        nominal = self.ws.simulate([*self.ws.base, *self.at(x)])
+        out = np.empty((sum(m.size for m in self.ws.measured), len(x)))
+        for j, place in enumerate(self.places):
+            h = STEP * place.scale if x[j] + STEP * place.scale <= place.high else -STEP * place.scale
+            moved = x.copy()
+            moved[j] += h
+            table = self.ws.simulate([*self.ws.base, *self.at(moved)])
+            out[:, j] = self.ws.whiten([(a - b) / h for a, b in zip(table, nominal, strict=True)])
+        return out
+
+
+def _library(ws: Comparison, fit: Fit, screen: Screen) -> tuple[_Library, FloatArray]:
+    """What may take part, and the numbers of ``fit``."""
+    effects, places, x = list(fit.whole), list[_Place](), list[float]()
+    fixed = len(fit.nuisance)
+
+    def add(index: int, name: str) -> None:
+        active = effects[index]
+        p = active.effect.parameter(name)
+        low, high = p.bounds(ws.physics, active.values)
+        places.append(_Place(index, name, p.off(ws.physics), low, high, p.scale))
+        x.append(active.values[name])
+
+    named = [(i + fixed, name) for i, name in fit.free]
+    straight = [
+        i >= fixed and not effects[i].effect.finite and effects[i].effect.parameter(name).kind == 'amplitude'
+        for i, name in named
+    ]
+    kept = [place not in fit.at_bound for place in fit.free]
+    for (i, name), is_term, is_kept in zip(named, straight, kept, strict=True):
+        if is_kept and not is_term:
+            add(i, name)
+    always = len(places)
+    for (i, name), is_term in zip(named, straight, strict=True):
+        if is_term:
+            add(i, name)
+    room = int(MOST_VALUES / max(len(fit.residual), 1)) - len(places)
+    for candidate in _best_shapes(ws, fit, screen)[: max(room, 0)]:
+        effects.append(ActiveEffect(candidate.effect, {**candidate.off, **_shape(candidate)}))
+        for name in candidate.free:
+            add(len(effects) - 1, name)
+    return _Library(ws, tuple(effects), fixed, tuple(places), always), np.array(x)
+
+
+def _shape(candidate: Candidate) -> dict[str, float]:
+    """Its choices and shapes; its sizes stay off."""
+    return {n: v for n, v in candidate.start.items() if n not in candidate.free}
+
+
+def _best_shapes(ws: Comparison, fit: Fit, screen: Screen) -> list[Candidate]:
+    """Of each further effect whose sizes count in proportion the candidate that explains most beside ``fit``."""
+    taken = {slot(a.effect, a.values) for a in fit.whole}
+    best: dict[tuple[object, ...], Candidate] = {}
+    for score in screen.score(fit.residual, unbound(fit)):
+        c = score.candidate
+        sized = all(c.effect.parameter(name).kind == 'amplitude' for name in c.free)
+        place = slot(c.effect, c.start)
+        if sized and not c.effect.finite and place not in taken and c.effect.name not in ws.first | ws.setup:
+            best.setdefault(place, c)
+    return list(best.values())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Moments:
+    """Products of all columns, of the folds together: always (a), terms (k), target (1)."""
+
+    table: FloatArray
+    always: int
+    size: float
+
+    def beside(self) -> tuple[FloatArray, FloatArray, float]:
+        """Products of the terms (k, k), with the target (k,), and of the target, without what is always there."""
+        a, t = self.always, self.table
+        if a:
+            t = t - t[:, :a] @ _solved(t[:a, :a], t[:a])
+        return t[a:-1, a:-1], t[a:-1, -1], float(max(t[-1, -1], 1e-12 * self.table[-1, -1]))
+
+    def with_always(self, sizes: FloatArray) -> FloatArray:
+        """Sizes (a + k,) of all, if those of the terms are ``sizes``."""
+        a, t = self.always, self.table
+        return np.concatenate([_solved(t[:a, :a], t[:a, -1] - t[:a, a:-1] @ sizes), sizes])
+
+
+def _solved(f: FloatArray, g: FloatArray) -> FloatArray:
+    """F c = g, with a ridge so small that only what nothing shows is held by it."""
+    scale = np.sqrt(np.maximum(np.diag(f), 1e-300))
+    lower = f / np.outer(scale, scale) + 1e-9 * np.eye(len(f))
+    return np.asarray((np.linalg.solve(lower, (g.T / scale).T).T / scale).T) if len(f) else g
+
+
+def averaged(
+    f: FloatArray, g: FloatArray, whole: float, size: float, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Mean sizes (k,) of the terms over all subsets, and how likely each takes part (k,).
+
+    ``f`` (k, k), ``g`` (k,), ``whole``: products of terms and target, whose ``size`` is a number of independent values;
+    terms of unit rms have ``f`` about ``size`` on the diagonal. Noise: Jeffreys' prior; each number of terms is as
+    likely.
+    """
+    count = len(g)
+    diagonal = np.diag(f).copy()
+    usable = diagonal > LEAST_LENGTH * size
+    if not usable.any() or whole <= 0.0:
+        return np.zeros(count), np.zeros(count)
+    inside = np.zeros(count, dtype=bool)
+    slab = 1.0
+    steps = min(max(WALK[0], WALK[1] * count), WALK[2])
+    sizes, weights, total = np.zeros(count), np.zeros(count), 0.0
+    for step in range(steps):
+        odds, chosen, mean = _flips(f, g, whole, size, diagonal, inside, slab)
+        odds[~usable] = -50.0
+        flip = 1.0 / (1.0 + np.exp(-np.clip(odds, -500.0, 500.0)))
+        member = np.where(inside, 1.0 - flip, flip)
+        pull = (member + 0.5 / count) / np.maximum(1.0 - flip, 1e-12)
+        weight = 1.0 / float(pull.sum())
+        if step >= steps // 5:
+            sizes[chosen] += weight * mean
+            weights += weight * member
+            total += weight
+        if step % 5 == 4:
+            slab = _slab(f, g, whole, size, chosen, rng)
+        turned = int(rng.choice(count, p=pull * weight))
+        inside[turned] = not inside[turned]
+    return sizes / total, weights / total
+
+
+def _flips(
+    f: FloatArray, g: FloatArray, whole: float, size: float, diagonal: FloatArray, inside: BoolArray, slab: float
+) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
+    """Logarithms (k,) of the odds for each term being turned on or off; the terms that are on, and their sizes."""
+    chosen = np.flatnonzero(inside)
+    n, count = len(chosen), len(g)
+    left, room, pull = whole, diagonal + slab, g
+    mean, spread = np.zeros(0), np.zeros(0)
+    if n:
+        inverse = np.linalg.inv(f[np.ix_(chosen, chosen)] + slab * np.eye(n))
+        mean, spread = inverse @ g[chosen], np.diag(inverse)
+        across = f[chosen]
+        left = max(whole - float(mean @ g[chosen]), 1e-12 * whole)
+        room = np.maximum(room - np.einsum('ij,ij->j', across, inverse @ across), slab)
+        pull = g - mean @ across
+    with_it = np.maximum(left - pull**2 / room, 1e-12 * whole)
+    odds = 0.5 * np.log(slab / room) - 0.5 * size * np.log(with_it / left) + np.log((1.0 + n) / max(count - n, 1))
+    if n:
+        without = left + mean**2 / spread
+        odds[chosen] = (
+            -0.5 * np.log(slab * spread) - 0.5 * size * np.log(without / left) - np.log(n / (count - n + 1.0))
+        )
+    return odds, chosen, mean
+
+
+def _slab(
+    f: FloatArray, g: FloatArray, whole: float, size: float, chosen: npt.NDArray[np.intp], rng: np.random.Generator
+) -> float:
+    """A precision of the sizes, drawn by how likely it is with the ``chosen`` terms."""
+    if not len(chosen):
+        return float(rng.choice(SLABS))
+    values, vectors = np.linalg.eigh(f[np.ix_(chosen, chosen)])
+    along = vectors.T @ g[chosen]
+    room = values[None, :] + SLABS[:, None]
+    left = np.maximum(whole - (along**2 / room).sum(axis=1), 1e-12 * whole)
+    logs = 0.5 * np.log(SLABS[:, None] / room).sum(axis=1) - 0.5 * size * np.log(left)
+    p = np.exp(logs - logs.max())
+    return float(rng.choice(SLABS, p=p / p.sum()))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Line:
+    """The simulation in proportion around ``x``: ``columns`` (D, p), of unit rms; ``lengths`` (p,): by what they were
+    divided; ``target`` (D,): what is measured beyond everything being off. ``fold`` (D,), from 0. ``named`` (p,): what
+    the named model has. ``tables``: of each fold the products of all columns and the target.
+    """
+
+    library: _Library
+    columns: FloatArray
+    lengths: FloatArray
+    target: FloatArray
+    fold: npt.NDArray[np.int64]
+    named: BoolArray
+    size: float
+    tables: tuple[FloatArray, ...]
+
+    def moments(self, without: int = -1) -> _Moments:
+        """Of all folds but one."""
+        seen = [t for i, t in enumerate(self.tables) if i != without]
+        share = float(np.mean(self.fold != without))
+        return _Moments(np.sum(seen, axis=0), self.library.always, self.size * share)
+
+    def solved(self, moments: _Moments, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+        """Sizes (p,) of everything, columns being of unit rms, and how likely each takes part."""
+        f, g, whole = moments.beside()
+        sizes, weights = averaged(f, g, whole, max(moments.size - moments.always, 2.0), rng)
+        return moments.with_always(sizes), np.concatenate([np.ones(moments.always), weights])
+
+    def refitted(self, moments: _Moments) -> FloatArray:
+        """Sizes (p,) of the named model alone."""
+        out, t = np.zeros(len(self.named)), moments.table
+        out[self.named] = _solved(t[:-1, :-1][np.ix_(self.named, self.named)], t[:-1, -1][self.named])
+        return out
+
+
+def _line(library: _Library, x: FloatArray, named: BoolArray) -> _Line:
+    ws = library.ws
+    residual, _ = library.residual(x)
+    jacobian = library.jacobian(x)
+    off = np.array([p.off for p in library.places])
+    off[: library.always] = x[: library.always]
+    target = residual + jacobian @ (x - off)
+    size = ws.effective_size()
+    lengths = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-150) / np.sqrt(size)
+    folds = ws.folds()
+    groups = (np.unique(folds, return_inverse=True)[1] % MOST_FOLDS)[ws.row_cases()]
+    # The square of a whitened vector adds up to the number of values; that of a plant already to the independent ones.
+    scale = 1.0 if ws.open_level else np.sqrt(size / max(ws.size, 1))
+    columns = scale * jacobian / lengths
+    tables = []
+    for fold in range(int(groups.max()) + 1):
+        part = np.column_stack((columns[groups == fold], scale * target[groups == fold]))
+        tables.append(part.T @ part)
+    return _Line(library, columns, lengths, scale * target, groups, named, size, tuple(tables))
+
+
+def predictive_of(ws: Comparison, fit: Fit, screen: Screen, rng: np.random.Generator) -> Predictive | None:
+    """The model that predicts best, with its error on unseen cases; None if there is nothing to choose from."""
+    library, x = _library(ws, fit, screen)
+    if len(library.places) == library.always or len(np.unique(ws.folds())) < 2:
+        return None
+    named = np.arange(len(x)) < len(x) - sum(p.index >= len(fit.whole) for p in library.places)
+    start = x
+    line = _line(library, x, named)
+    weights = np.zeros(len(x))
+    for _ in range(ROUNDS):
+        sizes, weights = line.solved(line.moments(), rng)
+        x, straight = _reached(line, x, sizes)
+        if straight:
+            break
+        line = _line(library, x, named)
+    unseen, before, gained = _unseen(line, x, rng)
+    better = unseen < before
+    # By chance the averaged model hardly ever gains: where nothing stands out, it is next to nothing.
+    clear = float(gained.sum()) > float(np.sqrt(len(gained)) * np.std(gained))
+    noise = before <= (1.0 + LOWERS) * ws.floor()
+    remains = clear and not noise and unseen < (1.0 - LOWERS) * before
+    terms = _terms(line, x, weights) if better else ()
+    chosen = x if better else start
+    return Predictive(tuple(library.at(chosen)), terms, unseen, before, remains and bool(terms))
+
+
+def _reached(line: _Line, x: FloatArray, sizes: FloatArray) -> tuple[FloatArray, bool]:
+    """The numbers that ``sizes`` ask for, as far as the simulation follows, and whether it follows the whole way."""
+    library, ws = line.library, line.library.ws
+    off = np.array([p.off for p in library.places])
+    off[: library.always] = x[: library.always]
+    low, high = (np.array([getattr(p, n) for p in library.places]) for n in ('low', 'high'))
+    wanted = off + sizes / line.lengths
+    moved = np.linalg.norm(line.columns * sizes, axis=0)
+    left = float(np.linalg.norm(line.target - line.columns @ sizes))
+    small = (moved < NEGLIGIBLE * max(left, 1e-300)) & ~line.named
+    wanted = np.clip(np.where(small, off, wanted), low, high)
+    loss = ws.loss(library.residual(x)[0])
+    for share in (1.0, 0.5, 0.25):
+        at = np.where(small, off, x + share * (wanted - x))
+        residual, _ = library.residual(at)
+        if share == 1.0:
+            expected = line.target - line.columns @ ((at - off) * line.lengths)
+            apart = float(np.linalg.norm(_as_line(line, residual) - expected))
+            if apart <= ELSEWHERE * max(float(np.linalg.norm(expected)), 1e-300):
+                return at, True
+        if np.isfinite(residual).all() and ws.loss(residual) < loss:
+            return at, False
+    return x, True
+
+
+def _as_line(line: _Line, residual: FloatArray) -> FloatArray:
+    """A whitened residual in the scale of the line."""
+    ws = line.library.ws
+    return residual if ws.open_level else residual * np.sqrt(line.size / max(ws.size, 1))
+
+
+def _unseen(line: _Line, x: FloatArray, rng: np.random.Generator) -> tuple[float, float, FloatArray]:
+    """Gap on unseen cases of the averaged and of the named model, and the drop of squared error on each case."""
+    library, ws = line.library, line.library.ws
+    more, named = np.empty_like(line.target), np.empty_like(line.target)
+    for fold in range(len(line.tables)):
+        test = line.fold == fold
+        moments = line.moments(fold)
+        for out, sizes in ((more, line.solved(moments, rng)[0]), (named, line.refitted(moments))):
+            out[test] = line.target[test] - line.columns[test] @ sizes
+    back = 1.0 if ws.open_level else np.sqrt(max(ws.size, 1) / line.size)
+    now, difference = library.residual(x)
+
+    def gap(white: FloatArray) -> float:
+        change = ws.unwhitened(back * white - now)
+        return ws.gap([d + c for d, c in zip(difference, change, strict=True)])
+
+    gained = np.bincount(ws.row_cases(), named**2 - more**2)
+    return gap(more), gap(named), np.asarray(gained)
+
+
+def _terms(line: _Line, x: FloatArray, weights: FloatArray) -> tuple[Term, ...]:
+    """What the model has beyond the named effects, the largest first."""
+    library, out = line.library, list[tuple[float, Term]]()
+    for j, place in enumerate(library.places):
+        if line.named[j] or x[j] == place.off:
+            continue
+        active = library.effects[place.index]
+        p = active.effect.parameter(place.name)
+        several = sum(q.kind == 'amplitude' for q in active.effect.parameters) > 1
+        name = f'{active.label} {place.name}' if several else active.label
+        moved = float(np.linalg.norm(line.columns[:, j])) * abs(x[j] - place.off) * line.lengths[j]
+        out.append((moved, Term(name, float(x[j]), p.unit, float(weights[j]))))
+    return tuple(t for _, t in sorted(out, key=lambda row: -row[0]))
+
+
+def as_model(effects: Sequence[ActiveEffect]) -> Mapping[str, Mapping[str, float]]:
+    """Values of the effects by name, as a plant's ``simulate`` takes them."""
+    return {a.effect.name: dict(a.values) for a in effects}
