@@ -426,8 +426,8 @@ def test_only_sizes_of_one_kind_and_of_different_effects_are_compared() -> None:
     assert (tie.members, tie.sizes, tie.unit) == (((0, 'x'), (1, 'y')), (0.5, 0.5), 'V')
     assert coincidences(amplitudes(*two, same=True), physics) == []
     assert coincidences(amplitudes(('x', 'V', 0.5), ('y', 'm', 0.5)), physics) == []
-    # An angle is a number.
-    assert coincidences(amplitudes(('x', 'rad', 0.5), ('y', '', 0.5)), physics)[0].unit == ''
+    # An angle and a share are unlike quantities.
+    assert coincidences(amplitudes(('x', 'rad', 0.5), ('y', '', 0.5)), physics) == []
     # Five deviations from nothing, or it has no size; and what a step does at once has none.
     for size, pairs in ((0.0049, 1), (0.0051, 3)):
         (first,) = coincidences(amplitudes(*two, ('z', 'V', size)), physics)
@@ -501,9 +501,11 @@ def test_an_alternative_that_comes_close_is_refitted_in_full(
     (other,) = search.alternatives(null, fit, 0, gain)
     assert other.chi2 == pytest.approx(short, rel=1e-3)
     assert asked == ([3, 8] if again else [3])
-    # After twice the budget there are none; beyond the budget two are tried.
+    # After twice the budget none is refitted in full, and none is dropped without a word.
     search._begun = plant.simulations - 1401
-    assert search.alternatives(null, fit, 0, gain) == []
+    asked.clear()
+    assert len(search.alternatives(null, fit, 0, gain)) == 1
+    assert asked == [3]
 
 
 def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> None:
