@@ -49,15 +49,19 @@ SAME = 0.02
 """Relative change of the level up to which it counts as the same."""
 
 
-def _exact(plant: Plant, measured: Sequence[FloatArray]) -> npt.NDArray[np.bool_]:
-    """Channels (c,) of which every reading is exactly as simulated, if others are not."""
-    simulated = plant.simulate_effects([])
-    same = np.ones(len(plant.channels), dtype=bool)
-    for m, s in zip(measured, simulated, strict=False):
+def _exact(plant: Plant, measured: Sequence[FloatArray], nuisance: Sequence[ActiveEffect]) -> npt.NDArray[np.bool_]:
+    """Channels (c,) that never change and are exactly as simulated, if others are not: no measurement."""
+    tables = np.concatenate(list(measured), axis=1)
+    there = np.isfinite(tables)
+    low = np.where(there, tables, np.inf).min(axis=1, initial=np.inf)
+    high = np.where(there, tables, -np.inf).max(axis=1, initial=-np.inf)
+    constant = there.any(axis=1) & (low == high)
+    if not constant.any() or constant[there.any(axis=1)].all():
+        return np.zeros(len(constant), dtype=bool)
+    for m, s in zip(measured, plant.simulate_effects(nuisance), strict=False):
         if np.shape(m) == np.shape(s):
-            same &= np.all(~np.isfinite(m) | (m == s), axis=1)
-    seen = np.sum([np.isfinite(m).sum(axis=1) for m in measured], axis=0) > 0
-    return np.asarray(same & seen) if not same[seen].all() else np.zeros(len(same), dtype=bool)
+            constant &= np.all(~np.isfinite(m) | (m == s), axis=1)
+    return np.asarray(constant)
 
 
 class PlantComparison(Comparison):
@@ -77,7 +81,7 @@ class PlantComparison(Comparison):
         self.nuisance = tuple(ActiveEffect(e, e.off_values(plant.physics, next(e.variants()))) for e in plant.nuisance)
         self.measured = measured_by(plant)
         check_plant(plant)
-        exact = _exact(plant, self.measured)
+        exact = _exact(plant, self.measured, self.nuisance)
         # Readings that are the simulation's to the last digit are no measurement: nothing can be held against them.
         self.measured = [np.where(exact[:, None], np.nan, m) for m in self.measured]
         self.exact = tuple(name for name, e in zip(plant.channels, exact.tolist(), strict=True) if e)

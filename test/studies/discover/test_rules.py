@@ -365,7 +365,7 @@ def test_an_effect_is_named_from_stated_limits_on(gain: float, penalty: float, l
 
 
 @pytest.mark.parametrize(
-    ('weaker', 'open_level', 'named'), [(1.0, False, True), (0.1, False, False), (0.1, True, True)]
+    ('weaker', 'open_level', 'named'), [(1.0, False, True), (0.1, False, False), (1.0, True, True), (0.1, True, False)]
 )
 def test_an_effect_whose_size_may_be_none_is_not_named_whatever_is_lost_without_it(
     monkeypatch: pytest.MonkeyPatch, weaker: float, open_level: bool, named: bool
