@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Whole searches that never saw what judges them, beside peers in the same folds. ``python -m blind.nested auxtel``.
 
 Each fold's readings are taken out, terms, sizes and shrinkage are found without them, and what the model that predicts

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """A CSV table with a header: its lines, its declared columns, and what is said of a table that is another program's."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What a table of another program is: its encoding, separator, header and units, and the shell line that converts it.
 
 Nothing is converted by itself: a reader that refuses a table says these words.

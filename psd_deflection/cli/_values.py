@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Values of options: a mistake ends with status 2. Light, for the commands that only speak to a daemon."""
 
 from __future__ import annotations

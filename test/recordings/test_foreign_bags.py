@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Bags as reindexing, copying by hand and stepped clocks leave them: samples stay, and what is odd is named."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """Measures by how much joints move with their offsets: what a controller reports of itself is no measurement.
 
 On an arm at rest the measured positions q of a joint are a + s f(o): f is the offset o behind a lag of first order. A

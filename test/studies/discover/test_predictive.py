@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What predicts beside what is named: many small terms against a selection by BIC; honest unseen errors."""
 
 from __future__ import annotations

@@ -1,3 +1,5 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
 """What predicts, beside what is named: the terms of the library weighed together, each by how likely it is.
 
 Names need proof, a prediction does not: of many small terms none may stand out, and together they still lower the error
