@@ -54,7 +54,7 @@ def test_parameters_options_loads_frames_and_arms_refuse_it(text: str, tmp_path:
     with pytest.raises(ConfigError, match='not a list of numbers'):
         load_history(f'constant:0,{text},0:20', 1000.0)
     (tmp_path / 'frames.csv').write_text(f'file,t,exposure\na.png,{text},0\n')
-    with pytest.raises(RecordingError, match='which is not a number of seconds'):
+    with pytest.raises(RecordingError, match=r"column t holds '.*', which is not a number"):
         Footage(str(tmp_path), 0.0)
     urdf = tmp_path / 'arm.urdf'
     urdf.write_text(
@@ -64,9 +64,7 @@ def test_parameters_options_loads_frames_and_arms_refuse_it(text: str, tmp_path:
     )
     with pytest.raises(ConfigError, match='must be 1 finite number'):
         read_arm(urdf, 'tool')
-    with pytest.raises(SystemExit) as ended:
-        main(['load', '--url', 'http://127.0.0.1:1/', '--', '0', text, '0'])
-    assert ended.value.code == 2
+    assert main(['load', '--url', 'http://127.0.0.1:1/', '--', '0', text, '0']) == 2
 
 
 def test_a_text_is_made_a_number_in_one_place() -> None:

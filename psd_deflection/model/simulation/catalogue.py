@@ -17,6 +17,7 @@ where the file, or a recording made with it, is read.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import math
@@ -193,23 +194,6 @@ def _made(name: str, values: Mapping[str, object], source: str, places: Mapping[
     return ActiveEffect(effect, out)
 
 
-MEANT = {
-    'hum': 'mains_interference',
-    'mains': 'mains_interference',
-    'drift': 'laser_pointing_drift',
-    'tilt': 'plane_tilt',
-    'light': 'ambient_light',
-    'stray_light': 'ambient_light',
-    'clipping': 'spot_clipping',
-    'saturation': 'amplifier_saturation',
-    'hysteresis': 'clamp_friction',
-    'stiffness': 'bending_stiffness',
-    'temperature': 'thermal_drift',
-    'rotation': 'sensor_rotation',
-}
-"""What people call an effect, and its name."""
-
-
 def _effect(name: str, values: Mapping[str, object], source: str, places: Mapping[str, Place]) -> Effect:
     """The effect that ``values`` have the law of, or the one that is in its place."""
     if LAW in values:
@@ -218,7 +202,7 @@ def _effect(name: str, values: Mapping[str, object], source: str, places: Mappin
             raise ConfigError(f'{source}.{LAW}: name = {effect.name!r}: must be {name!r}, as in {source}.name')
         return effect
     if name not in places:
-        meant = MEANT.get(name.lower())
+        meant = _called(name.lower(), places)
         hint = (
             f'; did you mean {meant}?'
             if meant
@@ -228,6 +212,16 @@ def _effect(name: str, values: Mapping[str, object], source: str, places: Mappin
         yours = f' (one of your own is {name}.py or {name}.yaml in {folders}, see {FOLDERS})' if folders else ''
         raise ConfigError(f'{source}: name = {name!r}: no effect of that name{hint}{yours}')
     return _load(name, places[name])
+
+
+def _called(word: str, places: Mapping[str, Place]) -> str:
+    """The name of the effect that people call ``word``; nothing if none is called so."""
+    for name, place in sorted(places.items()):
+        # One that cannot be loaded is refused where it is asked for.
+        with contextlib.suppress(ConfigError):
+            if word in _load(name, place).also:
+                return name
+    return ''
 
 
 def with_laws(values: Mapping[str, object]) -> dict[str, object]:

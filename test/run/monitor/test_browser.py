@@ -549,7 +549,6 @@ def test_half_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[...,
 
 def test_a_label_of_the_time_axis_has_every_decimal_of_its_step(page: Page, serve: Callable[..., Serving]) -> None:
     page.open(serve().url)
-    page.live()
     digits = page.later(
         "import('/page/charts.js').then((charts) => [60, 5, 2.5, 1, 0.25, 0.05, 0.002].map(charts.decimals))"
     )
@@ -564,8 +563,9 @@ def test_a_load_of_the_page_takes_a_decimal_comma_or_refuses(
     page: Page, serve: Callable[..., Serving], typed: str, noted: float | None
 ) -> None:
     serving = serve()
+    serving.give(0, 20)
     page.open(serving.url)
-    page.live()
+    page.until('document.getElementById("load").offsetParent !== null && document.body.dataset.rows >= 1')
     page.driver.find_element(By.ID, 'load').click()
     field = page.driver.find_element(By.ID, 'fy')
     field.clear()

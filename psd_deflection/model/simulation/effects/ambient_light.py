@@ -57,4 +57,5 @@ EFFECT = Effect(
     apply=_apply,
     correct=_correct,
     order=1,
+    also=('light', 'stray_light'),
 )

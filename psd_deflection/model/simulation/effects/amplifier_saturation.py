@@ -57,4 +57,5 @@ EFFECT = Effect(
     apply=_apply,
     order=3,
     finite=True,
+    also=('saturation',),
 )

@@ -28,4 +28,5 @@ EFFECT = Effect(
     order=0,
     point='configure',
     configure=_configure,
+    also=('stiffness',),
 )

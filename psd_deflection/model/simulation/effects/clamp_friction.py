@@ -70,4 +70,5 @@ EFFECT = Effect(
     apply=_apply,
     trace_back=_trace_back,
     order=3,
+    also=('hysteresis',),
 )

@@ -29,4 +29,5 @@ EFFECT = Effect(
     point='beam',
     apply=_apply,
     uses=frozenset({'time'}),
+    also=('drift',),
 )

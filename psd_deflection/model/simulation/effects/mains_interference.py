@@ -70,4 +70,5 @@ EFFECT = Effect(
     point='volts',
     apply=_apply,
     order=2,
+    also=('hum', 'mains'),
 )

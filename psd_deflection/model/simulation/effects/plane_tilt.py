@@ -35,4 +35,5 @@ EFFECT = Effect(
     configure=_configure,
     finite=True,
     calibrated_as={'slope_ratio': 'link.slope_ratio'},
+    also=('tilt',),
 )

@@ -40,4 +40,5 @@ EFFECT = Effect(
     correct=_correct,
     order=2,
     calibrated_as={'angle': 'rotation'},
+    also=('rotation',),
 )

@@ -51,4 +51,5 @@ EFFECT = Effect(
     apply=_apply,
     order=0,
     finite=True,
+    also=('clipping',),
 )

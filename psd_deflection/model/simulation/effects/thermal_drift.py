@@ -37,4 +37,5 @@ EFFECT = Effect(
     correct=_correct,
     order=6,
     uses=frozenset({'temperature'}),
+    also=('temperature',),
 )
