@@ -34,6 +34,8 @@ UNBOUNDED = {
 GROWS = {'append', 'appendleft', 'add', 'setdefault', 'extend', 'update', 'put', 'put_nowait', 'insert'}
 
 BOUNDED_BY = {
+    'arms/compensation/response.py:_rows': 'MOST_ROWS',
+    'arms/compensation/response.py:suspects': 'the joints of the arm',
     'arms/inputs.py:_told': 'LONGEST_LIST',
     'camera/lens.py:_grids': 'one size of image a camera',
     'camera/reference.py:_waiting': '20 MOST_REST, or twice rest.frames',
@@ -61,6 +63,7 @@ BOUNDED_BY = {
     'measure/uncertainty/stamped.py:_told': 'our own sentences',
     'measure/watch.py:_learned': 'LEARN',
     'measure/watch.py:_since': 'REMEMBER',
+    'run/reading/pinger.py:_under_way': 'MOST_UNDER_WAY',
     'ros/camera.py:_since': 'one second',
     'ros/chain.py:_inputs': 'the links of the chain',
     'ros/follow.py:_goals': 'MOST_WAITING, and MOST_GOALS a second that end within ANSWER_S of being replaced',

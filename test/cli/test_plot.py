@@ -199,7 +199,7 @@ def test_json_is_in_si_units(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     found = json.loads(capsys.readouterr().out)
     assert (found['blocks'], found['estimates'], found['without_estimate']) == (200, 148, {'laser_lost': 52})
     assert found['duration_s'] == pytest.approx(4.0)
-    assert found['dx']['sd'] == pytest.approx(0.18e-6, abs=0.01e-6)
+    assert found['dx']['sd'] == pytest.approx(0.31e-6, abs=0.01e-6)
     assert found['dy']['min'] < -2e-3 < found['dy']['max']
     assert Path(found['out']).exists()
 

@@ -67,7 +67,7 @@ FIELDS = (
     Field('topics', str),
     Field('parameters', str),
 )
-"""Columns of --out. ``marks``, ``topics`` and ``parameters`` are JSON."""
+"""Columns of --out. ``marks``, ``clock_steps``, ``topics`` and ``parameters`` are JSON."""
 
 HEAD = ('state', 'seconds', 'samples', 'lost', 'flagged', 'rate (1/s)', 'lacks')
 
@@ -125,7 +125,11 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
 
 def _row(found: Mapping[str, Any]) -> dict[str, object]:
     texts = {name: '; '.join(found[name]) for name in ('lacks', 'warnings')}
-    return {**found, **texts, **{name: json.dumps(found[name]) for name in ('marks', 'topics', 'parameters')}}
+    return {
+        **found,
+        **texts,
+        **{name: json.dumps(found[name]) for name in ('marks', 'clock_steps', 'topics', 'parameters')},
+    }
 
 
 def _line(found: Mapping[str, Any]) -> list[str]:

@@ -87,8 +87,9 @@ def ask(daemon: Daemon, path: str, body: Mapping[str, object], *, timed: bool = 
             connection.connect()
             late = {'late': min(since_start_s(), MAX_AGO_S)} if timed else {}
             connection.request('POST', parts.path + path, json.dumps({**body, **late}), headers)
-            answer = connection.getresponse()
-            status, text = answer.status, answer.read(10_000).decode(errors='replace')
+            # The connection forgets an answer that ends with it.
+            with contextlib.closing(connection.getresponse()) as answer:
+                status, text = answer.status, answer.read(10_000).decode(errors='replace')
     except (http.client.HTTPException, OSError, ValueError) as error:
         raise _unreachable(daemon, error) from None
     message: Any = None

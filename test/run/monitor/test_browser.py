@@ -368,7 +368,7 @@ def test_a_load_is_noted_since_the_last_step(page: Page, serve: Callable[..., Se
     page.driver.find_element(By.ID, 'load').click()
     page.until('document.getElementById("since_step").textContent.startsWith("since the last step (")')
     page.driver.find_element(By.ID, 'since_step').click()
-    page.until('document.getElementById("ago").valueAsNumber >= 3.4')
+    page.until('Number(document.getElementById("ago").value) >= 3.4')
     page.driver.find_element(By.CSS_SELECTOR, '#weigh button[value=set]').click()
     page.until('document.getElementById("notice").textContent === "load noted"')
     # What passed while the dialog was open counts too.

@@ -48,7 +48,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class PredictingTerm:
     """``name``: effect with its choices, and its parameter if it has several. ``value`` in ``unit``; ``weight``: how
     likely it takes part, from 0 to 1.
     """
@@ -67,7 +67,7 @@ class Predictive:
     """
 
     effects: tuple[ActiveEffect, ...]
-    terms: tuple[Term, ...]
+    terms: tuple[PredictingTerm, ...]
     unseen: float
     unseen_named: float
     remains: bool
@@ -94,7 +94,7 @@ class Predictive:
 
 
 @dataclass(frozen=True, slots=True)
-class _Place:
+class _Number:
     """A number of the model: parameter ``name`` of effect ``index``; ``off``: its value without effect."""
 
     index: int
@@ -114,7 +114,7 @@ class _Library:
     ws: Comparison
     effects: tuple[ActiveEffect, ...]
     fixed: int
-    places: tuple[_Place, ...]
+    places: tuple[_Number, ...]
     always: int
 
     def at(self, x: FloatArray) -> list[ActiveEffect]:
@@ -145,14 +145,14 @@ class _Library:
 
 def _library(ws: Comparison, fit: Fit, screen: Screen) -> tuple[_Library, FloatArray]:
     """What may take part, and the numbers of ``fit``."""
-    effects, places, x = list(fit.whole), list[_Place](), list[float]()
+    effects, places, x = list(fit.whole), list[_Number](), list[float]()
     fixed = len(fit.nuisance)
 
     def add(index: int, name: str) -> None:
         active = effects[index]
         p = active.effect.parameter(name)
         low, high = p.bounds(ws.physics, active.values)
-        places.append(_Place(index, name, p.off(ws.physics), low, high, p.scale))
+        places.append(_Number(index, name, p.off(ws.physics), low, high, p.scale))
         x.append(active.values[name])
 
     named = [(i + fixed, name) for i, name in fit.free]
@@ -431,9 +431,9 @@ def _unseen(line: _Line, x: FloatArray, rng: np.random.Generator) -> tuple[float
     return gap(more), gap(named), np.asarray(gained)
 
 
-def _terms(line: _Line, x: FloatArray, weights: FloatArray) -> tuple[Term, ...]:
+def _terms(line: _Line, x: FloatArray, weights: FloatArray) -> tuple[PredictingTerm, ...]:
     """What the model has beyond the named effects, the largest first."""
-    library, out = line.library, list[tuple[float, Term]]()
+    library, out = line.library, list[tuple[float, PredictingTerm]]()
     for j, place in enumerate(library.places):
         if line.named[j] or x[j] == place.off:
             continue
@@ -442,7 +442,7 @@ def _terms(line: _Line, x: FloatArray, weights: FloatArray) -> tuple[Term, ...]:
         several = sum(q.kind == 'amplitude' for q in active.effect.parameters) > 1
         name = f'{active.label} {place.name}' if several else active.label
         moved = float(np.linalg.norm(line.columns[:, j])) * abs(x[j] - place.off) * line.lengths[j]
-        out.append((moved, Term(name, float(x[j]), p.unit, float(weights[j]))))
+        out.append((moved, PredictingTerm(name, float(x[j]), p.unit, float(weights[j]))))
     return tuple(t for _, t in sorted(out, key=lambda row: -row[0]))
 
 
