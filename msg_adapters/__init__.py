@@ -257,7 +257,8 @@ TOPICS = (
     ),
     Topic(
         MARK,
-        'a mark ("bumped it here"), at the time of its arrival; at most 200 printable characters',
+        'a mark ("bumped it here"), at the time of its arrival (by page or command: of the click, or of the '
+        "command's start); at most 200 printable characters",
         string.MESSAGE,
         Mark,
         string.from_mark,

@@ -8,7 +8,6 @@ import re
 from pathlib import Path
 
 import pytest
-import yaml
 
 from psd_deflection.devices.protocol.text_lines import Description, Line, parse
 from psd_deflection.devices.registry import DEVICES
@@ -31,7 +30,7 @@ def test_every_source_has_its_row() -> None:
 def test_the_parameters_of_a_page_are_parameters(page: str, tmp_path: Path) -> None:
     (text,) = blocks(page, 'yaml')
     path = tmp_path / 'rig.yaml'
-    path.write_text(yaml.safe_dump({'/**': {'ros__parameters': yaml.safe_load(text)}}))
+    path.write_text(text)
     assert load_rig(path).acquisition.source == page.removesuffix('.md')
 
 
