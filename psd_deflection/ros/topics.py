@@ -5,7 +5,7 @@
 
 Publishers, subscriptions and actions are made from a row alone (``endpoints.publisher_of``,
 ``InputGate.listen``, ``InputGate.serve``): name, type and QoS stand nowhere else, and a topic without
-a row can be neither published nor heard. ``python -m tools.topics`` writes the table of ``docs/topics.md`` from
+a row can be neither published nor heard. ``python -m tools.pages`` writes the table of ``docs/topics.md`` from
 these rows.
 """
 

@@ -1,12 +1,11 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The table of topics is whole: nothing is published or heard beside it, and the page shows it."""
+"""The table of topics is whole: nothing is published or heard beside it."""
 
 from __future__ import annotations
 
 import ast
 import functools
-from pathlib import Path
 
 import pytest
 
@@ -15,7 +14,6 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.ros.topics import HEARD, PUBLISHED, SERVED
 from psd_deflection.run.fanout import published, subscribed
 from test.recordings.making import estimate
-from tools import topics
 from tools.program import ROOT
 
 MAKERS = {
@@ -80,8 +78,3 @@ def test_every_row_says_what_is_on_it() -> None:
     assert [row.name for row in SERVED.values() if not (row.says and row.node and row.type)] == []
     # Any type there may be is named by a parameter, and that is one.
     assert [row.name for row in rows if not row.type] == ['~/controller_state']
-
-
-def test_the_page_has_the_table() -> None:
-    page = Path(topics.PAGE).read_text(encoding='utf-8')
-    assert topics.written(page) == page, 'python -m tools.topics'

@@ -1,0 +1,123 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Writes the tables of docs/ that the program has already: topics, commands, parameters, exit statuses, effects.
+
+python -m tools.pages
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+from msg_adapters import Delivery
+from psd_deflection.base import errors
+from psd_deflection.cli.main import COMMANDS
+from psd_deflection.model.simulation.catalogue import catalogue
+from psd_deflection.model.simulation.declaration import Effect
+from psd_deflection.rig.declarations import PARAMETERS
+from psd_deflection.rig.parameters import Parameter
+from psd_deflection.ros.topics import HEARD, PUBLISHED, SERVED, GraphTopic
+from tools.program import ROOT
+
+OWN_EFFECTS = {path.stem for path in (ROOT / 'psd_deflection/model/simulation/effects').glob('[a-z]*.py')}
+"""Not those of the person who writes the pages."""
+
+
+def topics() -> str:
+    """A row for each topic, or for those of several PSDs or solvers, and one for each action."""
+    heard = (rows[0] for rows in HEARD.values())
+    actions = [f'| `{a.name}` (action) | {a.type.split("/")[-1]} | {a.node} | | {a.says} |' for a in SERVED.values()]
+    return _table('topic | type | node | QoS | ', [*_rows(PUBLISHED.values(), ''), *_rows(heard, ' (in)'), *actions])
+
+
+def commands() -> str:
+    """A row for each command."""
+    return _table('command | ', (f'| `{name}` | {summary} |' for name, summary in COMMANDS.items()))
+
+
+def exit_statuses() -> str:
+    """A row for each exit status."""
+    return _table('status | meaning', (f'| {s} | {meaning} |' for s, meaning in errors.EXIT_STATUSES.items()))
+
+
+def parameters() -> str:
+    """A row for each parameter: those of the PSDs and beams once."""
+    rows = []
+    for p in PARAMETERS:
+        if not re.match(r'(psd|beam)_[2-9]', p.name):
+            name = re.sub(r'^(psd|beam)_1', r'\1_N', p.name)
+            default = f'`{p.default}` {p.unit}'.strip()
+            rows.append(f'| `{name}` | {default} | {_bounds(p)} | {"yes" if p.live else ""} |')
+    return _table('parameter | default | bounds | live', rows)
+
+
+def _bounds(p: Parameter) -> str:
+    """An interval, ``(`` where the bound itself is excluded, or the choices."""
+    if p.choices is not None:
+        return ', '.join(f'`{choice}`' for choice in p.choices)
+    low = f'({p.above:g}' if p.above is not None else '' if p.minimum is None else f'[{p.minimum:g}'
+    return f'{low}, {p.maximum:g}]' if low and p.maximum is not None else ''
+
+
+def effects() -> str:
+    """A row for each effect of the package, in the order in which they act."""
+    shown = sorted((e for e in catalogue().values() if e.name in OWN_EFFECTS), key=lambda e: e.rank)
+    return _table('effect | stage | what it does | parameters', (_effect(e) for e in shown))
+
+
+def _effect(effect: Effect) -> str:
+    values = (f'`{p.name}`{f" ({p.unit})" if p.unit else ""}' for p in effect.parameters)
+    return f'| `{effect.name}` | {effect.stage} | {effect.summary} | {", ".join(values)} |'
+
+
+def _table(head: str, rows: Iterable[str]) -> str:
+    return '\n'.join(
+        [f'| {head}|' if head.endswith(' ') else f'| {head} |', '|---' * (head.count('|') + 1) + '|', *rows]
+    )
+
+
+def _rows(rows: Iterable[GraphTopic], direction: str) -> Iterator[str]:
+    for _, alike in itertools.groupby(rows, key=lambda row: row._replace(name='')):
+        group = list(alike)
+        names = ', '.join(f'`{row.name}`' for row in group[:2]) + (' …' if len(group) > 2 else '')
+        row = group[0]
+        kind = row.type.split('/')[-1] or 'any'
+        yield f'| {names}{direction} | {kind} | {row.node} | {_qos(row.delivery)} | {row.says} |'
+
+
+def _qos(delivery: Delivery) -> str:
+    reliable = '' if delivery.reliable else ', best effort'
+    return f'{delivery.depth}{reliable}{", latched" if delivery.latched else ""}'
+
+
+TABLES = {
+    'topics': topics,
+    'commands': commands,
+    'exit statuses': exit_statuses,
+    'parameters': parameters,
+    'effects': effects,
+}
+PAGES = tuple(ROOT / 'docs' / name for name in ('topics.md', 'commands.md', 'effects.md'))
+
+
+def written(page: str) -> str:
+    """Return the text of ``page`` with the current tables."""
+    for name, table in TABLES.items():
+        begin, end = f'<!-- {name}: python -m tools.pages writes this table -->', f'<!-- end of {name} -->'
+        before, found, rest = page.partition(begin)
+        if found:
+            page = f'{before}{begin}\n\n{table()}\n\n{end}{rest.partition(end)[2]}'
+    return page
+
+
+def main(pages: Iterable[Path] = PAGES) -> None:
+    """Write the tables of ``pages`` into them."""
+    for page in pages:
+        page.write_text(written(page.read_text(encoding='utf-8')), encoding='utf-8')
+
+
+if __name__ == '__main__':
+    main()
