@@ -20,17 +20,17 @@ from launch_ros.substitutions import FindPackageShare
 
 PARAMETERS: dict[str, tuple[type, str]] = {
     'port': (str, 'serial port; without one, here or in params_file: the simulated rig'),
-    'demo': (bool, 'weights hang on the simulated rig in turn; false: it hangs what is noted'),
-    'source': (str, 'what the device speaks (psd-deflection devices --help)'),
+    'demo': (bool, 'weights hang on the simulated rig in turn; false: it hangs noted loads'),
+    'source': (str, 'protocol of the device (psd-deflection devices --help)'),
     'solver': (str, 'solver whose answer is /link_tip/deflection (ros2 param describe NODE solver)'),
     'autostart': (bool, 'configure and activate at start; false: wait for lifecycle transitions'),
     'record': (bool, 'record from the start'),
-    'bag_dir': (str, 'where recordings go'),
+    'bag_dir': (str, 'folder of recordings'),
     'monitor': (bool, 'serve the live page'),
     'markers': (bool, 'publish markers for RViz'),
     'publish_tf': (bool, 'publish the frames on /tf and /tf_static'),
     'publish_volts': (bool, 'publish raw samples as plain numbers, for plots'),
-    'frame_prefix': (str, 'put before the name of every frame'),
+    'frame_prefix': (str, 'prefix of every frame name'),
 }
 """Parameters of the node that may be given as arguments, with their types."""
 

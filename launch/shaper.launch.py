@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The shaper: ``ros2 launch psd_deflection shaper.launch.py params_file:=modes/rig.yaml shaped:=/arm/trajectory``.
 
-Trajectories on ``given`` come out on ``shaped``, which no link rings after.
+Shapes the trajectories of the topic ``given`` so that no link rings, and publishes them on ``shaped``.
 """
 
 from launch import LaunchDescription
@@ -14,13 +14,13 @@ from launch_ros.parameter_descriptions import ParameterValue
 
 PARAMETERS: dict[str, tuple[type, str]] = {
     'params_file': (str, 'rig file with the modes, as identify writes it'),
-    'frequency': (float, 'of the mode, Hz, instead of a rig file'),
-    'damping_ratio': (float, 'of that mode'),
+    'frequency': (float, 'frequency of the mode, Hz, instead of a rig file'),
+    'damping_ratio': (float, 'damping ratio of that mode'),
     'shaper': (str, 'zv, mzv, zvd, ei, or none to pass trajectories through (empty: the recommended one)'),
-    'urdf': (str, 'refuse trajectories beyond the limits of this file, or of the topic robot_description'),
-    'max_step': (float, 'refuse a trajectory that begins further from where the joints are, rad or m (empty: 0.05)'),
-    'action': (str, "the controller's action FollowJointTrajectory, for MoveIt (empty: topics alone)"),
-    'lead': (float, 'a trajectory begins so much later, s, so that it has arrived when it does (empty: 0.1)'),
+    'urdf': (str, 'reject trajectories beyond the joint limits of this URDF file, or of the topic robot_description'),
+    'max_step': (float, 'reject a trajectory that begins further from the joints, rad or m (empty: 0.05)'),
+    'action': (str, 'FollowJointTrajectory action of the controller, for MoveIt (empty: topics only)'),
+    'lead': (float, 'delay of each trajectory, s, so that it arrives before it begins (empty: 0.1)'),
 }
 """Parameters of the node that may be given as arguments, with their types; `modes` stands in a parameter file."""
 
