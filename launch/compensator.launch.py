@@ -2,8 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The compensator: ``ros2 launch psd_deflection compensator.launch.py tip:=tool0 drive:=true``.
 
-Kinematics come from the topic ``robot_description``. With ``drive`` it is silent until ``/compensator/enable`` is called. For
-``forward_position_controller``::
+Kinematics come from the topic ``robot_description``. With ``drive`` it is silent until
+``/compensator/enable`` is called. For ``forward_position_controller``::
 
     ros2 launch psd_deflection compensator.launch.py tip:=tool0 drive:=true \
         output:=commands commands:=/forward_position_controller/commands
@@ -50,7 +50,9 @@ def generate_launch_description() -> LaunchDescription:
         [
             DeclareLaunchArgument('tip', description='link of the end effector'),
             DeclareLaunchArgument('namespace', default_value='', description='namespace of the node and its topics'),
-            DeclareLaunchArgument('drive', default_value='false', description='publish for a controller (false: proposals only)'),
+            DeclareLaunchArgument(
+                'drive', default_value='false', description='publish for a controller; false: proposals'
+            ),
             DeclareLaunchArgument('params_file', default_value='', description='ROS parameters of the node'),
             *(
                 DeclareLaunchArgument(name, default_value='', description=what)
