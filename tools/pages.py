@@ -48,10 +48,10 @@ def parameters() -> str:
     rows = []
     for p in PARAMETERS:
         if not re.match(r'(psd|beam)_[2-9]', p.name):
-            name = re.sub(r'^(psd|beam)_1', r'\1_N', p.name)
+            name = re.sub(r'^(psd|beam)_1', r'\1_N', p.name) + ('`, live' if p.live else '`')
             default = f'`{p.default}` {p.unit}'.strip()
-            rows.append(f'| `{name}` | {default} | {_bounds(p)} | {"yes" if p.live else ""} |')
-    return _table('parameter | default | bounds | live', rows)
+            rows.append(f'| `{name} | {default} | {_bounds(p)} |')
+    return _table('parameter | default | bounds', rows)
 
 
 def _bounds(p: Parameter) -> str:
@@ -65,12 +65,12 @@ def _bounds(p: Parameter) -> str:
 def effects() -> str:
     """A row for each effect of the package, in the order in which they act."""
     shown = sorted((e for e in catalogue().values() if e.name in OWN_EFFECTS), key=lambda e: e.rank)
-    return _table('effect | stage | what it does | parameters', (_effect(e) for e in shown))
+    return _table('effect | what it does | parameters', (_effect(e) for e in shown))
 
 
 def _effect(effect: Effect) -> str:
     values = (f'`{p.name}`{f" ({p.unit})" if p.unit else ""}' for p in effect.parameters)
-    return f'| `{effect.name}` | {effect.stage} | {effect.summary} | {", ".join(values)} |'
+    return f'| `{effect.name}` | {effect.summary} | {", ".join(values)} |'
 
 
 def _table(head: str, rows: Iterable[str]) -> str:

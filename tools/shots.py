@@ -159,7 +159,7 @@ def reports(folder: Path) -> dict[str, Path]:
 
 
 def at_every_width() -> None:
-    """Live page and reports at every width: build/shots, and one sheet of each in docs/figures."""
+    """Live page and reports at every width, and one sheet of each, in build/shots."""
     EVERYWHERE.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder:
         program = Program([*PSD_DEFLECTION, 'monitor', '--monitor-port', '0', '--demo'])
@@ -172,12 +172,6 @@ def at_every_width() -> None:
             sheets[name] = everywhere(path.as_uri(), name, charted)
     for name, sheet in sheets.items():
         sheet.save(EVERYWHERE / f'{name}.png')
-    for name in KEPT:
-        sheets[name].quantize(200, Image.Quantize.FASTOCTREE).save(FIGURES / f'widths_{name}.png', optimize=True)
-
-
-KEPT = ('page', 'discover')
-"""The sheets that the documents show."""
 
 
 def drawn(seconds: float) -> Callable[[Any], bool]:
