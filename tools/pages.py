@@ -17,7 +17,7 @@ from psd_deflection.base import errors
 from psd_deflection.cli.main import COMMANDS
 from psd_deflection.model.simulation.catalogue import catalogue
 from psd_deflection.model.simulation.declaration import Effect
-from psd_deflection.rig.declarations import PARAMETERS
+from psd_deflection.rig.declarations import SECTIONS
 from psd_deflection.rig.parameters import Parameter
 from psd_deflection.ros.topics import HEARD, PUBLISHED, SERVED, GraphTopic
 from tools.program import ROOT
@@ -44,22 +44,17 @@ def exit_statuses() -> str:
 
 
 def parameters() -> str:
-    """A row for each parameter: those of the PSDs and beams once."""
+    """A row for each section of the rig file, with the default of each parameter: those of the PSDs and beams once."""
     rows = []
-    for p in PARAMETERS:
-        if not re.match(r'(psd|beam)_[2-9]', p.name):
-            name = re.sub(r'^(psd|beam)_1', r'\1_N', p.name) + ('`, live' if p.live else '`')
-            default = f'`{p.default}` {p.unit}'.strip()
-            rows.append(f'| `{name} | {default} | {_bounds(p)} |')
-    return _table('parameter | default | bounds', rows)
+    for section in SECTIONS:
+        if not re.match(r'(psd|beam)_[2-9]', section.prefix):
+            found = (_default(p, len(section.prefix)) for p in section.parameters.values())
+            rows.append(f'| {section.prefix.replace("_1", "_N") or "none"} | {"; ".join(found)} |')
+    return _table('prefix | parameters with defaults', rows)
 
 
-def _bounds(p: Parameter) -> str:
-    """An interval, ``(`` where the bound itself is excluded, or the choices."""
-    if p.choices is not None:
-        return ', '.join(f'`{choice}`' for choice in p.choices)
-    low = f'({p.above:g}' if p.above is not None else '' if p.minimum is None else f'[{p.minimum:g}'
-    return f'{low}, {p.maximum:g}]' if low and p.maximum is not None else ''
+def _default(p: Parameter, start: int) -> str:
+    return f'`{p.name[start:]}{"*" if p.live else ""}` {p.default if p.default != "" else "–"} {p.unit}'.strip()
 
 
 def effects() -> str:
