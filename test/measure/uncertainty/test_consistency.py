@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.measure.uncertainty.consistency import Consistency, Suspect, widened
-from psd_deflection.measure.uncertainty.stamped import StampedDots
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import rig_from_values
 
 CENTERS = np.array([[0.0, 0.070], [-0.100, 0.0]])
 COVARIANCE = np.diag([4e-12, 1e-12, 9e-12, 2e-12]) + 0.5e-12
@@ -76,38 +74,6 @@ def test_limits(chi_square: float, contradict: bool, widens: bool, limit: float)
     assert np.abs(got.possible) == pytest.approx(1.5 * np.abs(got.errors) if widens else np.zeros(4))
 
 
-def test_a_contradiction_is_held_and_forgotten_by_a_fiftieth_a_block() -> None:
-    of = Consistency()
-    first = check(scaled_to(60.0), of)
-    assert first.contradict
-    blocks = 0
-    while (got := check(np.zeros(4), of)).contradict:
-        blocks += 1
-        assert got.chi_square == pytest.approx(0.0, abs=1e-9)
-        assert np.abs(got.possible) == pytest.approx(np.abs(first.possible) * 0.98 ** (blocks / 2.0))
-    # 60 falls to 25.
-    assert blocks == math.floor(math.log(2.4) / -math.log(0.98))
-    assert of.held == 0.0
-    assert got.possible == (0.0, 0.0, 0.0, 0.0)
-
-
-def test_an_error_that_lasts_is_widened_for_though_no_block_alone_shows_it() -> None:
-    """Two sd in every block; not one, and not hum of the worst constant phase, which its own variance explains."""
-    small, hum, large = (scaled_to(chi_square) for chi_square in (1.0, 2.0, 4.0))
-    for readings, widens in ((small, False), (hum, False), (large, True)):
-        of = Consistency()
-        got = [check(readings, of) for _ in range(60)]
-        assert not any(c.contradict for c in got)
-        assert not any(got[0].possible)
-        assert all(any(c.possible) == widens for c in got[20:])
-    # By half as much again as the error of each reading.
-    np.testing.assert_allclose(np.abs(got[-1].possible), 1.5 * np.abs(got[-1].errors), rtol=1e-2)
-    # What was wrong and is not any more is forgotten in about a second.
-    after = [check(0.0 * large, of) for _ in range(120)]
-    assert any(after[10].possible)
-    assert not any(after[-1].possible)
-
-
 def test_what_has_next_to_no_part_in_the_base_line_is_not_accused() -> None:
     """Along a base line in x a wrong y changes its length to second order only."""
     for y, seen in ((0.0, False), (0.0028 * 2**0.5 * 1.05, True), (0.0028 * 2**0.5 * 0.95, False)):
@@ -152,66 +118,6 @@ def seen(change: Any, blocks: int = 60, size: float = 1.0) -> str:
         checked = consistency.check(tuple(apart.tolist()), tuple((a * r).tolist()), NOISE**2 * np.eye(4))
         suspect.add(tuple(readings.tolist()), checked.errors)
     return suspect.most_likely(NOISE)
-
-
-def with_(i: int, law: Any) -> Any:
-    def change(readings: FloatArray) -> FloatArray:
-        out = readings.copy()
-        out[i] = law(out[i])
-        return out
-
-    return change
-
-
-@pytest.mark.parametrize('name', ['x1', 'y1', 'x2', 'y2'])
-def test_a_reading_that_stands_still_or_is_inverted_is_named(name: str) -> None:
-    i = ('x1', 'y1', 'x2', 'y2').index(name)
-    assert seen(with_(i, lambda _: 3e-4)) == f'{name} does not move with the others'
-    assert seen(with_(i, lambda v: -v), size=0.2) == f'{name} has the wrong sign'
-    # Too little to tell: few blocks, small motion.
-    assert seen(with_(i, lambda _: 3e-4), blocks=9) == ''
-    assert seen(with_(i, lambda _: 3e-4), size=0.02) == ''
-    # Neither law: half as large.
-    assert seen(with_(i, lambda v: 0.5 * v)) == ''
-
-
-@pytest.mark.parametrize(('psd', 'order'), [(1, [1, 0, 2, 3]), (2, [0, 1, 3, 2])])
-def test_exchanged_axes_are_named(psd: int, order: list[int]) -> None:
-    assert seen(lambda r: r[order]) == f'the axes of psd_{psd} are exchanged'
-
-
-@pytest.mark.parametrize(('scatter', 'said'), [(0.005, 'y1 has the wrong sign'), (0.1, '')])
-def test_a_sign_is_wrong_if_nothing_but_the_sign_is(scatter: float, said: str) -> None:
-    """What is left of an inverted reading must be below a hundredth of its motion, or be noise."""
-    suspect = Suspect(CENTERS, CENTERS)
-    for block in range(60):
-        should = 4e-4 * (-1.0) ** block
-        reads = -should + scatter * 4e-4 * (-1.0) ** (block // 2)
-        suspect.add((0.0, reads, 0.0, 0.0), (0.0, reads - should, 0.0, 0.0))
-    assert suspect.most_likely(NOISE) == said
-
-
-def test_a_base_line_may_lie_along_any_direction() -> None:
-    residual = (1e-6, -2e-6, 3e-6, 4e-6)
-    for x, y in ((0.14, 0.05), (0.05, 0.14), (-0.05, 0.14), (0.0, -0.1)):
-        along = np.array([x, y, -x, -y]) / math.hypot(x, y) / 2**0.5
-        r = float(along @ residual)
-        got = Consistency().check((x, y), residual, COVARIANCE)
-        assert got.chi_square == pytest.approx(r * r / float(along @ COVARIANCE @ along), rel=1e-9)
-        want = [r / a if abs(a) > 0.02 else 0.0 for a in along]
-        assert got.errors == pytest.approx(want)
-
-
-def test_sound_readings_are_not_accused() -> None:
-    assert seen(lambda r: r) == ''
-
-
-def test_the_p_is_that_of_the_chi_square() -> None:
-    """One degree of freedom: 3.84 is the 5 % point, 6.63 the 1 % point."""
-    stamped = StampedDots(rig_from_values({}), flat=True)
-    for chi_square, p in ((0.0, '1'), (3.8415, '0.05'), (6.6349, '0.01')):
-        stamped.chi_square = chi_square
-        assert dict(stamped.words())['p of that chi-square'] == p
 
 
 def test_what_is_remembered_follows_its_laws_through_any_blocks() -> None:
@@ -298,21 +204,3 @@ def test_a_reading_is_named_by_the_moments_of_what_was_seen() -> None:
         assert suspect.most_likely(NOISE) == want, case
         told[want] = told.get(want, 0) + 1
     assert len(told) == 11
-
-
-def test_what_was_seen_is_forgotten_by_a_five_hundredth_a_block() -> None:
-    """A reading that stands still for 500 blocks and follows for 1500: weights, moments and base lines by numpy."""
-    rng = np.random.default_rng(13)
-    suspect = Suspect(CENTERS, CENTERS)
-    places = 4e-4 * rng.normal(size=2000)
-    for block, place in enumerate(places.tolist()):
-        # Of y1 what is read: at first nothing.
-        read = place if block >= 500 else 0.0
-        suspect.add((0.0, read, 0.0, 0.0), (0.0, read - place, 0.0, 0.0))
-    weights = (1.0 - 1.0 / 500.0) ** np.arange(1999, -1, -1)
-    assert suspect._weight == pytest.approx(weights.sum(), rel=1e-12)
-    np.testing.assert_allclose(suspect._sum[5], weights @ (places - places[0]), rtol=1e-9)
-    np.testing.assert_allclose(suspect._squares[2, 1], weights @ (places - places[0]) ** 2, rtol=1e-9)
-    read = np.where(np.arange(2000) < 500, 0.0, places)
-    apart = np.hypot(REST[0], REST[1] + read)
-    assert suspect._swapped[0] == pytest.approx(weights @ (apart - math.hypot(*REST)) ** 2, rel=1e-9)

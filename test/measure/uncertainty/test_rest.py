@@ -50,13 +50,6 @@ def test_diagnostics_say_whose_noise_it_is(flat: bool, words: str) -> None:
     assert len(stamped.noise_words()) >= 4
 
 
-def test_diagnostics_say_of_how_many_readings_too_many_a_chi_square_is() -> None:
-    third = {'psd_3.center': [0.08, -0.06]}
-    of_two, of_three = (dict(StampedDots(load_rig(overrides=more)).words()) for more in ({}, third))
-    assert of_two['chi-square of the readings'] == '0.00'
-    assert of_three['chi-square of the readings'] == '0.00 of 1 degrees of freedom'
-
-
 @pytest.mark.parametrize(
     ('more', 'freedom'), [({}, 1), ({'psd_3.center': [0.08, -0.06], 'psd_4.center': [0.0, 0.1]}, 3)]
 )
@@ -64,12 +57,3 @@ def test_diagnostics_say_how_probable_a_chi_square_is(more: dict[str, object], f
     stamped = StampedDots(load_rig(overrides=more))
     stamped.chi_square, stamped.freedom = 6.0, freedom
     assert dict(stamped.words())['p of that chi-square'] == f'{chi2.sf(6.0, freedom):.2g}'
-
-
-def test_the_check_of_three_psds_goes_on_from_its_memory() -> None:
-    one, other = (StampedDots(load_rig(overrides={'psd_3.center': [0.08, -0.06]})) for _ in range(2))
-    assert one._redundancy is not None
-    assert other._redundancy is not None
-    one._redundancy.set_state((2.0, 7.0, *(1e-12 * k for k in range(18))))
-    other.restore(one.memory())
-    assert other._redundancy.state() == one._redundancy.state()
