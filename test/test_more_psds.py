@@ -261,7 +261,7 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
     assert left_out.count((psd + 1,)) > 30
     assert left_out.count((psd + 1,)) + left_out.count(()) == 90
     assert not any(s.left_out for s in spots if s.index * 20 < FAILS)
-    assert pipeline.stamped.most_likely_wrong() == f'psd_{psd + 1} does not fit the others and is left out'
+    assert pipeline.estimator.most_likely_wrong() == f'psd_{psd + 1} does not fit the others and is left out'
     assert f'psd_{psd + 1} contradicts the others and is left out' in pipeline.counters.findings
     # What is left agrees.
     good = [e.chi_square for e, s in zip(found, spots, strict=True) if s.left_out]
@@ -273,8 +273,8 @@ def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig,
     records, truth, pipeline = run(three, inverted(psd))
     assert len(primaries(records)) == 180
     assert_inside(records, truth)
-    assert pipeline.stamped.contradictions > 60
-    assert pipeline.stamped.most_likely_wrong() == ''
+    assert pipeline.estimator.contradictions > 60
+    assert pipeline.estimator.most_likely_wrong() == ''
 
 
 def test_a_stuck_psd_tells_on_itself_where_the_check_cannot(three: Rig) -> None:
@@ -305,7 +305,7 @@ def test_refuse_refuses_only_what_cannot_be_told(three: Rig) -> None:
     reported, _, pipeline = run(with_solver(three, 'exact', consistency='report', **LEVEL), inverted(2))
     assert len(primaries(reported)) == 180
     assert not any(s.left_out for s in spots_of(reported))
-    assert pipeline.stamped.contradictions > 60
+    assert pipeline.estimator.contradictions > 60
 
 
 def test_with_one_psd_left_the_rule_for_one_holds(three: Rig) -> None:
@@ -343,7 +343,7 @@ def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
     assert_inside(records, truth)
     assert spots_of(records)[100].left_out == (4,)
     assert spots_of(records)[-1].left_out == (1, 4)
-    assert pipeline.stamped.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'
+    assert pipeline.estimator.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'
 
 
 @pytest.mark.statistics
@@ -461,9 +461,9 @@ def test_the_noise_is_that_of_the_samples_without_any_rest(three: Rig, solver: s
     ringing = loads.steps([(0.0, -30.0, -10.0), (10.0, 10.0, 5.0), (0.0, 0.0, 0.0)], 1.0)
     pipeline = Pipeline(rig)
     list(pipeline.process(chunk_of(RigSimulator(rig, 4).step(ringing.loads).counts)))
-    assert pipeline.stamped.noise_source() == 'measured in motion'
-    assert pipeline.stamped.noise.sample_sd() == pytest.approx(1e-6, rel=0.1)
-    assert pipeline.stamped.noise.mean_sd() == pytest.approx(1e-6 / 20**0.5, rel=0.3)
+    assert pipeline.estimator.noise_source() == 'measured in motion'
+    assert pipeline.estimator.noise.sample_sd() == pytest.approx(1e-6, rel=0.1)
+    assert pipeline.estimator.noise.mean_sd() == pytest.approx(1e-6 / 20**0.5, rel=0.3)
 
 
 STUDIES: dict[str, list[str]] = {

@@ -35,7 +35,9 @@ _GOLDEN = 'test/test_golden.py'
 _SOLVERS = (
     *('sensitivity', 'truth', 'golden', 'interface', 'properties', 'degenerate', 'registry', 'gauss_newton', 'one_psd'),
 )
-_UNCERTAINTY = (*('consistency', 'combinations', 'stamped', 'redundancy', 'rest', 'block_fit', 'noise', 'converter'),)
+_UNCERTAINTY = (
+    *('consistency', 'combinations', 'block_estimator', 'outliers', 'rest', 'block_fit', 'noise', 'converter'),
+)
 _RUNS = ('test/measure/test_pipeline.py', 'test/test_layouts.py')
 
 ROOMS: Mapping[str, Room] = {
@@ -74,7 +76,7 @@ ROOMS: Mapping[str, Room] = {
             'test/model/misalignment/test_spread.py',
             'test/measure/uncertainty/test_pipeline_state.py',
             'test/measure/test_health.py',
-            'test/measure/test_memory.py',
+            'test/measure/test_state.py',
             'test/model/simulation/test_added_effect.py -k refused',
             'test/test_more_psds.py -k psd_left or without_one or contradicts or on_itself or all_psds or the_last',
             'test/measure/motion/test_motion.py -k anew or begun_at or noted or is_refused',
@@ -100,7 +102,7 @@ ROOMS: Mapping[str, Room] = {
             *(f'test/measure/uncertainty/test_{n}.py' for n in _UNCERTAINTY),
             'test/measure/uncertainty/test_vibration.py -k tone or hum or regular or fit_states or counted',
             'test/measure/test_pipeline.py -k zero',
-            'test/measure/test_memory.py',
+            'test/measure/test_state.py',
             'test/test_more_psds.py -k contradicts or degree or tells_on_itself or one_after',
             'test/measure/uncertainty/test_pipeline_state.py',
         ),

@@ -19,7 +19,7 @@ import numpy as np
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.measures import BlockMeasures
-from psd_deflection.measure.memory import Memory, Value, misfit, numbers
+from psd_deflection.measure.state import State, Value, mismatch, numbers
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock, channel_names, dot_names
 from psd_deflection.rig.config import Rig
 
@@ -75,7 +75,7 @@ class Stillness:
     """``blocks`` (P,): for how many blocks in a row each detector's values have not changed."""
 
     part = 'the count of blocks whose values do not change'
-    remembers = (FROZEN,)
+    prefixes = (FROZEN,)
 
     def __init__(self, psds: int) -> None:
         self.blocks: tuple[int, ...] = (0,) * psds
@@ -84,11 +84,11 @@ class Stillness:
         """Take one block, as :meth:`OpticsHealth.still` has it."""
         self.blocks = tuple(n + 1 if same else 0 for n, same in zip(self.blocks, still, strict=True))
 
-    def memory(self) -> Memory:
+    def state_dict(self) -> State:
         """The counts, if there are any."""
         return {FROZEN: self.blocks} if any(self.blocks) else {}
 
-    def restore(self, values: Mapping[str, Value]) -> None:
+    def load_state_dict(self, values: Mapping[str, Value]) -> None:
         """Take the counts. Raises ValueError if they are of another number of PSDs."""
         row = numbers(values, FROZEN, 'one count for each PSD', len(self.blocks))
         if row is not None:
@@ -99,7 +99,7 @@ class Loudness:
     """How noisy the noisy detectors are: x, y and sum of each, averaged since it became so. Nothing of the others."""
 
     part = 'the noise of noisy detectors'
-    remembers = (LOUD,)
+    prefixes = (LOUD,)
 
     def __init__(self) -> None:
         # By PSD: blocks that were averaged, blocks in a row that were quiet, mean squares of x, y and sum, V^2.
@@ -119,16 +119,16 @@ class Loudness:
         self._noises[psd] = (blocks, quiet, *squares)
         return [math.sqrt(square) for square in squares]
 
-    def memory(self) -> Memory:
+    def state_dict(self) -> State:
         """The noises, if there are any."""
         rows = [(float(psd), *noise) for psd, noise in sorted(self._noises.items())]
         return {LOUD: tuple(value for row in rows for value in row)} if rows else {}
 
-    def restore(self, values: Mapping[str, Value]) -> None:
+    def load_state_dict(self, values: Mapping[str, Value]) -> None:
         """Take the noises. Raises ValueError if they are no rows of six."""
         row = numbers(values, LOUD, 'six numbers for each noisy detector') or ()
         if len(row) % _LOUD_ROW or not all(0.0 <= value < math.inf for value in row):
-            raise misfit(LOUD, row, 'six numbers for each noisy detector')
+            raise mismatch(LOUD, row, 'six numbers for each noisy detector')
         self._noises = {int(row[at]): row[at + 1 : at + _LOUD_ROW] for at in range(0, len(row), _LOUD_ROW)}
 
 

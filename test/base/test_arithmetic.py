@@ -278,15 +278,15 @@ NOT_OF_A_BLOCK = {
     ('model/plate/layout.py', 'check_twist'): 'compares with a bound',
     ('model/solvers/base_pair.py', '_refuse_what_is_unseen'): 'compares with a bound',
     ('model/solvers/pose.py', '__init__'): 'compares with a bound',
-    ('measure/uncertainty/stamped.py', '_p_value'): 'told in /diagnostics alone',
+    ('measure/uncertainty/consistency.py', 'survival'): 'told in /diagnostics alone',
     ('measure/uncertainty/rest.py', 'why_moving'): 'compares with a bound; what it decides is recorded',
     ('measure/pipeline.py', 'zero'): 'what it finds is recorded and not computed again',
     ('measure/averaging.py', 'block_middle_ns'): 'adds whole numbers',
     ('measure/uncertainty/noise.py', '_autocovariance'): 'adds whole numbers',
     ('measure/health.py', '__init__'): 'a whole number to the power of one',
-    ('measure/uncertainty/consistency.py', '__init__'): 'the suspect is told in /diagnostics alone',
-    ('measure/uncertainty/consistency.py', 'add'): 'the suspect is told in /diagnostics alone',
-    ('measure/uncertainty/stamped.py', 'noise_words'): 'told in /diagnostics alone',
+    ('measure/uncertainty/outliers.py', '__init__'): 'the suspect is told in /diagnostics alone',
+    ('measure/uncertainty/outliers.py', 'add'): 'the suspect is told in /diagnostics alone',
+    ('measure/uncertainty/block_estimator.py', 'noise_words'): 'told in /diagnostics alone',
 }
 MATRICES = {'linalg', 'fft', 'einsum', 'dot', 'vdot', 'inner', 'matmul', 'tensordot', 'trace', 'polyfit', 'convolve'}
 FUNCTIONS = {

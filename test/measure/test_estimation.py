@@ -78,7 +78,7 @@ def test_the_noise_of_a_zero_of_psds_at_the_base_is_that_of_the_rig_file(monkeyp
     # Of the others it is that of a block's mean, as it was measured.
     for rig, noise in ((load_rig(overrides=base), want), (load_rig(), 20e-12)):
         estimation = Estimation(rig, ())
-        monkeypatch.setattr(estimation.stamped, 'mean_variances', lambda size: (size * 1e-12,) * 4)
+        monkeypatch.setattr(estimation.estimator, 'mean_variances', lambda size: (size * 1e-12,) * 4)
         assert estimation.zero_noise(20) == pytest.approx((noise,) * 4, rel=1e-9, abs=0.0)
 
 

@@ -228,7 +228,8 @@ def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> Non
         return one
 
     def said() -> tuple[int, str]:
-        return entry().level, entry().message
+        one = entry()
+        return one.level, one.message
 
     told = list(run.told)
     through(pipeline, run, range(25), told)
@@ -250,8 +251,8 @@ def test_a_memory_that_is_none_is_refused() -> None:
     one = (5.0, 1.0, 0.0, 0.0, 0.0, 0.0)
     for values in (one, (4.0, *one[1:], *6 * one), (math.inf,), (-4.0, *9 * one), (*one, *5 * (0.0,), math.nan)):
         with pytest.raises(ValueError, match=r'state.inertia: .* in blocks of 20 samples'):
-            filtered.restore({INERTIA: values})
-    filtered.restore({INERTIA: (*one, *one)})
+            filtered.load_state_dict({INERTIA: values})
+    filtered.load_state_dict({INERTIA: (*one, *one)})
     assert filtered.inertia.told == [(1_000_000_000, (0.0, 0.0, 0.0))]
 
 

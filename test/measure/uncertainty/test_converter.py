@@ -107,6 +107,6 @@ def test_ten_bits_untold_are_in_the_intervals() -> None:
 def test_diagnostics_name_the_steps() -> None:
     pipeline = Pipeline(load_rig())
     list(pipeline.process(streams.chunk(volts_of(Row('10 bit', bits=10), motion(1, 0)[0], 1))))
-    assert dict(pipeline.stamped.words())['steps of the converter'] == (
+    assert dict(pipeline.estimator.words())['steps of the converter'] == (
         'x1 19.5 mV, y1 19.5 mV, sum1 19.5 mV, x2 19.5 mV, y2 19.5 mV, sum2 19.5 mV (rig file 0.305 mV)'
     )

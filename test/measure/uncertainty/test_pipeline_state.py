@@ -146,7 +146,7 @@ def test_a_dead_reading_is_widened_named_and_refused_if_asked() -> None:
     assert all(e.chi_square > 1e4 for e in late)
     assert all(abs(e.dy + 2.2272e-3) < 3.0 * e.covariance[4] ** 0.5 for e in late[-50:])
     assert all(abs(e.dy + 2.2272e-3) > 1e-4 for e in late[-50:])
-    assert pipeline.stamped.most_likely_wrong() == 'y1 does not move with the others'
+    assert pipeline.estimator.most_likely_wrong() == 'y1 does not move with the others'
     _, records = run(load_rig(overrides={'consistency': 'refuse'}), samples)
     spots = [s for s in records if isinstance(s, SpotMeans) and s.index > 200]
     assert {s.status for s in spots} == {BlockStatus.INCONSISTENT}

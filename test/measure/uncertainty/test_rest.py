@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
 from psd_deflection.measure.uncertainty.rest import why_moving
-from psd_deflection.measure.uncertainty.stamped import StampedDots
 from psd_deflection.rig.config import load_rig
 
 
@@ -43,17 +43,17 @@ def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts:
     ('flat', 'words'), [(False, 'noise of the rig file'), (True, 'noise of the rig file until it is measured')]
 )
 def test_diagnostics_say_whose_noise_it_is(flat: bool, words: str) -> None:
-    stamped = StampedDots(load_rig(), flat)
-    assert dict(stamped.words())['covariance from'] == words
+    estimator = BlockEstimator(load_rig(), flat)
+    assert dict(estimator.words())['covariance from'] == words
     # The noise of each reading is told if it is measured.
-    assert len(stamped.words()) == (6 + len(stamped.noise_words()) if flat else 5)
-    assert len(stamped.noise_words()) >= 4
+    assert len(estimator.words()) == (6 + len(estimator.noise_words()) if flat else 5)
+    assert len(estimator.noise_words()) >= 4
 
 
 @pytest.mark.parametrize(
     ('more', 'freedom'), [({}, 1), ({'psd_3.center': [0.08, -0.06], 'psd_4.center': [0.0, 0.1]}, 3)]
 )
 def test_diagnostics_say_how_probable_a_chi_square_is(more: dict[str, object], freedom: int) -> None:
-    stamped = StampedDots(load_rig(overrides=more))
-    stamped.chi_square, stamped.freedom = 6.0, freedom
-    assert dict(stamped.words())['p of that chi-square'] == f'{chi2.sf(6.0, freedom):.2g}'
+    estimator = BlockEstimator(load_rig(overrides=more))
+    estimator.chi_square, estimator.freedom = 6.0, freedom
+    assert dict(estimator.words())['p of that chi-square'] == f'{chi2.sf(6.0, freedom):.2g}'

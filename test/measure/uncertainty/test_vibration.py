@@ -14,9 +14,9 @@ from blind import generator
 from blind.coverage import LOSSES, ROWS, Row, motion, rig, shaken, volts_of
 from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.uncertainty.block_estimator import VIBRATION
 from psd_deflection.measure.uncertainty.block_fit import BlockFit
 from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
-from psd_deflection.measure.uncertainty.stamped import VIBRATION
 from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch, rms_of, words_of
 from psd_deflection.records import FloatArray, IntArray, RawChunk, Record, SpotMeans, TipMotion
 from psd_deflection.rig.config import Rig, load_rig
@@ -166,7 +166,7 @@ def test_what_another_rig_remembers_of_tones_does_not_fit() -> None:
     assert noisy.gathered == len(block) + 4
     pipeline = Pipeline(load_rig())
     with pytest.raises(ValueError, match='17 numbers for each tone'):
-        pipeline.stamped.restore({'state.noise': (0.0,) * 4, VIBRATION: (0.1, 1.0)})
+        pipeline.estimator.load_state_dict({'state.noise': (0.0,) * 4, VIBRATION: (0.1, 1.0)})
 
 
 def test_the_filter_states_it_too() -> None:

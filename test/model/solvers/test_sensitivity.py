@@ -14,7 +14,7 @@ from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers import SolverStatus, make_solver, solver_from_rig
 from psd_deflection.model.solvers.interface import Solver
 from psd_deflection.model.solvers.registry import check_arrangement, solver_class
-from psd_deflection.model.solvers.some_psds import geometry_of, solver_of_some
+from psd_deflection.model.solvers.subset import geometry_of, subset_solver
 from psd_deflection.rig.config import rig_from_values
 from test.model.solvers.test_truth import FLAT_THREE, RAISED, THREE, TWO, VARIANCES, least_squares
 
@@ -225,7 +225,7 @@ def test_two_of_three_psds_allow_for_the_tilt_that_they_do_not_see(rays: Any) ->
     np.testing.assert_array_equal(geometry.centers, THREE.centers[kept])
     np.testing.assert_array_equal(geometry.zeros, THREE.zeros[kept])
     np.testing.assert_array_equal(geometry.heights, THREE.heights[kept])
-    solver = solver_of_some('pose', rig, kept)
+    solver = subset_solver('pose', rig, kept)
     assert solver is not None
     variances = np.array(VARIANCES[:4])
     dots = np.asarray(rays.tip_dots(geometry, tied(geometry, (2e-3, -3e-3, 0.02)))) + np.array(
@@ -261,14 +261,14 @@ def test_who_can_do_with_fewer_psds() -> None:
     """Every method that needs no third; minimum_tilt takes two at height 0 and no others; one PSD gives no twist."""
     rig = of_three()
     for name in ('exact', 'beam', 'wls', 'ols', 'iterative', 'wls_exact'):
-        some = solver_of_some(name, rig, [1, 2])
+        some = subset_solver(name, rig, [1, 2])
         assert some is not None
         assert some.name == name
         assert some.allowance((0.0,) * 4, VARIANCES[:4]) is None
-    assert solver_of_some('minimum_tilt', rig, [1, 2]) is None
-    assert solver_of_some('pose', rig, [1]) is None
-    assert solver_of_some('exact', rig, [1]) is None
-    three = solver_of_some('pose', rig, [0, 1, 2])
+    assert subset_solver('minimum_tilt', rig, [1, 2]) is None
+    assert subset_solver('pose', rig, [1]) is None
+    assert subset_solver('exact', rig, [1]) is None
+    three = subset_solver('pose', rig, [0, 1, 2])
     assert three is not None
     assert three.tilts == 'free'
 

@@ -14,9 +14,9 @@ import pytest
 from blind import generator
 from psd_deflection.measure.estimation import HELD
 from psd_deflection.measure.health import FROZEN, LOUD
-from psd_deflection.measure.memory import restore
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.measure.uncertainty.stamped import HELD_RESIDUAL, NOISE, REDUNDANCY, SOME, STEPS, VIBRATION
+from psd_deflection.measure.state import load_states
+from psd_deflection.measure.uncertainty.block_estimator import NOISE, PSDS, STEPS, VIBRATION
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.model.simulation.tip_load import TIP_LOADS
 from psd_deflection.recordings.read.readers import open_recording
@@ -65,7 +65,7 @@ def test_every_value_belongs_to_one_part_and_comes_back() -> None:
 
 
 @pytest.mark.parametrize(
-    'name', ['state.noise', 'state.noise_segment', 'state.block_fit', 'state.motion', 'state.unseen']
+    'name', ['state.noise', 'state.noise_segment', 'state.psds.0_1', 'state.motion', 'state.unseen']
 )
 @pytest.mark.parametrize('value', [(1.0,), 'words', 3.0, (float('nan'),)])
 def test_a_value_that_does_not_fit_is_named_with_its_part(name: str, value: float | str | tuple[float, ...]) -> None:
@@ -87,7 +87,7 @@ def test_a_value_of_no_part_is_named() -> None:
     assert any('two or more of 2 PSDs' in said for said in pipeline.misfits)
     pipeline.apply(ParameterChange(0, 0, ((ENVIRONMENT[0], 'noon'),)))
     assert 'expected a number' in pipeline.misfits[0]
-    assert restore((), {}) == []
+    assert load_states((), {}) == []
 
 
 def test_a_replay_says_what_it_cannot_go_on_from(tmp_path: Path) -> None:
@@ -159,15 +159,15 @@ LINK = {
 THIRD = {'psd_3.center': [0.08, -0.06]}
 CASES = {
     'sound': Case(NOISE, (1, 40, 99, 130, 173, 251)),
-    'y1 dead': Case(HELD_RESIDUAL, (1, 99, 173), dead),
+    'y1 dead': Case(PSDS + '0_1', (1, 99, 173), dead),
     'vibrates': Case(VIBRATION, (99, 149, 171), vibrating),
     'ten bits': Case(STEPS, (160,), coarse),
     'PSD 2 dark': Case(HELD, (212, 260), dark, {'degraded': 'hold'}),
     'PSD 1 stands still': Case(FROZEN, (178,), stuck, {'frozen': 'refuse'}),
     'x2 noisy': Case(LOUD, (20,), noisy),
     'effects of the link': Case(TIP_LOADS, (151, 251), rig=LINK),
-    'PSD 3 does not follow': Case(REDUNDANCY, (151,), rig=THIRD),
-    'fit of two of three PSDs': Case(SOME + '0_1', (200,), rig=THIRD),
+    'PSD 3 does not follow': Case(PSDS + '0_1_2', (151,), rig=THIRD),
+    'fit of two of three PSDs': Case(PSDS + '0_1', (200,), rig=THIRD),
 }
 
 

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck
-from psd_deflection.measure.uncertainty.redundancy import CONTRADICTS
-from psd_deflection.measure.uncertainty.stamped import PlateModel, StampedDots
+from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
+from psd_deflection.measure.uncertainty.consistency import CONTRADICTS, ConsistencyResult
+from psd_deflection.measure.uncertainty.plate_model import PlateModel
 from psd_deflection.model.plate.plate import Tilts, flat_points, plate_points
+from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 
 THIRD: dict[str, Any] = {
@@ -51,14 +52,14 @@ def test_a_plate_model_leaves_what_it_does_not_explain_and_nothing_else(tilts: T
     beams = (rig.centers + rig.zeros)[kept]
     np.testing.assert_array_equal(model.beams, beams)
     exact = (plate_points(poses, beams, heights) - rig.centers[kept]).reshape(6, -1)
-    assert np.abs(model.left(exact)).max() < 1e-10
+    assert np.abs(model.residuals(exact)).max() < 1e-10
     # Of small errors about rest: what least squares of the slopes leaves.
     errors = 1e-7 * rng.normal(size=(4, 2 * len(kept)))
     slopes = model.slopes_at((0.0,) * 5)
     assert slopes.shape == (2 * len(kept), unknowns_of(tilts))
     at_rest = rig.zeros[kept].ravel()
     want = errors - errors @ np.linalg.pinv(slopes).T @ slopes.T
-    np.testing.assert_allclose(model.left(at_rest + errors), want, atol=1e-12)
+    np.testing.assert_allclose(model.residuals(at_rest + errors), want, atol=1e-12)
 
 
 def test_steps_from_rest_end_below_a_tenth_of_a_nanometre_at_the_largest_poses() -> None:
@@ -67,7 +68,7 @@ def test_steps_from_rest_end_below_a_tenth_of_a_nanometre_at_the_largest_poses()
     poses = np.array([[3e-3, -3e-3, 0.05, 0.01, 0.01]])
     model = PlateModel(rig, range(3), 'free')
     dots = (plate_points(poses, rig.centers + rig.zeros, rig.heights) - rig.centers).reshape(1, -1)
-    assert np.abs(model.left(dots)).max() < 1e-10
+    assert np.abs(model.residuals(dots)).max() < 1e-10
 
 
 def test_of_a_flat_plate_the_residual_is_computed_anew() -> None:
@@ -84,7 +85,7 @@ def test_of_a_flat_plate_the_residual_is_computed_anew() -> None:
 def test_words_say_the_noise_of_each_reading_beside_the_rig_files() -> None:
     """In um, of a sample and of a mean of twenty, which has the root of a twentieth of it."""
     rig = rig_of(2, {'psd_1.noise': [4e-3, 2e-3], 'converter.bits': 24, 'psd_2.sensitivity': [1e-3, 5e-4]})
-    words = dict(StampedDots(rig).noise_words())
+    words = dict(BlockEstimator(rig).noise_words())
     assert list(words) == [f'noise of {name} (um)' for name in ('x1', 'y1', 'x2', 'y2')]
     for name, um in (('x1', 2.0), ('y1', 1.0), ('x2', 2.0), ('y2', 1.0)):
         mean = um / 20.0**0.5
@@ -92,43 +93,39 @@ def test_words_say_the_noise_of_each_reading_beside_the_rig_files() -> None:
         assert words[f'noise of {name} (um)'] == said
 
 
+def checked(of: BlockEstimator, dots: FloatArray, residual: FloatArray, covariance: FloatArray) -> ConsistencyResult:
+    args = tuple(dots.tolist()), tuple(residual.tolist()), covariance, (0.0,) * 5
+    return of.check(of.full, of.full.unexplained(*args), None)
+
+
 @pytest.mark.parametrize('psds', [2, 3])
-def test_while_noise_is_unknown_readings_may_contradict_each_other_more(psds: int) -> None:
+def test_limits_are_wider_while_the_noise_is_unknown(psds: int) -> None:
     rig, times = rig_of(psds), 16.0
-    stamped = StampedDots(rig)
-    spread = 1e-12 * np.eye(2 * psds)
-    limit = float(chi2.isf(CONTRADICTS, 2 * psds - 3))
-    wrong = np.zeros(2 * psds)
-    wrong[0] = 1e-6
-    rest = tuple(rig.zeros.ravel().tolist())
-
-    def said(size: float) -> ConsistencyCheck:
-        dots = tuple((np.array(rest) + size * wrong).tolist())
-        left = tuple((size * wrong).tolist())
-        return stamped.check(dots, left, spread, (0.0,) * 5)
-
-    unit = said(1e-3).chi_square / 1e-6
-    stamped.contradictions = 0
-    assert not said((0.98 * times * limit / unit) ** 0.5).contradict
-    assert stamped.contradictions == 0
-    assert said((1.02 * times * limit / unit) ** 0.5).contradict
-    assert stamped.contradictions == 1
-    assert stamped.chi_square == pytest.approx(1.02 * times * limit, rel=1e-3)
-    assert stamped.freedom == (1 if psds == 2 else 3)
+    of, rest = BlockEstimator(rig), rig.zeros.ravel()
+    limit = times * float(chi2.isf(CONTRADICTS, 2 * psds - 3))
+    error = 1e-9 * np.eye(2 * psds)[0]
+    unit = checked(of, rest + error, error, 1e-12 * np.eye(2 * psds)).chi_square
+    of.contradictions = 0
+    for share, count in ((0.98, 0), (1.02, 1)):
+        size = (share * limit / unit) ** 0.5
+        checked(of, rest + size * error, size * error, 1e-12 * np.eye(2 * psds))
+        assert of.contradictions == count
+    assert of.chi_square == pytest.approx(1.02 * limit, rel=1e-3)
+    assert of.freedom == 2 * psds - 3
 
 
 @pytest.mark.parametrize('psds', [2, 3])
 def test_new_zeros_are_those_of_a_rig_that_always_had_them(psds: int) -> None:
     old, new = rig_of(psds), rig_of(psds, {'psd_1.zero': [2e-3, 1e-3], 'psd_2.zero': [0.0, -1e-3]})
-    moved, fresh = StampedDots(old), StampedDots(new)
-    rng = np.random.default_rng(3)
+    moved, fresh = BlockEstimator(old), BlockEstimator(new)
+    checked(moved, old.zeros.ravel(), 1e-3 * np.eye(2 * psds)[0], 1e-12 * np.eye(2 * psds))
     moved.set_zeros(new)
-    samples = new.zeros.ravel() + 1e-6 * rng.normal(size=(20, 2 * psds))
-    a, b = (of.fit(ALL, samples) for of in (moved, fresh))
-    assert a.dots == b.dots
-    np.testing.assert_array_equal(a.covariance, b.covariance)
-    left = tuple(1e-6 * rng.normal(size=2 * psds))
-    answers = [of.check(a.dots, left, a.covariance, (0.0,) * 5) for of in (moved, fresh)]
+    rng = np.random.default_rng(3)
+    samples, residual = (new.zeros.ravel() + 1e-6 * rng.normal(size=(n, 2 * psds)) for n in (20, 1))
+    one, other = (of.fit(of.full, ALL, samples) for of in (moved, fresh))
+    assert one[0] == other[0]
+    np.testing.assert_array_equal(one[1], other[1])
+    answers = [checked(of, np.array(one[0]), residual[0], one[1]) for of in (moved, fresh)]
     assert answers[0] == answers[1]
     for of in (moved, fresh):
         for block in range(100):
@@ -137,35 +134,40 @@ def test_new_zeros_are_those_of_a_rig_that_always_had_them(psds: int) -> None:
     np.testing.assert_array_equal(moved.noise.gamma, fresh.noise.gamma)
 
 
-def test_the_first_blocks_of_a_second_change_no_noise_and_the_last_does() -> None:
-    """Segments of 50 blocks; the fit then has the new noise, that of some PSDs too."""
+def test_segments_change_the_noise_of_all_sets() -> None:
+    """Segments of 50 blocks; the fits then have the new noise."""
     rig = rig_of(3)
-    stamped = StampedDots(rig)
-    some = stamped.some((0, 2), 'none')
-    assert some is stamped.some((0, 2), 'none')
+    of = BlockEstimator(rig)
+    subset = of.subset((0, 2), 'none')
+    assert subset is of.subset((0, 2), 'none')
     rng = np.random.default_rng(4)
-    changed = []
-    for block in range(150):
-        samples = rig.zeros.ravel() + 3e-6 * rng.normal(size=(20, 6))
-        if stamped.learn(block, ALL, samples, VOLTS):
-            changed.append(block)
-    assert changed == [49, 99, 149]
+    blocks = [rig.zeros.ravel() + 3e-6 * rng.normal(size=(20, 6)) for _ in range(150)]
+    assert [b for b, samples in enumerate(blocks) if of.learn(b, ALL, samples, VOLTS)] == [49, 99, 149]
     still = np.tile(rig.zeros.ravel(), (20, 1))
-    whole, part = stamped.fit(ALL, still), stamped.fit_some(some, ALL, still)
-    assert np.sqrt(np.diag(whole.covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
-    assert np.sqrt(np.diag(part.covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
-    assert len(part.dots) == 4
-    assert not StampedDots(rig_of(), flat=False).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])
+    for psds, count in ((of.full, 6), (subset, 4)):
+        dots, covariance = of.fit(psds, ALL, still)
+        assert np.sqrt(np.diag(covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
+        assert len(dots) == count
+    assert not BlockEstimator(rig_of(), False).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])
 
 
 def test_the_base_line_is_between_the_places_of_the_dots() -> None:
-    """Its direction and with it each reading's part: of centres that differ in both axes, and dots of centimetres."""
-    stamped = StampedDots(rig_of(2, {'psd_1.center': [0.02, 0.07], 'psd_2.center': [-0.1, 0.03]}))
-    dots = np.array([0.03, -0.01, -0.02, 0.015])
-    residual = np.array([1e-6, -2e-6, 3e-6, 5e-6])
-    spread = np.diag([1.0, 2.0, 3.0, 4.0]) * 1e-12
+    """Of centres that differ in both axes, and dots of centimetres."""
+    of = BlockEstimator(rig_of(2, {'psd_1.center': [0.02, 0.07], 'psd_2.center': [-0.1, 0.03]}))
+    dots, residual = np.array([0.03, -0.01, -0.02, 0.015]), np.array([1e-6, -2e-6, 3e-6, 5e-6])
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0]) * 1e-12
     way = np.array([0.02 + 0.1, 0.07 - 0.03]) + dots[:2] - dots[2:]
     a = np.concatenate((way, -way)) / np.hypot(*way) / 2.0**0.5
-    got = stamped.check(tuple(dots.tolist()), tuple(residual.tolist()), spread)
-    assert got.chi_square == pytest.approx((a @ residual) ** 2 / (a @ spread @ a), rel=1e-9)
+    got = checked(of, dots, residual, covariance)
+    assert got.chi_square == pytest.approx((a @ residual) ** 2 / (a @ covariance @ a), rel=1e-9)
     np.testing.assert_allclose(got.errors, (a @ residual) / a, rtol=1e-9)
+
+
+def test_nothing_is_redundant_while_the_tilt_is_only_bounded() -> None:
+    rig = rig_of(3)
+    of = BlockEstimator(rig, tilts='free')
+    for tilts, freedom in (('bounded', 0), ('none', 1)):
+        psds = BlockEstimator(rig, tilts='free').subset((0, 1), tilts)  # type: ignore[arg-type]
+        found = psds.unexplained(tuple(rig.zeros[:2].ravel().tolist()), (0.0,) * 4, 1e-12 * np.eye(4), (0.0,) * 5)
+        assert of.check(psds, found, None).freedom == freedom
+        assert psds.check.agrees(found, 1.0) == bool(freedom)
