@@ -71,6 +71,14 @@ def _long(frozen: tuple[int, ...]) -> list[tuple[int, str]]:
     ]
 
 
+def _first_of_each(faults: Iterable[tuple[int, BlockStatus, str]]) -> dict[int, tuple[BlockStatus, str]]:
+    """Return the first fault of each PSD."""
+    out: dict[int, tuple[BlockStatus, str]] = {}
+    for psd, status, reason in faults:
+        out.setdefault(psd, (status, reason))
+    return out
+
+
 class Stillness:
     """``blocks`` (P,): for how many blocks in a row each detector's values have not changed."""
 
@@ -171,33 +179,30 @@ class OpticsHealth:
 
         ``frozen``: blocks in a row without change, per PSD. ``x1`` in a reason is PSD 1's x, whatever channel it is on.
         """
-        faults: dict[int, tuple[BlockStatus, str]] = {}
-
-        def add(found: Iterable[tuple[int, BlockStatus, str]]) -> None:
-            for psd, status, reason in found:
-                faults.setdefault(psd, (status, reason))
-
-        present = len(block.seq)
+        present, enough = len(block.seq), len(block.seq) >= self._min_samples
         least, most, dots = measures.least, measures.most, measures.means
         low, high = least[2::3], most[2::3]
-        add(self._dark(low))
-        add(saturated := self._saturated(least, most))
-        if not saturated and not faults and bool((block.flags & FLAG_OVER_RANGE).any()):
+        faults = _first_of_each([*self._dark(low), *self._saturated(least, most)])
+        if not faults and bool((block.flags & FLAG_OVER_RANGE).any()):
             return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)
         if self.refuses_frozen:
-            add((psd, BlockStatus.FROZEN, reason) for psd, reason in _long(frozen))
-        if present < self._min_samples and not faults:
+            faults = _first_of_each((psd, BlockStatus.FROZEN, reason) for psd, reason in _long(frozen)) | faults
+        if not enough and not faults:
             reason = f'{present} of {self._size} samples, at least {self._min_samples} are needed'
             return Verdict(BlockStatus.TOO_FEW_SAMPLES, reason, 0)
-        add(self._outside(dots))
+        faults = _first_of_each(self._outside(dots)) | faults
         half_light = self._half_light(low) if self._splitter else False
         findings = self._findings(dots, high, set(faults), half_light)
         if not faults:
             return Verdict(BlockStatus.OK, '', 0, findings, half_light)
-        # The worst cause first: a lost laser explains a saturated or outside reading.
+        return self._faulty(faults, enough, findings, half_light)
+
+    def _faulty(
+        self, faults: dict[int, tuple[BlockStatus, str]], enough: bool, findings: tuple[str, ...], half_light: bool
+    ) -> Verdict:
+        """Return the verdict of the worst cause: a lost laser explains a saturated or outside reading."""
         psd = min(faults, key=lambda p: (_ORDER.index(faults[p][0]), p))
         status, reason = faults[psd]
-        enough = present >= self._min_samples
         lone = len(faults) == 1 and enough
         sound = tuple(i for i in range(self._psds) if i + 1 not in faults) if enough else ()
         return Verdict(status, reason, psd if lone else 0, findings, half_light, frozenset(faults), sound)

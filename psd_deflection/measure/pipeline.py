@@ -14,7 +14,7 @@ recording starts, it is written as a record (:meth:`Pipeline.memory`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,6 +80,12 @@ class PipelineCounters:
     degraded: int = 0
     refused: dict[str, int] = field(default_factory=dict)
     findings: dict[str, int] = field(default_factory=dict)
+
+    def count_findings(self, findings: Iterable[str]) -> None:
+        """Count the findings of a block by what is before their colon."""
+        for finding in findings:
+            name = finding.split(':')[0]
+            self.findings[name] = self.findings.get(name, 0) + 1
 
 
 class Pipeline:
@@ -445,12 +451,10 @@ class Pipeline:
         findings, used = seen.verdict.findings, answer.used
         if used is not None and used.excluded:
             findings = (*findings, f'psd_{used.excluded} contradicts the others and is left out')
-        sound = status is BlockStatus.OK and not findings
         # Of this block: what it has to say counts from the next one on.
         vibrates = self.estimator.vibrates
-        changed = sound and self.estimator.learn(seen.index, seen.slots, seen.samples, measures.volts)
-        if changed and self.motion_filter is not None:
-            self.motion_filter.set_noise(self.estimator.noise.gamma)
+        if status is BlockStatus.OK and not findings:
+            self._learn(seen, measures)
         if answer.complete and used is not None and used.checked is not None:
             self.estimator.search_outliers(seen.index, used.readings.dots, used.checked)
         if not self._optics.refuses_frozen:
@@ -460,10 +464,14 @@ class Pipeline:
             findings += (f'vibrates: {vibrates}',)
         if answer.estimate is not None:
             findings += self._calibrated.findings(answer.estimate.pose)
-        for finding in findings:
-            name = finding.split(':')[0]
-            self.counters.findings[name] = self.counters.findings.get(name, 0) + 1
+        self.counters.count_findings(findings)
         return findings
+
+    def _learn(self, seen: SeenBlock, measures: BlockMeasures) -> None:
+        """Take a good block into the noise."""
+        changed = self.estimator.learn(seen.index, seen.slots, seen.samples, measures.volts)
+        if changed and self.motion_filter is not None:
+            self.motion_filter.set_noise(self.estimator.noise.gamma)
 
     def _moved(self, motion: ModalFilter, seen: SeenBlock, usable: bool) -> TipMotion | None:
         """The motion by the filter; ``usable``: whether samples of the block can be used."""

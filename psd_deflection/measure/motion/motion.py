@@ -193,15 +193,7 @@ class ModalFilter:
         """
         seconds = self._size * self._period
         if self._index is not None:
-            missed = index - self._index - 1
-            away = (t_ns - self._t_ns) / 1e9
-            # After a restart numbers and times do not agree.
-            if missed < 0 or away > self._longest + 2.0 * seconds or abs(away - (missed + 1) * seconds) > 0.5 * seconds:
-                self.forget()
-            if self._index is not None:
-                self._take_late()
-                for k in range(missed):
-                    self._coast(seconds, self._forced(self._t_ns + round(1e9 * (k + 1) * seconds)))
+            self._pass_missed(index - self._index - 1, (t_ns - self._t_ns) / 1e9, seconds)
         self.inertia.forget_before(self._before_ns(t_ns))
         if self._index is None and slots is None:
             return None
@@ -218,6 +210,16 @@ class ModalFilter:
         else:
             self._update(slots, poses, pushed, forced)
         return self._moved()
+
+    def _pass_missed(self, missed: int, away: float, seconds: float) -> None:
+        """Coast through ``missed`` blocks of ``seconds``; begin anew if the next one, ``away`` s, is too far."""
+        # After a restart numbers and times do not agree.
+        if missed < 0 or away > self._longest + 2.0 * seconds or abs(away - (missed + 1) * seconds) > 0.5 * seconds:
+            self.forget()
+            return
+        self._take_late()
+        for k in range(missed):
+            self._coast(seconds, self._forced(self._t_ns + round(1e9 * (k + 1) * seconds)))
 
     def _coast(self, seconds: float, forced: Forced | None) -> None:
         if self.coasted == 0.0:

@@ -227,7 +227,7 @@ class ConsistencyCheck:
         doubtful = hold or found.chi_square > factor * self._doubtful
         squares = [e * e if doubtful else 0.0 for e in errors]
         if contradict and blamed:
-            squares = [square if 1 + i // 2 in blamed else 0.0 for i, square in enumerate(squares)]
+            squares = [square * (1 + i // 2 in blamed) for i, square in enumerate(squares)]
         self._hold(found, squares if hold else [0.0] * len(squares), factor)
         contradict = contradict or self._excluded > 0 or any(self._held)
         possible = self._possible(squares)
