@@ -93,7 +93,11 @@ ROOMS: Mapping[str, Room] = {
     ),
     'detector': Room(
         ('psd_deflection/model/detector', 'psd_deflection/measure/health.py', 'psd_deflection/rig/wiring.py'),
-        ('test/model/detector', 'test/measure/test_health.py', 'test/rig/test_wiring.py', _GOLDEN),
+        (
+            *('test/model/detector', 'test/measure/test_health.py', 'test/rig/test_wiring.py', _GOLDEN),
+            'test/measure/test_state.py -k still or noisy or fit_is_named',
+            'test/model/simulation/test_effect_terms.py -k spot',
+        ),
         slow=_RUNS,
     ),
     'uncertainty': Room(
