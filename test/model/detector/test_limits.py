@@ -267,3 +267,18 @@ def test_other_light_counts_over_each_detectors_own_area() -> None:
     share = (8.0 - rig.amplifier.sum_nominal) / 8.0
     want = [(share * half) ** 2 / 3.0 for half in (3e-3, 4e-3, 5e-3)]
     assert OpticsHealth(rig).background_variance((8.0,) * 3) == pytest.approx(want)
+
+
+def test_a_spot_at_a_corner_is_told_once_and_the_faulty_psd_hides_no_other() -> None:
+    corner = (*DOTS[:2], 4.9e-3, -4.9e-3)
+    assert judge(dots=corner).findings == ('psd_2: the spot is clipped at the edge',)
+    dark = judge(changed(2, 0.0), corner)
+    assert dark.faulty == 1
+    assert dark.findings == ('psd_2: the spot is clipped at the edge',)
+
+
+def test_two_samples_can_be_still_and_one_cannot() -> None:
+    health = OpticsHealth(load_rig(overrides={'min_samples': 1}))
+    volts = np.tile(np.array(GOOD, np.float32), (2, 1))
+    assert health.still(of(volts)) == (True, True)
+    assert health.still(of(volts[:1])) == (False, False)
