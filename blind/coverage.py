@@ -201,7 +201,7 @@ def _scored(got: Sequence[DeflectionEstimate], truth: Array, rest_s: int, pipeli
     return Scored(
         inside(error[rest], covariance[rest]),
         inside(error[ringing], covariance[ringing]),
-        pipeline.stamped.contradictions / len(got),
+        pipeline.estimator.contradictions / len(got),
     )
 
 
@@ -297,7 +297,7 @@ def alarms(row: Row, seed: int) -> tuple[int, int]:
     own = replace(row, offsets=())
     pipeline = Pipeline(rig(own))
     got = estimates(pipeline, volts_of(own, clean, seed), np.ones(len(clean), bool))
-    return pipeline.stamped.contradictions, len(got)
+    return pipeline.estimator.contradictions, len(got)
 
 
 def false_alarms(seeds: int, rows: int | None = None) -> int:

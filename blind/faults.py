@@ -47,7 +47,7 @@ def fault(kind: str, channel: int, load: tuple[float, float, float], seed: int =
             continue
         sd = np.sqrt(np.array(e.covariance).reshape(3, 3).diagonal())
         worst = max(worst, float(np.abs((np.array((e.dx, e.dy, e.theta)) - truth[e.block]) / sd).max()))
-    return worst, pipeline.stamped.most_likely_wrong()
+    return worst, pipeline.estimator.most_likely_wrong()
 
 
 FAULTS = tuple(

@@ -99,12 +99,6 @@ def test_a_replay_with_another_rig_and_blocks() -> None:
     assert len(psd_deflection.replay(psd_deflection.open(CLEAN), rig, solver='wls')) == 100
 
 
-def test_a_block_without_an_estimate_has_no_row() -> None:
-    recording = psd_deflection.open(ROOT / 'bags' / 'laser_off')
-    blocks = sum(1 for _ in recording.blocks())
-    assert 0 < len(psd_deflection.replay(recording)) < blocks
-
-
 def test_the_nominal_rig_is_a_warning(tmp_path: Path) -> None:
     rows = '\n'.join(f'{i / 1000:.3f},0,0,5,0,0,5' for i in range(40))
     path = tmp_path / 'run.csv'
@@ -320,12 +314,6 @@ def test_a_dot_off_its_detector_is_refused() -> None:
         psd_deflection.solve([0.0, -1.0, 0.0, -2.0])  # mm for m
 
 
-def test_errors_are_an_attribute_of_the_package() -> None:
-    script = 'import psd_deflection; print(psd_deflection.errors.ConfigError.exit_status)'
-    said = subprocess.run([sys.executable, '-c', script], capture_output=True, text=True, check=True).stdout
-    assert int(said) == ConfigError.exit_status
-
-
 @pytest.mark.parametrize('name', ['thesis_rig.yaml', 'three_psds.yaml'])
 def test_a_rig_can_be_sent_to_another_process_and_copied(name: str) -> None:
     rig = psd_deflection.load_rig(ROOT / 'config' / name)
@@ -356,17 +344,6 @@ def test_every_function_takes_a_rig_or_its_file() -> None:
 
 
 @pytest.mark.repeatable
-def test_a_rig_is_calibrated_as_its_file_is(tmp_path: Path) -> None:
-    file = ROOT / 'config' / 'thesis_rig.yaml'
-    run = psd_deflection.simulate(None, [(0, 0, 0), (30, 0, 0), (0, -50, -29)], seconds=1, seed=3)
-    of_file = psd_deflection.calibrate(run, file)
-    of_rig = psd_deflection.calibrate([run], psd_deflection.load_rig(file))
-    assert of_rig.found.values.tolist() == of_file.found.values.tolist()
-    of_rig.save(tmp_path)
-    assert psd_deflection.load_rig(tmp_path / 'rig.yaml').link == psd_deflection.load_rig(file).link
-
-
-@pytest.mark.repeatable
 def test_the_budget_of_python_is_that_of_the_command(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     rig = str(ROOT / 'config' / 'thesis_rig.yaml')
     out = tmp_path / 'budget'
@@ -376,19 +353,6 @@ def test_the_budget_of_python_is_that_of_the_command(capsys: pytest.CaptureFixtu
     told = capsys.readouterr().out
     assert answer.tree() == json.loads(told) == json.loads((out / 'budget.json').read_text())
     assert (out / 'report.html').read_text() == answer.report()
-
-
-def test_a_validation_takes_a_table(tmp_path: Path) -> None:
-    run = pushed()
-    table = tmp_path / 'tracker.csv'
-    samples = run.samples[::50]
-    t = samples['t_ns'] * 1e-9
-    rows = [f'{at:.6f},{x:.9f},{y:.9f},{turn:.9f}' for at, (x, y, turn) in zip(t, run.pose[::50], strict=True)]
-    table.write_text('\n'.join(['t,dx,dy,theta', *rows]) + '\n')
-    found = psd_deflection.validate(run, table)
-    tree = found.tree()
-    assert tree['references'] + tree['left_out'] == len(samples)
-    assert 'tracker.csv' in found.report()
 
 
 @pytest.mark.parametrize(

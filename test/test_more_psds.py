@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -21,12 +20,10 @@ from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.simulation import loads
 from psd_deflection.model.simulation.simulator import RigSimulator
-from psd_deflection.model.solvers import Solver, solver_from_rig
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.write.sinks import open_sink
 from psd_deflection.records import (
     MOST_PSDS,
-    AppliedLoad,
     BlockStatus,
     DeflectionEstimate,
     FloatArray,
@@ -128,12 +125,6 @@ def test_what_is_made_for_two_is_refused(three: Rig, changes: dict[str, object],
         Pipeline(replace_values(three, changes))
 
 
-def test_samples_of_another_number_of_psds_are_refused(three: Rig) -> None:
-    two = RigSimulator(load_rig()).step(np.zeros((20, 3)))
-    with pytest.raises(ConfigError, match='samples are of 2 PSDs, the rig file has 3'):
-        list(Pipeline(three).process(chunk_of(two.counts)))
-
-
 # By truth.
 
 
@@ -167,15 +158,6 @@ def test_errors_are_those_of_the_covariance(
         # The tilts have the sign that was given.
         tilts = np.array([(e.phi, e.omega) for e in found]).mean(axis=0)
         assert tilts == pytest.approx(pose[3:], abs=2e-5)
-
-
-def test_an_answer_goes_with_each_dot_as_its_gain_says(three: Rig, rays: RayPlane) -> None:
-    pose = solver_from_rig('pose', three)
-    dots = tuple(rays.tip_dots(Geometry.from_rig(three), (1e-3, -1e-3, 0.01, 2e-3, 1e-3)).tolist())
-    variances = (1e-12, 2e-12, 3e-12, 1e-12, 2e-12, 3e-12)
-    found = pose.solve(dots, variances)
-    by_differences = Solver.gain(pose, dots, variances, found)
-    assert pose.gain(dots, variances, found) == pytest.approx(by_differences, rel=1e-4, abs=1e-5)
 
 
 # One PSD fails in the middle of a stream.
@@ -279,7 +261,7 @@ def test_a_psd_that_contradicts_the_others_is_named_and_left_out(
     assert left_out.count((psd + 1,)) > 30
     assert left_out.count((psd + 1,)) + left_out.count(()) == 90
     assert not any(s.left_out for s in spots if s.index * 20 < FAILS)
-    assert pipeline.stamped.most_likely_wrong() == f'psd_{psd + 1} does not fit the others and is left out'
+    assert pipeline.estimator.most_likely_wrong() == f'psd_{psd + 1} does not fit the others and is left out'
     assert f'psd_{psd + 1} contradicts the others and is left out' in pipeline.counters.findings
     # What is left agrees.
     good = [e.chi_square for e, s in zip(found, spots, strict=True) if s.left_out]
@@ -291,8 +273,8 @@ def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig,
     records, truth, pipeline = run(three, inverted(psd))
     assert len(primaries(records)) == 180
     assert_inside(records, truth)
-    assert pipeline.stamped.contradictions > 60
-    assert pipeline.stamped.most_likely_wrong() == ''
+    assert pipeline.estimator.contradictions > 60
+    assert pipeline.estimator.most_likely_wrong() == ''
 
 
 def test_a_stuck_psd_tells_on_itself_where_the_check_cannot(three: Rig) -> None:
@@ -323,7 +305,7 @@ def test_refuse_refuses_only_what_cannot_be_told(three: Rig) -> None:
     reported, _, pipeline = run(with_solver(three, 'exact', consistency='report', **LEVEL), inverted(2))
     assert len(primaries(reported)) == 180
     assert not any(s.left_out for s in spots_of(reported))
-    assert pipeline.stamped.contradictions > 60
+    assert pipeline.estimator.contradictions > 60
 
 
 def test_with_one_psd_left_the_rule_for_one_holds(three: Rig) -> None:
@@ -361,7 +343,7 @@ def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
     assert_inside(records, truth)
     assert spots_of(records)[100].left_out == (4,)
     assert spots_of(records)[-1].left_out == (1, 4)
-    assert pipeline.stamped.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'
+    assert pipeline.estimator.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'
 
 
 @pytest.mark.statistics
@@ -383,23 +365,6 @@ def test_a_reading_that_drifts_slowly_is_held_by_the_covariance(three: Rig, solv
 
 
 # Bit for bit again.
-
-
-@pytest.mark.parametrize(('solver', 'fault'), [('pose', None), ('pose', dark(2)), ('exact', inverted(1))])
-def test_from_the_memory_at_any_block_the_same_bits_follow(three: Rig, solver: str, fault: Spoil | None) -> None:
-    rig = with_solver(three, solver, **({} if solver == 'pose' else LEVEL))
-    counts = RigSimulator(rig, 5).step(PUSHED.loads).counts
-    if fault is not None:
-        fault(counts)
-    cut = FAILS + 400
-    first, second = Pipeline(rig), Pipeline(rig)
-    list(first.process(chunk_of(counts[:cut])))
-    memory = first.memory(rig)
-    assert memory is not None
-    second.apply(memory)
-    again = list(second.process(chunk_of(counts[cut:], cut)))
-    assert primaries(again) == primaries(list(first.process(chunk_of(counts[cut:], cut))))
-    assert len(primaries(again)) == (len(counts) - cut) // 20
 
 
 def test_a_recording_of_three_is_replayed_without_a_differing_bit(
@@ -473,19 +438,6 @@ def test_the_cloud_of_two_is_as_it_was() -> None:
     assert [point_cloud2.point_of(n).itemsize for n in (3, MOST_PSDS)] == [44, 8 + 12 * MOST_PSDS]
 
 
-def test_a_csv_of_samples_keeps_loads_beside_many_channels(tmp_path: Path, three: Rig) -> None:
-    counts = RigSimulator(three).step(np.zeros((20, 3))).counts
-    seq = np.arange(20)
-    volts = (counts * STEP).astype(np.float32)
-    sink = open_sink(tmp_path / 'a.csv', three.flat(), samples_with=[AppliedLoad], psds=3)
-    with contextlib.closing(sink):
-        sink.put(AppliedLoad(0, 1.0, 2.0, 3.0))
-        sink.put(SampleBlock(0, seq, seq * 1_000_000, volts, np.zeros(20, np.uint8)))
-    read = open_recording(tmp_path / 'a.csv')
-    assert read.loads() == [AppliedLoad(0, 1.0, 2.0, 3.0)]
-    assert all((read.samples[c] == volts[:, i]).all() for i, c in enumerate(channel_names(3)))
-
-
 def test_a_zero_is_of_all_psds(three: Rig) -> None:
     zeros = {'psd_1.zero': [1e-4, -1e-4], 'psd_2.zero': [0.0, 2e-4], 'psd_3.zero': [-3e-4, 1e-4]}
     counts = RigSimulator(replace_values(three, zeros), 2).step(np.zeros((600, 3))).counts
@@ -501,14 +453,6 @@ def test_a_zero_is_of_all_psds(three: Rig) -> None:
     )
 
 
-def test_exchanged_inputs_are_those_of_the_first_two(three: Rig) -> None:
-    counts = RigSimulator(three, 2).step(PUSHED.loads[:2500]).counts
-    swapped = counts[:, list(itertools.chain(range(3, 6), range(3), range(6, 9)))]
-    straight = primaries(list(Pipeline(three).process(chunk_of(counts))))
-    exchanged = replace_values(three, {'psds_exchanged': True})
-    assert primaries(list(Pipeline(exchanged).process(chunk_of(swapped)))) == straight
-
-
 @pytest.mark.statistics
 @pytest.mark.parametrize(('solver', 'more'), [('pose', {}), ('exact', LEVEL)])
 def test_the_noise_is_that_of_the_samples_without_any_rest(three: Rig, solver: str, more: dict[str, object]) -> None:
@@ -517,9 +461,9 @@ def test_the_noise_is_that_of_the_samples_without_any_rest(three: Rig, solver: s
     ringing = loads.steps([(0.0, -30.0, -10.0), (10.0, 10.0, 5.0), (0.0, 0.0, 0.0)], 1.0)
     pipeline = Pipeline(rig)
     list(pipeline.process(chunk_of(RigSimulator(rig, 4).step(ringing.loads).counts)))
-    assert pipeline.stamped.noise_source() == 'measured in motion'
-    assert pipeline.stamped.noise.sample_sd() == pytest.approx(1e-6, rel=0.1)
-    assert pipeline.stamped.noise.mean_sd() == pytest.approx(1e-6 / 20**0.5, rel=0.3)
+    assert pipeline.estimator.noise_source() == 'measured in motion'
+    assert pipeline.estimator.noise.sample_sd() == pytest.approx(1e-6, rel=0.1)
+    assert pipeline.estimator.noise.mean_sd() == pytest.approx(1e-6 / 20**0.5, rel=0.3)
 
 
 STUDIES: dict[str, list[str]] = {

@@ -72,7 +72,17 @@ def said_live(path: Path) -> str:
             spectrum.add(block)
     count = pipeline.counters
     new = Seen(
-        0, count.samples, 0, 0, 0, count.blocks, count.estimates, count.degraded, pipeline.stamped.contradictions, 0, 0
+        0,
+        count.samples,
+        0,
+        0,
+        0,
+        count.blocks,
+        count.estimates,
+        count.degraded,
+        pipeline.estimator.contradictions,
+        0,
+        0,
     )
     entries = [
         estimates_entry(pipeline, new, 'unknown'),

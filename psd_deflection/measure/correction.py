@@ -18,7 +18,7 @@ import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.memory import Memory, Value, misfit
+from psd_deflection.measure.state import State, Value, mismatch
 from psd_deflection.model.plate.plate import flat_poses
 from psd_deflection.model.simulation.catalogue import acting, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect, Reading, Use, Values
@@ -46,7 +46,7 @@ class Surroundings:
     """
 
     part = 'what is known of the surroundings'
-    remembers = ENVIRONMENT
+    prefixes = ENVIRONMENT
 
     def __init__(self) -> None:
         self.known: dict[str, float] = {}
@@ -61,15 +61,15 @@ class Surroundings:
         since: FloatArray = (t_ns - self.known.get(START, float(t_ns[0]))) * np.float64(1e-9)
         return since
 
-    def memory(self) -> Memory:
+    def state_dict(self) -> State:
         """What is known."""
         return dict(self.known)
 
-    def restore(self, values: Mapping[str, Value]) -> None:
+    def load_state_dict(self, values: Mapping[str, Value]) -> None:
         """Take what another one knew. Raises ValueError if one of ``values`` is no number."""
         for name, value in values.items():
             if not isinstance(value, (int, float)):
-                raise misfit(name, value, 'a number')
+                raise mismatch(name, value, 'a number')
             self.known[name] = float(value)
 
 

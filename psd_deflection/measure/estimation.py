@@ -1,15 +1,15 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The dots of one block -> the estimate with its covariance: by all detectors, by some of them, or by one.
+"""The dots of one block -> the estimate with its covariance: by all detectors, by a subset, or by one.
 
-The primary solver answers first; the check of the readings too many says whether they belong together, and which
-detector contradicts the others. The other solvers answer from the same readings. It remembers the last twist that was
-measured, for ``degraded: hold``.
+The primary solver solves all readings. If their check asks for it, it solves the subsets without one PSD; then the
+check excludes a PSD or none, and the estimate is made from what is left. The other solvers solve the same readings.
+The state is the last twist that was measured, for ``degraded: hold``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import nan, pi
 from typing import NamedTuple
@@ -18,9 +18,10 @@ import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.measure.health import FROZEN_BLOCKS, OpticsHealth, Verdict
-from psd_deflection.measure.memory import Memory, Value, numbers
-from psd_deflection.measure.uncertainty.consistency import ConsistencyCheck, widened
-from psd_deflection.measure.uncertainty.stamped import SomePsds, StampedDots
+from psd_deflection.measure.state import State, Value, numbers
+from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
+from psd_deflection.measure.uncertainty.consistency import ConsistencyResult, Unexplained, widened
+from psd_deflection.measure.uncertainty.psd_set import PsdSet
 from psd_deflection.model.detector import dot_noise_variances
 from psd_deflection.model.misalignment.spread import ParameterSpread
 from psd_deflection.model.plate import Geometry
@@ -30,16 +31,15 @@ from psd_deflection.model.solvers.interface import Solution, Solver, SolverStatu
 from psd_deflection.model.solvers.one_psd import NAME as ONE_PSD
 from psd_deflection.model.solvers.one_psd import OnePsd
 from psd_deflection.model.solvers.registry import solver_class
-from psd_deflection.model.solvers.some_psds import solver_of_some
+from psd_deflection.model.solvers.subset import subset_solver
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
 
 HELD, SYSTEMATIC, ZERO_VARIANCES = 'state.held_twist', 'state.systematic', 'state.zero_variances'
-"""Names under which :meth:`Estimation.memory` is recorded."""
+"""Names of the state of :class:`Estimation`."""
 
 Dots = tuple[float, ...]
 Failure = tuple[BlockStatus, str]
-_Found = tuple['BlockReadings', DeflectionEstimate | None, Failure | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,46 +71,71 @@ class HeldTwist(NamedTuple):
 
 
 class BlockReadings(NamedTuple):
-    """What a block is solved from.
+    """Readings of one block that are solved together.
 
-    ``dots`` (C,) m; ``variances`` (C,) m^2; ``spread`` (C, C) m^2 of the dots, None if ``variances`` are all of it.
-    ``kept``: the PSDs (from 0) that they are of, with their fit and check ``some``; None: all. ``checked``: the check
-    of the readings. ``factor``: what the calibration's uncertainty makes of the dots. ``wrong``: the PSD (from 1) that
-    contradicts them.
+    ``psds``: whose they are. ``dots`` (C,) m; ``variances`` (C,) m^2; ``covariance`` (C, C)
+    m^2 of the dots, None if ``variances`` are all of it.
     """
 
+    psds: PsdSet
     dots: Dots
     variances: tuple[float, ...]
-    spread: FloatArray | None = None
-    kept: tuple[int, ...] | None = None
-    some: SomePsds | None = None
-    checked: ConsistencyCheck | None = None
+    covariance: FloatArray | None = None
+
+    @property
+    def dense_covariance(self) -> FloatArray:
+        """(C, C), m^2, whichever is given."""
+        return np.diag(self.variances) if self.covariance is None else self.covariance
+
+
+class SolvedReadings(NamedTuple):
+    """Readings and the primary solver's solution; nothing of the state has changed yet.
+
+    ``failure``: why there is no solution. ``factor`` (C, k) m: square root of what the calibration's uncertainty adds
+    to the dots' covariance, None if nothing. ``unexplained``: what no pose explains of the readings.
+    """
+
+    readings: BlockReadings
+    solution: Solution | None
+    failure: str = ''
     factor: FloatArray | None = None
-    wrong: int = 0
+    unexplained: Unexplained | None = None
+
+
+class CheckedReadings(NamedTuple):
+    """What an estimate is made from. ``checked``: None if the readings cannot be checked.
+
+    ``factor``: as of :class:`SolvedReadings`. ``excluded``: the PSD (from 1) that contradicts these readings.
+    """
+
+    readings: BlockReadings
+    factor: FloatArray | None
+    checked: ConsistencyResult | None
+    excluded: int = 0
 
 
 class BlockSolution(NamedTuple):
-    """What the primary solver makes of a block.
+    """The primary solver's result for a block.
 
-    ``dots`` (2P,) m: the block's value at its stamp. ``used``: what the estimate is made from; None if it comes from
+    ``dots`` (2P,) m at the block's timestamp. ``used``: what the estimate is made from; None if it comes from
     one detector or if there is none. ``failure``: why a sound block has no estimate.
     """
 
     dots: Dots
-    used: BlockReadings | None = None
+    used: CheckedReadings | None = None
     estimate: DeflectionEstimate | None = None
     failure: Failure | None = None
 
     @property
     def complete(self) -> bool:
         """Whether all detectors are in the estimate."""
-        return self.used is not None and self.used.kept is None
+        return self.used is not None and self.used.readings.psds.is_full
 
 
 class Estimation:
     """The solvers of a rig and the uncertainty of what they answer.
 
-    ``stamped``: noise, fit and check of the stream. ``systematic`` (3, 3): what the covariance of the last estimate
+    ``estimator``: noise, fit and check of the stream. ``systematic`` (3, 3): what the covariance of the last estimate
     holds besides noise, None if nothing. ``held``: see :class:`HeldTwist`. ``zero_variances`` (2P,) m^2 of the rig's
     zero, () if it has none that was taken.
 
@@ -118,7 +143,7 @@ class Estimation:
     """
 
     part = 'the estimate'
-    remembers = (HELD, SYSTEMATIC, ZERO_VARIANCES)
+    prefixes = (HELD, SYSTEMATIC, ZERO_VARIANCES)
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         config = rig.estimator
@@ -130,7 +155,7 @@ class Estimation:
         self.systematic: FloatArray | None = None
         self.build(rig, effects)
         # After the solvers, which refuse a geometry that cannot be solved.
-        self.stamped = StampedDots(rig, flat=not rig.psds_at_base, tilts=solver_class(config.solver).tilts)
+        self.estimator = BlockEstimator(rig, not rig.psds_at_base, solver_class(config.solver).tilts)
 
     def build(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         """Use ``rig`` from the next block on."""
@@ -141,7 +166,7 @@ class Estimation:
         self._spread_from(self.zero_variances)
         names = [config.solver, *(name for name in config.solvers if name != config.solver)]
         self._solvers = [(name, solver_from_rig(name, rig), name == config.solver) for name in names]
-        self._some_solvers: dict[tuple[int, tuple[int, ...]], Solver | None] = {}
+        self._subset_solvers: dict[tuple[int, tuple[int, ...]], Solver | None] = {}
 
     def _spread_from(self, zero_variances: tuple[float, ...]) -> None:
         """Take the uncertainty of the calibration, and of a zero with these variances (2P,) m^2, () if it has none."""
@@ -149,9 +174,9 @@ class Estimation:
         at_base = self._rig.psds_at_base
         self.spread = None if at_base else ParameterSpread.from_rig(self._rig, zero_variances, self._effects)
 
-    def memory(self) -> Memory:
-        """The held twist, what the filter's covariance takes over from the last estimate, how sure the zero is."""
-        out: Memory = {}
+    def state_dict(self) -> State:
+        """Return the held twist, what the filter's covariance takes from the last estimate, the zero's variances."""
+        out: State = {}
         config = self._rig.estimator
         if self.spread is not None and self.zero_variances:
             out[ZERO_VARIANCES] = self.zero_variances
@@ -161,8 +186,8 @@ class Estimation:
             out[SYSTEMATIC] = tuple(self.systematic.ravel().tolist())
         return out
 
-    def restore(self, values: Mapping[str, Value]) -> None:
-        """Go on from another one's :meth:`memory`. Raises ValueError if it was of another number of PSDs."""
+    def load_state_dict(self, values: Mapping[str, Value]) -> None:
+        """See :class:`psd_deflection.measure.state.Part`. Raises ValueError for another number of PSDs."""
         if variances := numbers(values, ZERO_VARIANCES, 'a variance of each reading', 2 * len(self._rig.psds)):
             self._spread_from(variances)
         if held := numbers(values, HELD, 'time, twist and variance', 3):
@@ -185,7 +210,7 @@ class Estimation:
         """Covariance (3, 3) of what vibrates too fast for a block: of the pose and of its rate, in SI units."""
         gain = self.gain_at_rest()
         pose, rate = np.zeros((3, 3)), np.zeros((3, 3))
-        for tone in self.stamped.noise.tones:
+        for tone in self.estimator.noise.tones:
             own = self._by.einsum('ic,cd,jd->ij', gain, tone.covariance, gain)
             pose += own
             rate += self._by.square(2.0 * pi * tone.frequency * self._rig.converter.sample_rate_hz) * own
@@ -193,137 +218,150 @@ class Estimation:
 
     def zero_noise(self, size: int) -> tuple[float, ...]:
         """Variances (2P,), m^2, of the dots of a whole block of ``size`` samples at rest."""
-        return self.stamped.mean_variances(size) if self.stamped.flat else self.variances[-1]
+        return self.estimator.mean_variances(size) if self.estimator.on_plate else self.variances[-1]
 
     def solve(self, block: SeenBlock) -> BlockSolution:
-        """The primary solver's estimate of a block whose verdict is OK or names sound detectors."""
+        """Return the primary solver's estimate of a block whose verdict is OK or names sound detectors."""
         verdict = block.verdict
-        whole = BlockReadings(block.means, self._variances_of(block))
+        variances = self._variances_of(block)
         if verdict.status is BlockStatus.OK:
-            fitted = self.stamped.fit(block.slots, block.samples)
-            whole = whole._replace(dots=fitted.dots, spread=self._spread_of(block, fitted.covariance))
-            return self._agreed(block, whole, whole)
-        if not verdict.sound:
-            return BlockSolution(whole.dots)
-        if self.stamped.flat:
-            whole = whole._replace(variances=self.stamped.mean_variances(len(block.slots)))
-        others = self._some(verdict.sound, block, whole) if len(verdict.sound) > 1 else None
-        if others is not None:
-            return self._agreed(block, whole, others)
-        if len(verdict.sound) == 1:
-            return BlockSolution(whole.dots, None, self._from_one(verdict.sound[0], block, whole))
-        return BlockSolution(whole.dots)
+            readings = self._fitted(self.estimator.full, block, variances)
+            return self._solve_consistent(block, readings.dots, variances, readings)
+        if self.estimator.on_plate and verdict.sound:
+            variances = self.estimator.mean_variances(len(block.slots))
+        subset = self._subset(verdict.sound, block, variances) if len(verdict.sound) > 1 else None
+        if subset is not None:
+            return self._solve_consistent(block, block.means, variances, subset)
+        estimate = self._from_one(verdict.sound[0], block, variances) if len(verdict.sound) == 1 else None
+        return BlockSolution(block.means, None, estimate)
 
-    def others(self, block: SeenBlock, used: BlockReadings) -> Iterator[DeflectionEstimate]:
-        """The estimates of the other solvers."""
+    def other_estimates(self, block: SeenBlock, used: CheckedReadings) -> Iterator[DeflectionEstimate]:
+        """Yield the estimates of the other solvers."""
         for number in range(1, len(self._solvers)):
-            solution, _ = self._solve(number, used)
+            solution, _ = self._solution(number, used.readings)
             if solution is not None:
                 yield self._estimate(number, block, solution, used)
 
-    def left_out(self, used: BlockReadings | None) -> tuple[int, ...]:
-        """The PSDs (from 1) without which a block was solved."""
-        if used is None or used.kept is None:
+    def excluded(self, used: CheckedReadings | None) -> tuple[int, ...]:
+        """Return the PSDs (from 1) without which a block was solved."""
+        if used is None:
             return ()
-        return tuple(n for n in range(1, len(self._rig.psds) + 1) if n - 1 not in used.kept)
+        return tuple(n for n in range(1, len(self._rig.psds) + 1) if n - 1 not in used.readings.psds.psds)
 
-    def _agreed(self, block: SeenBlock, whole: BlockReadings, readings: BlockReadings) -> BlockSolution:
-        """The answer from ``readings``, without the PSD that contradicts the others if it can be told.
+    def _solve_consistent(
+        self, block: SeenBlock, dots: Dots, variances: tuple[float, ...], readings: BlockReadings
+    ) -> BlockSolution:
+        """Solve ``readings``, without the PSD that contradicts the others if it can be told.
 
-        ``whole``: the readings of all PSDs.
+        ``dots`` (2P,) m to publish, ``variances`` (2P,) m^2 of all PSDs.
         """
-        used, estimate, failure = self._most_agreed(block, whole, readings)
-        if estimate is not None:
-            self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
-        return BlockSolution(whole.dots, used, estimate, failure)
+        solved, own = self._solved(readings), readings.psds
+        may_exclude = len(own.psds) > 2 and self._rig.estimator.consistency != 'report' and self.estimator.on_plate
+        if solved.solution is None or not may_exclude:
+            return self._finish(block, dots, solved, self._check(solved, None))
+        numbers = own.check.candidates(solved.unexplained, self.estimator.limit_factor)
+        subsets = {number: self._solved_without(number, block, variances, own) for number in numbers}
+        checked = self._check(solved, [number for number, subset in subsets.items() if self._agrees(subset)])
+        number = self._to_exclude(block, own, checked)
+        if number and number not in subsets:
+            subsets[number] = self._solved_without(number, block, variances, own)
+        without = subsets[number] if number else None
+        if without is None:
+            return self._finish(block, dots, solved, checked)
+        return self._finish(block, dots, without, self._check(without, None), own.psds[number - 1] + 1)
 
-    def _most_agreed(self, block: SeenBlock, whole: BlockReadings, readings: BlockReadings) -> _Found:
-        """As :meth:`_primary`, without the PSD that contradicts the others if it can be told."""
-        before = tuple(range(len(self._rig.psds))) if readings.kept is None else readings.kept
-        if len(before) < 3 or self._rig.estimator.consistency == 'report':
-            return self._primary(block, readings)
-        taken: dict[int, BlockReadings | None] = {}
-
-        def without(psd: int) -> BlockReadings | None:
-            # Once a block: a fit remembers the motion that it saw.
-            if psd not in taken:
-                taken[psd] = self._some(tuple(p for p in before if p != psd), block, whole)
-            return taken[psd]
-
-        def agree_without(number: int) -> bool:
-            others = without(before[number - 1])
-            return others is not None and self._agree(others)
-
-        found = self._primary(block, readings, agree_without)
-        checked = found[0].checked
-        wrong = before[checked.wrong - 1] if checked is not None and checked.wrong else -1
-        still = [psd for psd in before if block.frozen[psd] >= FROZEN_BLOCKS]
-        if wrong < 0 and checked is not None and checked.contradict and len(still) == 1:
-            # The check cannot tell, but a detector whose values do not change by one bit tells on itself.
-            wrong = still[0]
-        others = without(wrong) if wrong >= 0 else None
-        return found if others is None else self._primary(block, others._replace(wrong=wrong + 1))
-
-    def _agree(self, readings: BlockReadings) -> bool:
-        """Whether the readings of some PSDs agree with each other."""
-        solution, _ = self._solve(0, readings)
-        if solution is None or readings.some is None:
-            return False
-        spread = np.diag(readings.variances) if readings.spread is None else readings.spread
-        return self.stamped.agree(readings.some, readings.dots, solution.residual, spread, solution[:5])
-
-    def _some(self, kept: tuple[int, ...], block: SeenBlock, whole: BlockReadings) -> BlockReadings | None:
-        """The readings of the PSDs ``kept`` (from 0) alone; None if the primary method cannot do with them."""
-        solver = self._solver(0, kept)
-        if solver is None:
-            return None
-        some = self.stamped.some(kept, solver.tilts)
-        at = some.columns
-        dots = tuple(whole.dots[i] for i in at)
-        readings = BlockReadings(dots, tuple(whole.variances[i] for i in at), kept=kept, some=some)
-        fitted = self.stamped.fit_some(some, block.slots, block.samples)
-        return readings._replace(dots=fitted.dots, spread=self._spread_of(block, fitted.covariance, at))
-
-    def _solver(self, number: int, kept: tuple[int, ...] | None) -> Solver | None:
-        """Solver ``number`` for all PSDs, or for those ``kept`` (from 0); None if it cannot do with them."""
-        name, solver, _ = self._solvers[number]
-        if kept is None:
-            return solver
-        key = (number, kept)
-        if key not in self._some_solvers:
-            self._some_solvers[key] = solver_of_some(name, self._rig, kept)
-        return self._some_solvers[key]
-
-    def _primary(
-        self, block: SeenBlock, readings: BlockReadings, agree_without: Callable[[int], bool] | None = None
-    ) -> _Found:
-        """The readings with their check, the primary solver's estimate, and why there is none.
-
-        ``agree_without``: as :meth:`StampedDots.check` has it.
-        """
-        solution, failure = self._solve(0, readings)
+    def _solved(self, readings: BlockReadings) -> SolvedReadings:
+        solution, failure = self._solution(0, readings)
         if solution is None:
-            return readings, None, (BlockStatus.NOT_SOLVED, failure)
+            return SolvedReadings(readings, None, failure)
         factor = None if self.spread is None else self.spread.factor(solution.dx, solution.dy, solution.theta)
-        checked: ConsistencyCheck | None = None
-        if self.stamped.flat:
-            allowed = np.diag(readings.variances) if readings.spread is None else readings.spread
-            if factor is not None:
-                allowed = allowed + self._by.einsum('ik,jk->ij', factor, factor)
-            pose = solution[:5]
-            checked = self.stamped.check(readings.dots, solution.residual, allowed, pose, readings.some, agree_without)
-        readings = readings._replace(checked=checked, factor=factor)
-        told = checked is not None and checked.contradict and not checked.wrong
-        if checked is not None and told and self._rig.estimator.consistency == 'refuse':
+        covariance = readings.dense_covariance
+        if factor is not None:
+            covariance = covariance + self._by.einsum('ik,jk->ij', factor, factor)
+        return SolvedReadings(readings, solution, '', factor, self._unexplained(readings, solution, covariance))
+
+    def _unexplained(self, readings: BlockReadings, solution: Solution, covariance: FloatArray) -> Unexplained | None:
+        if not self.estimator.on_plate:
+            return None
+        return readings.psds.unexplained(readings.dots, solution.residual, covariance, solution[:5])
+
+    def _solved_without(
+        self, number: int, block: SeenBlock, variances: tuple[float, ...], psds: PsdSet
+    ) -> SolvedReadings | None:
+        """Solve the readings of ``psds`` but PSD ``number`` of them (from 1); None if no method can."""
+        rest = psds.psds[: number - 1] + psds.psds[number:]
+        readings = self._subset(rest, block, variances)
+        return None if readings is None else self._solved(readings)
+
+    def _agrees(self, solved: SolvedReadings | None) -> bool:
+        """Whether readings are consistent by their noise alone, and enough to tell."""
+        if solved is None or solved.solution is None:
+            return False
+        readings, found = solved.readings, solved.unexplained
+        if solved.factor is not None:
+            found = self._unexplained(readings, solved.solution, readings.dense_covariance)
+        return readings.psds.check.agrees(found, self.estimator.limit_factor)
+
+    def _check(self, solved: SolvedReadings, blamed: Collection[int] | None) -> ConsistencyResult | None:
+        """Update the check of a set of PSDs with a block; None if the readings cannot be checked."""
+        if solved.solution is None or not self.estimator.on_plate:
+            return None
+        return self.estimator.check(solved.readings.psds, solved.unexplained, blamed)
+
+    def _to_exclude(self, block: SeenBlock, psds: PsdSet, checked: ConsistencyResult | None) -> int:
+        """Return the PSD to exclude, from 1 among ``psds``; 0: none."""
+        if checked is None or checked.excluded or not checked.contradict:
+            return 0 if checked is None else checked.excluded
+        # The check cannot tell, but a detector whose values do not change by one bit is known to be wrong.
+        still = [n for n, psd in enumerate(psds.psds, 1) if block.frozen[psd] >= FROZEN_BLOCKS]
+        return still[0] if len(still) == 1 else 0
+
+    def _finish(
+        self,
+        block: SeenBlock,
+        dots: Dots,
+        solved: SolvedReadings,
+        checked: ConsistencyResult | None,
+        excluded: int = 0,
+    ) -> BlockSolution:
+        """Return the estimate from ``solved``, or why there is none; ``excluded``: the PSD (from 1) that it lacks."""
+        used = CheckedReadings(solved.readings, solved.factor, checked, excluded)
+        if solved.solution is None:
+            return BlockSolution(dots, used, None, (BlockStatus.NOT_SOLVED, solved.failure))
+        contradict = checked is not None and checked.contradict and not checked.excluded
+        if checked is not None and contradict and self._rig.estimator.consistency == 'refuse':
             words = 'four readings' if len(self._rig.psds) == 2 else 'readings'
             reason = f'the {words} contradict each other: chi-square {checked.chi_square:.0f} of {checked.freedom}'
-            return readings, None, (BlockStatus.INCONSISTENT, reason)
-        return readings, self._estimate(0, block, solution, readings), None
+            return BlockSolution(dots, used, None, (BlockStatus.INCONSISTENT, reason))
+        estimate = self._estimate(0, block, solved.solution, used)
+        self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
+        return BlockSolution(dots, used, estimate)
 
-    def _solve(self, number: int, readings: BlockReadings) -> tuple[Solution | None, str]:
-        """The answer of solver ``number``, or None and the reason."""
+    def _fitted(self, psds: PsdSet, block: SeenBlock, variances: tuple[float, ...]) -> BlockReadings:
+        """Return the readings of ``psds`` at the block's timestamp; ``variances`` (2P,) m^2 of all."""
+        dots, covariance = self.estimator.fit(psds, block.slots, block.samples)
+        own = tuple(variances[i] for i in psds.columns)
+        return BlockReadings(psds, dots, own, self._covariance_of(block, covariance, psds.columns))
+
+    def _subset(self, psds: tuple[int, ...], block: SeenBlock, variances: tuple[float, ...]) -> BlockReadings | None:
+        """Return the readings of ``psds`` (from 0) alone; None if the primary method cannot do with them."""
+        solver = self._solver(0, psds)
+        return None if solver is None else self._fitted(self.estimator.subset(psds, solver.tilts), block, variances)
+
+    def _solver(self, number: int, psds: tuple[int, ...]) -> Solver | None:
+        """Return solver ``number`` for ``psds`` (from 0); None if it cannot do with them."""
+        name, solver, _ = self._solvers[number]
+        if len(psds) == len(self._rig.psds):
+            return solver
+        key = (number, psds)
+        if key not in self._subset_solvers:
+            self._subset_solvers[key] = subset_solver(name, self._rig, psds)
+        return self._subset_solvers[key]
+
+    def _solution(self, number: int, readings: BlockReadings) -> tuple[Solution | None, str]:
+        """Return the solution of solver ``number``, or None and the reason."""
         name = self._solvers[number][0]
-        solver = self._solver(number, readings.kept)
+        solver = self._solver(number, readings.psds.psds)
         if solver is None:
             return None, f'{name}: takes all PSDs'
         s = solver.solve(readings.dots, readings.variances)
@@ -331,11 +369,11 @@ class Estimation:
             return None, f'{name}: {s.status.name.lower().replace("_", " ")}'
         return s, ''
 
-    def _estimate(self, number: int, block: SeenBlock, s: Solution, readings: BlockReadings) -> DeflectionEstimate:
-        """An answer with its covariance."""
+    def _estimate(self, number: int, block: SeenBlock, s: Solution, used: CheckedReadings) -> DeflectionEstimate:
+        """Return a solution with its covariance as an estimate."""
         name, _, primary = self._solvers[number]
-        checked = readings.checked
-        covariance, systematic = self._covariance(number, s, readings)
+        checked = used.checked
+        covariance, systematic = self._covariance(number, s, used)
         if primary:
             self.systematic = systematic
         return DeflectionEstimate(
@@ -355,41 +393,40 @@ class Estimation:
         )
 
     def _covariance(
-        self, number: int, s: Solution, readings: BlockReadings
+        self, number: int, s: Solution, used: CheckedReadings
     ) -> tuple[tuple[float, ...], FloatArray | None]:
-        """The covariance of an answer, and what it holds besides noise, None if nothing."""
-        solver = self._solver(number, readings.kept)
-        checked, factor = readings.checked, readings.factor
+        """Return the covariance of a solution, and what it holds besides noise, None if nothing."""
+        readings, checked, factor = used.readings, used.checked, used.factor
+        solver = self._solver(number, readings.psds.psds)
         possible = () if checked is None or self._rig.estimator.consistency != 'widen' else checked.possible
         # A printed threshold method has no covariance, and no slope either.
         if solver is None or s.covariance[0] != s.covariance[0]:
             return s.covariance, None
-        if readings.spread is None and factor is None and not any(possible):
+        if readings.covariance is None and factor is None and not any(possible):
             return s.covariance, None
         gain = solver.gain(readings.dots, readings.variances, s)
         noise = own = self._noise_of(solver, gain, s, readings)
         if factor is not None:
             own = own + _through(gain, factor, self._by)
-        # A check that was made with all PSDs tells nothing of some of them.
-        if any(possible) and len(possible) == gain.shape[1]:
+        if any(possible):
             own = widened(own, gain, possible, self._by)
         return tuple(own.ravel().tolist()), own - noise if own is not noise else None
 
     def _noise_of(self, solver: Solver, gain: FloatArray, s: Solution, readings: BlockReadings) -> FloatArray:
-        """The covariance (3, 3) by the noise of the readings alone."""
-        if readings.spread is None:
+        """Return the covariance (3, 3) by the noise of the readings alone."""
+        if readings.covariance is None:
             return np.array(s.covariance).reshape(3, 3)
-        own = self._by.einsum('ic,ck,jk->ij', gain, readings.spread, gain)
+        own = self._by.einsum('ic,ck,jk->ij', gain, readings.covariance, gain)
         allowance = solver.allowance(readings.dots, readings.variances)
         return own if allowance is None else own + allowance
 
-    def _spread_of(self, block: SeenBlock, covariance: FloatArray, columns: Sequence[int] | None = None) -> FloatArray:
-        """:meth:`_variances_of` for the fit's own covariance (C, C), of the readings ``columns`` or of all."""
+    def _covariance_of(self, block: SeenBlock, covariance: FloatArray, columns: Sequence[int]) -> FloatArray:
+        """Return the fit's covariance (C, C) of the readings ``columns``, widened as in :meth:`_variances_of`."""
         if not block.verdict.findings:
             return covariance
         background = np.repeat(self._optics.background_variance(block.mean_sums), 2)
         more = 4.0 if block.verdict.half_light else 1.0
-        return more * covariance + np.diag(background if columns is None else background[list(columns)])
+        return more * covariance + np.diag(background[list(columns)])
 
     def _variances_of(self, block: SeenBlock) -> tuple[float, ...]:
         """Variances of the dots' means, m^2: from the noise, and from missing or foreign light."""
@@ -401,7 +438,7 @@ class Estimation:
         more = 4.0 if block.verdict.half_light else 1.0
         return tuple(more * v + b for v, b in zip(variances, background, strict=True))
 
-    def _from_one(self, psd: int, block: SeenBlock, readings: BlockReadings) -> DeflectionEstimate | None:
+    def _from_one(self, psd: int, block: SeenBlock, variances: tuple[float, ...]) -> DeflectionEstimate | None:
         """The translation from the remaining detector ``psd`` (from 0), by the rule that ``degraded`` names."""
         config = self._rig.estimator
         by = self._by
@@ -415,8 +452,8 @@ class Estimation:
             age = max(block.t_ns - held.t_ns, 0) / 1e9
             theta = held.theta
             variance = held.variance + by.square(config.twist_sd) * -by.expm1(-age / config.twist_hold)
-        x, y = readings.dots[2 * psd : 2 * psd + 2]
-        vx, vy = readings.variances[2 * psd : 2 * psd + 2]
+        x, y = block.means[2 * psd : 2 * psd + 2]
+        vx, vy = variances[2 * psd : 2 * psd + 2]
         dx, dy, cov = self._one_psd.solve(psd, (x, y), (vx, vy), theta, variance)
         if self.spread is not None:
             gain = np.zeros((3, 2 * len(self._rig.psds)))
@@ -441,6 +478,6 @@ class Estimation:
 
 
 def _through(gain: FloatArray, factor: FloatArray, by: Arithmetic) -> FloatArray:
-    """(3, 3): what dots that spread by ``factor`` (C, k) m do to an answer with ``gain`` (3, C)."""
+    """Return (K F)(K F)^T (3, 3) for ``gain`` K (3, C) and ``factor`` F (C, k) m."""
     moved = by.einsum('ij,jk->ik', gain, factor)
     return by.einsum('ik,jk->ij', moved, moved)

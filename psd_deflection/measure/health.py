@@ -19,7 +19,7 @@ import numpy as np
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.measures import BlockMeasures
-from psd_deflection.measure.memory import Memory, Value, misfit, numbers
+from psd_deflection.measure.state import State, Value, mismatch, numbers
 from psd_deflection.records import FLAG_OVER_RANGE, BlockStatus, SampleBlock, channel_names, dot_names
 from psd_deflection.rig.config import Rig
 
@@ -71,11 +71,19 @@ def _long(frozen: tuple[int, ...]) -> list[tuple[int, str]]:
     ]
 
 
+def _first_of_each(faults: Iterable[tuple[int, BlockStatus, str]]) -> dict[int, tuple[BlockStatus, str]]:
+    """Return the first fault of each PSD."""
+    out: dict[int, tuple[BlockStatus, str]] = {}
+    for psd, status, reason in faults:
+        out.setdefault(psd, (status, reason))
+    return out
+
+
 class Stillness:
     """``blocks`` (P,): for how many blocks in a row each detector's values have not changed."""
 
     part = 'the count of blocks whose values do not change'
-    remembers = (FROZEN,)
+    prefixes = (FROZEN,)
 
     def __init__(self, psds: int) -> None:
         self.blocks: tuple[int, ...] = (0,) * psds
@@ -84,11 +92,11 @@ class Stillness:
         """Take one block, as :meth:`OpticsHealth.still` has it."""
         self.blocks = tuple(n + 1 if same else 0 for n, same in zip(self.blocks, still, strict=True))
 
-    def memory(self) -> Memory:
+    def state_dict(self) -> State:
         """The counts, if there are any."""
         return {FROZEN: self.blocks} if any(self.blocks) else {}
 
-    def restore(self, values: Mapping[str, Value]) -> None:
+    def load_state_dict(self, values: Mapping[str, Value]) -> None:
         """Take the counts. Raises ValueError if they are of another number of PSDs."""
         row = numbers(values, FROZEN, 'one count for each PSD', len(self.blocks))
         if row is not None:
@@ -99,7 +107,7 @@ class Loudness:
     """How noisy the noisy detectors are: x, y and sum of each, averaged since it became so. Nothing of the others."""
 
     part = 'the noise of noisy detectors'
-    remembers = (LOUD,)
+    prefixes = (LOUD,)
 
     def __init__(self) -> None:
         # By PSD: blocks that were averaged, blocks in a row that were quiet, mean squares of x, y and sum, V^2.
@@ -119,16 +127,16 @@ class Loudness:
         self._noises[psd] = (blocks, quiet, *squares)
         return [math.sqrt(square) for square in squares]
 
-    def memory(self) -> Memory:
+    def state_dict(self) -> State:
         """The noises, if there are any."""
         rows = [(float(psd), *noise) for psd, noise in sorted(self._noises.items())]
         return {LOUD: tuple(value for row in rows for value in row)} if rows else {}
 
-    def restore(self, values: Mapping[str, Value]) -> None:
+    def load_state_dict(self, values: Mapping[str, Value]) -> None:
         """Take the noises. Raises ValueError if they are no rows of six."""
         row = numbers(values, LOUD, 'six numbers for each noisy detector') or ()
         if len(row) % _LOUD_ROW or not all(0.0 <= value < math.inf for value in row):
-            raise misfit(LOUD, row, 'six numbers for each noisy detector')
+            raise mismatch(LOUD, row, 'six numbers for each noisy detector')
         self._noises = {int(row[at]): row[at + 1 : at + _LOUD_ROW] for at in range(0, len(row), _LOUD_ROW)}
 
 
@@ -171,33 +179,30 @@ class OpticsHealth:
 
         ``frozen``: blocks in a row without change, per PSD. ``x1`` in a reason is PSD 1's x, whatever channel it is on.
         """
-        faults: dict[int, tuple[BlockStatus, str]] = {}
-
-        def add(found: Iterable[tuple[int, BlockStatus, str]]) -> None:
-            for psd, status, reason in found:
-                faults.setdefault(psd, (status, reason))
-
-        present = len(block.seq)
+        present, enough = len(block.seq), len(block.seq) >= self._min_samples
         least, most, dots = measures.least, measures.most, measures.means
         low, high = least[2::3], most[2::3]
-        add(self._dark(low))
-        add(saturated := self._saturated(least, most))
-        if not saturated and not faults and bool((block.flags & FLAG_OVER_RANGE).any()):
+        faults = _first_of_each([*self._dark(low), *self._saturated(least, most)])
+        if not faults and bool((block.flags & FLAG_OVER_RANGE).any()):
             return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)
         if self.refuses_frozen:
-            add((psd, BlockStatus.FROZEN, reason) for psd, reason in _long(frozen))
-        if present < self._min_samples and not faults:
+            faults = _first_of_each((psd, BlockStatus.FROZEN, reason) for psd, reason in _long(frozen)) | faults
+        if not enough and not faults:
             reason = f'{present} of {self._size} samples, at least {self._min_samples} are needed'
             return Verdict(BlockStatus.TOO_FEW_SAMPLES, reason, 0)
-        add(self._outside(dots))
+        faults = _first_of_each(self._outside(dots)) | faults
         half_light = self._half_light(low) if self._splitter else False
         findings = self._findings(dots, high, set(faults), half_light)
         if not faults:
             return Verdict(BlockStatus.OK, '', 0, findings, half_light)
-        # The worst cause first: a lost laser explains a saturated or outside reading.
+        return self._faulty(faults, enough, findings, half_light)
+
+    def _faulty(
+        self, faults: dict[int, tuple[BlockStatus, str]], enough: bool, findings: tuple[str, ...], half_light: bool
+    ) -> Verdict:
+        """Return the verdict of the worst cause: a lost laser explains a saturated or outside reading."""
         psd = min(faults, key=lambda p: (_ORDER.index(faults[p][0]), p))
         status, reason = faults[psd]
-        enough = present >= self._min_samples
         lone = len(faults) == 1 and enough
         sound = tuple(i for i in range(self._psds) if i + 1 not in faults) if enough else ()
         return Verdict(status, reason, psd if lone else 0, findings, half_light, frozenset(faults), sound)

@@ -8,13 +8,13 @@ metres -> correction of the effects in the rig file -> health checks -> solvers 
 the tip load that the link model computes from them.
 
 Its parts remember things from block to block: the noise, the motion, the twist that ``degraded: hold`` keeps, what
-effects of the link remember of past loads. Each part tells that itself (:mod:`psd_deflection.measure.memory`); when a
+effects of the link remember of past loads. Each part tells that itself (:mod:`psd_deflection.measure.state`); when a
 recording starts, it is written as a record (:meth:`Pipeline.memory`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -27,9 +27,9 @@ from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERAT
 from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, SeenBlock
 from psd_deflection.measure.health import CalibratedRange, Loudness, OpticsHealth, Stillness, Verdict
 from psd_deflection.measure.measures import BlockMeasures, measured, of_one_length
-from psd_deflection.measure.memory import STATE, WHOLE, Memory, Part, Value, numbers, restore
 from psd_deflection.measure.motion.known import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
+from psd_deflection.measure.state import STATE, WHOLE, Part, State, Value, load_states, numbers
 from psd_deflection.measure.uncertainty.rest import why_moving
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
 from psd_deflection.model.simulation.catalogue import effects_of_rig
@@ -81,6 +81,12 @@ class PipelineCounters:
     refused: dict[str, int] = field(default_factory=dict)
     findings: dict[str, int] = field(default_factory=dict)
 
+    def count_findings(self, findings: Iterable[str]) -> None:
+        """Count the findings of a block by what is before their colon."""
+        for finding in findings:
+            name = finding.split(':')[0]
+            self.findings[name] = self.findings.get(name, 0) + 1
+
 
 class Pipeline:
     """Samples in, records out. ``misfits``: of the last change, what no part of this rig could go on from.
@@ -111,14 +117,21 @@ class Pipeline:
         self._stillness = Stillness(len(rig.psds))
         self._loudness = Loudness()
         self.estimation = Estimation(rig, self._effects)
-        self.stamped = self.estimation.stamped
+        self.estimator = self.estimation.estimator
         self._take(rig)
         self.motion_filter = self._new_filter()
 
     @property
     def _parts(self) -> tuple[Part, ...]:
-        """Everything that remembers."""
-        parts = (self._surroundings, self._stillness, self._loudness, self.estimation, self.tip_loads, self.stamped)
+        """Everything that has a state."""
+        parts = (
+            self._surroundings,
+            self._stillness,
+            self._loudness,
+            self.estimation,
+            self.tip_loads,
+            self.estimator,
+        )
         return parts if self.motion_filter is None else (*parts, self.motion_filter)
 
     def _new_filter(self) -> ModalFilter | None:
@@ -126,7 +139,7 @@ class Pipeline:
         if self.rig.estimator.filter == 'none':
             return None
         gain = self.estimation.gain_at_rest()
-        return ModalFilter(self.rig, self.tip_loads.compliance, gain, self.stamped.noise.gamma)
+        return ModalFilter(self.rig, self.tip_loads.compliance, gain, self.estimator.noise.gamma)
 
     def _take(self, rig: Rig) -> None:
         self.rig = rig
@@ -221,9 +234,9 @@ class Pipeline:
             self._begin(self.rig)
         if told:
             self._change_rig(told)
-        self.misfits = restore(self._parts, memory)
+        self.misfits = load_states(self._parts, memory)
         if self.motion_filter is not None:
-            self.motion_filter.set_noise(self.stamped.noise.gamma)
+            self.motion_filter.set_noise(self.estimator.noise.gamma)
             self._apply_load(self.motion_filter, load)
 
     def _change_rig(self, told: Mapping[str, Value]) -> None:
@@ -238,12 +251,12 @@ class Pipeline:
             self.estimation.zero_variances = zero_variances(rig)
         self.estimation.build(rig, self._effects)
         self._take(rig)
-        self.stamped.set_zeros(rig)
+        self.estimator.set_zeros(rig)
         if zeroed:
             # The tip did not move with its zero.
             self.motion_filter = self._new_filter()
 
-    def _apply_load(self, motion: ModalFilter, told: Memory) -> None:
+    def _apply_load(self, motion: ModalFilter, told: State) -> None:
         try:
             load = numbers(told, KNOWN_LOAD, 'seconds, nanoseconds and a load', 5)
         except ValueError as error:
@@ -255,22 +268,22 @@ class Pipeline:
     @property
     def gathers(self) -> int:
         """How many numbers the segment of the noise under way makes of :meth:`memory`; 0 between two segments."""
-        return self.stamped.noise.gathered
+        return self.estimator.noise.gathered
 
     def memory(self, rig: Rig) -> ParameterChange | None:
         """The state that the next block depends on besides its samples and ``rig``; None if there is none.
 
         ``rig``: the rig as it was at the start; later changes are part of the memory. Nothing is changed by it.
         """
-        values: Memory = {
+        values: State = {
             name: tuple(map(float, value)) if isinstance(value, list) else value
             for name, value in self.rig.values.items()
             if value != rig.values[name]
         }
         for part in self._parts:
             # Before the first block the fit knows what a new one knows.
-            if part is not self.stamped or self.last_spots is not None:
-                values |= part.memory()
+            if part is not self.estimator or self.last_spots is not None:
+                values |= part.state_dict()
         if not values:
             return None
         last = self.last_spots
@@ -350,7 +363,7 @@ class Pipeline:
         solvable = verdict.status is BlockStatus.OK or verdict.sound
         answer = self.estimation.solve(seen) if solvable else BlockSolution(seen.means)
         self.last_estimate = answer.estimate
-        self.stamped.left_out = self.estimation.left_out(answer.used)
+        self.estimator.excluded = self.estimation.excluded(answer.used)
         status, reason = answer.failure or (verdict.status, verdict.reason)
         self._count(status, verdict, answer)
         yield from self._estimates(seen, answer, status)
@@ -367,7 +380,7 @@ class Pipeline:
             status=status,
             reason=reason,
             findings=findings,
-            left_out=self.stamped.left_out,
+            left_out=self.estimator.excluded,
             published=seen.due,
         )
         yield self.last_spots
@@ -419,7 +432,7 @@ class Pipeline:
                 yield moved
         self._keep_for_zero(seen, answer)
         if seen.due and best is not None and used is not None:
-            yield from self.estimation.others(seen, used)
+            yield from self.estimation.other_estimates(seen, used)
 
     def _keep_for_zero(self, seen: SeenBlock, answer: BlockSolution) -> None:
         """Keep the dots of the last good blocks; a zero must not be a mean across an outage."""
@@ -429,23 +442,21 @@ class Pipeline:
         last = self.last_spots
         if last is not None and seen.t_ns - last.t_ns > ZERO_BLOCKS * self._cutter.block_size * self._period_ns:
             self._recent = []
-        self._recent = [*self._recent[1 - ZERO_BLOCKS :], answer.used.dots]
+        self._recent = [*self._recent[1 - ZERO_BLOCKS :], answer.used.readings.dots]
 
     def _findings(
         self, measures: BlockMeasures, seen: SeenBlock, answer: BlockSolution, status: BlockStatus
     ) -> tuple[str, ...]:
         """What is odd about a block; of one that is not, the noise is learnt."""
         findings, used = seen.verdict.findings, answer.used
-        if used is not None and used.wrong:
-            findings = (*findings, f'psd_{used.wrong} contradicts the others and is left out')
-        sound = status is BlockStatus.OK and not findings
+        if used is not None and used.excluded:
+            findings = (*findings, f'psd_{used.excluded} contradicts the others and is left out')
         # Of this block: what it has to say counts from the next one on.
-        vibrates = self.stamped.vibrates
-        changed = sound and self.stamped.learn(seen.index, seen.slots, seen.samples, measures.volts)
-        if changed and self.motion_filter is not None:
-            self.motion_filter.set_noise(self.stamped.noise.gamma)
+        vibrates = self.estimator.vibrates
+        if status is BlockStatus.OK and not findings:
+            self._learn(seen, measures)
         if answer.complete and used is not None and used.checked is not None:
-            self.stamped.suspect(seen.index, used.dots, used.checked)
+            self.estimator.search_outliers(seen.index, used.readings.dots, used.checked)
         if not self._optics.refuses_frozen:
             self._stillness.count(self._optics.still(measures))
         findings += self._optics.late_findings(measures, seen.verdict, self._stillness.blocks, self._loudness)
@@ -453,10 +464,14 @@ class Pipeline:
             findings += (f'vibrates: {vibrates}',)
         if answer.estimate is not None:
             findings += self._calibrated.findings(answer.estimate.pose)
-        for finding in findings:
-            name = finding.split(':')[0]
-            self.counters.findings[name] = self.counters.findings.get(name, 0) + 1
+        self.counters.count_findings(findings)
         return findings
+
+    def _learn(self, seen: SeenBlock, measures: BlockMeasures) -> None:
+        """Take a good block into the noise."""
+        changed = self.estimator.learn(seen.index, seen.slots, seen.samples, measures.volts)
+        if changed and self.motion_filter is not None:
+            self.motion_filter.set_noise(self.estimator.noise.gamma)
 
     def _moved(self, motion: ModalFilter, seen: SeenBlock, usable: bool) -> TipMotion | None:
         """The motion by the filter; ``usable``: whether samples of the block can be used."""
@@ -472,7 +487,7 @@ class Pipeline:
         systematic = self.estimation.systematic
         covariance = moved.covariance if systematic is None else moved.covariance + systematic
         velocity_covariance = moved.velocity_covariance
-        if self.stamped.noise.tones:
+        if self.estimator.noise.tones:
             pose, rate = self.estimation.vibration()
             covariance, velocity_covariance = covariance + pose, velocity_covariance + rate
         dx, dy, theta = moved.pose.tolist()

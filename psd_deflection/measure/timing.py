@@ -106,36 +106,47 @@ class ClockMap:
         if not self._started:
             self._started = True
             self._start(device, t_host_ns)
-        early = self._host(device) - t_host_ns
-        jumped = device < self._last_device or early > EARLY_NS
+        early_ns = self._host(device) - t_host_ns
         delay = t_host_ns - device
         bucket = (device - self._origin) // SECOND_NS
-        if not jumped and bucket != self._bucket and self._bucket_min is not None:
-            jumped = self._bucket_min[1] - (self._host(self._bucket_min[0]) - self._bucket_min[0]) > LATE_NS
-        if jumped:
-            steady = (
-                passed_us is not None
-                and device > self._last_device
-                and abs(device - self._last_device - passed_us * 1000.0) < EARLY_NS
-                and early > EARLY_NS
-            )
-            self.resets += not steady
-            self.stepped_ns = -early if steady else 0
-            self._start(device, t_host_ns)
-            self._bucket_min = (device, delay)
-            return not steady
+        if device < self._last_device or early_ns > EARLY_NS or (bucket != self._bucket and self._second_was_late()):
+            return self._restart(device, delay, early_ns, passed_us)
         self._last_device = device
         if bucket != self._bucket:
-            if self._bucket_min is not None:
-                self._minima.append(self._bucket_min)
-                del self._minima[: -(WINDOW_S if self._round_trip is None else ASKED_WINDOW_S)]
-            self._bucket, self._bucket_min = bucket, None
-            self._refit(device)
+            self._close_second(bucket, device)
         if self._bucket_min is None or delay < self._bucket_min[1]:
             self._bucket_min = (device, delay)
             if len(self._minima) < FIT_AFTER_S:
                 self._refit(device)
         return False
+
+    def _second_was_late(self) -> bool:
+        """Whether all samples of the last second came later than the map by ``LATE_NS``."""
+        if self._bucket_min is None:
+            return False
+        device, delay = self._bucket_min
+        return delay - (self._host(device) - device) > LATE_NS
+
+    def _restart(self, device: int, delay: int, early_ns: int, passed_us: float | None) -> bool:
+        """Start again with this pair; True if the clock jumped, False if the first samples were late."""
+        steady = (
+            passed_us is not None
+            and device > self._last_device
+            and abs(device - self._last_device - passed_us * 1000.0) < EARLY_NS
+            and early_ns > EARLY_NS
+        )
+        self.resets += not steady
+        self.stepped_ns = -early_ns if steady else 0
+        self._start(device, device + delay)
+        self._bucket_min = (device, delay)
+        return not steady
+
+    def _close_second(self, bucket: int, device: int) -> None:
+        if self._bucket_min is not None:
+            self._minima.append(self._bucket_min)
+            del self._minima[: -(WINDOW_S if self._round_trip is None else ASKED_WINDOW_S)]
+        self._bucket, self._bucket_min = bucket, None
+        self._refit(device)
 
     def lay_anew(self, t_device_us: int, t_host_ns: int) -> None:
         """The clock cannot be followed: begin again with this pair."""

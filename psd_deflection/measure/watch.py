@@ -306,10 +306,21 @@ class Watch:
         if not sound or estimate is None or estimate.block != spots.index:
             self._drop()
             return
-        if self._last_index is not None and spots.index != self._last_index + 1:
+        if self._last_index not in (None, spots.index - 1):
             self._drop()
         self._last_index = spots.index
-        d, c = spots.dots, self._centers
+        self._add_readings(spots.dots)
+        if self.load is not None and told is not None and told.t_ns == estimate.t_ns:
+            loads = zip(self._compliance, told[1:], self.load[1:], strict=True)
+            self._off = [off + c * (a - b) for off, (c, a, b) in zip(self._off, loads, strict=True)]
+        self._pose = [total + value for total, value in zip(self._pose, estimate.pose, strict=True)]
+        self._count += 1
+        if self._count == self._blocks:
+            self._close(spots.t_ns)
+
+    def _add_readings(self, d: tuple[float, ...]) -> None:
+        """Add the dots (2P,), m, of a block, and the excess length of each base line."""
+        c = self._centers
         for channel, value in zip(self._readings, d, strict=True):
             channel.add(value)
         for channel, (a, b) in zip(self._lines, self._pairs, strict=True):
@@ -317,14 +328,6 @@ class Watch:
             y = c[a][1] + d[2 * a + 1] - c[b][1] - d[2 * b + 1]
             (ax, ay), (bx, by) = self._beams[a], self._beams[b]
             channel.add(math.sqrt(x * x + y * y) - math.sqrt((ax - bx) ** 2 + (ay - by) ** 2))
-        if self.load is not None and told is not None and told.t_ns == estimate.t_ns:
-            for i in range(3):
-                self._off[i] += self._compliance[i] * (told[1 + i] - self.load[1 + i])
-        for i, value in enumerate(estimate.pose):
-            self._pose[i] += value
-        self._count += 1
-        if self._count == self._blocks:
-            self._close(spots.t_ns)
 
     def _drop(self) -> None:
         for channel in (*self._readings, *self._lines):
@@ -401,14 +404,15 @@ class Watch:
             self._quiet = 0 if beyond else self._quiet + 1
             if self._quiet >= BACK and not self._lasting:
                 self.alarm = None
-            return
-        if not beyond:
+        elif not beyond:
             self._pending_ns = None
-            return
-        if self._pending_ns is None:
-            self._pending_ns = t_ns
-        if t_ns - self._pending_ns < 1e9 * CONFIRM_S and self.load is not None:
-            return
+        else:
+            self._pending_ns = t_ns if self._pending_ns is None else self._pending_ns
+            if t_ns - self._pending_ns >= 1e9 * CONFIRM_S or self.load is None:
+                self._confirm(t_ns, beyond)
+
+    def _confirm(self, t_ns: int, beyond: list[_Channel]) -> None:
+        """Raise the alarm of the channel that is shifted most."""
         shifts = {c.name: c.shift() for c in beyond}
         first = max(beyond, key=lambda c: abs(shifts[c.name][0]))
         also = tuple(c.name for c in beyond if c is not first)

@@ -77,7 +77,7 @@ class HealthReporter:
             pipeline.blocks,
             pipeline.estimates,
             pipeline.degraded,
-            s.pipeline.stamped.contradictions,
+            s.pipeline.estimator.contradictions,
             wire.clock_jumps,
             s.refused.total(),
         )
@@ -276,7 +276,7 @@ def estimates_entry(pipeline: Pipeline, new: Seen, rate: str, latency: Latency |
         *((f'found: {finding}', str(count)) for finding, count in sorted(counters.findings.items())),
         *((f'refused: {cause}', str(count)) for cause, count in sorted(counters.refused.items())),
     ]
-    values += pipeline.stamped.words()
+    values += pipeline.estimator.words()
     if latency is not None:
         values.append(('latency, median (ms)', f'{latency.median * 1e3:.3f}'))
         values.append(('latency, worst of a second (ms)', f'{latency.worst * 1e3:.3f}'))
@@ -285,7 +285,7 @@ def estimates_entry(pipeline: Pipeline, new: Seen, rate: str, latency: Latency |
 
 def _doubt(pipeline: Pipeline, contradictions: int) -> str:
     """What widens the covariance of blocks that all have estimates; '' if nothing does."""
-    stamped = pipeline.stamped
+    stamped = pipeline.estimator
     if contradictions:
         wrong = stamped.most_likely_wrong() or 'which one is wrong cannot be told'
         readings = 'four readings' if len(pipeline.rig.psds) == 2 else 'readings'

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from psd_deflection.base.charts import BUCKETS, MOST_POINTS, Chart, Colour, Panel, Rule, Series, drawn
+from psd_deflection.base.charts import BUCKETS, Chart, Colour, Panel, Rule, Series, drawn
 from psd_deflection.base.drawings import BarColumn, Bars, Matrix, in_page
 from psd_deflection.base.pages import page, table
 from psd_deflection.records import FloatArray
@@ -95,25 +95,6 @@ def test_a_cloud_keeps_points_that_do_not_lie_on_each_other() -> None:
     assert np.sum(at == 10.0) == 1
     assert kept.max() == 7.0
     assert content['note'] == f'{len(at)} of 40000 points are drawn'
-
-
-def test_a_wide_cloud_is_thinned() -> None:
-    rng = np.random.default_rng(3)
-    content = told(one(rng.normal(size=50_000), rng.normal(size=50_000)))
-    assert len(column(content, 0)) == MOST_POINTS
-
-
-def test_a_short_curve_is_there_whole() -> None:
-    x = np.arange(2.0 * BUCKETS)
-    content = told(one(x, x))
-    assert column(content, 0).tolist() == x.tolist()
-    assert content['note'] == ''
-
-
-def test_nothing_but_nan_is_no_error() -> None:
-    nothing = np.full(3 * BUCKETS, np.nan)
-    content = told(one(nothing, nothing))
-    assert np.isnan(column(content, 0)).all()
 
 
 def test_words_of_a_stranger_are_words() -> None:

@@ -256,7 +256,7 @@ def test_the_recordings_that_a_beginner_plays_raise_no_alarm() -> None:
         pipeline = Pipeline(rig_at_start(recording))
         for _ in replayed(recording, pipeline):
             pass
-        assert dict(pipeline.stamped.words())['blocks whose readings contradict each other'] == '0'
+        assert dict(pipeline.estimator.words())['blocks whose readings contradict each other'] == '0'
 
 
 def test_the_tests_that_follow_the_steps_are_there() -> None:

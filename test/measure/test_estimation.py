@@ -8,15 +8,13 @@ import math
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from psd_deflection.measure.estimation import BlockReadings, Estimation
+from psd_deflection.measure.estimation import Estimation
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.misalignment.model import INDEX
-from psd_deflection.model.solvers.interface import SolverStatus
 from psd_deflection.records import BlockStatus, DeflectionEstimate, FloatArray, RawChunk, SpotMeans
 from psd_deflection.rig.config import load_rig
 
@@ -80,18 +78,8 @@ def test_the_noise_of_a_zero_of_psds_at_the_base_is_that_of_the_rig_file(monkeyp
     # Of the others it is that of a block's mean, as it was measured.
     for rig, noise in ((load_rig(overrides=base), want), (load_rig(), 20e-12)):
         estimation = Estimation(rig, ())
-        monkeypatch.setattr(estimation.stamped, 'mean_variances', lambda size: (size * 1e-12,) * 4)
+        monkeypatch.setattr(estimation.estimator, 'mean_variances', lambda size: (size * 1e-12,) * 4)
         assert estimation.zero_noise(20) == pytest.approx((noise,) * 4, rel=1e-9, abs=0.0)
-
-
-def test_the_translation_by_one_detector_is_as_unsure_as_its_reading(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At rest the arm of PSD 2 lies along X: its own variance is all of dX."""
-    volts = at_rest(1)
-    volts[:, :3] = 0.0
-    pipeline = Pipeline(load_rig(overrides={'degraded': 'zero'}))
-    monkeypatch.setattr(pipeline.stamped, 'mean_variances', lambda size: (0.0, 0.0, size * 1e-12, 0.0))
-    (found,) = (r for r in pipeline.process(chunk(volts)) if isinstance(r, DeflectionEstimate) and r.primary)
-    assert found.covariance[0] == pytest.approx(20e-12, rel=1e-9, abs=0.0)
 
 
 def test_fewer_samples_make_the_mean_less_sure() -> None:
@@ -218,23 +206,3 @@ def test_a_method_without_a_covariance_has_none() -> None:
     assert list(found) == ['exact', 'iterative_printed', 'wls']
     assert np.isnan(found['iterative_printed'].covariance).all()
     assert not np.isnan(found['wls'].covariance).any()
-
-
-def test_a_solver_that_fails_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    estimation = Estimation(load_rig(overrides={'solver': 'wls'}), ())
-    failed = SimpleNamespace(status=SolverStatus.NOT_CONVERGED)
-    monkeypatch.setattr(type(estimation.primary), 'solve', lambda *_: failed)
-    assert estimation._solve(0, BlockReadings((0.0,) * 4, (1e-12,) * 4)) == (None, 'wls: not converged')
-
-
-def test_readings_that_the_primary_solver_cannot_solve_do_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    estimation = Estimation(load_rig(), ())
-    asked: list[int] = []
-
-    def fails(number: int, readings: BlockReadings) -> tuple[None, str]:
-        asked.append(number)
-        return None, 'not converged'
-
-    monkeypatch.setattr(estimation, '_solve', fails)
-    assert not estimation._agree(BlockReadings((0.0,) * 4, (1e-12,) * 4))
-    assert asked == [0]

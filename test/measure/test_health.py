@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.estimation import HELD
-from psd_deflection.measure.health import FROZEN, LOUD
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers.one_psd import OnePsd
-from psd_deflection.records import BlockStatus, Counts, DeflectionEstimate, ParameterChange, Record, SpotMeans, TipLoad
+from psd_deflection.records import BlockStatus, Counts, DeflectionEstimate, Record, SpotMeans, TipLoad
 from psd_deflection.rig.config import Rig, load_rig
 from test.measure.test_pipeline import STEP, chunk_of, still
 
@@ -57,25 +55,6 @@ def test_the_translation_of_one_psd_is_exact_where_the_twist_is(psd: int) -> Non
     got = OnePsd(Geometry.from_rig(rig)).solve(psd - 1, dot, (1e-12, 1e-12), theta, 1e-6)
     assert got[0] == pytest.approx(dx, abs=1e-15)
     assert got[1] == pytest.approx(dy, abs=1e-15)
-
-
-@pytest.mark.parametrize('psd', [1, 2])
-def test_its_covariance_is_what_a_draw_shows(psd: int) -> None:
-    rig = load_rig()
-    solver = OnePsd(Geometry.from_rig(rig))
-    rng = np.random.default_rng(1)
-    variances, sd = (4e-12, 1e-12), 2e-3
-    answers = []
-    for _ in range(20_000):
-        dot = (1e-3 + rng.normal(0, 2e-6), -5e-4 + rng.normal(0, 1e-6))
-        theta = 0.004 + rng.normal(0, sd)
-        dx, dy, _ = solver.solve(psd - 1, dot, variances, theta, sd**2)
-        answers.append((dx, dy, theta))
-    _, _, stated = solver.solve(psd - 1, (1e-3, -5e-4), variances, 0.004, sd**2)
-    seen = np.cov(np.array(answers).T)
-    sds = np.sqrt(np.diag(seen))
-    np.testing.assert_allclose(np.sqrt(np.diag(np.reshape(stated, (3, 3)))), sds, rtol=0.03)
-    np.testing.assert_allclose(np.reshape(stated, (3, 3)) / np.outer(sds, sds), seen / np.outer(sds, sds), atol=0.03)
 
 
 def test_off_is_the_default_and_nothing_is_estimated() -> None:
@@ -122,26 +101,6 @@ def test_with_one_laser_lost_the_translation_goes_on_by_the_rule_and_returns(psd
     assert pipeline.zero() is None
 
 
-def test_a_held_twist_is_forgotten_at_the_stated_rate() -> None:
-    rig = load_rig(overrides={'degraded': 'hold', 'twist_hold': 0.2, 'twist_sd': 0.02})
-    found = primaries(records_of(Pipeline(rig), dark(moving(60), 1, slice(10, 60))))
-    for block in (10, 20, 59):
-        age = 0.02 * (block - 9)
-        expected = found[9].covariance[8] + 0.02**2 * (1 - np.exp(-age / 0.2))
-        assert found[block].covariance[8] == pytest.approx(expected, rel=1e-9)
-
-
-def test_there_is_no_twist_to_hold_before_the_first() -> None:
-    found = primaries(records_of(Pipeline(load_rig(overrides={'degraded': 'hold'})), dark(moving(6), 1, slice(0, 3))))
-    assert sorted(found) == [3, 4, 5]
-
-
-def test_both_lost_is_no_estimate_by_any_rule() -> None:
-    counts = dark(dark(moving(6), 1, slice(2, 4)), 2, slice(2, 4))
-    found = primaries(records_of(Pipeline(load_rig(overrides={'degraded': 'zero'})), counts))
-    assert sorted(found) == [0, 1, 4, 5]
-
-
 def test_what_is_saturated_is_said_with_the_parameter_of_the_range() -> None:
     counts = moving(1)
     counts[3, 2] = 32767
@@ -149,62 +108,7 @@ def test_what_is_saturated_is_said_with_the_parameter_of_the_range() -> None:
     assert spot.reason == 'sum1 saturated: 10.000 V, converter.full_scale is 10 V'
 
 
-def test_a_saturated_or_strayed_detector_leaves_the_other_too() -> None:
-    rig = load_rig(overrides={'degraded': 'zero'})
-    counts = moving(3)
-    counts[SIZE : 2 * SIZE, 3] = 32767
-    records = records_of(Pipeline(rig), counts)
-    assert [s.status for s in spots(records)] == [BlockStatus.OK, BlockStatus.SATURATED, BlockStatus.OK]
-    assert primaries(records)[1].solver == 'one_psd'
-
-
 # ---- memory and replay
-
-
-def replayed(pipeline: Pipeline, counts: Counts, first: int, change: ParameterChange | None) -> list[Record]:
-    if change is not None:
-        pipeline.apply(change)
-    return records_of(pipeline, counts, first)
-
-
-@pytest.mark.parametrize('start', [5, 12, 18])
-def test_a_recording_that_begins_in_an_outage_replays_bit_for_bit(start: int) -> None:
-    rig = load_rig(overrides={'degraded': 'hold'})
-    counts = dark(moving(30), 2, slice(10, 20))
-    counts[14 * SIZE : 24 * SIZE, 0:3] = counts[14 * SIZE, 0:3]
-    live = Pipeline(rig)
-    records_of(live, counts[: start * SIZE])
-    memory = live.memory(live.rig)
-    assert memory is not None
-    assert memory.block == start
-    after = records_of(live, counts[start * SIZE :], start * SIZE)
-    again = replayed(Pipeline(rig), counts[start * SIZE :], start * SIZE, memory)
-    assert primaries(again) == primaries(after)
-    assert [(s.status, s.reason, s.findings) for s in spots(again)] == [
-        (s.status, s.reason, s.findings) for s in spots(after)
-    ]
-    # Without what was remembered it could not have.
-    if 10 < start < 14:
-        assert primaries(replayed(Pipeline(rig), counts[start * SIZE :], start * SIZE, None)) != primaries(after)
-
-
-def test_what_is_remembered_says_only_what_matters() -> None:
-    pipeline = Pipeline(load_rig())
-    records_of(pipeline, moving(5))
-    memory = pipeline.memory(pipeline.rig)
-    assert memory is not None
-    before = dict(memory.values)
-    assert not {HELD, FROZEN} & set(before)
-    pipeline.change({'degraded': 'hold'})
-    memory = pipeline.memory(pipeline.rig)
-    assert memory is not None
-    assert set(dict(memory.values)) - set(before) == {HELD}
-    frozen = moving(5)
-    frozen[:, 3:6] = frozen[0, 3:6]
-    records_of(pipeline, frozen, 5 * SIZE)
-    memory = pipeline.memory(pipeline.rig)
-    assert memory is not None
-    assert dict(memory.values)[FROZEN] == (0, 5)
 
 
 # ---- findings
@@ -222,51 +126,10 @@ def test_a_detector_that_stands_still_is_reported_and_refused_where_it_shall_be(
     assert 'psd_1 stands still: no bit has moved for 5 blocks' in [s.reason for s in spots(records)]
 
 
-def test_without_noise_by_the_rig_file_standing_still_is_no_fault() -> None:
-    counts = moving(10)
-    counts[:] = counts[0]
-    records = records_of(Pipeline(load_rig(overrides={'amplifier.noise': 1e-5})), counts)
-    assert all(s.status is BlockStatus.OK for s in spots(records))
-
-
 def findings_of(rig: Rig, counts: Counts) -> tuple[SpotMeans, DeflectionEstimate | None]:
     records = records_of(Pipeline(rig), counts)
     (spot,) = spots(records)
     return spot, primaries(records).get(0)
-
-
-def test_noise_is_told_and_motion_is_not_taken_for_it() -> None:
-    counts = moving(1)
-    rng = np.random.default_rng(2)
-    noisy = counts.copy()
-    noisy[:, 3] += np.rint(rng.normal(0, 0.05 / STEP, SIZE)).astype(np.int16)
-    spot, estimate = findings_of(load_rig(), noisy)
-    assert len(spot.findings) == 1
-    assert spot.findings[0].startswith('psd_2 is noisy')
-    assert estimate is not None
-    swinging = counts.copy()
-    swing = 1e-3 / 5e-4 * np.sin(2 * np.pi * 14.0 * np.arange(SIZE) * 1e-3)
-    swinging[:, 0] += np.rint(swing / STEP).astype(np.int16)
-    assert findings_of(load_rig(), swinging)[0].findings == ()
-
-
-@pytest.mark.parametrize(('times', 'least', 'most'), [(3.0, 0, 3), (7.0, 42, 50)])
-def test_noise_is_told_from_five_times_the_rig_files_on(times: float, least: int, most: int) -> None:
-    rng = np.random.default_rng(3)
-    told = 0
-    for _ in range(50):
-        counts = moving(1)
-        counts[:, 0] = np.rint(rng.normal(0.0, times * 2e-3 / STEP, SIZE)).astype(np.int16)
-        told += bool(findings_of(load_rig(), counts)[0].findings)
-    assert least <= told <= most
-
-
-def test_noise_is_held_against_the_readings_own() -> None:
-    counts = moving(1)
-    counts[:, 3] += np.rint(np.random.default_rng(2).normal(0, 0.05 / STEP, SIZE)).astype(np.int16)
-    assert findings_of(load_rig(overrides={'psd_2.noise': [0.05, 0.0]}), counts)[0].findings == ()
-    (finding,) = findings_of(load_rig(overrides={'psd_2.noise': [0.0, 0.05]}), counts)[0].findings
-    assert finding.startswith('psd_2 is noisy')
 
 
 def noisy_blocks(blocks: int, volts: float) -> Counts:
@@ -297,31 +160,6 @@ def test_a_burst_of_noise_is_not_named_after_what_came_before() -> None:
     counts[50 * SIZE :, 3] = np.rint(4.0 * counts[50 * SIZE :, 3]).astype(np.int16)
     levels = levels_of(Pipeline(load_rig()), counts)
     assert levels[-1] == pytest.approx(80.0, rel=0.25)
-
-
-def test_a_pipeline_goes_on_with_the_noise_of_another() -> None:
-    counts = noisy_blocks(40, 0.02)
-    live, replay = Pipeline(load_rig()), Pipeline(load_rig())
-    levels_of(live, counts[: 20 * SIZE])
-    memory = live.memory(live.rig)
-    assert memory is not None
-    assert dict(memory.values)[LOUD][:2] == (2.0, 20.0)  # type: ignore[index]
-    replay.apply(memory)
-    later = counts[20 * SIZE :]
-    assert levels_of(replay, later, 20 * SIZE) == levels_of(live, later, 20 * SIZE)
-
-
-def test_a_spot_at_the_edge_is_told() -> None:
-    counts = moving(1)
-    counts[:, 4] += np.int16(round(4.6e-3 / 5e-4 / STEP))
-    spot, estimate = findings_of(load_rig(), counts)
-    assert spot.findings == ('psd_2: the spot is clipped at the edge',)
-    assert spot.status is BlockStatus.OK
-    assert estimate is not None
-    # Also if the other detector has failed.
-    spot, _ = findings_of(load_rig(), dark(counts, 1, slice(0, 1)))
-    assert spot.status is BlockStatus.LASER_LOST
-    assert spot.findings == ('psd_2: the spot is clipped at the edge',)
 
 
 def test_other_light_is_told_and_widens_the_covariance() -> None:
@@ -388,10 +226,6 @@ def test_outside_the_calibrated_range_the_block_says_so() -> None:
         assert len(said) == 10
         assert all(f.startswith(f'outside the calibrated range: {name} {shown:.1g}') for f in said)
         assert pipeline.counters.findings == {'outside the calibrated range': 10}
-
-
-def test_of_a_rig_that_tells_no_range_nothing_is_said() -> None:
-    assert not [f for s in spots(records_of(Pipeline(load_rig()), moving(5))) for f in s.findings]
 
 
 @pytest.mark.parametrize('given', [[1.0], [0.0, 0.0], [0.0, 0.0, 1.0, 1.0, 1.0, 0.5]])

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -16,7 +15,6 @@ import pytest
 
 from msg_adapters import DEFLECTION, DEFLECTION_WITH_COVARIANCE, SAMPLES, WRENCH, to_messages
 from psd_deflection.cli.main import main
-from psd_deflection.measure.health import FROZEN
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.model.simulation.loads import direct, sidebar
@@ -114,21 +112,6 @@ def test_iterative_agrees_with_exact_and_wls_shows_its_small_angle_error(rig: Ri
     assert np.rad2deg(error[2]) * 1e3 == pytest.approx(-0.05077, abs=0.05)
 
 
-def test_the_records_do_not_depend_on_how_the_samples_were_chunked(rig: Rig) -> None:
-    counts = RigSimulator(rig, 1).step(np.tile(sidebar(30.0), (400, 1))).counts
-    whole = Pipeline(rig)
-    expected = run(whole.process, chunk_of(counts)) + run(whole.flush)
-    cuts = [0, 1, 7, 20, 59, 60, 61, 250, 400]
-    pieces = Pipeline(rig)
-    got: list[Record] = []
-    for a, b in itertools.pairwise(cuts):
-        got += run(pieces.process, chunk_of(counts[a:b], a))
-    got += run(pieces.flush)
-    assert [r for r in got if isinstance(r, DeflectionEstimate | TipLoad)] == [
-        r for r in expected if isinstance(r, DeflectionEstimate | TipLoad)
-    ]
-
-
 def spots_of(records: list[Record]) -> SpotMeans:
     (spots,) = (r for r in records if isinstance(r, SpotMeans))
     return spots
@@ -164,27 +147,6 @@ def test_the_device_flag_over_range_is_believed(rig: Rig) -> None:
     chunk = chunk_of(still(REST, 20, 0))
     chunk.flags[3] = 1
     assert spots_of(run(Pipeline(rig).process, chunk)).status is BlockStatus.SATURATED
-
-
-@pytest.mark.parametrize(('present', 'status'), [(9, BlockStatus.TOO_FEW_SAMPLES), (10, BlockStatus.OK)])
-def test_too_few_samples_are_no_block(rig: Rig, present: int, status: BlockStatus) -> None:
-    pipeline = Pipeline(rig)
-    assert run(pipeline.process, chunk_of(still(REST, present, 0))) == []
-    spots = spots_of(run(pipeline.flush))
-    assert spots.status is status
-    assert (spots.present, spots.lost) == (present, 20 - present)
-
-
-def test_fewer_samples_make_a_wider_covariance(rig: Rig) -> None:
-    pipeline = Pipeline(rig)
-    run(pipeline.process, chunk_of(still(REST, 10, 0)))
-    (half,) = (r for r in run(pipeline.flush) if isinstance(r, DeflectionEstimate) and r.primary)
-    (full,) = (
-        r
-        for r in run(Pipeline(rig).process, chunk_of(still(REST, 20, 0)))
-        if isinstance(r, DeflectionEstimate) and r.primary
-    )
-    np.testing.assert_allclose(np.array(half.covariance), 2.0 * np.array(full.covariance), rtol=0.03, atol=1e-18)
 
 
 def test_zero_takes_the_present_dots_and_applies_from_the_next_block_on(rig: Rig) -> None:
@@ -324,16 +286,6 @@ def test_a_zero_is_refused_while_the_link_moves(rig: Rig) -> None:
     assert pipeline.zero() is not None
 
 
-def test_what_the_readings_contradict_is_half_a_length_over_the_root_of_two(rig: Rig) -> None:
-    """A dot that is off along the base line by e leaves e/2 in each dot, so e/(2 sqrt 2) rms of four readings."""
-    along = np.array([0.1, 0.07]) / np.hypot(0.1, 0.07)
-    dots = np.tile(np.concatenate((20e-6 * along, [0.0, 0.0])), (20, 1))
-    (best,) = (
-        r for r in run(Pipeline(rig).process, exact_chunk(dots)) if isinstance(r, DeflectionEstimate) and r.primary
-    )
-    assert best.residual_rms == pytest.approx(20e-6 / 8.0**0.5, rel=1e-3)
-
-
 def test_before_the_first_block_a_change_is_of_block_0_at_time_0(rig: Rig) -> None:
     assert Pipeline(rig).change({'psd_1.zero': (1e-5, 0.0)}) == ParameterChange(0, 0, (('psd_1.zero', (1e-5, 0.0)),))
     drifts = load_rig(overrides={'effects.a.name': 'thermal_drift', 'effects.a.psd': 1, 'effects.a.x': 1e-6})
@@ -363,22 +315,6 @@ def test_counters_count(rig: Rig) -> None:
     counters = pipeline.counters
     assert (counters.samples, counters.blocks, counters.estimates, counters.degraded) == (110, 6, 3, 0)
     assert counters.refused == {'laser_lost': 2, 'saturated': 1}
-
-
-@pytest.mark.parametrize('psd', [1, 2])
-def test_the_light_of_a_room_is_taken_off_by_the_sum_of_its_own_psd(psd: int) -> None:
-    """0.5 V at (2, -1) mm beside 4.5 V of a laser at the centre; the other PSD has 4 V without such light."""
-    values = {'name': 'ambient_light', 'psd': psd, 'level': 0.5, 'x': 2e-3, 'y': -1e-3}
-    dots = np.zeros((40, 4))
-    dots[:, 2 * psd - 2 : 2 * psd] = 0.5 / 5.0 * np.array([2e-3, -1e-3])
-    chunk = exact_chunk(dots)
-    chunk.readings[:, 8 - 3 * psd] = 4.0
-    records = run(Pipeline(load_rig(overrides={f'effects.a.{k}': v for k, v in values.items()})).process, chunk)
-    np.testing.assert_allclose(estimates(records, 'exact'), np.zeros((2, 3)), atol=1e-9)
-    for spots in records:
-        if isinstance(spots, SpotMeans):
-            np.testing.assert_allclose(spots.dots, np.zeros(4), atol=1e-10)
-            assert spots.sums == ((5.0, 4.0) if psd == 1 else (4.0, 5.0))
 
 
 def test_the_stamp_goes_by_the_rate_of_the_rig_file() -> None:
@@ -424,18 +360,8 @@ def test_an_acceleration_is_there_after_the_last_block(rig: Rig) -> None:
     # The last sample of the last whole block came at 39 ms.
     assert pipeline.accelerate(base) == 39_000_001
     # A replay says when it was there.
-    assert pipeline.accelerate(base._replace(t_ns=6), 12_345) == 12_345
+    assert pipeline.accelerate(BaseAcceleration(6, base.linear, base.angular), 12_345) == 12_345
     assert Pipeline(pipeline.rig).accelerate(base, 12_345) == 12_345
-
-
-def test_detectors_that_stand_still_from_the_first_block_on_are_told_with_the_fifth(rig: Rig) -> None:
-    for blocks, told in ((4, {}), (5, {'psd_1 stands still': 1, 'psd_2 stands still': 1})):
-        pipeline = Pipeline(rig)
-        run(pipeline.process, exact_chunk(np.zeros((20 * blocks, 4))))
-        assert pipeline.counters.findings == told
-        memory = pipeline.memory(rig)
-        assert memory is not None
-        assert dict(memory.values)[FROZEN] == (blocks, blocks)
 
 
 def test_what_drifts_is_taken_off_by_time_and_temperature_as_far_as_they_are_known() -> None:

@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from psd_deflection.measure.memory import misfit
 from psd_deflection.measure.motion.modal import Oscillator
+from psd_deflection.measure.state import mismatch
 from psd_deflection.records import AppliedLoad, FloatArray
 
 DOUBT = 0.05
@@ -84,15 +84,15 @@ class KnownLoads:
                 end[a] += pushed[-1]
         return Pushed(samples, end, variance)
 
-    def memory(self) -> tuple[tuple[float, ...], list[float]]:
+    def state(self) -> tuple[tuple[float, ...], list[float]]:
         """The load that acts, with whether there is one, four numbers; and those that wait, five numbers each."""
         held = (1.0, *self.held.tolist()) if self.held is not None else (0.0,) * 4
         return held, [v for load in self._waiting for v in (*split_ns(load.t_ns), *load[1:])]
 
-    def restore(self, name: str, values: tuple[float, ...]) -> None:
-        """Go on from another one's :meth:`memory`. Raises ValueError, which names ``name``, for a wrong length."""
+    def load_state(self, name: str, values: tuple[float, ...]) -> None:
+        """Go on from another one's :meth:`state_dict`. Raises ValueError, which names ``name``, for a wrong length."""
         if len(values) < 4 or (len(values) - 4) % 5:
-            raise misfit(name, values, 'four numbers and five for each load that waits')
+            raise mismatch(name, values, 'four numbers and five for each load that waits')
         self.held = np.array(values[1:4]) if values[0] else None
         waiting = np.reshape(values[4:], (-1, 5)).tolist()
         self._waiting = [AppliedLoad(joined_ns(s, ns), fx, fy, tz) for s, ns, fx, fy, tz in waiting]

@@ -23,12 +23,12 @@ import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.measure.memory import Memory, Value, misfit, numbers
 from psd_deflection.measure.motion.inertia import Forced, Inertia
 from psd_deflection.measure.motion.innovations import Innovations
 from psd_deflection.measure.motion.known import KnownLoads, Pushed, joined_ns, split_ns
 from psd_deflection.measure.motion.modal import BlockTables, Oscillator
 from psd_deflection.measure.motion.unseen import UnseenLoads
+from psd_deflection.measure.state import State, Value, mismatch, numbers
 from psd_deflection.measure.uncertainty.block_fit import LARGEST, inverse
 from psd_deflection.records import AppliedLoad, FloatArray, IntArray
 from psd_deflection.rig.config import Rig
@@ -99,7 +99,7 @@ class ModalFilter:
     """
 
     part = 'the filter of the motion'
-    remembers = (STATE, INERTIA, UNSEEN, LOADS)
+    prefixes = (STATE, INERTIA, UNSEEN, LOADS)
 
     def __init__(self, rig: Rig, compliance: tuple[float, float, float], gain: FloatArray, noise: FloatArray) -> None:
         """``compliance``: m/N, m/N, rad/(N m). ``gain`` (3, C): of the solver at rest. ``noise``: :meth:`set_noise`."""
@@ -193,15 +193,7 @@ class ModalFilter:
         """
         seconds = self._size * self._period
         if self._index is not None:
-            missed = index - self._index - 1
-            away = (t_ns - self._t_ns) / 1e9
-            # After a restart numbers and times do not agree.
-            if missed < 0 or away > self._longest + 2.0 * seconds or abs(away - (missed + 1) * seconds) > 0.5 * seconds:
-                self.forget()
-            if self._index is not None:
-                self._take_late()
-                for k in range(missed):
-                    self._coast(seconds, self._forced(self._t_ns + round(1e9 * (k + 1) * seconds)))
+            self._pass_missed(index - self._index - 1, (t_ns - self._t_ns) / 1e9, seconds)
         self.inertia.forget_before(self._before_ns(t_ns))
         if self._index is None and slots is None:
             return None
@@ -218,6 +210,16 @@ class ModalFilter:
         else:
             self._update(slots, poses, pushed, forced)
         return self._moved()
+
+    def _pass_missed(self, missed: int, away: float, seconds: float) -> None:
+        """Coast through ``missed`` blocks of ``seconds``; begin anew if the next one, ``away`` s, is too far."""
+        # After a restart numbers and times do not agree.
+        if missed < 0 or away > self._longest + 2.0 * seconds or abs(away - (missed + 1) * seconds) > 0.5 * seconds:
+            self.forget()
+            return
+        self._take_late()
+        for k in range(missed):
+            self._coast(seconds, self._forced(self._t_ns + round(1e9 * (k + 1) * seconds)))
 
     def _coast(self, seconds: float, forced: Forced | None) -> None:
         if self.coasted == 0.0:
@@ -397,10 +399,10 @@ class ModalFilter:
         """How far the load wanders in a second by what was seen last, by its steps alone: N, N, N m."""
         return tuple((np.sqrt(self._rate()[:, 0]) / self._compliance).tolist())
 
-    def memory(self) -> Memory:
+    def state_dict(self) -> State:
         """What the next block depends on, besides the noise; {} if nothing is known."""
-        out: Memory = {}
-        held, waiting = self._known.memory()
+        out: State = {}
+        held, waiting = self._known.state()
         if self._index is not None:
             times = (float(self._index), *split_ns(self._t_ns), self.coasted)
             arrays = [self._x, self._p, self._shared, self._weights]
@@ -418,16 +420,16 @@ class ModalFilter:
             out[INERTIA] = (float(len(told)), *told, *_flat(arrays))
         return out
 
-    def restore(self, values: Mapping[str, Value]) -> None:
-        """Go on from another one's :meth:`memory`. Raises ValueError if it had another number of rates or samples."""
+    def load_state_dict(self, values: Mapping[str, Value]) -> None:
+        """Go on from a :meth:`state_dict`. Raises ValueError if it had another number of rates or samples."""
         if state := numbers(values, STATE, 'the state of the filter'):
             self._restore_state(state)
         if unseen := numbers(values, UNSEEN, 'states of the last blocks'):
             if self._unseen is None or not self._unseen.gather(unseen[12:]):
-                raise misfit(UNSEEN, unseen, 'states of as many blocks as the filter coasts')
+                raise mismatch(UNSEEN, unseen, 'states of as many blocks as the filter coasts')
             self._swung = np.reshape(unseen[:12], (3, 4))
         if loads := numbers(values, LOADS, 'known loads'):
-            self._known.restore(LOADS, loads)
+            self._known.load_state(LOADS, loads)
         if inertia := numbers(values, INERTIA, 'accelerations of the base'):
             self._restore_inertia(inertia)
 
@@ -435,7 +437,7 @@ class ModalFilter:
         known = 8 + 12 + 48 + 48 + 3 * self.levels
         end = known + (self._unseen.variances.size if self._unseen is not None else 0)
         if len(values) < end or (len(values) - end) % 5:
-            raise misfit(
+            raise mismatch(
                 STATE, values, f'the state of a filter with {self.levels} rates, {end} numbers and five a load'
             )
         self._index = int(values[0])
@@ -447,14 +449,14 @@ class ModalFilter:
         self._begin_unseen()
         if self._unseen is not None:
             self._unseen.variances[:] = np.reshape(values[known:end], self._unseen.variances.shape)
-        self._known.restore(STATE, (*values[4:8], *values[end:]))
+        self._known.load_state(STATE, (*values[4:8], *values[end:]))
 
     def _restore_inertia(self, values: tuple[float, ...]) -> None:
         n = self._size
         told = int(values[0]) + 1 if 0.0 <= values[0] < len(values) and np.isfinite(values).all() else 0
         known, taken = values[told:], 6 * n + 3 + 12 * n
         if told % 5 != 1 or len(known) not in (6, 6 + taken):
-            raise misfit(INERTIA, values, f'accelerations in blocks of {n} samples')
+            raise mismatch(INERTIA, values, f'accelerations in blocks of {n} samples')
         rows = np.reshape(values[1:told], (-1, 5)).tolist()
         self.inertia.told = [(joined_ns(s, ns), tuple(deflection)) for s, ns, *deflection in rows]
         # Perhaps some came after the last block.

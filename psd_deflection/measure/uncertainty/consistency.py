@@ -1,196 +1,311 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The one reading too many: whether the four readings belong to one flat plate, and which one does not.
+"""Whether the readings of a block belong to one pose of the plate, and which PSD's do not.
 
-Two PSDs give four readings for three unknowns. What is left is one number a block: how much longer
-the base line between the dots is than that between the beams, r = a^T e for errors e of the readings,
-with a = (n, -n)/sqrt(2) and n along the base line. Over its variance a^T C a it is a chi-square of one
-degree of freedom. A sound rig is beyond ``LIMIT`` in one block of 10^6; a dead, stuck, swapped or
-inverted reading, a PSD that is turned or scaled, and a plate that tilts are beyond it as soon as they
-cost more than a few standard deviations.
+N PSDs give 2N readings for p unknowns (3 of a flat plate). With the residual r of the readings, their covariance C and
+their slopes J by the unknowns, what no pose explains has
 
-If one reading i alone is wrong, it is wrong by e_i = r/a_i. Which one, a single block cannot tell; so
-``widen`` adds the errors that each of them would cause, sum_i (K_i e_i)(K_i e_i)^T with the solver's
-gain K and half as much again, and the truth stays inside. While the link rings, two wrong readings may
-cancel in r for a block; so r is held and forgotten over a second. An r that lasts is widened for at a
-smaller size than one of a single block. Over many blocks and poses the wrong one can often be told:
-the true reading of i is m_i - r/a_i if the others are right, and what i says of it must then follow
-one law: nothing (dead or stuck), or the opposite (inverted). If two readings would do, none is named.
+    chi-square = r^T Q r,     Q = W - W J (J^T W J)^-1 J^T W,     W = C^-1,
+
+of 2N - p degrees of freedom (generalised least squares; Q J = 0, so r may come from any solver). If PSD i alone is
+wrong, its error is e_i = Q_ii^-1 (Q r)_i (Baarda's data snooping, by pairs); with one or two degrees of freedom, which
+tell no PSD from another, each reading has its own e_i.
+
+The one redundant reading of two PSDs on a flat plate is known without linearising: r = a^T e, by how much the base
+line between the dots is longer than that between the beams, with a = (n, -n)/sqrt(2) and n along it.
+
+A PSD is excluded if the readings are inconsistent with it and consistent without it, and no other PSD could be
+blamed; for a second, because its readings may be right for a block while the link rings. If several could be blamed,
+or none alone, the covariance is widened by sum_i (K e_i)(K e_i)^T with the solver's gain K and half as much again, so
+that the truth stays inside; the errors are held and fade over a second. A residual that lasts is widened for at a
+smaller size than that of a single block.
 """
 
 from __future__ import annotations
 
+import abc
+import math
+from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.measure.uncertainty.block_fit import inverse
 from psd_deflection.records import FloatArray
 
-LIMIT = 25.0
-"""Chi-square beyond which the readings contradict each other: one sound block in 1.7 million (Gaussian noise), with the
-second that it holds for: one block in 35 000."""
+CONTRADICTS, DOUBTFUL = 5.7330e-7, 0.01
+"""Shares of consistent blocks that are taken for inconsistent (one in 1.7 million), and for doubtful."""
 
-NAMES = ('x1', 'y1', 'x2', 'y2')
+ONE_DEGREE = (25.0, 6.635)
+"""Chi-squares of those shares with one degree of freedom: SciPy's take a fifth of a second to import."""
 
 UNMEASURED = 16.0
-"""Times ``LIMIT`` while the noise is not measured yet: it may be four times what the rig file says."""
-
-WIDEN = 6.635
-"""Chi-square from which one block is widened: 1 % of sound blocks, by less than their own errors."""
+"""Factor on the limits while the noise is not measured yet: it may be four times what the rig file says."""
 
 LASTING = 2.5
-"""The same for the mean r of the last blocks, over the variance of one block. Hum of constant phase, which is in that
-variance, has at most 2."""
+"""Chi-square, by the covariance of one block, of a mean residual that lasts. Hum of constant phase has at most 2."""
 
 SLOWLY = 1.0 / 8.0
-"""Share of the newest block in that mean."""
+"""Weight of the newest block in that mean."""
 
-_MORE = 1.5
-"""Times the error of one reading alone: the errors of two exchanged readings cancel in part in r."""
+HOLD = 50
+"""Blocks for which a PSD stays excluded after its last inconsistent block: a second at 50 blocks a second."""
+
+_WIDEN = 1.5
+"""Factor on the error of one reading alone: errors of two readings cancel in part in the residual."""
 
 _FADE = 0.98
-"""What is left of a held r^2 after a block."""
+"""Factor a block on held squares."""
 
-_UNSEEN = 0.02
-"""A reading with a smaller part in the base line cannot be checked by it."""
+_UNSEEN = 4e-4
+"""A reading with a smaller share of what is redundant cannot be checked."""
 
-_NONE = (0.0, 0.0, 0.0, 0.0)
-
-_FORGET = 1.0 / 500.0
-_ENOUGH = 10
-"""Blocks before a reading is named."""
-
-_NEAR = 0.02
-"""How near to -1 the slope of an inverted reading on what it should be must be."""
+_UNSEEN_PART = 0.02
+"""The same for a component of a: a^2 of 4e-4."""
 
 
-class ConsistencyCheck(NamedTuple):
-    """One block's answer.
+class ConsistencyResult(NamedTuple):
+    """The check of one block.
 
-    ``chi_square`` of this block. ``contradict``: this block or one shortly before is beyond ``LIMIT``.
-    ``errors`` (4,): of each reading if it alone is wrong, m. ``possible`` (4,): what the covariance is to
-    allow for, m: the same from ``WIDEN`` on, or with the r that is held or lasts. Of more than two PSDs ``errors`` and
-    ``possible`` are (2P,), ``freedom`` counts the redundant readings, and ``wrong`` is the PSD (from 1) to leave out,
-    0: none.
+    ``chi_square`` of this block, of ``freedom`` degrees. ``contradict``: this block, or one shortly before, is
+    inconsistent. ``errors`` (2N,) m: of each reading if its PSD alone is wrong. ``possible`` (2N,) m: the errors that
+    the covariance is to allow for. ``excluded``: the PSD to exclude, from 1 among those that are checked; 0: none.
     """
 
     chi_square: float
     contradict: bool
     errors: tuple[float, ...]
     possible: tuple[float, ...]
-    wrong: int = 0
+    excluded: int = 0
     freedom: int = 1
 
 
-class Consistency:
-    """Holds the readings of each block against each other; it remembers the r of the last second.
+class Unexplained(abc.ABC):
+    """What no pose explains of the readings of one block.
 
-    ``held``: r^2 of a contradiction, m^2, or 0. ``mean``: of r over the last blocks, m. ``lasting``: r^2 of one that
-    lasts, m^2, or 0.
+    ``value`` (k,) m and its ``chi_square``. ``information`` (k,) 1/m^2: chi-square of each error over its square.
     """
 
-    def __init__(self, by: Arithmetic = FIXED) -> None:
-        self._by = by
-        self.held = 0.0
-        self.mean = 0.0
-        self.lasting = 0.0
+    value: list[float]
+    chi_square: float
+    information: list[float]
 
-    def check(
-        self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray, *, limit: float = LIMIT
-    ) -> ConsistencyCheck:
-        """Check one block.
+    @abc.abstractmethod
+    def chi_square_of(self, value: list[float]) -> float:
+        """Return the chi-square of another ``value``, such as a mean over blocks."""
 
-        ``apart``: centre of PSD 1 and its dot less those of PSD 2, m. ``residual`` (4,): what the solver leaves of
-        the dots, m. ``covariance`` (4, 4) of the dots, m^2. ``limit``: chi-square beyond which they contradict.
-        """
+    @abc.abstractmethod
+    def errors_of(self, value: list[float]) -> list[float]:
+        """Return the errors (k,), m, that would cause ``value``, each alone."""
+
+    @abc.abstractmethod
+    def of_readings(self, errors: list[float]) -> tuple[float, ...]:
+        """Return ``errors`` (k,) as errors (2N,) of the readings, m."""
+
+
+class BaseLineExcess(Unexplained):
+    """Excess length r of the base line between two dots; k = 1."""
+
+    def __init__(
+        self, apart: tuple[float, float], residual: tuple[float, ...], covariance: FloatArray, by: Arithmetic = FIXED
+    ) -> None:
+        """``apart``: dot of PSD 1 less that of PSD 2, m, not (0, 0). ``residual`` (4,) m, ``covariance`` (4, 4) m^2."""
         x, y = apart
-        size = self._by.root(2.0 * (x * x + y * y))
-        if size == 0.0:
-            return ConsistencyCheck(0.0, False, _NONE, _NONE)
+        size = by.root(2.0 * (x * x + y * y))
         ax, ay = x / size, y / size
         x1, y1, x2, y2 = residual
         r = ax * (x1 - x2) + ay * (y1 - y2)
         u1, v1, u2, v2 = [ax * (c[0] - c[2]) + ay * (c[1] - c[3]) for c in covariance.tolist()]
-        variance = ax * (u1 - u2) + ay * (v1 - v2)
-        chi_square = r * r / variance if variance > 0.0 else 0.0
-        contradict = chi_square > limit
-        held = max(_FADE * self.held, r * r if contradict else 0.0)
-        self.held = held if held > limit * variance else 0.0
-        one_x, one_y = [1.0 / p if abs(p) > _UNSEEN else 0.0 for p in (ax, ay)]
-        self.mean += SLOWLY * (r - self.mean)
-        square = self.mean * self.mean
-        # Chance takes the mean of an r that lasts below the limit for some blocks.
-        lasts = square * LIMIT > LASTING * limit * variance
-        lasting = max(_FADE * self.lasting, square if lasts else 0.0)
-        self.lasting = lasting if lasting > variance else 0.0
-        # The limit's share: below it an error is not sure enough to be held, and may still be many standard deviations.
-        doubtful = chi_square * LIMIT > WIDEN * limit
-        root = _MORE * self._by.root(max(self.held, self.lasting, r * r if doubtful else 0.0))
-        errors = (r * one_x, r * one_y, -r * one_x, -r * one_y)
-        possible = (root * one_x, root * one_y, -root * one_x, -root * one_y)
-        return ConsistencyCheck(chi_square, self.held > 0.0, errors, possible)
+        self._variance = ax * (u1 - u2) + ay * (v1 - v2)
+        self._per_reading = [1.0 / a if abs(a) > _UNSEEN_PART else 0.0 for a in (ax, ay, -ax, -ay)]
+        self.value = [r]
+        self.chi_square = self.chi_square_of(self.value)
+        self.information = [1.0 / self._variance if self._variance > 0.0 else 0.0]
+
+    def chi_square_of(self, value: list[float]) -> float:
+        """See :class:`Unexplained`."""
+        return value[0] * value[0] / self._variance if self._variance > 0.0 else 0.0
+
+    def errors_of(self, value: list[float]) -> list[float]:
+        """See :class:`Unexplained`."""
+        return value
+
+    def of_readings(self, errors: list[float]) -> tuple[float, ...]:
+        """See :class:`Unexplained`."""
+        (r,) = errors
+        return tuple([r * part for part in self._per_reading])
+
+
+class UnexplainedResidual(Unexplained):
+    """Residual of N PSDs; k = 2N."""
+
+    def __init__(
+        self, residual: tuple[float, ...], slopes: FloatArray, covariance: FloatArray, by: Arithmetic = FIXED
+    ) -> None:
+        """``residual`` (2N,) m, ``slopes`` J (2N, p), ``covariance`` (2N, 2N) m^2."""
+        self._by = by
+        weights = inverse(covariance[None])[0]
+        # Each unknown in its own unit, so that the elimination sees numbers of one size.
+        scaled = slopes / np.sqrt(by.sum(slopes * slopes, 0))
+        weighted = by.einsum('ij,jk->ik', weights, scaled)
+        normal = inverse(by.einsum('ji,jk->ik', scaled, weighted)[None])[0]
+        self._q = np.asarray(weights - by.einsum('ia,ab,jb->ij', weighted, normal, weighted))
+        self._freedom = len(residual) - slopes.shape[1]
+        self.value = list(residual)
+        self.chi_square = max(self.chi_square_of(self.value), 0.0)
+        self.information = np.diag(self._q).tolist()
+
+    def _pull(self, value: list[float]) -> FloatArray:
+        return self._by.einsum('ij,j->i', self._q, np.array(value))
+
+    def chi_square_of(self, value: list[float]) -> float:
+        """See :class:`Unexplained`."""
+        return float(self._by.sum(np.array(value) * self._pull(value), 0))
+
+    def errors_of(self, value: list[float]) -> list[float]:
+        """See :class:`Unexplained`."""
+        q, pull = self._q, self._pull(value).tolist()
+        if self._freedom < 3:
+            least = _UNSEEN * float(q.max())
+            return [p / own if own > least else 0.0 for own, p in zip(self.information, pull, strict=True)]
+        errors: list[float] = []
+        for at in range(0, len(pull), 2):
+            (a, b), (_, d) = q[at : at + 2, at : at + 2].tolist()
+            u, v = pull[at : at + 2]
+            determinant = a * d - b * b
+            if determinant > _UNSEEN * a * d:
+                errors += [(d * u - b * v) / determinant, (a * v - b * u) / determinant]
+            else:
+                # It is seen in one direction only.
+                errors += [u / (a + d), v / (a + d)]
+        return errors
+
+    def of_readings(self, errors: list[float]) -> tuple[float, ...]:
+        """See :class:`Unexplained`."""
+        return tuple(errors)
+
+
+class ConsistencyCheck:
+    """Checks block after block; its state is which PSD was excluded lately, and the errors that are held."""
+
+    def __init__(self, psds: int, unknowns: int, size: int, by: Arithmetic = FIXED) -> None:
+        """``psds``: N. ``unknowns``: p; with 2N or more nothing is redundant. ``size``: k of what it is given."""
+        self._by = by
+        self._psds = psds
+        self.freedom = max(2 * psds - unknowns, 0)
+        self.limit, self._doubtful = _limits(self.freedom)
+        self._excluded, self._blocks_left = 0, 0
+        self._held, self._mean, self._lasting = [0.0] * size, [0.0] * size, [0.0] * size
+
+    def agrees(self, found: Unexplained | None, factor: float) -> bool:
+        """Whether the readings are consistent, and there are enough of them to tell; ``factor`` on the limits."""
+        return found is not None and found.chi_square <= factor * self.limit
+
+    def candidates(self, found: Unexplained | None, factor: float) -> tuple[int, ...]:
+        """Return the PSDs (from 1) of which :meth:`update` needs to know whether the others are consistent."""
+        if found is None:
+            return ()
+        if found.chi_square > factor * self.limit:
+            return tuple(range(1, self._psds + 1))
+        return (self._excluded,) if self._excluded and self._blocks_left > 1 else ()
+
+    def update(self, found: Unexplained | None, factor: float, blamed: Collection[int] | None) -> ConsistencyResult:
+        """Check one block; ``factor`` on the limits.
+
+        ``blamed``: those of the :meth:`candidates` without which the readings are consistent; None: no PSD may be
+        excluded. Of all readings together a wrong one is mixed into the others, so they need fits of their own.
+        """
+        if found is None:
+            none = (0.0,) * (2 * self._psds)
+            return ConsistencyResult(0.0, False, none, none, 0, self.freedom)
+        contradict = found.chi_square > factor * self.limit
+        self._exclude(contradict, blamed)
+        errors = found.errors_of(found.value)
+        self._update_lasting(found, factor)
+        hold = contradict and not self._excluded
+        doubtful = hold or found.chi_square > factor * self._doubtful
+        squares = [e * e if doubtful else 0.0 for e in errors]
+        if contradict and blamed:
+            squares = [square * (1 + i // 2 in blamed) for i, square in enumerate(squares)]
+        self._hold(found, squares if hold else [0.0] * len(squares), factor)
+        contradict = contradict or self._excluded > 0 or any(self._held)
+        possible = self._possible(squares)
+        result = found.chi_square, contradict, found.of_readings(errors), found.of_readings(possible)
+        return ConsistencyResult(*result, self._excluded, self.freedom)
+
+    def _possible(self, squares: list[float]) -> list[float]:
+        """Return the errors that the covariance is to allow for: those of this block, held ones, lasting ones."""
+        if self._excluded:
+            return [0.0] * len(squares)
+        # Both readings of a PSD may be wrong together: the sum of two outer products is at least half of theirs.
+        together = 2.0 if self.freedom >= 3 else 1.0
+        largest = map(max, squares, self._held, self._lasting)
+        return [_WIDEN * self._by.root(together * square) for square in largest]
+
+    def _exclude(self, contradict: bool, blamed: Collection[int] | None) -> None:
+        if blamed is None:
+            self._excluded = 0
+        elif contradict:
+            if self._excluded not in blamed:
+                self._excluded = next(iter(blamed)) if len(blamed) == 1 else 0
+            self._blocks_left = HOLD if self._excluded else 0
+        elif self._excluded:
+            self._blocks_left -= 1
+            if self._blocks_left <= 0 or self._excluded not in blamed:
+                self._excluded = 0
+
+    def _update_lasting(self, found: Unexplained, factor: float) -> None:
+        """Update the mean of the last blocks, and hold the errors of a residual that lasts."""
+        self._mean = [mean + SLOWLY * (r - mean) for mean, r in zip(self._mean, found.value, strict=True)]
+        lasts = found.chi_square_of(self._mean) > factor * LASTING
+        squares = [e * e for e in found.errors_of(self._mean)] if lasts else [0.0] * len(self._mean)
+        faded = [max(_FADE * old, new) for old, new in zip(self._lasting, squares, strict=True)]
+        self._lasting = faded if _exceeds(faded, found, 1.0) else [0.0] * len(faded)
+
+    def _hold(self, found: Unexplained, squares: list[float], factor: float) -> None:
+        faded = [max(_FADE * old, new) for old, new in zip(self._held, squares, strict=True)]
+        kept = not self._excluded and _exceeds(faded, found, factor * self.limit)
+        self._held = faded if kept else [0.0] * len(faded)
+
+    def state(self) -> tuple[float, ...]:
+        """Return the state as numbers."""
+        return (float(self._excluded), float(self._blocks_left), *self._held, *self._mean, *self._lasting)
+
+    def load_state(self, values: tuple[float, ...]) -> None:
+        """Go on from :meth:`state`. Raises ValueError if it is that of another number of PSDs."""
+        excluded, blocks_left, *numbers = values
+        size = len(self._held)
+        if len(numbers) != 3 * size or not 0 <= excluded <= self._psds:
+            raise ValueError(f'the check of {self._psds} PSDs has {2 + 3 * size} values, not {len(values)}')
+        self._excluded, self._blocks_left = int(excluded), int(blocks_left)
+        self._held, self._mean, self._lasting = numbers[:size], numbers[size : 2 * size], numbers[2 * size :]
+
+
+def _exceeds(squares: list[float], found: Unexplained, limit: float) -> bool:
+    """Whether the chi-square of one of the squared errors is above ``limit``."""
+    return any(square * i > limit for square, i in zip(squares, found.information, strict=True))
+
+
+def _limits(freedom: int) -> tuple[float, float]:
+    """Return the chi-squares of ``CONTRADICTS`` and ``DOUBTFUL``."""
+    if freedom < 2:
+        return ONE_DEGREE
+    from scipy.special import chdtri
+
+    return float(chdtri(freedom, CONTRADICTS)), float(chdtri(freedom, DOUBTFUL))
+
+
+def survival(chi_square: float, freedom: int) -> float:
+    """Return the probability that a chi-square of ``freedom`` degrees is larger; 1 for none."""
+    if freedom == 1:
+        return math.erfc(math.sqrt(0.5 * chi_square))
+    from scipy.special import chdtrc
+
+    return float(chdtrc(freedom, chi_square)) if freedom else 1.0
 
 
 def widened(covariance: FloatArray, gain: FloatArray, errors: tuple[float, ...], by: Arithmetic = FIXED) -> FloatArray:
-    """``covariance`` (3, 3) and what each of ``errors`` (2P,) alone would cause through ``gain`` (3, 2P)."""
+    """Return ``covariance`` (3, 3) + sum_i (K e_i)(K e_i)^T; ``errors`` e (2N,), ``gain`` K (3, 2N)."""
     caused = gain * np.array(errors)
     return np.asarray(covariance + by.einsum('ik,jk->ij', caused, caused))
-
-
-class Suspect:
-    """Finds the reading that is most likely wrong from the poses that were seen."""
-
-    def __init__(self, centers: FloatArray, beams: FloatArray) -> None:
-        """``centers``, ``beams`` (2, 2), m. Beginning anew forgets what was seen."""
-        self._apart = tuple((centers[0] - centers[1]).tolist())
-        self._base_line = float(np.hypot(*(beams[0] - beams[1])))
-        self._swapped = [0.0, 0.0, 0.0]
-        self._blocks = 0
-        self._weight = 0.0
-        self._sum = np.zeros(8)
-        self._squares = np.zeros((3, 4))
-
-    def add(self, dots: tuple[float, ...], errors: tuple[float, ...]) -> None:
-        """A block's readings (4,) m and :attr:`Checked.errors`."""
-        x1, y1, x2, y2 = dots
-        should = np.array(dots) - errors
-        ax, ay = self._apart
-        for i, (x, y) in enumerate(((x1 - x2, y1 - y2), (y1 - x2, x1 - y2), (x1 - y2, y1 - x2))):
-            r = ((ax + x) ** 2 + (ay + y) ** 2) ** 0.5 - self._base_line
-            self._swapped[i] = (1.0 - _FORGET) * self._swapped[i] + r * r
-        both = np.concatenate((dots, should))
-        if not self._blocks:
-            self._first = both
-        both = both - self._first
-        said, should = both[:4], both[4:]
-        keep = 1.0 - _FORGET
-        self._blocks += 1
-        self._weight = keep * self._weight + 1.0
-        self._sum = keep * self._sum + both
-        self._squares = keep * self._squares + np.stack((said * said, said * should, should * should))
-
-    def most_likely(self, noise: float) -> str:
-        """What is wrong, as 'y2 does not move', or '' if that cannot be told. ``noise``: sd of a reading, m."""
-        if self._blocks < _ENOUGH:
-            return ''
-        for psd in (1, 2):
-            # The length of the base line is right if the axes are exchanged, and far off if not.
-            if self._swapped[psd] < min(0.01 * self._swapped[0], self._weight * (10.0 * noise) ** 2):
-                return f'the axes of psd_{psd} are exchanged'
-        mean = self._sum / self._weight
-        said, should = mean[:4], mean[4:]
-        moments = self._squares / self._weight - np.stack((said * said, said * should, should * should))
-        found = []
-        for c, name in enumerate(NAMES):
-            own, shared, wanted = moments[:, c].tolist()
-            # It must have had reason to move, by far more than noise.
-            if wanted < (100.0 * noise) ** 2:
-                continue
-            slope = shared / wanted
-            off = own - slope * shared
-            if own < (5.0 * noise) ** 2:
-                found.append(f'{name} does not move with the others')
-            elif abs(slope + 1.0) < _NEAR and off < (10.0 * noise) ** 2 + 1e-4 * wanted:
-                found.append(f'{name} has the wrong sign')
-        return found[0] if len(found) == 1 else ''

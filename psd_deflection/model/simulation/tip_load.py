@@ -29,7 +29,7 @@ class TipLoads:
     """
 
     part = 'the load at the tip'
-    remembers = (TIP_LOADS,)
+    prefixes = (TIP_LOADS,)
 
     def __init__(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
         """``effects``: those of the rig file, in the order in which they act; none: the nominal link."""
@@ -85,7 +85,7 @@ class TipLoads:
         """Deflection for a load of 1 N, 1 N, 1 N m at the tip: m/N, m/N, rad/(N m)."""
         return self._statics.deflection(1.0, 1.0, 1.0)
 
-    def memory(self) -> dict[str, float | str | tuple[float, ...]]:
+    def state_dict(self) -> dict[str, float | str | tuple[float, ...]]:
         """What :meth:`restore` needs to go on from here; {} if the next load depends on the pose alone."""
         moved = self.zeroed and any(self._offset)
         if not moved and not any(self._remembered):
@@ -95,8 +95,8 @@ class TipLoads:
             out += [float(len(remembered)), *remembered]
         return {TIP_LOADS: tuple(out)}
 
-    def restore(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:
-        """Go on from another one's :meth:`memory`. Raises ValueError if it had other effects."""
+    def load_state_dict(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:
+        """Go on from another one's :meth:`state_dict`. Raises ValueError if it had other effects."""
         told = values.get(TIP_LOADS, ())
         numbers = told if isinstance(told, tuple) else ()
         taken: list[list[float]] = []

@@ -42,7 +42,7 @@ from msg_adapters.header import header, stamp_ns
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_file
 from psd_deflection.base.sequence import RecordedSequence
-from psd_deflection.measure.memory import WHOLE
+from psd_deflection.measure.state import WHOLE
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.estimates import EstimateSeries
 from psd_deflection.recordings.read.allowance import Warnings

@@ -21,7 +21,7 @@ import numpy as np
 
 from msg_adapters import DIAGNOSTICS, FILTERED, INPUTS, RIG, SAMPLES, pose_stamped, to_messages
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.measure.memory import WHOLE
+from psd_deflection.measure.state import WHOLE
 from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import differences, provenance
 from psd_deflection.recordings.recording import Recording, RecordingWindow

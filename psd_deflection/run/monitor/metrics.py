@@ -59,7 +59,7 @@ def of_pipeline(pipeline: Pipeline) -> list[Family]:
         counter('estimates', 'Blocks that have an estimate', count.estimates),
         counter('estimates_degraded', 'Estimates that do not come from all detectors', count.degraded),
         counters('blocks_refused', 'cause', 'Blocks without an estimate', count.refused),
-        counter('contradictions', 'Blocks whose readings contradict each other', pipeline.stamped.contradictions),
+        counter('contradictions', 'Blocks whose readings contradict each other', pipeline.estimator.contradictions),
     ]
 
 

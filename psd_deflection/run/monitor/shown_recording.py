@@ -169,8 +169,8 @@ class ShownRecording:
         level, message = OK, 'end of the recording' if self._ended else 'estimates flow'
         if spots is not None and spots.reason:
             level, message = ERROR, spots.reason
-        elif self._pipeline.stamped.vibrates:
-            level, message = WARN, f'vibrates {self._pipeline.stamped.vibrates}: too fast for a block'
+        elif self._pipeline.estimator.vibrates:
+            level, message = WARN, f'vibrates {self._pipeline.estimator.vibrates}: too fast for a block'
         entries.append(
             DiagnosticEntry(
                 'psd_deflection: estimates',
@@ -180,7 +180,7 @@ class ShownRecording:
                     ('rate (estimates/s)', str(rates[1])),
                     ('estimates', str(estimates)),
                     *refused,
-                    *self._pipeline.stamped.words(),
+                    *self._pipeline.estimator.words(),
                 ),
             )
         )

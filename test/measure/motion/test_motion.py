@@ -16,6 +16,7 @@ from psd_deflection.measure.motion.motion import STATE
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import KNOWN_LOAD, AppliedLoad, FloatArray, ParameterChange, RawChunk, TipMotion
 from psd_deflection.rig.config import load_rig
+from test import streams
 
 RIG = motion.rig_of()
 
@@ -198,7 +199,7 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(operation: motion.Run
     assert through(replay, dark, range(start, 300)) == expected
     # And it would not be the same without.
     without = Pipeline(RIG)
-    without.apply(memory._replace(values=tuple(v for v in memory.values if v[0] != STATE)))
+    without.apply(streams.without(memory, STATE))
     assert through(without, dark, range(start, 300)) != expected
 
 

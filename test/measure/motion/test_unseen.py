@@ -4,13 +4,11 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 
 from psd_deflection.measure.motion.modal import Oscillator
-from psd_deflection.measure.motion.unseen import LARGER, LATELY, UnseenLoads
+from psd_deflection.measure.motion.unseen import LARGER, UnseenLoads
 
 MODES = (Oscillator(14.0, 0.02), Oscillator(21.0, 0.05))
 SECONDS = 0.02
@@ -52,28 +50,6 @@ def test_what_the_process_noise_foresaw_is_not_added() -> None:
     expected = LARGER**2 * np.maximum(np.array([1e-6, 0.0, 1e-6, 0.0]) / 9.0 - foreseen.diagonal(), 0.0)
     assert 0.0 < expected[0] < 0.9 * LARGER**2 * 1e-6 / 9.0
     np.testing.assert_allclose(held.variances[0, 0], expected, rtol=1e-12)
-
-
-def test_it_fades_in_half_a_minute() -> None:
-    held = unseen()
-    held.add(at_rest(0.0), SURE, NO_NOISE)
-    held.add(at_rest(1e-3), SURE, NO_NOISE)
-    first = held.variances[0, 0, 0]
-    for _ in range(round(LATELY / SECONDS)):
-        held.add(at_rest(1e-3), SURE, NO_NOISE)
-    assert held.variances[0, 0, 0] == pytest.approx(first / math.e)
-
-
-def test_no_span_goes_across_a_beginning() -> None:
-    held = unseen()
-    held.add(at_rest(0.0), SURE, NO_NOISE)
-    held.begin()
-    held.add(at_rest(1e-3), SURE, NO_NOISE)
-    assert not held.variances.any()
-    held.add(at_rest(2e-3), SURE, NO_NOISE)
-    assert held.variances.any()
-    held.forget()
-    assert not held.variances.any()
 
 
 def test_it_grows_evenly_from_span_to_span() -> None:

@@ -7,9 +7,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.measure.uncertainty.block_fit import BlockFit, basis, inverse
+from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.uncertainty.block_fit import BlockFit, basis
 from psd_deflection.measure.uncertainty.combinations import combinations, combinations_of
-from psd_deflection.records import FloatArray, IntArray
+from psd_deflection.records import DeflectionEstimate, FloatArray, IntArray, RawChunk
+from psd_deflection.rig.config import load_rig
 
 PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
 SIGMA = 1e-6
@@ -40,20 +42,13 @@ def dots_of(pose: FloatArray) -> FloatArray:
     return np.stack(out, axis=1)
 
 
-@pytest.mark.parametrize('size', [1, 2, 5, 9, 20, 64, 100])
+@pytest.mark.parametrize('size', [1, 2, 5, 9, 11, 12, 20, 64, 100])
 def test_the_polynomials_are_orthonormal_and_start_with_the_mean(size: int) -> None:
     q = basis(size)
     np.testing.assert_allclose(q.T @ q, np.eye(q.shape[1]), atol=1e-13)
     np.testing.assert_allclose(q[:, 0], size**-0.5)
-    assert q.shape[1] <= 5
-
-
-def test_combinations_are_orthogonal_and_the_last_does_not_see_motion() -> None:
-    t = combinations(PLACES)
-    np.testing.assert_allclose(t @ t.T, np.eye(4), atol=1e-15)
-    small = dots_of(np.array([[1e-6, 0.0, 0.0], [0.0, 1e-6, 0.0], [0.0, 0.0, 1e-6]]))
-    assert abs(small @ t[3]).max() < 1e-12
-    assert abs(small @ t[2]).max() > 5e-8
+    orders = {1: 1, 2: 1, 5: 3, 9: 5, 11: 5, 12: 3, 20: 5, 64: 5, 100: 5}
+    assert q.shape[1] == orders[size]
 
 
 def test_the_last_combination_is_the_length_of_the_base_line_wherever_the_beams_are() -> None:
@@ -68,12 +63,6 @@ def test_the_last_combination_is_the_length_of_the_base_line_wherever_the_beams_
         np.testing.assert_allclose(of.fixed(dots), of.of(dots)[3], atol=1e-15)
         for row, z in zip(dots, of.of(dots).T, strict=True):
             np.testing.assert_allclose(of.back(z.tolist(), np.eye(4))[0], row, atol=1e-15)
-
-
-def test_inverses_of_positive_definite_matrices() -> None:
-    a = np.random.default_rng(0).normal(size=(6, 7, 5))
-    m = np.einsum('nij,nik->njk', a, a)
-    np.testing.assert_allclose(np.einsum('nij,njk->nik', inverse(m), m), np.tile(np.eye(5), (6, 1, 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize('slots', GAPS, ids=lambda s: f'{len(s)} samples')
@@ -99,60 +88,6 @@ def test_a_ringing_plate_is_followed_where_samples_are_missing_too(slots: IntArr
     assert worst_of_mean > 3e-5
 
 
-def test_at_rest_the_mean_is_kept_to_3_percent_and_the_variance_is_the_measured_one() -> None:
-    rng = np.random.default_rng(1)
-    fit = fitter()
-    got, means, stated = [], [], []
-    for _ in range(4000):
-        dots = rng.normal(0.0, SIGMA, (SIZE, 4))
-        fitted = fit.fit(ALL, dots)
-        got.append(fitted.dots)
-        means.append(dots.mean(axis=0))
-        stated.append(fitted.covariance.diagonal())
-    cost = np.std(got, axis=0) / np.std(means, axis=0)
-    assert (cost < 1.04).all()
-    assert (cost > 1.0).all()
-    np.testing.assert_allclose(np.sqrt(np.mean(stated, axis=0)), np.std(got, axis=0), rtol=0.06)
-
-
-def test_coloured_and_common_noise_is_in_the_covariance() -> None:
-    """One disturbance in all readings alike: the mean of x1 and x2 has it whole, their difference not at all."""
-    lags = 0.9 ** np.arange(SIZE)
-    gamma = np.tile(lags * SIGMA**2, (4, 4, 1))
-    gamma[range(4), range(4), 0] += 0.01 * SIGMA**2
-    fitted = fitter(gamma).fit(ALL, np.zeros((SIZE, 4)))
-    toeplitz = 0.9 ** abs(ALL[:, None] - ALL)
-    # Weights by the colour make it somewhat less than that of the mean.
-    expected = SIGMA**2 * toeplitz.mean()
-    assert 0.85 * expected < fitted.covariance[0, 2] <= expected
-    difference = np.array([1.0, 0.0, -1.0, 0.0])
-    assert difference @ fitted.covariance @ difference < 0.011 * expected
-
-
-def test_a_load_that_is_switched_inside_the_block_widens_it() -> None:
-    fit = fitter()
-    rng = np.random.default_rng(2)
-    for _ in range(50):
-        fit.fit(ALL, rng.normal(0.0, SIGMA, (SIZE, 4)))
-    t = np.maximum(ALL - 6, 0) * 1e-3
-    dots = rng.normal(0.0, SIGMA, (SIZE, 4))
-    dots[:, 1::2] += 8.5 * t[:, None] ** 2
-    fitted = fit.fit(ALL, dots)
-    assert fitted.misfit
-    error = fitted.dots[1] - 8.5 * 3.5e-3**2
-    assert abs(error) < 3.0 * fitted.covariance[1, 1] ** 0.5
-
-
-@pytest.mark.parametrize('combination', range(4))
-def test_what_bends_in_one_block_is_motion_but_not_of_the_base_line(combination: int) -> None:
-    """Five standard deviations of order 2: the link may do that, the base line between the dots cannot."""
-    fit, turn, q = fitter(), combinations(PLACES), basis(SIZE)
-    fitted = fit.fit(ALL, 5.0 * SIGMA * q[:, 2:3] * turn[combination])
-    at_the_stamp = float(turn[combination] @ fitted.dots)
-    followed = 5.0 * SIGMA * float(np.interp(9.5, ALL, q[:, 2]))
-    assert at_the_stamp / followed == pytest.approx(0.0 if combination == 3 else 0.96, abs=0.03)
-
-
 @pytest.mark.statistics
 def test_what_is_stated_of_a_dying_motion_is_its_error() -> None:
     """A mode of 14 Hz with 2 % of damping, from 0.1 mm to nothing: motion that is over is stated no longer."""
@@ -169,39 +104,6 @@ def test_what_is_stated_of_a_dying_motion_is_its_error() -> None:
             if block >= 60:
                 squares.append((fitted.dots[0] - truth[0]) ** 2 / fitted.covariance[0, 0])
     assert 0.85 < np.mean(squares) < 1.05
-
-
-def test_another_fit_goes_on_from_the_state_to_the_bit() -> None:
-    rng = np.random.default_rng(3)
-    one, other = fitter(), fitter()
-    for _ in range(20):
-        one.fit(ALL, rng.normal(0.0, 5.0 * SIGMA, (SIZE, 4)))
-    other.set_state(one.state())
-    dots = rng.normal(0.0, SIGMA, (SIZE, 4))
-    a, b = one.fit(GAPS[1], dots[GAPS[1]]), other.fit(GAPS[1], dots[GAPS[1]])
-    assert a.dots == b.dots
-    assert (a.covariance == b.covariance).all()
-    with pytest.raises(ValueError, match='80 values, not 3'):
-        other.set_state((1.0, 2.0, 3.0))
-
-
-@pytest.mark.parametrize('present', [8, 9, 10, 11])
-def test_so_few_samples_that_they_cannot_tell_all_orders_have_errors_as_large_as_stated(present: int) -> None:
-    """Polynomials of order 4 with coefficients by chance; 8 samples tell four of the five, 9 tell all."""
-    rng = np.random.default_rng(4)
-    powers = np.vander((ALL - 9.5) / 9.5, 5, increasing=True)
-    fit = fitter()
-    for _ in range(150):
-        fit.fit(ALL, 1e-4 * powers @ rng.normal(size=(5, 4)))
-    state, errors = fit.state(), []
-    for _ in range(60):
-        fit.set_state(state)
-        coefficients = 1e-4 * rng.normal(size=(5, 4))
-        slots = np.sort(rng.choice(SIZE, present, replace=False))
-        fitted = fit.fit(slots, (powers @ coefficients)[slots])
-        errors.append((fitted.dots - coefficients[0]) / np.sqrt(fitted.covariance.diagonal()))
-    rms = float(np.sqrt(np.mean(np.square(errors))))
-    assert (0.5 if present < 9 else 0.0) < rms < 1.0
 
 
 class Dense:
@@ -383,59 +285,71 @@ def test_at_rest_the_memory_of_motion_adds_little_noise() -> None:
     assert np.mean(np.abs(z) < 1.959964) == pytest.approx(0.955, abs=0.012)
 
 
-def test_motion_that_is_over_is_not_stated_for_long() -> None:
-    """A motion of 0.1 mm is some 10^4 times its noise: the memory forgets it after ten times its length."""
-    fit = fitter()
-    shaken(fit, 10.0, 1e-4, 300)
-    stated = shaken(fit, 10.0, 0.0, 250)[1]
-    assert stated[0] > 1.15 * stated[-1]
-    assert np.median(stated[200:]) < 1.07 * stated[-1]
-
-
-def test_a_mean_of_blocks_that_lasts_is_that_mean() -> None:
-    """Of the same coefficient in each block: 12 blocks of nothing, then n of c^2 - v, over 12 + n."""
-    fit = fitter()
-    bend = 1e-6 * basis(SIZE)[:, 2]
-    blocks = 40
-    for _ in range(blocks):
-        fit.fit(ALL, np.outer(bend, [1.0, 0.0, 1.0, 0.0]))
-    squares, _, long, counted = np.array(fit.state()).reshape(4, 4, 5)
-    # sqrt 2 of the readings' bend in the first combination; v is the noise of a sample.
-    excess = 2.0 * 1e-12 - SIGMA**2
-    assert long[0, 2] == pytest.approx(excess * blocks / (12.0 + blocks))
-    assert counted[0, 2] == 12.0 + blocks
-    assert squares[0, 2] == pytest.approx(excess * (1.0 - (11.0 / 12.0) ** blocks))
-    for _ in range(300):
-        fit.fit(ALL, np.outer(bend, [1.0, 0.0, 1.0, 0.0]))
-    assert np.array(fit.state()).reshape(4, 4, 5)[3].max() == 250.0
-
-
-def test_what_lasted_begins_with_what_is_of_late_where_it_is_over() -> None:
-    fit = fitter()
-    bend = 1e-5 * basis(SIZE)[:, 2]
+@pytest.mark.parametrize('slots', [ALL, np.delete(ALL, [3, 11, 12])], ids=['all', 'gaps'])
+def test_in_motion_a_block_is_the_least_squares_polynomial_at_its_middle(slots: IntArray) -> None:
+    """So much motion that nothing is known of the coefficients: weights by dense least squares of order 4."""
+    gamma = white()
+    fit = BlockFit(SIZE, PLACES, PLACES)
+    fit.set_noise(gamma)
+    rng = np.random.default_rng(5)
+    u = (ALL - 9.5) / 9.5
     for _ in range(200):
-        fit.fit(ALL, np.outer(bend, [1.0, 0.0, 1.0, 0.0]))
-    counts = []
-    for _ in range(60):
-        fit.fit(ALL, np.zeros((SIZE, 4)))
-        squares, _, long, counted = np.array(fit.state()).reshape(4, 4, 5)
-        # Never above that of late by more than the noise and the motion of late.
-        assert long[0, 2] - squares[0, 2] <= SIGMA**2 + max(float(squares[0, 2]), 0.0) + 1e-18
-        counts.append(float(counted[0, 2]))
-    assert 12.0 in counts
+        shape = np.polynomial.polynomial.polyvander(u, 4) @ rng.normal(size=(5, 4))
+        fit.fit(ALL, 1e-4 * shape + SIGMA * rng.normal(size=(SIZE, 4)))
+    dots = (1e-4 * shape + SIGMA * rng.normal(size=(SIZE, 4)))[slots]
+    got = fit.fit(slots, dots)
+    powers = np.polynomial.polynomial.polyvander(u[slots], 4)
+    w = np.linalg.pinv(powers)[0]
+    # The base line between the dots does not move, whatever the link does: there the mean may be better.
+    moving = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 1.0]])
+    # To second order in the motion: the length of the base line is taken exactly.
+    np.testing.assert_allclose(moving @ got.dots, moving @ (w @ dots), atol=2e-8)
+    want = SIGMA**2 * float(w @ w)
+    np.testing.assert_allclose((moving @ got.covariance @ moving.T).diagonal(), 2.0 * want, rtol=5e-3)
 
 
-def test_a_fit_with_the_longer_memory_goes_on_from_its_state_to_the_bit() -> None:
-    rng = np.random.default_rng(8)
-    first, second = fitter(), fitter()
-    for _ in range(30):
-        first.fit(ALL, rng.normal(0.0, 3e-6, (SIZE, 4)))
-    second.set_state(first.state())
-    for slots in (ALL, GAPS[1], ALL):
-        dots = rng.normal(0.0, SIGMA, (len(slots), 4))
-        one, two = first.fit(slots, dots), second.fit(slots, dots)
-        assert one.dots == two.dots
-        assert (one.covariance == two.covariance).all()
-    assert first.state() == second.state()
-    with pytest.raises(ValueError, match='80 values, not 40'):
-        second.set_state(first.state()[:40])
+@pytest.mark.parametrize(('size', 'coloured'), [(64, True), (65, False)])
+def test_colour_makes_the_weights_of_blocks_up_to_64_samples(size: int, coloured: bool) -> None:
+    """Noise of the one lag: in motion the weights are those of generalised, or of ordinary, least squares."""
+    gamma = np.zeros((4, 4, size))
+    gamma[range(4), range(4), 0], gamma[range(4), range(4), 1] = SIGMA**2, 0.45 * SIGMA**2
+    fit, rng = BlockFit(size, PLACES, PLACES), np.random.default_rng(7)
+    fit.set_noise(gamma)
+    powers = np.polynomial.polynomial.polyvander(np.linspace(-1.0, 1.0, size), 4)
+    at = np.arange(size)
+    for _ in range(100):
+        dots = np.outer(1e-3 * powers @ rng.normal(size=5), [1.0, 0.0, 1.0, 0.0])
+        dots += SIGMA * rng.normal(size=(size, 4))
+        fit.fit(at, dots)
+    toeplitz = np.eye(size) + 0.45 * (np.eye(size, k=1) + np.eye(size, k=-1))
+    weight = np.linalg.inv(toeplitz) if coloured else np.eye(size)
+    want = (np.linalg.inv(powers.T @ weight @ powers) @ powers.T @ weight @ dots)[0]
+    got = fit.fit(at, dots).dots
+    assert got[0] + got[2] == pytest.approx(want[0] + want[2], abs=2e-9)
+
+
+def swaying(size: int, lost: tuple[int, ...] = ()) -> FloatArray:
+    """Errors of ΔY over their standard deviations: 14 Hz of 0.3 mm, blocks of ``size``, of which slots are ``lost``."""
+    rng, n = np.random.default_rng(1), 30_000
+    seq = np.arange(n)
+    volts = np.tile([0.0, 0.0, 5.0], (n, 2))
+    volts[:, 1::3] -= 0.6 * np.sin(88.0 * 1e-3 * seq + 0.3)[:, None]
+    volts += 2e-3 * rng.normal(size=volts.shape)
+    seq = seq[~np.isin(seq % size, lost)]
+    pipeline = Pipeline(load_rig(overrides={'block_size': size, 'min_samples': 5, 'solvers': ['exact']}))
+    chunk = RawChunk(seq, seq * 1_000_000, volts[seq].astype(np.float32), np.zeros(len(seq), np.uint8))
+    found = [r for r in pipeline.process(chunk) if isinstance(r, DeflectionEstimate) and r.t_ns > 5_000_000_000]
+    return np.array([(r.dy - 3e-4 * np.sin(88.0e-9 * r.t_ns + 0.3)) / r.covariance[4] ** 0.5 for r in found])
+
+
+@pytest.mark.parametrize('size', [5, 6, 8, 11])
+def test_small_blocks_follow_motion_and_say_how_well(size: int) -> None:
+    """With one order for four samples 0.31 of the intervals of blocks of 8 held the truth."""
+    z = np.abs(swaying(size))
+    assert np.mean(z < 1.959964) == pytest.approx(0.95, abs=0.02)
+    assert np.mean(z < 3.0) > 0.99
+
+
+def test_blocks_that_always_lose_their_end_say_how_little_they_tell() -> None:
+    """Weights of some 1e-5 a block are weights: 0.93 were within three deviations, and the rms error was 6 um."""
+    assert np.mean(np.abs(swaying(20, tuple(range(12, 20)))) < 3.0) > 0.99

@@ -11,9 +11,8 @@ import pytest
 from blind.coverage import Row, coarse, motion, volts_of
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.uncertainty.converter import ConverterSteps
-from psd_deflection.measure.uncertainty.stamped import STEPS
-from psd_deflection.records import DeflectionEstimate, RawChunk
 from psd_deflection.rig.config import load_rig
+from test import streams
 
 FILE, COARSEST = 20.0 / 2**16, 20.0 / 2**8
 TEN = 20.0 / 2**10
@@ -98,20 +97,6 @@ def test_a_step_is_not_believed_before_thirty_samples_and_one_finer_value_ends_i
     assert not steps.steps.any()
 
 
-def test_it_goes_on_from_its_state() -> None:
-    samples = volts(TEN, 3e-3)
-    one, other = (ConverterSteps(6, FILE, COARSEST) for _ in range(2))
-    assert one.state() == ()
-    one.add(samples[:20])
-    other.set_state(one.state())
-    for part in (samples[20:40], samples[40:400]):
-        assert one.add(part) == other.add(part)
-        assert one.state() == other.state()
-        np.testing.assert_array_equal(one.steps, other.steps)
-    with pytest.raises(ValueError, match='3 channels have 9'):
-        ConverterSteps(3, FILE, COARSEST).set_state(one.state())
-
-
 def test_ten_bits_untold_are_in_the_intervals() -> None:
     """The finding: 0.77 of the intervals of one axis held the truth."""
     s = coarse(24, told=False)
@@ -119,20 +104,9 @@ def test_ten_bits_untold_are_in_the_intervals() -> None:
     assert s.joint > 0.93
 
 
-def test_diagnostics_name_them_and_a_recording_begun_later_replays_to_the_bit() -> None:
-    own = load_rig()
-    samples = volts_of(Row('10 bit', bits=10), motion(5, 0)[0], 1).astype(np.float32)
-    seq = np.arange(len(samples))
-    head, tail = (RawChunk(s, s * 1_000_000, samples[s], np.zeros(len(s), np.uint8)) for s in (seq[:2500], seq[2500:]))
-    live = Pipeline(own)
-    list(live.process(head))
-    assert dict(live.stamped.words())['steps of the converter'] == (
+def test_diagnostics_name_the_steps() -> None:
+    pipeline = Pipeline(load_rig())
+    list(pipeline.process(streams.chunk(volts_of(Row('10 bit', bits=10), motion(1, 0)[0], 1))))
+    assert dict(pipeline.estimator.words())['steps of the converter'] == (
         'x1 19.5 mV, y1 19.5 mV, sum1 19.5 mV, x2 19.5 mV, y2 19.5 mV, sum2 19.5 mV (rig file 0.305 mV)'
     )
-    memory = live.memory(own)
-    assert memory is not None
-    assert STEPS in dict(memory.values)
-    replay = Pipeline(own)
-    replay.apply(memory)
-    expected, again = ([r for r in p.process(tail) if isinstance(r, DeflectionEstimate)] for p in (live, replay))
-    assert again == expected

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from psd_deflection.measure.uncertainty.block_fit import BlockFit
-from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
+from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise, undithered
 from psd_deflection.records import FloatArray
 
 PLACES = np.array([[0.0, 0.070], [-0.100, 0.0]])
 SIGMA = 1e-6
 SIZE = 20
+ALL = np.arange(SIZE)
 SEGMENT = SEGMENT_BLOCKS * SIZE
 STEP = 1e-9
 
@@ -209,3 +210,89 @@ def test_what_remembers_nothing_goes_on_as_from_the_start() -> None:
     other.set_state(one.state())
     assert one.state() == other.state() == (0.0, 0.0, 0.0, 0.0)
     np.testing.assert_array_equal(one.gamma, other.gamma)
+
+
+# Segments that are one and the same but for their size: its autocovariance goes with the variance exactly.
+RULES = {
+    'a segment joins the mean': ([1.0, 1.0, 1.5], 3.5 / 3.0),
+    'below twice it joins': ([1.0, 1.0, 1.9], 3.9 / 3.0),
+    'above twice it waits': ([1.0, 1.0, 2.1], 1.0),
+    'above two fifths it joins': ([1.0, 1.0, 0.41], 2.41 / 3.0),
+    'below two fifths it is believed': ([1.0, 1.0, 0.39], 0.39),
+    'two louder ones wait': ([1.0, 1.0, 9.0, 9.0], 1.0),
+    'the third louder one is believed': ([1.0, 1.0, 9.0, 9.0, 9.0], 9.0),
+    'an old one in between begins the count again': ([1.0, 1.0, 9.0, 9.0, 1.0, 9.0, 9.0], 1.0),
+    'so does one in motion': ([1.0, 1.0, 9.0, 9.0, -9.0, 9.0, 9.0], 1.0),
+    'three after it are believed': ([1.0, 1.0, 9.0, -9.0, 9.0, 9.0, 9.0], 9.0),
+    'the mean is of twenty': ([*[1.0] * 40, 1.4], 1.0 + 0.4 / 20.0),
+}
+"""Variances of segments, negative where the plate rings besides; the variance that is used in the end."""
+
+
+def test_segments_follow_the_rules() -> None:
+    one, wrong = coloured(SEGMENT, 0.0, 30), {}
+    for rule, (segments, want) in RULES.items():
+        noise = stream()
+        for k, times in enumerate(segments):
+            feed(noise, abs(times) ** 0.5 * one + (ringing(SEGMENT) if times < 0.0 else 0.0), k * SEGMENT_BLOCKS)
+            if k == 1:
+                first = noise.sample_sd()
+        got = float(np.mean(np.square(noise.sample_sd() / first)))
+        if got != pytest.approx(want, rel=1e-3):
+            wrong[rule] = got
+    assert wrong == {}
+
+
+@pytest.mark.parametrize('sigma', [0.0, 0.2, 0.35])
+def test_what_noise_does_not_dither_stays_as_an_error_of_rounding(sigma: float) -> None:
+    """Mean square over all places of the mean of the rounded reading less the place, added up by hand."""
+    step = 3.0
+    place = (np.arange(2000) + 0.5) / 2000.0
+    deviate = np.linspace(-7.0, 7.0, 4001)
+    weight = np.exp(-0.5 * deviate**2) / np.exp(-0.5 * deviate**2).sum()
+    mean = np.rint(place[:, None] + sigma * deviate) @ weight
+    want = step**2 * float(np.mean((mean - place) ** 2))
+    assert undithered((sigma * step) ** 2, step) == pytest.approx(want, rel=5e-3)
+    assert undithered(1.0, 0.0) == 0.0
+
+
+def steps_of(stated: float, step: float) -> FloatArray:
+    return np.asarray(StreamNoise(SIZE, PLACES, PLACES, stated, step).gamma[0, 0])
+
+
+def test_the_least_noise_is_that_of_rounding_and_what_is_not_dithered_stays() -> None:
+    """q^2/12 a sample, and at every lag sum_k q^2/(2 pi^2 k^2) exp(-4 pi^2 k^2 s^2/q^2) for noise s."""
+    step = 2e-6
+    k = np.arange(1, 100_000)
+    for s in (0.0, 0.2e-6, 0.5e-6):
+        # The rig file's noise has the rounding in it.
+        stated = s**2 + step**2 / 12.0
+        stays = step**2 / (2.0 * np.pi**2) * float(np.sum(np.exp(-4.0 * (np.pi * k * s / step) ** 2) / k**2))
+        got = steps_of(stated, step)
+        np.testing.assert_allclose(got[1:], stays, rtol=6e-3, atol=1e-20)
+        assert got[0] - got[1] == pytest.approx(stated, rel=1e-9)
+    # Less than rounding there is not.
+    got = steps_of(0.0, step)
+    assert got[0] - got[1] == pytest.approx(step**2 / 12.0, rel=1e-9)
+    # Without a converter it is as stated.
+    np.testing.assert_array_equal(steps_of(3e-12, 0.0), [3e-12, *(0.0,) * (SIZE - 1)])
+
+
+def test_each_reading_has_its_own_steps_and_noise() -> None:
+    of = StreamNoise(SIZE, PLACES, PLACES, 1e-12 * np.arange(1.0, 5.0), 1e-6 * np.arange(4.0))
+    for c in range(4):
+        alone = StreamNoise(SIZE, PLACES, PLACES, 1e-12 * (c + 1.0), 1e-6 * c).gamma[c, c]
+        np.testing.assert_allclose(of.gamma[c, c], alone, rtol=1e-12)
+    np.testing.assert_allclose(of.sample_sd(), np.sqrt([of.gamma[c, c, 0] for c in range(4)]))
+
+
+def test_a_segment_need_not_be_whole_to_be_of_its_place() -> None:
+    """Segments are of 50 blocks by their numbers: what begins in the middle of one ends with it."""
+    of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
+    rng = np.random.default_rng(8)
+    told = [b for b in range(20, 130) if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
+    assert told == [49, 99]
+    # A block of a later segment closes one whose end was lost; too little of one changes nothing.
+    of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
+    told = [b for b in [*range(40), 51, *range(52, 60), 130] if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
+    assert told == [51]

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
 from psd_deflection.measure.uncertainty.rest import why_moving
-from psd_deflection.measure.uncertainty.stamped import StampedDots
 from psd_deflection.rig.config import load_rig
 
 
@@ -43,33 +43,17 @@ def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts:
     ('flat', 'words'), [(False, 'noise of the rig file'), (True, 'noise of the rig file until it is measured')]
 )
 def test_diagnostics_say_whose_noise_it_is(flat: bool, words: str) -> None:
-    stamped = StampedDots(load_rig(), flat)
-    assert dict(stamped.words())['covariance from'] == words
+    estimator = BlockEstimator(load_rig(), flat)
+    assert dict(estimator.words())['covariance from'] == words
     # The noise of each reading is told if it is measured.
-    assert len(stamped.words()) == (6 + len(stamped.noise_words()) if flat else 5)
-    assert len(stamped.noise_words()) >= 4
-
-
-def test_diagnostics_say_of_how_many_readings_too_many_a_chi_square_is() -> None:
-    third = {'psd_3.center': [0.08, -0.06]}
-    of_two, of_three = (dict(StampedDots(load_rig(overrides=more)).words()) for more in ({}, third))
-    assert of_two['chi-square of the readings'] == '0.00'
-    assert of_three['chi-square of the readings'] == '0.00 of 1 degrees of freedom'
+    assert len(estimator.words()) == (6 + len(estimator.noise_words()) if flat else 5)
+    assert len(estimator.noise_words()) >= 4
 
 
 @pytest.mark.parametrize(
     ('more', 'freedom'), [({}, 1), ({'psd_3.center': [0.08, -0.06], 'psd_4.center': [0.0, 0.1]}, 3)]
 )
 def test_diagnostics_say_how_probable_a_chi_square_is(more: dict[str, object], freedom: int) -> None:
-    stamped = StampedDots(load_rig(overrides=more))
-    stamped.chi_square, stamped.freedom = 6.0, freedom
-    assert dict(stamped.words())['p of that chi-square'] == f'{chi2.sf(6.0, freedom):.2g}'
-
-
-def test_the_check_of_three_psds_goes_on_from_its_memory() -> None:
-    one, other = (StampedDots(load_rig(overrides={'psd_3.center': [0.08, -0.06]})) for _ in range(2))
-    assert one._redundancy is not None
-    assert other._redundancy is not None
-    one._redundancy.set_state((2.0, 7.0, *(1e-12 * k for k in range(18))))
-    other.restore(one.memory())
-    assert other._redundancy.state() == one._redundancy.state()
+    estimator = BlockEstimator(load_rig(overrides=more))
+    estimator.chi_square, estimator.freedom = 6.0, freedom
+    assert dict(estimator.words())['p of that chi-square'] == f'{chi2.sf(6.0, freedom):.2g}'

@@ -14,11 +14,11 @@ from blind import generator
 from blind.coverage import LOSSES, ROWS, Row, motion, rig, shaken, volts_of
 from psd_deflection.cli.main import main
 from psd_deflection.measure.pipeline import Pipeline
+from psd_deflection.measure.uncertainty.block_estimator import VIBRATION
 from psd_deflection.measure.uncertainty.block_fit import BlockFit
 from psd_deflection.measure.uncertainty.noise import SEGMENT_BLOCKS, StreamNoise
-from psd_deflection.measure.uncertainty.stamped import VIBRATION
 from psd_deflection.measure.uncertainty.vibration import Tone, ToneSearch, rms_of, words_of
-from psd_deflection.records import DeflectionEstimate, FloatArray, IntArray, RawChunk, Record, SpotMeans, TipMotion
+from psd_deflection.records import FloatArray, IntArray, RawChunk, Record, SpotMeans, TipMotion
 from psd_deflection.rig.config import Rig, load_rig
 
 SIZE, RATE = 20, 1000.0
@@ -150,29 +150,6 @@ def shaking(seconds: int, hz: float = 87.0) -> FloatArray:
     return generator.electronics(m, light, none, [])
 
 
-@pytest.mark.parametrize('start', [99, 120, 149, 171])
-def test_a_recording_begun_while_it_vibrates_replays_to_the_bit(start: int) -> None:
-    own = load_rig()
-    volts = volts_of(ROWS[0], shaking(5), 1)
-    live = Pipeline(own)
-    list(live.process(chunk(volts[: 20 * start])))
-    memory = live.memory(own)
-    assert memory is not None
-    assert VIBRATION in dict(memory.values)
-    replay = Pipeline(own)
-    replay.apply(memory)
-    assert not replay.misfits
-    rest = chunk(volts[20 * start :], 20 * start)
-    expected = list(live.process(rest))
-    again = list(replay.process(rest))
-    assert [r for r in again if isinstance(r, DeflectionEstimate)] == [
-        r for r in expected if isinstance(r, DeflectionEstimate)
-    ]
-    named = [[r.findings for r in one if isinstance(r, SpotMeans)] for one in (again, expected)]
-    assert named[0] == named[1]
-    assert all(named[0])
-
-
 def test_what_another_rig_remembers_of_tones_does_not_fit() -> None:
     places = np.array([[0.0, 0.07], [-0.1, 0.0]])
     noisy = StreamNoise(SIZE, places, places, 1e-12, 1e-9)
@@ -189,7 +166,7 @@ def test_what_another_rig_remembers_of_tones_does_not_fit() -> None:
     assert noisy.gathered == len(block) + 4
     pipeline = Pipeline(load_rig())
     with pytest.raises(ValueError, match='17 numbers for each tone'):
-        pipeline.stamped.restore({'state.noise': (0.0,) * 4, VIBRATION: (0.1, 1.0)})
+        pipeline.estimator.load_state_dict({'state.noise': (0.0,) * 4, VIBRATION: (0.1, 1.0)})
 
 
 def test_the_filter_states_it_too() -> None:
@@ -215,12 +192,3 @@ def test_info_says_what_vibrates(tmp_path: Path, capsys: pytest.CaptureFixture[s
     capsys.readouterr()
     assert main(['info', str(tmp_path / 'quiet.csv'), '--json']) == 0
     assert json.loads(capsys.readouterr().out)['vibration'] is None
-
-
-def test_the_floor_under_a_tone_is_that_of_its_own_frequency() -> None:
-    """Of power that grows in proportion to the frequency it is the power itself, between the middles of groups."""
-    search = ToneSearch(SIZE, SEGMENT_BLOCKS)
-    power = np.arange(N // 2 + 1, dtype=np.float64)[:, None]
-    floor = np.log(2.0) * search._floor(power)
-    inside = slice(search._start + 100, -200)
-    np.testing.assert_allclose(floor[inside], power[inside], atol=0.6)

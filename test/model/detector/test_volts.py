@@ -19,7 +19,6 @@ from psd_deflection.model.detector import (
     dot_noise_variances,
     make_sensor,
 )
-from psd_deflection.records import CHANNELS
 from psd_deflection.rig.config import replace_values, rig_from_values
 from psd_deflection.rig.declarations import SENSOR_TYPES, PsdConfig
 
@@ -37,13 +36,6 @@ def test_counts_become_volts_rounded_once() -> None:
     got = counts_to_volts(counts, 10.0 / 32768.0)
     assert got.dtype == np.float32
     assert got[0].tolist() == [np.float32(c * (10.0 / 32768.0)) for c in counts[0].tolist()]
-
-
-def test_ten_volts_are_five_millimetres_and_channels_stay_in_order() -> None:
-    dots = VoltsToDots.from_rig(rig_from_values({})).dots(volts(10.0, -10.0, 5.0, 2.0, -4.0, 5.0))
-    assert dots.dtype == np.float64
-    np.testing.assert_allclose(dots, [[5e-3, -5e-3, 1e-3, -2e-3]], rtol=1e-15)
-    assert [CHANNELS[i] for i in (0, 1, 3, 4)] == ['x1', 'y1', 'x2', 'y2']
 
 
 def test_noise_is_the_amplifiers_and_the_converters() -> None:
@@ -128,15 +120,6 @@ def test_a_quadrants_volts_are_unbent_and_agree_with_a_lateral_one_at_the_centre
     np.testing.assert_allclose(beyond[0, 0], 1.5 * w, rtol=1e-9)
 
 
-def test_electrodes_of_both_psds_come_out_as_places_and_light() -> None:
-    calibration = VoltsToDots.from_rig(rig_from_values({'psd_2.type': 'pincushion'}))
-    electrodes = np.array([[3.0, 1.0, 2.0, 2.0, 0.0, 1.0, 1.0, 0.0]])
-    volts = calibration.volts_of_electrodes(electrodes)
-    # 5 mm at the edge: (3 - 1)/(3 + 1) and ((X2 + Y1) - (X1 + Y2))/sum of it; a duolateral counts the light twice.
-    np.testing.assert_allclose(calibration.dots(volts.astype(np.float32)), [[2.5e-3, 0.0, 5e-3, 0.0]], atol=1e-9)
-    np.testing.assert_allclose(volts[:, 2::3], [[4.0, 2.0]])
-
-
 def test_electrodes_go_through_the_wiring_once() -> None:
     wired = {'psds_exchanged': True, 'psd_1.axes': ['-y', 'x'], 'psd_1.sensitivity': [1e-3, 2e-3]}
     calibration = VoltsToDots.from_rig(rig_from_values(wired))
@@ -144,20 +127,6 @@ def test_electrodes_go_through_the_wiring_once() -> None:
     electrodes = np.array([[1.0, 1.0, 1.0, 1.0, 3.0, 1.0, 3.0, 5.0]])
     dots = calibration.dots(calibration.seen(calibration.volts_of_electrodes(electrodes).astype(np.float32)))
     np.testing.assert_allclose(dots, [[1.25e-3, 2.5e-3, 0.0, 0.0]], atol=1e-9)
-
-
-def test_an_axis_without_current_makes_no_place() -> None:
-    calibration = VoltsToDots.from_rig(rig_from_values({}))
-    volts = calibration.volts_of_electrodes(np.array([[0.0, 0.0, 3.0, 1.0, 1.0, 1.0, 1.0, 1.0]]))
-    np.testing.assert_array_equal(volts, [[0.0, 0.0, 0.0, 0.0, 0.0, 2.0]])
-
-
-def test_a_quadrants_electrodes_are_unbent_once() -> None:
-    rig = rig_from_values({'psd_1.type': 'quadrant', 'psd_1.spot_radius': 0.5e-3})
-    calibration = VoltsToDots.from_rig(rig)
-    four = calibration.sensors[0].currents(np.array([[0.3e-3, -0.1e-3]]), 4.0)
-    volts = calibration.volts_of_electrodes(np.hstack((four, np.ones((1, 4)))))
-    np.testing.assert_allclose(calibration.dots(volts.astype(np.float32))[0, :2], [0.3e-3, -0.1e-3], rtol=1e-5)
 
 
 def test_other_light_is_taken_off_as_photocurrents_add() -> None:
@@ -201,12 +170,6 @@ def test_a_place_is_valid_as_far_as_its_sensor_reaches() -> None:
     np.testing.assert_allclose(make_sensor(psd('quadrant', 3e-3)).reach(), [4.5e-3, 4e-3], rtol=1e-12)
 
 
-@pytest.mark.parametrize('kind', SENSOR_TYPES)
-def test_less_than_no_light_is_no_place_either(kind: str) -> None:
-    """Offsets of the amplifiers with the laser off."""
-    assert np.isnan(make_sensor(psd(kind)).place(np.array([[-0.2, -0.1, -0.15, -0.1]]))).all()
-
-
 def test_a_ratio_is_a_place_and_back_for_each_sensor() -> None:
     for kind in SENSOR_TYPES:
         sensor = make_sensor(psd(kind, 2e-3))
@@ -237,11 +200,3 @@ def test_each_of_three_psds_has_its_own_curve_and_sensitivity() -> None:
         want = read.copy()
         want[0, 3 * psd : 3 * psd + 3] = 0.0
         np.testing.assert_array_equal(calibration.volts_of_electrodes(lost), want)
-
-
-def test_less_light_than_a_tenth_of_the_other_is_taken_for_a_tenth() -> None:
-    one = VoltsToDots.from_rig(rig_from_values({'psd_2.dark': [1.0, -1.0, 0.1]}))
-    # (S v - b d) / 0.01 V, for v = (1, 0) V at 0.5 mm/V, whatever is left of the light above 0.1 V.
-    for whole in (0.105, 0.1, 0.09):
-        want = [(whole * 0.5e-3 - 0.05e-3) / 0.01, 0.05e-3 / 0.01]
-        np.testing.assert_allclose(one.dots(volts(0.0, 0.0, 0.0, 1.0, 0.0, whole))[0, 2:], want, rtol=1e-5, atol=1e-10)

@@ -9,11 +9,12 @@ import pytest
 
 from psd_deflection.measure.estimation import SYSTEMATIC, ZERO_VARIANCES
 from psd_deflection.measure.pipeline import Pipeline
-from psd_deflection.model.misalignment.model import COUNT, INDEX, readings, response_of
+from psd_deflection.model.misalignment.model import COUNT, INDEX, readings
 from psd_deflection.model.misalignment.rig import known_of_rig, vector_of_rig
 from psd_deflection.model.misalignment.spread import ParameterSpread
 from psd_deflection.records import DeflectionEstimate, FloatArray, ParameterChange, RawChunk, Record, TipMotion
 from psd_deflection.rig.config import Rig, rig_from_values
+from test import streams
 
 NAMES = ['psd_1.rotation', 'psd_1.gain_x', 'psd_2.gain_y', 'psd_2.center_x', 'psd_1.zero_x']
 SDS = [0.005, 0.004, 0.003, 2e-4, 3e-6]
@@ -67,19 +68,6 @@ def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
         assert said / np.outer(sd, sd) == pytest.approx(seen / np.outer(sd, sd), abs=0.25), name
 
 
-def test_noise_alone_on_request() -> None:
-    total, noise = (
-        estimates([*Pipeline(rig).process(chunk_of(still(rig, POSE, 20)))])['exact'].covariance[0] ** 0.5
-        for rig in (calibrated(), calibrated(covariance='noise'))
-    )
-    assert total > 4e-6
-    assert noise < 1e-6
-
-
-def test_a_rig_that_was_not_calibrated_has_no_spread() -> None:
-    assert ParameterSpread.from_rig(rig_from_values({})) is None
-
-
 def test_the_polynomial_is_what_it_stands_for() -> None:
     from psd_deflection.model.misalignment.spread import dots_by_parameters
 
@@ -92,40 +80,6 @@ def test_the_polynomial_is_what_it_stands_for() -> None:
         wanted = slopes @ known_of_rig(rig).covariance @ slopes.T
         factor = spread.factor(dx, dy, theta)
         assert factor @ factor.T == pytest.approx(wanted, rel=2e-3, abs=1e-3 * float(np.diag(wanted).max()))
-
-
-def test_the_dots_move_as_those_that_are_corrected_by_detectors_that_bend_their_readings() -> None:
-    from psd_deflection.model.misalignment.spread import dots_by_parameters
-
-    p = vector_of_rig(calibrated()).as_used.copy()
-    for name, value in (('psd_1.nonlinearity', 300.0), ('psd_2.nonlinearity', -200.0), ('psd_1.rotation', 0.02)):
-        p[INDEX[name]] = value
-    poses = np.array([[3e-3, -2e-3], [1e-3, 3e-3], [0.03, -0.02]])
-    found = dots_by_parameters(p, poses, 0.585)
-    for name, step in (
-        ('psd_1.gain_x', 1e-5),
-        ('psd_2.gain_y', 1e-5),
-        ('psd_1.center_y', 1e-7),
-        ('psd_2.rotation', 1e-6),
-    ):
-        after, before = p.copy(), p.copy()
-        after[INDEX[name]] += step
-        before[INDEX[name]] -= step
-        ends = [readings(q, poses, 0.585) for q in (after, before)]
-        places = [
-            np.stack([axis for psd in (0, 1) for axis in response_of(p, psd).place(r[2 * psd], r[2 * psd + 1])])
-            for r in ends
-        ]
-        moved = (places[0] - places[1]) / (2.0 * step)
-        assert found[:, :, INDEX[name]] == pytest.approx(moved.T, rel=1e-5, abs=1e-7)
-
-
-def test_parameters_that_only_go_together_count_once() -> None:
-    p = vector_of_rig(calibrated()).as_used
-    together = np.random.default_rng(3).normal(size=(COUNT, 2)) * 1e-4
-    factor = ParameterSpread(p, together @ together.T, 0.585).factor(*POSE)
-    assert factor.shape == (4, 2)
-    assert np.isfinite(factor).all()
 
 
 def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
@@ -194,7 +148,7 @@ def test_what_the_filters_covariance_holds_besides_noise_is_remembered() -> None
     assert live.estimation.systematic is not None
     assert told == tuple(live.estimation.systematic.ravel().tolist())
     replay.apply(memory)
-    without.apply(memory._replace(values=tuple(v for v in memory.values if v[0] != SYSTEMATIC)))
+    without.apply(streams.without(memory, SYSTEMATIC))
     dark = chunk_of(still(rig, POSE, 20), 200)
     dark.readings[:, :3] = 0.0
     moved = [[r for r in pipeline.process(dark) if isinstance(r, TipMotion)] for pipeline in (live, replay, without)]

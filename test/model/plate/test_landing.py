@@ -86,10 +86,6 @@ def test_the_beams_are_apart_by_more_than_a_micrometre_in_any_direction() -> Non
         check_twist(Geometry(np.zeros((3, 2)), np.zeros((3, 2)), np.zeros(3), 0.585))
 
 
-def test_a_force_at_the_tip_is_what_a_geometry_supposes() -> None:
-    assert Geometry(np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2), 0.585).slope_ratio == 1.5
-
-
 @pytest.mark.parametrize('name', ['centers', 'zeros', 'heights'])
 def test_what_is_not_finite_is_named(name: str) -> None:
     arrays = {'centers': np.zeros((2, 2)), 'zeros': np.zeros((2, 2)), 'heights': np.zeros(2)}

@@ -115,30 +115,6 @@ def test_a_correction_that_reads_what_it_does_not_declare_is_refused(folder: Pat
     assert (correction.uses_temperature, correction.uses_time) == (name == 'temperature', name == 'time')
 
 
-def test_a_beam_that_reads_what_it_does_not_declare_is_refused(folder: Path) -> None:
-    code = (
-        CODE.replace('samples.dots', 'samples.beams').replace("'dots'", "'beam'").replace('    correct=_correct,\n', '')
-    )
-    (folder / f'{NAME}.py').write_text(code.replace("{'temperature'}", ''))
-    with pytest.raises(ConfigError, match='fails on a reading'):
-        Pipeline(load_rig(overrides=EFFECT))
-
-
-def test_moved_heights_are_moved_optics(folder: Path) -> None:
-    code = """
-from psd_deflection.model.simulation.declaration import Effect, EffectParameter
-
-def _configure(physics, values):
-    physics.heights = physics.heights + values['by']
-
-EFFECT = Effect('taller', 'optics', 's', 'e', 's', 'n', (EffectParameter('by', 'm', -1.0, 1.0, 1e-3, 'd'),),
-                'configure', configure=_configure)
-"""
-    (folder / 'taller.py').write_text(code)
-    assert Correction.from_rig(load_rig(overrides={'effects.taller.by': 0.01})).active
-    assert not Correction.from_rig(load_rig(overrides={'effects.taller.by': 0.0})).active
-
-
 LOADED = """
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 
@@ -223,16 +199,6 @@ def test_a_package_offers_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv(FOLDERS, '')
     assert Pipeline(load_rig(overrides=EFFECT)).needs_temperature
-
-
-def test_the_folder_by_default_is_in_the_users_configuration(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv(FOLDERS, raising=False)
-    monkeypatch.setenv('XDG_CONFIG_HOME', str(tmp_path))
-    folder = tmp_path / 'psd_deflection' / 'effects'
-    folder.mkdir(parents=True)
-    assert NAME not in effect_names()
-    (folder / f'{NAME}.py').write_text(CODE)
-    assert NAME in effect_names()
 
 
 LINK = {'bending_stiffness', 'torsional_stiffness', 'damping'}

@@ -24,15 +24,6 @@ from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
 from psd_deflection.records import FloatArray, RawChunk, TipLoad
 from psd_deflection.rig.config import Rig, load_rig, rig_from_values
 
-NAMES = {
-    *('bending_stiffness', 'torsional_stiffness', 'clamp_bending_compliance', 'clamp_torsional_compliance'),
-    *('clamp_friction', 'creep', 'damping', 'tip_mass', 'second_bending_mode', 'self_weight', 'mount_tilt'),
-    *('load_offset', 'load_direction', 'plane_tilt', 'laser_pointing_drift', 'refraction', 'sensor_rotation'),
-    *('sensor_position', 'sensor_gain', 'sensor_nonlinearity', 'axis_crosstalk', 'ambient_light', 'thermal_drift'),
-    *('spot_clipping', 'mains_interference', 'amplifier_saturation', 'amplifier_lag', 'channel_skew', 'quantisation'),
-    'tip_force',
-}
-
 RIG = load_rig()
 HISTORY = loads.steps([(0, 0, 0), (5, -50, -29), (60, 10, 20), (20, -25, 10)], 0.3).loads
 WARM = 20.0 + 5.0 * np.linspace(0, 1, len(HISTORY)) ** 2
@@ -79,10 +70,6 @@ def volts_of(effects: list[ActiveEffect]) -> FloatArray:
     model.run(HISTORY, WARM)
     model.finish(samples)
     return samples.volts
-
-
-def test_the_fixed_names_are_in_the_catalogue() -> None:
-    assert set(catalogue()) >= NAMES
 
 
 @pytest.mark.parametrize('active', EVERY)
@@ -215,10 +202,6 @@ def test_the_wrench_is_the_load(active: ActiveEffect) -> None:
     assert (np.abs(found - LOADS) < 1e-3 * size).all()
     moved = np.abs(volts[-1] - nominal[-1]).max() > 0.05
     assert not moved or (np.abs(blind - LOADS) > 1e-3 * size).any()
-
-
-def test_a_rig_without_effects_corrects_nothing() -> None:
-    assert not Correction.from_rig(RIG).active
 
 
 def test_effect_parameters_are_declared_soundly() -> None:

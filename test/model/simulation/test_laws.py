@@ -14,7 +14,7 @@ import psd_deflection
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli.main import main
 from psd_deflection.measure.correction import Correction
-from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_of_rig, make_active, sort_effects
+from psd_deflection.model.simulation.catalogue import FOLDERS, catalogue, effects_of_rig
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.law_files import read_law
 from psd_deflection.model.simulation.laws import (
@@ -118,11 +118,6 @@ def test_a_law_of_what_a_reading_knows_is_corrected() -> None:
     assert np.abs(seen.dots - true.dots).max() > 5e-6
     fixed = Correction(RIG, active(law)).apply(seen.dots.T, seen.sums.T, WARM - WARM[0])
     np.testing.assert_allclose(fixed, true.dots.T, atol=1e-11)
-
-
-def test_a_law_of_the_load_is_not_corrected_and_does_no_harm() -> None:
-    dots = np.full((3, 4), 1e-4)
-    np.testing.assert_array_equal(Correction(RIG, active(law_of('product', 'y2', 'load_fy'))).apply(dots), dots)
 
 
 def test_a_file_is_read_as_it_was_written_and_switched_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -263,23 +258,6 @@ def test_one_cause_on_two_quantities_is_one_law() -> None:
     np.testing.assert_array_equal(
         ForwardModel(RIG, [half]).run(LOADS).volts, ForwardModel(RIG, active(less)).run(LOADS).volts
     )
-
-
-def test_a_joint_law_acts_once_before_what_reads_between_samples() -> None:
-    late = make_active('channel_skew', {'psd': 2, 'delay': 3e-4}, 'test')
-    together = ForwardModel(RIG, sort_effects([*active(JOINT), late])).run(LOADS).volts
-    apart = ForwardModel(RIG, sort_effects([*active(LOAD), *active(DOT), late])).run(LOADS).volts
-    np.testing.assert_array_equal(together, apart)
-
-
-def test_what_can_be_corrected_of_a_joint_law_is() -> None:
-    (joint,) = active(JOINT)
-    assert joint.effect.corrected == 'reading'
-    dots = np.full((1, 4), 3e-4)
-    np.testing.assert_allclose(
-        Correction(RIG, [joint]).apply(dots), Correction(RIG, active(DOT)).apply(dots), rtol=0, atol=1e-15
-    )
-    assert Correction(RIG, [joint]).apply(dots)[0, 3] != dots[0, 3]
 
 
 def test_a_joint_law_is_one_file(tmp_path: Path) -> None:

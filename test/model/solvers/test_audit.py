@@ -16,10 +16,6 @@ from psd_deflection.studies.thesis.comparison import VARIANCES, dots_of, grid, t
 UNITS = np.array([1e6, 1e6, 1e3 * 180.0 / np.pi])
 
 
-def sd(covariance: Any) -> Any:
-    return np.sqrt(np.diag(np.reshape(covariance, (3, 3)))) * UNITS
-
-
 @pytest.fixture(scope='module')
 def code_runs() -> tuple[Any, Any]:
     """Appendix D on 12,000 flat poses within 5 mm and 3 degrees: poses, answers."""
@@ -61,42 +57,6 @@ def test_a_wrong_slope_ratio_costs_little(k: float) -> None:
     rms = np.sqrt(np.mean((found.pose - poses[:, :3]) ** 2, axis=0)) * UNITS
     want = {1.0: (1.9, 1.5, 1.0), 1.395: (0.45, 0.36, 0.25), 2.0: (2.6, 2.1, 1.4)}[k]
     np.testing.assert_allclose(rms, want, rtol=0.05)
-
-
-@pytest.mark.parametrize(('k', 'flat_um', 'beam_um'), [(1.5, 115.0, 0.0), (1.395, 107.0, 8.0), (2.0, 154.0, 37.0)])
-def test_height_needs_the_tie(k: float, flat_um: float, beam_um: float) -> None:
-    """Surfaces 20 mm above the section, 50 N: dY off without the tie, with it, and with a wrong k."""
-    geometry = Geometry(thesis_geometry().centers, np.zeros((2, 2)), np.full(2, 0.020), 0.585, 1.5)
-    dx, dy = 0.12e-3, -2.2272e-3
-    pose = np.array([[dx, dy, -0.016418, -k * dy / 0.585, k * dx / 0.585]])
-    dots = dots_of(geometry, pose)
-    for name, want in (('exact', flat_um), ('beam', beam_um)):
-        got = make_solver(name, geometry).solve_many(dots, VARIANCES).pose[0, 1]
-        assert abs(got - dy) * 1e6 == pytest.approx(want, abs=1.0)
-
-
-def test_staggered_psds_see_tilt_to_a_millidegree() -> None:
-    """h = (+100, -50, -50) mm, R = 100 mm, 2 um: 0.93 and 1.32 mdeg."""
-    turns = np.radians([0.0, 120.0, 240.0])
-    centers = 0.1 * np.column_stack((np.cos(turns), np.sin(turns)))
-    geometry = Geometry(centers, np.zeros((3, 2)), np.array([0.1, -0.05, -0.05]), 0.585)
-    rng = np.random.default_rng(3)
-    dots = dots_of(geometry, np.tile([1e-4, -2e-3, -0.015, 0.005, 0.0], (5000, 1)))
-    found = make_solver('pose', geometry).solve_many(dots + 2e-6 * rng.standard_normal(dots.shape), np.full(6, 4e-12))
-    spread = np.sort(np.degrees(found.tilt.std(axis=0)) * 1e3)
-    np.testing.assert_allclose(spread, [0.93, 1.32], rtol=0.05)
-
-
-def test_noise_of_the_base_pair() -> None:
-    """One plane with the tie: 3.2 / 3.7 um / 1.33 mdeg. Two planes without twist: 7.60 times a reading's noise."""
-    centers = thesis_geometry().centers
-    one_plane = Geometry(centers, np.zeros((2, 2)), np.full(2, -0.585), 0.585, 1.5)
-    got = make_solver('base_pair', one_plane).solve((0.0,) * 4, (4e-12,) * 4)
-    np.testing.assert_allclose(sd(got.covariance), [3.26, 3.66, 1.33], atol=0.01)
-    two_planes = Geometry(centers, np.zeros((2, 2)), np.array([-0.585, -0.485]), 0.585)
-    got = make_solver('base_pair', two_planes, assume='no_twist').solve((0.0,) * 4, (4e-12,) * 4)
-    np.testing.assert_allclose(sd(got.covariance), [15.2, 15.2, 0.0], atol=0.01)
-    assert got.theta == 0.0
 
 
 def test_the_printed_test_stops_at_zero_with_psd_2_on_the_other_side(rays: Any) -> None:

@@ -136,46 +136,6 @@ def test_no_hit_is_no_measurement(golden: Any) -> None:
     assert code[:3] == (0.0, 0.0, 0.0)
 
 
-def test_exact_is_the_minimum_for_any_weights(golden: Any, rays: Any) -> None:
-    geometry = golden.geometry('G11')
-    variances = np.array(VARIANCES['all different'])
-    pose = np.array([0.002, -0.003, 0.04, 0.0, 0.0])
-    dots = rays.tip_dots(geometry, pose) + np.array([1e-4, -2e-4, 1.5e-4, 0.5e-4])
-    got = make_solver('exact', geometry).solve(tuple(dots.tolist()), VARIANCES['all different'])
-
-    def cost(p: np.ndarray[Any, Any]) -> float:
-        return float(((dots - rays.tip_dots(geometry, p)) ** 2 / variances).sum())
-
-    best = cost(np.array(got[:5]))
-    for axis, step in ((0, 1e-7), (1, 1e-7), (2, 1e-6)):
-        for sign in (-1.0, 1.0):
-            other = np.array(got[:5])
-            other[axis] += sign * step
-            assert cost(other) > best
-
-
-def test_exact_and_iterative_agree_for_equal_weights_and_three_psds(rays: Any) -> None:
-    dots = some_dots(rays, STAGGERED, 50, 1e-4)
-    variances = np.full(6, 4e-12)
-    exact = make_solver('exact', STAGGERED).solve_many(dots, variances)
-    iterative = make_solver('iterative', STAGGERED).solve_many(dots, variances)
-    np.testing.assert_allclose(exact.pose, iterative.pose, rtol=0, atol=1e-13)
-
-
-def test_iterative_finds_a_large_turn(golden: Any, rays: Any) -> None:
-    geometry = golden.geometry()
-    dots = tuple(rays.tip_dots(geometry, (0.01, -0.02, 1.4, 0.0, 0.0)).tolist())
-    got = make_solver('iterative', geometry).solve(dots, VARIANCES['equal'])
-    np.testing.assert_allclose(got[:3], (0.01, -0.02, 1.4), rtol=0, atol=1e-14)
-
-
-def test_a_sine_above_one_is_inadmissible(golden: Any) -> None:
-    dots = (0.0, 0.0, 0.0, 0.5)
-    solver = make_solver('wls_exact', golden.geometry())
-    assert solver.solve(dots, VARIANCES['equal']).status is SolverStatus.INADMISSIBLE
-    assert solver.solve_many(np.array([dots]), np.array(VARIANCES['equal'])).status[0] == SolverStatus.INADMISSIBLE
-
-
 def test_a_base_line_too_short_for_any_tilt_is_inadmissible(golden: Any) -> None:
     # 30 um shorter along (0.1, 0.07) m; noise of 2 um.
     shrink = 30e-6 * np.array([0.1, 0.07]) / np.hypot(0.1, 0.07)

@@ -14,7 +14,7 @@ from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers import SolverStatus, make_solver, solver_from_rig
 from psd_deflection.model.solvers.interface import Solver
 from psd_deflection.model.solvers.registry import check_arrangement, solver_class
-from psd_deflection.model.solvers.some_psds import geometry_of, solver_of_some
+from psd_deflection.model.solvers.subset import geometry_of, subset_solver
 from psd_deflection.rig.config import rig_from_values
 from test.model.solvers.test_truth import FLAT_THREE, RAISED, THREE, TWO, VARIANCES, least_squares
 
@@ -94,12 +94,6 @@ def judged(solver: Solver, dots: Array, covariance_within: float, gain_within: f
     np.testing.assert_allclose(of_dots / size, gain / size, rtol=0.0, atol=gain_within)
 
 
-def test_the_gain_of_iterative_knows_that_the_base_line_is_not_the_beams(rays: Any) -> None:
-    """Its covariance does not: it counts the beams' spread, some per cent more than the dots' own."""
-    dots = np.asarray(rays.tip_dots(SKEW, (2e-3, -3e-3, 0.04, 0.2, -0.15)))
-    judged(make_solver('iterative', SKEW), dots, 0.1, 1e-5)
-
-
 @pytest.mark.parametrize('pose', POSES)
 @pytest.mark.parametrize(('geometry', 'gain_within'), [(TWO, 0.02), (FLAT_THREE, 0.02), (RAISED, 0.3)])
 def test_the_covariance_of_beam_is_that_of_its_answer(
@@ -147,40 +141,6 @@ def test_the_base_pair_is_weighted_least_squares_of_its_model(
     np.testing.assert_allclose(stated_gain, gain, rtol=0.0, atol=2e-3 * np.abs(gain).max())
 
 
-@pytest.mark.parametrize('method', ['exact', 'iterative', 'ols', 'wls', 'wls_exact'])
-@pytest.mark.parametrize('geometry', [SKEW, FLAT_THREE])
-def test_a_flat_plates_method_says_of_tilts_that_there_are_none(rays: Any, method: str, geometry: Geometry) -> None:
-    variances = VARIANCES[: 2 * len(geometry.centers)]
-    dots = rays.tip_dots(geometry, (1e-3, 2e-3, 0.03, 0.0, 0.0))
-    solver = make_solver(method, geometry)
-    one, many = solver.solve(tuple(dots.tolist()), variances), solver.solve_many(dots[None], np.array(variances))
-    assert one[3:5] == (0.0, 0.0)
-    assert not many.tilt.any()
-    closed = method in ('ols', 'wls', 'wls_exact')
-    assert (one.iterations == 0) == closed
-
-
-def test_the_thesis_weights_say_no_tilts_and_take_no_steps() -> None:
-    one = make_solver('wls', SKEW, weights='thesis').solve((1e-3, 0.0, -1e-3, 2e-3), VARIANCES[:4])
-    assert (one.phi, one.omega, one.iterations) == (0.0, 0.0, 0)
-
-
-@pytest.mark.parametrize(('geometry', 'steps'), [(SKEW, 3), (FLAT_THREE, 6)])
-def test_newton_doubles_its_digits(rays: Any, geometry: Geometry, steps: int) -> None:
-    """From some millidegrees off two steps reach the last digit, and a third sees that nothing changes.
-
-    With three PSDs the start is farther off if the weights differ.
-    """
-    variances = VARIANCES[: 2 * len(geometry.centers)]
-    rng = np.random.default_rng(5)
-    for _ in range(20):
-        noise = rng.normal(size=len(variances)) * 2e-5
-        dots = rays.tip_dots(geometry, (2e-3, -1e-3, rng.uniform(-0.05, 0.05), 0.0, 0.0)) + noise
-        one = make_solver('exact', geometry).solve(tuple(dots.tolist()), variances)
-        assert one.status is SolverStatus.OK
-        assert one.iterations <= steps
-
-
 @pytest.mark.parametrize('geometry', [SKEW, FLAT_THREE])
 @pytest.mark.parametrize('method', ['exact', 'iterative'])
 def test_the_residual_is_what_the_plate_at_the_answer_does_not_explain(
@@ -192,25 +152,6 @@ def test_the_residual_is_what_the_plate_at_the_answer_does_not_explain(
     one = make_solver(method, geometry).solve(tuple(dots.tolist()), variances)
     np.testing.assert_allclose(one.residual, dots - rays.tip_dots(geometry, one[:5]), rtol=0.0, atol=1e-14)
     assert np.abs(one.residual).max() > 1e-5
-
-
-def test_minimum_tilt_leaves_no_residual(rays: Any) -> None:
-    dots = rays.tip_dots(SKEW, (2e-3, -1e-3, 0.04, 0.1, -0.1))
-    one = make_solver('minimum_tilt', SKEW).solve(tuple(dots.tolist()), VARIANCES[:4])
-    assert one.residual == (0.0, 0.0, 0.0, 0.0)
-    assert (one.status, one.iterations) == (SolverStatus.OK, 0)
-
-
-def test_trial_angles_treble_their_digits(rays: Any) -> None:
-    """From 0 to 3 degrees: 0.05 rad, a third of its cube, a third of that one's cube."""
-    for theta in (0.05, -0.05):
-        dots = tuple(rays.tip_dots(SKEW, (1e-3, 2e-3, theta, 0.0, 0.0)).tolist())
-        one = make_solver('iterative', SKEW).solve(dots, VARIANCES[:4])
-        assert one.theta == pytest.approx(theta, abs=1e-14)
-        assert one.iterations == 3
-    still = make_solver('iterative', SKEW).solve(tuple(rays.tip_dots(SKEW, (0.0,) * 5).tolist()), VARIANCES[:4])
-    assert still.theta == pytest.approx(0.0, abs=1e-15)
-    assert still.iterations == 1
 
 
 @pytest.mark.parametrize(('method', 'tries'), [('exact', 30), ('iterative', 50)])
@@ -284,7 +225,7 @@ def test_two_of_three_psds_allow_for_the_tilt_that_they_do_not_see(rays: Any) ->
     np.testing.assert_array_equal(geometry.centers, THREE.centers[kept])
     np.testing.assert_array_equal(geometry.zeros, THREE.zeros[kept])
     np.testing.assert_array_equal(geometry.heights, THREE.heights[kept])
-    solver = solver_of_some('pose', rig, kept)
+    solver = subset_solver('pose', rig, kept)
     assert solver is not None
     variances = np.array(VARIANCES[:4])
     dots = np.asarray(rays.tip_dots(geometry, tied(geometry, (2e-3, -3e-3, 0.02)))) + np.array(
@@ -316,25 +257,18 @@ def test_two_of_three_psds_allow_for_the_tilt_that_they_do_not_see(rays: Any) ->
     np.testing.assert_allclose(solver.gain(*args, got), want.gain(*args, want.solve(*args)), rtol=1e-12)
 
 
-def test_a_middle_without_its_end_is_no_answer() -> None:
-    solver = solver_of_some('pose', of_three(), [0, 1])
-    assert solver is not None
-    bad = solver.solve((float('nan'), 0.0, 0.0, 0.0), VARIANCES[:4])
-    assert bad.status is SolverStatus.NOT_CONVERGED
-
-
 def test_who_can_do_with_fewer_psds() -> None:
     """Every method that needs no third; minimum_tilt takes two at height 0 and no others; one PSD gives no twist."""
     rig = of_three()
     for name in ('exact', 'beam', 'wls', 'ols', 'iterative', 'wls_exact'):
-        some = solver_of_some(name, rig, [1, 2])
+        some = subset_solver(name, rig, [1, 2])
         assert some is not None
         assert some.name == name
         assert some.allowance((0.0,) * 4, VARIANCES[:4]) is None
-    assert solver_of_some('minimum_tilt', rig, [1, 2]) is None
-    assert solver_of_some('pose', rig, [1]) is None
-    assert solver_of_some('exact', rig, [1]) is None
-    three = solver_of_some('pose', rig, [0, 1, 2])
+    assert subset_solver('minimum_tilt', rig, [1, 2]) is None
+    assert subset_solver('pose', rig, [1]) is None
+    assert subset_solver('exact', rig, [1]) is None
+    three = subset_solver('pose', rig, [0, 1, 2])
     assert three is not None
     assert three.tilts == 'free'
 
@@ -432,20 +366,6 @@ def test_options_come_from_the_rig_file() -> None:
         assert solver_class('beam').options_from_rig(rig_from_values({**two, **effect})) == {'tilt_in_dots': True}
 
 
-def test_a_large_turn_is_gone_to_by_half_radians() -> None:
-    """1.4 rad: two steps of 0.5, then 0.4 by tangents: off by 2e-2, 4e-6, nothing; the last trial sees that."""
-    dots = _turned(SKEW, 1.4)
-    one = make_solver('iterative', SKEW).solve(dots, VARIANCES[:4])
-    assert one.theta == pytest.approx(1.4, abs=1e-14)
-    assert one.iterations == 6
-
-
-def _turned(geometry: Geometry, theta: float) -> tuple[float, ...]:
-    """Dots of a flat plate that only turns: q = R(-theta) l."""
-    c, s = np.cos(theta), np.sin(theta)
-    return tuple((geometry.beams @ np.array([[c, -s], [s, c]]) - geometry.centers).ravel().tolist())
-
-
 def test_a_quarter_turn_has_a_way_out_of_where_no_angle_is_better() -> None:
     """Each dot is a quarter turn from its beam, without rounding: at angle 0 the agreement is exactly 0."""
     centers = np.array([[0.125, 0.0], [-0.125, 0.0]])
@@ -453,14 +373,6 @@ def test_a_quarter_turn_has_a_way_out_of_where_no_angle_is_better() -> None:
     one = make_solver('iterative', geometry).solve((-0.125, -0.125, 0.125, 0.125), VARIANCES[:4])
     assert one.status is SolverStatus.OK
     assert one[:3] == pytest.approx((0.0, 0.0, np.pi / 2.0), abs=1e-14)
-
-
-def test_a_sine_below_minus_one_is_inadmissible_too() -> None:
-    solver = make_solver('wls_exact', TWO)
-    for dots in ((0.0, 0.0, 0.0, 0.5), (0.0, 0.0, 0.0, -0.5)):
-        assert solver.solve(dots, VARIANCES[:4]).status is SolverStatus.INADMISSIBLE
-    # And one that is no number is no sine.
-    assert solver.solve((float('nan'), 0.0, 0.0, 0.0), VARIANCES[:4]).status is SolverStatus.NOT_CONVERGED
 
 
 def test_a_link_without_end_and_a_weight_without_end_are_refused() -> None:
@@ -534,38 +446,3 @@ def test_a_sine_is_inadmissible_from_one_on_in_either_direction() -> None:
         ends = said.index(SolverStatus.INADMISSIBLE)
         assert 3 < ends < 30
         assert said == [SolverStatus.OK] * ends + [SolverStatus.INADMISSIBLE] * (60 - ends)
-
-
-def test_more_blocks_than_are_worked_on_at_once_share_their_variances(rays: Any) -> None:
-    dots = rays.tip_dots(SKEW, (1e-3, 2e-3, 0.02, 0.0, 0.0)) + np.random.default_rng(6).normal(size=(4100, 4)) * 1e-4
-    solver = make_solver('exact', SKEW)
-    many = solver.solve_many(dots, np.array(VARIANCES[:4]))
-    for i in (0, 4095, 4096, 4099):
-        one = solver.solve(tuple(dots[i].tolist()), VARIANCES[:4])
-        np.testing.assert_allclose(many.pose[i], one[:3], rtol=0.0, atol=1e-13)
-    assert many.status.tolist() == [0] * 4100
-
-
-@pytest.mark.parametrize(
-    ('method', 'geometry'),
-    [(m, SKEW) for m in ('exact', 'wls', 'wls_exact', 'ols', 'iterative', 'beam')]
-    + [('pose', THREE), ('base_pair', AT_THE_BASE)],
-)
-def test_dots_of_another_number_of_psds_are_no_block(method: str, geometry: Geometry) -> None:
-    """Fewer never; what is more is of no PSD either, wherever the readings are taken pair by pair."""
-    count = 2 * len(geometry.centers)
-    solver = make_solver(method, geometry)
-    with pytest.raises((ValueError, IndexError)):
-        solver.solve((0.0,) * (count - 1), VARIANCES[: count - 1])
-    if method in ('exact', 'ols', 'beam', 'pose', 'base_pair'):
-        with pytest.raises(ValueError):
-            solver.solve((0.0,) * (count + 2), (1e-12,) * (count + 2))
-
-
-def test_tilts_begin_at_none_and_take_few_steps(rays: Any) -> None:
-    """Of half a degree: each step is some thousand times smaller than the one before."""
-    for pose in POSES:
-        dots = np.asarray(rays.tip_dots(THREE, (*pose, 0.01, -0.008)))
-        one = make_solver('pose', THREE).solve(tuple(dots.tolist()), VARIANCES)
-        assert one[:5] == pytest.approx((*pose, 0.01, -0.008), abs=1e-12)
-        assert one.iterations <= 5

@@ -70,7 +70,7 @@ def geometry_of(rig: Rig, kept: Sequence[int]) -> Geometry:
     return replace(whole, centers=whole.centers[at], zeros=whole.zeros[at], heights=whole.heights[at])
 
 
-def solver_of_some(name: str, rig: Rig, kept: Sequence[int]) -> Solver | None:
+def subset_solver(name: str, rig: Rig, kept: Sequence[int]) -> Solver | None:
     """The method ``name`` for the PSDs ``kept`` (from 0), with the rig's options; None if it cannot do with them."""
     geometry = geometry_of(rig, kept)
     try:

@@ -1,0 +1,250 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Estimate of the dots at a block's timestamp, its covariance, and the check of the readings.
+
+Joins the noise of the stream (:mod:`psd_deflection.measure.uncertainty.noise`) with the fit and the check of each set
+of PSDs (:mod:`psd_deflection.measure.uncertainty.psd_set`), and knows their state.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from psd_deflection.measure.state import State, Value, mismatch, numbers
+from psd_deflection.measure.uncertainty.combinations import Left
+from psd_deflection.measure.uncertainty.consistency import UNMEASURED, ConsistencyResult, Unexplained, survival
+from psd_deflection.measure.uncertainty.converter import ConverterSteps, Volts
+from psd_deflection.measure.uncertainty.noise import StreamNoise
+from psd_deflection.measure.uncertainty.outliers import OutlierSearch
+from psd_deflection.measure.uncertainty.psd_set import PsdSet
+from psd_deflection.measure.uncertainty.vibration import Tone, words_of
+from psd_deflection.model.detector import dot_noise_variances
+from psd_deflection.model.plate.plate import Tilts
+from psd_deflection.records import FloatArray, IntArray, channel_names, dot_names
+from psd_deflection.rig.config import Rig
+
+NOISE, SEGMENT, SUMS = 'state.noise', 'state.noise_segment', 'state.sums_segment'
+VIBRATION, STEPS, PSDS = 'state.vibration', 'state.converter_steps', 'state.psds.'
+"""Names of the state; ``PSDS`` goes on with the PSDs (from 0) of a set, such as "state.psds.0_1"."""
+
+
+class BlockEstimator:
+    """Fits, checks and learns from block after block.
+
+    ``full``: all PSDs. ``contradictions``: inconsistent blocks. ``misfits``: blocks with motion that the fit cannot
+    follow. ``chi_square``: of the last check, of ``freedom`` degrees. ``excluded``: PSDs (from 1) without which the
+    last block was solved. ``vibrates``: what is faster than a block can follow, such as "14 um rms near 87 Hz"; '' if
+    nothing is. ``on_plate``: whether the PSDs are on the plate: then the noise is measured, and the readings checked.
+    """
+
+    part = 'the fit and the noise of the dots'
+    prefixes = (NOISE, SUMS, VIBRATION, STEPS, PSDS)
+
+    def __init__(self, rig: Rig, on_plate: bool = True, tilts: Tilts = 'none') -> None:
+        """``tilts``: what the rig's solver says of the plate's tilts; it counts for more than two PSDs."""
+        self._rig = rig
+        self.on_plate = on_plate
+        self._size = rig.estimator.block_size
+        variances = dot_noise_variances(rig)
+        self._stated_sd = np.sqrt(variances)
+        self.full = PsdSet(rig, range(len(rig.psds)), tilts)
+        self._subsets: dict[tuple[int, ...], PsdSet] = {}
+        self._pending: dict[tuple[int, ...], tuple[float, ...]] = {}
+        steps = rig.converter.volts_per_count * rig.sensitivities.ravel()
+        self.noise = StreamNoise(self._size, rig.centers, rig.centers + rig.zeros, variances, steps, *self._model())
+        self._meters_per_volt = 0.5 * (rig.sensitivities[:, 0] + rig.sensitivities[:, 1])
+        self._converter = ConverterSteps.of_rig(rig)
+        if on_plate:
+            self.noise.look_for_tones(len(rig.psds))
+        self._outliers = OutlierSearch(rig.centers, rig.centers + rig.zeros)
+        self.excluded: tuple[int, ...] = ()
+        self.freedom = 1
+        self.contradictions = 0
+        self.chi_square = 0.0
+        self.misfits = 0
+        self._use_noise()
+
+    def _model(self) -> tuple[FloatArray | None, Left | None]:
+        """Return the slopes at rest and the residuals of the solver's model, None for two PSDs."""
+        model = self.full.model
+        return (None, None) if model is None else (model.rest_slopes, model.residuals)
+
+    def set_zeros(self, rig: Rig) -> None:
+        """Use the zeros of ``rig`` from now on; the checks begin anew."""
+        self._rig = rig
+        beams = rig.centers + rig.zeros
+        self.full.set_geometry(rig)
+        self.noise.set_geometry(rig.centers, beams, *self._model())
+        self._subsets, self._pending = {}, {}
+        self._use_noise()
+        self._outliers = OutlierSearch(rig.centers, beams)
+
+    def subset(self, psds: tuple[int, ...], tilts: Tilts) -> PsdSet:
+        """Return the set of ``psds`` (from 0), two or more; ``tilts``: as of :class:`PsdSet`."""
+        own = self._subsets.get(psds)
+        if own is None:
+            own = self._subsets[psds] = PsdSet(self._rig, psds, tilts)
+            own.set_noise(self.noise)
+            if psds in self._pending:
+                own.load_state(self._pending.pop(psds))
+        return own
+
+    def fit(self, psds: PsdSet, slots: IntArray, samples: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
+        """Return the dots (C,) m of ``psds`` at the middle of a block, and their covariance (C, C) m^2.
+
+        ``slots`` (n,): which samples are present; ``samples`` (n, 2P), m, of all PSDs.
+        """
+        fitted = psds.fitted(slots, samples)
+        self.misfits += fitted.misfit
+        return fitted.dots, fitted.covariance
+
+    def mean_variances(self, present: int) -> tuple[float, ...]:
+        """Return the variances (C,), m^2, of the mean of so many samples of each reading."""
+        more = self._size / present
+        return tuple(more * sd * sd for sd in self.noise.mean_sd().tolist())
+
+    @property
+    def limit_factor(self) -> float:
+        """Factor on the limits of the checks."""
+        return 1.0 if self.noise.measured or not self.on_plate else UNMEASURED
+
+    def check(self, psds: PsdSet, found: Unexplained | None, blamed: Collection[int] | None) -> ConsistencyResult:
+        """Check the readings of a block and update the check's state; as :meth:`ConsistencyCheck.update`."""
+        result = psds.check.update(found, self.limit_factor, blamed)
+        self.contradictions += result.contradict
+        self.chi_square, self.freedom = result.chi_square, result.freedom
+        return result
+
+    def learn(self, index: int, slots: IntArray, samples: FloatArray, volts: Volts) -> bool:
+        """Take a good block into the noise; True if that changed. ``volts`` (n, 3P): x, y, sum of each PSD.
+
+        Nothing of this block's estimate waits for it.
+        """
+        if not self.on_plate:
+            return False
+        changed = self._converter.add(volts)
+        if changed:
+            self._use_steps()
+        sums = np.multiply(volts[:, 2::3], self._meters_per_volt, dtype=np.float64)
+        changed |= self.noise.add(index, slots, samples, sums)
+        if changed:
+            self._use_noise()
+        return changed
+
+    def _use_steps(self) -> None:
+        """Use the steps of the rig file where the samples show none that are coarser."""
+        rig = self._rig
+        shown = self._converter.steps.reshape(-1, 3)[:, :2]
+        steps = np.maximum(shown, rig.converter.volts_per_count) * rig.sensitivities
+        self.noise.set_steps(steps.ravel())
+
+    def _use_noise(self) -> None:
+        for psds in (self.full, *self._subsets.values()):
+            psds.set_noise(self.noise)
+        self.vibrates = words_of(self.noise.tones, self._rig.converter.sample_rate_hz)
+
+    def search_outliers(self, index: int, dots: tuple[float, ...], result: ConsistencyResult) -> None:
+        """Take a block into the search for a wrong reading: each inconsistent one, of the others every tenth."""
+        if len(dots) == 4 and (result.contradict or index % 10 == 0):
+            self._outliers.add(dots, result.errors)
+
+    def most_likely_wrong(self) -> str:
+        """Return which reading is most likely wrong and what is wrong with it, or '' if unknown."""
+        if self.full.model is None:
+            return self._outliers.most_likely(float(self.noise.mean_sd().max()))
+        names = ' and '.join(f'psd_{psd}' for psd in self.excluded)
+        return f'{names} does not fit the others and is left out' if names else ''
+
+    def noise_source(self) -> str:
+        """Return where the noise that covariances use comes from, in words."""
+        if not self.noise.measured:
+            return 'of the rig file until it is measured'
+        return 'measured at rest' if self.noise.at_rest else 'measured in motion'
+
+    def words(self) -> tuple[tuple[str, str], ...]:
+        """Return rows for /diagnostics: the check of the readings, and the noise against the rig file's."""
+        two = self.full.model is None
+        freedom = '' if two else f' of {self.freedom} degrees of freedom'
+        share = survival(self.chi_square, 1 if two else self.freedom)
+        rows = (
+            ('chi-square of the readings', f'{self.chi_square:.2f}{freedom}'),
+            ('p of that chi-square', f'{share:.2g}'),
+            ('blocks whose readings contradict each other', str(self.contradictions)),
+            ('blocks with motion that the fit cannot follow', str(self.misfits)),
+        )
+        if not self.on_plate:
+            return (*rows, ('covariance from', 'noise of the rig file'))
+        source = ('covariance from', f'noise {self.noise_source()}')
+        return (*rows, source, ('vibrates', self.vibrates or 'no'), *self._step_words(), *self.noise_words())
+
+    def _step_words(self) -> tuple[tuple[str, str], ...]:
+        if not self._converter.steps.any():
+            return ()
+        stated = self._rig.converter.volts_per_count * 1e3
+        shown = zip(channel_names(len(self._rig.psds)), self._converter.steps.tolist(), strict=True)
+        words = ', '.join(f'{name} {step * 1e3:.3g} mV' for name, step in shown if step)
+        return (('steps of the converter', f'{words} (rig file {stated:.3g} mV)'),)
+
+    def noise_words(self) -> tuple[tuple[str, str], ...]:
+        """Return for each reading the noise of a sample and of a block's mean against the rig file's, um."""
+        stated = self._stated_sd * 1e6
+        names = dot_names(len(stated) // 2)
+        rows = zip(names, self.noise.sample_sd(), self.noise.mean_sd(), stated, stated / self._size**0.5, strict=True)
+        return tuple(
+            (
+                f'noise of {name} (um)',
+                f'{a * 1e6:.3f} a sample (rig file {file:.3f}), {b * 1e6:.3f} a block ({mean:.3f})',
+            )
+            for name, a, b, file, mean in rows
+        )
+
+    def state_dict(self) -> State:
+        """See :class:`psd_deflection.measure.state.Part`."""
+        out: State = {}
+        if self.on_plate:
+            tones = tuple(v for t in self.noise.tones for v in (t.frequency, *t.covariance.ravel().tolist()))
+            rows = {NOISE: self.noise.state(), VIBRATION: tones, SEGMENT: self.noise.segment()}
+            rows |= {SUMS: self.noise.sums(), STEPS: self._converter.state()}
+            out |= {name: row for name, row in rows.items() if row}
+        sets = {self.full.psds: self.full, **self._subsets}
+        states = {**self._pending, **{psds: own.state() for psds, own in sets.items()}}
+        return out | {PSDS + '_'.join(map(str, psds)): state for psds, state in states.items()}
+
+    def load_state_dict(self, values: Mapping[str, Value]) -> None:
+        """See :class:`psd_deflection.measure.state.Part`. Raises ValueError for another block size or other PSDs."""
+        if steps := numbers(values, STEPS, 'the steps of these channels'):
+            self._converter.set_state(steps)
+            self._use_steps()
+        if noise := numbers(values, NOISE, 'the noise of this rig'):
+            self.noise.set_state(noise)
+            sums = numbers(values, SUMS, 'sum signals of a segment') or ()
+            self.noise.set_segment(numbers(values, SEGMENT, 'blocks of a segment') or (), sums)
+            self.noise.tones = _tones(numbers(values, VIBRATION, 'what vibrates') or (), 2 * len(self._rig.psds))
+            self._use_noise()
+        for name in values:
+            if name.startswith(PSDS):
+                self._load_set(name, values)
+
+    def _load_set(self, name: str, values: Mapping[str, Value]) -> None:
+        count = len(self._rig.psds)
+        psds = tuple(int(n) for n in name.removeprefix(PSDS).split('_'))
+        if len(psds) < 2 or max(psds) >= count:
+            raise ValueError(f'{name}: expected two or more of {count} PSDs')
+        if psds == self.full.psds:
+            self.full.load_state(numbers(values, name, 'the fit of this rig') or ())
+            return
+        size = 3 + len(psds) * (6 + len(self.full.fit.state()) // count)
+        # They need the method that solves them, so they begin when they are first asked for.
+        self._pending[psds] = numbers(values, name, 'the fit of these PSDs', size) or ()
+        self._subsets.pop(psds, None)
+
+
+def _tones(values: tuple[float, ...], count: int) -> tuple[Tone, ...]:
+    """Return the tones of ``count`` readings. Raises ValueError if they are those of others."""
+    each = 1 + count * count
+    if len(values) % each:
+        raise mismatch(VIBRATION, values, f'{each} numbers for each tone')
+    rows = np.reshape(values, (-1, each))
+    return tuple(Tone(float(row[0]), row[1:].reshape(count, count)) for row in rows)

@@ -1,0 +1,173 @@
+# Copyright 2026 psd_deflection maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""What joins noise, fit and check: each part asked by itself, against what it should say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
+from psd_deflection.measure.uncertainty.consistency import CONTRADICTS, ConsistencyResult
+from psd_deflection.measure.uncertainty.plate_model import PlateModel
+from psd_deflection.model.plate.plate import Tilts, flat_points, plate_points
+from psd_deflection.records import FloatArray
+from psd_deflection.rig.config import Rig, load_rig
+
+THIRD: dict[str, Any] = {
+    'psd_1.zero': [1e-3, -2e-3],
+    'psd_2.height': 0.05,
+    'psd_3.center': [0.08, -0.06],
+    'psd_3.height': -0.03,
+}
+ALL = np.arange(20)
+VOLTS = np.full((20, 9), 5.0)
+
+
+def rig_of(psds: int = 2, named: Mapping[str, object] | None = None, **more: object) -> Rig:
+    return load_rig(overrides={**(THIRD if psds == 3 else {}), **(named or {}), **more})
+
+
+def unknowns_of(tilts: Tilts) -> int:
+    return 5 if tilts == 'free' else 3
+
+
+@pytest.mark.parametrize('tilts', ['none', 'tied', 'bounded', 'free'])
+@pytest.mark.parametrize('kept', [[0, 1, 2], [0, 2]])
+def test_a_plate_model_leaves_what_it_does_not_explain_and_nothing_else(tilts: Tilts, kept: list[int]) -> None:
+    if tilts == 'free' and len(kept) == 2:
+        return
+    rig = rig_of(3)
+    model = PlateModel(rig, kept, tilts)
+    k = {'none': 0.0, 'free': 0.0}.get(tilts, rig.link.slope_ratio / rig.link.length)
+    rng = np.random.default_rng(1)
+    poses = rng.uniform(-1.0, 1.0, (6, 5)) * (3e-3, 3e-3, 0.03, 0.01, 0.01)
+    if tilts != 'free':
+        poses[:, 3], poses[:, 4] = -k * poses[:, 1], k * poses[:, 0]
+    heights = np.zeros(len(kept)) if tilts == 'none' else rig.heights[kept]
+    beams = (rig.centers + rig.zeros)[kept]
+    np.testing.assert_array_equal(model.beams, beams)
+    exact = (plate_points(poses, beams, heights) - rig.centers[kept]).reshape(6, -1)
+    assert np.abs(model.residuals(exact)).max() < 1e-10
+    # Of small errors about rest: what least squares of the slopes leaves.
+    errors = 1e-7 * rng.normal(size=(4, 2 * len(kept)))
+    slopes = model.slopes_at((0.0,) * 5)
+    assert slopes.shape == (2 * len(kept), unknowns_of(tilts))
+    at_rest = rig.zeros[kept].ravel()
+    want = errors - errors @ np.linalg.pinv(slopes).T @ slopes.T
+    np.testing.assert_allclose(model.residuals(at_rest + errors), want, atol=1e-12)
+
+
+def test_steps_from_rest_end_below_a_tenth_of_a_nanometre_at_the_largest_poses() -> None:
+    """3 mm, 3 degrees and tilts of half a degree: after six steps more than a nanometre is left."""
+    rig = rig_of(3)
+    poses = np.array([[3e-3, -3e-3, 0.05, 0.01, 0.01]])
+    model = PlateModel(rig, range(3), 'free')
+    dots = (plate_points(poses, rig.centers + rig.zeros, rig.heights) - rig.centers).reshape(1, -1)
+    assert np.abs(model.residuals(dots)).max() < 1e-10
+
+
+def test_of_a_flat_plate_the_residual_is_computed_anew() -> None:
+    """That of a method for small angles has its own error in it; another model's is taken as it is."""
+    rig = rig_of(3)
+    pose = np.array([2e-3, -3e-3, 0.05])
+    dots = flat_points(pose, rig.centers + rig.zeros).ravel() - rig.centers.ravel()
+    told = (1e-5,) * 6
+    assert np.abs(PlateModel(rig, range(3), 'none').residual(tuple(dots.tolist()), told)).max() < 1e-15
+    for tilts in ('tied', 'bounded', 'free'):
+        assert PlateModel(rig, range(3), tilts).residual(tuple(dots.tolist()), told) == told
+
+
+def test_words_say_the_noise_of_each_reading_beside_the_rig_files() -> None:
+    """In um, of a sample and of a mean of twenty, which has the root of a twentieth of it."""
+    rig = rig_of(2, {'psd_1.noise': [4e-3, 2e-3], 'converter.bits': 24, 'psd_2.sensitivity': [1e-3, 5e-4]})
+    words = dict(BlockEstimator(rig).noise_words())
+    assert list(words) == [f'noise of {name} (um)' for name in ('x1', 'y1', 'x2', 'y2')]
+    for name, um in (('x1', 2.0), ('y1', 1.0), ('x2', 2.0), ('y2', 1.0)):
+        mean = um / 20.0**0.5
+        said = f'{um:.3f} a sample (rig file {um:.3f}), {mean:.3f} a block ({mean:.3f})'
+        assert words[f'noise of {name} (um)'] == said
+
+
+def checked(of: BlockEstimator, dots: FloatArray, residual: FloatArray, covariance: FloatArray) -> ConsistencyResult:
+    args = tuple(dots.tolist()), tuple(residual.tolist()), covariance, (0.0,) * 5
+    return of.check(of.full, of.full.unexplained(*args), None)
+
+
+@pytest.mark.parametrize('psds', [2, 3])
+def test_limits_are_wider_while_the_noise_is_unknown(psds: int) -> None:
+    rig, times = rig_of(psds), 16.0
+    of, rest = BlockEstimator(rig), rig.zeros.ravel()
+    limit = times * float(chi2.isf(CONTRADICTS, 2 * psds - 3))
+    error = 1e-9 * np.eye(2 * psds)[0]
+    unit = checked(of, rest + error, error, 1e-12 * np.eye(2 * psds)).chi_square
+    of.contradictions = 0
+    for share, count in ((0.98, 0), (1.02, 1)):
+        size = (share * limit / unit) ** 0.5
+        checked(of, rest + size * error, size * error, 1e-12 * np.eye(2 * psds))
+        assert of.contradictions == count
+    assert of.chi_square == pytest.approx(1.02 * limit, rel=1e-3)
+    assert of.freedom == 2 * psds - 3
+
+
+@pytest.mark.parametrize('psds', [2, 3])
+def test_new_zeros_are_those_of_a_rig_that_always_had_them(psds: int) -> None:
+    old, new = rig_of(psds), rig_of(psds, {'psd_1.zero': [2e-3, 1e-3], 'psd_2.zero': [0.0, -1e-3]})
+    moved, fresh = BlockEstimator(old), BlockEstimator(new)
+    checked(moved, old.zeros.ravel(), 1e-3 * np.eye(2 * psds)[0], 1e-12 * np.eye(2 * psds))
+    moved.set_zeros(new)
+    rng = np.random.default_rng(3)
+    samples, residual = (new.zeros.ravel() + 1e-6 * rng.normal(size=(n, 2 * psds)) for n in (20, 1))
+    one, other = (of.fit(of.full, ALL, samples) for of in (moved, fresh))
+    assert one[0] == other[0]
+    np.testing.assert_array_equal(one[1], other[1])
+    answers = [checked(of, np.array(one[0]), residual[0], one[1]) for of in (moved, fresh)]
+    assert answers[0] == answers[1]
+    for of in (moved, fresh):
+        for block in range(100):
+            samples = new.zeros.ravel() + 1e-6 * np.random.default_rng(block).normal(size=(20, 2 * psds))
+            of.learn(block, ALL, samples, VOLTS[:, : 3 * psds])
+    np.testing.assert_array_equal(moved.noise.gamma, fresh.noise.gamma)
+
+
+def test_segments_change_the_noise_of_all_sets() -> None:
+    """Segments of 50 blocks; the fits then have the new noise."""
+    rig = rig_of(3)
+    of = BlockEstimator(rig)
+    subset = of.subset((0, 2), 'none')
+    assert subset is of.subset((0, 2), 'none')
+    rng = np.random.default_rng(4)
+    blocks = [rig.zeros.ravel() + 3e-6 * rng.normal(size=(20, 6)) for _ in range(150)]
+    assert [b for b, samples in enumerate(blocks) if of.learn(b, ALL, samples, VOLTS)] == [49, 99, 149]
+    still = np.tile(rig.zeros.ravel(), (20, 1))
+    for psds, count in ((of.full, 6), (subset, 4)):
+        dots, covariance = of.fit(psds, ALL, still)
+        assert np.sqrt(np.diag(covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
+        assert len(dots) == count
+    assert not BlockEstimator(rig_of(), False).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])
+
+
+def test_the_base_line_is_between_the_places_of_the_dots() -> None:
+    """Of centres that differ in both axes, and dots of centimetres."""
+    of = BlockEstimator(rig_of(2, {'psd_1.center': [0.02, 0.07], 'psd_2.center': [-0.1, 0.03]}))
+    dots, residual = np.array([0.03, -0.01, -0.02, 0.015]), np.array([1e-6, -2e-6, 3e-6, 5e-6])
+    covariance = np.diag([1.0, 2.0, 3.0, 4.0]) * 1e-12
+    way = np.array([0.02 + 0.1, 0.07 - 0.03]) + dots[:2] - dots[2:]
+    a = np.concatenate((way, -way)) / np.hypot(*way) / 2.0**0.5
+    got = checked(of, dots, residual, covariance)
+    assert got.chi_square == pytest.approx((a @ residual) ** 2 / (a @ covariance @ a), rel=1e-9)
+    np.testing.assert_allclose(got.errors, (a @ residual) / a, rtol=1e-9)
+
+
+def test_nothing_is_redundant_while_the_tilt_is_only_bounded() -> None:
+    rig = rig_of(3)
+    of = BlockEstimator(rig, tilts='free')
+    for tilts, freedom in (('bounded', 0), ('none', 1)):
+        psds = BlockEstimator(rig, tilts='free').subset((0, 1), tilts)  # type: ignore[arg-type]
+        found = psds.unexplained(tuple(rig.zeros[:2].ravel().tolist()), (0.0,) * 4, 1e-12 * np.eye(4), (0.0,) * 5)
+        assert of.check(psds, found, None).freedom == freedom
+        assert psds.check.agrees(found, 1.0) == bool(freedom)
