@@ -134,7 +134,7 @@ class HealthReporter:
             ('silences', str(wire.silences)),
             ('refused on coming back', str(wire.refused_reopenings)),
             *((f'messages refused: {topic}', str(count)) for topic, count in sorted(s.refused.items())),
-            ('blocks waiting', str(s.acquisition.queue.qsize())),
+            ('blocks waiting', str(s.acquisition.queue.blocks)),
             ('inputs dropped, because the pipeline was held up', str(s.processing.requests_dropped)),
         ]
         values.append(('simulated', 'yes' if s.simulated else 'no'))

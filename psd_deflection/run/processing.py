@@ -22,7 +22,7 @@ from psd_deflection.base.log import INFO, WARNING, Say
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
 from psd_deflection.run.behind import why_behind
-from psd_deflection.run.reading.arrivals import Arrival, Item, Noted, Restarted
+from psd_deflection.run.reading.arrivals import Arrival, ItemQueue, Noted, Restarted
 
 T = TypeVar('T')
 
@@ -94,7 +94,7 @@ class Processing:
 
     def __init__(
         self,
-        items: queue.SimpleQueue[Item],
+        items: ItemQueue,
         pipeline: Pipeline,
         say: Say,
         clock: Callable[[], int] = time.monotonic_ns,

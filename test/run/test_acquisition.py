@@ -146,6 +146,16 @@ def test_a_full_queue_drops_the_newest_and_counts(device: Any, rig: Rig, sample:
     assert run.acquisition.counters.queue_dropped == 60
 
 
+def test_a_note_of_the_time_map_takes_no_block_s_room(sample: Any) -> None:
+    acquisition = Acquisition(load_rig(overrides={'queue_blocks': 2}), unsaid)
+    acquisition.feed([sample(s) for s in range(20)], 10**9)
+    # 0.3 s of samples within a millisecond: the map steps.
+    acquisition.feed([sample(s) for s in range(20, 320)], 10**9 + 10**6)
+    items = [acquisition.queue.get() for _ in range(acquisition.queue.qsize())]
+    assert any(isinstance(item, Noted) for item in items)
+    assert numbers(items) == list(range(40))
+
+
 def test_stop_hands_over_what_was_read(device: Any, rig: Rig, sample: Any) -> None:
     run = Run(rig)
     device.send_frames(*[sample(s) for s in range(7)])

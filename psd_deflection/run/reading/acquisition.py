@@ -38,7 +38,7 @@ from psd_deflection.records import (
 )
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.behind import SLOW
-from psd_deflection.run.reading.arrivals import Arrival, Ended, Gathered, Item, Noted, Restarted
+from psd_deflection.run.reading.arrivals import Arrival, Ended, Gathered, ItemQueue, Noted, Restarted
 from psd_deflection.run.reading.clock_watch import ClockWatch
 from psd_deflection.run.reading.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
@@ -85,7 +85,7 @@ class Acquisition:
     def __init__(self, rig: Rig, say: Say) -> None:
         self.source: Source = make_source(rig)
         self.counters = AcquisitionCounters()
-        self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self.queue = ItemQueue()
         self.why_full: Callable[[], str] = lambda: SLOW
         # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
         # running must not tear the stamps apart.
@@ -181,7 +181,7 @@ class Acquisition:
         samples = 0
         with contextlib.suppress(queue.Empty):
             while True:
-                item = self.queue.get_nowait()
+                item = self.queue.get()
                 samples += len(item.raw.seq) if isinstance(item, Arrival) else 0
         self.queue.put(Ended())
         self.counters.abandoned += samples
@@ -493,7 +493,7 @@ class Acquisition:
             squeezed, t_ns = int((raised > t_ns).sum()), raised
         self._note_squeezed(squeezed, now)
         self._last_t_ns = int(t_ns[-1])
-        if self.queue.qsize() >= self._rig.acquisition.queue_blocks:
+        if self.queue.blocks >= self._rig.acquisition.queue_blocks:
             self.counters.queue_dropped += len(gathered.seq)
             self.counters.dropped_why = self.why_full()
             self._repeats.tell(
