@@ -15,7 +15,7 @@ from psd_deflection.rig.parameters import Section
 
 DOCS = Path(__file__).parents[2] / 'docs'
 ROW = re.compile(r'^\| (`[^|]*`) \| ([^|]+) \|', re.MULTILINE)
-SECTIONS = (settings.SETTINGS, shaping.SHAPING, chain_file.SETTINGS, chain_file._JOINT, chain_file._LINK)
+SECTIONS = (settings.SETTINGS, shaping.SHAPING, chain_file.SETTINGS, chain_file.JOINT, chain_file.LINK)
 
 
 def stated(page: str) -> dict[str, str]:

@@ -37,7 +37,7 @@ def devices(tmp_path: Path) -> Iterator[list[ScriptedDevice]]:
     both = [ScriptedDevice(tmp_path / f'port_{n}') for n in range(2)]
     yield both
     for device in both:
-        if not device._gone.is_set():
+        if device.plugged:
             device.unplug()
 
 

@@ -97,7 +97,7 @@ class ScriptedHost(ScriptedDevice):
 def device() -> Iterator[ScriptedHost]:
     scripted = ScriptedHost()
     yield scripted
-    if not scripted._gone.is_set():
+    if scripted.plugged:
         scripted.unplug()
 
 
@@ -137,7 +137,7 @@ class Sender:
         self.answer = answer
         self.rig = load_rig(overrides={'port': f'udp://127.0.0.1:{place[1]}'})
         self.pinged = threading.Event()
-        self._place = place
+        self.place = place
         self._ended = threading.Event()
         self.sockets: list[socket.socket] = []
         self._threads: list[threading.Thread] = []
@@ -155,7 +155,7 @@ class Sender:
         decoder = FrameDecoder()
         while not self._ended.wait(0.01) and made is self.sockets[-1]:
             # As a device does once a second.
-            made.sendto(self.answer, self._place)
+            made.sendto(self.answer, self.place)
             while select.select((made,), (), (), 0.0)[0]:
                 for frame in decoder.feed(made.recv(4096)):
                     if isinstance(frame, PingFrame):
@@ -163,7 +163,7 @@ class Sender:
 
     def send(self, *datagrams: bytes) -> None:
         for datagram in datagrams:
-            self.sockets[-1].sendto(datagram, self._place)
+            self.sockets[-1].sendto(datagram, self.place)
 
     def hush(self) -> None:
         """From now on it sends what the test sends."""
@@ -250,7 +250,7 @@ def test_a_device_that_sends_from_another_place_introduces_itself(
 
 def test_strangers_are_told_and_nothing_of_theirs_is_taken(sender: Sender, over_udp: Run, sample: Any) -> None:
     stranger = Sender(encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'OTHER'})))
-    stranger._place = sender._place
+    stranger.place = sender.place
     try:
         said = over_udp.heard('are not taken')
         assert said.startswith(f'{sender.rig.acquisition.port}: datagrams of 127.0.0.1:')

@@ -10,6 +10,7 @@ import queue
 import shutil
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -43,7 +44,7 @@ class Disk:
 
     def usage(self, path: Path) -> Any:
         self.asked.release()
-        return shutil._ntuple_diskusage(100_000 * MB, 0, self.free)
+        return SimpleNamespace(total=100_000 * MB, used=0, free=self.free)
 
 
 @pytest.fixture

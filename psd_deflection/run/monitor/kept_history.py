@@ -134,15 +134,25 @@ class HistoryKeeper:
 
     def save(self) -> None:
         """Save what is new, unless the disk still has to do with the last time."""
-        if self._restored and self._idle.is_set():
+        if self._restored and self.idle:
             self._idle.clear()
             kept, self._failed_from = self._history.unsaved(self._failed_from), None
             self._todo.put_nowait(kept)
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits to be written."""
+        return self._idle.is_set()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
     def end(self) -> None:
         """Save what is new, and end; a disk that hangs is not waited for longer than ``END_S``."""
         until = time.monotonic() + END_S
-        if not self._thread.is_alive() or not self._idle.wait(END_S):
+        if not self.alive or not self._idle.wait(END_S):
             return
         self.restore()
         self.save()

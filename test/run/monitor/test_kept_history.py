@@ -72,7 +72,7 @@ def test_what_is_kept_at_any_time_is_what_there_was(
             file.save(made.unsaved())
     file.save(made.unsaved())
     kept = file.load(LATER, LATER)
-    whole = made._rings[1].between(0, made._rings[1].newest + 1)
+    whole = made.rings[1].between(0, made.rings[1].newest + 1)
     assert kept.cells[-len(whole) :].tobytes() == whole.tobytes()
     file.close()
 
@@ -95,10 +95,10 @@ def test_two_runs_are_as_one(file_of: Open) -> None:
         assert got.keys() == want.keys()
         for name, values in want.items():
             np.testing.assert_allclose(got[name], values, rtol=1e-12)
-    assert [text for _, text in second._marks] == ['[1]', '[2]']
+    assert [text for _, text in second.marks] == ['[1]', '[2]']
     # The cell under way is replaced, not kept twice.
     file.save(second.unsaved())
-    assert len(file.load(LATER, LATER).cells) == len(whole._rings[1].between(0, whole._rings[1].newest + 1))
+    assert len(file.load(LATER, LATER).cells) == len(whole.rings[1].between(0, whole.rings[1].newest + 1))
 
 
 def test_only_the_last_week_is_kept(file_of: Open) -> None:
@@ -167,10 +167,10 @@ class Keeping:
 
     def saved(self) -> None:
         self.keeper.save()
-        until(self.keeper._idle.is_set)
+        until(lambda: self.keeper.idle)
 
     def count(self) -> int:
-        return len(self.history._rings[1].between(0, LATER))
+        return len(self.history.rings[1].between(0, LATER))
 
 
 @pytest.fixture
@@ -291,7 +291,7 @@ def test_a_disk_that_hangs_holds_nobody(keep: Callable[[], Keeping], monkeypatch
     one.keeper.end()
     # Not for the minutes that the disk may hang.
     assert time.monotonic() - begun < 60.0
-    assert one.keeper._thread.is_alive()
+    assert one.keeper.alive
     gate.set()
 
 
@@ -315,7 +315,6 @@ def test_the_hours_of_a_page_outlive_it(serve: Serve, tmp_path: Path, monkeypatc
     second.server.close()
 
     third = serve(monitor_history=False)
-    assert third.server._keeper is None
     assert history_of(third, 400.0, points=40)['marks'] == []
 
 
