@@ -35,9 +35,12 @@ from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import CAMERA_INFO, COMPRESSED, IMAGE
 from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN
+from psd_deflection.run.realtime import SHARED_MEMORY, shared_memory_left
 
 NODE_NAME = 'camera'
 MOST_DISTORTIONS = 14
+SHARED_BYTES = 1_000_000
+"""Shared memory that Fast DDS takes for a participant and its ports."""
 LARGEST_NUMBER = 1e7
 """Bound of the numbers of a camera's matrix, px, and of its distortion."""
 
@@ -176,8 +179,13 @@ def _info_fault(message: Any) -> str:
 
 def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Say) -> int:
     """Measure until SIGINT or SIGTERM. Raises ConfigError."""
+    left = shared_memory_left()
+    if left < SHARED_BYTES:
+        say(
+            f'{SHARED_MEMORY} has {left / 1e3:.0f} kB left, images need {SHARED_BYTES / 1e3:.0f}: DDS uses UDP', WARNING
+        )
     with (
-        ros(NODE_NAME, ros_arguments, shared_memory=True) as signals,
+        ros(NODE_NAME, ros_arguments, shared_memory=left >= SHARED_BYTES) as signals,
         contextlib.closing(CameraNode(given, say)) as owner,
     ):
         serve(owner, signals)

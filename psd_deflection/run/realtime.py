@@ -12,9 +12,11 @@ import ctypes
 import gc
 import os
 import socket
+import sys
 import time
 from collections.abc import Callable
 
+SHARED_MEMORY = '/dev/shm'
 READER_PRIORITY = 50
 """SCHED_FIFO priority of the reader thread. Threads inherit the policy, so the reader sets its own."""
 
@@ -58,6 +60,16 @@ def settle() -> None:
     """Exempt the present objects from garbage collection: they stay until the end."""
     gc.collect()
     gc.freeze()
+
+
+def shared_memory_left() -> int:
+    """Free bytes of ``SHARED_MEMORY``, in which DDS and the tracing of ROS 2 map memory."""
+    try:
+        system = os.statvfs(SHARED_MEMORY)
+    except OSError:
+        # Where there is none, nothing can be mapped, and whoever tries is told so.
+        return sys.maxsize
+    return system.f_bavail * system.f_frsize
 
 
 class Watchdog:

@@ -48,6 +48,7 @@ from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder, picture_name, recording_name
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.cli._values import whole
+from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.recordings.write.sinks import open_reference_file
 
 PREVIEW_S = 1.0
@@ -90,6 +91,7 @@ def _node(args: argparse.Namespace) -> int:
     """The ROS node: it has no IN, but subscribes to images."""
     if args.out is not None or importlib.util.find_spec('rclpy') is None:
         raise UsageError('IN is missing: a video, a folder of images or a device; without IN it is a ROS node')
+    require_ros()
     from psd_deflection.ros.camera import run_camera
 
     settings = read_settings(args.params_file)
