@@ -104,6 +104,9 @@ class ShaperNode(BaseNode[ShaperSettings]):
 
     def _shape(self, message: Any) -> Any:
         """The message of a trajectory, shaped. Raises ConfigError for one that cannot be followed."""
+        if rivals := self.rivals():
+            # Both would answer, and the arm would get each motion twice.
+            raise ConfigError(f'another node publishes {rivals[0]}')
         if self._undescribed:
             raise ConfigError(f'nobody has told the limits of the joints on {DESCRIPTION} yet')
         trajectory = _trajectory(message)
@@ -150,6 +153,8 @@ class ShaperNode(BaseNode[ShaperSettings]):
     def _state(self) -> tuple[int, str]:
         if not self.active:
             return STALE, 'not active'
+        if rivals := self.rivals():
+            return WARN, f'it shapes nothing: another node publishes {rivals[0]}'
         if self._why:
             return WARN, f'the last trajectory was refused: {self._why}'
         if self._undescribed:

@@ -24,7 +24,7 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 
-from psd_deflection.base.bounds import MESSAGE_BYTES, ByteBudget
+from psd_deflection.base.bounds import MESSAGE_BYTES, BoundedMap, ByteBudget
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.log import ERROR, WARNING, Say
 from psd_deflection.recordings.write.bag_writer import BagWriter
@@ -110,8 +110,8 @@ class Recorder:
     ``dropped_samples``: how many the run has dropped so far, before those that it processed last; a
     recording says how many it lacks because of that. ``between_blocks`` runs an action in the
     thread that calls the wires (``Processing.request``). ``node``: full name of the recorded ROS
-    node. ``failure``: why the last recording ended by itself, empty while all is well; for
-    diagnostics.
+    node. ``failure``: why the last recording ended by itself, empty while all is well.
+    ``ended_early``: the same of each such recording, by its folder.
     """
 
     def __init__(
@@ -128,6 +128,7 @@ class Recorder:
         self.written = 0
         self.files_deleted = 0
         self.failure = ''
+        self.ended_early: BoundedMap[Path, str] = BoundedMap()
         self._say = say
         self._between_blocks = between_blocks
         self._limit = queue_blocks * MESSAGES_PER_BLOCK
@@ -253,12 +254,17 @@ class Recorder:
                     break
             if thread.is_alive():
                 waiting = f'it is not waited for, and {take.budget.holders} messages are not written'
-                self._say(
+                why = (
                     f'{take.folder}: {self._why_behind(take)}; {waiting}. '
-                    f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole',
-                    WARNING,
+                    f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole'
                 )
+                if take.folder is not None:
+                    self._end_early(take.folder, why)
+                self._say(why, WARNING)
         return None if ended.done() and ended.exception() is not None else folder
+
+    def _end_early(self, folder: Path, why: str) -> None:
+        self.failure = self.ended_early[folder] = why
 
     def _why_behind(self, take: Take) -> str:
         thread = self._writing.get(take)
@@ -304,7 +310,7 @@ class Recorder:
         if not why:
             take.closed.set_result(bag.folder)
             return
-        self.failure = why
+        self._end_early(bag.folder, why)
         self._say(f'recording stopped: {why}', ERROR)
         take.closed.set_exception(RecordingError(f'recording stopped: {why}'))
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from msg_adapters import ACCELERATION, LOAD, MARK, TOPIC_TYPES, accel_stamped, from_fields, string, to_messages
 from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
-from psd_deflection.base.errors import SamplesDroppedError
+from psd_deflection.base.errors import RecordingError, SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING, Say
 from psd_deflection.base.printable import printable
 from psd_deflection.measure.pipeline import Pipeline
@@ -78,7 +78,7 @@ class Session:
     def __init__(self, rig: Rig, say: Say, node: str = '', unzeroed: Rig | None = None) -> None:
         self._simulated: SimulatedRigProcess | None = None
         self._closed = False
-        self._short: SamplesDroppedError | None = None
+        self._short: SamplesDroppedError | RecordingError | None = None
         self.listeners: list[Say] = [say]
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
@@ -172,7 +172,8 @@ class Session:
     def failed(self) -> BaseException | None:
         """The error that ended the pipeline or the reader thread, or None.
 
-        After :meth:`close` it is a SamplesDroppedError if samples were read and not processed.
+        After :meth:`close` it is a SamplesDroppedError if samples were read and not processed, a RecordingError if
+        the last recording is not whole.
         """
         return self.processing.failed or self.acquisition.failed or self._short
 
@@ -462,6 +463,8 @@ class Session:
         self.acquisition.stop()
         self._finish()
         folder = self.recorder.close()
+        if self.recorder.failure and self._short is None:
+            self._short = RecordingError(f'the recording ended early: {self.recorder.failure}')
         if self.watcher is not None and (left := self.watcher.close(KEEP_S)):
             self._tell(f'watch: {left}', WARNING)
         if self._store is not None and not self._store.join(KEEP_S):

@@ -111,6 +111,16 @@ def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> Non
     values = {v.key: v.value for v in reports[-1].status[0].values}
     assert (values['shaper'], values['delay (s)'], values['trajectories refused']) == ('zvd', '0.0834', '3')
 
+    # With another one of its name each motion would come twice: both refuse.
+    twin = peer.node.create_publisher(JointTrajectory, '/shaper/shaped', 5)
+    reports.clear()
+    held = 'it shapes nothing: another node publishes /shaper/shaped'
+    peer.until(lambda: any(held == r.status[0].message for r in reports), 'a second publisher')
+    good.header.stamp = peer.node.get_clock().now().to_msg()
+    given.publish(good)
+    node.until('trajectory refused: another node publishes /shaper/shaped')
+    peer.node.destroy_publisher(twin)
+
     # A stop goes through.
     heard.clear()
     given.publish(message())

@@ -6,23 +6,27 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import threading
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 import yaml
 
-from psd_deflection.base.errors import EXIT_STATUSES, SamplesDroppedError
+from psd_deflection.base.errors import EXIT_STATUSES, RecordingError, SamplesDroppedError
 from psd_deflection.base.log import texts
+from psd_deflection.cli._display import Display
 from psd_deflection.cli.main import main
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.records import Record
-from psd_deflection.rig.config import Rig, replace_values
-from psd_deflection.run import behind
+from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.run import behind, recorder
 from psd_deflection.run.diagnostics import HealthReporter
+from psd_deflection.run.headless import run_until_signal
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S, until
 
@@ -147,6 +151,39 @@ def test_samples_that_found_no_room_are_told_and_counted_everywhere(
     assert f'{taken} present, ' in shown
     # On the wire nothing was lost.
     assert session.acquisition.counters.lost == 0
+
+
+def test_a_disk_that_fills_gives_a_true_sentence_and_status(
+    device: Any,
+    rig: Rig,
+    tmp_path: Path,
+    sample: Callable[..., SampleFrame],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    full = usage._replace(free=0)
+    monkeypatch.setattr(recorder, 'LOOK_EVERY', 20)
+    monkeypatch.setattr(shutil, 'disk_usage', lambda _: full if sent else usage)
+    sent: list[SampleFrame] = []
+    display = Display()
+
+    def feed(session: Session) -> bool:
+        display.watch(session)
+        if not sent:
+            sent.extend(sample(seq) for seq in range(100))
+            device.send_frames(*sent)
+        return bool(session.recorder.failure)
+
+    values = {'port': rig.acquisition.port, 'bag_dir': str(tmp_path), 'record': True, 'keep_zero': False}
+    begin = partial(Session, load_rig(overrides={**values, 'realtime': False}), display.say)
+    early = pytest.raises(RecordingError, match=r'ended early: .* the disk has 0 MB left')
+    with early as ended, display.telling_recorded():
+        run_until_signal(begin, feed)
+    assert ended.value.exit_status == 4
+    (folder,) = tmp_path.glob('psd_*')
+    assert f'recorded {folder}; it ended early\n  replay it:  ' in capsys.readouterr().err
+    assert main(['replay', str(folder), '--compare']) == 0
 
 
 def test_what_waits_at_the_end_behind_a_part_that_hangs_is_counted_and_the_part_named(
