@@ -181,9 +181,7 @@ def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Say) ->
     """Measure until SIGINT or SIGTERM. Raises ConfigError."""
     left = shared_memory_left()
     if left < SHARED_BYTES:
-        say(
-            f'{SHARED_MEMORY} has {left / 1e3:.0f} kB left, images need {SHARED_BYTES / 1e3:.0f}: DDS uses UDP', WARNING
-        )
+        say(f'{SHARED_MEMORY} has {left // 1000} kB left, of {SHARED_BYTES // 1000}: images come by UDP', WARNING)
     with (
         ros(NODE_NAME, ros_arguments, shared_memory=left >= SHARED_BYTES) as signals,
         contextlib.closing(CameraNode(given, say)) as owner,
