@@ -65,9 +65,9 @@ class Display:
             if folder.is_dir():
                 rest = '; it ended early' if folder in ended_early else ''
                 replay = f'{program()} replay {shlex.quote(str(folder))} --compare'
-                self.say(f'recorded {folder}{rest}\n  replay it:  {replay}')
+                self.log(f'recorded {folder}{rest}\n  replay it:  {replay}')
 
-    def say(self, text: str, level: int = INFO, /) -> None:
+    def log(self, text: str, level: int = INFO, /) -> None:
         """Print a message on its own line, above the live one."""
         with self._lock:
             self._put(f'{_SIGNS.get(level, "")}{text}\n', shown=False)

@@ -26,12 +26,12 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 
 from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
-from psd_deflection.base.log import WARNING, Say
-from psd_deflection.base.printable import printable
+from psd_deflection.base.log import WARNING, LogCallback
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.ros.actions import FAILURES, GuardedClient, GuardedServer
 from psd_deflection.ros.endpoints import action_class, graph_name, message_class, overriding, qos, refused_qos
 from psd_deflection.ros.topics import HEARD, MOST_GOALS, SERVED, GraphTopic
-from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.repeats import RateLimitedLog
 
 LONGEST = 200
 """Characters of a reason, in which a stranger's words may be."""
@@ -42,14 +42,14 @@ MOST_A_SECOND = 2000
 
 
 class InputGate:
-    """Subscriptions of ``node``. ``say`` gets the refusals. ``clock``: monotonic, s.
+    """Subscriptions of ``node``. ``log`` gets the refusals. ``clock``: monotonic, s.
 
     ``refused``: messages by topic; ``why``: the last reason of each.
     """
 
-    def __init__(self, node: Node, say: Say, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, node: Node, log: LogCallback, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
-        self._repeats = Repeats(say)
+        self._limited_log = RateLimitedLog(log)
         # Names of topics whose latched row waits for a publisher that is latched, with what subscribes to it.
         self._latched: dict[str, Callable[[], Subscription]] = {}
         self.refused = Tally()
@@ -168,13 +168,13 @@ class InputGate:
     def refuse(self, topic: str, why: str) -> None:
         """Count a message and say why it is refused."""
         self.refused.add(topic)
-        self.why[topic] = printable(why, LONGEST)
-        self._repeats.tell(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
+        self.why[topic] = sanitize(why, LONGEST)
+        self._limited_log.log(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
 
     def settle(self) -> None:
         """Say what was counted and is due, and look for latched publishers; to be called once a second."""
         self.look_for_latched()
-        self._repeats.settle(self._clock())
+        self._limited_log.settle(self._clock())
 
     def values(self) -> list[tuple[str, str]]:
         """For the node's diagnostics."""

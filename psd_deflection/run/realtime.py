@@ -90,7 +90,7 @@ class Watchdog:
         self._interval = int(usec) / 2e6 if usec.isdecimal() and meant else 0.0
         self._last = -self._interval
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         if not self._address:
             return
         try:
@@ -103,7 +103,7 @@ class Watchdog:
 
     def ready(self) -> None:
         """The daemon runs."""
-        self._tell('READY=1')
+        self._report('READY=1')
 
     def alive(self) -> None:
         """Tell systemd that the process is alive; to be called from the loop that must not hang."""
@@ -112,8 +112,8 @@ class Watchdog:
         now = self._clock()
         if now - self._last >= self._interval:
             self._last = now
-            self._tell('WATCHDOG=1')
+            self._report('WATCHDOG=1')
 
     def stopping(self) -> None:
         """The daemon ends."""
-        self._tell('STOPPING=1')
+        self._report('STOPPING=1')

@@ -124,7 +124,7 @@ def test_given_up_ends_a_read(connected: Connected) -> None:
 
 
 @pytest.mark.parametrize(
-    ('error', 'said'),
+    ('error', 'message'),
     [
         (socket.gaierror(-2, 'Name or service not known'), r'no host of the name rig is known; is it spelt right\?'),
         (ConnectionRefusedError(111, 'Connection refused'), 'the host is there, but nothing listens on its port 4000'),
@@ -134,12 +134,12 @@ def test_given_up_ends_a_read(connected: Connected) -> None:
     ],
 )
 @pytest.mark.parametrize('scheme', ['socket', 'rfc2217'])
-def test_why_there_is_no_connection(scheme: str, error: OSError, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_why_there_is_no_connection(scheme: str, error: OSError, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def connect(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(socket, 'create_connection', connect)
-    with pytest.raises(DeviceError, match=rf'^{scheme}://rig:4000: {said}') as told:
+    with pytest.raises(DeviceError, match=rf'^{scheme}://rig:4000: {message}') as told:
         open_port(f'{scheme}://rig:4000', BAUD)
     assert '\n' not in str(told.value)
 
@@ -174,11 +174,11 @@ def test_a_connection_that_does_not_come_is_not_waited_for(
             given_up.set()
 
         threading.Thread(target=give_up).start()
-        said = 'given up'
+        text = 'given up'
     else:
         monkeypatch.setattr(tcp_port, 'CONNECT_S', 0.0)
-        said = 'no answer in'
-    with pytest.raises(DeviceError, match=said):
+        text = 'no answer in'
+    with pytest.raises(DeviceError, match=text):
         open_port(named(listener), BAUD, given_up=given_up)
     go_on.set()
     until(lambda: bool(made) and made[0].fileno() == -1)
@@ -306,8 +306,8 @@ def test_a_silent_sender_gives_way_to_another_device_but_not_to_junk(
     stranger.send(b'junk')
     until(lambda: udp.port.read(WAIT_S) == b'' and udp.port.describe()['datagrams of other senders'] == '2')
     stranger.send(b'device too')
-    said = rf'{udp.name}: {shown(device)} is silent, and {shown(stranger)} sends now'
-    with pytest.raises(PortClosedError, match=said):
+    text = rf'{udp.name}: {shown(device)} is silent, and {shown(stranger)} sends now'
+    with pytest.raises(PortClosedError, match=text):
         all_of(udp.port, 1)
 
 

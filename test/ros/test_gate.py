@@ -30,16 +30,16 @@ class Gated:
     """A gate on a node of the peer's own executor."""
 
     def __init__(self, peer: Any) -> None:
-        self.said: list[str] = []
+        self.logged: list[str] = []
         self.levels: list[int] = []
         self.heard: list[str] = []
         self.node = rclpy.create_node('gated', context=peer.context)
         peer.executor.add_node(self.node)
         self.now = 100.0
-        self.gate = InputGate(self.node, self._say, lambda: self.now)
+        self.gate = InputGate(self.node, self._log, lambda: self.now)
 
-    def _say(self, text: str, level: int = INFO, /) -> None:
-        self.said.append(text)
+    def _log(self, text: str, level: int = INFO, /) -> None:
+        self.logged.append(text)
         self.levels.append(level)
 
     def listen(self) -> None:
@@ -86,7 +86,7 @@ def test_good_ones_are_taken_and_others_counted_and_said(
 
     peer.until(sent, 'the messages')
     assert set(gated.heard) == {'good'}
-    assert set(gated.said) == {
+    assert set(gated.logged) == {
         f'{TOPIC}: refused: empty',
         f'{TOPIC}: refused: 2009 bytes: must be at most 1000',
     }
@@ -94,7 +94,7 @@ def test_good_ones_are_taken_and_others_counted_and_said(
     count, why = gated.gate.values()
     assert count == (f'messages refused: {TOPIC}', str(gated.gate.refused[TOPIC]))
     assert why[0] == f'refused last: {TOPIC}'
-    assert f'{TOPIC}: refused: {why[1]}' in gated.said
+    assert f'{TOPIC}: refused: {why[1]}' in gated.logged
 
 
 def test_a_text_that_is_no_text_ends_nothing(peer: Any, gated: Gated) -> None:
@@ -157,4 +157,4 @@ def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
     gated.listen()
     peer.node.create_publisher(String, TOPIC, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
     peer.until(lambda: gated.gate.refused[TOPIC] > 0, 'the publisher that is best effort')
-    assert 'a publisher is best effort, and this has to be reliable' in gated.said[0]
+    assert 'a publisher is best effort, and this has to be reliable' in gated.logged[0]

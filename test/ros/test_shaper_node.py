@@ -53,8 +53,8 @@ def point(seconds: float, positions: list[float]) -> JointTrajectoryPoint:
 def told(peer: Any, **positions: float) -> None:
     """Let joints be told again and again."""
     out = peer.node.create_publisher(JointState, '/joint_states', 5)
-    said = JointState(name=list(positions), position=list(positions.values()))
-    peer.node.create_timer(0.02, lambda: out.publish(said))
+    stated = JointState(name=list(positions), position=list(positions.values()))
+    peer.node.create_timer(0.02, lambda: out.publish(stated))
 
 
 def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> None:

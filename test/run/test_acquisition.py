@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.base.log import INFO, WARNING, texts, unsaid
+from psd_deflection.base.log import INFO, WARNING, null_log, texts
 from psd_deflection.devices import contract_frames, port_source
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
 from psd_deflection.devices.serial_port import SerialPort
@@ -54,8 +54,8 @@ def numbers(items: list[Item]) -> list[int]:
 
 class Run:
     def __init__(self, rig: Rig) -> None:
-        self.said: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
-        self.acquisition = Acquisition(rig, lambda text, level=INFO: self.said.put((text, level)))
+        self.logged: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+        self.acquisition = Acquisition(rig, lambda text, level=INFO: self.logged.put((text, level)))
         self.acquisition.open()
         self.acquisition.start()
 
@@ -66,7 +66,7 @@ class Run:
     def heard_with(self, text: str) -> tuple[str, int]:
         """The same with its severity."""
         while True:
-            message, level = self.said.get(timeout=WAIT_S)
+            message, level = self.logged.get(timeout=WAIT_S)
             if text in message:
                 return message, level
 
@@ -147,7 +147,7 @@ def test_a_full_queue_drops_the_newest_and_counts(device: Any, rig: Rig, sample:
 
 
 def test_a_note_of_the_time_map_takes_no_block_s_room(sample: Any) -> None:
-    acquisition = Acquisition(load_rig(overrides={'queue_blocks': 2}), unsaid)
+    acquisition = Acquisition(load_rig(overrides={'queue_blocks': 2}), null_log)
     acquisition.feed([sample(s) for s in range(20)], 10**9)
     # 0.3 s of samples within a millisecond: the map steps.
     acquisition.feed([sample(s) for s in range(20, 320)], 10**9 + 10**6)
@@ -241,7 +241,7 @@ def test_samples_without_hello_are_named(device: Any, rig: Rig, sample: Any, mon
 
 
 @pytest.mark.parametrize(
-    ('version', 'info', 'said'),
+    ('version', 'info', 'message'),
     [
         (2, {}, 'protocol version 2, this is version 1'),
         (1, {'sample_rate_hz': 500.0}, 'sample_rate_hz 500.0, the rig file says 1000'),
@@ -252,12 +252,12 @@ def test_samples_without_hello_are_named(device: Any, rig: Rig, sample: Any, mon
     ],
 )
 def test_a_device_that_does_not_fit_is_named(
-    device: Any, rig: Rig, hello: HelloFrame, version: int, info: dict[str, object], said: str
+    device: Any, rig: Rig, hello: HelloFrame, version: int, info: dict[str, object], message: str
 ) -> None:
     device.answer = encode(HelloFrame(version, {**hello.info, **info}))
     with pytest.raises(DeviceError) as error:
         Acquisition(rig, texts(print)).open()
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert rig.acquisition.port in str(error.value)
 
 
@@ -482,7 +482,7 @@ def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
     monkeypatch.setattr(module, 'make_source', lambda rig: source)
     own = {'monotonic': lambda: source.now_ns / 1e9, 'monotonic_ns': lambda: source.now_ns}
     monkeypatch.setattr(module, 'time', SimpleNamespace(**{**vars(time), **own}))
-    acquisition = Acquisition(load_rig(), unsaid)
+    acquisition = Acquisition(load_rig(), null_log)
     acquisition.open()
     acquisition.start()
     while not isinstance(acquisition.queue.get(timeout=WAIT_S), Ended):

@@ -61,9 +61,9 @@ class Hanging:
 def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
     device: Any, rig: Rig, tmp_path: Path, part: str, told: str
 ) -> None:
-    said: list[str] = []
+    logged: list[str] = []
     rig = replace_values(rig, {'bag_dir': str(tmp_path), 'record': True, 'realtime': False, 'keep_zero': False})
-    session = Session(rig, texts(said.append))
+    session = Session(rig, texts(logged.append))
     session.start()
     owner = cast(Any, getattr(session, part))
     hanging = Hanging()
@@ -75,7 +75,7 @@ def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
         owner._thread = hanging
     session.close()
     assert 0.0 < hanging.waited_s <= ALLOWED_S
-    assert any(told in text for text in said)
+    assert any(told in text for text in logged)
     # What was said to hang did not: it ends as it would have.
     thread.join(WAIT_S)
     assert not thread.is_alive()
@@ -94,9 +94,9 @@ class Held:
         assert self.go.wait(WAIT_S)
 
 
-def run_of(rig: Rig, folder: Path, said: list[str], **values: object) -> tuple[Session, Held]:
+def run_of(rig: Rig, folder: Path, message: list[str], **values: object) -> tuple[Session, Held]:
     given = {'bag_dir': str(folder), 'record': True, 'realtime': False, 'keep_zero': False, 'block_size': 20, **values}
-    session, held = Session(replace_values(rig, cast(Any, given)), texts(said.append)), Held()
+    session, held = Session(replace_values(rig, cast(Any, given)), texts(message.append)), Held()
     session.processing.sinks.append(held)
     session.start()
     return session, held
@@ -109,8 +109,8 @@ def ended_with(session: Session) -> list[BaseException]:
 def test_samples_that_found_no_room_are_told_and_counted_everywhere(
     device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said: list[str] = []
-    session, held = run_of(rig, tmp_path, said, queue_blocks=2)
+    logged: list[str] = []
+    session, held = run_of(rig, tmp_path, logged, queue_blocks=2)
     device.send_frames(*(sample(seq) for seq in range(20)))
     assert held.holds.wait(WAIT_S)
     device.send_frames(*(sample(seq) for seq in range(20, 400)))
@@ -119,7 +119,7 @@ def test_samples_that_found_no_room_are_told_and_counted_everywhere(
     until(lambda: session.acquisition.queue.empty())
     device.send_frames(*(sample(seq) for seq in range(400, 440)))
     until(lambda: session.acquisition.counters.samples == 440 and session.acquisition.queue.empty())
-    (line,) = (line for line in said if 'dropped here' in line)
+    (line,) = (line for line in logged if 'dropped here' in line)
     assert re.fullmatch(
         r'this machine is too slow: \d+ samples dropped here so far \(2 blocks wait, queue_blocks\)', line
     )
@@ -176,7 +176,7 @@ def test_a_disk_that_fills_gives_a_true_sentence_and_status(
         return bool(session.recorder.failure)
 
     values = {'port': rig.acquisition.port, 'bag_dir': str(tmp_path), 'record': True, 'keep_zero': False}
-    begin = partial(Session, load_rig(overrides={**values, 'realtime': False}), display.say)
+    begin = partial(Session, load_rig(overrides={**values, 'realtime': False}), display.log)
     early = pytest.raises(RecordingError, match=r'ended early: .* the disk has 0 MB left')
     with early as ended, display.telling_recorded():
         run_until_signal(begin, feed)
@@ -194,8 +194,8 @@ def test_what_waits_at_the_end_behind_a_part_that_hangs_is_counted_and_the_part_
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(behind, 'HELD_S', 0.0)
-    said: list[str] = []
-    session, held = run_of(rig, tmp_path, said)
+    logged: list[str] = []
+    session, held = run_of(rig, tmp_path, logged)
     device.send_frames(*(sample(seq) for seq in range(20)))
     assert held.holds.wait(WAIT_S)
     device.send_frames(*(sample(seq) for seq in range(20, 100)))
@@ -203,10 +203,10 @@ def test_what_waits_at_the_end_behind_a_part_that_hangs_is_counted_and_the_part_
     session.close()
     assert any(
         line == 'pipeline is held up in run.processing.give: the last 80 samples were read and not processed'
-        for line in said
-    ), said
-    assert 'pipeline is held up in run.processing.give: the last block is not waited for' in said
-    assert not any('subscriber' in line or 'the disk' in line for line in said)
+        for line in logged
+    ), logged
+    assert 'pipeline is held up in run.processing.give: the last block is not waited for' in logged
+    assert not any('subscriber' in line or 'the disk' in line for line in logged)
     assert '80 samples were read and not processed (0 while it ran, 80 at the end)' in str(session.failed)
     (folder,) = tmp_path.glob('psd_*')
     assert open_recording(folder).dropped_here == (80, 0)

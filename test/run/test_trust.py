@@ -13,7 +13,7 @@ from tools.program import ROOT
 
 PACKAGE = ROOT / 'psd_deflection'
 PAGE = (ROOT / 'docs' / 'trust.md').read_text('utf-8')
-SAYS = {'say', '_say', '_tell', 'tell', 'log', 'warn'}
+LOGS = {'log', '_log', '_report', 'warn', '_warn'}
 CORRECTS = re.compile(
     r'start(s|ed) (again|anew)|time map|1 ns apart|dropped|deleted,|kept to|not processed|not kept|left with|back$|'
     r'to come back|not corrected|begins later|cannot be read|taking a|is not waited|stopped: |refused|still '
@@ -52,7 +52,7 @@ def lines() -> Iterator[str]:
         for call in ast.walk(tree):
             if room in ('run', 'ros', 'devices') and isinstance(call, ast.Call):
                 name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, 'id', '')
-                yield from (text_of(a) for a in call.args if name in SAYS)
+                yield from (text_of(a) for a in call.args if name in LOGS)
 
 
 def rows(heading: str, column: int) -> list[list[str]]:
@@ -69,9 +69,9 @@ def test_each_correction_has_a_line_that_the_package_logs() -> None:
 
 def test_each_logged_correction_is_in_the_table() -> None:
     stated = [part for row in rows('Corrections', 1) for part in row]
-    logged = {line for line in lines() if ' ' in line and CORRECTS.search(line)}
-    assert len(logged) > 20
-    assert [line for line in logged if not any(part in line for part in (*stated, *OTHER))] == []
+    result = {line for line in lines() if ' ' in line and CORRECTS.search(line)}
+    assert len(result) > 20
+    assert [line for line in result if not any(part in line for part in (*stated, *OTHER))] == []
 
 
 def test_each_statement_is_one_of_the_package_and_says_how_it_is_known() -> None:

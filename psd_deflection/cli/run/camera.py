@@ -97,7 +97,7 @@ def _node(args: argparse.Namespace) -> int:
     settings = read_settings(args.params_file)
     if args.target is not None:
         settings = settings.of_kind(args.target)
-    return run_camera(args.ros_arguments, settings, Display().say)
+    return run_camera(args.ros_arguments, settings, Display().log)
 
 
 def _print_target(args: argparse.Namespace, settings: CameraSettings) -> int:
@@ -161,7 +161,7 @@ def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
             reasons.add(answer.words)
             sink.put(answer.t_ns, answer.as_record(), answer.words)
             found = [*found[-999:], answer] if answer.status is Status.OK else found
-    _tell(args, settings, reference, reasons, found)
+    _report(args, settings, reference, reasons, found)
     return 0
 
 
@@ -220,7 +220,7 @@ def _answers(
     yield from answers
 
 
-def _tell(
+def _report(
     args: argparse.Namespace,
     settings: CameraSettings,
     reference: CameraReference,

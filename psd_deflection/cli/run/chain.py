@@ -74,13 +74,13 @@ def run(args: argparse.Namespace) -> int:
     if args.no_ros:
         with display.telling_recorded(), _written(args.out) as stream:
             teller = _Teller(args, display, stream)
-            return run_until_signal(lambda: ChainSession(file, display.say), teller.watch, teller.listen)
+            return run_until_signal(lambda: ChainSession(file, display.log), teller.watch, teller.listen)
     require_ros(', or run with --no-ros')
     from psd_deflection.ros.chain import run_chain
 
     with display.telling_recorded():
         teller = _Teller(args, display, None)
-        return run_chain(args.ros_arguments, file, display.say, teller.watch)
+        return run_chain(args.ros_arguments, file, display.log, teller.watch)
 
 
 @contextlib.contextmanager

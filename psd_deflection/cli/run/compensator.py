@@ -46,4 +46,4 @@ def run(args: argparse.Namespace) -> int:
     from psd_deflection.ros.compensator import DescribedArm, run_compensator
 
     robot = arm or DescribedArm(args.tip, args.base)
-    return run_compensator(args.ros_arguments, robot, settings, Display().say, args.drive)
+    return run_compensator(args.ros_arguments, robot, settings, Display().log, args.drive)

@@ -95,8 +95,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, overrides: dict[str, object], display: Display) -> int:
     if args.no_ros:
-        return run_headless(overrides, display.say, display.watch, start_views)
+        return run_headless(overrides, display.log, display.watch, start_views)
     require_ros(', or run with --no-ros to acquire and record without it')
     from psd_deflection.ros import estimator
 
-    return estimator.run(args.ros_arguments, overrides, display.say, display.watch)
+    return estimator.run(args.ros_arguments, overrides, display.log, display.watch)

@@ -40,4 +40,4 @@ def run(args: argparse.Namespace) -> int:
     require_ros()
     from psd_deflection.ros.shaper import run_shaper
 
-    return run_shaper(args.ros_arguments, settings, Display().say)
+    return run_shaper(args.ros_arguments, settings, Display().log)

@@ -83,7 +83,7 @@ class ItemQueue:
 
 
 @dataclass(slots=True)
-class Gathered:
+class SampleBuffer:
     """Samples that wait to be handed over, one row each: extended number, time and readings as in the source."""
 
     seq: list[int] = field(default_factory=list)
