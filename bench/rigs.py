@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.rows import RESULTS, Row, figure, keep, tell
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 
 SETTLE_S = 3.0
 TICK_S = 0.005
@@ -76,7 +76,7 @@ def sessions(ports: list[str], seconds: float) -> None:
     from psd_deflection.run.session import Session
 
     os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    running = [Session(load_rig(None, {'port': port, 'keep_zero': False}), unsaid) for port in ports]
+    running = [Session(load_rig(None, {'port': port, 'keep_zero': False}), null_log) for port in ports]
     settle()
     for session in running:
         session.start()

@@ -73,7 +73,7 @@ class Score(NamedTuple):
 
     ``z``: by parameter, error over its standard deviation. ``inside``: share of published poses within their 95 %
     ellipsoid; ``axes`` (3,): within 1.96 standard deviations; ``noise_only``: within the ellipsoid of the noise.
-    ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``unsaid``: parameters
+    ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``null_log``: parameters
     that the Fisher information leaves open and calibrate does not report; ``said``: the reverse. ``moved``: the group
     that was moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it cannot tell that from.
     """
@@ -85,7 +85,7 @@ class Score(NamedTuple):
     before: Array
     after: Array
     gap: tuple[float, float]
-    unsaid: list[str]
+    null_log: list[str]
     said: list[str]
     moved: str
     named: str
@@ -213,7 +213,7 @@ def score(seed: int, lit: bool = False) -> Score:
     # Told alone, or as the largest part of what moves together.
     told = alone | {max(d.parts, key=lambda n: abs(d.parts[n])) for d in found.undetermined}
     every = {n for d in found.undetermined for n in d.parts}
-    unsaid = [n for n, s in own.items() if s > OPEN + BORDER and n not in every]
+    null_log = [n for n, s in own.items() if s > OPEN + BORDER and n not in every]
     said = [n for n in told & alone if own.get(n, 1.0) < OPEN - BORDER]
     group = GROUPS[seed // 2 % len(GROUPS)] if seed % 2 else ''
     again = misaligned.record(
@@ -229,7 +229,7 @@ def score(seed: int, lit: bool = False) -> Score:
         np.sqrt(np.mean(error_0**2, axis=0)),
         np.sqrt(np.mean(error**2, axis=0)),
         (found.gap.heldout_before, found.gap.heldout_after),
-        unsaid,
+        null_log,
         said,
         group,
         '' if checked.holds else checked.groups[0].group,
@@ -335,7 +335,7 @@ class Summary(NamedTuple):
     parameters: float
     poses: float
     worse: int
-    unsaid: int
+    null_log: int
     said: int
     named: float
     alarms: float
@@ -354,7 +354,7 @@ def summary(scores: Sequence[Score]) -> Summary:
             bool(s.gap[1] > s.gap[0] or np.linalg.norm(s.after * length) > np.linalg.norm(s.before * length))
             for s in scores
         ),
-        sum(len(s.unsaid) for s in scores),
+        sum(len(s.null_log) for s in scores),
         sum(len(s.said) for s in scores),
         float(np.mean([s.named == s.moved for s in moved])) if moved else 1.0,
         float(np.mean([bool(s.named) for s in still])) if still else 0.0,
@@ -380,7 +380,7 @@ def table(scores: Sequence[Score]) -> Iterator[str]:
     yield ''
     yield f'- rigs that came out worse: {total.worse} of {len(scores)}'
     every = len(scores) * len(scores[0].z)
-    yield f'- parameters that the Fisher information leaves open and nothing reports: {total.unsaid} of {every}'
+    yield f'- parameters that the Fisher information leaves open and nothing reports: {total.null_log} of {every}'
     yield f'- parameters reported as open that it does not leave open: {total.said}'
     moved = [s for s in scores if s.moved]
     like = sum(s.moved in (s.named, *s.like) for s in moved) / max(len(moved), 1)
@@ -408,9 +408,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     scores = list(over(partial(score, lit=args.light), range(args.rigs), args.jobs, 'rigs'))
     print('\n'.join(table(scores)))
     for number, s in enumerate(scores):
-        if s.moved != s.named or s.unsaid or s.said:
+        if s.moved != s.named or s.null_log or s.said:
             told = f'moved {s.moved or "nothing"}, named {s.named or "nothing"} {s.like}'
-            print(f'rig {number}: {told}; {s.unsaid} {s.said}')
+            print(f'rig {number}: {told}; {s.null_log} {s.said}')
     return 0
 
 

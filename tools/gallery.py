@@ -25,7 +25,7 @@ from psd_deflection.cli.main import main as psd_deflection
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.replay.engine import open_for_replay, replayed
 from psd_deflection.records import SampleBlock
-from psd_deflection.run.diagnostics import OK, Seen, estimates_entry, laser_entry
+from psd_deflection.run.diagnostics import OK, CounterSnapshot, estimates_entry, laser_entry
 from psd_deflection.run.monitor.spectrum import Spectrum, line_entry
 from tools.gallery_cases import CASES, STUDIES, Case
 from tools.program import ROOT
@@ -71,7 +71,7 @@ def said_live(path: Path) -> str:
         for block in (record for record in records if isinstance(record, SampleBlock)):
             spectrum.add(block)
     count = pipeline.counters
-    new = Seen(
+    new = CounterSnapshot(
         0,
         count.samples,
         0,

@@ -37,7 +37,7 @@ from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.arms.compensation.shaping import ShaperSettings
 from psd_deflection.arms.compensation.trajectory import KINK_S, Trajectory
 from psd_deflection.arms.inputs import REST_S
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 from psd_deflection.camera.opencv import opencv
 from psd_deflection.camera.settings import CameraSettings
 from psd_deflection.records import FloatArray
@@ -241,7 +241,7 @@ class Estimator(Attacked):
         # What the watch holds is soon as much as it may be.
         watch = {'watch': 'on', 'watch_dir': str(folder), 'watch_minutes': 0.5, 'watch_memory': 2_000_000}
         given = {'filter': 'modal', 'keep_zero': False, 'bag_dir': str(folder), **watch}
-        self._node = EstimatorNode(given, unsaid, Signals())
+        self._node = EstimatorNode(given, null_log, Signals())
         super().__init__(self._node)
 
     def _sessions(self) -> list[Session]:
@@ -272,7 +272,7 @@ class Chain(Attacked):
     words = (str(CHAIN),)
 
     def __init__(self, folder: Path) -> None:
-        self._node = ChainNode(read_chain(str(CHAIN), {'bag_dir': str(folder)}, None), unsaid, Signals())
+        self._node = ChainNode(read_chain(str(CHAIN), {'bag_dir': str(folder)}, None), null_log, Signals())
         super().__init__(self._node)
 
     def _sessions(self) -> list[Session]:
@@ -305,7 +305,7 @@ class Camera(Attacked):
 
     def __init__(self, folder: Path) -> None:
         self._answers = 0
-        super().__init__(CameraNode(CameraSettings(rest_frames=1), unsaid))
+        super().__init__(CameraNode(CameraSettings(rest_frames=1), null_log))
         _listen('/reference/deflection', self._heard)
 
     def _heard(self, message: Any) -> None:
@@ -346,7 +346,7 @@ class Compensator(Attacked):
         settings = CompensatorSettings(
             axes=('x', 'z'), joints=tuple(NAMES), good=1, stale=1.0, controller_state='std_msgs/msg/Bool'
         )
-        self._node = CompensatorNode(read_arm(URDF, 'tool'), settings, unsaid, True)
+        self._node = CompensatorNode(read_arm(URDF, 'tool'), settings, null_log, True)
         super().__init__(self._node)
         self._stamps: list[float] = []
         self._commands: list[FloatArray] = []
@@ -403,7 +403,7 @@ class Shaper(Attacked):
         self._shaped, self.step, self._turns = 0, 0.0, 0
         self._wrong: list[str] = []
         self._last: tuple[int, Trajectory] | None = None
-        super().__init__(ShaperNode(ShaperSettings(frequency=12.0, urdf='robot_description'), unsaid))
+        super().__init__(ShaperNode(ShaperSettings(frequency=12.0, urdf='robot_description'), null_log))
         _listen('/shaper/shaped', self._heard)
 
     def _heard(self, message: Any) -> None:

@@ -23,7 +23,7 @@ from pathlib import Path
 from rosbags.rosbag2 import Reader
 
 from blind.campaign import conclude, options
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.repair import recover
 from psd_deflection.rig.config import Rig, load_rig
@@ -35,7 +35,7 @@ ALLOWED_S = 1.0
 
 def daemon(rig: Rig) -> None:
     """The child: records until it is killed."""
-    session = Session(rig, unsaid)
+    session = Session(rig, null_log)
     session.start()
     signal.pause()
 

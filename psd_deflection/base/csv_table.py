@@ -13,7 +13,7 @@ from typing import NamedTuple, TextIO
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.foreign_tables import text_fault, what_of_header, why_no_number
 from psd_deflection.base.numbers import NUMBER
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 
 MAX_LINE = 10_000
 """Maximum characters of a line; a longer line is not a row of a table."""
@@ -62,7 +62,7 @@ class Row(NamedTuple):
         return self.table.refuse(why, self.line)
 
     def _holds(self, name: str) -> str:
-        return f'column {name} holds {printable(self.text(name), LONGEST_CELL)!r}'
+        return f'column {name} holds {sanitize(self.text(name), LONGEST_CELL)!r}'
 
 
 class CsvTable:

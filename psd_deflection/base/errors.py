@@ -23,7 +23,7 @@ EXIT_STATUSES: Mapping[int, str] = {
     7: 'a running daemon or a Dask scheduler: none answers, or it refuses',
     8: 'of many recordings some failed; the others are done',
     9: 'samples were dropped here: this machine was too slow for them',
-    71: 'the machine: too little memory, or no further thread',
+    71: 'the machine: too little memory, no further thread, or no room in /dev/shm',
     INTERRUPTED: 'Ctrl-C before it was done (what runs until Ctrl-C ends with 0)',
 }
 """What each exit status of ``psd-deflection`` means; its help and the documentation are made from this table."""
@@ -108,7 +108,7 @@ class SamplesDroppedError(PsdDeflectionError):
 
 
 class MachineError(PsdDeflectionError):
-    """The operating system gives no more memory, or no further thread (``ulimit -v``, ``-u``, a container's limits).
+    """The operating system gives no more memory, shared memory or thread (``ulimit -v``, ``-u``, a container's limits).
 
     Example: ``too little memory; see the limits of the shell (ulimit -v), the container or the unit``.
     """

@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from pathlib import PurePath
 from typing import BinaryIO, NamedTuple
 
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.spelling import did_you_mean
 
 OUT = 'OUT.csv'
@@ -75,7 +75,7 @@ class Meant(NamedTuple):
 
 def quoted(path: PurePath) -> str:
     """The name of a file in a shell line."""
-    text = printable(str(path), 500)
+    text = sanitize(str(path), 500)
     return text if re.fullmatch(r'[\w./+@%-]+', text) else "'" + text.replace("'", "'\\''") + "'"
 
 
@@ -221,10 +221,10 @@ def what_of_header(
         return f'{_converted(path, program, layout)}; {form}'
     words = f'the header lacks {", ".join(lacking)}'
     if names:
-        words += f'; it has {printable(",".join(names), LONGEST_HEADER)}'
+        words += f'; it has {sanitize(",".join(names), LONGEST_HEADER)}'
     guesses = meant([name for name in names if name not in known], lacking)
     if guesses:
-        told = ', '.join(f'{m.ours} for {printable(m.found, 30)}{f" ({m.unit})" if m.unit else ""}' for m in guesses)
+        told = ', '.join(f'{m.ours} for {sanitize(m.found, 30)}{f" ({m.unit})" if m.unit else ""}' for m in guesses)
         words += f'; did you mean {told}?'
     if len(guesses) == len(lacking):
         ours = {m.found: m.ours for m in guesses}

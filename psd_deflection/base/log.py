@@ -13,14 +13,14 @@ from typing import Protocol
 INFO, WARNING, ERROR = 20, 30, 40
 
 
-class Say(Protocol):
+class LogCallback(Protocol):
     """Takes one line for people, from any thread."""
 
     def __call__(self, text: str, level: int = INFO, /) -> None:
         """``level``: information, ``WARNING`` for what somebody should look at, ``ERROR`` for what does not work."""
 
 
-def texts(take: Callable[[str], object]) -> Say:
+def texts(take: Callable[[str], object]) -> LogCallback:
     """What says a line by giving its text alone to ``take``."""
 
     def say(text: str, level: int = INFO, /) -> None:
@@ -29,5 +29,5 @@ def texts(take: Callable[[str], object]) -> Say:
     return say
 
 
-def unsaid(text: str, level: int = INFO, /) -> None:
+def null_log(text: str, level: int = INFO, /) -> None:
     """Say nothing."""

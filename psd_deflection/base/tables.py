@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.spelling import did_you_mean
 
 if TYPE_CHECKING:
@@ -117,7 +117,7 @@ def html_table(caption: str, rows: Iterable[tuple[str, object]]) -> str:
 
 
 def _cell(value: object) -> str:
-    return html.escape(printable(str(value), LONGEST_CELL))
+    return html.escape(sanitize(str(value), LONGEST_CELL))
 
 
 def columns(rows: Sequence[Sequence[str]], left: int = 1) -> str:

@@ -10,11 +10,11 @@ import shlex
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from psd_deflection.base.axes import SHOWN, SHOWN_UNITS, SYMBOLS
-from psd_deflection.base.errors import SamplesDroppedError
+from psd_deflection.base.errors import RecordingError, SamplesDroppedError
 from psd_deflection.base.log import ERROR, INFO, WARNING
 from psd_deflection.cli._program import program
 from psd_deflection.run.session import Session
@@ -36,7 +36,7 @@ class Display:
         self._last = 0.0
         self._shown = False
         self._counted = 0
-        self._recorded: list[Path] = []
+        self._recorded: dict[Path, Mapping[Path, str]] = {}
 
     def watch(self, session: Session) -> None:
         """Watch a running session: show its state, and remember its recordings."""
@@ -46,25 +46,28 @@ class Display:
     def note_recorded(self, session: Session) -> None:
         """Remember the recording that the session makes, for :meth:`tell_recorded`."""
         folder = session.recorder.folder
-        if folder is not None and folder not in self._recorded:
-            self._recorded.append(folder)
+        if folder is not None:
+            self._recorded[folder] = session.recorder.ended_early
 
     @contextlib.contextmanager
     def telling_recorded(self) -> Iterator[None]:
-        """At the end of a run print the recordings that were made, also if it could not keep up."""
+        """At the end of a run print the recordings that were made, also if something of them is missing."""
         try:
             yield
-        except SamplesDroppedError:
+        except (SamplesDroppedError, RecordingError):
             self._tell_recorded()
             raise
         self._tell_recorded()
 
     def _tell_recorded(self) -> None:
         """Print the recordings that were made, and how to replay them."""
-        for folder in (f for f in self._recorded if f.is_dir()):
-            self.say(f'recorded {folder}\n  replay it:  {program()} replay {shlex.quote(str(folder))} --compare')
+        for folder, ended_early in self._recorded.items():
+            if folder.is_dir():
+                rest = '; it ended early' if folder in ended_early else ''
+                replay = f'{program()} replay {shlex.quote(str(folder))} --compare'
+                self.log(f'recorded {folder}{rest}\n  replay it:  {replay}')
 
-    def say(self, text: str, level: int = INFO, /) -> None:
+    def log(self, text: str, level: int = INFO, /) -> None:
         """Print a message on its own line, above the live one."""
         with self._lock:
             self._put(f'{_SIGNS.get(level, "")}{text}\n', shown=False)

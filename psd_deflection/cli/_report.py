@@ -13,7 +13,7 @@ from typing import Any
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import replace_file
 from psd_deflection.base.json_text import json_text
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 
 LONGEST_LINE = 2000
 """Characters of a line with words of a file or of a device in it."""
@@ -30,7 +30,7 @@ def show(*lines: str, aside: bool = False) -> None:
     Each may hold words of a file or a device and is made printable: a line end in it is shown as an escape.
     """
     for line in lines or ('',):
-        print(printable(line, LONGEST_LINE), file=sys.stderr if aside else sys.stdout)
+        print(sanitize(line, LONGEST_LINE), file=sys.stderr if aside else sys.stdout)
 
 
 def show_text(text: str, *, aside: bool = False) -> None:

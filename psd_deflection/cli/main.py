@@ -40,7 +40,7 @@ from psd_deflection.base.errors import (
 )
 from psd_deflection.base.optional import not_installed
 from psd_deflection.base.plugins import loaded
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.cli._report import LONGEST_LINE
 
@@ -276,7 +276,7 @@ def _tell(line: str) -> None:
     """Print on the standard error; if that cannot be written, only the exit status reports the error."""
     with contextlib.suppress(OSError):
         # It may hold words of a file or of a device.
-        print(printable(line, LONGEST_LINE), file=sys.stderr)
+        print(sanitize(line, LONGEST_LINE), file=sys.stderr)
 
 
 def _discard_output() -> None:

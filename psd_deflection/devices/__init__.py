@@ -6,7 +6,7 @@ Everything that a plug-in needs is exported here; ``docs/devices/README.md`` sho
 this package opens no port and computes nothing.
 """
 
-from psd_deflection.devices.device import Answer, Device, Ear, LineDevice, PowerUp, Probe
+from psd_deflection.devices.device import Answer, Device, LineDevice, PowerUp, Probe, ProtocolProbe
 from psd_deflection.devices.source import (
     BadFrame,
     Clock,
@@ -25,7 +25,6 @@ __all__ = [
     'BadFrame',
     'Clock',
     'Device',
-    'Ear',
     'Event',
     'HelloFrame',
     'LineDevice',
@@ -33,6 +32,7 @@ __all__ = [
     'PortClosedError',
     'PowerUp',
     'Probe',
+    'ProtocolProbe',
     'Received',
     'Sample',
     'Source',

@@ -70,7 +70,7 @@ class Answer(NamedTuple):
     usable: bool = True
 
 
-class Ear(Protocol):
+class ProtocolProbe(Protocol):
     """Listens on one port for one device's protocol. ``promising``: samples of the device have come."""
 
     promising: bool
@@ -83,13 +83,13 @@ class Ear(Protocol):
 class Probe:
     """How ``psd-deflection devices`` recognises a device. A probe must not start, stop or set anything.
 
-    ``listen``: makes an :class:`Ear`, given the line speed. ``question``: bytes that the device answers,
+    ``listen``: makes an :class:`ProtocolProbe`, given the line speed. ``question``: bytes that the device answers,
     empty if it sends unasked. ``baud``: the speed that the device may need instead of 115200.
     ``first``: it must be asked before the others, because a question in another protocol confuses it.
     ``ports``: how many ports make one device; ``together``: the parameters that such a set needs in addition.
     """
 
-    listen: Callable[[int], Ear]
+    listen: Callable[[int], ProtocolProbe]
     question: bytes = b''
     baud: int = 115_200
     first: bool = False

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import MappingProxyType
 
 from psd_deflection import __version__
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 
 COMPUTES = ('psd_deflection', 'python', 'numpy', 'scipy')
 """Entries that the last digits of an estimate may depend on."""
@@ -49,7 +49,7 @@ def differences(then: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
     if not then:
         return ['a version that does not say what computed it']
     return [
-        f'{name} {printable(then.get(name, "not stated"), _LONGEST)}, now {now.get(name, "not stated")}'
+        f'{name} {sanitize(then.get(name, "not stated"), _LONGEST)}, now {now.get(name, "not stated")}'
         for name in COMPUTES
         if then.get(name) != now.get(name)
     ]

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from msg_adapters import LOAD, REFERENCE, SAMPLES, TEMPERATURE
 from psd_deflection.base.errors import ConfigError, RecordingError
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.tables import Table, html_table
 from psd_deflection.measure.averaging import BlockCutter
 from psd_deflection.recordings.charts import moments, samples_chart
@@ -367,7 +367,7 @@ class Recording(abc.ABC):
             words = f'{self.path}: ' + ', '.join(f'{name} {value}' for name, value in self._summary())
         except RecordingError as error:
             words = str(error)
-        return f'<{type(self).__name__} {printable(words, LONGEST_REPR)}>'
+        return f'<{type(self).__name__} {sanitize(words, LONGEST_REPR)}>'
 
     def _repr_html_(self) -> str:
         rows: list[tuple[str, object]] = []

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from psd_deflection.base.errors import ConfigError, RecordingError
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.records import Mark
 
@@ -59,7 +59,7 @@ def _mark_ns(recording: Marked, bound: str, after_ns: int | None) -> int:
         names = sorted({mark.text for mark in there})
         have = f'its marks are {", ".join(names[:MOST_NAMED])}' if names else 'it has no marks'
         raise RecordingError(
-            f'{recording.path}: has no mark {printable(text, LONGEST_TEXT)!r}; {have}{did_you_mean(text, names)}'
+            f'{recording.path}: has no mark {sanitize(text, LONGEST_TEXT)!r}; {have}{did_you_mean(text, names)}'
         )
     # To the mark that it begins with there is nothing: the next one is meant.
     return next((t_ns for t_ns in found if after_ns is None or t_ns > after_ns), found[-1])

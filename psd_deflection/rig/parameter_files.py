@@ -14,7 +14,7 @@ from typing import Any
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.foreign_yaml import YamlError, edited, text_of_file, tree_of_text
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 
 MAX_KEYS = 10_000
 LONGEST_SOURCE = 4000
@@ -120,7 +120,7 @@ def with_values(text: str, values: Mapping[str, object], source: str, path: Path
         raise ConfigError(f'{path}: cannot be written again with the same values')
     older = '# ' + ' '.join(source.split()[:2]) + ' '
     kept = ''.join(line for line in out.splitlines(keepends=True) if not line.startswith(older))
-    return f'# {printable(source, LONGEST_SOURCE)}\n{kept}'
+    return f'# {sanitize(source, LONGEST_SOURCE)}\n{kept}'
 
 
 def _readable(value: object) -> object:

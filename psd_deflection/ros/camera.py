@@ -21,7 +21,7 @@ from typing import Any
 from msg_adapters import REFERENCE, REFERENCE_WITH_COVARIANCE, to_messages
 from psd_deflection.arms.inputs import stamp_fault
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.log import WARNING, Say
+from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.footage import decoded, of_ros_image
 from psd_deflection.camera.opencv import opencv
@@ -35,9 +35,12 @@ from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import CAMERA_INFO, COMPRESSED, IMAGE
 from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN
+from psd_deflection.run.realtime import SHARED_MEMORY, shared_memory_left
 
 NODE_NAME = 'camera'
 MOST_DISTORTIONS = 14
+SHARED_BYTES = 1_000_000
+"""Shared memory that Fast DDS takes for a participant and its ports."""
 LARGEST_NUMBER = 1e7
 """Bound of the numbers of a camera's matrix, px, and of its distortion."""
 
@@ -45,14 +48,14 @@ LARGEST_NUMBER = 1e7
 class CameraNode(BaseNode[CameraSettings]):
     """The node. ``given``: parameters of a file or an option. Raises ConfigError if OpenCV is missing, too."""
 
-    def __init__(self, given: CameraSettings, say: Say) -> None:
+    def __init__(self, given: CameraSettings, log: LogCallback) -> None:
         opencv()
         self._given = given
         self._reference: CameraReference | None = None
         self._info: Any = None
         self._since: collections.Counter[str] = collections.Counter()
         self._last: FrameAnswer | None = None
-        super().__init__(NODE_NAME, say)
+        super().__init__(NODE_NAME, log)
 
     def declare(self) -> DeclaredParameters[CameraSettings]:
         """Those of a camera."""
@@ -174,11 +177,14 @@ def _info_fault(message: Any) -> str:
     return f'{beyond[0]:g}: must be finite and at most {LARGEST_NUMBER:g}' if beyond else ''
 
 
-def run_camera(ros_arguments: Sequence[str], given: CameraSettings, say: Say) -> int:
+def run_camera(ros_arguments: Sequence[str], given: CameraSettings, log: LogCallback) -> int:
     """Measure until SIGINT or SIGTERM. Raises ConfigError."""
+    left = shared_memory_left()
+    if left < SHARED_BYTES:
+        log(f'{SHARED_MEMORY} has {left // 1000} kB left, of {SHARED_BYTES // 1000}: images come by UDP', WARNING)
     with (
-        ros(NODE_NAME, ros_arguments, shared_memory=True) as signals,
-        contextlib.closing(CameraNode(given, say)) as owner,
+        ros(NODE_NAME, ros_arguments, shared_memory=left >= SHARED_BYTES) as signals,
+        contextlib.closing(CameraNode(given, log)) as owner,
     ):
         serve(owner, signals)
     return 0

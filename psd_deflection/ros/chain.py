@@ -19,7 +19,7 @@ from msg_adapters.pose_with_covariance_stamped import from_end_effector
 from psd_deflection.arms.chains.chain_file import SETTINGS, ChainFile, ChainSettings
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.inputs import joints_fault
-from psd_deflection.base.log import WARNING, Say
+from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.recordings import cdr
 from psd_deflection.ros.declared import DeclaredParameters
 from psd_deflection.ros.names import BASE, END, END_REST, RECORD, REST, TIP, ZERO
@@ -28,7 +28,7 @@ from psd_deflection.ros.running import ros
 from psd_deflection.ros.services import Zeroed, add_rig_services
 from psd_deflection.ros.topics import JOINT_STATES, PUBLISHED
 from psd_deflection.ros.transforms import FramePublisher, installed, static_transforms, transform_message
-from psd_deflection.ros.wires import InputRecorder, PublisherWire, topics_of
+from psd_deflection.ros.wires import InputRecorder, PublisherSink, topics_of
 from psd_deflection.run.chain import ChainSession, Composed
 from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN, HealthReporter
 from psd_deflection.run.fanout import subscribed
@@ -46,17 +46,17 @@ class ChainNode(BaseNode[ChainSettings]):
 
     SYSTEM_TIME = True
 
-    def __init__(self, file: ChainFile, say: Say, signals: Signals) -> None:
+    def __init__(self, file: ChainFile, log: LogCallback, signals: Signals) -> None:
         self.chain: ChainSession | None = None
         self._file = file
         self._signals = signals
-        self._wires: list[PublisherWire] = []
+        self._wires: list[PublisherSink] = []
         self._inputs: list[InputRecorder] = []
         self._told: list[RigPublisher] = []
         self._health: list[HealthReporter] = []
         self._seen = (0, 0)
         self._frames: FramePublisher | None = None
-        super().__init__(NODE_NAME, say)
+        super().__init__(NODE_NAME, log)
 
     def declare(self) -> DeclaredParameters[ChainSettings]:
         """Those of a chain."""
@@ -72,7 +72,7 @@ class ChainNode(BaseNode[ChainSettings]):
         else:
             self.log('tf2_msgs is not installed: no frames on /tf', WARNING)
         for name, rig in zip(file.names, file.rigs, strict=True):
-            self._wires.append(PublisherWire(node, topics_of(rig), name))
+            self._wires.append(PublisherSink(node, topics_of(rig), name))
             self._inputs.append(InputRecorder(node, subscribed(rig), name))
         if any(joint.name for joint in file.joints):
             self.gate.listen(JOINT_STATES, self._joints_fault, self._joints)
@@ -90,7 +90,7 @@ class ChainNode(BaseNode[ChainSettings]):
             for wire, inputs, session in zip(self._wires, self._inputs, chain.sessions, strict=True):
                 session.fanout.wires.insert(0, wire)
                 told = RigPublisher(wire, session)
-                session.fanout.change_wires.append(told)
+                session.fanout.change_sinks.append(told)
                 session.processing.sinks.append(told)
                 self._told.append(told)
                 inputs.session = session
@@ -218,13 +218,15 @@ def chain_transforms(file: ChainFile, composed: Composed) -> list[Any]:
     return out
 
 
-def run_chain(ros_args: Sequence[str], file: ChainFile, say: Say, watch: Callable[[ChainSession], object]) -> int:
+def run_chain(
+    ros_args: Sequence[str], file: ChainFile, log: LogCallback, watch: Callable[[ChainSession], object]
+) -> int:
     """Run the node until SIGINT or SIGTERM. ``watch``: called about ten times a second.
 
     Raises the errors of the package if the run cannot start, or if a pipeline failed.
     """
     with ros(NODE_NAME, ros_args) as signals:
-        owner, watchdog = ChainNode(file, say, signals), Watchdog()
+        owner, watchdog = ChainNode(file, log, signals), Watchdog()
 
         def runs() -> bool:
             chain = owner.chain

@@ -42,7 +42,7 @@ from psd_deflection.arms.compensation.settings import ALL_JOINTS, SETTINGS, Comp
 from psd_deflection.arms.compensation.settings import COMMANDS as WITH_COMMANDS
 from psd_deflection.arms.inputs import LARGEST_POSITION, frame_fault, joints_fault, quaternion_fault, stamp_fault
 from psd_deflection.base.errors import ConfigError, DeviceError
-from psd_deflection.base.log import INFO, WARNING, Say
+from psd_deflection.base.log import INFO, WARNING, LogCallback
 from psd_deflection.records import FloatArray
 from psd_deflection.ros.declared import DeclaredParameters
 from psd_deflection.ros.description import robot_description
@@ -64,7 +64,7 @@ from psd_deflection.ros.topics import (
     SCALING,
 )
 from psd_deflection.run.diagnostics import ERROR, OK, WARN
-from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.repeats import RateLimitedLog
 from psd_deflection.run.signals import StopRequestedError
 
 NODE_NAME = 'compensator'
@@ -98,7 +98,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self,
         arm: Arm,
         settings: CompensatorSettings,
-        say: Say,
+        log: LogCallback,
         drive: bool,
         hurried: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -116,7 +116,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._release_until = math.inf
         # Since when only offsets that the controller does not tell are left.
         self._owed_t: float | None = None
-        super().__init__(NODE_NAME, say)
+        super().__init__(NODE_NAME, log)
 
     def declare(self) -> DeclaredParameters[CompensatorSettings]:
         """Those of a compensator."""
@@ -128,14 +128,14 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._sums = self.settings.output == WITH_COMMANDS
         self.compensator = Compensator(self._arm, self.settings, dry=not self._drive)
         self.command = self._told = self.compensator.command()
-        self._repeats = Repeats(self.log)
+        self._limited_log = RateLimitedLog(self.log)
         self._listen()
         self._array = message_class(PUBLISHED[OFFSETS].type)
         outputs = [PROPOSED] if not self._drive else [OFFSETS, COMMANDS] if self._sums else [OFFSETS]
         self._publishers = {topic: self.publisher(topic) for topic in outputs}
         if self._drive:
             self.node.create_service(SetBool, ENABLE, self._enable)
-        self.node.create_timer(TOLD_S, self._tell, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.node.create_timer(TOLD_S, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._begun = time.monotonic()
         out = self._publishers[outputs[-1]].topic_name
         when = ', once it is enabled' if self._drive else ''
@@ -198,7 +198,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
                 # The executor waits for this transition. Offsets go back only while the controller
                 # and the joints are heard.
                 self.gate.take_in()
-                self._tell()
+                self._report()
         except BaseException as error:
             # Whatever failed, the sender's thread takes the offsets back alone.
             self._alone = error
@@ -347,6 +347,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         rivals = self.rivals() if self._drive else []
         other = f'another node publishes {rivals[0]}' if rivals else ''
         if self._drive and now - self._begun < LOOK_S:
+            self.gate.look_for_latched()
             other = other or 'it looks whether another node commands the robot'
         with self._lock:
             self.compensator.stop(other or self._robot.fault(now), rival=bool(other))
@@ -396,8 +397,8 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
                 offsets = less
         self.command = command._replace(offsets=offsets, sends=False)
 
-    def _tell(self) -> None:
-        self._repeats.settle(time.monotonic())
+    def _report(self) -> None:
+        self._limited_log.settle(time.monotonic())
         self._check_robot()
         command = self.command
         before, self._told = self._told, command
@@ -407,7 +408,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         if before.state is not command.state or told:
             warns = command.foreign or (command.why and command.state is not State.OFF)
             level = WARNING if warns and command.state is not State.RELEASING else INFO
-            self._repeats.tell(str(command.state), command.text, level, time.monotonic(), NEWS)
+            self._limited_log.log(str(command.state), command.text, level, time.monotonic(), NEWS)
 
     def _enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         if not self.active:
@@ -483,17 +484,17 @@ def run_compensator(
     ros_args: Sequence[str],
     robot: Arm | DescribedArm,
     settings: CompensatorSettings,
-    say: Say,
+    log: LogCallback,
     drive: bool,
 ) -> int:
     """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
     with ros(NODE_NAME, ros_args) as signals, contextlib.suppress(StopRequestedError):
         arm = robot
         if isinstance(arm, DescribedArm):
-            arm = arm_of(robot_description(signals, say), ROBOT_DESCRIPTION, arm.tip, arm.base)
+            arm = arm_of(robot_description(signals, log), ROBOT_DESCRIPTION, arm.tip, arm.base)
         if settings.joints == (ALL_JOINTS,):
             settings = dataclasses.replace(settings, joints=arm.names)
-        owner = CompensatorNode(arm, settings, say, drive, lambda: bool(signals.stop))
+        owner = CompensatorNode(arm, settings, log, drive, lambda: bool(signals.stop))
         try:
             serve(owner, signals, owner.runs)
         finally:

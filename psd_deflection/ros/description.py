@@ -12,7 +12,7 @@ from typing import Any
 from rclpy.node import Node
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.log import Say
+from psd_deflection.base.log import LogCallback
 from psd_deflection.ros.gate import InputGate
 from psd_deflection.ros.running import SPIN_S, executor_of
 from psd_deflection.ros.topics import ROBOT_DESCRIPTION
@@ -31,7 +31,7 @@ def listen_to_description(gate: InputGate, take: Callable[[str], None]) -> None:
 
 
 def robot_description(
-    signals: Signals, say: Say, wait_s: float = WAIT_S, clock: Callable[[], float] = time.monotonic
+    signals: Signals, log: LogCallback, wait_s: float = WAIT_S, clock: Callable[[], float] = time.monotonic
 ) -> str:
     """The text on ``robot_description`` in the namespace that the ROS arguments give; rclpy is started.
 
@@ -41,10 +41,10 @@ def robot_description(
     heard: list[str] = []
     node = Node(f'{ROBOT_DESCRIPTION}_reader', start_parameter_services=False)
     try:
-        gate = InputGate(node, say)
+        gate = InputGate(node, log)
         listen_to_description(gate, heard.append)
         topic = node.resolve_topic_name(ROBOT_DESCRIPTION)
-        say(f'waiting for the robot on {topic}')
+        log(f'waiting for the robot on {topic}')
         until = clock() + wait_s
         with executor_of(node) as executor:
             while not heard:

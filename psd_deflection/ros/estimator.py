@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from msg_adapters import DEFLECTION, DIAGNOSTICS, SAMPLES, WRENCH, to_messages
-from psd_deflection.base.log import WARNING, Say
+from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.rig.config import Rig
@@ -28,7 +28,7 @@ from psd_deflection.ros.parameters import LiveParameters
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.services import Zeroed, add_rig_services
 from psd_deflection.ros.transforms import TransformPublisher, installed
-from psd_deflection.ros.wires import InputRecorder, PublisherWire, VoltsPublisher, topics_of
+from psd_deflection.ros.wires import InputRecorder, PublisherSink, VoltsPublisher, topics_of
 from psd_deflection.run.diagnostics import STALE, HealthReporter
 from psd_deflection.run.fanout import subscribed
 from psd_deflection.run.monitor.start import Views, start_views
@@ -49,7 +49,7 @@ class EstimatorNode(BaseNode[Rig]):
 
     SYSTEM_TIME = True
 
-    def __init__(self, overrides: Mapping[str, object], say: Say, signals: Signals) -> None:
+    def __init__(self, overrides: Mapping[str, object], log: LogCallback, signals: Signals) -> None:
         self.session: Session | None = None
         self._signals = signals
         self._health: HealthReporter | None = None
@@ -57,7 +57,7 @@ class EstimatorNode(BaseNode[Rig]):
         self._rig_told: RigPublisher | None = None
         self._markers: RigMarkers | None = None
         self._transforms: TransformPublisher | None = None
-        super().__init__(NODE_NAME, say, overrides)
+        super().__init__(NODE_NAME, log, overrides)
 
     def declare(self) -> LiveParameters:
         """Those of the rig."""
@@ -67,7 +67,7 @@ class EstimatorNode(BaseNode[Rig]):
     def set_up(self) -> None:
         """Make what is on the graph while the node lives."""
         add_rig_services(self.node, lambda: self.session, self._zero, lambda session, on: [session.record(on)])
-        self._wire = PublisherWire(self.node, topics_of(self.settings))
+        self._wire = PublisherSink(self.node, topics_of(self.settings))
         self._inputs = InputRecorder(self.node, subscribed(self.settings))
 
     def watched(self) -> Iterable[str]:
@@ -103,7 +103,7 @@ class EstimatorNode(BaseNode[Rig]):
             self._health = HealthReporter(session)
             session.fanout.wires.insert(0, self._wire)
             self._rig_told = RigPublisher(self._wire, session)
-            session.fanout.change_wires.append(self._rig_told)
+            session.fanout.change_sinks.append(self._rig_told)
             session.processing.sinks.append(self._rig_told)
             self._make_views(session)
             self._inputs.session = session
@@ -193,7 +193,7 @@ class EstimatorNode(BaseNode[Rig]):
 def run(
     ros_args: Sequence[str],
     overrides: Mapping[str, object],
-    say: Say,
+    log: LogCallback,
     while_running: Callable[[Session], None] | None = None,
 ) -> int:
     """Run the node until SIGINT or SIGTERM, however often they come.
@@ -203,7 +203,7 @@ def run(
     start, or if the pipeline failed.
     """
     with ros(NODE_NAME, ros_args) as signals:
-        owner, watchdog = EstimatorNode(overrides, say, signals), Watchdog()
+        owner, watchdog = EstimatorNode(overrides, log, signals), Watchdog()
 
         def runs() -> bool:
             session = owner.session

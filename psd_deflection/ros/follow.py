@@ -315,7 +315,7 @@ class Follower:
         if goal.sent is not None:
             goal.future.cancel()
 
-        def say(handle: Any) -> Any:
+        def log(handle: Any) -> Any:
             if status == GoalStatus.STATUS_SUCCEEDED:
                 handle.succeed()
             elif status == GoalStatus.STATUS_CANCELED and handle.is_cancel_requested:
@@ -325,4 +325,4 @@ class Follower:
             return result
 
         if self._owner.node.executor is not None:
-            self._server.finish(goal.handle, say)
+            self._server.finish(goal.handle, log)

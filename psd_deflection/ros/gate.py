@@ -20,18 +20,18 @@ from rclpy.action import GoalResponse
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
 
 from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
-from psd_deflection.base.log import WARNING, Say
-from psd_deflection.base.printable import printable
+from psd_deflection.base.log import WARNING, LogCallback
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.ros.actions import FAILURES, GuardedClient, GuardedServer
 from psd_deflection.ros.endpoints import action_class, graph_name, message_class, overriding, qos, refused_qos
 from psd_deflection.ros.topics import HEARD, MOST_GOALS, SERVED, GraphTopic
-from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.repeats import RateLimitedLog
 
 LONGEST = 200
 """Characters of a reason, in which a stranger's words may be."""
@@ -42,14 +42,16 @@ MOST_A_SECOND = 2000
 
 
 class InputGate:
-    """Subscriptions of ``node``. ``say`` gets the refusals. ``clock``: monotonic, s.
+    """Subscriptions of ``node``. ``log`` gets the refusals. ``clock``: monotonic, s.
 
     ``refused``: messages by topic; ``why``: the last reason of each.
     """
 
-    def __init__(self, node: Node, say: Say, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, node: Node, log: LogCallback, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
-        self._repeats = Repeats(say)
+        self._limited_log = RateLimitedLog(log)
+        # Names of topics whose latched row waits for a publisher that is latched, with what subscribes to it.
+        self._latched: dict[str, Callable[[], Subscription]] = {}
         self.refused = Tally()
         self.why: BoundedMap[str, str] = BoundedMap()
 
@@ -68,9 +70,22 @@ class InputGate:
         for a topic without a row, ImportError if its message is not installed, and ConfigError for a QoS override that
         ROS does not take.
         """
-        return [
-            self._subscribe(row, check, take, name or graph_name(row), type_name or row.type) for row in HEARD[topic]
-        ]
+        rows = HEARD[topic]
+        if len(rows) > 1 and rows[0].delivery.latched:
+            latched, rows = rows[0], rows[1:]
+            name = name or graph_name(latched)
+            self._latched[name] = functools.partial(self._subscribe, latched, check, take, name, latched.type)
+        return [self._subscribe(row, check, take, name or graph_name(row), type_name or row.type) for row in rows]
+
+    def look_for_latched(self) -> None:
+        """Subscribe to what a latched publisher said before we came.
+
+        Not before there is one: DDS would warn every publisher that is not latched of a QoS that does not fit.
+        """
+        for name in list(self._latched):
+            publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(name))
+            if any(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers):
+                self._latched.pop(name)()
 
     def serve(
         self,
@@ -153,12 +168,13 @@ class InputGate:
     def refuse(self, topic: str, why: str) -> None:
         """Count a message and say why it is refused."""
         self.refused.add(topic)
-        self.why[topic] = printable(why, LONGEST)
-        self._repeats.tell(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
+        self.why[topic] = sanitize(why, LONGEST)
+        self._limited_log.log(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
 
     def settle(self) -> None:
-        """Say what was counted and is due; to be called now and then."""
-        self._repeats.settle(self._clock())
+        """Say what was counted and is due, and look for latched publishers; to be called once a second."""
+        self.look_for_latched()
+        self._limited_log.settle(self._clock())
 
     def values(self) -> list[tuple[str, str]]:
         """For the node's diagnostics."""

@@ -20,7 +20,7 @@ from rcl_interfaces.msg import Log
 from rclpy.logging import LoggingSeverity, get_logging_directory
 from rclpy.node import Node
 
-from psd_deflection.base.log import INFO, Say
+from psd_deflection.base.log import INFO, LogCallback
 from psd_deflection.ros.endpoints import publisher_of
 from psd_deflection.ros.topics import ROSOUT
 
@@ -40,10 +40,10 @@ def rcl_log_file() -> Path | None:
 
 
 class NodeLog:
-    """Call it with a line. ``say`` puts it on the terminal; what ``--log-level`` leaves out goes nowhere."""
+    """Call it with a line. ``log`` puts it on the terminal; what ``--log-level`` leaves out goes nowhere."""
 
-    def __init__(self, node: Node, say: Say) -> None:
-        self._say = say
+    def __init__(self, node: Node, log: LogCallback) -> None:
+        self._log = log
         self._logger = node.get_logger()
         self._publisher = publisher_of(node, ROSOUT)
         self._lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
@@ -67,7 +67,7 @@ class NodeLog:
         # An abandoned thread may log a line after the node is gone.
         with contextlib.suppress(RuntimeError):
             self._publisher.publish(line)
-        self._say(text, level)
+        self._log(text, level)
 
     def close(self) -> None:
         """Write the last lines."""

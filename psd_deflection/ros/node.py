@@ -25,7 +25,7 @@ from rclpy.publisher import Publisher
 
 from msg_adapters import DIAGNOSTICS, to_messages
 from psd_deflection.base.errors import ConfigError, PsdDeflectionError
-from psd_deflection.base.log import ERROR, WARNING, Say
+from psd_deflection.base.log import ERROR, WARNING, LogCallback
 from psd_deflection.recordings import cdr
 from psd_deflection.records import DiagnosticEntry, DiagnosticReport
 from psd_deflection.rig.declarations import BY_NAME, FRAME_PREFIX
@@ -101,7 +101,7 @@ class BaseNode(abc.ABC, Generic[T]):
 
     A node overrides :meth:`declare`, :meth:`set_up`, what its lifecycle does, and :meth:`health`.
 
-    ``say``: gets each line for the terminal. ``overrides``: parameters that take precedence over those of ROS's
+    ``log``: gets each line for the terminal. ``overrides``: parameters that take precedence over those of ROS's
     arguments. Before ``super().__init__`` a node keeps what :meth:`set_up` needs. Raises ConfigError if a parameter is
     refused; then nothing of the node is left.
 
@@ -112,7 +112,7 @@ class BaseNode(abc.ABC, Generic[T]):
     SYSTEM_TIME: ClassVar[bool] = False
     """What it measures is stamped by the system clock, so it refuses ``use_sim_time``."""
 
-    def __init__(self, name: str, say: Say, overrides: Mapping[str, object] = MappingProxyType({})) -> None:
+    def __init__(self, name: str, log: LogCallback, overrides: Mapping[str, object] = MappingProxyType({})) -> None:
         self.error: Exception | None = None
         self.finished = self.active = False
         self._starting = False
@@ -121,7 +121,7 @@ class BaseNode(abc.ABC, Generic[T]):
         self._diagnostics: Publisher | None = None
         self.node = _made(name, overrides)
         self.node.owner = self
-        self.log = NodeLog(self.node, say)
+        self.log = NodeLog(self.node, log)
         self.gate = self.node.gate = InputGate(self.node, self.log)
         try:
             self.parameters = self.declare()

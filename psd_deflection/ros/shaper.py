@@ -24,8 +24,8 @@ from psd_deflection.arms.compensation.shaping import DESCRIPTION, SHAPING, Shape
 from psd_deflection.arms.compensation.trajectory import QUANTITIES, Trajectory, checked, start_of
 from psd_deflection.arms.inputs import KnownJoints, joints_fault, stamp_fault
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.log import WARNING, Say
-from psd_deflection.base.printable import printable
+from psd_deflection.base.log import WARNING, LogCallback
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.ros.declared import DeclaredParameters
 from psd_deflection.ros.description import listen_to_description
 from psd_deflection.ros.follow import Follower
@@ -33,7 +33,7 @@ from psd_deflection.ros.node import BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.topics import JOINT_STATES, SHAPED, TRAJECTORY
 from psd_deflection.run.diagnostics import OK, STALE, WARN
-from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.repeats import RateLimitedLog
 
 NODE_NAME = 'shaper'
 NEWS = 6
@@ -45,13 +45,13 @@ LONGEST = 200
 class ShaperNode(BaseNode[ShaperSettings]):
     """The node. Raises ConfigError for a bad parameter or file."""
 
-    def __init__(self, settings: ShaperSettings, say: Say) -> None:
+    def __init__(self, settings: ShaperSettings, log: LogCallback) -> None:
         self._asked = settings
         self._known = KnownJoints()
         self._shaped = self._refused = 0
         self._why = ''
         self._follow: Follower | None = None
-        super().__init__(NODE_NAME, say)
+        super().__init__(NODE_NAME, log)
 
     def declare(self) -> DeclaredParameters[ShaperSettings]:
         """Those of a shaper."""
@@ -60,7 +60,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
     def set_up(self) -> None:
         """Listen to trajectories and joints."""
         self._shaper, self._described = trajectory_shaper(self.settings)
-        self._repeats = Repeats(self.log)
+        self._limited_log = RateLimitedLog(self.log)
         self._out = self.publisher(SHAPED)
         self.gate.listen(TRAJECTORY, _trajectory_fault, self._given)
         self.gate.listen(JOINT_STATES, lambda m: joints_fault(m.name, m.position, ()), self._joints)
@@ -95,15 +95,18 @@ class ShaperNode(BaseNode[ShaperSettings]):
             shaped = self._shape(message)
         except ConfigError as error:
             self._refused += 1
-            self._why = printable(str(error), LONGEST)
+            self._why = sanitize(str(error), LONGEST)
             kind = 'undescribed' if self._undescribed else 'refused'
-            self._repeats.tell(kind, f'trajectory refused: {self._why}', WARNING, time.monotonic(), NEWS)
+            self._limited_log.log(kind, f'trajectory refused: {self._why}', WARNING, time.monotonic(), NEWS)
             return
         self._why = ''
         self._out.publish(shaped)
 
     def _shape(self, message: Any) -> Any:
         """The message of a trajectory, shaped. Raises ConfigError for one that cannot be followed."""
+        if rivals := self.rivals():
+            # Both would answer, and the arm would get each motion twice.
+            raise ConfigError(f'another node publishes {rivals[0]}')
         if self._undescribed:
             raise ConfigError(f'nobody has told the limits of the joints on {DESCRIPTION} yet')
         trajectory = _trajectory(message)
@@ -150,6 +153,8 @@ class ShaperNode(BaseNode[ShaperSettings]):
     def _state(self) -> tuple[int, str]:
         if not self.active:
             return STALE, 'not active'
+        if rivals := self.rivals():
+            return WARN, f'it shapes nothing: another node publishes {rivals[0]}'
         if self._why:
             return WARN, f'the last trajectory was refused: {self._why}'
         if self._undescribed:
@@ -160,7 +165,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
 
     def health(self) -> Iterable[Health]:
         """What was shaped and refused."""
-        self._repeats.settle(time.monotonic())
+        self._limited_log.settle(time.monotonic())
         level, text = self._state()
         shaper = self._shaper.shaper
         values = (
@@ -203,10 +208,10 @@ def _message(trajectory: Trajectory, header: Any) -> Any:
     return out
 
 
-def run_shaper(ros_args: Sequence[str], settings: ShaperSettings, say: Say) -> int:
+def run_shaper(ros_args: Sequence[str], settings: ShaperSettings, log: LogCallback) -> int:
     """Run the node until SIGINT or SIGTERM."""
     with ros(NODE_NAME, ros_args) as signals:
-        owner = ShaperNode(settings, say)
+        owner = ShaperNode(settings, log)
         try:
             serve(owner, signals)
         finally:

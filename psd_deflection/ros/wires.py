@@ -13,7 +13,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from msg_adapters import DIAGNOSTICS, TOPIC_TYPES, vector3_stamped
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 from psd_deflection.model.solvers.registry import solver_class
 from psd_deflection.recordings import cdr
 from psd_deflection.records import Record, SampleBlock, TemperatureReading
@@ -34,7 +34,7 @@ def topics_of(rig: Rig) -> tuple[str, ...]:
     return (*published(rig), *volts)
 
 
-class PublisherWire:
+class PublisherSink:
     """Publishes encoded messages: a wire of the fan-out. While it is not ``active``, diagnostics alone.
 
     ``below``: namespace of the topics in that of the node.
@@ -68,7 +68,7 @@ class PublisherWire:
 class VoltsPublisher:
     """A sink of records: each raw sample as plain numbers, which plots draw; the bag has them as ``/psd/samples``."""
 
-    def __init__(self, wire: PublisherWire, frame_prefix: str) -> None:
+    def __init__(self, wire: PublisherSink, frame_prefix: str) -> None:
         self._wire = wire
         self._frame_prefix = frame_prefix
         self._encode = cdr.encoder_of(vector3_stamped.MESSAGE)
@@ -89,7 +89,7 @@ class InputRecorder(InputGate):
     """
 
     def __init__(self, node: Node, topics: Iterable[str], below: str = '') -> None:
-        super().__init__(node, unsaid)
+        super().__init__(node, null_log)
         self.session: Session | None = None
         self._below = below
         self._subscriptions: dict[str, list[Subscription]] = {}

@@ -28,7 +28,7 @@ from urllib.parse import urlsplit
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.json_text import json_text
-from psd_deflection.base.log import WARNING, Say
+from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.measure.watch import Alarm
 
 COMMAND_S = 10.0
@@ -64,16 +64,16 @@ def finding(alarm: Alarm, about: Mapping[str, object]) -> dict[str, object]:
 class AlarmOut:
     """``command``: a program and its arguments, as a shell splits them; no shell runs it. It gets the JSON, one
     line, on its standard input. ``webhook``: an ``http`` or ``https`` address, to which it is posted, or a file that
-    holds one. '' for neither. ``about``: joins each finding. ``say`` gets a line of what fails.
+    holds one. '' for neither. ``about``: joins each finding. ``log`` gets a line of what fails.
 
     Raises ConfigError for a command that is not there and for an address that is none. ``sent``, ``failed``: counts;
     ``failure``: why the last one failed, '' if it did not.
     """
 
-    def __init__(self, command: str, webhook: str, say: Say, about: Mapping[str, object] | None = None) -> None:
+    def __init__(self, command: str, webhook: str, log: LogCallback, about: Mapping[str, object] | None = None) -> None:
         self.sent = self.failed = 0
         self.failure = ''
-        self._say, self._about = say, dict(about or {})
+        self._log, self._about = log, dict(about or {})
         self._ways: list[tuple[str, Callable[[bytes], None]]] = []
         self._said: set[str] = set()
         if command:
@@ -96,7 +96,7 @@ class AlarmOut:
             return
         self._waiting.put(f'{json_text(finding(alarm, self._about))}\n'.encode())
         if self._thread is None:
-            self._thread = threading.Thread(target=self._hand_on, name='alarms', daemon=True)
+            self._thread = threading.Thread(target=self._forward, name='alarms', daemon=True)
             self._thread.start()
 
     def values(self) -> list[tuple[str, str]]:
@@ -115,7 +115,7 @@ class AlarmOut:
         self._thread.join(patience_s / 2.0)
         return not self._thread.is_alive()
 
-    def _hand_on(self) -> None:
+    def _forward(self) -> None:
         while (text := self._waiting.get()) is not None:
             for name, way in self._ways:
                 try:
@@ -131,7 +131,7 @@ class AlarmOut:
         self.failure = f'{name}: {why}'
         if name not in self._said:
             self._said.add(name)
-            self._say(f'watch: {name}: {why}; an alarm was not handed on, and further ones are counted', WARNING)
+            self._log(f'watch: {name}: {why}; an alarm was not handed on, and further ones are counted', WARNING)
 
 
 class _NotHandedOnError(Exception):

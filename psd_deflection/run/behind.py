@@ -16,7 +16,7 @@ _PACKAGE = 'psd_deflection.'
 _STATES = {'D': 'waits for the disk', 'T': 'is stopped'}
 
 
-def why_behind(thread: threading.Thread, still_s: float) -> str:
+def lag_reason(thread: threading.Thread, still_s: float) -> str:
     """Why ``thread`` is behind, in words. ``still_s``: how long it has made no step, s."""
     state = _state_of(thread)
     if still_s < HELD_S or state == 'R':

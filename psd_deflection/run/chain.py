@@ -20,7 +20,7 @@ from typing import NamedTuple
 from psd_deflection.arms.chains.chain import EndEffector
 from psd_deflection.arms.chains.chain_file import ChainFile
 from psd_deflection.arms.chains.joining import Joined, Joiner
-from psd_deflection.base.log import INFO, Say
+from psd_deflection.base.log import INFO, LogCallback
 from psd_deflection.records import (
     BlockStatus,
     DeflectionEstimate,
@@ -30,7 +30,7 @@ from psd_deflection.records import (
     SpotMeans,
 )
 from psd_deflection.rig.config import Rig, replace_values
-from psd_deflection.run.processing import Spokesman
+from psd_deflection.run.processing import OutageLog
 from psd_deflection.run.session import Session
 from psd_deflection.run.simulated_rig import simulates, started_early
 
@@ -74,7 +74,7 @@ class _LinkSink:
 
 
 class ChainSession:
-    """Opens every rig on construction. ``say`` gets one line for each change of state, from any thread.
+    """Opens every rig on construction. ``log`` gets one line for each change of state, from any thread.
 
     ``sessions``: in the order of the links. ``listeners`` get each :class:`Composed`, from any pipeline thread.
     ``reasons``: for each link, why its last block had no estimate, or ''. ``last``: the newest composed one, or None.
@@ -85,8 +85,8 @@ class ChainSession:
     def __init__(
         self,
         file: ChainFile,
-        say: Say,
-        open_session: Callable[[str, Rig, Say], Session] = lambda _, rig, say: Session(rig, say),
+        log: LogCallback,
+        open_session: Callable[[str, Rig, LogCallback], Session] = lambda _, rig, log: Session(rig, log),
     ) -> None:
         self.file = file
         self.sessions: list[Session] = []
@@ -96,8 +96,8 @@ class ChainSession:
         self._angles = file.angles
         self._closed = False
         self._lock = threading.Lock()
-        self._say = say
-        self._spokesman = Spokesman(lambda line, level=INFO: say(f'end effector: {line}', level))
+        self._log = log
+        self._outage_log = OutageLog(lambda line, level=INFO: log(f'end effector: {line}', level))
         self._joiner = Joiner([round(1e9 * r.estimator.block_size / r.converter.sample_rate_hz) for r in file.rigs])
         try:
             with contextlib.ExitStack() as early:
@@ -116,7 +116,7 @@ class ChainSession:
             session.processing.sinks.append(_LinkSink(self, link))
 
     def _said(self, name: str, line: str, level: int = INFO, /) -> None:
-        self._say(f'{name}: {line}', level)
+        self._log(f'{name}: {line}', level)
 
     @property
     def alive(self) -> bool:
@@ -181,7 +181,7 @@ class ChainSession:
                 self.last = composed
                 for listener in self.listeners:
                     listener(composed)
-                self._spokesman.block(composed.why and 'missing', f'not composed: {composed.why}', time.monotonic())
+                self._outage_log.block(composed.why and 'missing', f'not composed: {composed.why}', time.monotonic())
 
     def _compose(self, joined: Joined) -> Composed:
         if joined.missing:

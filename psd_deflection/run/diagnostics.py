@@ -37,7 +37,7 @@ LATE_SHARE = 0.25
 LOAD_WALK = ('load wanders, fx (N in 1 s)', 'load wanders, fy (N in 1 s)', 'load wanders, tz (N m in 1 s)')
 
 
-class Seen(NamedTuple):
+class CounterSnapshot(NamedTuple):
     """What was counted up to ``t_ns``, or between two reports."""
 
     t_ns: int
@@ -58,7 +58,7 @@ class HealthReporter:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._seen: Seen | None = None
+        self._seen: CounterSnapshot | None = None
         self._foretold = Innovations()
         self._base = (0, 0, 0, 0)
 
@@ -68,7 +68,7 @@ class HealthReporter:
         s.settle()
         wire, pipeline = s.acquisition.counters, s.pipeline.counters
         dropped = wire.queue_dropped + s.recorder.dropped
-        now = Seen(
+        now = CounterSnapshot(
             t_ns,
             wire.samples,
             wire.lost,
@@ -85,7 +85,11 @@ class HealthReporter:
         before = self._seen
         self._seen = now
         seconds = (now.t_ns - before.t_ns) / 1e9 if before is not None else 0.0
-        new = Seen(0, *(b - a for a, b in zip(before[1:], now[1:], strict=True))) if before is not None else now
+        new = (
+            CounterSnapshot(0, *(b - a for a, b in zip(before[1:], now[1:], strict=True)))
+            if before is not None
+            else now
+        )
 
         def rate(count: int) -> str:
             return f'{count / seconds:.2f}' if seconds > 0 else 'unknown'
@@ -105,7 +109,7 @@ class HealthReporter:
             str(hello.info.get('serial', '')) if hello is not None else '',
         )
 
-    def _acquisition(self, new: Seen, rate: str) -> DiagnosticEntry:
+    def _acquisition(self, new: CounterSnapshot, rate: str) -> DiagnosticEntry:
         s = self._session
         wire = s.acquisition.counters
         level, message = OK, 'samples flow'
@@ -134,7 +138,7 @@ class HealthReporter:
             ('silences', str(wire.silences)),
             ('refused on coming back', str(wire.refused_reopenings)),
             *((f'messages refused: {topic}', str(count)) for topic, count in sorted(s.refused.items())),
-            ('blocks waiting', str(s.acquisition.queue.qsize())),
+            ('blocks waiting', str(s.acquisition.queue.blocks)),
             ('inputs dropped, because the pipeline was held up', str(s.processing.requests_dropped)),
         ]
         values.append(('simulated', 'yes' if s.simulated else 'no'))
@@ -143,7 +147,7 @@ class HealthReporter:
             values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))
         return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))
 
-    def _clock(self, new: Seen) -> DiagnosticEntry:
+    def _clock(self, new: CounterSnapshot) -> DiagnosticEntry:
         acquisition = self._session.acquisition
         clock, wire = acquisition.clock_state(), acquisition.counters
         stepped = acquisition.system_clock_step_ns()
@@ -249,7 +253,9 @@ class HealthReporter:
         return DiagnosticEntry('psd_deflection: recording', level, message, values)
 
 
-def estimates_entry(pipeline: Pipeline, new: Seen, rate: str, latency: Latency | None = None) -> DiagnosticEntry:
+def estimates_entry(
+    pipeline: Pipeline, new: CounterSnapshot, rate: str, latency: Latency | None = None
+) -> DiagnosticEntry:
     """Whether ``pipeline`` makes estimates, and why not. ``new``: since the last report; ``rate``: estimates/s."""
     counters, spots = pipeline.counters, pipeline.last_spots
     level, message = OK, 'estimates flow'

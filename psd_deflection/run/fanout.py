@@ -56,12 +56,12 @@ class Fanout:
     def __init__(self, frame_prefix: str = '') -> None:
         self._frame_prefix = frame_prefix
         self.wires: list[Wire] = []
-        self.change_wires: list[ChangeWire] = []
+        self.change_sinks: list[ChangeWire] = []
 
     def put(self, record: Record) -> None:
         """Encode and hand on."""
         if isinstance(record, ParameterChange):
-            for change_wire in self.change_wires:
+            for change_wire in self.change_sinks:
                 change_wire.put_change(record)
             return
         last: object = None

@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.base.log import Say
+from psd_deflection.base.log import LogCallback
 from psd_deflection.model.detector import counts_to_volts
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.rig.config import Rig, replace_values
@@ -29,10 +29,10 @@ SIMULATED_PUSH = 0.5e-3
 """m: how far the simulated hand moves a dot."""
 
 
-def run_guided(rig: Rig, world: Rig, say: Say, show: Callable[[Guide], None]) -> Checkup:
+def run_guided(rig: Rig, world: Rig, log: LogCallback, show: Callable[[Guide], None]) -> Checkup:
     """Lead through the pushes on the device of ``rig``; without a port, on a simulated rig that is really ``world``.
 
-    ``say`` gets the prompts and the lines between them, ``show`` the guide after each chunk of
+    ``log`` gets the prompts and the lines between them, ``show`` the guide after each chunk of
     samples. Raises DeviceError, ConfigError.
     """
     # A few lost samples do no harm here, and a priority is one more thing to read about.
@@ -42,12 +42,12 @@ def run_guided(rig: Rig, world: Rig, say: Say, show: Callable[[Guide], None]) ->
         process = SimulatedRigProcess(world)
         process.push((0.0, 0.0, 0.0))
         rig = replace_values(rig, {'port': process.port})
-        say('No port is given: a simulated rig, and a simulated hand that does what is asked.')
-    acquisition = Acquisition(rig, say)
+        log('No port is given: a simulated rig, and a simulated hand that does what is asked.')
+    acquisition = Acquisition(rig, log)
     try:
         acquisition.open()
         acquisition.start()
-        return _lead(rig, acquisition, process, say, show)
+        return _lead(rig, acquisition, process, log, show)
     finally:
         if process is not None:
             process.hang_up()
@@ -60,7 +60,7 @@ def _lead(
     rig: Rig,
     acquisition: Acquisition,
     process: SimulatedRigProcess | None,
-    say: Say,
+    log: LogCallback,
     show: Callable[[Guide], None],
 ) -> Checkup:
     guide = Guide(rig)
@@ -69,7 +69,7 @@ def _lead(
     while guide.phase is not Phase.DONE:
         if guide.prompt() != prompt:
             prompt = guide.prompt()
-            say(prompt)
+            log(prompt)
             if process is not None:
                 process.push(_simulated_push(rig, guide))
         try:
@@ -89,7 +89,7 @@ def _lead(
             told = guide.feed(volts.astype(float))
             show(guide)
             if told:
-                say(told)
+                log(told)
     drift, sd = guide.drift()
     return check(CheckProblem(rig, guide.pushes, levels(rig, guide.rest()), drift, sd))
 

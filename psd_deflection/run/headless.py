@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Protocol, TypeVar
 
-from psd_deflection.base.log import Say
+from psd_deflection.base.log import LogCallback
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.run.realtime import Watchdog, settle
 from psd_deflection.run.session import Session
@@ -50,9 +50,9 @@ R = TypeVar('R', bound=Run)
 
 def run_headless(
     values: Mapping[str, object],
-    say: Say,
+    log: LogCallback,
     watch: Callable[[Session], None],
-    start_companion: Callable[[Session, Say], Companion | None],
+    start_companion: Callable[[Session, LogCallback], Companion | None],
 ) -> int:
     """Run a session with these parameters until SIGINT, SIGTERM or SIGHUP; return the exit status.
 
@@ -61,9 +61,9 @@ def run_headless(
     """
 
     def begin() -> Session:
-        return Session(rig_from_values(values, 'command line'), say)
+        return Session(rig_from_values(values, 'command line'), log)
 
-    return run_until_signal(begin, watch, lambda session: start_companion(session, say))
+    return run_until_signal(begin, watch, lambda session: start_companion(session, log))
 
 
 def run_until_signal(

@@ -18,11 +18,11 @@ from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from typing import Any, Protocol, TypeVar
 
-from psd_deflection.base.log import INFO, WARNING, Say
+from psd_deflection.base.log import INFO, WARNING, LogCallback
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
-from psd_deflection.run.behind import why_behind
-from psd_deflection.run.reading.arrivals import Arrival, Item, Noted, Restarted
+from psd_deflection.run.behind import lag_reason
+from psd_deflection.run.reading.arrivals import Arrival, ItemQueue, Noted, Restarted
 
 T = TypeVar('T')
 
@@ -54,14 +54,14 @@ class Latency:
     worst: float
 
 
-class Spokesman:
+class OutageLog:
     """Reports when estimates stop and why, and when they resume: one line a second at most.
 
     Blocks that were affected in between are counted in the next line.
     """
 
-    def __init__(self, say: Say) -> None:
-        self._say = say
+    def __init__(self, log: LogCallback) -> None:
+        self._log = log
         self._last_line = -INTERVAL_S
         self._now = ''
         self._text = ''
@@ -82,7 +82,7 @@ class Spokesman:
             line += f' ({self._blocks} {noun} affected since the last line)'
         self._last_line = now
         self._blocks = self._changes = 0
-        self._say(line, WARNING if cause else INFO)
+        self._log(line, WARNING if cause else INFO)
 
 
 class Processing:
@@ -94,9 +94,9 @@ class Processing:
 
     def __init__(
         self,
-        items: queue.SimpleQueue[Item],
+        items: ItemQueue,
         pipeline: Pipeline,
-        say: Say,
+        log: LogCallback,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self.pipeline = pipeline
@@ -111,7 +111,7 @@ class Processing:
         self._latencies: deque[tuple[int, float]] = deque()
         self._heard_ns = clock()
         self._thread = threading.Thread(target=self._run, name='pipeline', daemon=True)
-        self._spokesman = Spokesman(say)
+        self._outage_log = OutageLog(log)
 
     def start(self) -> None:
         """Start the thread."""
@@ -122,9 +122,9 @@ class Processing:
         if self._thread.ident is not None:
             self._thread.join(timeout)
 
-    def why_behind(self) -> str:
+    def lag_reason(self) -> str:
         """Why blocks wait for it, in words."""
-        return why_behind(self._thread, time.monotonic() - self.beat)
+        return lag_reason(self._thread, time.monotonic() - self.beat)
 
     @property
     def alive(self) -> bool:
@@ -236,4 +236,4 @@ class Processing:
             without = ' and '.join(f'psd_{psd}' for psd in spots.left_out)
             how = f'without {without}' if without else 'translation from one detector alone'
             text = f'degraded, {how}: {spots.reason}'
-        self._spokesman.block(cause, text, time.monotonic())
+        self._outage_log.block(cause, text, time.monotonic())

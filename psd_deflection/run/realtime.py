@@ -12,9 +12,11 @@ import ctypes
 import gc
 import os
 import socket
+import sys
 import time
 from collections.abc import Callable
 
+SHARED_MEMORY = '/dev/shm'
 READER_PRIORITY = 50
 """SCHED_FIFO priority of the reader thread. Threads inherit the policy, so the reader sets its own."""
 
@@ -60,6 +62,16 @@ def settle() -> None:
     gc.freeze()
 
 
+def shared_memory_left() -> int:
+    """Free bytes of ``SHARED_MEMORY``, in which DDS and the tracing of ROS 2 map memory."""
+    try:
+        system = os.statvfs(SHARED_MEMORY)
+    except OSError:
+        # Where there is none, nothing can be mapped, and whoever tries is told so.
+        return sys.maxsize
+    return system.f_bavail * system.f_frsize
+
+
 class Watchdog:
     """Tells systemd that the daemon is ready and alive (sd_notify(3)).
 
@@ -78,7 +90,7 @@ class Watchdog:
         self._interval = int(usec) / 2e6 if usec.isdecimal() and meant else 0.0
         self._last = -self._interval
 
-    def _tell(self, text: str) -> None:
+    def _report(self, text: str) -> None:
         if not self._address:
             return
         try:
@@ -91,7 +103,7 @@ class Watchdog:
 
     def ready(self) -> None:
         """The daemon runs."""
-        self._tell('READY=1')
+        self._report('READY=1')
 
     def alive(self) -> None:
         """Tell systemd that the process is alive; to be called from the loop that must not hang."""
@@ -100,8 +112,8 @@ class Watchdog:
         now = self._clock()
         if now - self._last >= self._interval:
             self._last = now
-            self._tell('WATCHDOG=1')
+            self._report('WATCHDOG=1')
 
     def stopping(self) -> None:
         """The daemon ends."""
-        self._tell('STOPPING=1')
+        self._report('STOPPING=1')

@@ -24,14 +24,14 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from pathlib import Path
 
-from psd_deflection.base.bounds import MESSAGE_BYTES, ByteBudget
+from psd_deflection.base.bounds import MESSAGE_BYTES, BoundedMap, ByteBudget
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.base.log import ERROR, WARNING, Say
+from psd_deflection.base.log import ERROR, WARNING, LogCallback
 from psd_deflection.recordings.write.bag_writer import BagWriter
 from psd_deflection.records import ParameterChange
 from psd_deflection.rig.config import Rig
 from psd_deflection.rig.running import AcquisitionConfig
-from psd_deflection.run.behind import SLOW, why_behind
+from psd_deflection.run.behind import SLOW, lag_reason
 
 MESSAGES_PER_BLOCK = 100
 """The recorder's queue holds this many messages for each block of ``queue_blocks``. A block makes
@@ -79,7 +79,7 @@ class _GoneError(Exception):
     """Somebody deleted or moved the file: further messages would be lost."""
 
 
-class Take:
+class RecordingJob:
     """One recording.
 
     ``opened``: resolves to its folder once it is attached, or to the error that prevented it.
@@ -105,19 +105,19 @@ class Take:
 
 
 class Recorder:
-    """Makes one recording at a time; a wire like any other. ``say`` gets a line if a recording ends by itself.
+    """Makes one recording at a time; a wire like any other. ``log`` gets a line if a recording ends by itself.
 
     ``dropped_samples``: how many the run has dropped so far, before those that it processed last; a
     recording says how many it lacks because of that. ``between_blocks`` runs an action in the
     thread that calls the wires (``Processing.request``). ``node``: full name of the recorded ROS
-    node. ``failure``: why the last recording ended by itself, empty while all is well; for
-    diagnostics.
+    node. ``failure``: why the last recording ended by itself, empty while all is well.
+    ``ended_early``: the same of each such recording, by its folder.
     """
 
     def __init__(
         self,
         queue_blocks: int,
-        say: Say,
+        log: LogCallback,
         between_blocks: Callable[[Callable[[], None]], None],
         dropped_samples: Callable[[], int] = lambda: 0,
         node: str = '',
@@ -128,16 +128,17 @@ class Recorder:
         self.written = 0
         self.files_deleted = 0
         self.failure = ''
-        self._say = say
+        self.ended_early: BoundedMap[Path, str] = BoundedMap()
+        self._log = log
         self._between_blocks = between_blocks
         self._limit = queue_blocks * MESSAGES_PER_BLOCK
         # Held to swap references and to count, never while waiting for the disk.
         self._lock = threading.Lock()
         # Two recordings opened in one second must not choose the same name.
         self._naming = threading.Lock()
-        self._opening: Take | None = None
-        self._take: Take | None = None
-        self._writing: dict[Take, threading.Thread] = {}
+        self._opening: RecordingJob | None = None
+        self._take: RecordingJob | None = None
+        self._writing: dict[RecordingJob, threading.Thread] = {}
         self._threads: list[threading.Thread] = []
         self._ended = False
 
@@ -174,7 +175,7 @@ class Recorder:
         with self._lock:
             take = self._take or self._opening
             if take is None:
-                take = Take(rig.acquisition)
+                take = RecordingJob(rig.acquisition)
                 if self._ended:
                     take.opened.set_exception(RecordingError('not recorded: the run has ended'))
                     return take.opened
@@ -200,7 +201,7 @@ class Recorder:
             take.dropped_messages += 1
             self.dropped += 1
             if self.dropped == 1:
-                self._say(f'{take.folder}: messages are dropped: {self._why_behind(take)}', WARNING)
+                self._log(f'{take.folder}: messages are dropped: {self._lag_reason(take)}', WARNING)
         else:
             take.queue.put((topic, type_name, cdr, t_ns))
 
@@ -253,20 +254,25 @@ class Recorder:
                     break
             if thread.is_alive():
                 waiting = f'it is not waited for, and {take.budget.holders} messages are not written'
-                self._say(
-                    f'{take.folder}: {self._why_behind(take)}; {waiting}. '
-                    f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole',
-                    WARNING,
+                why = (
+                    f'{take.folder}: {self._lag_reason(take)}; {waiting}. '
+                    f'If the end is missing, `psd-deflection recover {take.folder}` makes it whole'
                 )
+                if take.folder is not None:
+                    self._end_early(take.folder, why)
+                self._log(why, WARNING)
         return None if ended.done() and ended.exception() is not None else folder
 
-    def _why_behind(self, take: Take) -> str:
+    def _end_early(self, folder: Path, why: str) -> None:
+        self.failure = self.ended_early[folder] = why
+
+    def _lag_reason(self, take: RecordingJob) -> str:
         thread = self._writing.get(take)
-        return why_behind(thread, time.monotonic() - take.beat) if thread is not None else SLOW
+        return lag_reason(thread, time.monotonic() - take.beat) if thread is not None else SLOW
 
     def _run(
         self,
-        take: Take,
+        take: RecordingJob,
         rig: Rig,
         hello: Mapping[str, object] | None,
         memory: Callable[[Rig], ParameterChange | None],
@@ -304,8 +310,8 @@ class Recorder:
         if not why:
             take.closed.set_result(bag.folder)
             return
-        self.failure = why
-        self._say(f'recording stopped: {why}', ERROR)
+        self._end_early(bag.folder, why)
+        self._log(f'recording stopped: {why}', ERROR)
         take.closed.set_exception(RecordingError(f'recording stopped: {why}'))
 
     def _open(self, rig: Rig, hello: Mapping[str, object] | None) -> BagWriter:
@@ -328,7 +334,7 @@ class Recorder:
             except RecordingError as error:
                 raise RecordingError(f'{error}; {ELSEWHERE}') from None
 
-    def _refuse(self, take: Take, error: Exception) -> None:
+    def _refuse(self, take: RecordingJob, error: Exception) -> None:
         """Resolve ``take.opened`` with an error, unless it is resolved already."""
         with self._lock:
             if self._opening is not take:
@@ -336,7 +342,7 @@ class Recorder:
             self._opening = None
         take.opened.set_exception(error)
 
-    def _record(self, take: Take, bag: BagWriter) -> str:
+    def _record(self, take: RecordingJob, bag: BagWriter) -> str:
         """Write until the end, and close; return '' or why the recording ended early."""
         try:
             try:
@@ -372,7 +378,7 @@ class Recorder:
             return f'{bag.folder}: {type(error).__name__}: {error}'
         return ''
 
-    def _write(self, bag: BagWriter, take: Take) -> None:
+    def _write(self, bag: BagWriter, take: RecordingJob) -> None:
         items, config = take.queue, take.config
         since_look = 0
         unwritten = gathered = False
@@ -413,7 +419,7 @@ class Recorder:
             if deleted is None:
                 raise _FullError(f'{missing} and there is no older file of this recording to delete')
             self.files_deleted += 1
-            self._say(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)', WARNING)
+            self._log(f'{deleted}: deleted, {missing} (disk_full is delete_oldest)', WARNING)
 
 
 def _look_for(bag: BagWriter) -> None:

@@ -8,7 +8,7 @@ import re
 from dataclasses import dataclass, field
 
 from psd_deflection.base.bounds import BoundedMap
-from psd_deflection.base.log import INFO, Say
+from psd_deflection.base.log import INFO, LogCallback
 
 FIRST_WAIT_S = 10.0
 LONGEST_WAIT_S = 3600.0
@@ -38,19 +38,19 @@ class _Kind:
     reasons: dict[str, _Reason] = field(default_factory=dict)
 
 
-class Repeats:
-    """``say``: told of the lines. The first line with a reason is said at once; the next one with that reason waits
+class RateLimitedLog:
+    """``log``: told of the lines. The first line with a reason is said at once; the next one with that reason waits
     ``FIRST_WAIT_S``, the one after it twice as long, and so on up to ``LONGEST_WAIT_S``. A reason that was quiet for
     that long starts anew. Two lines of a kind have one reason if they differ in numbers and quoted words alone.
 
     Owns no clock: every time comes from the caller, s.
     """
 
-    def __init__(self, say: Say) -> None:
-        self._say = say
+    def __init__(self, log: LogCallback) -> None:
+        self._log = log
         self._kinds: BoundedMap[str, _Kind] = BoundedMap()
 
-    def tell(self, kind: str, line: str, level: int, now_s: float, at_once: int = 1) -> None:
+    def log(self, kind: str, line: str, level: int, now_s: float, at_once: int = 1) -> None:
         """Say ``line`` now, or count it. ``kind``: one of the program's own few names. ``level``: its severity.
         ``at_once``: so many of the kind are said without waiting."""
         known = self._kinds.setdefault(kind, _Kind())
@@ -80,7 +80,7 @@ class Repeats:
                     self._said(reason, f'{reason.since} more {ago}: {reason.line}', now_s)
 
     def _said(self, reason: _Reason, line: str, now_s: float) -> None:
-        self._say(line, reason.level)
+        self._log(line, reason.level)
         reason.since, reason.said_s = 0, now_s
         reason.next_s = now_s + reason.wait_s
         reason.wait_s = min(2.0 * reason.wait_s, LONGEST_WAIT_S)

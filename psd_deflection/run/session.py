@@ -18,9 +18,9 @@ from pathlib import Path
 
 from msg_adapters import ACCELERATION, LOAD, MARK, TOPIC_TYPES, accel_stamped, from_fields, string, to_messages
 from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
-from psd_deflection.base.errors import SamplesDroppedError
-from psd_deflection.base.log import ERROR, INFO, WARNING, Say
-from psd_deflection.base.printable import printable
+from psd_deflection.base.errors import RecordingError, SamplesDroppedError
+from psd_deflection.base.log import ERROR, INFO, WARNING, LogCallback
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.solvers.registry import check_arrangement, check_live
 from psd_deflection.recordings import cdr
@@ -32,7 +32,7 @@ from psd_deflection.run.processing import Processing, RecordSink
 from psd_deflection.run.reading.acquisition import Acquisition
 from psd_deflection.run.realtime import lock_memory
 from psd_deflection.run.recorder import Recorder
-from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.repeats import RateLimitedLog
 from psd_deflection.run.session_texts import ANEW, load_text, mark_text, zero_text
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.run.watcher import Watcher, WatcherWire
@@ -66,7 +66,7 @@ LONGEST_LINE = 2000
 
 
 class Session:
-    """Opens the device on construction. ``say`` and every function in ``listeners`` get one line for each
+    """Opens the device on construction. ``log`` and every function in ``listeners`` get one line for each
     change of state, from any thread. ``input_sinks`` get known loads, references and temperatures as they come.
     ``load``: the known load that is held now, or None. ``refused``: messages of other nodes that could not
     be used, by topic, ``why_refused``: the last one of each. ``node``: full name of the ROS node, for recordings.
@@ -75,18 +75,18 @@ class Session:
     Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
     """
 
-    def __init__(self, rig: Rig, say: Say, node: str = '', unzeroed: Rig | None = None) -> None:
+    def __init__(self, rig: Rig, log: LogCallback, node: str = '', unzeroed: Rig | None = None) -> None:
         self._simulated: SimulatedRigProcess | None = None
         self._closed = False
-        self._short: SamplesDroppedError | None = None
-        self.listeners: list[Say] = [say]
+        self._short: SamplesDroppedError | RecordingError | None = None
+        self.listeners: list[LogCallback] = [log]
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
         self._zeroed_ns = 0
         self.refused = Tally()
         self.why_refused: BoundedMap[str, str] = BoundedMap()
-        say = self._tell
-        self._repeats = Repeats(say)
+        log = self._report
+        self._limited_log = RateLimitedLog(log)
         self._mark_rate = RateLimit(MARKS_A_SECOND)
         check_live(rig.estimator.solver)
         check_arrangement(rig)
@@ -96,7 +96,7 @@ class Session:
             self._simulated = SimulatedRigProcess(rig)
             rig = replace_values(rig, {'port': self._simulated.port})
             pipeline = Pipeline(rig)
-            say(
+            log(
                 f'no port given: started the simulated rig on {self._simulated.port}, '
                 f'{_SIMULATED[rig.acquisition.demo]} (parameter port names a real one)',
                 WARNING,
@@ -104,9 +104,9 @@ class Session:
         same = left_as_in_the_thesis(rig.values)
         if same:
             more = f' and {len(same) - 1} more (`psd-deflection params` lists them)' if len(same) > 1 else ''
-            say(f'as in the thesis rig, unless you measured the same: {same[0]}{more}')
+            log(f'as in the thesis rig, unless you measured the same: {same[0]}{more}')
         try:
-            self.acquisition = Acquisition(rig, say)
+            self.acquisition = Acquisition(rig, log)
             self.acquisition.open()
             hello = self.acquisition.hello
             self._store: ZeroStore | None = None
@@ -115,21 +115,21 @@ class Session:
                 self._store = ZeroStore(unzeroed or rig, hello.info.get('serial') if hello is not None else None)
                 rig, about, level = self._store.load(rig)
                 if about:
-                    say(about, level)
+                    log(about, level)
                     pipeline = Pipeline(rig)
                     pipeline.tip_loads.zeroed = self._store.loaded
-            say('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
-            self.processing = Processing(self.acquisition.queue, pipeline, say)
-            self.acquisition.why_full = self.processing.why_behind
+            log('; '.join(f'{name}: {what}' for name, what in self.acquisition.source.describe().items()))
+            self.processing = Processing(self.acquisition.queue, pipeline, log)
+            self.acquisition.why_full = self.processing.lag_reason
             self.recorder = Recorder(
-                rig.acquisition.queue_blocks, say, self.processing.request, lambda: self.processing.dropped_before, node
+                rig.acquisition.queue_blocks, log, self.processing.request, lambda: self.processing.dropped_before, node
             )
             self.fanout = Fanout(rig.monitor.frame_prefix)
-            self.fanout.change_wires.append(self.recorder)
+            self.fanout.change_sinks.append(self.recorder)
             self.processing.sinks.append(self.fanout)
             self.watcher: Watcher | None = None
             if rig.acquisition.watch == 'on':
-                self.watcher = Watcher(pipeline, say, hello.info if hello is not None else None, node)
+                self.watcher = Watcher(pipeline, log, hello.info if hello is not None else None, node)
                 self.processing.sinks.append(self.watcher)
         except BaseException:
             if hasattr(self, 'acquisition'):
@@ -138,8 +138,8 @@ class Session:
                 self._simulated.close()
             raise
 
-    def _tell(self, text: str, level: int = INFO, /) -> None:
-        text = printable(text, LONGEST_LINE)
+    def _report(self, text: str, level: int = INFO, /) -> None:
+        text = sanitize(text, LONGEST_LINE)
         for listener in tuple(self.listeners):
             listener(text, level)
 
@@ -172,7 +172,8 @@ class Session:
     def failed(self) -> BaseException | None:
         """The error that ended the pipeline or the reader thread, or None.
 
-        After :meth:`close` it is a SamplesDroppedError if samples were read and not processed.
+        After :meth:`close` it is a SamplesDroppedError if samples were read and not processed, a RecordingError if
+        the last recording is not whole.
         """
         return self.processing.failed or self.acquisition.failed or self._short
 
@@ -190,7 +191,7 @@ class Session:
         """
         cdr.prepare(TOPIC_TYPES.values())
         if self.rig.acquisition.realtime:
-            self._tell(lock_memory())
+            self._report(lock_memory())
         # The recorder comes last: publishing has priority.
         self.fanout.wires.append(self.recorder)
         if self.watcher is not None and self.watcher.keeps:
@@ -201,7 +202,7 @@ class Session:
             if wait((asked,), OPEN_S).done:
                 asked.result()
             else:
-                self._tell(
+                self._report(
                     'the disk does not answer; the recording begins when it does, samples flow meanwhile', WARNING
                 )
                 asked.add_done_callback(self._tell_refused)
@@ -222,7 +223,7 @@ class Session:
                 if wanted and (load := self.load) is not None:
                     # It holds already when the recording begins.
                     self._put_load(load._replace(t_ns=max(load.t_ns, asked_ns)))
-                self._tell(f'recording to {folder}' if wanted else f'recording ended: {folder}')
+                self._report(f'recording to {folder}' if wanted else f'recording ended: {folder}')
 
         if wanted:
             hello = self.acquisition.hello.info if self.acquisition.hello is not None else None
@@ -236,7 +237,7 @@ class Session:
         error = done.exception()
         if error is not None:
             self.recorder.failure = str(error)
-            self._tell(f'not recorded: {error}', ERROR)
+            self._report(f'not recorded: {error}', ERROR)
 
     def take_input(self, topic: str, message: bytes) -> Record | None:
         """Record an encoded message of another node, and show it.
@@ -276,7 +277,7 @@ class Session:
             ago_s = (self.acquisition.now_ns() - self._zeroed_ns) / 1e9
             # Once is enough of a stream of loads.
             self._zeroed_ns = 0
-            self._tell(f'the load acted already when the zero was taken, {ago_s:.2f} s ago: {ANEW}', WARNING)
+            self._report(f'the load acted already when the zero was taken, {ago_s:.2f} s ago: {ANEW}', WARNING)
         if self._simulated is not None and self.hangs:
             self._simulated.push(load[1:])
         if self.pipeline.motion_filter is not None:
@@ -341,7 +342,7 @@ class Session:
             self.watcher.put_message(MARK, TOPIC_TYPES[MARK], message, mark.t_ns)
         for sink in self.input_sinks:
             sink.put(mark)
-        self._tell(mark_text(mark))
+        self._report(mark_text(mark))
         return mark
 
     def refuse_input(self, topic: str, why: str) -> None:
@@ -352,11 +353,11 @@ class Session:
         # The reason first: the main thread asks for it as soon as there is a count.
         self.why_refused[topic] = why
         self.refused.add(topic)
-        self._repeats.tell(f'refused {topic}', f'{topic}: refused: {why}', WARNING, time.monotonic())
+        self._limited_log.log(f'refused {topic}', f'{topic}: refused: {why}', WARNING, time.monotonic())
 
     def settle(self) -> None:
         """Let what was counted of refused messages be said when it is due; to be called now and then."""
-        self.processing.later(lambda: self._repeats.settle(time.monotonic()))
+        self.processing.later(lambda: self._limited_log.settle(time.monotonic()))
 
     def note_load(
         self, fx: float, fy: float, tz: float, *, add: bool = False, ago_s: float = 0.0, late_s: float = 0.0
@@ -384,7 +385,7 @@ class Session:
             fx, fy, tz = held.fx + fx, held.fy + fy, held.tz + tz
         load = AppliedLoad(since_ns, fx, fy, tz)
         self._put_load(load)
-        self._tell(load_text(load, ago_s))
+        self._report(load_text(load, ago_s))
         return load
 
     def _put_load(self, load: AppliedLoad) -> None:
@@ -426,10 +427,10 @@ class Session:
         taken = self.processing.request(change)
         if taken is not None:
             self._zeroed_ns = self.acquisition.now_ns()
-            self._tell(zero_text(self.rig))
+            self._report(zero_text(self.rig))
             self._keep_zero()
             if self.load is not None and any(self.load[1:]):
-                self._tell(f'the zero was taken under a load ({load_text(self.load)}): {ANEW}', WARNING)
+                self._report(f'the zero was taken under a load ({load_text(self.load)}): {ANEW}', WARNING)
         return taken
 
     def change(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:
@@ -440,13 +441,13 @@ class Session:
         """
         self.processing.request(lambda: self.processing.give([self.pipeline.change(values)]))
         shown = (f'{name} = {list(v) if isinstance(v, tuple) else v}' for name, v in values.items())
-        self._tell(f'changed: {", ".join(shown)}')
+        self._report(f'changed: {", ".join(shown)}')
         if any(name in ZEROS for name in values):
             self._keep_zero()
 
     def _keep_zero(self) -> None:
         if self._store is not None:
-            self._store.keep(self.rig, self._tell)
+            self._store.keep(self.rig, self._report)
 
     def close(self) -> Path | None:
         """Stop reading, process what was read, end the recording; return its folder.
@@ -462,10 +463,12 @@ class Session:
         self.acquisition.stop()
         self._finish()
         folder = self.recorder.close()
+        if self.recorder.failure and self._short is None:
+            self._short = RecordingError(f'the recording ended early: {self.recorder.failure}')
         if self.watcher is not None and (left := self.watcher.close(KEEP_S)):
-            self._tell(f'watch: {left}', WARNING)
+            self._report(f'watch: {left}', WARNING)
         if self._store is not None and not self._store.join(KEEP_S):
-            self._tell(f'{self._store.path}: not written within {KEEP_S:g} s; the zero may not be kept', WARNING)
+            self._report(f'{self._store.path}: not written within {KEEP_S:g} s; the zero may not be kept', WARNING)
         if self._simulated is not None:
             self._simulated.close()
         return folder
@@ -482,14 +485,14 @@ class Session:
             self.processing.join(JOIN_S)
         counters = self.acquisition.counters
         if self.processing.alive:
-            why = self.processing.why_behind()
+            why = self.processing.lag_reason()
             samples = self.acquisition.abandon()
             self.processing.join(JOIN_S)
             if samples:
                 counters.dropped_why = why
-                self._tell(f'{why}: the last {samples} samples were read and not processed', WARNING)
+                self._report(f'{why}: the last {samples} samples were read and not processed', WARNING)
             if self.processing.alive:
-                self._tell(f'{self.processing.why_behind()}: the last block is not waited for', WARNING)
+                self._report(f'{self.processing.lag_reason()}: the last block is not waited for', WARNING)
         self.processing.dropped_before = counters.dropped_here
         if counters.dropped_here:
             self._short = SamplesDroppedError(

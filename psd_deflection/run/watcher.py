@@ -24,7 +24,7 @@ from msg_adapters import INPUTS, SAMPLES
 from psd_deflection.base.bounds import MESSAGE_BYTES, ByteBudget
 from psd_deflection.base.errors import RecordingError
 from psd_deflection.base.files import HeldFolder
-from psd_deflection.base.log import ERROR, WARNING, Say
+from psd_deflection.base.log import ERROR, WARNING, LogCallback
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Alarm, Watch
 from psd_deflection.recordings.write.bag_writer import BagWriter
@@ -57,22 +57,24 @@ class _Segment:
 
 
 class Watcher:
-    """A sink of records, after the one that publishes them, and a wire. ``say``: takes a line for each alarm.
+    """A sink of records, after the one that publishes them, and a wire. ``log``: takes a line for each alarm.
 
     ``hello``: the device's. ``node``: full name of the ROS node, for what is kept and handed on. Raises ConfigError
     if ``watch_command`` or ``watch_webhook`` cannot be used.
     """
 
-    def __init__(self, pipeline: Pipeline, say: Say, hello: Mapping[str, object] | None, node: str = '') -> None:
+    def __init__(
+        self, pipeline: Pipeline, log: LogCallback, hello: Mapping[str, object] | None, node: str = ''
+    ) -> None:
         config = pipeline.rig.acquisition
         self.watch = Watch(pipeline.rig, pipeline.tip_loads.compliance)
         self.folder: Path | None = None
         self.failure = ''
-        self._pipeline, self._say, self._hello, self._node = pipeline, say, hello, node
+        self._pipeline, self._log, self._hello, self._node = pipeline, log, hello, node
         self._parent = Path(config.watch_dir).expanduser() if config.watch_dir else None
         self._config = config
         serial = str((hello or {}).get('serial', ''))
-        self._out = AlarmOut(config.watch_command, config.watch_webhook, say, {'device': serial, 'node': node})
+        self._out = AlarmOut(config.watch_command, config.watch_webhook, log, {'device': serial, 'node': node})
         self._window_ns = round(60e9 * config.watch_minutes) + 2 * SEGMENT_NS
         self._memory = ByteBudget(config.watch_memory)
         self._forgotten = 0
@@ -101,7 +103,7 @@ class Watcher:
         t_ns = int(record.t_ns[-1])
         if self.watch.alarms > self._said and self.watch.alarm is not None:
             self._said = self.watch.alarms
-            self._say(f'watch: since {_clock(self.watch.alarm.since_ns)}: {self.watch.alarm.words}', WARNING)
+            self._log(f'watch: since {_clock(self.watch.alarm.since_ns)}: {self.watch.alarm.words}', WARNING)
             self._out.put(self.watch.alarm)
             if self._parent is not None and self._due_ns is None:
                 self._due_ns = t_ns + AFTER_NS
@@ -143,7 +145,7 @@ class Watcher:
         if full:
             self._forgotten += 1
             if self._forgotten == 1:
-                self._say(
+                self._log(
                     f'watch: {self._memory.most / 1e6:g} MB are full (watch_memory): '
                     'what is kept begins later than watch_minutes says',
                     WARNING,
@@ -200,7 +202,7 @@ class Watcher:
             self._segments.clear()
         if self._writing is not None and self._writing.is_alive():
             self._memory.give_back(sum(s.bytes for s in segments), sum(len(s.items) for s in segments))
-            self._say('watch: the disk still writes what was kept before; this is not kept', WARNING)
+            self._log('watch: the disk still writes what was kept before; this is not kept', WARNING)
             return
         self._writing = threading.Thread(target=self._write, args=(segments,), name='watch', daemon=True)
         self._writing.start()
@@ -211,11 +213,11 @@ class Watcher:
             self._empty_folder()
         except RecordingError as error:
             self.failure = f'not kept: {error}'
-            self._say(f'watch: {self.failure}', ERROR)
+            self._log(f'watch: {self.failure}', ERROR)
             return
         finally:
             self._memory.give_back(sum(s.bytes for s in segments), sum(len(s.items) for s in segments))
-        self._say(f'watch: kept as {self.folder}; see `psd-deflection discover {self.folder}`')
+        self._log(f'watch: kept as {self.folder}; see `psd-deflection discover {self.folder}`')
 
     def _written(self, segments: list[_Segment]) -> Path:
         if self._parent is None or not segments:
@@ -257,10 +259,10 @@ class Watcher:
                         held.remove(name)
                 path.rmdir()
             except OSError as error:
-                self._say(f'watch: {path}: cannot be deleted ({error.strerror or error})', WARNING)
+                self._log(f'watch: {path}: cannot be deleted ({error.strerror or error})', WARNING)
                 continue
             bounds = f'at most {most} recordings and {most_bytes / 1e6:g} MB stay in watch_dir'
-            self._say(f'watch: {path}: deleted, the oldest of what was kept ({bounds})')
+            self._log(f'watch: {path}: deleted, the oldest of what was kept ({bounds})')
 
 
 def _made(path: Path) -> tuple[int, str]:

@@ -18,7 +18,7 @@ from typing import Any
 
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.files import replace_file
-from psd_deflection.base.log import ERROR, INFO, WARNING, Say
+from psd_deflection.base.log import ERROR, INFO, WARNING, LogCallback
 from psd_deflection.rig.config import Rig, replace_values
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import check_value
@@ -79,10 +79,10 @@ class ZeroStore:
             return f'{self.path}: the zero cannot be kept ({error.strerror or error})'
         return ''
 
-    def keep(self, rig: Rig, say: Say) -> None:
-        """Save the zero of ``rig`` in a separate thread; ``say`` gets a line if it fails. The last zero wins."""
+    def keep(self, rig: Rig, log: LogCallback) -> None:
+        """Save the zero of ``rig`` in a separate thread; ``log`` gets a line if it fails. The last zero wins."""
         self._wanted = rig
-        self._thread = threading.Thread(target=self._keep, args=(say,), name='zero', daemon=True)
+        self._thread = threading.Thread(target=self._keep, args=(log,), name='zero', daemon=True)
         self._thread.start()
 
     def join(self, timeout: float) -> bool:
@@ -92,9 +92,9 @@ class ZeroStore:
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
-    def _keep(self, say: Say) -> None:
+    def _keep(self, log: LogCallback) -> None:
         with self._saving:
             rig, self._wanted = self._wanted, None
             trouble = self.save(rig) if rig is not None else ''
         if trouble:
-            say(trouble, ERROR)
+            log(trouble, ERROR)

@@ -23,7 +23,7 @@ from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.files import replace_file
 from psd_deflection.base.json_text import json_text
 from psd_deflection.base.pages import page, table
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.tables import Table
 from psd_deflection.model.simulation.catalogue import effects_to_values
 from psd_deflection.model.simulation.declaration import ActiveEffect
@@ -84,7 +84,7 @@ class StudyResult(abc.ABC):
         """The answer as columns with units, a row for each thing that was found."""
 
     def __repr__(self) -> str:
-        return f'<{type(self).__name__}: {printable(" ".join(self.sentences()), LONGEST_REPR)}>'
+        return f'<{type(self).__name__}: {sanitize(" ".join(self.sentences()), LONGEST_REPR)}>'
 
     def page_sentences(self) -> list[str]:
         """Those of :meth:`sentences` that stand above the sections of the page; a section may have the others."""

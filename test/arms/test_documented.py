@@ -15,7 +15,7 @@ from psd_deflection.rig.parameters import Section
 
 DOCS = Path(__file__).parents[2] / 'docs'
 ROW = re.compile(r'^\| (`[^|]*`) \| ([^|]+) \|', re.MULTILINE)
-SECTIONS = (settings.SETTINGS, shaping.SHAPING, chain_file.SETTINGS, chain_file._JOINT, chain_file._LINK)
+SECTIONS = (settings.SETTINGS, shaping.SHAPING, chain_file.SETTINGS, chain_file.JOINT, chain_file.LINK)
 
 
 def stated(page: str) -> dict[str, str]:
@@ -28,10 +28,10 @@ def stated(page: str) -> dict[str, str]:
 
 
 def test_the_page_has_the_defaults_of_the_compensator() -> None:
-    said, declared = stated('compensation.md'), settings.SETTINGS.parameters
+    message, declared = stated('compensation.md'), settings.SETTINGS.parameters
     numbers = {p.name: p.default for p in declared.values() if p.live}
-    assert {name: float(said[name]) for name in numbers} == numbers
-    assert (said['takeover'], declared['takeover'].default) == ('true', True)
+    assert {name: float(message[name]) for name in numbers} == numbers
+    assert (message['takeover'], declared['takeover'].default) == ('true', True)
 
 
 def test_what_may_be_set_while_a_node_runs_is_what_the_pages_say() -> None:

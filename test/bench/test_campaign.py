@@ -20,7 +20,7 @@ from bench.campaign.faults import Row, report
 from bench.campaign.fuzz import GRAMMARS, TARGETS, corrupted, judged
 from bench.campaign.kinds import FAULTS
 from bench.campaign.line import DIGIT, VOLTS_PER_COUNT, Line, identities
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloRequestFrame, SampleFrame, encode
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.reading.acquisition import Acquisition
@@ -67,7 +67,7 @@ def test_a_sample_is_known_again_by_its_volts() -> None:
 
 
 def test_the_line_keeps_its_ledger(line: Line, recording_rig: Rig) -> None:
-    acquisition = Acquisition(recording_rig, unsaid)
+    acquisition = Acquisition(recording_rig, null_log)
     acquisition.open()
     acquisition.start()
     seen: set[int] = set()

@@ -142,7 +142,7 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'status', 'said'),
+    ('arguments', 'status', 'message'),
     [
         (['--set', 'nothing'], 2, 'NAME=VALUE'),
         (['--set', 'nothing=1'], 2, 'no such input'),
@@ -157,9 +157,9 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
     ],
 )
 def test_bad_input_is_refused_in_one_line(
-    arguments: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['budget', *arguments]) == status
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count('\n') == 1

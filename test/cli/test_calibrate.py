@@ -177,9 +177,9 @@ def test_dark_levels_go_with_a_calibration(
     """Gains are those of the lasers alone: without dark levels they are 2 % and 1 % below."""
     lit = ['calibrate', str(made / 'lit.csv'), '--params-file', str(RIG), '--quiet']
     assert main([*lit, '--dark', str(off), '--out', str(tmp_path)]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     assert re.search(
-        r'psd_1 with its laser off: sum 0\.(0999|1000)\d ± .* 1\.9\d+% of the light pulls to \(\+1\.50', said
+        r'psd_1 with its laser off: sum 0\.(0999|1000)\d ± .* 1\.9\d+% of the light pulls to \(\+1\.50', output
     )
     found = json.loads((tmp_path / 'calibration.json').read_text())
     for axis in 'xy':

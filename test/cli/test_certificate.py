@@ -141,14 +141,14 @@ def test_as_found_is_what_the_old_rig_file_measures(calibrated: Path) -> None:
 
 
 def test_the_rule_decides(calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = {}
+    stated = {}
     for limit in ('1e-3 1e-3 1e-1', '1e-9 1e-9 1e-9', '2e-5 1e-3 1e-1'):
         assert main(['certificate', str(calibrated), '--out', str(tmp_path), '--json', '--limit', *limit.split()]) == 0
         tree = json.loads(capsys.readouterr().out)
-        said[limit] = [one['conformity'] for one in tree['poses']]
-    assert all(one == {'found': 'conforms', 'left': 'conforms'} for one in said['1e-3 1e-3 1e-1'])
-    assert all(one['left'] == 'not decided' for one in said['1e-9 1e-9 1e-9'])
-    assert 'does not conform' in {one['found'] for one in said['1e-9 1e-9 1e-9']}
+        stated[limit] = [one['conformity'] for one in tree['poses']]
+    assert all(one == {'found': 'conforms', 'left': 'conforms'} for one in stated['1e-3 1e-3 1e-1'])
+    assert all(one['left'] == 'not decided' for one in stated['1e-9 1e-9 1e-9'])
+    assert 'does not conform' in {one['found'] for one in stated['1e-9 1e-9 1e-9']}
 
 
 def _with(tree: dict[str, object], **changes: object) -> str:

@@ -51,6 +51,6 @@ def test_two_simulated_links_as_json_and_csv(tmp_path: Path, capsys: pytest.Capt
 )
 def test_refused(argv: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(argv) == status
-    said = capsys.readouterr().err
-    assert message in said
-    assert said.count('\n') == 1
+    output = capsys.readouterr().err
+    assert message in output
+    assert output.count('\n') == 1

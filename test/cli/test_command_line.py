@@ -119,7 +119,7 @@ def test_recordings_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[
     no_column.write_text('t,x1,y1,sum1,x2,sum2\n0,0,0,5,0,5\n')
     no_number = tmp_path / 'b.csv'
     no_number.write_text('t,x1,y1,sum1,x2,y2,sum2\n0,0,0,5,0,0,5\n0.001,0,0,5,0,abc,5\n')
-    for path, said in (
+    for path, message in (
         (tmp_path / 'nowhere', 'no such recording'),
         (empty, 'is empty'),
         (text, 'is no recording'),
@@ -130,7 +130,7 @@ def test_recordings_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[
     ):
         status, err = refused(capsys, 'replay', str(path))
         assert status == 4
-        assert said in err
+        assert message in err
         assert str(path) in err
 
 

@@ -65,7 +65,7 @@ def test_the_drawing_is_written(tmp_path: Path, name: str, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'status', 'said'),
+    ('arguments', 'status', 'message'),
     [
         (['--params-file', RIG, '--sigma', '0'], 2, '--sigma'),
         (['--params-file', RIG, '--radius', '-1'], 2, '--radius'),
@@ -74,9 +74,9 @@ def test_the_drawing_is_written(tmp_path: Path, name: str, capsys: pytest.Captur
     ],
 )
 def test_bad_input_is_refused_in_one_line(
-    arguments: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['design', *arguments]) == status
     error = capsys.readouterr().err
-    assert said in error
+    assert message in error
     assert error.count('\n') == 1

@@ -15,6 +15,8 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.run import simulated_rig
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, started_early
 
+# Nothing else shows a process that nobody has taken yet.
+WAITING = simulated_rig._waiting
 ROOT = Path(__file__).parent.parent.parent
 
 
@@ -38,18 +40,18 @@ def test_it_is_started_where_no_port_is_known(
 
 def test_the_first_that_needs_one_takes_it_and_no_one_leaves_it_behind() -> None:
     with started_early(True):
-        (process,) = simulated_rig._waiting
+        (process,) = WAITING
         rig = SimulatedRigProcess(load_rig())
         assert rig.port.startswith('/dev/')
-        assert simulated_rig._waiting == []
+        assert WAITING == []
         assert process.poll() is None
         rig.close()
         assert process.poll() is not None
     with started_early(True):
-        (unused,) = simulated_rig._waiting
+        (unused,) = WAITING
     assert unused.poll() is not None
     with started_early(False):
-        assert simulated_rig._waiting == []
+        assert WAITING == []
 
 
 def test_it_ends_without_a_word_when_its_daemon_is_gone_before() -> None:

@@ -49,8 +49,15 @@ def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_what_is_corrected_is_said() -> None:
 
-    said = {name: catalogue()[name].corrected for name in ('plane_tilt', 'refraction', 'creep', 'bending_stiffness')}
-    assert said == {'plane_tilt': 'reading', 'refraction': 'reading', 'creep': 'wrench', 'bending_stiffness': 'wrench'}
+    corrected = {
+        name: catalogue()[name].corrected for name in ('plane_tilt', 'refraction', 'creep', 'bending_stiffness')
+    }
+    assert corrected == {
+        'plane_tilt': 'reading',
+        'refraction': 'reading',
+        'creep': 'wrench',
+        'bending_stiffness': 'wrench',
+    }
     assert catalogue()['amplifier_lag'].corrected == ''
 
 

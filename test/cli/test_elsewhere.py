@@ -83,10 +83,10 @@ def test_the_page_of_a_recording_is_served(way: tuple[str, str]) -> None:
     # Its output ends with it: if it fails, nothing is waited for.
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding='utf-8') as page:
         assert page.stdout is not None
-        said = []
+        logged = []
         for line in page.stdout:
-            said.append(line)
+            logged.append(line)
             if line.startswith('monitor: http://'):
                 break
         page.terminate()
-    assert said[-1].startswith('monitor: http://'), said
+    assert logged[-1].startswith('monitor: http://'), logged

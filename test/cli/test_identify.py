@@ -44,11 +44,11 @@ def test_a_person_reads_sentences_and_sees_pictures(
     rig = tmp_path / 'mine.yaml'
     rig.write_text('/**:\n  ros__parameters:\n    min_samples: 12 # mine\n')
     assert main(['identify', str(run), '--params-file', str(rig), '--out', str(out)]) == 0
-    said = capsys.readouterr().out
-    assert 'Hz, damping ratio 0.0' in said
-    assert 'from 2 ring-downs' in said
-    assert 'input shaper' in said
-    assert 'dynamics.bending_frequency: 1' in said
+    output = capsys.readouterr().out
+    assert 'Hz, damping ratio 0.0' in output
+    assert 'from 2 ring-downs' in output
+    assert 'input shaper' in output
+    assert 'dynamics.bending_frequency: 1' in output
     text = (out / 'rig.yaml').read_text()
     assert text.startswith('# Identified by psd-deflection ')
     assert 'min_samples: 12 # mine' in text

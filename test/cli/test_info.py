@@ -102,9 +102,9 @@ def test_info_takes_the_rate_over_the_whole_and_a_pause_for_none(
 
 def test_an_unreadable_recording_is_status_4_and_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['info', str(tmp_path / 'none.csv')]) == 4
-    said = capsys.readouterr().err
-    assert said.count('\n') == 1
-    assert 'no such recording' in said
+    output = capsys.readouterr().err
+    assert output.count('\n') == 1
+    assert 'no such recording' in output
 
 
 def test_an_older_word_for_a_default_is_no_change(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -48,7 +48,7 @@ def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize(
-    ('argv', 'said'),
+    ('argv', 'message'),
     [
         (['simulate', '--out', 'a.csv', '--seed', '-1'], '--seed -1: must be a whole number of at least 0'),
         (['simulate', '--out', 'a.csv', '--seed', '1.5'], '--seed 1.5: must be a whole number'),
@@ -96,12 +96,12 @@ def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
     ids=lambda v: ' '.join(v)[-60:] if isinstance(v, list) else '',
 )
 def test_a_value_that_an_option_does_not_take_is_status_2(
-    argv: list[str], said: str, folder: Path, capsys: pytest.CaptureFixture[str]
+    argv: list[str], message: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / 'taken').touch()
     status, err = refused(capsys, *argv)
     assert status == 2
-    assert said in err
+    assert message in err
     assert [p.name for p in folder.iterdir()] == ['taken']
 
 
@@ -421,9 +421,9 @@ def test_a_machine_that_gives_no_more_is_one_line(
 
     monkeypatch.setattr('psd_deflection.cli.recordings.info.open_recording', fail)
     assert main(['info', 'x.csv']) == 71
-    said = capsys.readouterr().err
-    assert why in said
-    assert said.count('\n') == 1
+    output = capsys.readouterr().err
+    assert why in output
+    assert output.count('\n') == 1
 
 
 def test_another_error_of_ours_is_still_a_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -475,7 +475,7 @@ def rig_file(folder: Path, body: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ('body', 'status', 'said'),
+    ('body', 'status', 'message'),
     [
         ('solver: exakt', 3, "solver = 'exakt': must be one of exact, wls,"),
         ('psd_2: {center: [0.0, 0.070]}', 6, 'coincide'),
@@ -483,12 +483,12 @@ def rig_file(folder: Path, body: str) -> str:
     ],
 )
 def test_params_refuses_a_rig_that_cannot_be_evaluated(
-    body: str, status: int, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    body: str, status: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['params', '--params-file', rig_file(tmp_path, body)]) == status
     out, err = capsys.readouterr()
     assert out == ''
-    assert said in err
+    assert message in err
 
 
 def test_a_recording_with_a_typing_error_is_found(capsys: pytest.CaptureFixture[str]) -> None:

@@ -52,17 +52,17 @@ def scheduler() -> Iterator[str]:
 def test_every_engine_gives_the_serial_answer(
     archive: Path, scheduler: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said: dict[str, tuple[str, bytes]] = {}
+    stated: dict[str, tuple[str, bytes]] = {}
     for i, executor in enumerate(('serial', 'processes:1', scheduler)):
         out = archive / f'{i}.parquet'
         words = ['replay', 'archive/*', '--compare', '--json', '--executor', executor, '--out', str(out)]
         assert main(words) == 8
         told = capsys.readouterr()
         assert told.err.endswith('psd-deflection replay: 1 of 3 recordings failed; the others are done\n')
-        said[executor] = (told.out, out.read_bytes())
-    assert said['processes:1'] == said['serial']
-    assert said[scheduler] == said['serial']
-    rows = [json.loads(line) for line in said['serial'][0].splitlines()]
+        stated[executor] = (told.out, out.read_bytes())
+    assert stated['processes:1'] == stated['serial']
+    assert stated[scheduler] == stated['serial']
+    rows = [json.loads(line) for line in stated['serial'][0].splitlines()]
     assert [Path(row['recording']).name for row in rows] == ['broken.csv', 'one.mcap', 'two.mcap']
     assert 'the header lacks' in rows[0]['error']
     assert [row['compared']['identical'] for row in rows[1:]] == [True, True]
@@ -129,7 +129,7 @@ def test_each_recording_is_calibrated_for_itself(archive: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ('words', 'said'),
+    ('words', 'message'),
     [
         (['discover', 'a', 'b', '--executor', 'processes', '--out', 'x'], 'needs --each'),
         (['discover', 'a', '--out', 'x.parquet'], 'needs --each'),
@@ -142,10 +142,10 @@ def test_each_recording_is_calibrated_for_itself(archive: Path, capsys: pytest.C
     ],
 )
 def test_what_does_not_fit_is_refused_before_the_work(
-    words: list[str], said: str, archive: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], message: str, archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_folders_are_those_of_the_archive(tmp_path: Path) -> None:

@@ -20,14 +20,14 @@ DOCS = Path(__file__).parents[2] / 'docs'
 
 def test_tables_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['thesis', 'compare-methods', '--out', str(tmp_path / 'new' / 'figures')]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     written = sorted((tmp_path / 'new' / 'figures').iterdir())
     assert [p.name for p in written] == sorted(f'{name}.png' for name in FIGURES)
     for path in written:
-        assert f'wrote {path}' in said
+        assert f'wrote {path}' in output
         assert path.read_bytes().startswith(b'\x89PNG')
         assert 5_000 < path.stat().st_size < 150_000
-    lines = [line for line in said.splitlines() if not line.startswith('wrote ')]
+    lines = [line for line in output.splitlines() if not line.startswith('wrote ')]
     assert max(len(line) for line in lines) <= 120
     end = next(i for i, line in enumerate(lines) if line.startswith('Section 2.3'))
     rows = {m.label: [line for line in lines[:end] if line.startswith(m.label + '  ')] for m in methods()}
@@ -38,7 +38,7 @@ def test_tables_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert '8.98 / 6.3 / 3.32' in largest
     assert rows['Appendix D iterative'][0].endswith('5.25 to 5.83 %')
     squeezed = [' '.join(line.split()) for line in lines[end:]]
-    for said in (
+    for output in (
         '2.36 ΔY, µm 2000 -2000 -2000',
         '2.38 DT, µm imaginary 100006 100006',
         'exact, ols, wls 1.63 / 1.83 / 1.33',
@@ -48,7 +48,7 @@ def test_tables_and_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
         'A in mm 149.53 (122.07)',
         '4.33, mm and rad in one norm 3.868',
     ):
-        assert said in squeezed
+        assert output in squeezed
     for cause in CAUSES:
         assert sum(line.startswith(cause.label + ' ') for line in lines) == 1
     (alone,) = (line for line in lines if line.startswith('the algorithms alone'))

@@ -59,11 +59,11 @@ def test_a_person_reads_sentences_and_a_table(
 ) -> None:
     out = tmp_path / 'new' / 'out'
     assert main(['validate', str(run), '--reference', str(late), '--align', '--out', str(out)]) == 0
-    said = capsys.readouterr().out
-    assert 'ahead of that of the samples: subtract 12.' in said
-    assert 'The offset is removed in what follows.' in said
-    assert 'The reference gave no answer 1 times: blurred 1.' in said
-    lines = said.splitlines()
+    output = capsys.readouterr().out
+    assert 'ahead of that of the samples: subtract 12.' in output
+    assert 'The offset is removed in what follows.' in output
+    assert 'The reference gave no answer 1 times: blurred 1.' in output
+    lines = output.splitlines()
     assert any(line.startswith('exact ') for line in lines)
     assert not any(line.startswith('appendix_d ') for line in lines)
     page = (out / 'report.html').read_text()

@@ -52,9 +52,9 @@ def test_names_of_files_reach_the_terminal_in_printable_lines(
         ['plot', str(copy), '--out', str(copy) + '.svg'],
     ):
         assert main(command) == 0
-        said = capsys.readouterr()
-        clean_of(said.out)
-        assert '\\x1b[31m\\nstate' in said.out, command
+        output = capsys.readouterr()
+        clean_of(output.out)
+        assert '\\x1b[31m\\nstate' in output.out, command
 
 
 def test_a_message_about_a_file_prints_none_either(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -65,6 +65,6 @@ def test_a_message_about_a_file_prints_none_either(tmp_path: Path, capsys: pytes
     shutil.copytree(CLEAN, copy)
     (copy / 'metadata.yaml').write_text('x: [')
     assert main(['info', str(copy)]) == 4
-    said = capsys.readouterr().err
-    clean_of(said)
-    assert '\\x1b[31m' in said
+    output = capsys.readouterr().err
+    clean_of(output)
+    assert '\\x1b[31m' in output

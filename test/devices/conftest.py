@@ -157,8 +157,8 @@ class Run:
     """The reader on a rig, and what it said."""
 
     def __init__(self, rig: Rig) -> None:
-        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.acquisition = Acquisition(rig, texts(self.said.put))
+        self.logged: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.acquisition = Acquisition(rig, texts(self.logged.put))
         self.acquisition.open()
         self.acquisition.start()
 
@@ -178,7 +178,7 @@ class Run:
 
     def heard(self, text: str) -> str:
         while True:
-            message = self.said.get(timeout=WAIT_S)
+            message = self.logged.get(timeout=WAIT_S)
             if text in message:
                 return message
 

@@ -124,7 +124,7 @@ def test_given_up_ends_a_read(connected: Connected) -> None:
 
 
 @pytest.mark.parametrize(
-    ('error', 'said'),
+    ('error', 'message'),
     [
         (socket.gaierror(-2, 'Name or service not known'), r'no host of the name rig is known; is it spelt right\?'),
         (ConnectionRefusedError(111, 'Connection refused'), 'the host is there, but nothing listens on its port 4000'),
@@ -134,12 +134,12 @@ def test_given_up_ends_a_read(connected: Connected) -> None:
     ],
 )
 @pytest.mark.parametrize('scheme', ['socket', 'rfc2217'])
-def test_why_there_is_no_connection(scheme: str, error: OSError, said: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_why_there_is_no_connection(scheme: str, error: OSError, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def connect(*_: object, **__: object) -> None:
         raise error
 
     monkeypatch.setattr(socket, 'create_connection', connect)
-    with pytest.raises(DeviceError, match=rf'^{scheme}://rig:4000: {said}') as told:
+    with pytest.raises(DeviceError, match=rf'^{scheme}://rig:4000: {message}') as told:
         open_port(f'{scheme}://rig:4000', BAUD)
     assert '\n' not in str(told.value)
 
@@ -174,11 +174,11 @@ def test_a_connection_that_does_not_come_is_not_waited_for(
             given_up.set()
 
         threading.Thread(target=give_up).start()
-        said = 'given up'
+        text = 'given up'
     else:
         monkeypatch.setattr(tcp_port, 'CONNECT_S', 0.0)
-        said = 'no answer in'
-    with pytest.raises(DeviceError, match=said):
+        text = 'no answer in'
+    with pytest.raises(DeviceError, match=text):
         open_port(named(listener), BAUD, given_up=given_up)
     go_on.set()
     until(lambda: bool(made) and made[0].fileno() == -1)
@@ -306,8 +306,8 @@ def test_a_silent_sender_gives_way_to_another_device_but_not_to_junk(
     stranger.send(b'junk')
     until(lambda: udp.port.read(WAIT_S) == b'' and udp.port.describe()['datagrams of other senders'] == '2')
     stranger.send(b'device too')
-    said = rf'{udp.name}: {shown(device)} is silent, and {shown(stranger)} sends now'
-    with pytest.raises(PortClosedError, match=said):
+    text = rf'{udp.name}: {shown(device)} is silent, and {shown(stranger)} sends now'
+    with pytest.raises(PortClosedError, match=text):
         all_of(udp.port, 1)
 
 
@@ -318,12 +318,14 @@ def test_what_strangers_send_is_bounded(udp: Datagrammed) -> None:
             stranger.send(bytes([n]) * 1000)
         udp.port.read(WAIT_S)
     until(lambda: udp.port.read(0.0) == b'')
-    assert len(udp.port._candidates) == MOST_SENDERS
-    assert all(len(one.kept) <= KEPT for one in udp.port._candidates.values())
+    # Memory is bounded, and nothing public says how much is kept of a stranger.
+    candidates = udp.port._candidates
+    assert len(candidates) == MOST_SENDERS
+    assert all(len(one.kept) <= KEPT for one in candidates.values())
     device = udp.sender()
     device.send(b'device')
     assert all_of(udp.port, 6) == b'device'
-    assert udp.port._candidates == {}
+    assert not udp.port._candidates
 
 
 def test_the_largest_datagram(udp: Datagrammed) -> None:
@@ -431,6 +433,11 @@ def remote() -> Iterator[Remote]:
     made.close()
 
 
+def await_input(port: OpenPort, size: int) -> None:
+    # pyserial's thread receives; a read of ours would take the bytes away.
+    until(lambda: port._serial.in_waiting == size)  # type: ignore[attr-defined]
+
+
 def test_a_remote_serial_port_with_its_line_speed(remote: Remote) -> None:
     port = open_port(remote.name, 921_600)
     assert remote.serial.baudrate == 921_600
@@ -444,7 +451,7 @@ def test_a_remote_serial_port_with_its_line_speed(remote: Remote) -> None:
         received += remote.device.listen(WAIT_S) or b''
     assert received == every
     remote.device.send(b'old')
-    until(lambda: port._serial.in_waiting == 3)  # type: ignore[attr-defined]
+    await_input(port, 3)
     port.discard_input()
     assert port.read(0.0) == b''
     remote.hang_up()
@@ -464,7 +471,7 @@ def test_more_than_can_be_read_ends_the_port(remote: Remote, monkeypatch: pytest
     monkeypatch.setattr(rfc2217_port, 'MOST_WAITING', 100)
     port = open_port(remote.name, BAUD)
     remote.device.send(bytes(200))
-    until(lambda: port._serial.in_waiting == 200)  # type: ignore[attr-defined]
+    await_input(port, 200)
     with pytest.raises(PortClosedError, match=r'more comes than can be read \(200 bytes wait\)'):
         port.read(0.0)
     port.close()

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from psd_deflection.base.errors import ConfigError, DeviceError
-from psd_deflection.base.log import texts, unsaid
+from psd_deflection.base.log import null_log, texts
 from psd_deflection.cli.main import main
 from psd_deflection.devices import PowerUp
 from psd_deflection.devices.registry import GROUP, SIMULATED, find_device, known_devices, make_source, source_names
@@ -71,9 +71,9 @@ def test_help_names_it(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.M
 
 @pytest.mark.usefixtures('installed')
 def test_a_session_without_a_port_runs_on_its_twin() -> None:
-    said: list[str] = []
+    logged: list[str] = []
     estimates = Estimates(4)
-    session = Session(load_rig(overrides={'source': NAME}), texts(said.append))
+    session = Session(load_rig(overrides={'source': NAME}), texts(logged.append))
     try:
         session.processing.sinks.append(estimates)
         session.start()
@@ -83,7 +83,7 @@ def test_a_session_without_a_port_runs_on_its_twin() -> None:
     assert session.failed is None
     assert session.simulated
     assert session.acquisition.counters.bad <= 1, 'only what was half sent when the port was opened'
-    assert any('my converter on' in text for text in said)
+    assert any('my converter on' in text for text in logged)
 
 
 @pytest.mark.usefixtures('installed')
@@ -110,7 +110,7 @@ def test_one_without_a_twin_is_refused_where_a_twin_is_needed(
     with pytest.raises(ConfigError, match=rf"source = '{NAME}': cannot be simulated; serial, dataq, .* can"):
         simulated_devices(NAME, load_rig())
     with pytest.raises(DeviceError, match='no such port'):
-        Session(load_rig(overrides={'source': NAME}), unsaid)
+        Session(load_rig(overrides={'source': NAME}), null_log)
 
 
 def test_one_that_declares_another_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:

@@ -37,7 +37,7 @@ def test_a_name(name: str, address: Address | None) -> None:
 
 
 @pytest.mark.parametrize(
-    ('name', 'said'),
+    ('name', 'message'),
     [
         ('tcp://rig:4000', 'rfc2217://HOST:PORT or udp://HOST:PORT; did you mean socket://'),
         ('sockt://rig:4000', 'did you mean socket'),
@@ -54,8 +54,8 @@ def test_a_name(name: str, address: Address | None) -> None:
         ('socket://' + 'x' * 5000, 'must be socket'),
     ],
 )
-def test_a_name_that_cannot_be_says_key_value_and_what_is_allowed(name: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said) as error:
+def test_a_name_that_cannot_be_says_key_value_and_what_is_allowed(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
         make_source(load_rig(overrides={'port': name}))
     assert str(error.value).startswith(f'port = {name[:20]!r}'[:-1])
     assert len(str(error.value)) < 400

@@ -93,8 +93,8 @@ def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
     rows = ''.join(f'{i / 1000:.3f},0.1,0.2,5,0.3,0.4,5\n' for i in range(100))
     path = tmp_path / 'run.csv'
     path.write_text('t,x1,y1,sum1,x2,y2,sum2\n' + rows)
-    said: list[str] = []
-    acquisition = Acquisition(load_rig(overrides={'source': 'replay', 'port': str(path)}), texts(said.append))
+    logged: list[str] = []
+    acquisition = Acquisition(load_rig(overrides={'source': 'replay', 'port': str(path)}), texts(logged.append))
     acquisition.open()
     acquisition.start()
     items: list[Any] = []
@@ -102,7 +102,7 @@ def test_the_reader_ends_with_the_recording(tmp_path: Path) -> None:
         items.append(acquisition.queue.get(timeout=WAIT_S))
     acquisition.stop()
     assert sum(len(i.raw.seq) for i in items if isinstance(i, Arrival)) == 100
-    assert any('at its end' in s for s in said)
+    assert any('at its end' in s for s in logged)
 
 
 def test_error_names_a_file_that_is_not_a_recording(tmp_path: Path) -> None:

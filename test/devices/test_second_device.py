@@ -91,8 +91,8 @@ class Kept:
 
 
 def test_it_works_unchanged_with_the_daemon(port: str) -> None:
-    said: list[str] = []
-    session = Session(load_rig(overrides={'port': port}), texts(said.append))
+    logged: list[str] = []
+    session = Session(load_rig(overrides={'port': port}), texts(logged.append))
     kept = Kept()
     estimates = Estimates(40)
     session.processing.sinks += [kept, estimates]

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError, DeviceError
-from psd_deflection.base.log import texts, unsaid
+from psd_deflection.base.log import null_log, texts
 from psd_deflection.devices import registry as _registry
 from psd_deflection.devices.contract_frames import ContractFrames
 from psd_deflection.devices.protocol.frames import BadFrame, HelloFrame
@@ -93,7 +93,7 @@ def acquisition_of(
     source = Scripted(load_rig())
     source.script, source.clock, source.numbered = script, clock, numbered
     with patch('psd_deflection.run.reading.acquisition.make_source', lambda rig: source):
-        return Acquisition(load_rig(), unsaid)
+        return Acquisition(load_rig(), null_log)
 
 
 def run(acquisition: Acquisition) -> list[Item]:
@@ -121,15 +121,15 @@ def test_a_plug_in_is_found_by_its_entry_point() -> None:
 
 
 @pytest.mark.parametrize(
-    ('name', 'said'),
+    ('name', 'message'),
     [
         ('serail', 'did you mean serial'),
         ('broken', 'cannot be loaded'),
         ('odd', 'neither a psd_deflection.devices.Device nor derived from Source'),
     ],
 )
-def test_a_name_that_makes_no_source_is_refused(name: str, said: str) -> None:
-    with pytest.raises(ConfigError, match=said) as error:
+def test_a_name_that_makes_no_source_is_refused(name: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message) as error:
         make_source(load_rig(overrides={'source': name}))
     assert f"source = '{name}'" in str(error.value)
 
@@ -217,8 +217,8 @@ def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gi
             if gives_up:
                 over.set()
 
-    said: list[str] = []
-    acquisition = Acquisition(load_rig(overrides={'source': 'scripted'}), texts(said.append))
+    logged: list[str] = []
+    acquisition = Acquisition(load_rig(overrides={'source': 'scripted'}), texts(logged.append))
     acquisition.source = source = Patient(load_rig())
     source.script = [PortClosedError('scripted: gone')]
     acquisition.open()
@@ -227,7 +227,7 @@ def test_a_run_that_ends_waits_for_no_source(monkeypatch: pytest.MonkeyPatch, gi
     acquisition.stop()
     assert isinstance(acquisition.queue.get(timeout=WAIT_S), Ended)
     hangs = ['scripted: the source hangs; it is not waited for']
-    assert said[said.index('scripted: gone; waiting for it to come back') + 1 :] == ([] if gives_up else hangs)
+    assert logged[logged.index('scripted: gone; waiting for it to come back') + 1 :] == ([] if gives_up else hangs)
     over.set()
 
 

@@ -54,10 +54,10 @@ def test_a_port_of_the_network_is_asked_too(
         finally:
             stop.set()
             thread.join()
-    said = capsys.readouterr().out
-    assert 'PSD device SIM-0001' in said
-    assert f'port: "{name}"' in said
-    assert 'baud' not in said
+    output = capsys.readouterr().out
+    assert 'PSD device SIM-0001' in output
+    assert f'port: "{name}"' in output
+    assert 'baud' not in output
 
 
 def test_a_name_that_is_no_port_is_a_mistake_of_the_command_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -33,13 +33,13 @@ def readable(path: Path) -> list[SampleBlock]:
         recording.loads()
         recording.estimates()
 
-    said = ''
+    text = ''
     try:
         everything()
     except RecordingError as error:
-        said = str(error)
-    assert said.startswith(str(path)) or not said
-    assert '\n' not in said
+        text = str(error)
+    assert text.startswith(str(path)) or not text
+    assert '\n' not in text
     return blocks
 
 

@@ -83,10 +83,10 @@ def test_rounding_of_another_version_is_told_and_is_no_failure(
     name = recorded(tmp_path, monkeypatch, {'psd_deflection': '0.0.9', 'numpy': '1.25.0'})
     disturbed(monkeypatch, 3e-16)
     assert main(['replay', name, '--compare']) == 0
-    said = capsys.readouterr().out
-    assert 'differ by rounding alone' in said
-    assert 'rounding may differ: recorded with psd_deflection 0.0.9, now ' in said
-    assert 'numpy 1.25.0, now ' in said
+    output = capsys.readouterr().out
+    assert 'differ by rounding alone' in output
+    assert 'rounding may differ: recorded with psd_deflection 0.0.9, now ' in output
+    assert 'numpy 1.25.0, now ' in output
     assert main(['replay', name, '--compare', '--strict']) == 1
 
 

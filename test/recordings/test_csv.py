@@ -223,13 +223,13 @@ def test_no_text_ends_in_a_traceback(tmp_path: Path, junk: str, where: int) -> N
     text = '\n'.join([HEADER + ',temperature', *(f'0.00{i},{ROW},20' for i in range(4))])
     path = tmp_path / 'a.csv'
     path.write_bytes((text[:where] + junk + text[where:]).encode('utf-8', 'surrogatepass'))
-    said = ''
+    line = ''
     try:
         for b in open_recording(path).blocks():
             assert np.isfinite(b.volts).all()
     except RecordingError as error:
-        said = str(error)
-    assert '\n' not in said.replace(repr(junk)[1:-1], '')
+        line = str(error)
+    assert '\n' not in line.replace(repr(junk)[1:-1], '')
 
 
 # --- estimates ----------------------------------------------------------------------------------

@@ -152,19 +152,19 @@ def test_a_logger_s_table_follows_its_advice(tmp_path: Path, name: str) -> None:
     content, words = CONVERTIBLE[name]
     path = tmp_path / f'{name}.csv'
     path.write_bytes(content)
-    said = []
+    logged = []
     for n in range(6):
         why = refusal(path)
         if not why:
             break
-        said.append(why)
+        logged.append(why)
         offered = re.findall(r'`([^`]* > OUT\.csv)`', why)
         assert offered, why
         line = offered[-1].replace('IN.csv', path.name)
         subprocess.run(['bash', '-c', line], cwd=tmp_path, check=True, timeout=20)
         path = (tmp_path / 'OUT.csv').rename(tmp_path / f'{name}_{n}.csv')
-    assert said
-    assert all(word in ' '.join(said) for word in words), said
+    assert logged
+    assert all(word in ' '.join(logged) for word in words), logged
     samples = open_recording(path).samples
     assert np.allclose(np.diff(samples['t']), 0.01, atol=1e-5)
     assert np.allclose([[float(s[c]) for c in NAMES] for s in samples], [volts(i) for i in range(N)], atol=1e-6)
@@ -236,7 +236,7 @@ def test_every_reader_of_a_csv_says_the_same(tmp_path: Path, reader: str) -> Non
     names = form.split(',')
     path = tmp_path / 'frames.csv'
 
-    def said(text: bytes) -> str:
+    def logged(text: bytes) -> str:
         path.write_bytes(text)
         with pytest.raises(PsdDeflectionError) as caught:
             read(path)
@@ -244,8 +244,8 @@ def test_every_reader_of_a_csv_says_the_same(tmp_path: Path, reader: str) -> Non
         return str(caught.value)
 
     row = ','.join(['0.5'] * len(names))
-    capitals = said(f'{form.upper()}\n{row}\n'.encode())
+    capitals = logged(f'{form.upper()}\n{row}\n'.encode())
     assert f'did you mean {names[0]} for {names[0].upper()}' in capitals
-    assert 'cells between semicolons' in said(f'{form}\n{row}\n{row}\n'.replace(',', ';').encode())
-    assert 'UTF-16' in said(f'{form}\n{row}\n'.encode('utf-16'))
-    assert f'column {names[1]} is there twice' in said(f'{form},{names[1]}\n{row},1\n'.encode())
+    assert 'cells between semicolons' in logged(f'{form}\n{row}\n{row}\n'.replace(',', ';').encode())
+    assert 'UTF-16' in logged(f'{form}\n{row}\n'.encode('utf-16'))
+    assert f'column {names[1]} is there twice' in logged(f'{form},{names[1]}\n{row},1\n'.encode())

@@ -166,12 +166,16 @@ def test_a_wrong_bound_is_refused(words: list[str], status: int, told: str, caps
     assert told in capsys.readouterr().err
 
 
+def actions_of(name: str) -> list[argparse.Action]:
+    # argparse has no public way to ask what a command takes.
+    (commands,) = [a for a in make_parser([name])._actions if isinstance(a, argparse._SubParsersAction)]
+    return list(commands.choices[name]._actions)
+
+
 def test_every_command_that_reads_a_recording_takes_a_part_of_it() -> None:
     without = []
     for name in COMMANDS:
-        parser = make_parser([name])
-        (commands,) = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
-        actions = commands.choices[name]._actions
+        actions = actions_of(name)
         if any(a.dest in ('recording', 'recordings') for a in actions) and not any(
             '--from' in a.option_strings for a in actions
         ):
@@ -198,8 +202,7 @@ OF_THE_FILE = {'bytes', 'path', 'name', 'sha256', 'recording'}
 
 def parted(name: str) -> set[str]:
     """Options of the command ``name``."""
-    (commands,) = [a for a in make_parser([name])._actions if isinstance(a, argparse._SubParsersAction)]
-    return {option for action in commands.choices[name]._actions for option in action.option_strings}
+    return {option for action in actions_of(name) for option in action.option_strings}
 
 
 def answer_without_names(text: str) -> object:

@@ -165,12 +165,12 @@ def test_an_earlier_repair_is_not_overwritten(tmp_path: Path) -> None:
     assert (folder / 'run_0.mcap').stat().st_size == 20_000
 
 
-@pytest.mark.parametrize(('content', 'said'), [(b'no mcap at all', 'not an MCAP'), (None, 'no such recording')])
-def test_an_unreadable_recording_gives_one_line(tmp_path: Path, content: bytes | None, said: str) -> None:
+@pytest.mark.parametrize(('content', 'message'), [(b'no mcap at all', 'not an MCAP'), (None, 'no such recording')])
+def test_an_unreadable_recording_gives_one_line(tmp_path: Path, content: bytes | None, message: str) -> None:
     path = tmp_path / 'a.mcap'
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(RecordingError, match=said):
+    with pytest.raises(RecordingError, match=message):
         recover(path)
 
 

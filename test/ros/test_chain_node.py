@@ -53,8 +53,8 @@ def test_end_effector_links_joints_zero_and_recording(chain: Program, peer: Any,
 
     def turned() -> bool:
         joints.publish(JointState(name=['elbow', 'wrist'], position=[0.25, math.nan]))
-        said = [v.value for m in health for s in m.status for v in s.values if v.key == 'angle elbow']
-        return said[-1:] == ['0.250000']
+        stated = [v.value for m in health for s in m.status for v in s.values if v.key == 'angle elbow']
+        return stated[-1:] == ['0.250000']
 
     peer.until(turned, 'the turned joint in /diagnostics')
     ended = peer.call(SetBool, '/chain/record', SetBool.Request(data=False))

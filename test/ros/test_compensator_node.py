@@ -89,11 +89,11 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
         ('tell_joints', *JOINTS['stale joints']),
         ('tell_joints', *JOINTS['leaping joints']),
     ):
-        said = len(compensator.text)
+        stated = len(compensator.text)
         setattr(plant, topic, fault)
 
-        def holds(said: int = said, why: str = why) -> bool:
-            return re.search(f'holding: .*{why}', compensator.text[said:]) is not None
+        def holds(stated: int = stated, why: str = why) -> bool:
+            return re.search(f'holding: .*{why}', compensator.text[stated:]) is not None
 
         peer.until(holds, why)
         # What was on its way before it held has come, however much that was.
@@ -101,9 +101,9 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
         held = len(plant.offsets)
         peer.until(lambda held=held: len(plant.offsets) > held + 20, 'more of them')
         assert not np.ptp(plant.offsets[held - 20 :], axis=0).any()
-        said = len(compensator.text)
+        stated = len(compensator.text)
         plant.tell = plant.tell_joints = faithful
-        peer.until(lambda said=said: 'following' in compensator.text[said:], 'following')
+        peer.until(lambda stated=stated: 'following' in compensator.text[stated:], 'following')
     assert [s.name for s in states[0].status] == ['compensator: offsets']
     # Handed over: it ends at no offset.
     compensator.process.send_signal(2)
@@ -247,8 +247,8 @@ def test_what_strangers_send_is_refused_and_moves_nothing(compensator: Program, 
         return int(values.get(f'messages refused: {topic.strip("/")}', '0'))
 
     def refused(topic: str, why: str) -> Callable[[], bool]:
-        said, before = compensator.text.count(why), counted(topic)
-        return lambda: compensator.text.count(why) > said or (before >= 3 and counted(topic) > before)
+        wanted, before = compensator.text.count(why), counted(topic)
+        return lambda: compensator.text.count(why) > wanted or (before >= 3 and counted(topic) > before)
 
     for name, (message, topic, why) in strange_messages().items():
         send = partial(senders[topic].publish, message)
@@ -319,19 +319,19 @@ def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> 
         runs.publish(Bool(data=True))
         peer.until(lambda: plant.error() < 1e-4, 'offsets that follow')
         for why in ('its speed scaling is 0', 'its state of the controller comes no more'):
-            said = len(node.text)
+            stated = len(node.text)
             scale, active = (0.0, True) if 'speed' in why else (1.0, False)
             # A protective stop while the load changes: the arm must not be asked to leap when it ends.
             # Both changes together move no offset by half of follow_error: until the stop is known,
             # joints that do not follow would be another reason to hold, which only ~/enable ends.
             plant.stands = True
             plant.arm.force *= 1.2
-            peer.until(lambda said=said, why=why: f'run: {why}' in node.text[said:], why)
+            peer.until(lambda stated=stated, why=why: f'run: {why}' in node.text[stated:], why)
             held = len(plant.offsets) + 5
             peer.until(lambda held=held: len(plant.offsets) > held + 20, 'offsets that are held')
             assert np.ptp(plant.offsets[held:], axis=0).max() == 0.0
             scale, active, plant.stands = 1.0, True, False
-            peer.until(lambda said=said: 'following' in node.text[said:], 'following')
+            peer.until(lambda stated=stated: 'following' in node.text[stated:], 'following')
         assert plant.step() <= WITHIN
     finally:
         node.end()

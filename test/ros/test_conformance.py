@@ -101,7 +101,7 @@ class Running:
         lines = [f'    {key}: {value}' for key, value in self.profile.params.items()]
         file.write_text('\n'.join([f'{NAMESPACE}/{name}:', '  ros__parameters:', *lines]) + '\n')
         latched = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        self.logged: list[Log] = peer.collect(Log, '/rosout', latched)
+        self.lines: list[Log] = peer.collect(Log, '/rosout', latched)
         self.reports: list[DiagnosticArray] = peer.collect(DiagnosticArray, '/diagnostics')
         words = (*self.profile.words, '--ros-args', '-r', f'__ns:={NAMESPACE}', '--params-file', str(file))
         self.program = Program([*PSD_DEFLECTION, name, *words], env={'PYTHONWARNINGS': WARNINGS}, cwd=folder)
@@ -147,8 +147,8 @@ class Running:
             self._publishers[topic] = self.peer.node.create_publisher(kind, f'{NAMESPACE}/{topic}', 5)
         self._publishers[topic].publish(message)
 
-    def said(self, text: str, level: int = 0) -> bool:
-        return any(text in line.msg and line.level >= level for line in self.logged)
+    def logged(self, text: str, level: int = 0) -> bool:
+        return any(text in line.msg and line.level >= level for line in self.lines)
 
     def texts(self, since: int) -> str:
         """All that its diagnostics have said from report number ``since`` on."""
@@ -500,7 +500,7 @@ def test_live_parameter_acts(running: Running) -> None:
 
 
 def test_log_is_on_rosout(running: Running) -> None:
-    running.peer.until(lambda: any(line.name == f'left.{running.name}' for line in running.logged), 'its log')
+    running.peer.until(lambda: any(line.name == f'left.{running.name}' for line in running.lines), 'its log')
 
 
 def test_diagnostics_are_named_after_the_node(running: Running) -> None:
@@ -576,8 +576,8 @@ def test_refusals_are_warnings(running: Running) -> None:
     # Each test may run in a process of its own: what the others sent may not have been sent here.
     sent = next(sent for sent in running.profile.refused.values() if not isinstance(sent, str))
 
-    running.peer.until_sent(lambda: running.send(sent), lambda: running.said('refused', 30), 'a warning')
-    levels = {line.level for line in running.logged if 'refused: ' in line.msg}
+    running.peer.until_sent(lambda: running.send(sent), lambda: running.logged('refused', 30), 'a warning')
+    levels = {line.level for line in running.lines if 'refused: ' in line.msg}
     assert levels == {30}
 
 
@@ -586,7 +586,7 @@ def test_second_publisher_is_told(running: Running) -> None:
     name = f'{NAMESPACE}/{topic}'
     rival = running.peer.node.create_publisher(kind, name, 5)
     try:
-        running.peer.until(lambda: running.said(f'another node publishes on {name} too', 30), 'the warning')
+        running.peer.until(lambda: running.logged(f'another node publishes on {name} too', 30), 'the warning')
     finally:
         running.peer.node.destroy_publisher(rival)
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.base.log import texts, unsaid
+from psd_deflection.base.log import null_log, texts
 
 pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
@@ -35,14 +35,14 @@ def signals(domain: int) -> Iterator[Signals]:
 def test_what_was_published_before_is_heard(signals: Signals, peer: Any) -> None:
     publisher = peer.node.create_publisher(String, '/left/robot_description', LATCHED)
     publisher.publish(String(data=URDF))
-    said: list[str] = []
-    assert robot_description(signals, texts(said.append)) == URDF
-    assert said == ['waiting for the robot on /left/robot_description']
+    logged: list[str] = []
+    assert robot_description(signals, texts(logged.append)) == URDF
+    assert logged == ['waiting for the robot on /left/robot_description']
 
 
 def test_if_nobody_publishes_it_the_error_says_so(signals: Signals) -> None:
     with pytest.raises(ConfigError, match=r'^/left/robot_description: no description .* \(nobody publishes it\)'):
-        robot_description(signals, unsaid, wait_s=0.0)
+        robot_description(signals, null_log, wait_s=0.0)
 
 
 def test_an_empty_one_is_no_description(signals: Signals, peer: Any) -> None:
@@ -61,4 +61,4 @@ def test_an_empty_one_is_no_description(signals: Signals, peer: Any) -> None:
 def test_a_signal_ends_the_waiting(signals: Signals) -> None:
     signals.stop = True
     with pytest.raises(StopRequestedError):
-        robot_description(signals, unsaid)
+        robot_description(signals, null_log)

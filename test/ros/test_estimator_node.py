@@ -440,8 +440,8 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     assert abs(stamp(health[-1]) - stamp(poses[-1])) < 60 * 10**9
     # What the terminal shows is on /rosout as well.
     daemon.until('frames have no prefix')
-    said = 'publishing on ROS domain'
-    peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(said) for m in log), 'its log')
+    text = 'publishing on ROS domain'
+    peer.until(lambda: any(m.name == 'left.estimator' and m.msg.startswith(text) for m in log), 'its log')
     levels = {m.msg.partition(' ')[0]: m.level for m in log}
     # 20 is information, 30 a warning: simulated data must not pass for measured.
     assert (levels['publishing'], levels['no'], levels['use_sim_time']) == (20, 30, 30)
@@ -509,7 +509,7 @@ def test_signals_end_it_and_leave_a_whole_recording(
 
 
 def test_what_cannot_run_says_why_in_one_line(domain: int, capfd: pytest.CaptureFixture[str]) -> None:
-    for words, status, said in (
+    for words, status, message in (
         ('-p link.lenght:=1.0', 3, 'link.lenght = 1.0: no parameter of that name; did you mean'),
         ('-p amplifier.noise:=-1.0', 3, 'amplifier.noise = -1.0 V: must be above 0'),
         ('-p solver:=magic', 3, 'magic'),
@@ -523,7 +523,7 @@ def test_what_cannot_run_says_why_in_one_line(domain: int, capfd: pytest.Capture
         ('--params-file /nowhere/rig.yaml', 3, '/nowhere/rig.yaml'),
     ):
         assert main(['estimator', '--ros-args', *words.split()]) == status, words
-        (line,) = [line for line in capfd.readouterr().err.splitlines() if said in line]
+        (line,) = [line for line in capfd.readouterr().err.splitlines() if message in line]
         assert line.startswith('psd-deflection estimator: '), line
     assert main(['estimator', '--port', '/dev/nothing_here']) == 5
     assert '/dev/nothing_here: no such port' in capfd.readouterr().err

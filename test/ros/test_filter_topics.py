@@ -70,8 +70,8 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     assert status.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
     assert float({v.key: v.value for v in status.values}['NIS a sample, dX']) > 0.5
     # Best effort: either may have come first.
-    (said, *_) = [line for line in estimator.lines if '/link_base/acceleration: refused' in line]
-    assert "frame_id 'tool0': must be link_base" in said or 'angular x = nan: must be finite' in said
+    (wanted, *_) = [line for line in estimator.lines if '/link_base/acceleration: refused' in line]
+    assert "frame_id 'tool0': must be link_base" in wanted or 'angular x = nan: must be finite' in wanted
     recording = open_recording(folder)
     noted = [name for change in recording.changes for name, _ in change.values]
     assert noted.count(KNOWN_LOAD) == 2

@@ -12,11 +12,13 @@ import pytest
 pytestmark = pytest.mark.ros
 rclpy = pytest.importorskip('rclpy')
 
+from rclpy.event_handler import PublisherEventCallbacks  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from msg_adapters import INPUTS, LOAD, MARK, Delivery  # noqa: E402
+from msg_adapters import INPUTS, LATCHED, LOAD, MARK, Delivery  # noqa: E402
 from psd_deflection.base.log import INFO, WARNING  # noqa: E402
+from psd_deflection.ros.endpoints import qos  # noqa: E402
 from psd_deflection.ros.gate import MOST_A_SECOND, InputGate  # noqa: E402
 from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic  # noqa: E402
 
@@ -28,16 +30,16 @@ class Gated:
     """A gate on a node of the peer's own executor."""
 
     def __init__(self, peer: Any) -> None:
-        self.said: list[str] = []
+        self.logged: list[str] = []
         self.levels: list[int] = []
         self.heard: list[str] = []
         self.node = rclpy.create_node('gated', context=peer.context)
         peer.executor.add_node(self.node)
         self.now = 100.0
-        self.gate = InputGate(self.node, self._say, lambda: self.now)
+        self.gate = InputGate(self.node, self._log, lambda: self.now)
 
-    def _say(self, text: str, level: int = INFO, /) -> None:
-        self.said.append(text)
+    def _log(self, text: str, level: int = INFO, /) -> None:
+        self.logged.append(text)
         self.levels.append(level)
 
     def listen(self) -> None:
@@ -84,7 +86,7 @@ def test_good_ones_are_taken_and_others_counted_and_said(
 
     peer.until(sent, 'the messages')
     assert set(gated.heard) == {'good'}
-    assert set(gated.said) == {
+    assert set(gated.logged) == {
         f'{TOPIC}: refused: empty',
         f'{TOPIC}: refused: 2009 bytes: must be at most 1000',
     }
@@ -92,7 +94,7 @@ def test_good_ones_are_taken_and_others_counted_and_said(
     count, why = gated.gate.values()
     assert count == (f'messages refused: {TOPIC}', str(gated.gate.refused[TOPIC]))
     assert why[0] == f'refused last: {TOPIC}'
-    assert f'{TOPIC}: refused: {why[1]}' in gated.said
+    assert f'{TOPIC}: refused: {why[1]}' in gated.logged
 
 
 def test_a_text_that_is_no_text_ends_nothing(peer: Any, gated: Gated) -> None:
@@ -126,6 +128,26 @@ def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> No
     peer.until(lambda: not flooded() or len(gated.heard) > MOST_A_SECOND, 'the next second')
 
 
+def test_a_latched_value_comes_and_no_other_publisher_is_warned(
+    peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    row = GraphTopic(TOPIC, 'std_msgs/msg/String', 'gated', 'words', Delivery(1))
+    monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, (row._replace(delivery=LATCHED), row))
+    gated.listen()
+    warned: list[Any] = []
+    plain = peer.node.create_publisher(
+        String, TOPIC, 5, event_callbacks=PublisherEventCallbacks(incompatible_qos=warned.append)
+    )
+    peer.until(lambda: plain.publish(String(data='plain')) or 'plain' in gated.heard, 'the publisher without memory')
+    gated.gate.settle()
+    plain.publish(String(data='last'))
+    peer.until(lambda: 'last' in gated.heard, 'its last word')
+    assert not warned
+    peer.node.destroy_publisher(plain)
+    peer.node.create_publisher(String, TOPIC, qos(LATCHED)).publish(String(data='latched'))
+    peer.until_sent(gated.gate.settle, lambda: 'latched' in gated.heard, 'what was said before')
+
+
 def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
     peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -135,4 +157,4 @@ def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
     gated.listen()
     peer.node.create_publisher(String, TOPIC, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
     peer.until(lambda: gated.gate.refused[TOPIC] > 0, 'the publisher that is best effort')
-    assert 'a publisher is best effort, and this has to be reliable' in gated.said[0]
+    assert 'a publisher is best effort, and this has to be reliable' in gated.logged[0]

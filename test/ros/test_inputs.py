@@ -82,8 +82,8 @@ def test_an_acceleration_says_its_frame() -> None:
 
 @pytest.mark.parametrize('part', ['force.z', 'torque.x', 'torque.y'])
 def test_a_component_that_cannot_be_used_is_refused(part: str) -> None:
-    said = fault(LOAD, {f'wrench.{part}': 50.0})
-    assert said == f'{part.replace(".", " ")} = 50: cannot be used, only force x, force y and torque z can'
+    text = fault(LOAD, {f'wrench.{part}': 50.0})
+    assert text == f'{part.replace(".", " ")} = 50: cannot be used, only force x, force y and torque z can'
     assert fault(LOAD, {f'wrench.{part}': -0.0}) == ''
 
 

@@ -76,6 +76,6 @@ def test_a_recorder_that_joins_a_running_node_replays_bit_for_bit(
     while messages_lost(bag := recorded_late(peer, poses, tmp_path)):
         assert time.monotonic() < deadline, f'{bag}: nothing but recordings with losses'
     assert main(['replay', str(bag), '--compare']) == 0
-    said = capsys.readouterr().out
-    assert 'starts in mid-run; compared from block' in said
-    assert 'no bit differs' in said
+    output = capsys.readouterr().out
+    assert 'starts in mid-run; compared from block' in output
+    assert 'no bit differs' in output

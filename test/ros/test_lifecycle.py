@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 
 pytestmark = pytest.mark.ros
 pytest.importorskip('rclpy')
@@ -265,7 +265,7 @@ def test_an_unforeseen_error_at_the_start_is_not_swallowed(domain: int, monkeypa
 
     monkeypatch.setattr(estimator, 'Session', broken)
     with pytest.raises(ZeroDivisionError, match='of our own making'):
-        estimator.run(['--ros-args'], {}, unsaid)
+        estimator.run(['--ros-args'], {}, null_log)
 
 
 def test_a_refusal_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -274,4 +274,4 @@ def test_a_refusal_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(node, '_ManagedNode', refused)
     with pytest.raises(ConfigError, match=r'^ROS: error creating node: no security libraries Please compile$'):
-        estimator.run(['--ros-args'], {}, unsaid)
+        estimator.run(['--ros-args'], {}, null_log)

@@ -53,8 +53,8 @@ def point(seconds: float, positions: list[float]) -> JointTrajectoryPoint:
 def told(peer: Any, **positions: float) -> None:
     """Let joints be told again and again."""
     out = peer.node.create_publisher(JointState, '/joint_states', 5)
-    said = JointState(name=list(positions), position=list(positions.values()))
-    peer.node.create_timer(0.02, lambda: out.publish(said))
+    stated = JointState(name=list(positions), position=list(positions.values()))
+    peer.node.create_timer(0.02, lambda: out.publish(stated))
 
 
 def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> None:
@@ -110,6 +110,16 @@ def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> Non
     peer.until(lambda: any('ZVD for 12 Hz' in r.status[0].message for r in reports), 'diagnostics')
     values = {v.key: v.value for v in reports[-1].status[0].values}
     assert (values['shaper'], values['delay (s)'], values['trajectories refused']) == ('zvd', '0.0834', '3')
+
+    # With another one of its name each motion would come twice: both refuse.
+    twin = peer.node.create_publisher(JointTrajectory, '/shaper/shaped', 5)
+    reports.clear()
+    held = 'it shapes nothing: another node publishes /shaper/shaped'
+    peer.until(lambda: any(held == r.status[0].message for r in reports), 'a second publisher')
+    good.header.stamp = peer.node.get_clock().now().to_msg()
+    given.publish(good)
+    node.until('trajectory refused: another node publishes /shaper/shaped')
+    peer.node.destroy_publisher(twin)
 
     # A stop goes through.
     heard.clear()

@@ -85,6 +85,10 @@ class ScriptedDevice:
     def send_frames(self, *frames: GoodFrame) -> None:
         self.send(b''.join(encode(f) for f in frames))
 
+    @property
+    def plugged(self) -> bool:
+        return not self._gone.is_set()
+
     def unplug(self) -> None:
         self._gone.set()
         self._thread.join()
@@ -128,7 +132,7 @@ def patient(monkeypatch: pytest.MonkeyPatch) -> None:
 def device(tmp_path: Path) -> Iterator[ScriptedDevice]:
     scripted = ScriptedDevice(tmp_path / 'port')
     yield scripted
-    if not scripted._gone.is_set():
+    if scripted.plugged:
         scripted.unplug()
 
 

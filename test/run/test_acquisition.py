@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.base.log import INFO, WARNING, texts, unsaid
+from psd_deflection.base.log import INFO, WARNING, null_log, texts
 from psd_deflection.devices import contract_frames, port_source
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, PongFrame, encode
 from psd_deflection.devices.serial_port import SerialPort
@@ -54,8 +54,8 @@ def numbers(items: list[Item]) -> list[int]:
 
 class Run:
     def __init__(self, rig: Rig) -> None:
-        self.said: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
-        self.acquisition = Acquisition(rig, lambda text, level=INFO: self.said.put((text, level)))
+        self.logged: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
+        self.acquisition = Acquisition(rig, lambda text, level=INFO: self.logged.put((text, level)))
         self.acquisition.open()
         self.acquisition.start()
 
@@ -66,7 +66,7 @@ class Run:
     def heard_with(self, text: str) -> tuple[str, int]:
         """The same with its severity."""
         while True:
-            message, level = self.said.get(timeout=WAIT_S)
+            message, level = self.logged.get(timeout=WAIT_S)
             if text in message:
                 return message, level
 
@@ -144,6 +144,16 @@ def test_a_full_queue_drops_the_newest_and_counts(device: Any, rig: Rig, sample:
         items.append(run.acquisition.queue.get(timeout=WAIT_S))
     assert numbers(items) == list(range(40))
     assert run.acquisition.counters.queue_dropped == 60
+
+
+def test_a_note_of_the_time_map_takes_no_block_s_room(sample: Any) -> None:
+    acquisition = Acquisition(load_rig(overrides={'queue_blocks': 2}), null_log)
+    acquisition.feed([sample(s) for s in range(20)], 10**9)
+    # 0.3 s of samples within a millisecond: the map steps.
+    acquisition.feed([sample(s) for s in range(20, 320)], 10**9 + 10**6)
+    items = [acquisition.queue.get() for _ in range(acquisition.queue.qsize())]
+    assert any(isinstance(item, Noted) for item in items)
+    assert numbers(items) == list(range(40))
 
 
 def test_stop_hands_over_what_was_read(device: Any, rig: Rig, sample: Any) -> None:
@@ -231,7 +241,7 @@ def test_samples_without_hello_are_named(device: Any, rig: Rig, sample: Any, mon
 
 
 @pytest.mark.parametrize(
-    ('version', 'info', 'said'),
+    ('version', 'info', 'message'),
     [
         (2, {}, 'protocol version 2, this is version 1'),
         (1, {'sample_rate_hz': 500.0}, 'sample_rate_hz 500.0, the rig file says 1000'),
@@ -242,12 +252,12 @@ def test_samples_without_hello_are_named(device: Any, rig: Rig, sample: Any, mon
     ],
 )
 def test_a_device_that_does_not_fit_is_named(
-    device: Any, rig: Rig, hello: HelloFrame, version: int, info: dict[str, object], said: str
+    device: Any, rig: Rig, hello: HelloFrame, version: int, info: dict[str, object], message: str
 ) -> None:
     device.answer = encode(HelloFrame(version, {**hello.info, **info}))
     with pytest.raises(DeviceError) as error:
         Acquisition(rig, texts(print)).open()
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert rig.acquisition.port in str(error.value)
 
 
@@ -472,7 +482,7 @@ def pinged(source: Asked, monkeypatch: pytest.MonkeyPatch) -> Acquisition:
     monkeypatch.setattr(module, 'make_source', lambda rig: source)
     own = {'monotonic': lambda: source.now_ns / 1e9, 'monotonic_ns': lambda: source.now_ns}
     monkeypatch.setattr(module, 'time', SimpleNamespace(**{**vars(time), **own}))
-    acquisition = Acquisition(load_rig(), unsaid)
+    acquisition = Acquisition(load_rig(), null_log)
     acquisition.open()
     acquisition.start()
     while not isinstance(acquisition.queue.get(timeout=WAIT_S), Ended):
@@ -505,16 +515,16 @@ def test_a_device_that_cannot_be_asked_is_not_asked_twice(monkeypatch: pytest.Mo
 def test_a_silence_says_which_frames_came_instead(
     device: Any, run: Run, sample: Any, monkeypatch: pytest.MonkeyPatch, t_us: int | None, why: str
 ) -> None:
-    said: list[str] = []
-    monkeypatch.setattr(run.acquisition._repeats, 'tell', lambda name, line, *_: said.append(line))
     size = 0
     if t_us is not None:
         frames = FrameDecoder().feed(b'\x00' + b''.join(encode(sample(s, t_us)) for s in range(5)))
         run.acquisition.feed(frames, 0)
         size = 100
     monkeypatch.setattr(run.acquisition.source, 'wake', lambda: None)
-    run.acquisition._silent(size, 0)
-    assert re.search(why, said[0])
-    run.acquisition._silent(size, 0)
+    # What the reader does at a silence, with bytes in its last read: a device cannot be made to send just then.
+    silent = run.acquisition._silent
+    silent(size, 0)
+    assert re.search(why, run.heard('still listening'))
+    silent(size, 10**12)
     # The frames are those since the last line.
-    assert ('baud rate' in said[1]) == bool(size)
+    assert ('baud rate' in run.heard('still listening')) == bool(size)

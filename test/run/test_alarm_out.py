@@ -86,21 +86,21 @@ KEEP = 'import sys, pathlib; pathlib.Path(sys.argv[1]).open("a").write(sys.stdin
 
 
 def handed_on(command: str = '', webhook: str = '', times: int = 1) -> tuple[AlarmOut, list[str]]:
-    said: list[str] = []
-    out = AlarmOut(command, webhook, texts(said.append), {'device': 'abc'})
+    logged: list[str] = []
+    out = AlarmOut(command, webhook, texts(logged.append), {'device': 'abc'})
     for _ in range(times):
         out.put(ALARM)
     assert out.close(2.0 * WAIT_S)
-    return out, said
+    return out, logged
 
 
 def test_command_and_web_address_get_the_same_finding(tmp_path: Path, server: Server) -> None:
     kept = tmp_path / 'it is; $(kept)'
-    out, said = handed_on(python(KEEP, str(kept)), server.url)
+    out, stated = handed_on(python(KEEP, str(kept)), server.url)
     expected = finding(ALARM, {'device': 'abc'})
     assert json.loads(kept.read_text()) == expected
     assert [json.loads(body) for body in server.got] == [expected]
-    assert said == []
+    assert stated == []
     assert (out.sent, out.failed) == (2, 0)
     assert expected['since'] == '2023-11-14T22:13:20.250Z'
     assert (expected['channel'], expected['shift'], expected['unit']) == ('x1', 5e-6, 'm')
@@ -114,9 +114,9 @@ def test_no_shell_reads_the_command(tmp_path: Path) -> None:
 
 
 def test_a_command_that_fails_is_said_once_and_counted() -> None:
-    out, said = handed_on(python('import sys; sys.exit(3)'), times=3)
+    out, stated = handed_on(python('import sys; sys.exit(3)'), times=3)
     assert (out.sent, out.failed) == (0, 3)
-    assert said == [
+    assert stated == [
         f'watch: command {sys.executable}: ended with status 3; an alarm was not handed on, '
         'and further ones are counted'
     ]
@@ -141,16 +141,16 @@ def test_a_command_that_hangs_is_killed_with_what_it_started(monkeypatch: pytest
 
 
 def test_a_command_that_reads_nothing_is_no_failure() -> None:
-    out, said = handed_on('true', times=2)
-    assert (out.sent, said) == (2, [])
+    out, stated = handed_on('true', times=2)
+    assert (out.sent, stated) == (2, [])
 
 
 def test_a_web_address_is_tried_three_times_and_again_at_the_next_alarm(server: Server) -> None:
     server.answers = [503, 500, 429, 503, 200]
-    out, said = handed_on('', server.url, times=2)
+    out, stated = handed_on('', server.url, times=2)
     assert len(server.got) == 5
     assert (out.sent, out.failed) == (1, 1)
-    assert said == [
+    assert stated == [
         'watch: webhook at 127.0.0.1: answers 429; an alarm was not handed on, and further ones are counted'
     ]
 
@@ -166,16 +166,16 @@ def test_what_no_repetition_mends_is_tried_once_and_no_redirection_is_followed(s
 def test_a_server_that_is_away_is_said() -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = taken.getsockname()[1]
-    out, said = handed_on('', f'http://127.0.0.1:{port}/')
+    out, stated = handed_on('', f'http://127.0.0.1:{port}/')
     assert out.failed == 1
-    assert said[0].startswith('watch: webhook at 127.0.0.1: cannot be reached (Connection refused)')
+    assert stated[0].startswith('watch: webhook at 127.0.0.1: cannot be reached (Connection refused)')
 
 
 def test_alarms_that_wait_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, 'MOST_WAITING', 0)
-    out, said = handed_on('true', times=2)
+    out, stated = handed_on('true', times=2)
     assert out.failed == 2
-    assert said == ['watch: alarms: 0 wait already; an alarm was not handed on, and further ones are counted']
+    assert stated == ['watch: alarms: 0 wait already; an alarm was not handed on, and further ones are counted']
 
 
 def test_an_address_that_is_a_secret_stays_in_its_file(server: Server, tmp_path: Path) -> None:

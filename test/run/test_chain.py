@@ -16,7 +16,7 @@ from psd_deflection.arms.chains.chain import Chain, EndEffector
 from psd_deflection.arms.chains.chain_file import ChainFile, read_chain
 from psd_deflection.arms.chains.joining import PATIENCE
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.base.log import texts, unsaid
+from psd_deflection.base.log import null_log, texts
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.run.chain import ChainSession, Composed
 from test.heard import WAIT_S
@@ -37,7 +37,7 @@ def devices(tmp_path: Path) -> Iterator[list[ScriptedDevice]]:
     both = [ScriptedDevice(tmp_path / f'port_{n}') for n in range(2)]
     yield both
     for device in both:
-        if not device._gone.is_set():
+        if device.plugged:
             device.unplug()
 
 
@@ -55,8 +55,8 @@ class Running:
     """A chain whose devices have sent ``count`` samples each; ``composed``: what came of them."""
 
     def __init__(self, file: ChainFile) -> None:
-        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.chain = ChainSession(file, texts(self.said.put))
+        self.logged: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.chain = ChainSession(file, texts(self.logged.put))
         self.composed: queue.SimpleQueue[Composed] = queue.SimpleQueue()
         self.chain.listeners.append(self.composed.put)
         self.chain.start()
@@ -68,7 +68,7 @@ class Running:
         self.sent += count
 
     def heard(self, text: str) -> None:
-        while text not in self.said.get(timeout=WAIT_S):
+        while text not in self.logged.get(timeout=WAIT_S):
             pass
 
     def until(self, wanted: Callable[[Composed], bool]) -> Composed:
@@ -163,5 +163,5 @@ def test_a_link_that_cannot_be_opened_ends_the_others(file: ChainFile, devices: 
     devices[1].unplug()
     before = threading.active_count()
     with pytest.raises(DeviceError, match='port_1'):
-        ChainSession(file, unsaid)
+        ChainSession(file, null_log)
     assert threading.active_count() <= before

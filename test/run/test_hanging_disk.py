@@ -89,10 +89,10 @@ class Live:
     """A session on ``device`` that has not started; :meth:`flow` is a second of its stream."""
 
     def __init__(self, device: ScriptedDevice, sample: Sample, bags: Path, **parameters: Any) -> None:
-        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.logged: queue.SimpleQueue[str] = queue.SimpleQueue()
         self.estimates = threading.Semaphore(0)
         values = {'port': str(device.link), 'bag_dir': str(bags), 'zero_file': str(bags.parent / 'zero.json')}
-        self.session = Session(load_rig(overrides={**values, 'realtime': False, **parameters}), texts(self.said.put))
+        self.session = Session(load_rig(overrides={**values, 'realtime': False, **parameters}), texts(self.logged.put))
         self.session.processing.sinks.append(self)
         self._device, self._sample, self._sent = device, sample, 0
 
@@ -109,7 +109,7 @@ class Live:
             assert self.estimates.acquire(timeout=WAIT_S)
 
     def heard(self, text: str) -> str:
-        while text not in (line := self.said.get(timeout=WAIT_S)):
+        while text not in (line := self.logged.get(timeout=WAIT_S)):
             pass
         return line
 

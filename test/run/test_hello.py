@@ -18,7 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.base.log import texts, unsaid
+from psd_deflection.base.log import null_log, texts
 from psd_deflection.devices.protocol.frames import HelloFrame, SampleFrame
 from psd_deflection.devices.protocol.words import MAX_TEXT
 from psd_deflection.devices.source import Received, Source
@@ -58,7 +58,7 @@ def gate(first: Mapping[str, object] | None = None, *, volts: bool = False) -> H
 
 
 @pytest.mark.parametrize(
-    ('changes', 'said'),
+    ('changes', 'message'),
     [
         ({'sample_rate_hz': HUGE}, "sample_rate_hz 'a whole number of 1027 bits', the rig file says 1000"),
         ({'sample_rate_hz': math.nan}, "sample_rate_hz 'nan', the rig file says 1000"),
@@ -77,10 +77,10 @@ def gate(first: Mapping[str, object] | None = None, *, volts: bool = False) -> H
         ({'channels': {'x1': 1}}, 'channels'),
     ],
 )
-def test_what_does_not_fit_is_refused_at_the_start_and_later(changes: dict[str, object], said: str) -> None:
+def test_what_does_not_fit_is_refused_at_the_start_and_later(changes: dict[str, object], message: str) -> None:
     for before in (gate(), gate(GOOD)):
         kept = before.hello
-        with pytest.raises(DeviceError, match=f'port: HELLO has {said}') as error:
+        with pytest.raises(DeviceError, match=f'port: HELLO has {message}') as error:
             before.take(HelloFrame(1, info(**changes)), 'port', volts=False)
         assert len(str(error.value)) < 400
         assert (before.hello, before.volts_per_count) == (kept, VOLTS)
@@ -160,9 +160,9 @@ class Quiet(Source):
         return {}
 
 
-def opened(monkeypatch: pytest.MonkeyPatch, source: Source, said: list[str], rig: Rig | None = None) -> Acquisition:
+def opened(monkeypatch: pytest.MonkeyPatch, source: Source, message: list[str], rig: Rig | None = None) -> Acquisition:
     monkeypatch.setattr(module, 'make_source', lambda rig: source)
-    acquisition = Acquisition(load_rig() if rig is None else rig, texts(said.append))
+    acquisition = Acquisition(load_rig() if rig is None else rig, texts(message.append))
     acquisition.open()
     return acquisition
 
@@ -181,24 +181,24 @@ def stamps(acquisition: Acquisition) -> list[int]:
 
 
 def test_a_flood_of_hellos_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    logged: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), logged)
     for k in range(3000):
         acquisition.feed([HelloFrame(1, info(sample_rate_hz=k % 500))], k * 1_000_000)
-    assert len(said) == 1
-    assert 'sample_rate_hz 0, the rig file says 1000' in said[0]
-    assert 'kept to the first HELLO' in said[0]
+    assert len(logged) == 1
+    assert 'sample_rate_hz 0, the rig file says 1000' in logged[0]
+    assert 'kept to the first HELLO' in logged[0]
 
 
 def test_the_scale_of_samples_does_not_change_in_mid_stream(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    logged: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), logged)
     other = HelloFrame(1, info(volts_per_count=1.0009 * VOLTS))
     for k in range(40):
         acquisition.feed([sample(k), other], k * 1_000_000)
     chunks = [acquisition.queue.get() for _ in range(2)]
     assert [c.raw.volts_per_count for c in chunks if isinstance(c, Arrival)] == [VOLTS, VOLTS]
-    assert len(said) == 1
+    assert len(logged) == 1
 
 
 def test_another_device_in_mid_stream_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -210,27 +210,27 @@ def test_another_device_in_mid_stream_is_not_read(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_number_that_stands_still_floods_neither_log_nor_queue(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    logged: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), logged)
     for k in range(1200):
         acquisition.feed([sample(20, 20_000 + 1000 * k)], k * 1_000_000)
-    assert said == []
+    assert logged == []
     assert (acquisition.counters.restarts, acquisition.counters.repeated) == (0, 1199)
     assert acquisition.queue.empty()
 
 
 def test_a_device_that_starts_anew_all_the_time_is_told_now_and_then(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    logged: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), logged)
     for k in range(1000):
         acquisition.feed([sample(10_000 - 200 * (k % 2), 1000 * k)], k * 1_000_000)
     assert acquisition.counters.restarts > 100
-    assert len([line for line in said if 'started anew' in line]) <= module.NEWS + 1
+    assert len([line for line in logged if 'started anew' in line]) <= module.NEWS + 1
 
 
 def test_a_clock_that_stands_still_is_told_and_stamps_follow_the_host(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
-    acquisition = opened(monkeypatch, Quiet(GOOD), said)
+    logged: list[str] = []
+    acquisition = opened(monkeypatch, Quiet(GOOD), logged)
     late = []
     for k in range(19_000):
         now = 10**12 + k * 1_000_000
@@ -239,15 +239,15 @@ def test_a_clock_that_stands_still_is_told_and_stamps_follow_the_host(monkeypatc
     assert len(late) >= 950
     assert max(late) < 80_000_000
     assert acquisition.counters.clock_jumps > 100
-    assert any('clock stands still' in line for line in said)
+    assert any('clock stands still' in line for line in logged)
     # And as often that stamps are squeezed.
-    assert len(said) <= 2 * (module.NEWS + 3)
+    assert len(logged) <= 2 * (module.NEWS + 3)
 
 
 def test_the_kept_words_are_the_same_for_a_port_of_bytes(device: Any, rig: Rig) -> None:
     body = json.dumps(info(serial='\ud800', firmware='\x1b[31m')).encode()
     device.answer = sealed(b'\x10\x01' + body)
-    acquisition = Acquisition(rig, unsaid)
+    acquisition = Acquisition(rig, null_log)
     acquisition.open()
     try:
         assert acquisition.hello is not None
@@ -261,14 +261,14 @@ def test_no_rate_on_the_wire_ends_the_reader(device: Any, rig: Rig, rate: str) -
     text = json.dumps(info(sample_rate_hz=12345)).replace('12345', rate)
     device.answer = sealed(b'\x10\x01' + text.encode())
     with pytest.raises(DeviceError, match='sample_rate_hz'):
-        Acquisition(rig, unsaid).open()
+        Acquisition(rig, null_log).open()
 
 
 THREE = {**GOOD, 'psds': 3, 'channels': list(channel_names(3))}
 
 
 @pytest.mark.parametrize(
-    ('third', 'hello', 'said'),
+    ('third', 'hello', 'message'),
     [
         (True, GOOD, 'HELLO has psds 2, the rig file has 3 PSDs'),
         (False, THREE, 'HELLO has psds 3, the rig file has 2 PSDs'),
@@ -279,10 +279,10 @@ THREE = {**GOOD, 'psds': 3, 'channels': list(channel_names(3))}
     ],
 )
 def test_a_device_with_other_psds_than_the_rig_file_is_refused(
-    third: bool, hello: dict[str, object], said: str
+    third: bool, hello: dict[str, object], message: str
 ) -> None:
     rig = load_rig(overrides={'psd_3.center': [0.08, 0.0]} if third else {})
-    with pytest.raises(DeviceError, match=said):
+    with pytest.raises(DeviceError, match=message):
         HelloGate(rig).take(HelloFrame(1, hello), 'port', volts=False)
 
 

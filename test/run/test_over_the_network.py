@@ -97,7 +97,7 @@ class ScriptedHost(ScriptedDevice):
 def device() -> Iterator[ScriptedHost]:
     scripted = ScriptedHost()
     yield scripted
-    if not scripted._gone.is_set():
+    if scripted.plugged:
         scripted.unplug()
 
 
@@ -137,7 +137,7 @@ class Sender:
         self.answer = answer
         self.rig = load_rig(overrides={'port': f'udp://127.0.0.1:{place[1]}'})
         self.pinged = threading.Event()
-        self._place = place
+        self.place = place
         self._ended = threading.Event()
         self.sockets: list[socket.socket] = []
         self._threads: list[threading.Thread] = []
@@ -155,7 +155,7 @@ class Sender:
         decoder = FrameDecoder()
         while not self._ended.wait(0.01) and made is self.sockets[-1]:
             # As a device does once a second.
-            made.sendto(self.answer, self._place)
+            made.sendto(self.answer, self.place)
             while select.select((made,), (), (), 0.0)[0]:
                 for frame in decoder.feed(made.recv(4096)):
                     if isinstance(frame, PingFrame):
@@ -163,7 +163,7 @@ class Sender:
 
     def send(self, *datagrams: bytes) -> None:
         for datagram in datagrams:
-            self.sockets[-1].sendto(datagram, self._place)
+            self.sockets[-1].sendto(datagram, self.place)
 
     def hush(self) -> None:
         """From now on it sends what the test sends."""
@@ -239,9 +239,9 @@ def test_a_device_that_sends_from_another_place_introduces_itself(
     take(over_udp.acquisition, 20)
     monkeypatch.setattr(udp_port, 'SILENT_S', 0.0)
     sender.start()
-    said = over_udp.heard('sends now')
-    assert 'is silent, and 127.0.0.1:' in said
-    assert said.endswith('waiting for it to come back')
+    text = over_udp.heard('sends now')
+    assert 'is silent, and 127.0.0.1:' in text
+    assert text.endswith('waiting for it to come back')
     over_udp.heard('the device is back')
     sender.send(frames(sample, *range(40, 60)))
     assert numbers(take(over_udp.acquisition, 20)) == list(range(40, 60))
@@ -250,10 +250,10 @@ def test_a_device_that_sends_from_another_place_introduces_itself(
 
 def test_strangers_are_told_and_nothing_of_theirs_is_taken(sender: Sender, over_udp: Run, sample: Any) -> None:
     stranger = Sender(encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'OTHER'})))
-    stranger._place = sender._place
+    stranger.place = sender.place
     try:
-        said = over_udp.heard('are not taken')
-        assert said.startswith(f'{sender.rig.acquisition.port}: datagrams of 127.0.0.1:')
+        text = over_udp.heard('are not taken')
+        assert text.startswith(f'{sender.rig.acquisition.port}: datagrams of 127.0.0.1:')
         stranger.send(frames(sample, *range(500, 520)))
         sender.send(frames(sample, *range(20)))
         assert numbers(take(over_udp.acquisition, 20)) == list(range(20))
@@ -303,14 +303,14 @@ def served(request: pytest.FixtureRequest) -> Iterator[str]:
 def test_a_run_over_the_network_is_recorded_and_replayed_bit_by_bit(
     served: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said: list[str] = []
+    logged: list[str] = []
     rig = load_rig(overrides={'port': served, 'record': True, 'bag_dir': str(tmp_path), 'keep_zero': False})
-    session = Session(rig, texts(said.append))
+    session = Session(rig, texts(logged.append))
     estimates = Estimates(40)
     session.processing.sinks.append(estimates)
     try:
         session.start()
-        assert estimates.enough.wait(WAIT_S), said
+        assert estimates.enough.wait(WAIT_S), logged
     finally:
         folder = session.close()
     assert session.failed is None
@@ -318,7 +318,7 @@ def test_a_run_over_the_network_is_recorded_and_replayed_bit_by_bit(
     assert main(['replay', str(folder), '--compare', '--strict']) == 0
     assert 'no bit differs' in capsys.readouterr().out
     # The device is there for the next one.
-    again = Acquisition(load_rig(overrides={'port': served}), texts(said.append))
+    again = Acquisition(load_rig(overrides={'port': served}), texts(logged.append))
     again.open()
     again.start()
     assert isinstance(again.queue.get(timeout=WAIT_S), Arrival)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import queue
 import threading
 from collections.abc import Collection
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -19,7 +18,7 @@ from psd_deflection.records import DeflectionEstimate, RawChunk, Record
 from psd_deflection.rig.config import load_rig
 from psd_deflection.run import processing as module
 from psd_deflection.run.processing import Processing
-from psd_deflection.run.reading.arrivals import Arrival, Ended, Item
+from psd_deflection.run.reading.arrivals import Arrival, Ended, ItemQueue
 from test.heard import WAIT_S
 
 MS = 1_000_000
@@ -32,8 +31,8 @@ def chunk(index: int, read_ns: int) -> Arrival:
 
 
 @pytest.fixture
-def items() -> queue.SimpleQueue[Item]:
-    return queue.SimpleQueue()
+def items() -> ItemQueue:
+    return ItemQueue()
 
 
 class Held:
@@ -48,9 +47,7 @@ class Held:
         return 'done'
 
 
-def test_a_request_that_was_given_up_is_never_carried_out(
-    items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_request_that_was_given_up_is_never_carried_out(items: ItemQueue, monkeypatch: pytest.MonkeyPatch) -> None:
     processing, held, done = Processing(items, Pipeline(load_rig()), texts(print)), Held(), list[str]()
     processing.start()
     with ThreadPoolExecutor(1) as other:
@@ -68,9 +65,7 @@ def test_a_request_that_was_given_up_is_never_carried_out(
     assert done == ['in time']
 
 
-def test_a_request_that_was_begun_is_waited_for(
-    items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_request_that_was_begun_is_waited_for(items: ItemQueue, monkeypatch: pytest.MonkeyPatch) -> None:
     processing, held = Processing(items, Pipeline(load_rig()), texts(print)), Held()
 
     def impatient(asked: Collection[Future[Any]], timeout: float) -> Any:
@@ -88,9 +83,7 @@ def test_a_request_that_was_begun_is_waited_for(
     processing.join(WAIT_S)
 
 
-def test_timeout_of_a_begun_request_says_that_it_was_begun(
-    items: queue.SimpleQueue[Item], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_timeout_of_a_begun_request_says_that_it_was_begun(items: ItemQueue, monkeypatch: pytest.MonkeyPatch) -> None:
     processing, held = Processing(items, Pipeline(load_rig()), texts(print)), Held()
 
     def impatient(asked: Collection[Future[Any]], timeout: float) -> Any:
@@ -106,7 +99,7 @@ def test_timeout_of_a_begun_request_says_that_it_was_begun(
     processing.join(WAIT_S)
 
 
-def test_errors_of_a_request_come_through(items: queue.SimpleQueue[Item]) -> None:
+def test_errors_of_a_request_come_through(items: ItemQueue) -> None:
     def refuse() -> None:
         raise TimeoutError('its own')
 
@@ -135,7 +128,7 @@ class Clock:
             self.now = next(self._ends)
 
 
-def after(items: queue.SimpleQueue[Item], read_and_end_ms: list[tuple[int, int]]) -> tuple[Processing, Clock]:
+def after(items: ItemQueue, read_and_end_ms: list[tuple[int, int]]) -> tuple[Processing, Clock]:
     """Processing and its clock after blocks that were read and had gone to the sinks at these times."""
     clock = Clock([end * MS for _, end in read_and_end_ms])
     processing = Processing(items, Pipeline(load_rig()), texts(print), clock)
@@ -155,7 +148,7 @@ def told(processing: Processing) -> tuple[float, float] | None:
     return (round(latency.median * 1e3), round(latency.worst * 1e3)) if latency is not None else None
 
 
-def test_latency_is_from_the_last_byte_to_the_last_sink_of_the_last_second(items: queue.SimpleQueue[Item]) -> None:
+def test_latency_is_from_the_last_byte_to_the_last_sink_of_the_last_second(items: ItemQueue) -> None:
     processing, clock = after(items, [(100, 400), (600, 900), (1290, 1300), (1330, 1350)])
     assert told(processing) == (300, 300)
     clock.now = 1450 * MS
@@ -167,7 +160,7 @@ def test_latency_is_from_the_last_byte_to_the_last_sink_of_the_last_second(items
 
 
 @pytest.mark.parametrize('blocks', [10, 400])
-def test_a_second_is_a_second_however_many_blocks_it_has(items: queue.SimpleQueue[Item], blocks: int) -> None:
+def test_a_second_is_a_second_however_many_blocks_it_has(items: ItemQueue, blocks: int) -> None:
     """The worst is the first: a fixed number of blocks would forget it, or remember it for too long."""
     every = 2000 // blocks
     ends = [5000 + every * i for i in range(blocks)]

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from psd_deflection.base.log import texts
-from psd_deflection.run.processing import Spokesman
+from psd_deflection.run.processing import OutageLog
 from psd_deflection.run.realtime import Watchdog, lock_memory, prefer_reader
 
 
@@ -100,20 +100,20 @@ def test_refused_system_resources_are_reported(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_lines_about_estimates_come_once_a_second_with_counts() -> None:
-    said: list[str] = []
-    spokesman = Spokesman(texts(said.append))
+    logged: list[str] = []
+    spokesman = OutageLog(texts(logged.append))
     # Fifty blocks a second, every other one without an estimate, for ten seconds.
     for i in range(500):
         lost = i % 2 == 1
         spokesman.block('LASER_LOST' if lost else '', 'no estimate: laser 1 lost' if lost else '', 10.0 + 0.02 * i)
-    assert 9 <= len(said) <= 11
-    assert said[0] == 'no estimate: laser 1 lost'
-    assert '25 blocks affected' in said[1] or '26 blocks affected' in said[1]
+    assert 9 <= len(logged) <= 11
+    assert logged[0] == 'no estimate: laser 1 lost'
+    assert '25 blocks affected' in logged[1] or '26 blocks affected' in logged[1]
     # And nothing while nothing changes.
-    before = len(said)
+    before = len(logged)
     for i in range(500):
         spokesman.block('', '', 30.0 + 0.02 * i)
-    assert len(said) <= before + 1
+    assert len(logged) <= before + 1
     spokesman.block('SATURATED', 'no estimate: x1 saturated', 50.0)
     spokesman.block('', '', 52.0)
-    assert said[-2:] == ['no estimate: x1 saturated', 'estimates are back']
+    assert logged[-2:] == ['no estimate: x1 saturated', 'estimates are back']

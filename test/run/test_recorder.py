@@ -10,6 +10,7 @@ import queue
 import shutil
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -43,7 +44,7 @@ class Disk:
 
     def usage(self, path: Path) -> Any:
         self.asked.release()
-        return shutil._ntuple_diskusage(100_000 * MB, 0, self.free)
+        return SimpleNamespace(total=100_000 * MB, used=0, free=self.free)
 
 
 @pytest.fixture
@@ -53,8 +54,8 @@ def disk(monkeypatch: pytest.MonkeyPatch) -> Disk:
 
 class Run:
     def __init__(self, rig: Rig, queue_blocks: int = 1000) -> None:
-        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
-        self.recorder = Recorder(queue_blocks, texts(self.said.put), lambda action: action())
+        self.logged: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.recorder = Recorder(queue_blocks, texts(self.logged.put), lambda action: action())
         self.folder = self.start(rig)
         self.count = 0
 
@@ -73,7 +74,7 @@ class Run:
             self.count += 1
 
     def heard(self) -> str:
-        return self.said.get(timeout=WAIT_S)
+        return self.logged.get(timeout=WAIT_S)
 
     def indices(self) -> list[int]:
         return [b.index for b in open_recording(self.folder).blocks()]
@@ -89,11 +90,11 @@ def test_a_disk_that_is_nearly_full_ends_the_recording_whole(tmp_path: Path, dis
     assert disk.asked.acquire(timeout=WAIT_S)
     disk.free = 150 * MB
     run.put(2 * module.LOOK_EVERY)
-    said = run.heard()
-    assert 'the disk has 150 MB left, less than disk_reserve = 200 MB; it is complete up to here' in said
-    assert said.count('\n') == 0
+    text = run.heard()
+    assert 'the disk has 150 MB left, less than disk_reserve = 200 MB; it is complete up to here' in text
+    assert text.count('\n') == 0
     assert run.recorder.folder is None
-    assert run.recorder.failure in said
+    assert run.recorder.failure in text
     with Reader(run.folder) as reader:
         # The rig is in each file besides.
         assert reader.message_count == run.recorder.written + 1
@@ -117,9 +118,9 @@ def test_a_recording_that_is_taken_away_ends_with_one_line(tmp_path: Path, how: 
     else:
         run.folder.rename(tmp_path / 'elsewhere')
     run.put(module.LOOK_EVERY)
-    said = run.heard()
-    assert '_0.mcap: was deleted or moved while it was recorded; start another recording' in said
-    assert run.recorder.failure in said
+    text = run.heard()
+    assert '_0.mcap: was deleted or moved while it was recorded; start another recording' in text
+    assert run.recorder.failure in text
     assert run.recorder.folder is None
     if how == 'moved':
         assert [b.index for b in open_recording(tmp_path / 'elsewhere').blocks()][:1] == [0]
@@ -214,9 +215,9 @@ def test_a_disk_that_refuses_ends_the_recording_and_says_the_way_out(
 
     monkeypatch.setattr(os, 'fsync', refuse)
     run.put(60)
-    said = run.heard()
-    assert 'Input/output error' in said
-    assert f'psd-deflection recover {run.folder}' in said
+    text = run.heard()
+    assert 'Input/output error' in text
+    assert f'psd-deflection recover {run.folder}' in text
     monkeypatch.undo()
     assert run.stop() is None
 

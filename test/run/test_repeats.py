@@ -5,91 +5,91 @@
 from __future__ import annotations
 
 from psd_deflection.base.log import WARNING, texts
-from psd_deflection.run.repeats import FIRST_WAIT_S, LONGEST_WAIT_S, MOST_REASONS, Repeats
+from psd_deflection.run.repeats import FIRST_WAIT_S, LONGEST_WAIT_S, MOST_REASONS, RateLimitedLog
 
 
 def test_a_line_a_second_for_a_day_is_few_lines_and_none_is_forgotten() -> None:
-    said: list[str] = []
-    repeats = Repeats(texts(said.append))
+    logged: list[str] = []
+    repeats = RateLimitedLog(texts(logged.append))
     for k in range(86_400):
         # The words may differ each time: it is the kind that counts.
-        repeats.tell('hello', f'HELLO {k} refused', WARNING, 1000.0 + k)
-    assert said[:2] == ['HELLO 0 refused', 'HELLO 10 refused (and 9 more like it)']
-    assert len(said) < 40
+        repeats.log('hello', f'HELLO {k} refused', WARNING, 1000.0 + k)
+    assert logged[:2] == ['HELLO 0 refused', 'HELLO 10 refused (and 9 more like it)']
+    assert len(logged) < 40
     repeats.settle(1000.0 + 86_400 + LONGEST_WAIT_S)
-    last = said.pop()
-    counted = sum(int(line.split('(and ')[1].split()[0]) for line in said if '(and ' in line)
-    assert counted + len(said) + int(last.split(' more in')[0]) == 86_400
+    last = logged.pop()
+    counted = sum(int(line.split('(and ')[1].split()[0]) for line in logged if '(and ' in line)
+    assert counted + len(logged) + int(last.split(' more in')[0]) == 86_400
 
 
 def test_what_was_counted_is_said_when_it_is_due() -> None:
-    said: list[str] = []
-    repeats = Repeats(texts(said.append))
+    logged: list[str] = []
+    repeats = RateLimitedLog(texts(logged.append))
     for _ in range(3):
-        repeats.tell('restart', 'started anew', WARNING, 5.0)
-    assert said == ['started anew']
+        repeats.log('restart', 'started anew', WARNING, 5.0)
+    assert logged == ['started anew']
     repeats.settle(5.0 + 0.9 * FIRST_WAIT_S)
-    assert len(said) == 1
+    assert len(logged) == 1
     repeats.settle(5.0 + FIRST_WAIT_S)
     # It may be over by now, so the line says when it was.
-    assert said[1:] == ['2 more in the last 10 s: started anew']
+    assert logged[1:] == ['2 more in the last 10 s: started anew']
     repeats.settle(1e6)
-    assert len(said) == 2
+    assert len(logged) == 2
 
 
 def test_the_first_few_are_said_one_by_one_and_so_is_what_comes_after_a_quiet_time() -> None:
-    said: list[str] = []
-    repeats = Repeats(texts(said.append))
+    logged: list[str] = []
+    repeats = RateLimitedLog(texts(logged.append))
     for k in range(5):
-        repeats.tell('away', f'gone {k}', WARNING, float(k), at_once=3)
-    assert said == ['gone 0', 'gone 1', 'gone 2']
+        repeats.log('away', f'gone {k}', WARNING, float(k), at_once=3)
+    assert logged == ['gone 0', 'gone 1', 'gone 2']
     repeats.settle(1e5)
-    repeats.tell('away', 'gone again', WARNING, 2e5, at_once=3)
-    assert said[3:] == ['2 more in the last 99998 s: gone 4', 'gone again']
+    repeats.log('away', 'gone again', WARNING, 2e5, at_once=3)
+    assert logged[3:] == ['2 more in the last 99998 s: gone 4', 'gone again']
 
 
 def test_lines_that_are_said_at_once_make_the_next_wait_no_longer() -> None:
-    said: list[str] = []
-    repeats = Repeats(texts(said.append))
+    logged: list[str] = []
+    repeats = RateLimitedLog(texts(logged.append))
     for k in range(6):
-        repeats.tell('following', 'following', WARNING, float(k), at_once=6)
-    repeats.tell('following', 'following', WARNING, 6.0, at_once=6)
-    assert len(said) == 6
+        repeats.log('following', 'following', WARNING, float(k), at_once=6)
+    repeats.log('following', 'following', WARNING, 6.0, at_once=6)
+    assert len(logged) == 6
     repeats.settle(5.0 + FIRST_WAIT_S)
-    assert said[6:] == ['1 more in the last 10 s: following']
+    assert logged[6:] == ['1 more in the last 10 s: following']
 
 
 def test_one_kind_does_not_hold_up_another() -> None:
-    said: list[str] = []
-    repeats = Repeats(texts(said.append))
-    repeats.tell('a', 'one', WARNING, 0.0)
-    repeats.tell('b', 'two', WARNING, 0.0)
-    assert said == ['one', 'two']
+    logged: list[str] = []
+    repeats = RateLimitedLog(texts(logged.append))
+    repeats.log('a', 'one', WARNING, 0.0)
+    repeats.log('b', 'two', WARNING, 0.0)
+    assert logged == ['one', 'two']
 
 
 def test_a_new_reason_is_said_at_once_and_takes_no_count_of_another() -> None:
-    said: list[str] = []
-    repeats = Repeats(texts(said.append))
+    logged: list[str] = []
+    repeats = RateLimitedLog(texts(logged.append))
     for k in range(5):
-        repeats.tell('load', f"frame_id 'world{k}' at {k}.5e-3 s", WARNING, 100.0 + k)
-    repeats.tell('load', 'force x = nan', WARNING, 105.0)
-    repeats.tell('load', 'force x = nan', WARNING, 105.1)
-    assert said == ["frame_id 'world0' at 0.5e-3 s", 'force x = nan']
+        repeats.log('load', f"frame_id 'world{k}' at {k}.5e-3 s", WARNING, 100.0 + k)
+    repeats.log('load', 'force x = nan', WARNING, 105.0)
+    repeats.log('load', 'force x = nan', WARNING, 105.1)
+    assert logged == ["frame_id 'world0' at 0.5e-3 s", 'force x = nan']
     repeats.settle(116.0)
-    assert said[2:] == [
+    assert logged[2:] == [
         "4 more in the last 16 s: frame_id 'world4' at 4.5e-3 s",
         '1 more in the last 11 s: force x = nan',
     ]
 
 
 def test_reasons_without_end_are_few_lines_and_none_is_forgotten() -> None:
-    said: list[str] = []
-    repeats = Repeats(texts(said.append))
+    logged: list[str] = []
+    repeats = RateLimitedLog(texts(logged.append))
     for k in range(1000):
-        repeats.tell('load', 'x' * (k + 1), WARNING, 100.0)
-    assert len(said) == MOST_REASONS + 1
+        repeats.log('load', 'x' * (k + 1), WARNING, 100.0)
+    assert len(logged) == MOST_REASONS + 1
     repeats.settle(1e6)
-    assert said[-1].startswith(f'{1000 - MOST_REASONS - 1} more in the last ')
+    assert logged[-1].startswith(f'{1000 - MOST_REASONS - 1} more in the last ')
     # Those that are quiet make room.
-    repeats.tell('load', 'another', WARNING, 2e6)
-    assert said[-1] == 'another'
+    repeats.log('load', 'another', WARNING, 2e6)
+    assert logged[-1] == 'another'

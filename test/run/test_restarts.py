@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 from psd_deflection.base.sequence import SequenceExtender, Step
 from psd_deflection.cli.main import main
 from psd_deflection.devices.protocol.frames import SampleFrame
@@ -40,7 +40,7 @@ ESTIMATES = sum(samples >= load_rig().estimator.min_samples for samples in BLOCK
 def bag(device: ScriptedDevice, sample: Sample, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(processing, 'REQUEST_TIMEOUT_S', WAIT_S)
     values = {'port': str(device.link), 'bag_dir': str(tmp_path / 'bags'), 'keep_zero': False, 'realtime': False}
-    session = Session(load_rig(overrides={**values, 'record': True, 'disk_reserve': 1_000_000}), unsaid)
+    session = Session(load_rig(overrides={**values, 'record': True, 'disk_reserve': 1_000_000}), null_log)
     estimates = Estimates(ESTIMATES)
     session.processing.sinks.append(estimates)
     session.start()

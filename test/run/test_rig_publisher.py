@@ -42,7 +42,7 @@ class Running:
         self._session = session
         self._fanout = Fanout()
         self._fanout.wires.append(self)
-        self._fanout.change_wires.append(self.told)
+        self._fanout.change_sinks.append(self.told)
         self.told.tell()
         self.records: list[Record] = []
         for block, chunk in enumerate(chunks(rig, first)):
@@ -129,9 +129,9 @@ def test_a_recorder_that_joins_late_replays_bit_for_bit_from_the_next_memory(
     number = round(seconds / (0.02 * BLOCKS) * len(running.heard))
     bag = written(tmp_path / 'late', running.from_message(number))
     assert main(['replay', str(bag), '--compare', '--strict']) == 0
-    said = capsys.readouterr().out
-    assert f'starts in mid-run; compared from block {4000 + start}' in said
-    assert 'no bit differs' in said
+    output = capsys.readouterr().out
+    assert f'starts in mid-run; compared from block {4000 + start}' in output
+    assert 'no bit differs' in output
 
 
 def test_a_recorder_that_was_there_from_the_start_replays_from_the_start(
@@ -139,9 +139,9 @@ def test_a_recorder_that_was_there_from_the_start_replays_from_the_start(
 ) -> None:
     bag = written(tmp_path / 'early', running.heard)
     assert main(['replay', str(bag), '--compare', '--strict']) == 0
-    said = capsys.readouterr().out
-    assert 'mid-run' not in said
-    assert 'no bit differs' in said
+    output = capsys.readouterr().out
+    assert 'mid-run' not in output
+    assert 'no bit differs' in output
 
 
 def test_a_late_recording_without_a_memory_says_so(

@@ -27,7 +27,7 @@ from psd_deflection.run import session as module
 from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
 from psd_deflection.run.monitor.metrics import text_of
 from psd_deflection.run.monitor.shown import RefusedError, ShownSession
-from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.repeats import RateLimitedLog
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice
@@ -39,11 +39,11 @@ class Running:
     """A session on ``device``, past its first estimates."""
 
     def __init__(self, device: ScriptedDevice, sample: Sample, folder: Path) -> None:
-        self.said: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self.logged: queue.SimpleQueue[str] = queue.SimpleQueue()
         rig = load_rig(
             overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'bag_dir': str(folder)}
         )
-        self.session = Session(rig, texts(self.said.put))
+        self.session = Session(rig, texts(self.logged.put))
         estimates = Estimates(5)
         self.session.processing.sinks.append(estimates)
         self.session.start()
@@ -51,7 +51,7 @@ class Running:
         assert estimates.enough.wait(WAIT_S)
 
     def heard(self, text: str) -> None:
-        while text not in self.said.get(timeout=WAIT_S):
+        while text not in self.logged.get(timeout=WAIT_S):
             pass
 
 
@@ -89,7 +89,7 @@ def test_a_zero_that_was_taken_under_a_load_is_told(running: Running) -> None:
     session.note_load(0.0, -30.0, 0.0)
     session.refuse_input(LOAD, 'the end')
     told = []
-    while 'refused: the end' not in (text := running.said.get(timeout=WAIT_S)):
+    while 'refused: the end' not in (text := running.logged.get(timeout=WAIT_S)):
         told.append(text)
     assert not [text for text in told if 'anew' in text]
 
@@ -145,12 +145,12 @@ def test_no_zero_is_taken_of_a_device_that_has_said_nothing_for_long(
 
 
 def test_the_start_says_what_another_rig_has_as_in_the_thesis(device: ScriptedDevice) -> None:
-    said: list[str] = []
+    logged: list[str] = []
     rig = load_rig(
         overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'dynamics.torsion_frequency': 9.0}
     )
-    Session(rig, texts(said.append)).close()
-    (line,) = [text for text in said if 'as in the thesis rig' in text]
+    Session(rig, texts(logged.append)).close()
+    (line,) = [text for text in logged if 'as in the thesis rig' in text]
     assert re.search(r'the same: \S+ = .* and \d+ more \(`psd-deflection params` lists them\)$', line)
     assert len(line) <= 160
 
@@ -322,6 +322,6 @@ def test_what_was_counted_of_refused_messages_is_said_though_no_more_come(
 ) -> None:
     """The health is asked once a second, whatever the run publishes."""
     settled: queue.SimpleQueue[float] = queue.SimpleQueue()
-    monkeypatch.setattr(Repeats, 'settle', lambda _, now_s: settled.put(now_s))
+    monkeypatch.setattr(RateLimitedLog, 'settle', lambda _, now_s: settled.put(now_s))
     HealthReporter(running.session).report(1)
     assert settled.get(timeout=WAIT_S) <= time.monotonic()

@@ -36,7 +36,7 @@ def test_a_signal_ends_the_waiting_for_a_silent_device(
 
     threading.Thread(target=end, daemon=True).start()
     try:
-        assert run_headless({'port': str(device.link)}, Display().say, lambda session: None, start_views) == 0
+        assert run_headless({'port': str(device.link)}, Display().log, lambda session: None, start_views) == 0
         assert signal.getsignal(number) is signal.SIG_DFL
     finally:
         signal.signal(number, before)
@@ -66,7 +66,7 @@ def test_a_signal_ends_the_waiting_for_one_that_is_away(device: Any, sample: Any
     away: list[bool] = []
     shown: list[str] = []
     values: dict[str, object] = {'port': str(device.link), 'keep_zero': False, 'realtime': False}
-    assert run_headless(values, Display().say, look, start_views) == 0
+    assert run_headless(values, Display().log, look, start_views) == 0
     assert away
     assert 'no samples: the device is away' in shown[0]
 
@@ -102,10 +102,10 @@ def test_display_survives_a_closed_terminal(monkeypatch: pytest.MonkeyPatch) -> 
 
     display = Display()
     monkeypatch.setattr('sys.stderr', Gone())
-    display.say('unheard')
+    display.log('unheard')
     heard = io.StringIO()
     monkeypatch.setattr('sys.stderr', heard)
-    display.say('heard')
+    display.log('heard')
     assert heard.getvalue() == 'heard\n'
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 from psd_deflection.model.link import LinkStatics
 from psd_deflection.records import DeflectionEstimate, Record
 from psd_deflection.rig.config import load_rig
@@ -39,7 +39,7 @@ class Seen:
 
 
 def running(**parameters: object) -> tuple[Session, Seen]:
-    session, seen = Session(load_rig(overrides={'keep_zero': False, 'realtime': False, **parameters}), unsaid), Seen()
+    session, seen = Session(load_rig(overrides={'keep_zero': False, 'realtime': False, **parameters}), null_log), Seen()
     session.processing.sinks.append(seen)
     session.start()
     return session, seen

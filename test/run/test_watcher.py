@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from msg_adapters import LOAD, to_messages
-from psd_deflection.base.log import texts, unsaid
+from psd_deflection.base.log import null_log, texts
 from psd_deflection.devices.protocol.frames import SampleFrame
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.model.simulation.simulator import RigSimulator
@@ -42,10 +42,10 @@ class Chain:
     def __init__(self, folder: Path | None, **values: Any) -> None:
         kept = {} if folder is None else {'watch_dir': str(folder)}
         rig = load_rig(overrides={'watch': 'on', 'solvers': ['exact'], **kept, **values})
-        self.said: list[str] = []
+        self.logged: list[str] = []
         self.poses: dict[int, tuple[float, float, float]] = {}
         self.pipeline = Pipeline(rig)
-        self.watcher = Watcher(self.pipeline, texts(self.said.append), {'serial': 'abc'}, '/arm/psd_estimator')
+        self.watcher = Watcher(self.pipeline, texts(self.logged.append), {'serial': 'abc'}, '/arm/psd_estimator')
         self.fanout = Fanout()
         if self.watcher.keeps:
             self.fanout.wires.append(WatcherWire(self.watcher))
@@ -118,8 +118,8 @@ def test_the_minutes_around_an_alarm_are_kept_ready_for_discover(
     assert values['channel'] == 'x1'
     assert float(values['shift (um)']) == pytest.approx(5.0, abs=0.3)
     assert values['kept'] == str(folder)
-    assert chain.said[0].startswith('watch: since 2023-11-1')
-    assert str(folder) in chain.said[1]
+    assert chain.logged[0].startswith('watch: since 2023-11-1')
+    assert str(folder) in chain.logged[1]
     observation = read_observation(folder)
     # From the first whole block to three seconds after the alarm, which is some seconds after the bump.
     assert 16.0 < observation.duration < 20.0
@@ -157,7 +157,7 @@ def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert chain.watcher.close(1.0) == ''
     assert chain.watcher.folder is None
     assert not list(tmp_path.iterdir())
-    assert len(chain.said) == 1
+    assert len(chain.logged) == 1
 
 
 def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +169,7 @@ def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyP
     chain.feed(6.0, BUMP)
     assert chain.watcher.close(60.0) == ''
     assert not list(tmp_path.iterdir())
-    assert 'disk_reserve' in chain.said[-1]
+    assert 'disk_reserve' in chain.logged[-1]
     assert 'disk_reserve' in chain.watcher.failure
 
 
@@ -189,7 +189,7 @@ def test_ten_thousand_inputs_a_second_with_the_device_away_do_not_fill_the_memor
         if n % 1000 == 0:
             most = max(most, chain.watcher.held_bytes)
     assert 0 < most <= 1_000_000
-    assert [line for line in chain.said if 'watch_memory' in line] == [
+    assert [line for line in chain.logged if 'watch_memory' in line] == [
         'watch: 1 MB are full (watch_memory): what is kept begins later than watch_minutes says'
     ]
     assert int(dict(chain.watcher.entry().values)['dropped from memory, because it was full']) > 0
@@ -203,7 +203,7 @@ def test_nothing_is_held_of_a_device_that_has_been_away_for_long(tmp_path: Path)
     assert chain.watcher.held_bytes > 0
     chain.watcher.put_message(*a_load(START_NS + 100_000_000_000))
     assert chain.watcher.held_bytes == 0
-    assert not chain.said
+    assert not chain.logged
 
 
 def test_after_full_memory_what_is_kept_replays_as_the_run_computed_it(tmp_path: Path) -> None:
@@ -213,7 +213,7 @@ def test_after_full_memory_what_is_kept_replays_as_the_run_computed_it(tmp_path:
     chain.feed(14.0)
     for n in range(10_000):
         chain.watcher.put_message(*a_load(START_NS + 15_000_000_000 + n))
-    assert any('watch_memory' in line for line in chain.said)
+    assert any('watch_memory' in line for line in chain.logged)
     chain.feed(3.0)
     chain.feed(6.0, BUMP)
     assert chain.watcher.watch.alarms == 1
@@ -256,7 +256,7 @@ def test_the_oldest_of_what_was_kept_is_deleted_and_nothing_else(tmp_path: Path)
     folder = an_alarm(chain)
     assert [path.exists() for path in older] == [False, False, False, True, True]
     assert all(path.exists() for path in (folder, recorded, noted, elsewhere / 'watch_2021_0.mcap'))
-    told = [line for line in chain.said if 'deleted' in line]
+    told = [line for line in chain.logged if 'deleted' in line]
     assert len(told) == 3
     assert told[0].startswith(f'watch: {older[0]}: deleted, the oldest')
 
@@ -275,7 +275,7 @@ def test_what_was_kept_is_bounded_in_bytes(tmp_path: Path) -> None:
 
 def test_a_session_feeds_its_watch_and_reports_it(device: ScriptedDevice, sample: Callable[..., SampleFrame]) -> None:
     rig = load_rig(overrides={'port': str(device.link), 'keep_zero': False, 'realtime': False, 'watch': 'on'})
-    session = Session(rig, unsaid)
+    session = Session(rig, null_log)
     try:
         estimates = Estimates(5)
         session.processing.sinks.append(estimates)

@@ -25,8 +25,8 @@ def rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Rig:
 
 def test_kept_zero_applies_only_to_the_same_device(rig: Rig) -> None:
     assert ZeroStore(rig, 'A-1').save(replace_values(rig, ZERO)) == ''
-    back, said, _ = ZeroStore(rig, 'A-1').load(rig)
-    assert 'zero of the last run' in said
+    back, message, _ = ZeroStore(rig, 'A-1').load(rig)
+    assert 'zero of the last run' in message
     assert {name: back.values[name] for name in ZERO} == ZERO
     assert back.psds[0].zero == (1e-4, -2e-4)
     assert ZeroStore(rig, 'B-2').load(rig) == (rig, '', INFO)
@@ -44,18 +44,18 @@ def test_two_serial_numbers_never_share_a_zero(rig: Rig, one: str, other: str) -
 def test_a_zero_file_of_another_device_is_passed_over(tmp_path: Path) -> None:
     named = load_rig(overrides={'zero_file': str(tmp_path / 'zero.json')})
     assert ZeroStore(named, 'A').save(replace_values(named, ZERO)) == ''
-    back, said, level = ZeroStore(named, 'B').load(named)
+    back, message, level = ZeroStore(named, 'B').load(named)
     assert back is named
-    assert 'that of another device' in said
+    assert 'that of another device' in message
     assert level == WARNING
 
 
 def test_a_rig_file_that_says_otherwise_now_holds(rig: Rig) -> None:
     ZeroStore(rig, 'A').save(replace_values(rig, ZERO))
     edited = load_rig(overrides={'psd_1.zero': [5e-4, 0.0]})
-    back, said, level = ZeroStore(edited, 'A').load(edited)
+    back, message, level = ZeroStore(edited, 'A').load(edited)
     assert back is edited
-    assert 'the rig file holds' in said
+    assert 'the rig file holds' in message
     assert level == WARNING
 
 
@@ -83,11 +83,11 @@ def test_a_bad_file_never_stops_a_run(rig: Rig, content: bytes, why: str) -> Non
     store = ZeroStore(rig, 'A')
     store.path.parent.mkdir(parents=True)
     store.path.write_bytes(content)
-    back, said, _ = store.load(rig)
+    back, message, _ = store.load(rig)
     assert back is rig
-    assert f'{store.path}: the kept zero cannot be used (' in said
-    assert why in said
-    assert said.endswith('; the rig file holds')
+    assert f'{store.path}: the kept zero cannot be used (' in message
+    assert why in message
+    assert message.endswith('; the rig file holds')
 
 
 @pytest.mark.parametrize('zero', [[9, 9], 'x', [float('nan'), 0], [0], None, {}, [0, 0, 0], [True, 0]])
@@ -97,10 +97,10 @@ def test_a_kept_zero_is_checked_like_any_parameter(rig: Rig, zero: object) -> No
     kept = json.loads(store.path.read_text())
     assert store.load(rig)[0] is not rig
     store.path.write_text(json.dumps({**kept, 'psd_1.zero': zero}))
-    back, said, _ = store.load(rig)
+    back, message, _ = store.load(rig)
     assert back is rig
-    assert f'{store.path}: the kept zero cannot be used (' in said
-    assert 'psd_1.zero' in said
+    assert f'{store.path}: the kept zero cannot be used (' in message
+    assert 'psd_1.zero' in message
 
 
 def test_unwritable_zero_file_is_reported(tmp_path: Path) -> None:
@@ -116,11 +116,11 @@ def test_a_zero_that_cannot_be_kept_in_the_background_is_said(tmp_path: Path) ->
     (tmp_path / 'file').write_text('')
     rig = load_rig(overrides={'zero_file': str(tmp_path / 'file' / 'zero.json')})
     store = ZeroStore(rig, 'A')
-    said: list[tuple[str, int]] = []
+    logged: list[tuple[str, int]] = []
 
     def say(text: str, level: int = INFO, /) -> None:
-        said.append((text, level))
+        logged.append((text, level))
 
     store.keep(rig, say)
     assert store.join(WAIT_S)
-    assert said == [(store.save(rig), ERROR)]
+    assert logged == [(store.save(rig), ERROR)]

@@ -97,7 +97,7 @@ class _Place:
 
 
 SETTINGS = Section(ChainSettings)
-_JOINT, _LINK, _PLACE = Section(Joint), Section(_LinkEntry), Section(_Place)
+JOINT, LINK, _PLACE = Section(Joint), Section(_LinkEntry), Section(_Place)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,10 +154,10 @@ def read_chain(path: str | Path, given: Mapping[str, object] | None = None, slop
 
 
 def _link(path: Path, number: int, entry: object, given: Mapping[str, object]) -> tuple[ChainLink, Rig, Joint]:
-    read, more = _read(_LINK, entry, f'{path}: link {number}', ('parameters', 'mount', 'joint'))
+    read, more = _read(LINK, entry, f'{path}: link {number}', ('parameters', 'mount', 'joint'))
     where = f'{path}: {read.name}'
     rig = _rig(path, read, more.get('parameters', {}), given)
-    joint, _ = _read(_JOINT, more.get('joint', {}), f'{where}: joint')
+    joint, _ = _read(JOINT, more.get('joint', {}), f'{where}: joint')
     axis = np.array(joint.axis)
     link = ChainLink(
         read.name,

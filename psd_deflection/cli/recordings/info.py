@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from msg_adapters import SAMPLES
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.cli._fleet import (
     ERROR,
     executor_option,
@@ -175,9 +175,7 @@ def _lines_of_origin(found: Mapping[str, Any]) -> list[str]:
         by = f', node {found["node"]}' if found['node'] else ''
         out.append(row('recorded by', f'psd_deflection {found["version"]}{by}'))
     if found['made_with']:
-        told = [
-            f'{name} {printable(found["made_with"][name], 120)}' for name in NAMES[1:] if name in found['made_with']
-        ]
+        told = [f'{name} {sanitize(found["made_with"][name], 120)}' for name in NAMES[1:] if name in found['made_with']]
         out.append(row('computed by', ', '.join(told)))
     if found['device_hello'] is not None:
         hello = {k: ' '.join(map(str, v)) if isinstance(v, list) else v for k, v in found['device_hello'].items()}

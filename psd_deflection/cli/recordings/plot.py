@@ -24,7 +24,7 @@ import numpy as np
 
 from psd_deflection.base.axes import AXES, SHOWN, SHOWN_UNITS, SYMBOLS
 from psd_deflection.base.errors import RecordingError, UsageError
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name, span_options
 from psd_deflection.cli._plot_page import DrawnInputs, plot_page
 from psd_deflection.cli._progress import progress_of, told
@@ -205,7 +205,7 @@ def run(args: argparse.Namespace) -> int:
     """Read, replay, draw."""
     # A name that is no text is shown as far as it is one.
     name, title = (
-        printable(os.fsencode(n).decode(errors='replace'), LONGEST_NAME)
+        sanitize(os.fsencode(n).decode(errors='replace'), LONGEST_NAME)
         for n in (Path(args.recording).resolve().name, args.recording)
     )
     out = Path(args.out) if args.out is not None else default_out(args.recording)
@@ -343,7 +343,7 @@ def draw_recording(drawn: Drawn, spectrum: Spectrum, rig: Rig, name: str) -> Any
         for axes in left[len(_POSE) :]:
             _marks(axes, inputs)
         for mark in inputs.marks[:MOST_WORDS]:
-            words = printable(mark.text, LONGEST_WORDS)
+            words = sanitize(mark.text, LONGEST_WORDS)
             at = inputs.seconds(mark.t_ns)
             where = left[0].get_xaxis_transform()
             left[0].text(at, 0.97, f' {words}', rotation=90, fontsize=7, va='top', transform=where, clip_on=True)

@@ -48,6 +48,7 @@ from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder, picture_name, recording_name
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.cli._values import whole
+from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.recordings.write.sinks import open_reference_file
 
 PREVIEW_S = 1.0
@@ -90,12 +91,13 @@ def _node(args: argparse.Namespace) -> int:
     """The ROS node: it has no IN, but subscribes to images."""
     if args.out is not None or importlib.util.find_spec('rclpy') is None:
         raise UsageError('IN is missing: a video, a folder of images or a device; without IN it is a ROS node')
+    require_ros()
     from psd_deflection.ros.camera import run_camera
 
     settings = read_settings(args.params_file)
     if args.target is not None:
         settings = settings.of_kind(args.target)
-    return run_camera(args.ros_arguments, settings, Display().say)
+    return run_camera(args.ros_arguments, settings, Display().log)
 
 
 def _print_target(args: argparse.Namespace, settings: CameraSettings) -> int:
@@ -159,7 +161,7 @@ def _measure(args: argparse.Namespace, settings: CameraSettings) -> int:
             reasons.add(answer.words)
             sink.put(answer.t_ns, answer.as_record(), answer.words)
             found = [*found[-999:], answer] if answer.status is Status.OK else found
-    _tell(args, settings, reference, reasons, found)
+    _report(args, settings, reference, reasons, found)
     return 0
 
 
@@ -218,7 +220,7 @@ def _answers(
     yield from answers
 
 
-def _tell(
+def _report(
     args: argparse.Namespace,
     settings: CameraSettings,
     reference: CameraReference,

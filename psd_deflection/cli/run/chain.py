@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib.util
 import queue
 import sys
 from collections.abc import Iterator
@@ -27,12 +26,13 @@ from typing import TextIO
 from psd_deflection.arms.chains.chain import SLOPES
 from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.base.axes import SHOWN, SHOWN_UNITS
-from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
+from psd_deflection.base.errors import RecordingError, UsageError
 from psd_deflection.base.files import creating
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder
 from psd_deflection.cli._report import print_json
 from psd_deflection.cli._values import whole
+from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.run.chain import ChainSession, Composed
 from psd_deflection.run.headless import run_until_signal
 
@@ -74,16 +74,13 @@ def run(args: argparse.Namespace) -> int:
     if args.no_ros:
         with display.telling_recorded(), _written(args.out) as stream:
             teller = _Teller(args, display, stream)
-            return run_until_signal(lambda: ChainSession(file, display.say), teller.watch, teller.listen)
-    if importlib.util.find_spec('rclpy') is None:
-        raise ConfigError(
-            "rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`, or run with --no-ros"
-        )
+            return run_until_signal(lambda: ChainSession(file, display.log), teller.watch, teller.listen)
+    require_ros(', or run with --no-ros')
     from psd_deflection.ros.chain import run_chain
 
     with display.telling_recorded():
         teller = _Teller(args, display, None)
-        return run_chain(args.ros_arguments, file, display.say, teller.watch)
+        return run_chain(args.ros_arguments, file, display.log, teller.watch)
 
 
 @contextlib.contextmanager

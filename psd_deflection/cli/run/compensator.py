@@ -18,13 +18,12 @@ docs/compensation.md describes it.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 
 from psd_deflection.arms.compensation.arm import read_arm
 from psd_deflection.arms.compensation.settings import SETTINGS
-from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import of_options, section_options
+from psd_deflection.cli.run._ros import require_ros
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -43,9 +42,8 @@ def run(args: argparse.Namespace) -> int:
     """Run until Ctrl-C; then the offsets go back to zero."""
     settings = of_options(args, SETTINGS)
     arm = None if args.urdf is None else read_arm(args.urdf, args.tip, args.base)
-    if importlib.util.find_spec('rclpy') is None:
-        raise ConfigError("rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`")
+    require_ros()
     from psd_deflection.ros.compensator import DescribedArm, run_compensator
 
     robot = arm or DescribedArm(args.tip, args.base)
-    return run_compensator(args.ros_arguments, robot, settings, Display().say, args.drive)
+    return run_compensator(args.ros_arguments, robot, settings, Display().log, args.drive)

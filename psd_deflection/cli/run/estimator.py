@@ -20,13 +20,13 @@ While it runs:
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from collections.abc import Mapping, Sequence
 
-from psd_deflection.base.errors import ConfigError, UsageError
+from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import DEMO, given_parameters, over_file, parameter_option, refuse_demo
 from psd_deflection.cli._values import given_as_option
+from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.devices.registry import DEVICES, source_names
 from psd_deflection.model.solvers.registry import SOLVERS, check_live
 from psd_deflection.run.headless import run_headless
@@ -95,12 +95,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace, overrides: dict[str, object], display: Display) -> int:
     if args.no_ros:
-        return run_headless(overrides, display.say, display.watch, start_views)
-    if importlib.util.find_spec('rclpy') is None:
-        raise ConfigError(
-            "rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`, "
-            'or run with --no-ros to acquire and record without it'
-        )
+        return run_headless(overrides, display.log, display.watch, start_views)
+    require_ros(', or run with --no-ros to acquire and record without it')
     from psd_deflection.ros import estimator
 
-    return estimator.run(args.ros_arguments, overrides, display.say, display.watch)
+    return estimator.run(args.ros_arguments, overrides, display.log, display.watch)

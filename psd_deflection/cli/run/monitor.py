@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     values = over_file(args.params_file, overrides)
     display = Display()
     with display.telling_recorded(), started_early(simulates(values)):
-        return run_headless(values, display.say, display.watch, start_views)
+        return run_headless(values, display.log, display.watch, start_views)
 
 
 def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
@@ -142,12 +142,12 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     display = Display()
-    foxglove = FoxgloveServer(rig, display.say) if rig.monitor.foxglove else None
+    foxglove = FoxgloveServer(rig, display.log) if rig.monitor.foxglove else None
     feed = Feed() if foxglove is None else FeedBeside(foxglove, rig)
     server: MonitorServer | None = None
 
-    def say(text: str, level: int = INFO, /) -> None:
-        display.say(text, level)
+    def log(text: str, level: int = INFO, /) -> None:
+        display.log(text, level)
         if server is not None:
             server.tell(text, level)
 
@@ -161,16 +161,16 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
         str(args.recording),
         open_steps,
         feed,
-        say,
+        log,
         speed=args.speed,
         loop=args.loop,
         inputs=[*shown_part.loads(), *shown_part.references(), *shown_part.marks()],
         find_span=find_span,
     )
-    server = MonitorServer(shown, feed, rig.monitor, display.say)
+    server = MonitorServer(shown, feed, rig.monitor, display.log)
     server.start()
     if foxglove is not None:
-        display.say(foxglove.words())
+        display.log(foxglove.words())
     try:
         shown.start()
         while not stop.wait(0.1) and shown.failed is None:

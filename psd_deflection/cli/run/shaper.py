@@ -18,12 +18,11 @@ docs/shaping.md describes it.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 
 from psd_deflection.arms.compensation.shaping import SHAPING, trajectory_shaper
-from psd_deflection.base.errors import ConfigError
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import of_options, section_options
+from psd_deflection.cli.run._ros import require_ros
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,8 +37,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.ros_arguments:
         # Before ROS is started; else ROS may have parameters that change it.
         trajectory_shaper(settings)
-    if importlib.util.find_spec('rclpy') is None:
-        raise ConfigError("rclpy is not installed: source your ROS 2, or `pip install 'psd_deflection[ros]'`")
+    require_ros()
     from psd_deflection.ros.shaper import run_shaper
 
-    return run_shaper(args.ros_arguments, settings, Display().say)
+    return run_shaper(args.ros_arguments, settings, Display().log)

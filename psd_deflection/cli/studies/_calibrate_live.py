@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from psd_deflection.base.errors import DaemonError, RecordingError
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.cli._daemon import daemon_of
 from psd_deflection.cli._report import LONGEST_LINE, print_json, show, warn
 from psd_deflection.run.bench_calibration import BenchStep, follow
@@ -142,7 +142,7 @@ class LiveDisplay:
         up = f'\x1b[{self._drawn}A' if self._drawn else ''
         wide = shutil.get_terminal_size().columns - 1
         # A line that the terminal itself wraps would count as one when it is drawn over.
-        lines = [part for one in lines for part in textwrap.wrap(printable(one, LONGEST_LINE), wide) or ['']]
+        lines = [part for one in lines for part in textwrap.wrap(sanitize(one, LONGEST_LINE), wide) or ['']]
         text = '\n'.join(lines)
         sys.stdout.write(f'\r{up}\x1b[J{text}\n')
         sys.stdout.flush()

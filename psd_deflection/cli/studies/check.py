@@ -26,7 +26,7 @@ import sys
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import texts
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.cli._options import (
     given_parameters,
     in_the_world,
@@ -113,7 +113,7 @@ class GuideDisplay:
     def say(self, text: str) -> None:
         """A prompt or a message."""
         clear = '\r\x1b[K' if self._live else ''
-        print(f'{clear}{printable(text, LONGEST_LINE)}', file=self._stream, flush=True)
+        print(f'{clear}{sanitize(text, LONGEST_LINE)}', file=self._stream, flush=True)
 
     def update(self, guide: Guide) -> None:
         """Show how far the dots have moved, and how long the push has been held."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 
 MAX_TEXT = 200
 """Characters of one text. A longer one is cut."""
@@ -39,7 +39,7 @@ def device_words(info: Mapping[str, object]) -> dict[str, object]:
 
     What is harmless already comes back as it is.
     """
-    return {printable(str(key), MAX_TEXT): _harmless(value, 1) for key, value in info.items()}
+    return {sanitize(str(key), MAX_TEXT): _harmless(value, 1) for key, value in info.items()}
 
 
 def _harmless(value: object, depth: int) -> object:
@@ -47,7 +47,7 @@ def _harmless(value: object, depth: int) -> object:
         case None | bool():
             return value
         case str():
-            return printable(value, MAX_TEXT)
+            return sanitize(value, MAX_TEXT)
         case int() if abs(value) <= MAX_WHOLE:
             return value
         case float() if math.isfinite(value):
@@ -55,8 +55,8 @@ def _harmless(value: object, depth: int) -> object:
         case list() | tuple() if depth < MAX_DEPTH:
             return [_harmless(item, depth + 1) for item in value]
         case Mapping() if depth < MAX_DEPTH:
-            return {printable(str(key), MAX_TEXT): _harmless(item, depth + 1) for key, item in value.items()}
+            return {sanitize(str(key), MAX_TEXT): _harmless(item, depth + 1) for key, item in value.items()}
         case int():
             return f'a whole number of {value.bit_length()} bits'
         case _:
-            return printable(repr(value), MAX_TEXT)
+            return sanitize(repr(value), MAX_TEXT)

@@ -17,7 +17,7 @@ import numpy as np
 
 from psd_deflection.base.csv_table import CsvTable
 from psd_deflection.base.errors import RecordingError
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.csv_rows import MAX_SECONDS
 from psd_deflection.recordings.read.readers import open_recording
@@ -115,7 +115,7 @@ def _of_table(table: CsvTable) -> References:
             raise row.refuse(f'has more than {MAX_ROWS} rows')
         word = row.text('status') if 'status' in table.columns else 'ok'
         if word != 'ok':
-            refused[printable(word, LONGEST_STATUS)] += 1
+            refused[sanitize(word, LONGEST_STATUS)] += 1
             continue
         rows.append([row.number(name, MAX_SECONDS) for name in (*wanted, *deviations)])
     if not rows:

@@ -25,7 +25,7 @@ from aiohttp import WSMessage, WSMsgType, web
 from msg_adapters import MESSAGE_TYPES, RIG, TOPIC_TYPES
 from psd_deflection import __version__
 from psd_deflection.base.bounds import MESSAGE_BYTES, ByteBudget
-from psd_deflection.base.log import Say, unsaid
+from psd_deflection.base.log import LogCallback, null_log
 from psd_deflection.recordings.provenance import provenance
 from psd_deflection.records import ParameterChange, Record, RigState, SpotMeans
 from psd_deflection.rig.config import Rig
@@ -78,14 +78,14 @@ class _Viewer:
 class FoxgloveServer(GatedServer):
     """A wire of the fan-out. Serves from construction on; ``address``: its WebSocket URL.
 
-    ``say`` gets what is out of the ordinary. Raises ConfigError if the address cannot be served on.
+    ``log`` gets what is out of the ordinary. Raises ConfigError if the address cannot be served on.
     """
 
     websocket_path = '/'
 
-    def __init__(self, rig: Rig, say: Say = unsaid) -> None:
+    def __init__(self, rig: Rig, log: LogCallback = null_log) -> None:
         config = rig.monitor
-        super().__init__('foxglove', config.foxglove_address, config.foxglove_port, say, config.foxglove_origins)
+        super().__init__('foxglove', config.foxglove_address, config.foxglove_port, log, config.foxglove_origins)
         # A viewer forgets what it has of another one.
         self._session = secrets.token_hex(8)
         self._lock = threading.Lock()
@@ -206,11 +206,11 @@ class FeedBeside(Feed):
         super().put(record)
         self._fanout.put(record)
         if isinstance(record, ParameterChange):
-            self._tell(record.t_ns, record.block, dict(record.values))
+            self._report(record.t_ns, record.block, dict(record.values))
         elif isinstance(record, SpotMeans) and not self._told:
-            self._tell(record.t_ns, record.index, {})
+            self._report(record.t_ns, record.index, {})
 
-    def _tell(self, t_ns: int, block: int, changed: dict[str, object]) -> None:
+    def _report(self, t_ns: int, block: int, changed: dict[str, object]) -> None:
         self._told = True
         self._present |= changed
         self._fanout.put(RigState(t_ns, block, self._present, None, changed, __version__, provenance()))

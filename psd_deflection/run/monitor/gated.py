@@ -24,7 +24,7 @@ from typing import Any
 from aiohttp import WSCloseCode, WSMessage, WSMsgType, web
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.log import ERROR, WARNING, Say
+from psd_deflection.base.log import ERROR, WARNING, LogCallback
 from psd_deflection.run.monitor import access
 
 VIEWERS = 16
@@ -58,8 +58,8 @@ class GatedServer(abc.ABC):
 
     websocket_path = '/ws'
 
-    def __init__(self, name: str, address: str, port: int, say: Say, origins: tuple[str, ...] = ()) -> None:
-        self.name, self.say = name, say
+    def __init__(self, name: str, address: str, port: int, log: LogCallback, origins: tuple[str, ...] = ()) -> None:
+        self.name, self.log = name, log
         self.viewers: dict[web.WebSocketResponse, asyncio.Event] = {}
         self._address, self._port = address, port
         self._origins = frozenset(origin.lower().rstrip('/') for origin in origins)
@@ -131,7 +131,7 @@ class GatedServer(abc.ABC):
             if not self._started.done():
                 self._started.set_exception(error)
             else:
-                self.say(f'{self.name}: ended: {type(error).__name__}: {error}', ERROR)
+                self.log(f'{self.name}: ended: {type(error).__name__}: {error}', ERROR)
 
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
@@ -175,7 +175,7 @@ class GatedServer(abc.ABC):
                 if error.errno != errno.EADDRINUSE:
                     raise
                 # An unusual address is better than no view.
-                self.say(f'{self.name}: port {port} is in use (by another daemon?); taking a free one', WARNING)
+                self.log(f'{self.name}: port {port} is in use (by another daemon?); taking a free one', WARNING)
                 await web.TCPSite(runner, address, 0).start()
         except (OSError, UnicodeError) as error:
             reason = error.strerror or str(error) if isinstance(error, OSError) else str(error)
@@ -220,5 +220,5 @@ class GatedServer(abc.ABC):
         except (web.HTTPException, ConnectionError):
             raise
         except Exception as error:
-            self.say(f'{self.name}: {request.path!r}: {type(error).__name__}: {error}', ERROR)
+            self.log(f'{self.name}: {request.path!r}: {type(error).__name__}: {error}', ERROR)
             return web.Response(status=500, text='this should not have happened; the daemon has said what')

@@ -114,14 +114,14 @@ class Kept(NamedTuple):
     marks: list[tuple[int, str]] | None
 
 
-class _Ring:
+class Ring:
     """The newest cells of one width: cell ``key`` covers ``key * width_ns`` to ``(key + 1) * width_ns``."""
 
     def __init__(self, width_s: int, length: int, kind: np.dtype[np.void]) -> None:
         self.width_ns = width_s * 1_000_000_000
         self.length = length
         # Written once, so that the memory is there from the start.
-        self.cells: Cells = np.full(length, _empty(kind), kind)
+        self.cells: Cells = np.full(length, empty_cell(kind), kind)
 
     def merge(self, cell: np.void, t_ns: int) -> None:
         """Add ``cell`` to the one in whose time ``t_ns`` is."""
@@ -179,10 +179,10 @@ class History:
     def __init__(self, psds: int, block_size: int, levels: tuple[tuple[int, int], ...] = LEVELS) -> None:
         self.names = (*_POSE, *(f'sum{n}' for n in range(1, psds + 1)))
         self._block_size = block_size
-        self._kind = _kind(len(self.names))
-        self._rings = [_Ring(width_s, length, self._kind) for width_s, length in levels]
-        self._marks: deque[tuple[int, str]] = deque(maxlen=MOST_MARKS)
-        self._empty = _empty(self._kind)
+        self._kind = cell_kind(len(self.names))
+        self.rings = [Ring(width_s, length, self._kind) for width_s, length in levels]
+        self.marks: deque[tuple[int, str]] = deque(maxlen=MOST_MARKS)
+        self._empty = empty_cell(self._kind)
         self._unsaved_from = 0
         self._new_marks = True
         self._second: int | None = None
@@ -196,7 +196,7 @@ class History:
     @property
     def kept_length(self) -> int:
         """So many cells of the kept level reach as far back as the coarsest level."""
-        kept, last = self._rings[KEPT_LEVEL], self._rings[-1]
+        kept, last = self.rings[KEPT_LEVEL], self.rings[-1]
         return last.length * (last.width_ns // kept.width_ns)
 
     def unsaved(self, since_key: int | None = None) -> Kept:
@@ -205,7 +205,7 @@ class History:
         ``since_key``: where one began that was not kept after all.
         """
         self._close()
-        ring, since = self._rings[KEPT_LEVEL], self._unsaved_from
+        ring, since = self.rings[KEPT_LEVEL], self._unsaved_from
         since = since if since_key is None else min(since, since_key)
         # What the ring has lost since then holds as it was kept.
         since = max(since, ring.newest + 1 - ring.length)
@@ -213,25 +213,25 @@ class History:
         if len(cells):
             # More blocks may come in the last one.
             self._unsaved_from = int(cells['key'][-1])
-        marks = list(self._marks) if self._new_marks or since_key is not None else None
+        marks = list(self.marks) if self._new_marks or since_key is not None else None
         self._new_marks = False
         return Kept(since, cells, marks)
 
     def restore(self, kept: Kept) -> None:
         """Take what an earlier run kept: it is before what has come since, or in the same cell."""
-        own = self._rings[KEPT_LEVEL].cells['key']
+        own = self.rings[KEPT_LEVEL].cells['key']
         ends = [int(keys.min()) for keys in (own[own != _NONE], kept.cells['key'][-1:]) if len(keys)]
         self._unsaved_from = min(ends, default=0)
-        for ring in self._rings[KEPT_LEVEL:]:
-            ring.put(_merged(kept.cells, ring.width_ns // self._rings[KEPT_LEVEL].width_ns))
-        marks = sorted({*(kept.marks or ()), *self._marks}, key=lambda mark: mark[0])
-        self._marks.clear()
-        self._marks.extend(marks)
+        for ring in self.rings[KEPT_LEVEL:]:
+            ring.put(_merged(kept.cells, ring.width_ns // self.rings[KEPT_LEVEL].width_ns))
+        marks = sorted({*(kept.marks or ()), *self.marks}, key=lambda mark: mark[0])
+        self.marks.clear()
+        self.marks.extend(marks)
 
     @property
     def bytes(self) -> int:
         """Memory of the cells."""
-        return sum(ring.cells.nbytes for ring in self._rings)
+        return sum(ring.cells.nbytes for ring in self.rings)
 
     def add(self, result: BlockResult) -> None:
         """Take one more block."""
@@ -254,13 +254,13 @@ class History:
     def mark(self, t_ns: int, text: str) -> None:
         """Keep a mark: its time and what the page gets of it, JSON."""
         self._new_marks = True
-        self._marks.append((t_ns, text))
+        self.marks.append((t_ns, text))
 
     def window(self, wanted: Asked) -> Window:
         """What is known of a window, in as few cells as ``wanted.points``; empty times at its ends are left out."""
         self._close()
         need_ns = -((wanted.from_ns - wanted.to_ns) // wanted.points)
-        ring = self._ring(wanted.from_ns, need_ns)
+        ring = self.ring_for(wanted.from_ns, need_ns)
         merged = max(1, -(-need_ns // ring.width_ns))
         width_ns = merged * ring.width_ns
         first, last = wanted.from_ns // width_ns, -(-wanted.to_ns // width_ns)
@@ -273,7 +273,7 @@ class History:
 
     def answer(self, wanted: Asked) -> str:
         """:meth:`window` with the marks in it, as JSON."""
-        inside = [text for t_ns, text in self._marks if wanted.from_ns <= t_ns <= wanted.to_ns]
+        inside = [text for t_ns, text in self.marks if wanted.from_ns <= t_ns <= wanted.to_ns]
         left_out = max(len(inside) - SENT_MARKS, 0)
         content = json.dumps({**self.window(wanted).content(), 'marks_left_out': left_out})
         return f'{content[:-1]}, "marks": [{",".join(inside[left_out:])}]}}'
@@ -299,13 +299,13 @@ class History:
         out['lost'] = placed(cells['lost'], 0.0)
         return out
 
-    def _ring(self, from_ns: int, need_ns: int) -> _Ring:
+    def ring_for(self, from_ns: int, need_ns: int) -> Ring:
         """The coarsest level that is fine enough, or a coarser one if that does not reach back to ``from_ns``."""
-        fine = [ring for ring in self._rings if ring.width_ns <= need_ns] or self._rings[:1]
-        for ring in self._rings[len(fine) - 1 : -1]:
+        fine = [ring for ring in self.rings if ring.width_ns <= need_ns] or self.rings[:1]
+        for ring in self.rings[len(fine) - 1 : -1]:
             if from_ns // ring.width_ns > ring.newest - ring.length:
                 return ring
-        return self._rings[-1]
+        return self.rings[-1]
 
     def _start_second(self, second: int | None) -> None:
         self._second = second
@@ -322,14 +322,14 @@ class History:
             if values:
                 cell['count'][i], cell['total'][i] = len(values), math.fsum(values)
                 cell['least'][i], cell['greatest'][i] = min(values), max(values)
-        for ring in self._rings:
+        for ring in self.rings:
             ring.merge(cell, self._second * 1_000_000_000)
         self._start_second(self._second)
 
     def _go_back(self, t_ns: int) -> None:
         """Forget what lies from the second of ``t_ns`` on."""
-        finest, *coarser = self._rings
-        self._unsaved_from = min(self._unsaved_from, t_ns // self._rings[KEPT_LEVEL].width_ns)
+        finest, *coarser = self.rings
+        self._unsaved_from = min(self._unsaved_from, t_ns // self.rings[KEPT_LEVEL].width_ns)
         finest.forget(t_ns // finest.width_ns)
         for ring in coarser:
             key = t_ns // ring.width_ns
@@ -338,10 +338,10 @@ class History:
             scale = ring.width_ns // finest.width_ns
             for cell in finest.between(key * scale, (key + 1) * scale):
                 ring.merge(cell, int(cell['key']) * finest.width_ns)
-        kept = [mark for mark in self._marks if mark[0] < t_ns]
+        kept = [mark for mark in self.marks if mark[0] < t_ns]
         self._new_marks = True
-        self._marks.clear()
-        self._marks.extend(kept)
+        self.marks.clear()
+        self.marks.extend(kept)
 
 
 def _merged(cells: Cells, scale: int) -> Cells:
@@ -359,14 +359,15 @@ def _merged(cells: Cells, scale: int) -> Cells:
     return out
 
 
-def _kind(channels: int) -> np.dtype[np.void]:
+def cell_kind(channels: int) -> np.dtype[np.void]:
     """A cell: ``count``, ``total`` and so on have a place for each quantity."""
     many = (channels,)
     fields: list[Any] = [('key', 'i8'), ('blocks', 'i4'), ('lost', 'i8'), ('count', 'i4', many)]
     return np.dtype([*fields, ('total', 'f8', many), ('least', 'f4', many), ('greatest', 'f4', many)])
 
 
-def _empty(kind: np.dtype[np.void]) -> np.void:
+def empty_cell(kind: np.dtype[np.void]) -> np.void:
+    """A cell of this kind without a block."""
     cell: np.void = np.zeros(1, kind)[0]
     cell['key'], cell['least'], cell['greatest'] = _NONE, np.inf, -np.inf
     return cell

@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from psd_deflection.base.log import WARNING, Say
+from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.run.monitor.history import KEPT_LEVEL, LEVELS, MOST_MARKS, History, Kept
 
 VERSION = 1
@@ -106,13 +106,13 @@ class HistoryFile:
 
 
 class HistoryKeeper:
-    """Keeps ``history`` in the file ``path``. ``say`` gets a line if that fails.
+    """Keeps ``history`` in the file ``path``. ``log`` gets a line if that fails.
 
     One thread calls the methods; the file is touched by the keeper's own thread alone.
     """
 
-    def __init__(self, path: Path, history: History, say: Say) -> None:
-        self._path, self._history, self._say = path, history, say
+    def __init__(self, path: Path, history: History, log: LogCallback) -> None:
+        self._path, self._history, self._log = path, history, log
         self._shape = (history.kind, history.names, history.kept_length)
         self._todo: queue.Queue[Kept | None] = queue.Queue(maxsize=1)
         self._loaded: Kept | None = None
@@ -134,15 +134,25 @@ class HistoryKeeper:
 
     def save(self) -> None:
         """Save what is new, unless the disk still has to do with the last time."""
-        if self._restored and self._idle.is_set():
+        if self._restored and self.idle:
             self._idle.clear()
             kept, self._failed_from = self._history.unsaved(self._failed_from), None
             self._todo.put_nowait(kept)
 
+    @property
+    def idle(self) -> bool:
+        """Whether nothing waits to be written."""
+        return self._idle.is_set()
+
+    @property
+    def alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
     def end(self) -> None:
         """Save what is new, and end; a disk that hangs is not waited for longer than ``END_S``."""
         until = time.monotonic() + END_S
-        if not self._thread.is_alive() or not self._idle.wait(END_S):
+        if not self.alive or not self._idle.wait(END_S):
             return
         self.restore()
         self.save()
@@ -177,7 +187,7 @@ class HistoryKeeper:
         except sqlite3.DatabaseError as error:
             aside = self._path.with_name(self._path.name + ASIDE)
             self._path.replace(aside)
-            self._say(f'{self._path}: the kept history cannot be read ({error}); it is {aside.name} now', WARNING)
+            self._log(f'{self._path}: the kept history cannot be read ({error}); it is {aside.name} now', WARNING)
             return self._read()
 
     def _read(self) -> tuple[HistoryFile, Kept]:
@@ -192,7 +202,7 @@ class HistoryKeeper:
     def _fail(self, error: Exception) -> None:
         if not self._told:
             self._told = True
-            self._say(f'{self._path}: the history of the page cannot be kept ({error})', WARNING)
+            self._log(f'{self._path}: the history of the page cannot be kept ({error})', WARNING)
 
 
 def _is_mark(text: object) -> bool:

@@ -25,7 +25,7 @@ from aiohttp import web
 
 from psd_deflection import __version__
 from psd_deflection.base import page_files
-from psd_deflection.base.log import INFO, Say
+from psd_deflection.base.log import INFO, LogCallback
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import (
     AppliedLoad,
@@ -86,10 +86,10 @@ HEADERS = {
 
 
 class MonitorServer(GatedServer):
-    """Serves ``shown``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``say`` gets the address as a line."""
+    """Serves ``shown``, fed by ``feed``, from :meth:`start` to :meth:`close`. ``log`` gets the address as a line."""
 
-    def __init__(self, shown: Shown, feed: Feed, config: MonitorConfig, say: Say) -> None:
-        super().__init__('monitor', config.address, config.port, say)
+    def __init__(self, shown: Shown, feed: Feed, config: MonitorConfig, log: LogCallback) -> None:
+        super().__init__('monitor', config.address, config.port, log)
         self.token = ''
         self.url = ''
         self._shown = shown
@@ -111,7 +111,7 @@ class MonitorServer(GatedServer):
         self._alarm: Alarm | None = None
         self._history = History(len(shown.rig.psds), shown.rig.estimator.block_size)
         kept_in = shown.history_file() if config.history else None
-        self._keeper = None if kept_in is None else HistoryKeeper(kept_in, self._history, say)
+        self._keeper = None if kept_in is None else HistoryKeeper(kept_in, self._history, log)
         self._calibration = PageCalibration()
         self._messages: deque[tuple[int, float, str]] = deque(maxlen=MESSAGES)
         self._message_count = 0
@@ -133,7 +133,7 @@ class MonitorServer(GatedServer):
             self._keeper.start()
         self.url = f'http:{self.start_thread()}/'
         self._announced = announce(Served(self.url, self.token, str(self._shown.describe()['name']), os.getpid()))
-        self.say(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
+        self.log(f'monitor: {self.url}' + (f'#token={self.token}' if self.token else ''))
         return self.url
 
     def close(self) -> None:
@@ -460,7 +460,7 @@ class MonitorServer(GatedServer):
             return _answer(409, str(error))
         if name:
             # What came of it is told by the run itself.
-            self.say(f'monitor: {name} was asked for by {request.remote}')
+            self.log(f'monitor: {name} was asked for by {request.remote}')
         if self.viewers:
             self._take_health()
         return _answer(200, text)

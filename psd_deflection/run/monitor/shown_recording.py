@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from psd_deflection.base.errors import PsdDeflectionError
-from psd_deflection.base.log import Say
+from psd_deflection.base.log import LogCallback
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import (
     RESTART,
@@ -68,7 +68,7 @@ class ShownRecording:
         name: str,
         open_steps: Callable[[], tuple[Pipeline, Iterator[list[Record]]]],
         feed: Feed,
-        say: Say,
+        log: LogCallback,
         *,
         speed: float = 1.0,
         loop: bool = False,
@@ -79,7 +79,7 @@ class ShownRecording:
         self._name = name
         self._open = open_steps
         self._feed = feed
-        self._say = say
+        self._log = log
         self._speed = speed
         self._loop = loop
         self._inputs = sorted(inputs, key=lambda r: r.t_ns)
@@ -252,7 +252,7 @@ class ShownRecording:
             raise RefusedError(f'not zeroed: {why_no_zero(self._pipeline)}')
         self._feed.put(change)
         text = zero_text(self._pipeline.rig)
-        self._say(text)
+        self._log(text)
         return text
 
     def _look_for_span(self, find: Callable[[], tuple[int, int]]) -> None:
@@ -281,12 +281,12 @@ class ShownRecording:
             self._ended = True
             if not isinstance(error, PsdDeflectionError):
                 raise
-            self._say(str(error), ERROR)
+            self._log(str(error), ERROR)
 
     def _wait_at_the_end(self) -> None:
         self._ended = True
         if not self._stop.is_set():
-            self._say(f'{self._name}: end of the recording')
+            self._log(f'{self._name}: end of the recording')
         while not self._stop.is_set() and not self._again:
             self._woken.wait()
             self._woken.clear()

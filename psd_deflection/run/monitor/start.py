@@ -7,7 +7,7 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING
 
-from psd_deflection.base.log import Say
+from psd_deflection.base.log import LogCallback
 from psd_deflection.run.diagnostics import HealthReporter
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.monitor.feed import Feed
@@ -34,31 +34,31 @@ class Views:
             part.close()
 
 
-def start_views(session: Session, say: Say, *, reports: bool = True) -> Views:
+def start_views(session: Session, log: LogCallback, *, reports: bool = True) -> Views:
     """Serve ``session`` as its parameters ``monitor`` and ``foxglove`` say. They add sinks and wires to the session.
 
-    ``say`` gets each address as a line. ``reports``: whether Foxglove needs reports of the run's health; False if
+    ``log`` gets each address as a line. ``reports``: whether Foxglove needs reports of the run's health; False if
     somebody puts them to the session's fan-out. Raises ConfigError if something cannot be served.
     """
     views = Views()
     try:
         if session.rig.monitor.enabled:
-            views.parts.append(_start_page(session, say))
+            views.parts.append(_start_page(session, log))
         if session.rig.monitor.foxglove:
-            _start_foxglove(session, say, views, reports)
+            _start_foxglove(session, log, views, reports)
     except BaseException:
         views.close()
         raise
     return views
 
 
-def _start_page(session: Session, say: Say) -> MonitorServer:
+def _start_page(session: Session, log: LogCallback) -> MonitorServer:
     need_server()
     # Imported here: only the page needs aiohttp.
     from psd_deflection.run.monitor.server import MonitorServer
 
     feed = Feed()
-    server = MonitorServer(ShownSession(session), feed, session.rig.monitor, say)
+    server = MonitorServer(ShownSession(session), feed, session.rig.monitor, log)
     server.start()
     # After publishing and recording.
     session.processing.sinks.append(feed)
@@ -67,20 +67,20 @@ def _start_page(session: Session, say: Say) -> MonitorServer:
     return server
 
 
-def _start_foxglove(session: Session, say: Say, views: Views, reports: bool) -> None:
+def _start_foxglove(session: Session, log: LogCallback, views: Views, reports: bool) -> None:
     need_server()
     # Imported here, as the page.
     from psd_deflection.run.monitor.foxglove import FoxgloveServer
 
-    server = FoxgloveServer(session.rig, say)
+    server = FoxgloveServer(session.rig, log)
     views.parts.append(server)
-    say(server.words())
+    log(server.words())
     fanout = Fanout(session.rig.monitor.frame_prefix)
     fanout.wires.append(server)
     rig_told = RigPublisher(server, session)
     rig_told.tell()
     session.fanout.wires.append(server)
-    session.fanout.change_wires.append(rig_told)
+    session.fanout.change_sinks.append(rig_told)
     session.input_sinks.append(fanout)
     if reports:
         views.parts.append(Reports(session, fanout))

@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.base.log import ERROR, INFO, WARNING, Say
+from psd_deflection.base.log import ERROR, INFO, WARNING, LogCallback
 from psd_deflection.base.sequence import SequenceExtender, Step
 from psd_deflection.devices.protocol.frames import BadFrame, BadReason, HelloFrame, PongFrame, SampleFrame, StatusFrame
 from psd_deflection.devices.registry import make_source
@@ -38,13 +38,13 @@ from psd_deflection.records import (
 )
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.behind import SLOW
-from psd_deflection.run.reading.arrivals import Arrival, Ended, Gathered, Item, Noted, Restarted
+from psd_deflection.run.reading.arrivals import Arrival, Ended, ItemQueue, Noted, Restarted, SampleBuffer
 from psd_deflection.run.reading.clock_watch import ClockWatch
 from psd_deflection.run.reading.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
 from psd_deflection.run.reading.pinger import Pinger
 from psd_deflection.run.realtime import prefer_reader
-from psd_deflection.run.repeats import Repeats
+from psd_deflection.run.repeats import RateLimitedLog
 
 SILENCE_S = 2.0
 """A device that sends no sample for this long is reported, and asked for samples again."""
@@ -74,7 +74,7 @@ reading a sample. The kernel holds 4096 bytes for us."""
 
 
 class Acquisition:
-    """Reads one device until stopped. ``say`` gets one line for every change of state.
+    """Reads one device until stopped. ``log`` gets one line for every change of state.
 
     For every thread: ``source``, ``counters``, ``hello``, ``queue``, ``to_ros_ns``. ``why_full``:
     asked why the queue is full, by the reader thread. Of the reader thread: ``beat`` (monotonic
@@ -82,10 +82,10 @@ class Acquisition:
     names an unknown source.
     """
 
-    def __init__(self, rig: Rig, say: Say) -> None:
+    def __init__(self, rig: Rig, log: LogCallback) -> None:
         self.source: Source = make_source(rig)
         self.counters = AcquisitionCounters()
-        self.queue: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self.queue = ItemQueue()
         self.why_full: Callable[[], str] = lambda: SLOW
         # Monotonic time is mapped to ROS time by one constant: a step of the wall clock while
         # running must not tear the stamps apart.
@@ -96,8 +96,8 @@ class Acquisition:
         # Values from the rig.
         self._rig = rig
         self._name = self.source.name
-        self._say = say
-        self._repeats = Repeats(say)
+        self._log = log
+        self._limited_log = RateLimitedLog(log)
         self._gate = HelloGate(rig)
         self._block_size = rig.estimator.block_size
         self._period_us = 1e6 / rig.converter.sample_rate_hz
@@ -112,7 +112,7 @@ class Acquisition:
 
         # The stream: the first number that is taken, the last one that was, the last stamp that was
         # given, ns.
-        self._gathered = Gathered()
+        self._buffer = SampleBuffer()
         self._first_number = 0
         self._last_number = -1
         self._last_t_ns = 0
@@ -171,7 +171,7 @@ class Acquisition:
                 self.source.give_up()
                 self._thread.join(READ_TIMEOUT_S)
             else:
-                self._say(f'{self._name}: the source hangs; it is not waited for', WARNING)
+                self._log(f'{self._name}: the source hangs; it is not waited for', WARNING)
                 self.queue.put(Ended())
                 return
         self.source.close()
@@ -181,7 +181,7 @@ class Acquisition:
         samples = 0
         with contextlib.suppress(queue.Empty):
             while True:
-                item = self.queue.get_nowait()
+                item = self.queue.get()
                 samples += len(item.raw.seq) if isinstance(item, Arrival) else 0
         self.queue.put(Ended())
         self.counters.abandoned += samples
@@ -215,7 +215,7 @@ class Acquisition:
 
     def _run(self) -> None:
         if self._rig.acquisition.realtime:
-            self._say(prefer_reader())
+            self._log(prefer_reader())
         # Locking the memory takes its time: only what comes after it is as old as it looks.
         if self._connected:
             try:
@@ -228,7 +228,7 @@ class Acquisition:
         try:
             while not self._stop.is_set():
                 self.beat = time.monotonic()
-                self._repeats.settle(self.beat)
+                self._limited_log.settle(self.beat)
                 if not self._connected:
                     if not self._stop.wait(RETRY_S):
                         self._reopen()
@@ -241,8 +241,8 @@ class Acquisition:
                         if self.feed(events, now):
                             silent_since = now / 1e9
                             self._gather()
-                    elif self._gathered.seq:
-                        self._hand_over(now)
+                    elif self._buffer.seq:
+                        self._enqueue(now)
                     if now / 1e9 - silent_since > SILENCE_S:
                         silent_since = now / 1e9
                         self._silent(size, now)
@@ -251,13 +251,13 @@ class Acquisition:
                 except DeviceError as error:
                     self._disconnected(error)
                 except SourceEndedError as end:
-                    self._say(f'{self._name}: {end}')
+                    self._log(f'{self._name}: {end}')
                     break
         except BaseException as error:
             self.failed = error
             raise
         finally:
-            self._hand_over(time.monotonic_ns())
+            self._enqueue(time.monotonic_ns())
             self.queue.put(Ended())
 
     def _gather(self) -> None:
@@ -284,7 +284,9 @@ class Acquisition:
             most = max(new, key=lambda reason: new[reason], default='')
             why = f'{new[most]} bad frames: {most}' if most and new[most] else 'is the baud rate right?'
             what = f'bytes but no sample ({why})'
-        self._repeats.tell('silent', f'{self._name}: {what} for {SILENCE_S:g} s; still listening', WARNING, now / 1e9)
+        self._limited_log.log(
+            'silent', f'{self._name}: {what} for {SILENCE_S:g} s; still listening', WARNING, now / 1e9
+        )
         # It may have been stopped, by itself or by another program.
         self.source.wake()
 
@@ -293,12 +295,12 @@ class Acquisition:
             # Given up by us.
             return
         self.counters.disconnects += 1
-        self._hand_over(time.monotonic_ns())
+        self._enqueue(time.monotonic_ns())
         self.source.close()
         self._connected = False
         self._was_away = True
         self._refusal = ''
-        self._repeats.tell('away', f'{error}; waiting for it to come back', ERROR, time.monotonic(), NEWS)
+        self._limited_log.log('away', f'{error}; waiting for it to come back', ERROR, time.monotonic(), NEWS)
 
     def _reopen(self) -> None:
         try:
@@ -315,14 +317,14 @@ class Acquisition:
             # line.
             if 'no such port' not in refusal and refusal != self._refusal:
                 self._refusal = refusal
-                self._repeats.tell('refused', f'{refusal}; still trying', WARNING, time.monotonic(), NEWS)
+                self._limited_log.log('refused', f'{refusal}; still trying', WARNING, time.monotonic(), NEWS)
             return
         self._connected = True
         self._name = self.source.name
         self._bad_since_sample = 0
         if not self.source.numbered:
             self._restarted(self._sequence.restart())
-        self._repeats.tell('back', f'{self._name}: the device is back', INFO, time.monotonic(), NEWS)
+        self._limited_log.log('back', f'{self._name}: the device is back', INFO, time.monotonic(), NEWS)
 
     def feed(self, events: Sequence[Event], now: int) -> bool:
         """Sort the frames of one read at ``now`` (CLOCK_MONOTONIC, ns); True if one was a sample.
@@ -349,20 +351,20 @@ class Acquisition:
                     continue
                 if flags & FLAG_DEVICE_DROPPED:
                     counters.device_dropped += 1
-                waiting = self._gathered.seq
+                waiting = self._buffer.seq
                 self._last_number = number
                 if self._clock.torn(number, t):
                     # Samples from before the clock jumped are stamped by the map that was valid
                     # then.
-                    self._hand_over(now)
+                    self._enqueue(now)
                     if self._clock.observe(seq, t, now):
                         self._jumped(now)
                     self._note_step(now)
                 elif self._clock.lags(number, t, now):
-                    self._hand_over(now)
+                    self._enqueue(now)
                     self._clock.lay_anew(number, seq, t, now)
                     self.counters.clock_jumps += 1
-                    self._repeats.tell(
+                    self._limited_log.log(
                         'lag',
                         f"{self._name}: the device's clock stands still, or falls behind its sample numbers; "
                         'the time map starts again',
@@ -371,14 +373,14 @@ class Acquisition:
                         NEWS,
                     )
                 elif step_us := self._clock.stepped(number, t):
-                    self._hand_over(now)
+                    self._enqueue(now)
                     self._stepped(step_us, now)
                 elif waiting and number // self._block_size != waiting[0] // self._block_size:
-                    self._hand_over(now)
-                self._gathered.add(number, t, readings, flags)
+                    self._enqueue(now)
+                self._buffer.add(number, t, readings, flags)
                 counters.samples += 1
                 if number % self._block_size == self._block_size - 1:
-                    self._hand_over(now)
+                    self._enqueue(now)
             elif type(frame) is BadFrame:
                 reason = str(frame.reason)
                 counters.bad_frames.add(reason)
@@ -389,14 +391,14 @@ class Acquisition:
 
     def _jumped(self, now: int) -> None:
         self.counters.clock_jumps += 1
-        self._repeats.tell(
+        self._limited_log.log(
             'jump', f"{self._name}: the device's clock jumped; the time map starts again", WARNING, now / 1e9, NEWS
         )
 
     def _stepped(self, step_us: int, now: int) -> None:
         self.counters.clock_jumps += 1
         text = f"{self._name}: the device's clock jumped by {step_us / 1e3:+.1f} ms; the time map follows"
-        self._repeats.tell('jump', text, WARNING, now / 1e9, NEWS)
+        self._limited_log.log('jump', text, WARNING, now / 1e9, NEWS)
         self._note_step(now)
 
     def _note_step(self, now: int) -> None:
@@ -407,7 +409,7 @@ class Acquisition:
         self.counters.map_steps += 1
         off = f'{abs(step_ns) / 1e6:.1f} ms too {"late" if step_ns < 0 else "early"}'
         text = f'{self._name}: samples were stamped {off} (the line or the clock): the time map steps'
-        self._repeats.tell('step', text, WARNING, now / 1e9, NEWS)
+        self._limited_log.log('step', text, WARNING, now / 1e9, NEWS)
         self._record(CLOCK_STEP, step_ns / 1e9, self.counters.map_steps)
 
     def _record(self, name: str, value: float, count: int) -> None:
@@ -425,7 +427,7 @@ class Acquisition:
         self.counters.squeezed += count
         self._squeezes += 1
         text = f'{self._name}: {count} samples have stamps 1 ns apart, so that time does not go back'
-        self._repeats.tell('squeezed', text, WARNING, now / 1e9, NEWS)
+        self._limited_log.log('squeezed', text, WARNING, now / 1e9, NEWS)
         self._record(CLOCK_SQUEEZED, float(count), self._squeezes)
 
     def _unusual(self, number: int, step: Step, missing: int, flags: int, now: int) -> bool:
@@ -446,13 +448,13 @@ class Acquisition:
             self.counters.count_lost(missing, cause)
         elif step is Step.RESTART:
             self._restarted(number)
-            self._repeats.tell('restart', f'{self._name}: the device started anew', WARNING, now / 1e9, NEWS)
+            self._limited_log.log('restart', f'{self._name}: the device started anew', WARNING, now / 1e9, NEWS)
         return True
 
     def _restarted(self, number: int | None) -> None:
         """``number``: of the next sample."""
         self.counters.restarts += 1
-        self._hand_over(time.monotonic_ns())
+        self._enqueue(time.monotonic_ns())
         change = None
         if number is not None and self._last_number >= 0 and self.counters.restarts <= RECORDED_RESTARTS:
             values = ((RESTART, (self._last_number, number)),)
@@ -470,20 +472,20 @@ class Acquisition:
             if frame.temperature_centi is not None:
                 self.counters.temperature = frame.temperature_centi / 100.0
         elif isinstance(frame, Notice):
-            self._repeats.tell('notice', f'{self._name}: {frame.text}', WARNING, now / 1e9, NEWS)
+            self._limited_log.log('notice', f'{self._name}: {frame.text}', WARNING, now / 1e9, NEWS)
         elif isinstance(frame, HelloFrame) and frame != self.hello:
             try:
                 self._gate.take(frame, self._name, volts=self.source.volts)
             except AnotherDeviceError:
                 raise
             except DeviceError as error:
-                self._repeats.tell('hello', f'{error}; kept to the first HELLO', WARNING, now / 1e9)
+                self._limited_log.log('hello', f'{error}; kept to the first HELLO', WARNING, now / 1e9)
 
-    def _hand_over(self, now: int) -> None:
-        gathered = self._gathered
+    def _enqueue(self, now: int) -> None:
+        gathered = self._buffer
         if not gathered.seq:
             return
-        self._gathered = Gathered()
+        self._buffer = SampleBuffer()
         t_ns = self._ros_time_ns(np.array(gathered.t, np.int64))
         # A restarted clock map may give times before the last stamp: time must not go back.
         squeezed = 0
@@ -493,10 +495,10 @@ class Acquisition:
             squeezed, t_ns = int((raised > t_ns).sum()), raised
         self._note_squeezed(squeezed, now)
         self._last_t_ns = int(t_ns[-1])
-        if self.queue.qsize() >= self._rig.acquisition.queue_blocks:
+        if self.queue.blocks >= self._rig.acquisition.queue_blocks:
             self.counters.queue_dropped += len(gathered.seq)
             self.counters.dropped_why = self.why_full()
-            self._repeats.tell(
+            self._limited_log.log(
                 'full',
                 f'{self.counters.dropped_why}: {self.counters.queue_dropped} samples dropped here so far '
                 f'({self._rig.acquisition.queue_blocks} blocks wait, queue_blocks)',

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import queue
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -46,8 +47,43 @@ class Ended:
 Item = Arrival | Restarted | Noted | Ended
 
 
+class ItemQueue:
+    """First in, first out; counts the chunks of samples, because a note must not take the room of a block.
+
+    One thread puts arrivals, one takes items.
+    """
+
+    def __init__(self) -> None:
+        self._items: queue.SimpleQueue[Item] = queue.SimpleQueue()
+        self._arrived = self._taken = 0
+
+    def put(self, item: Item) -> None:
+        """Append an item; never waits."""
+        self._arrived += isinstance(item, Arrival)
+        self._items.put(item)
+
+    def get(self, timeout: float = 0.0) -> Item:
+        """The oldest item. Raises queue.Empty if none comes within ``timeout`` (s)."""
+        item = self._items.get(timeout > 0.0, timeout or None)
+        self._taken += isinstance(item, Arrival)
+        return item
+
+    def empty(self) -> bool:
+        """Whether no item waits."""
+        return self._items.empty()
+
+    def qsize(self) -> int:
+        """Number of items that wait."""
+        return self._items.qsize()
+
+    @property
+    def blocks(self) -> int:
+        """Number of arrivals that wait."""
+        return self._arrived - self._taken
+
+
 @dataclass(slots=True)
-class Gathered:
+class SampleBuffer:
     """Samples that wait to be handed over, one row each: extended number, time and readings as in the source."""
 
     seq: list[int] = field(default_factory=list)

@@ -12,7 +12,7 @@ from typing import Any
 
 from psd_deflection.base.errors import ConfigError, RecordingError
 from psd_deflection.base.foreign_yaml import tree_of_file
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.budget.certificate_page import FIELDS
@@ -83,7 +83,7 @@ def _check_provenance(given: dict[str, Any], path: Path) -> None:
 
 
 def _words(value: object) -> str:
-    return printable(str(value), LONGEST_WORDS)
+    return sanitize(str(value), LONGEST_WORDS)
 
 
 def _map(tree: Mapping[str, Any], key: str, path: Path) -> dict[str, Any]:

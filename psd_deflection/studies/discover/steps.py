@@ -34,11 +34,11 @@ from psd_deflection.studies.discover.search.weighing import (
     Unknown,
     heldout_per_channel_of,
     no_noise,
+    null_log,
     per_channel_of,
     sd_of,
     tied,
     unknown_of,
-    unsaid,
     waterfall_of,
 )
 
@@ -234,7 +234,7 @@ def where(problem: Problem) -> Problem:
     gap_after = ws.gap(fit.difference)
     unknown = (
         unknown_of(left, explained, gap_after, ws.floor(), ws.most_by_noise(), steps, ws.worded)
-        or unsaid(ws, problem.gap_before, gap_after)
+        or null_log(ws, problem.gap_before, gap_after)
         or (() if fit.effects else no_noise(ws, left, problem.gap_before, gap_after))
         or tied(coincidences(fit, ws.physics), fit, problem.result, before)
     )

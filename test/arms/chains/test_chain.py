@@ -183,7 +183,7 @@ def test_covariance_is_that_of_chance(slopes: str) -> None:
         covariances.append(mixed @ mixed.T)
     angles = [0.3, -0.8, 1.1]
     found = chain.compose([TipDeflection(p, c) for p, c in zip(tips, covariances, strict=True)], angles)
-    said = found.covariance - found.of_model
+    text = found.covariance - found.of_model
     # Draws of which mean and covariance are exact, so that few are enough.
     draws = rng.normal(size=(400, 9))
     draws -= draws.mean(axis=0)
@@ -197,7 +197,7 @@ def test_covariance_is_that_of_chance(slopes: str) -> None:
         row[:3] = at.position - mean.position
         row[3:] = Transform(at.rotation @ mean.rotation.T, at.position).rotation_vector
     seen = errors.T @ errors / len(draws)
-    whitened = np.linalg.solve(np.linalg.cholesky(said), np.linalg.cholesky(seen))
+    whitened = np.linalg.solve(np.linalg.cholesky(text), np.linalg.cholesky(seen))
     assert np.linalg.svd(whitened, compute_uv=False) == pytest.approx(np.ones(6), abs=0.025)
 
 

@@ -59,10 +59,10 @@ def test_what_a_line_leaves_out_of_a_motion_widens_the_covariance() -> None:
         t_ns = n * BLOCK_NS + BLOCK_NS // 2
         out += joiner.put(1, estimate(t_ns, 1e-3 * np.sin(2 * np.pi * 5.0 * t_ns / 1e9)))
     errors = np.array([j.tips[1].pose[0] - 1e-3 * np.sin(2 * np.pi * 5.0 * j.t_ns / 1e9) for j in out[3:]])
-    said = np.array([j.tips[1].covariance[0, 0] for j in out[3:]])
+    stated = np.array([j.tips[1].covariance[0, 0] for j in out[3:]])
     # Much more than the noise, and as large as the error is.
     assert np.sqrt(np.mean(errors**2)) > 10 * 2e-6
-    assert np.mean(errors**2) / np.mean(said) == pytest.approx(1.0, abs=0.5)
+    assert np.mean(errors**2) / np.mean(stated) == pytest.approx(1.0, abs=0.5)
 
 
 def test_a_lost_block_of_another_link_is_missing_at_the_times_beside_it() -> None:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from psd_deflection.base.printable import printable
+from psd_deflection.base.sanitize import sanitize
 from psd_deflection.devices.protocol.frames import BadFrame, FrameDecoder, HelloFrame, encode
 from psd_deflection.devices.protocol.text_lines import Description, parse, positive
 from psd_deflection.devices.protocol.words import MAX_TEXT, device_words, finite
@@ -46,15 +46,15 @@ def texts(value: Any) -> list[str]:
     ],
 )
 def test_a_text_in_one_printable_line(text: str, shown: str) -> None:
-    assert printable(text, 20) == shown
+    assert sanitize(text, 20) == shown
 
 
 @given(st.text(st.characters()), st.integers(1, 40))
 def test_printable_is_printable_bounded_and_stays(text: str, longest: int) -> None:
-    shown = printable(text, longest)
+    shown = sanitize(text, longest)
     assert shown.isprintable()
     assert len(shown) <= longest
-    assert printable(shown, longest) == shown
+    assert sanitize(shown, longest) == shown
 
 
 @given(st.dictionaries(st.text(st.characters()), JSON, max_size=6))

@@ -51,7 +51,7 @@ def test_a_list_is_relative_to_its_folder(archive: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ('content', 'said'),
+    ('content', 'message'),
     [
         (b'# nothing\n', 'lists no recording'),
         (b'\xff\xfe\n', 'is not UTF-8'),
@@ -59,9 +59,9 @@ def test_a_list_is_relative_to_its_folder(archive: Path) -> None:
         (b'\n' * (LARGEST_LIST + 1), 'larger than 16 MiB'),
     ],
 )
-def test_a_bad_list_is_refused(archive: Path, content: bytes, said: str) -> None:
+def test_a_bad_list_is_refused(archive: Path, content: bytes, message: str) -> None:
     (archive / 'list.txt').write_bytes(content)
-    with pytest.raises(RecordingError, match=said):
+    with pytest.raises(RecordingError, match=message):
         listed(['list.txt'])
     with pytest.raises(RecordingError, match=r'^c\*: matches no recording'):
         listed(['c*'])

@@ -148,8 +148,8 @@ class Serving:
         self.rig = load_rig(overrides={'monitor_port': 0, **overrides})
         self.shown = StillShown(self.rig)
         self.feed = Feed()
-        self.said: list[str] = []
-        self.server = MonitorServer(self.shown, self.feed, self.rig.monitor, texts(self.said.append))
+        self.logged: list[str] = []
+        self.server = MonitorServer(self.shown, self.feed, self.rig.monitor, texts(self.logged.append))
         self.url = self.server.start()
         self.port = int(self.url.rstrip('/').rpartition(':')[2])
 

@@ -162,14 +162,14 @@ def test_zero_and_record_work_on_this_machine(page: Page, start: Start, tmp_path
     dx = 'Number(document.getElementById("dx").textContent.replace("\\u2212", "-"))'
     page.until(f'{dx} > 400')
     notice = 'document.getElementById("notice").textContent'
-    said = ''
+    text = ''
     # While the link rings under the simulated load the zero is refused: once more then.
-    while not said.startswith('unloaded dots (mm): psd_1 ('):
-        assert said == '' or 'move' in said
+    while not text.startswith('unloaded dots (mm): psd_1 ('):
+        assert text == '' or 'move' in text
         page.driver.execute_script(f'{notice} = ""')
         page.driver.find_element(By.ID, 'zero').click()
         page.until(f'{notice} !== ""')
-        said = page.driver.execute_script(f'return {notice}')
+        text = page.driver.execute_script(f'return {notice}')
     page.until(f'Math.abs({dx}) < 20')
     record = page.driver.find_element(By.ID, 'record')
     record.click()

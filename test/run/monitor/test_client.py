@@ -241,10 +241,10 @@ def test_what_a_killed_daemon_left_is_removed(own_state: Path) -> None:
 def test_several_daemons_are_listed(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
     first, second = serve(), serve()
     assert main(['zero']) == 7
-    said = capsys.readouterr().err
-    assert first.url in said
-    assert second.url in said
-    assert '--url' in said
+    output = capsys.readouterr().err
+    assert first.url in output
+    assert second.url in output
+    assert '--url' in output
     assert main(['zero', '--url', second.url]) == 0
     assert (first.shown.zeros, second.shown.zeros) == (0, 1)
 
@@ -254,10 +254,10 @@ def test_without_a_daemon_the_error_says_how_to_start_one(
     command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(command) == 7
-    said = capsys.readouterr().err
-    assert 'http://127.0.0.1:9/: no daemon answers (' in said
-    assert 'psd-deflection estimator --monitor' in said
-    assert said.count('\n') == 1
+    output = capsys.readouterr().err
+    assert 'http://127.0.0.1:9/: no daemon answers (' in output
+    assert 'psd-deflection estimator --monitor' in output
+    assert output.count('\n') == 1
 
 
 def started(program: str, *words: str) -> subprocess.CompletedProcess[str]:
@@ -300,9 +300,9 @@ def test_a_mark_and_a_load_say_how_long_ago_they_were_typed(serve: Serve) -> Non
 @pytest.mark.parametrize('text', ['-1,5', '1_0', 'ten'])
 def test_a_load_that_is_no_number_says_so(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['load', '0', text, '0']) == 2
-    said = capsys.readouterr().err
-    assert f'FY {text}: must be a number' in said
-    assert ('decimals have a point' in said) == (',' in text)
+    output = capsys.readouterr().err
+    assert f'FY {text}: must be a number' in output
+    assert ('decimals have a point' in output) == (',' in text)
 
 
 @pytest.mark.parametrize('url', ['ftp://rig/', 'http://', 'http://rig:99999/', 'http://[::1/'])
@@ -344,9 +344,9 @@ def stranger() -> Iterator[str]:
 
 def test_another_server_is_no_daemon(stranger: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['zero', '--url', stranger]) == 7
-    said = capsys.readouterr().err
-    assert 'is no answer of a daemon' in said
-    assert '\x1b' not in said
+    output = capsys.readouterr().err
+    assert 'is no answer of a daemon' in output
+    assert '\x1b' not in output
     assert main(['echo', '--url', stranger]) == 7
     assert 'no daemon answers' in capsys.readouterr().err
 

@@ -80,11 +80,11 @@ class Viewer:
                     subscription, t_ns = struct.unpack_from('<IQ', got.data, 1)
                     self.messages.setdefault(self._topics[subscription], []).append((t_ns, got.data[13:]))
 
-    async def _take_text(self, ws: aiohttp.ClientWebSocketResponse, said: dict[str, Any]) -> None:
-        if said['op'] == 'serverInfo':
-            self.info = said
-        elif said['op'] == 'advertise':
-            for channel in said['channels']:
+    async def _take_text(self, ws: aiohttp.ClientWebSocketResponse, logged: dict[str, Any]) -> None:
+        if logged['op'] == 'serverInfo':
+            self.info = logged
+        elif logged['op'] == 'advertise':
+            for channel in logged['channels']:
                 assert (channel['encoding'], channel['schemaEncoding']) == ('cdr', 'ros2msg')
                 self._topics[channel['id']] = channel['topic']
                 self.offered[channel['topic']] = Schema(
@@ -158,8 +158,8 @@ class Served:
     """A server that the test feeds; ``said``: its lines."""
 
     def __init__(self) -> None:
-        self.said: list[str] = []
-        self.server = FoxgloveServer(load_rig(overrides={'foxglove_port': 0}), texts(self.said.append))
+        self.logged: list[str] = []
+        self.server = FoxgloveServer(load_rig(overrides={'foxglove_port': 0}), texts(self.logged.append))
         self.port = int(self.server.address.rpartition(':')[2])
 
     def give(self, count: int, size: int = 100) -> None:
@@ -193,7 +193,7 @@ def test_another_site_cannot_look(served: Served, headers: dict[str, str]) -> No
         return 101
 
     assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == 403
-    assert not served.said
+    assert not served.logged
 
 
 @pytest.mark.parametrize('origin', ['https://app.foxglove.dev', 'file://'])
@@ -272,7 +272,7 @@ def test_deaf_viewers_hold_a_bounded_backlog_and_do_not_delay_the_end(served: Se
     assert not served.server._thread.is_alive()
     for one in ones:
         one.close()
-    assert not served.said
+    assert not served.logged
 
 
 def test_viewers_that_vanish_cost_no_line(served: Served, caplog: pytest.LogCaptureFixture) -> None:
@@ -291,7 +291,7 @@ def test_viewers_that_vanish_cost_no_line(served: Served, caplog: pytest.LogCapt
         return not served.server.viewers and not served.server._looking
 
     until(all_gone)
-    assert not served.said
+    assert not served.logged
     assert not caplog.records
 
 
@@ -324,7 +324,7 @@ def test_what_is_not_understood_is_not_answered_and_harms_nobody(served: Served,
                         return int.from_bytes(got.data[1:5], 'little')
 
     assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == 7
-    assert not served.said
+    assert not served.logged
 
 
 def first_topic(served: Served) -> tuple[str, str]:

@@ -116,7 +116,9 @@ def test_cells_are_what_the_rows_say(
     wanted = history.Asked(until_ns - span * SECOND, until_ns, points)
     found = made.window(wanted)
     # Which level it was taken from is the finest that reaches back and is not finer than needed.
-    level = next(i for i, ring in enumerate(made._rings) if ring is made._ring(wanted.from_ns, span * SECOND // points))
+    level = next(
+        i for i, ring in enumerate(made.rings) if ring is made.ring_for(wanted.from_ns, span * SECOND // points)
+    )
     plain.of = tuple(i == level for i in range(3))  # type: ignore[assignment]
     width = found.width_ns
     assert width % (SMALL[level][0] * SECOND) == 0
@@ -267,8 +269,8 @@ def test_all_time_may_be_asked_for() -> None:
 
 def test_a_cell_that_is_too_old_for_its_place_does_not_take_it_back() -> None:
     """Cells 1 and 4 of a ring of three share a place, in which an old one still lies."""
-    ring = history._Ring(1, 3, history._kind(3))
-    cells = np.full(2, history._empty(history._kind(3)), history._kind(3))
+    ring = history.Ring(1, 3, history.cell_kind(3))
+    cells = np.full(2, history.empty_cell(history.cell_kind(3)), history.cell_kind(3))
     cells['key'] = (1, 4)
     cells['blocks'] = (1, 2)
     ring.put(cells[:1].copy())

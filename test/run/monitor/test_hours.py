@@ -17,7 +17,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import BlockStatus, Mark
-from psd_deflection.run.monitor.history import Asked
+from psd_deflection.run.monitor.history import Asked, History
 from test.heard import WAIT_S
 
 from .browsing import Page
@@ -177,16 +177,18 @@ def test_the_hours_fit_the_screen(page: Page, hour: Serving, width: int) -> None
     choose(page, '30 s')
 
 
-def test_looking_at_hours_for_long_leaves_the_heap_as_it_was(page: Page, hour: Serving) -> None:
+def test_looking_at_hours_for_long_leaves_the_heap_as_it_was(
+    page: Page, hour: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
     answers = 0
-    answer = hour.server._history.answer
+    answer = History.answer
 
-    def counted(wanted: Asked) -> str:
+    def counted(history: History, wanted: Asked) -> str:
         nonlocal answers
         answers += 1
-        return answer(wanted)
+        return answer(history, wanted)
 
-    hour.server._history.answer = counted  # type: ignore[method-assign]
+    monkeypatch.setattr(History, 'answer', counted)
     page.open(hour.url)
     page.until('document.body.dataset.rows > 0')
     # A clock that stands still: the next answer is asked for as soon as one is drawn.

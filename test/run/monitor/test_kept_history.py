@@ -72,7 +72,7 @@ def test_what_is_kept_at_any_time_is_what_there_was(
             file.save(made.unsaved())
     file.save(made.unsaved())
     kept = file.load(LATER, LATER)
-    whole = made._rings[1].between(0, made._rings[1].newest + 1)
+    whole = made.rings[1].between(0, made.rings[1].newest + 1)
     assert kept.cells[-len(whole) :].tobytes() == whole.tobytes()
     file.close()
 
@@ -95,10 +95,10 @@ def test_two_runs_are_as_one(file_of: Open) -> None:
         assert got.keys() == want.keys()
         for name, values in want.items():
             np.testing.assert_allclose(got[name], values, rtol=1e-12)
-    assert [text for _, text in second._marks] == ['[1]', '[2]']
+    assert [text for _, text in second.marks] == ['[1]', '[2]']
     # The cell under way is replaced, not kept twice.
     file.save(second.unsaved())
-    assert len(file.load(LATER, LATER).cells) == len(whole._rings[1].between(0, whole._rings[1].newest + 1))
+    assert len(file.load(LATER, LATER).cells) == len(whole.rings[1].between(0, whole.rings[1].newest + 1))
 
 
 def test_only_the_last_week_is_kept(file_of: Open) -> None:
@@ -157,9 +157,9 @@ class Keeping:
     """A keeper with its history."""
 
     def __init__(self, path: Path) -> None:
-        self.said: list[str] = []
+        self.logged: list[str] = []
         self.history = History(2, SIZE)
-        self.keeper = HistoryKeeper(path, self.history, texts(self.said.append))
+        self.keeper = HistoryKeeper(path, self.history, texts(self.logged.append))
         self.keeper.start()
 
     def restored(self) -> None:
@@ -167,10 +167,10 @@ class Keeping:
 
     def saved(self) -> None:
         self.keeper.save()
-        until(self.keeper._idle.is_set)
+        until(lambda: self.keeper.idle)
 
     def count(self) -> int:
-        return len(self.history._rings[1].between(0, LATER))
+        return len(self.history.rings[1].between(0, LATER))
 
 
 @pytest.fixture
@@ -196,7 +196,7 @@ def test_nothing_is_saved_before_what_was_kept_is_read(keep: Callable[[], Keepin
     two = keep()
     two.restored()
     assert two.count() == 1
-    assert one.said == two.said == []
+    assert one.logged == two.logged == []
 
 
 def test_a_damaged_file_is_put_aside(keep: Callable[[], Keeping], tmp_path: Path) -> None:
@@ -204,7 +204,7 @@ def test_a_damaged_file_is_put_aside(keep: Callable[[], Keeping], tmp_path: Path
     (tmp_path / 'state' / 'history.sqlite').write_bytes(b'no database at all' * 100)
     one = keep()
     one.restored()
-    assert one.said == [
+    assert one.logged == [
         f'{tmp_path}/state/history.sqlite: the kept history cannot be read (file is not a database); '
         'it is history.sqlite.damaged now'
     ]
@@ -229,7 +229,7 @@ def test_a_file_that_is_damaged_inside_is_put_aside(keep: Callable[[], Keeping],
     two = keep()
     two.restored()
     assert two.count() == 0
-    assert 'the kept history cannot be read (database disk image is malformed)' in two.said[0]
+    assert 'the kept history cannot be read (database disk image is malformed)' in two.logged[0]
     assert path.with_name('history.sqlite.damaged').read_bytes() == content
 
 
@@ -247,12 +247,12 @@ def test_marks_are_written_again_only_if_there_are_new_ones() -> None:
 def test_a_folder_that_cannot_be_written_costs_the_history_alone(keep: Callable[[], Keeping], tmp_path: Path) -> None:
     (tmp_path / 'state').write_text('a file')
     one = keep()
-    until(lambda: bool(one.said))
+    until(lambda: bool(one.logged))
     one.history.add(row(START_NS, 0.0))
     one.keeper.save()
     one.keeper.end()
-    (said,) = one.said
-    assert said.startswith(f'{tmp_path}/state/history.sqlite: the history of the page cannot be kept (')
+    (logged,) = one.logged
+    assert logged.startswith(f'{tmp_path}/state/history.sqlite: the history of the page cannot be kept (')
 
 
 def test_what_the_disk_refused_is_written_the_next_time(
@@ -269,8 +269,8 @@ def test_what_the_disk_refused_is_written_the_next_time(
         for k in range(3):
             one.history.add(row(START_NS + k * 10 * SECOND, 0.0))
             one.saved()
-    assert len(one.said) == 1
-    assert 'disk is full' in one.said[0]
+    assert len(one.logged) == 1
+    assert 'disk is full' in one.logged[0]
     one.history.add(row(START_NS + 50 * SECOND, 0.0))
     one.keeper.end()
     two = keep()
@@ -291,7 +291,7 @@ def test_a_disk_that_hangs_holds_nobody(keep: Callable[[], Keeping], monkeypatch
     one.keeper.end()
     # Not for the minutes that the disk may hang.
     assert time.monotonic() - begun < 60.0
-    assert one.keeper._thread.is_alive()
+    assert one.keeper.alive
     gate.set()
 
 
@@ -315,7 +315,6 @@ def test_the_hours_of_a_page_outlive_it(serve: Serve, tmp_path: Path, monkeypatc
     second.server.close()
 
     third = serve(monitor_history=False)
-    assert third.server._keeper is None
     assert history_of(third, 400.0, points=40)['marks'] == []
 
 

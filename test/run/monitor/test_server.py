@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import ConfigError
-from psd_deflection.base.log import unsaid
+from psd_deflection.base.log import null_log
 from psd_deflection.measure.watch import Alarm
 from psd_deflection.records import RESTART, AppliedLoad, BlockStatus, Mark, ParameterChange, ReferencePose
 from psd_deflection.rig.config import load_rig
@@ -159,7 +159,7 @@ def test_the_buttons_are_off_on_the_network_and_if_they_are_switched_off(
     assert reason in hello['why_no_control']
     # A token would be for nothing.
     assert hello['needs_token'] is False
-    assert 'token' not in serving.said[0]
+    assert 'token' not in serving.logged[0]
 
 
 def test_on_this_machine_the_buttons_work_and_report_the_result(serve: Serve) -> None:
@@ -171,7 +171,7 @@ def test_on_this_machine_the_buttons_work_and_report_the_result(serve: Serve) ->
     assert ask(serving.url + 'api/record', body={'record': False})[0] == 200
     assert serving.shown.recordings == ['recordings/test', None]
     # The run tells what came of it, once; here it is told who wanted it.
-    assert [line for line in serving.said if 'dots' in line or 'asked for' in line] == [
+    assert [line for line in serving.logged if 'dots' in line or 'asked for' in line] == [
         'monitor: zero was asked for by 127.0.0.1',
         *['monitor: record was asked for by 127.0.0.1'] * 2,
     ]
@@ -228,7 +228,7 @@ def test_a_load_is_noted(serve: Serve) -> None:
     assert ask(serving.url + 'api/play', body={'paused': True, 'seek': 2.5})[0] == 200
     assert serving.shown.played == [(True, 2.5)]
     # Who paused it is of no interest later.
-    assert [line for line in serving.said if 'asked for' in line] == ['monitor: load was asked for by 127.0.0.1'] * 4
+    assert [line for line in serving.logged if 'asked for' in line] == ['monitor: load was asked for by 127.0.0.1'] * 4
 
 
 @pytest.mark.parametrize(
@@ -404,7 +404,7 @@ def test_bad_requests_get_an_answer_and_no_log_line(
         answer = stranger.makefile('rb').readline()
     assert int(answer.split()[1]) == status
     assert caplog.records == []
-    assert len(serving.said) == 1
+    assert len(serving.logged) == 1
     assert ask(serving.url, 'GET')[0] == 200
 
 
@@ -463,7 +463,7 @@ def test_a_browser_that_comes_between_two_reports_is_shown_the_last(
 def test_on_the_network_the_buttons_need_the_token(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     serving = serve(monitor_control=True, monitor_address='0.0.0.0')
     url = f'http://127.0.0.1:{serving.port}/'
-    assert serving.said[0].endswith(f'#token={serving.server.token}')
+    assert serving.logged[0].endswith(f'#token={serving.server.token}')
     assert len(serving.server.token) >= 20
     assert ask(url + 'api/zero')[0] == 401
     assert ask(url + 'api/zero', headers={'X-Monitor-Token': serving.server.token[:-1]})[0] == 401
@@ -481,13 +481,13 @@ def test_a_port_in_use_is_reported_and_another_taken(serve: Serve) -> None:
     first = serve()
     second = serve(monitor_port=first.port)
     assert second.port != first.port
-    assert 'is in use' in second.said[0]
+    assert 'is in use' in second.logged[0]
     assert ask(second.url, 'GET')[0] == 200
 
 
 def test_an_address_of_another_machine_is_refused() -> None:
     rig = load_rig(overrides={'monitor_address': '192.0.2.1', 'monitor_port': 0})
-    server = MonitorServer(StillShown(rig), Feed(), rig.monitor, unsaid)
+    server = MonitorServer(StillShown(rig), Feed(), rig.monitor, null_log)
     with pytest.raises(ConfigError, match=r"monitor_address = '192\.0\.2\.1'"):
         server.start()
     server.close()

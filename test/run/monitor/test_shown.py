@@ -22,7 +22,7 @@ from psd_deflection.run.monitor.shown_recording import ShownRecording
 BAGS = Path(__file__).parents[3] / 'bags'
 
 
-def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, speed: float = 1e6) -> ShownRecording:
+def source_of(name: str, feed: Feed, message: list[str], ended: threading.Event, speed: float = 1e6) -> ShownRecording:
     rig = rig_at_start(open_recording(BAGS / name))
 
     def open_steps() -> tuple[Pipeline, Iterator[list[Record]]]:
@@ -31,7 +31,7 @@ def source_of(name: str, feed: Feed, said: list[str], ended: threading.Event, sp
         return pipeline, replayed(recording, pipeline)
 
     def say(text: str, level: int = INFO, /) -> None:
-        said.append(text)
+        message.append(text)
         ended.set()
 
     first = next(iter(open_recording(BAGS / name).blocks()))
@@ -53,8 +53,8 @@ def test_rates_are_of_a_second_however_long_ago_the_last_report_was(monkeypatch:
 
 
 def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
-    feed, said, ended = Feed(), list[str](), threading.Event()
-    source = source_of('lost_samples', feed, said, ended)
+    feed, wanted, ended = Feed(), list[str](), threading.Event()
+    source = source_of('lost_samples', feed, wanted, ended)
     source.start()
     assert ended.wait(60.0)
     source.close()
@@ -69,7 +69,7 @@ def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
         source.zero()
     with pytest.raises(RefusedError, match='not recorded again'):
         asyncio.run(source.record(True))
-    assert said == ['lost_samples: end of the recording']
+    assert wanted == ['lost_samples: end of the recording']
 
 
 class Heard(Feed):
@@ -86,15 +86,15 @@ class Heard(Feed):
 
 
 def test_a_zero_does_not_wait_for_the_next_block_of_a_slow_recording() -> None:
-    feed, said = Heard(), list[str]()
+    feed, stated = Heard(), list[str]()
     # The next block comes two seconds later, the longest wait; a request is answered at once.
-    source = source_of('clean', feed, said, threading.Event(), speed=1e-3)
+    source = source_of('clean', feed, stated, threading.Event(), speed=1e-3)
     source.start()
     assert feed.estimated.wait(60.0)
     told = source.zero()
     source.close()
     assert told.startswith('unloaded dots (mm): psd_1 (')
-    assert said == [told]
+    assert stated == [told]
 
 
 class Played(Feed):

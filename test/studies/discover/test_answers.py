@@ -597,8 +597,8 @@ def test_a_regressor_is_even_or_odd(regressor: str, even: bool) -> None:
 
 def test_a_gap_that_remains_is_never_left_unsaid() -> None:
     noise = cast(Workspace, SimpleNamespace(floor=lambda: 1e-6, worded=micrometres))
-    assert weighing.unsaid(noise, 9e-6, 1.5e-6) == ()
-    (u,) = weighing.unsaid(noise, 3e-6, 1.6e-6)
+    assert weighing.null_log(noise, 9e-6, 1.5e-6) == ()
+    (u,) = weighing.null_log(noise, 3e-6, 1.6e-6)
     assert u.signature == '1.25 µm remain, 1.6 times the noise, in no single place or band'
     assert u.rms == pytest.approx(math.sqrt(1.56) * 1e-6)
     assert u.explains == pytest.approx((1.6 / 3) ** 2)

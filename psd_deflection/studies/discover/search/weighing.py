@@ -158,7 +158,7 @@ def _beyond(gap: float, floor: float) -> float:
     return float(np.sqrt(max(gap**2 - floor**2, 0.0))) if np.isfinite(floor) else gap
 
 
-def unsaid(workspace: Comparison, before: float, after: float) -> tuple[Unknown, ...]:
+def null_log(workspace: Comparison, before: float, after: float) -> tuple[Unknown, ...]:
     """What remains although no place of it stands out: several small differences, or the simulation's own error."""
     floor = workspace.floor()
     if not after > UNSAID * floor:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 
-def printable(text: str, longest: int) -> str:
+def sanitize(text: str, longest: int) -> str:
     """``text`` in one line of printable characters; what is beyond ``longest`` characters is cut, with an ellipsis.
 
     A stranger's words (a device's, a file's) can so neither move the cursor, change colours, forge a line, nor fail
