@@ -111,7 +111,7 @@ class Board(Target):
         """See :class:`Target`."""
         plane, pixels = self.corners(grey)
         points = np.column_stack([plane, np.zeros(len(plane))])
-        rotation, place = self._guess(plane, lens.rays(pixels))
+        rotation, place = self.first_pose(plane, lens.rays(pixels))
         rotation, place, _, _ = _fitted(points, pixels, lens, rotation, place)
         pixels, shared_blur = self._refined(image, points, pixels, lens, rotation, place)
         kept = np.isfinite(pixels[:, 0])
@@ -182,7 +182,7 @@ class Board(Target):
             raise NoPoseError(Status.HIDDEN)
         return plane * [self._mirror, -1.0], np.reshape(pixels, (-1, 2)).astype(float)
 
-    def _guess(self, plane: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def first_pose(self, plane: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation and place by the homography from the plane to the rays (Zhang 2000)."""
         scale = float(np.sqrt(np.mean(plane**2)))
         x, y = (plane / scale).T

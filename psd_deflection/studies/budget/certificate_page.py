@@ -109,7 +109,7 @@ class Certified(StudyResult):
 
     def lines(self) -> list[str]:
         """The sentences and the table of poses."""
-        return [*self.sentences(), '', *columns(self._results(), left=4).splitlines()]
+        return [*self.sentences(), '', *columns(self.result_rows(), left=4).splitlines()]
 
     def tree(self) -> dict[str, Any]:
         """SI; (ΔX, ΔY, θ) in this order."""
@@ -164,7 +164,7 @@ class Certified(StudyResult):
         return [
             PageSection('Object and surroundings', (self._filled(OBJECT),)),
             PageSection('Reference', (self._filled(TRACEABLE),)),
-            PageSection('Results', (_table(self._results()), self._chart(), self._range())),
+            PageSection('Results', (_table(self.result_rows()), self.chart(), self._range())),
             PageSection('Decision rule', (f'<p>{html.escape(self._rule())}</p>',)),
             PageSection('How U was computed', (_HOW, _table(self._inputs(_six)))),
             PageSection('Correlations of the calibration', (_table(self._correlations(_six)),)),
@@ -175,7 +175,7 @@ class Certified(StudyResult):
         given = self.fields
         return table(('', ''), [(words, given[name] or _OPEN) for name, words in names.items()])
 
-    def _results(self) -> list[list[str]]:
+    def result_rows(self) -> list[list[str]]:
         """The head first."""
         judged = self.verdicts
         head = ['pose', *UNITS, *(f'as found {u}' for u in UNITS), *(f'u_c {u}' for u in UNITS)]
@@ -190,7 +190,7 @@ class Certified(StudyResult):
             rows.append(row + (list(judged[n]) if judged else []))
         return rows
 
-    def _chart(self) -> Chart:
+    def chart(self) -> Chart:
         """The error of each pose as found with its expanded uncertainty, and the limits."""
         number = np.arange(1.0, len(self.found.poses) + 1.0)
         limits = self.problem.limits
@@ -205,7 +205,7 @@ class Certified(StudyResult):
         return Chart('error of each pose as found, with its expanded uncertainty', panels, beside=3)
 
     def _numbers(self) -> list[list[str]]:
-        """As ``_results``, in SI units with all digits."""
+        """As ``result_rows``, in SI units with all digits."""
         names = ('dx', 'dy', 'theta')
         kinds = ('', 'as_found_', 'u_c_', 'nu_eff_', 'k_', 'U_')
         rows = [['pose', *(f'{kind}{name}' for kind in kinds for name in names)]]

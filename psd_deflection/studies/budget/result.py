@@ -70,9 +70,9 @@ class Budgeted(StudyResult):
 
     def lines(self) -> list[str]:
         """The situation, the table of all causes, the totals."""
-        out = [self._situation(), '', *columns(self._causes(), left=4).splitlines()]
-        out += ['', *columns(self._totals()).splitlines()]
-        out += ['', *columns(self._expanded()).splitlines()]
+        out = [self._situation(), '', *columns(self.cause_rows(), left=4).splitlines()]
+        out += ['', *columns(self.total_rows()).splitlines()]
+        out += ['', *columns(self.expanded_rows()).splitlines()]
         if self.sampled is not None:
             dx, dy, theta = _figures(self.sampled)
             out += ['', f'Monte Carlo, {self.draws} draws of everything at once (seed {self.seed}):']
@@ -83,14 +83,14 @@ class Budgeted(StudyResult):
 
     def sections(self) -> Iterable[PageSection]:
         """The chart, the totals, every cause."""
-        head, *rows = self._causes()
-        totals_head, *totals = self._totals()
+        head, *rows = self.cause_rows()
+        totals_head, *totals = self.total_rows()
         return [
             PageSection('', (f'<p class=quiet>{self._situation()}</p>',)),
             PageSection('Every cause beside the total', (_BARS, bars_of(self.budget))),
             PageSection('Totals', (table(totals_head, totals),)),
             PageSection('Every cause', (table(head, rows),)),
-            PageSection('Expanded uncertainty (GUM)', (table(*_split(self._expanded())), _RULES)),
+            PageSection('Expanded uncertainty (GUM)', (table(*_split(self.expanded_rows())), _RULES)),
             PageSection('Every error parameter', (table(*_split(parameter_rows(self.budget))),)),
         ]
 
@@ -162,7 +162,8 @@ class Budgeted(StudyResult):
             f'θ {math.degrees(theta):.4f} deg; method {at.method}; mean of {at.rig.estimator.block_size} samples'
         )
 
-    def _causes(self) -> list[list[str]]:
+    def cause_rows(self) -> list[list[str]]:
+        """Return a row of words for each cause: its name, kind, type, degrees of freedom, size and share."""
         rows = [['term', 'Table 3.1', 'kind', 'type', 'ν', *UNITS, 'ΔX %', 'ΔY %', 'θ %']]
         for cause, line in self.budget.lines:
             shares = [f'{100.0 * v:.1f}' for v in self.budget.shares(line).tolist()]
@@ -171,7 +172,7 @@ class Budgeted(StudyResult):
             rows.append([*head, *_figures(line), *shares])
         return rows
 
-    def _expanded(self) -> list[list[str]]:
+    def expanded_rows(self) -> list[list[str]]:
         """u_c, nu_eff, k, U, and what the draws say."""
         said = self.budget.expanded()
         rows = [['', *UNITS], ['standard uncertainty u_c', *shown(said.standard)]]
@@ -194,7 +195,8 @@ class Budgeted(StudyResult):
             f'{in_words(interval.half)}; k u_c differs by {each}.'
         )
 
-    def _totals(self) -> list[list[str]]:
+    def total_rows(self) -> list[list[str]]:
+        """Return a row of words for the total of each kind and of all causes."""
         rows = [['', *UNITS]]
         rows += [[f'all {kind.value} terms', *_figures(self.budget.total(kind))] for kind in Kind]
         return [*rows, ['total', *_figures(self.budget.total())]]

@@ -173,7 +173,7 @@ def calibrate(
     progress('fitting')
     free = fitted_parameters(kind)
     rows, first = with_one_zero(rows, rig, prior, kind, free)
-    first, prior, widened = _believed(first, rows, rig, prior, kind, free)
+    first, prior, widened = believed_fit(first, rows, rig, prior, kind, free)
     free = _determined(first, prior, free)
     whole = fit(rows, rig, prior, kind, free=free, start=first)
     progress('held-out motion')
@@ -181,7 +181,7 @@ def calibrate(
     before = before_of(vector, prior)
     gap, worse = _heldout(whole, rows, rig, believed, kind, before)
     if kind == 'reference':
-        whole = _with_clamp(whole, rows, rig, prior)
+        whole = with_clamp(whole, rows, rig, prior)
     refused = ''
     if worse:
         refused = (
@@ -262,7 +262,7 @@ def roughly_late(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) ->
     return float(lates[best]) if costs[best] < 0.9 * costs[middle] else 0.0
 
 
-def _believed(
+def believed_fit(
     first: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask
 ) -> tuple[CalibrationFit, Prior, list[str]]:
     """Widen what the rows contradict, the worst at a time, each once; the third are the names of these."""
@@ -376,7 +376,7 @@ def _without_refused_terms(
     return whole, prior, dropped
 
 
-def _with_clamp(whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior) -> CalibrationFit:
+def with_clamp(whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior) -> CalibrationFit:
     """The clamp's compliances from the reference's poses at rest under known loads, if there are any.
 
     The link's own stiffness is taken as the rig file has it: at one length a clamp that gives way is a softer link.

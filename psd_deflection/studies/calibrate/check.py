@@ -115,14 +115,14 @@ def check(
     q = np.linalg.solve(np.eye(len(at)) + p @ information, p)
     left = right - information @ (q @ right)
     m = information - information @ q @ information
-    groups = [_moved(name, at, left, m, scale) for name in dict.fromkeys(d.group for d in PARAMETERS)]
+    groups = [moved_group(name, at, left, m, scale) for name in dict.fromkeys(d.group for d in PARAMETERS)]
     seen = [g for g in groups if g.freedom]
     seen.sort(key=lambda g: -g.evidence)
     overall = overall_p([g.p for g in seen])
     if overall < LEVEL:
         # A shift of several tolerances is beyond the linear: the likely ones are fitted in full.
         null = explained(rows, rig, told, kind, free, best)[0]
-        fitted = [_fitted(g, rows, rig, told, kind, free, best, null) for g in seen[:FITTED]]
+        fitted = [fitted_group(g, rows, rig, told, kind, free, best, null) for g in seen[:FITTED]]
         seen = [*sorted(fitted, key=lambda g: -g.evidence), *seen[FITTED:]]
     like = [g.group for g in seen[1:] if seen[0].evidence - g.evidence < LIKE] if overall < LEVEL else []
     zeros = slice(ZERO, COUNT)
@@ -141,7 +141,8 @@ def overall_p(each: Sequence[float]) -> float:
     return min([1.0, *(len(each) * p for p in each)])
 
 
-def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> MovedGroup:
+def moved_group(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> MovedGroup:
+    """Return the shift of a group of parameters, with its evidence against nothing moved."""
     own = [i for i, index in enumerate(at) if index < ZERO and PARAMETERS[int(index)].group == name]
     block, score = m[np.ix_(own, own)], left[own]
     size, vectors = np.linalg.eigh(0.5 * (block + block.T))
@@ -160,7 +161,7 @@ def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: Floa
     return MovedGroup(name, float(chi2.sf(statistic, freedom)) if freedom else 1.0, evidence, freedom, named)
 
 
-def _fitted(
+def fitted_group(
     group: MovedGroup, rows: Rows, rig: Rig, told: Prior, kind: Kind, free: Mask, best: CalibrationFit, null: float
 ) -> MovedGroup:
     """The group with the evidence and the shifts of a full fit; ``null``: what :func:`explained` says if none moved."""

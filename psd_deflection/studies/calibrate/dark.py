@@ -201,7 +201,7 @@ def _level(runs: Sequence[CalibrationRun], rig: Rig, psd: int, lit: float | None
             f'a dark level needs {LEAST:g} s with sum{psd + 1} below {_limit(rig):g} V (sum_min), '
             f'and its median is {float(np.nanmedian(sums)):.3f} V'
         )
-    mean, sd, drift, drift_sd = _mean_and_drift(part, rig.converter.volts_per_count)
+    mean, sd, drift, drift_sd = mean_and_drift(part, rig.converter.volts_per_count)
     half = 0.5 * max(rig.psds[psd].active_area)
     level = max(float(mean[2]), 0.0)
     whole = rig.amplifier.sum_nominal + level if lit is None else lit
@@ -229,7 +229,7 @@ def _level(runs: Sequence[CalibrationRun], rig: Rig, psd: int, lit: float | None
     return DarkLevel(psd + 1, mean, sd, rig.psds[psd].dark, whole, place, half, seconds, run.name, run.digest)
 
 
-def _mean_and_drift(part: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def mean_and_drift(part: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Mean (3,) of ``part`` (n, 3), its standard error, the drift over all of it, and that of noise alone.
 
     From means of ``PIECES`` pieces, which colour shorter than they are does not correlate, and fewer of them if they

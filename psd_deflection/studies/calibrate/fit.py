@@ -210,7 +210,7 @@ def fit(
             linear = linearised(rows, z, rig, kind)
             if np.all(np.abs(step) <= 1e-2 * np.sqrt(np.diag(posterior(information, prior, free)))):
                 break
-        noise = _components(linear, rows, robust, kind, number, information, prior)
+        noise = variance_components(linear, rows, robust, kind, number, information, prior)
     inverse = weight_matrices(linear, rows, noise)
     robust = _robust(linear, inverse, noise, kind, PASSES)
     _, information = _step(linear, inverse, robust, z, prior, free, rows)
@@ -384,7 +384,7 @@ def posterior(information: FloatArray, prior: Prior, free: Mask) -> FloatArray:
     return np.asarray(out * np.outer(scale, scale))
 
 
-def _components(
+def variance_components(
     linear: Linear,
     rows: Rows,
     robust: FloatArray,
@@ -409,16 +409,17 @@ def _components(
     # Each of the four equations of a row pays its part of the parameters that were fitted.
     share = max(1.0 - used / (4.0 * len(errors)), 0.2)
     robustly = number == 0 and kind != 'loads'
-    dots = _deviation(redundant / expected, robustly) / share**0.5
+    dots = deviation_of(redundant / expected, robustly) / share**0.5
     if kind == 'self':
         return Noise(np.full(3, _FREE), max(dots, 0.3), 1.0)
     own = (np.einsum('nij,nj->ni', inverse**2, rows.variances) / rows.sd**2)[good].mean(axis=0) * dots**2
-    seen = np.array([_deviation(e, robustly) ** 2 for e in errors.T]) / share
+    seen = np.array([deviation_of(e, robustly) ** 2 for e in errors.T]) / share
     reference = np.sqrt(np.maximum(seen - own, 0.01 * own))
     return Noise(reference, max(dots, 0.3), fewer(errors, rows.run[good]))
 
 
-def _deviation(values: FloatArray, robustly: bool) -> float:
+def deviation_of(values: FloatArray, robustly: bool) -> float:
+    """Return the standard deviation of values, by the median if ``robustly``."""
     if robustly:
         return float(1.4826 * np.median(np.abs(values - np.median(values))))
     return float(np.sqrt(np.mean(values**2)))

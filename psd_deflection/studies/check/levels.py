@@ -79,7 +79,7 @@ def levels(rig: Rig, volts: FloatArray) -> Levels:
     still = (whole == whole[0]).all(axis=0)
     stuck = tuple(name for name, same in zip(CHANNELS, still.tolist(), strict=True) if same and moves)
     rate = rig.converter.sample_rate_hz
-    hum_hz, hum = _hum(_longest_run(volts)[: round(HUM_S * rate)], rate, noise)
+    hum_hz, hum = mains_hum(longest_run(volts)[: round(HUM_S * rate)], rate, noise)
     return Levels(noise, stated, hum, hum_hz, whole[:, 2::3].mean(axis=0), stuck, steps)
 
 
@@ -90,7 +90,7 @@ def _steps(rig: Rig, volts: FloatArray) -> FloatArray:
     return converter.steps
 
 
-def _longest_run(volts: FloatArray) -> FloatArray:
+def longest_run(volts: FloatArray) -> FloatArray:
     """The longest stretch without a lost sample."""
     there = np.concatenate(([False], np.isfinite(volts).all(axis=1), [False]))
     edges: npt.NDArray[np.int64] = np.flatnonzero(np.diff(there.astype(np.int8)))
@@ -99,7 +99,7 @@ def _longest_run(volts: FloatArray) -> FloatArray:
     return volts[starts[best] : ends[best]]
 
 
-def _hum(volts: FloatArray, rate: float, noise: FloatArray) -> tuple[float, FloatArray]:
+def mains_hum(volts: FloatArray, rate: float, noise: FloatArray) -> tuple[float, FloatArray]:
     """(Hz, amplitude (6,) V) of the mains frequency that stands out more; its neighbours say what does not.
 
     A Hann window keeps the link's ringing, tens of hertz away, out of it.

@@ -120,30 +120,30 @@ class Checkup(StudyResult):
     def sentences(self) -> list[str]:
         """The verdict, then what is wrong, one line each, then what to look at."""
         wrong = [f'{what}: {fix}' for what, fix in _findings(self)]
-        return [_verdict(self), *wrong, *_other_causes(self), *(f'note: {note}' for note in self.notes)]
+        return [_verdict(self), *wrong, *other_causes(self), *(f'note: {note}' for note in self.notes)]
 
     def lines(self) -> list[str]:
         """Pushes, verdict, lines for the rig file, levels."""
-        out = ['', *columns(_pushes(self)).splitlines(), '', _verdict(self)]
+        out = ['', *columns(push_rows(self)).splitlines(), '', _verdict(self)]
         findings = _findings(self)
         width = max((len(what) for what, _ in findings), default=0)
         out += [f'  {what:<{width}}   {fix}' for what, fix in findings]
-        out += [f'  {text}' for text in _other_causes(self)]
+        out += [f'  {text}' for text in other_causes(self)]
         if self.values:
             out += ['', 'Lines for the rig file, below ros__parameters:', '']
             out += [f'    {line(name, value)}' for name, value in self.values.items()]
         notes = [('note', note) for note in self.notes]
-        return [*out, '', *(f'{name:<9}{text}' for name, text in (*_levels(self), *notes))]
+        return [*out, '', *(f'{name:<9}{text}' for name, text in (*level_rows(self), *notes))]
 
     def sections(self) -> Iterable[PageSection]:
         """Pushes, lines for the rig file, levels."""
-        head, *rows = _pushes(self)
-        answers = (table(head, rows), _answers(self)) if self.pushes else (table(head, rows),)
+        head, *rows = push_rows(self)
+        answers = (table(head, rows), answers_chart(self)) if self.pushes else (table(head, rows),)
         out = [PageSection('How each channel answered', answers)]
         if self.values:
             lines = [(line(name, value),) for name, value in self.values.items()]
             out.append(PageSection('Lines for the rig file', (table(('below ros__parameters',), lines),)))
-        return [*out, PageSection('Noise, light and drift', (table(('', ''), _levels(self)),))]
+        return [*out, PageSection('Noise, light and drift', (table(('', ''), level_rows(self)),))]
 
     def table(self) -> Table:
         """One row a finding: ``where``, ``value`` (a number, numbers, or None), ``fix``, ``evidence``."""
@@ -187,13 +187,13 @@ class Checkup(StudyResult):
         }
 
 
-def _pushes(found: Checkup) -> list[list[str]]:
+def push_rows(found: Checkup) -> list[list[str]]:
     """How each channel answered, beside what the rig file expects of it."""
     rows = [['push', *(f'{c} µm' for c in DOTS), '', *DOTS, 'size']]
     for push, size in zip(found.pushes, found.sizes, strict=True):
         expected = on_channels(Wiring.from_rig(found.rig), push.expected)
         told_size = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
-        words = [_arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
+        words = [arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
         rows.append(
             [push.name, *(f'{v * 1e6:+z.1f}' for v in push.channels.tolist()), '  rig file:', *words, told_size]
         )
@@ -202,7 +202,7 @@ def _pushes(found: Checkup) -> list[list[str]]:
     return rows
 
 
-def _answers(found: Checkup) -> Chart:
+def answers_chart(found: Checkup) -> Chart:
     """How each channel moved at each push, and how it would by the rig file."""
     wiring = Wiring.from_rig(found.rig)
     at = np.arange(1.0, len(found.pushes) + 1.0)
@@ -219,7 +219,7 @@ def _answers(found: Checkup) -> Chart:
     return Chart('how each channel moved at each push', panels, beside=2)
 
 
-def _arrow(value: float, size: float) -> str:
+def arrow(value: float, size: float) -> str:
     """A direction: + or -, or 0 for next to nothing."""
     return '0' if abs(value) < 0.1 * size else '+' if value > 0.0 else '-'
 
@@ -252,7 +252,7 @@ def _findings(found: Checkup) -> list[tuple[str, str]]:
     return [*rows, *((f'{psd}: light', text) for psd, text in found.light.items())]
 
 
-def _other_causes(found: Checkup) -> list[str]:
+def other_causes(found: Checkup) -> list[str]:
     """What else would look the same."""
     return [f'or else: {_other(text)}' for text in dict.fromkeys(t for f in found.findings for t in f.equivalent)]
 
@@ -266,7 +266,8 @@ def _other(text: str) -> str:
     return f'the rig file is right, and {pushes} went the other way (sign of the load); this would look the same'
 
 
-def _levels(found: Checkup) -> list[tuple[str, str]]:
+def level_rows(found: Checkup) -> list[tuple[str, str]]:
+    """Return noise, hum, light and drift as pairs of a title and words."""
     measured = found.levels
     noise = '  '.join(f'{c} {v * 1e3:.2f}' for c, v in zip(CHANNELS, measured.noise.tolist(), strict=True))
     drift = '  '.join(

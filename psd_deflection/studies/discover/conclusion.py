@@ -284,7 +284,7 @@ class RigConclusion(Conclusion):
         """What is wrong with the set-up, what is missing besides, what that does to an estimate, the law."""
         missing = _missing(self, ' besides' if self.setup else '')
         tied = [t.sentence for t in ties(self.effects)]
-        return [s for s in (_setup(self), missing, *tied, _moved(self), _law(self), *self.beyond) if s]
+        return [s for s in (_setup(self), missing, *tied, _moved(self), law_sentence(self), *self.beyond) if s]
 
     def lines(self) -> list[str]:
         """The sentences in one line, what puts the set-up right, what would decide, what is unknown."""
@@ -430,7 +430,7 @@ def _moved(discovery: RigConclusion) -> str:
     return ' '.join(filter(None, (f'Without {them} an estimate is wrong by up to {words}.', uncorrected)))
 
 
-def _law(discovery: RigConclusion) -> str:
+def law_sentence(discovery: RigConclusion) -> str:
     """The law for what is unknown, in a sentence, or nothing."""
     if discovery.law is None:
         return ''

@@ -207,7 +207,7 @@ def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: L
         for _, s in seen:
             # The same for as long as a recording may be.
             possible = np.maximum(possible, separations(s * max(limits.seconds // s.seconds, 1.0)))
-        value, chosen = _together(seen, nothing_of(models), separations, limits.seconds)
+        value, chosen = best_combination(seen, nothing_of(models), separations, limits.seconds)
         if chosen and value - setting.effort > best[0]:
             best = (value - setting.effort, setting, chosen)
     _, setting, chosen = best
@@ -236,7 +236,7 @@ def rate_of(rig: Rig, setting: Setting) -> float:
     return changed.converter.sample_rate_hz
 
 
-def _together(
+def best_combination(
     seen: Sequence[tuple[Piece, ModelSums]],
     total: ModelSums,
     separations: Callable[[ModelSums], FloatArray],

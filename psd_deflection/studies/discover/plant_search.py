@@ -369,7 +369,7 @@ def regressors(ws: PlantComparison, fit: Fit) -> Table:
     return out
 
 
-def _where(ws: PlantComparison, fit: Fit, known: FloatArray | None) -> Localisation:
+def localise_cases(ws: PlantComparison, fit: Fit, known: FloatArray | None) -> Localisation:
     """What ``fit`` leaves by case and channel, and what it follows. Only what it follows makes it an unknown effect: a
     case may be worse than others because it moves more.
     """
@@ -426,7 +426,7 @@ class SimulatedPlant(Machine):
 
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
         """By case and channel, and what it follows."""
-        return _where(_of_plant(comparison), fit, fit.jacobian if fit.free else None)
+        return localise_cases(_of_plant(comparison), fit, fit.jacobian if fit.free else None)
 
     def regressors(self, comparison: Comparison, fit: Fit) -> Table:
         """Time, the plant's inputs, and the channel's own reading and rate."""

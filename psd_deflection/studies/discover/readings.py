@@ -177,18 +177,18 @@ class ReadingsPlant(Plant):
         by_choice: dict[tuple[float, ...], list[FloatArray]] = {}
         choices = [p for p in effect.parameters if p.kind == 'choice' and not p.each]
         for choice in effect.variants(table.psds):
-            active = ActiveEffect(effect, _dosed(effect, effect.off_values(self.physics, choice)))
+            active = ActiveEffect(effect, with_first_dose(effect, effect.off_values(self.physics, choice)))
             rows = self._rows(table, [active], forward)
             if not np.allclose(rows, self._rows(table, [active], backward), rtol=1e-9, atol=1e-6):
                 return None
             by_choice.setdefault(tuple(choice[p.name] for p in choices), []).append(rows)
         first, *others = by_choice.values()
         if choices and all(np.array_equal(a, b) for other in others for a, b in zip(first, other, strict=True)):
-            return dataclasses.replace(effect, parameters=tuple(map(_settled_choice, effect.parameters)))
+            return dataclasses.replace(effect, parameters=tuple(map(fixed_choice, effect.parameters)))
         return effect
 
 
-def _dosed(effect: Effect, off: Mapping[str, float]) -> dict[str, float]:
+def with_first_dose(effect: Effect, off: Mapping[str, float]) -> dict[str, float]:
     """``effect`` with a small size and the first shape that its declaration names."""
     out = dict(off)
     for p in effect.parameters:
@@ -200,7 +200,8 @@ def _dosed(effect: Effect, off: Mapping[str, float]) -> dict[str, float]:
     return out
 
 
-def _settled_choice(p: EffectParameter) -> EffectParameter:
+def fixed_choice(p: EffectParameter) -> EffectParameter:
+    """Return a choice with one value, for one that makes no difference at rest; anything else as it is."""
     if p.kind != 'choice' or p.each:
         return p
     return dataclasses.replace(p, choices=(int(p.nominal) if p.nominal in p.choices else p.choices[0],))

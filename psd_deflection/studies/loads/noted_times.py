@@ -194,29 +194,29 @@ def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads 
         return None
     width = max(2, round(PERIODS / rig.dynamics.bending_frequency / period))
     steps = lasting_steps(dots, width)
-    sizes = _expected(rig, loads[changes] - loads[changes - 1])
-    matched = _matched(changes, sizes, steps, period)
+    sizes = expected_movements(rig, loads[changes] - loads[changes - 1])
+    matched = matched_notes(changes, sizes, steps, period)
     if not matched:
         return None
     late = np.array([(changes[i] - steps[j].at) * period for i, j in matched])
     long = np.array([steps[j].last - steps[j].first > 2.0 * width + GRADUAL_S / period for _, j in matched])
-    if _alike(late, ALIKE_S) and not long.any():
+    if are_alike(late, ALIKE_S) and not long.any():
         return None
     edges = [0.0, *(s.at for s in steps), float(len(dots))]
     fitted = {i: time_of_step(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}
     late = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
     # One delay is left to a search, unless it would have to find it from what was lost.
     unseen = abs(float(np.median(late))) > ALIKE_S and any(steps[j].lost for _, j in matched)
-    if not unseen and _alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
+    if not unseen and are_alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
         return None
-    mended, timed = _as_acted(loads, changes, fitted, period)
-    left, rest = _left(rig, dots, mended)
-    if BETTER * left > _left(rig, dots, loads)[0]:
+    mended, timed = loads_with_times(loads, changes, fitted, period)
+    left, rest = residual_of_dots(rig, dots, mended)
+    if BETTER * left > residual_of_dots(rig, dots, loads)[0]:
         return None
-    return replace(_without_rough_motion(rig, mended, [n for n in timed if n.wrong], rest), timed=tuple(timed))
+    return replace(without_rough_motion(rig, mended, [n for n in timed if n.wrong], rest), timed=tuple(timed))
 
 
-def _as_acted(
+def loads_with_times(
     loads: FloatArray, changes: IntArray, fitted: Mapping[int, tuple[float, float]], period: float
 ) -> tuple[FloatArray, list[MendedNote]]:
     """The loads with change ``i`` from the time ``fitted[i]`` says, in the time that it took; the notes of these."""
@@ -233,16 +233,16 @@ def _as_acted(
     return mended, notes
 
 
-def _without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNote], rest: FloatArray) -> MendedLoads:
+def without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNote], rest: FloatArray) -> MendedLoads:
     """The mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
     t: FloatArray = np.arange(len(mended), dtype=np.float64) / rig.converter.sample_rate_hz
     unused = np.zeros(len(mended), dtype=bool)
     told = []
     for note in notes:
-        moving = _moving(rig, note, t)
+        moving = in_motion(rig, note, t)
         told.append(note)
         # A step is the simplest motion: if the link rings otherwise, that is the rig's.
-        if note.took > 0.0 and _rough(rest, moving & (t > note.hung + note.took), rig.estimator.block_size):
+        if note.took > 0.0 and is_rough(rest, moving & (t > note.hung + note.took), rig.estimator.block_size):
             unused |= moving
             told[-1] = MendedNote(note.number, note.load, note.noted, note.hung, note.took, settled_only=True)
     return MendedLoads(mended, tuple(told), unused)
@@ -264,18 +264,19 @@ def shifted(note: MendedNote, loads: FloatArray, period: float) -> Callable[[Seq
     return more
 
 
-def _alike(late: FloatArray, within: float) -> bool:
+def are_alike(late: FloatArray, within: float) -> bool:
+    """Return whether all delays, s, are ``within`` s of the middle one, and that is one delay of all."""
     middle = float(np.median(late))
     return abs(middle) <= ONE_DELAY_S and bool(np.all(np.abs(late - middle) <= within))
 
 
-def _expected(rig: Rig, changes: FloatArray) -> FloatArray:
+def expected_movements(rig: Rig, changes: FloatArray) -> FloatArray:
     """How far (k,) the dots move, m, by changes (k, 3) of the load."""
     poses = changes @ LinkStatics.from_rig(rig).compliance
     return np.asarray(np.linalg.norm(poses @ design_matrix(rig.centers + rig.zeros).T, axis=1))
 
 
-def _matched(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period: float) -> list[tuple[int, int]]:
+def matched_notes(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period: float) -> list[tuple[int, int]]:
     """Pairs of a noted change and a step, both in their order, at least cost; changes that move nothing have none."""
     if not steps or float(sizes.sum()) <= 0.0:
         return []
@@ -307,7 +308,7 @@ def _matched(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period:
     return out[::-1]
 
 
-def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:
+def residual_of_dots(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:
     """What a regression of the dots on the motion under ``loads`` leaves, m^2; block means of it (n, 2P), m."""
     period = 1.0 / rig.converter.sample_rate_hz
     static = loads @ LinkStatics.from_rig(rig).compliance
@@ -328,14 +329,14 @@ def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatAr
     return float((rest**2).sum()), np.repeat(blocks, size, axis=0)[: len(dots)]
 
 
-def _moving(rig: Rig, note: MendedNote, t: FloatArray) -> BoolArray:
+def in_motion(rig: Rig, note: MendedNote, t: FloatArray) -> BoolArray:
     """Samples (n,) in which the link moves by the load of ``note``."""
     slowest = max(1.0 / (2.0 * math.pi * f * max(ratio, 1e-3)) for f, ratio in link_modes(rig))
     ends = note.hung + note.took + SETTLED_S * slowest
     return np.asarray((t >= note.hung - 0.02) & (t < ends))
 
 
-def _rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
+def is_rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
     """Whether the link rings otherwise than the mended load makes it; ``rest`` (n, 2P): means of blocks of ``size``."""
     blocks, rings = rest[::size], ringing[::size]
     noise = 0.5 * np.nanmedian((np.diff(blocks, axis=0) ** 2).sum(axis=1))

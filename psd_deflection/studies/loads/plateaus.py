@@ -220,34 +220,34 @@ def stand_out(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> S
     sign or another unit may change a load that no other is like.
     """
     count = len(found.plateaus)
-    if np.abs(found.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not _closes(found, CLOSES + bent):
+    if np.abs(found.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not closes(found, CLOSES + bent):
         return StandingOut()
     # A detector at fault moves its dots as no plate does.
     as_plate = np.abs(found.across) <= PLATE * found.sizes + PLATE_M
-    off = _apart(found, (), 0.0)
+    off = deviation_in_tolerances(found, (), 0.0)
     order = np.argsort(-off, kind='stable')
     for share, right, most in ((EXACT, FEWEST_EXACT, count - FEWEST_EXACT), (1.0, FEWEST_RIGHT, 2)):
         for wrong in range(1, min(most, count - right) + 1):
             gone = order[:wrong]
-            stands = _stands(off[gone] / share, off[order[wrong:]] / share, bent)
-            if stands and (share == 1.0 or as_plate[gone].all()) and _known(found, gone, largest):
+            stands = stands_out(off[gone] / share, off[order[wrong:]] / share, bent)
+            if stands and (share == 1.0 or as_plate[gone].all()) and is_known(found, gone, largest):
                 return StandingOut(tuple(sorted(gone.tolist())))
     # Two wrong ones of seven leave too few to tell what effects do.
     fitting, tried = 0, []
     for k in range(1, count if count > FEWEST_RIGHT else 0):
-        slopes, offset = _proportion(found, (k,), SOFTER)
+        slopes, offset = proportional_part(found, (k,), SOFTER)
         if np.abs(slopes).max() > MOST * SOFTER or np.abs(offset).max() > MOST * OFFSET:
             continue
-        apart = _apart(found, (k,), SOFTER)
+        apart = deviation_in_tolerances(found, (k,), SOFTER)
         others = np.delete(apart, k)
         fitting += bool(others.max() <= 1.0 + bent * apart[k])
-        if _stands(apart[k : k + 1], others, bent) and _known(found, np.array([k]), largest):
+        if stands_out(apart[k : k + 1], others, bent) and is_known(found, np.array([k]), largest):
             tried.append(k)
     # If the others are in proportion whichever is left out, nobody knows which one is wrong.
     return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
 
 
-def _known(found: PlateauLoads, gone: IntArray, largest: float) -> bool:
+def is_known(found: PlateauLoads, gone: IntArray, largest: float) -> bool:
     """Whether the other loads say what effects in proportion do to those of ``gone``, or no effect does so much, or a
     change was noted twice.
     """
@@ -279,12 +279,13 @@ def _noted_twice(found: PlateauLoads, k: int) -> FloatArray | None:
     return hung if np.all(off <= allowed) and np.any(np.abs(hung - noted) > STANDS_OUT * allowed) else None
 
 
-def _stands(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
+def stands_out(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
+    """Return whether the ``wrong`` are far off and the others are not, in tolerances."""
     rest, least = float(others.max()), float(wrong.min())
     return rest <= 1.0 + bent * least and least > max(STANDS_OUT, 5.0 * rest)
 
 
-def _proportion(found: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
+def proportional_part(found: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
     """What effects do to all loads but ``gone``: (3, 3) and (3,), the likeliest if it is a share of ``softer``."""
     if softer == 0.0:
         return np.zeros((3, 3)), np.zeros(3)
@@ -295,9 +296,9 @@ def _proportion(found: PlateauLoads, gone: Sequence[int], softer: float) -> tupl
     return both[:3], both[3]
 
 
-def _apart(found: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
+def deviation_in_tolerances(found: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
     """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
-    slopes, offset = _proportion(found, gone, softer)
+    slopes, offset = proportional_part(found, gone, softer)
     off = np.abs(found.more - found.noted @ slopes - offset)
     allowed = TOLERANCE + SHARE * np.abs(found.noted).max(axis=1, keepdims=True)
     return np.asarray((off / allowed).max(axis=1))
@@ -308,9 +309,9 @@ def all_free(found: PlateauLoads, loads: FloatArray) -> bool:
 
     ``loads`` (n, 3): as the movement of ``found`` counts them; those that were already put right differ from the noted.
     """
-    if len(found.plateaus) < FEWEST or not _closes(found):
+    if len(found.plateaus) < FEWEST or not closes(found):
         return False
-    return int(np.count_nonzero(_apart(found, (), SOFTER) > 1.0)) >= 2 or _rounded(found, loads)
+    return int(np.count_nonzero(deviation_in_tolerances(found, (), SOFTER) > 1.0)) >= 2 or are_rounded(found, loads)
 
 
 def may_be_rounded(found: PlateauLoads) -> bool:
@@ -322,7 +323,7 @@ def may_be_rounded(found: PlateauLoads) -> bool:
     return 0.0 < forces < np.inf and bool(np.all(np.abs(found.more[:, :2]) < forces))
 
 
-def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
+def are_rounded(found: PlateauLoads, loads: FloatArray) -> bool:
     """Whether the loads that ``found`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
     return rounded(found.noted, np.array([p.of(loads) for p in found.plateaus]).reshape(-1, 3) + found.more)
 
@@ -346,17 +347,17 @@ def rounded(noted: FloatArray, hung: FloatArray) -> bool:
 
 def steps_of(noted: FloatArray) -> FloatArray:
     """(3,): to which steps the ``noted`` loads (k, 3) are rounded, N, N, N m; 0 for none, infinity if all are 0."""
-    return np.array([_step(noted[:, :2]), _step(noted[:, :2]), _step(noted[:, 2:])])
+    return np.array([largest_step(noted[:, :2]), largest_step(noted[:, :2]), largest_step(noted[:, 2:])])
 
 
-def _step(noted: FloatArray) -> float:
+def largest_step(noted: FloatArray) -> float:
     """The largest step of which all ``noted`` numbers are multiples; infinity if all are 0, 0 if there is none."""
     if not np.any(noted):
         return np.inf
     return max((s for s in STEPS if np.allclose(noted, s * np.round(noted / s), atol=1e-6)), default=0.0)
 
 
-def _closes(found: PlateauLoads, share: float = CLOSES) -> bool:
+def closes(found: PlateauLoads, share: float = CLOSES) -> bool:
     """Whether other loads, constant between changes, leave next to nothing of the movement."""
     return _rms(found.rest) < share * _rms(found.moved)
 
@@ -454,7 +455,7 @@ def noted_wrong(
     for bent in (0.2 * BENT, 0.0, 0.0, 0.0):
         if not which.gone:
             return []
-        slopes, offset = _proportion(found, which.gone, which.softer)
+        slopes, offset = proportional_part(found, which.gone, which.softer)
         for k in which.gone:
             hung[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + found.more[k] - offset)
         found = against()

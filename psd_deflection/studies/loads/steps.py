@@ -70,7 +70,7 @@ def lasting_steps(dots: FloatArray, width: int) -> list[DotStep]:
             keep[a:b] = False
     kept = np.flatnonzero(keep)
     out = []
-    for step in _steps_of_kept(dots[kept], width):
+    for step in steps_among_samples(dots[kept], width):
         first, last = kept[[step.first, step.last]].tolist()
         # Between the last sample before it and the first after it.
         before, after = np.interp((step.at - 1.0, step.at), np.arange(len(kept)), kept).tolist()
@@ -79,7 +79,8 @@ def lasting_steps(dots: FloatArray, width: int) -> list[DotStep]:
     return out
 
 
-def _steps_of_kept(dots: FloatArray, width: int) -> list[DotStep]:
+def steps_among_samples(dots: FloatArray, width: int) -> list[DotStep]:
+    """Return the lasting steps of dots (n, 4), m, without regard to lost samples."""
     n = len(dots)
     if n < 4 * width:
         return []
@@ -169,13 +170,13 @@ def time_of_step(
 
     middle = step.at * period
     around = min(0.15 + step.lost * period, MOST_AROUND_S)
-    sudden = _least(left, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
-    slow = _least(left, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
+    sudden = best_time(left, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
+    slow = best_time(left, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
     start, took = slow[1] if slow[0] < 0.5 * sudden[0] else (sudden[1][0], 0.0)
     return start, abs(took)
 
 
-def _least(
+def best_time(
     left: Callable[[FloatArray], float], starts: list[tuple[float, float]], reach: float
 ) -> tuple[float, tuple[float, float]]:
     """The least of ``left`` and where, from the best of ``starts``; starts without duration, in their order, keep none.

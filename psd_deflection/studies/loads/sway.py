@@ -101,7 +101,7 @@ def swaying(
         moves, across = np.split(power[:, band].sum(axis=1), [2])
         each = moves if sum(moves) > PLATE * sum(across) else np.zeros(2)
         axis = int(np.argmax(each))
-        peak = _strongest(f[band], power[axis, band])
+        peak = peak_frequency(f[band], power[axis, band])
         # A step that nobody noted has no tone.
         tone = float(power[axis, band & (np.abs(f - peak) <= TONE * peak)].sum())
         if peak * (b - a) * fine < 2.0 or tone < 0.5 * float(power[axis, band].sum()):
@@ -173,7 +173,7 @@ def left_out(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> Floa
     return out
 
 
-def _strongest(f: FloatArray, power: FloatArray) -> float:
+def peak_frequency(f: FloatArray, power: FloatArray) -> float:
     """Frequency at which ``power`` is largest, between those of ``f``: the top of a parabola through its logarithm."""
     if not len(f) or not power.any():
         return 0.0

@@ -103,7 +103,7 @@ class Offset:
 
 
 @dataclass
-class _Fit:
+class OffsetFit:
     """``left``: what the fit leaves (k, 3), m, m, rad; ``sizes`` (3,): its scatter."""
 
     value: float
@@ -115,10 +115,10 @@ class _Fit:
 
     def chi_square(self, sizes: FloatArray) -> float:
         """Mean over the references of what the fit leaves, in ``sizes``; an outlier counts like any other."""
-        return _robust(self.left / sizes)
+        return biweight_sum(self.left / sizes)
 
 
-def _robust(u: FloatArray) -> float:
+def biweight_sum(u: FloatArray) -> float:
     """Tukey's biweight in place of u^2, summed over the axes, mean over the references."""
     inside = np.clip(1.0 - (u / BIWEIGHT) ** 2, 0.0, None)
     return float((BIWEIGHT**2 / 3.0 * (1.0 - inside**3)).sum(axis=1).mean())
@@ -138,15 +138,16 @@ def clock_offset(
     if t[0] - largest > motion.t[-1] or t[-1] + largest < motion.t[0]:
         base = float(motion.t[0] - t[0])
         largest = float(max(t[-1] - t[0], motion.t[-1] - motion.t[0]))
-    found = _offset(motion, t + base, poses, largest, exposure)
+    found = offset_near(motion, t + base, poses, largest, exposure)
     return replace(found, value=found.value + base, rivals=tuple(r + base for r in found.rivals))
 
 
-def _offset(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
-    fits: list[_Fit] = []
-    best: _Fit | None = None
-    for start in _coarse(motion, t, poses, largest):
-        found = _refined(motion, t, poses, start, exposure, best)
+def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
+    """Return the offset up to ``largest`` s either way that fits best, and its rivals."""
+    fits: list[OffsetFit] = []
+    best: OffsetFit | None = None
+    for start in coarse_offsets(motion, t, poses, largest):
+        found = refined_offset(motion, t, poses, start, exposure, best)
         if found is not None and abs(found.value) <= largest + APART * motion.period:
             fits.append(found)
             if best is None or found.chi_square(best.sizes) < best.chi_square(best.sizes):
@@ -162,11 +163,11 @@ def _offset(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, ex
     rivals = tuple(
         f.value for f in fits if abs(f.value - best.value) > near and used * (f.chi_square(best.sizes) - least) < RIVAL
     )
-    explained = used * (_robust((poses - np.median(poses, axis=0)) / best.sizes) - least)
+    explained = used * (biweight_sum((poses - np.median(poses, axis=0)) / best.sizes) - least)
     return Offset(best.value, best.sd, best.drift, best.drift_sd, explained > MOVES, rivals, used)
 
 
-def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) -> list[float]:
+def coarse_offsets(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) -> list[float]:
     """Offsets, s, at which the motion explains the reference best, the best first."""
     single, there = motion.grid()
     n, period = len(single), motion.period
@@ -215,22 +216,22 @@ def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) ->
     return [float(lag) * period for lag in lags[best]]
 
 
-def _refined(
-    motion: Motion, t: FloatArray, poses: FloatArray, start: float, exposure: float, best: _Fit | None
-) -> _Fit | None:
+def refined_offset(
+    motion: Motion, t: FloatArray, poses: FloatArray, start: float, exposure: float, best: OffsetFit | None
+) -> OffsetFit | None:
     """The offset near ``start``, s; None if fewer than 20 references have samples about them.
 
     ``best``: another fit. One that stays far above its chi-square is not finished.
     """
     value = start
     weights = np.ones((len(t), 3))
-    fit: _Fit | None = None
+    fit: OffsetFit | None = None
     for passed in range(PASSES):
         seen, rates = motion.poses_at(t + value, exposure)
         good = np.isfinite(seen).all(axis=1)
         if good.sum() < FEWEST:
             return None
-        used = _Used(t[good], poses[good], seen[good], rates[good])
+        used = UsedReferences(t[good], poses[good], seen[good], rates[good])
         step, fit, weights[good] = used.solved(weights[good])
         value += step
         fit.value = value
@@ -244,7 +245,7 @@ def _refined(
 
 
 @dataclass(frozen=True)
-class _Used:
+class UsedReferences:
     """The references in the fit: times (k,), references, motion and its rates (k, 3)."""
 
     t: FloatArray
@@ -252,7 +253,7 @@ class _Used:
     seen: FloatArray
     rates: FloatArray
 
-    def solved(self, weights: FloatArray) -> tuple[float, _Fit, FloatArray]:
+    def solved(self, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
         """The step of the offset, s, the fit there, and the weights of the next pass (k, 3)."""
         k = len(self.t)
         # Of an axis that does not move, the readings are noise and explain nothing.
@@ -279,7 +280,7 @@ class _Used:
         w = next_weights / sizes**2
         information = float((w * own * own).sum())
         if information <= 0.0:
-            return 0.0, _Fit(0.0, math.inf, 0.0, math.inf, left, sizes), next_weights
+            return 0.0, OffsetFit(0.0, math.inf, 0.0, math.inf, left, sizes), next_weights
         step = float((w * own * left).sum()) / information
         scores = (w * own * left).sum(axis=1)
         spread = max(variance_of_sum(scores) / information**2, 1.0 / information)
@@ -289,7 +290,7 @@ class _Used:
         drift = float((w * ramp * left).sum()) / grows if grows > 0.0 else 0.0
         drift_spread = variance_of_sum((w * ramp * left).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf
         drift_sd = math.sqrt(max(drift_spread, 1.0 / grows)) if grows > 0.0 else math.inf
-        return step, _Fit(0.0, math.sqrt(spread), drift, drift_sd, left, sizes), next_weights
+        return step, OffsetFit(0.0, math.sqrt(spread), drift, drift_sd, left, sizes), next_weights
 
 
 def variance_of_sum(scores: FloatArray) -> float:

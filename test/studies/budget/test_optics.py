@@ -72,17 +72,6 @@ def test_shift_behind_a_boundary(degrees: float, micrometres: float) -> None:
     assert got == pytest.approx(micrometres, abs={5.0: 5e-3, 45.0: 5e-7, 80.0: 0.5}[degrees])
 
 
-def test_a_boundary_met_at_right_angles_shifts_nothing() -> None:
-    assert boundary_shift(0.0, 1.0003, 1.0002, 0.585) == 0.0
-
-
-def test_snells_law_and_its_limit() -> None:
-    angle = refracted_angle(0.5, 1.0, 1.5)
-    assert 1.5 * math.sin(angle) == pytest.approx(math.sin(0.5), rel=1e-15)
-    with pytest.raises(ConfigError, match='reflected totally'):
-        refracted_angle(1.2, 1.5, 1.0)
-
-
 def test_a_gradient_bends_the_beam() -> None:
     per_kelvin = index_per_kelvin(293.15)
     assert 1e6 * gradient_shift(abs(per_kelvin), 0.585) == pytest.approx(0.159, abs=5e-4)
@@ -101,11 +90,6 @@ def test_what_averaging_leaves_of_hum() -> None:
     assert averaging_gain(20, 60.0, 1000.0) == pytest.approx(0.157, abs=1e-3)
     # An alias of a constant is not averaged at all.
     assert averaging_gain(20, 1000.0, 1000.0) == 1.0
-
-
-@pytest.mark.parametrize(('celsius', 'hectopascal'), [(0.0, 6.11), (10.0, 12.28), (20.0, 23.39), (30.0, 42.47)])
-def test_saturated_vapour_is_that_of_the_tables(celsius: float, hectopascal: float) -> None:
-    assert saturation_pressure(273.15 + celsius) == pytest.approx(100.0 * hectopascal, rel=4e-3)
 
 
 def _magnus(celsius: float) -> float:

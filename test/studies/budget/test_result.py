@@ -78,7 +78,7 @@ def test_the_situation_is_the_load_and_the_pose(plain: Budgeted) -> None:
 
 
 def test_the_rows_of_the_causes_are_their_numbers(plain: Budgeted) -> None:
-    head, *rows = plain._causes()
+    head, *rows = plain.cause_rows()
     assert head[5:] == ['ΔX µm', 'ΔY µm', 'θ mdeg', 'ΔX %', 'ΔY %', 'θ %']
     whole = plain.budget.total().rms
     for row, (cause, line) in zip(rows, plain.budget.lines, strict=True):
@@ -94,21 +94,8 @@ def test_the_rows_of_the_causes_are_their_numbers(plain: Budgeted) -> None:
     assert text[4].startswith(f'{rows[0][0]:<{max(len(row[0]) for row in (head, *rows))}}  ')
 
 
-def test_words_stand_flush_left_and_numbers_right(plain: Budgeted) -> None:
-    lines = plain.lines()
-    head, first = lines[2], lines[4]
-    cells = plain._causes()[1]
-    at = head.index('type')
-    assert first[at - 2 :].startswith(f'  {cells[3]} ')
-    end = head.index('ν') + 1
-    # As wide as 999, so that one figure stands at the right of it.
-    assert cells[4] == '8'
-    assert head[end - 4 : end] == '   ν'
-    assert first[end - 4 : end] == '   8'
-
-
 def test_totals_are_sums_of_their_kind(plain: Budgeted) -> None:
-    rows = {row[0]: row[1:] for row in plain._totals()[1:]}
+    rows = {row[0]: row[1:] for row in plain.total_rows()[1:]}
     for kind in (*Kind, None):
         own = [line for cause, line in plain.budget.lines if kind is None or cause.kind is kind]
         bias = sum((line.bias for line in own), np.zeros(3))
@@ -123,7 +110,7 @@ def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain:
     variances = np.array([np.diag(line.covariance) for _, line in plain.budget.lines])
     bias = np.sum([line.bias for _, line in plain.budget.lines], axis=0)
     said = expanded(variances, [cause.freedom(plain.budget.at) for cause in CAUSES], bias)
-    _, *rows = plain._expanded()
+    _, *rows = plain.expanded_rows()
     assert len(rows) == 5
     assert [float(v) for v in rows[0][1:]] == pytest.approx((said.standard * SCALES).tolist(), abs=6e-4)
     assert rows[1][1:] == [f'{v:.0f}' for v in said.freedom.tolist()]
@@ -132,7 +119,7 @@ def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain:
     by_hand = said.factor * said.standard + np.abs(bias)
     assert [float(v) for v in rows[4][1:]] == pytest.approx((by_hand * SCALES).tolist(), abs=6e-4)
     assert answer.interval is not None
-    drawn = answer._expanded()[6:]
+    drawn = answer.expanded_rows()[6:]
     assert [float(v) for v in drawn[0][1:]] == pytest.approx((answer.interval.half * SCALES).tolist(), abs=6e-4)
     off = 100.0 * (said.factor * said.standard / answer.interval.half - 1.0)
     assert drawn[1][1:] == [f'{v:+.1f}' for v in off.tolist()]
@@ -245,7 +232,7 @@ def test_the_page_has_every_section(answer: Budgeted) -> None:
         *('Expanded uncertainty (GUM)', 'Every error parameter'),
     ]
     page = answer.report()
-    for cells in (*answer._causes(), *answer._totals(), *answer._expanded(), *parameter_rows(answer.budget)):
+    for cells in (*answer.cause_rows(), *answer.total_rows(), *answer.expanded_rows(), *parameter_rows(answer.budget)):
         assert all(f'>{cell}<' in page for cell in cells if cell)
     # The bars begin at a thousandth.
     assert 'from 0.001 of the total on' in page

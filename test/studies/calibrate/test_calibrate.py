@@ -247,7 +247,7 @@ def test_what_the_rows_contradict_is_widened_once_each_the_worst_first(
     # A fit that stays where it is.
     monkeypatch.setattr(module, 'fit', lambda *_, start, **__: start)
     free = np.ones(len(NAMES), dtype=bool)
-    _, wider, widened = module._believed(first, cast(Rows, None), nominal, prior, 'loads', free)
+    _, wider, widened = module.believed_fit(first, cast(Rows, None), nominal, prior, 'loads', free)
     assert widened == ['clamp.bending_compliance', 'psd_1.rotation']
     sd = prior.sd.copy()
     sd[[worst, next_one]] *= module.WIDER

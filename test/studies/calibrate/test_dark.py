@@ -21,8 +21,8 @@ from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import (
     PIECES,
     DarkLevel,
-    _mean_and_drift,
     dark_levels,
+    mean_and_drift,
     result_of_levels,
     values_of_levels,
     words_of_level,
@@ -240,7 +240,7 @@ def test_a_level_is_a_record(nominal: Rig) -> None:
 
 def test_few_pieces_widen_the_interval_to_that_of_student() -> None:
     part = np.random.default_rng(6).normal(0.0, 2e-3, (4000, 3))
-    mean, sd, _, _ = _mean_and_drift(part, 1e-9)
+    mean, sd, _, _ = mean_and_drift(part, 1e-9)
     pieces = np.array([piece.mean(axis=0) for piece in np.array_split(part, PIECES)])
     plain = pieces.std(axis=0, ddof=1) / PIECES**0.5
     worth = [fewer((pieces[:, [i]] - pieces[:, i].mean()), np.zeros(PIECES, dtype=np.int64)) ** 0.5 for i in range(3)]

@@ -22,9 +22,9 @@ from psd_deflection.studies.calibrate.fit import (
     Kind,
     Linear,
     Noise,
-    _components,
     pose_of_readings,
     prior_of_rig,
+    variance_components,
     weight_matrices,
 )
 
@@ -91,5 +91,5 @@ def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: 
     )
     linear = Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
     prior = prior_of_rig(rig_from_values({}))
-    found = _components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
+    found = variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
     assert found.dots == pytest.approx(told)

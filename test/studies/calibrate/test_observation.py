@@ -9,7 +9,7 @@ import pytest
 
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
-from psd_deflection.studies.calibrate.fit import _deviation
+from psd_deflection.studies.calibrate.fit import deviation_of
 from psd_deflection.studies.calibrate.observation import (
     CALM_LEAST,
     CalibrationRun,
@@ -171,10 +171,10 @@ def test_references_count_by_their_proportions_if_all_state_them() -> None:
 
 def test_half_of_the_deviations_tell_that_of_all() -> None:
     values = np.random.default_rng(3).normal(0.0, 2.0, 20_000)
-    assert _deviation(values, False) == pytest.approx(2.0, rel=0.02)
-    assert _deviation(values, True) == pytest.approx(2.0, rel=0.03)
+    assert deviation_of(values, False) == pytest.approx(2.0, rel=0.02)
+    assert deviation_of(values, True) == pytest.approx(2.0, rel=0.03)
     values[::10] += 1000.0
-    assert _deviation(values, True) == pytest.approx(2.0, rel=0.2)
+    assert deviation_of(values, True) == pytest.approx(2.0, rel=0.2)
 
 
 def test_the_steps_of_the_converter_are_no_noise() -> None:

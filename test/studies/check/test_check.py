@@ -27,7 +27,7 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.responses import responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup
-from psd_deflection.studies.check.wirings import WIRINGS, differences, line, parameters
+from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.from_recordings import read_observation
 
 CLOUD = 2e-3 * 0.5e-3
@@ -175,45 +175,6 @@ def test_a_rig_file_that_knows_its_wiring_is_right_and_the_nominal_one_is_then_w
         assert rig_from_values({**lines_of(turn), **nominal.values}).values == load_rig().values
 
 
-def test_all_four_signs_wrong_could_be_the_load_too_and_both_are_said() -> None:
-    loads = pushes(10.0)
-    turn = {name: (name, 1 if name.startswith('sum') else -1) for name in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')}
-    found = checked(recorded(loads, 0, turn), loads)
-    assert [(f.name, f.where, f.value) for f in found.findings] == [
-        ('channel_sign', c, -1.0) for c in ('x1', 'y1', 'x2', 'y2')
-    ]
-    assert {f.equivalent for f in found.findings} == {('load_sign of fx fy tz',)}
-    assert dict(found.values) == {'psd_1.axes': ['-x', '-y'], 'psd_2.axes': ['-x', '-y']}
-    # Pushed the other way on a rig that is wired right: the same evidence, the same two answers.
-    other = checked(recorded(pushes(10.0, (-1.0, -1.0, -1.0)), 0), loads)
-    assert [(f.name, f.where, f.equivalent) for f in other.findings] == [
-        (f.name, f.where, f.equivalent) for f in found.findings
-    ]
-    # One sign alone has no second reading.
-    lone = checked(recorded(loads, 0, {**{n: (n, 1) for n in turn}, 'y1': ('y1', -1)}), loads)
-    assert [(f.name, f.where, f.fix, f.equivalent) for f in lone.findings] == [
-        ('channel_sign', 'y1', 'psd_1.axes: [x, -y]', ())
-    ]
-    assert lone.findings[0].evidence > 0.5
-
-
-@pytest.mark.parametrize(('i', 'load'), list(enumerate(('fx', 'fy', 'tz'))))
-def test_the_sign_of_one_load_is_named_and_no_wire(i: int, load: str) -> None:
-    signs = [1.0, 1.0, 1.0]
-    signs[i] = -1.0
-    found = checked(recorded(pushes(10.0, signs), 1), pushes(10.0))
-    assert [(f.name, f.where, f.value) for f in found.findings] == [('load_sign', load, -1.0)]
-    assert not found.values
-
-
-def test_loads_in_kilograms_are_named() -> None:
-    loads = pushes(50.0)
-    found = checked(recorded(loads, 1), loads / 9.80665)
-    assert [(f.name, f.where) for f in found.findings] == [('load_unit', 'fx fy'), ('load_unit', 'tz')]
-    assert [f.value for f in found.findings] == pytest.approx([9.81, 9.81], abs=0.005)
-    assert found.verdict == WRONG
-
-
 @pytest.mark.parametrize('channel', ['x1', 'y1', 'x2', 'y2'])
 @pytest.mark.parametrize('stuck', [False, True])
 def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> None:
@@ -229,26 +190,6 @@ def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> Non
     assert re.fullmatch(rf'{channel}: [^:]+: .+', told)
     assert '  ' not in told
     assert any(line.startswith(f'  {channel}: ') for line in found.lines())
-
-
-def test_loads_that_leave_a_wire_untouched_cannot_tell_and_say_what_is_needed() -> None:
-    loads = pushes(10.0)
-    loads[:, 0] = 0.0
-    found = checked(recorded(loads, 3), loads)
-    assert found.verdict == CANNOT_TELL
-    assert [f.name for f in found.findings] == ['load_coverage']
-    assert found.findings[0].fix == 'record again with a load along X alone too'
-    assert '  pushes: not enough to tell   record again with a load along X alone too' in found.lines()
-    assert found.sentences()[0] == "CANNOT TELL: the rig file's wiring fits, and so does 1 of the other 127."
-    assert Wiring() in [c.wiring for c in found.found]
-    assert not found.values
-    # Weights on a sidebar: a force along Y and its torque, always together.
-    together = np.zeros((6000, 3))
-    together[2000:4000] = (0.0, -10.0, -5.85)
-    found = checked(recorded(together, 4), together)
-    assert [p.name for p in found.pushes] == ['+Y with +θ']
-    assert found.verdict == CANNOT_TELL
-    assert re.search(r', and so do \d+ of the other 127\.$', found.sentences()[0])
 
 
 def test_pushes_below_the_noise_accuse_nobody() -> None:
@@ -278,39 +219,6 @@ def test_noise_hum_and_light_are_held_against_the_rig_file() -> None:
     assert not quiet.notes
 
 
-def test_a_sum_beyond_the_limits_is_wrong() -> None:
-    loads = pushes(50.0)
-    for more, word in ((-3.5, 'too little: sum 1.50 V, below sum_min 2.5 V'), (3.0, 'too much: sum 8.00 V')):
-        volts = recorded(loads, 5)
-        volts[:, 5] += more
-        found = checked(volts, loads)
-        assert (found.verdict, found.findings, list(found.light)) == (WRONG, (), ['psd_2'])
-        assert found.light['psd_2'].startswith(word)
-        assert found.tree()['light'] == found.light
-        assert found.notes == ()
-        assert found.sentences()[0] == 'WRONG, but not in the wiring: that of the rig file fits.'
-
-
-def test_a_sum_that_does_not_answer_is_said_once() -> None:
-    loads = pushes(50.0)
-    volts = recorded(loads, 5)
-    volts[:, 5] = 0.0
-    assert [(f.name, f.where) for f in checked(volts, loads).findings] == [('stuck_channel', 'sum2')]
-
-
-def test_noise_that_the_rig_file_says_for_each_channel_is_held_against_each() -> None:
-    loads = pushes(50.0)
-    volts = recorded(loads, 5, sigmas=(1e-3, 2e-3, 2e-3, 1e-2, 2e-3, 2e-3))
-    rig = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]})
-    found = checked(volts, loads, rig)
-    (noisy,) = found.findings
-    assert (noisy.name, noisy.where) == ('noise_level', 'x2')
-    assert noisy.value == pytest.approx(2.5, rel=0.05)
-    assert found.values == {'psd_2.noise': pytest.approx([1e-2, 2e-3], rel=0.05)}
-    right = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [1e-2, 2e-3]})
-    assert not checked(volts, loads, right).findings
-
-
 @pytest.mark.parametrize('name', ['psd_1', 'psd_2'])
 def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> None:
     loads = pushes(50.0)
@@ -337,12 +245,6 @@ def test_drift_is_told_with_its_sign() -> None:
     assert found.drift[2] == pytest.approx(1e-6, rel=0.1)
     (note,) = found.notes
     assert re.match(r'drift: \+(59|6\d)\.\d µm a minute on x2', note)
-
-
-def test_every_wiring_differs_from_each_file_in_what_its_parameters_say() -> None:
-    assert len(set(WIRINGS)) == 128
-    for wiring, file in itertools.product(WIRINGS[::7], WIRINGS[::5]):
-        assert bool(differences(wiring, file)) == (wiring != file) == bool(parameters(wiring, file))
 
 
 def test_a_line_is_one_that_ros_reads_as_well() -> None:

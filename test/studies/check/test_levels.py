@@ -88,12 +88,12 @@ def test_steps_are_seen_wherever_they_are() -> None:
 
 def test_the_longest_run_is_the_first_of_those_without_a_lost_sample() -> None:
     volts = np.arange(120.0).reshape(20, 6)
-    assert module._longest_run(volts) == pytest.approx(volts)
+    assert module.longest_run(volts) == pytest.approx(volts)
     volts[[0, 7, 8, 15], [0, 5, 2, 3]] = np.nan
     # 1 to 6, 9 to 14 and 16 to 19.
-    assert module._longest_run(volts) == pytest.approx(volts[1:7])
+    assert module.longest_run(volts) == pytest.approx(volts[1:7])
     volts[6, 1] = np.nan
-    assert module._longest_run(volts) == pytest.approx(volts[9:15])
+    assert module.longest_run(volts) == pytest.approx(volts[9:15])
 
 
 def waves(n: int, rate: float, amplitudes: dict[float, float]) -> FloatArray:
@@ -107,14 +107,14 @@ def waves(n: int, rate: float, amplitudes: dict[float, float]) -> FloatArray:
 
 def test_hum_is_the_amplitude_of_the_mains_that_stands_out_more() -> None:
     noise = np.full(6, 1e-3)
-    hz, hum = module._hum(waves(4000, 1000.0, {50.0: 2e-3, 60.0: 5e-3}), 1000.0, noise)
+    hz, hum = module.mains_hum(waves(4000, 1000.0, {50.0: 2e-3, 60.0: 5e-3}), 1000.0, noise)
     assert hz == 60.0
     assert hum[1] == pytest.approx(5e-3, rel=0.03)
     assert hum[[0, 2, 3, 4, 5]].tolist() == [0.0] * 5
-    hz, hum = module._hum(waves(4000, 1000.0, {50.0: 5e-3, 60.0: 2e-3}), 1000.0, noise)
+    hz, hum = module.mains_hum(waves(4000, 1000.0, {50.0: 5e-3, 60.0: 2e-3}), 1000.0, noise)
     assert (hz, hum[1]) == (50.0, pytest.approx(5e-3, rel=0.03))
     # Without any it is that of the first.
-    hz, hum = module._hum(waves(4000, 1000.0, {}), 1000.0, noise)
+    hz, hum = module.mains_hum(waves(4000, 1000.0, {}), 1000.0, noise)
     assert (hz, hum.tolist()) == (50.0, [0.0] * 6)
 
 
@@ -151,34 +151,20 @@ def test_hum_stands_out_of_its_neighbours_five_times() -> None:
                 high = middle
             if high - low < 1e-9:
                 break
-        assert bool(module._hum(less, 500.0, np.zeros(6))[1][1] > 0.0) is seen
+        assert bool(module.mains_hum(less, 500.0, np.zeros(6))[1][1] > 0.0) is seen
 
 
 @pytest.mark.parametrize(('noise', 'seen'), [(0.0195, True), (0.0205, False)])
 def test_hum_below_a_quarter_of_the_noise_is_none(noise: float, seen: bool) -> None:
     volts = waves(4000, 1000.0, {50.0: 5e-3})
-    assert bool(module._hum(volts, 1000.0, np.full(6, noise))[1].any()) is seen
+    assert bool(module.mains_hum(volts, 1000.0, np.full(6, noise))[1].any()) is seen
 
 
 @pytest.mark.parametrize(
     ('n', 'rate', 'seen'), [(1000, 1000.0, True), (999, 1000.0, False), (600, 150.0, True), (600, 149.0, False)]
 )
 def test_hum_is_looked_for_in_a_second_and_at_two_and_a_half_samples_a_period(n: int, rate: float, seen: bool) -> None:
-    hz, hum = module._hum(waves(n, rate, {50.0: 0.1}), rate, np.full(6, 1e-3))
+    hz, hum = module.mains_hum(waves(n, rate, {50.0: 0.1}), rate, np.full(6, 1e-3))
     assert hz == 50.0
     assert bool(hum[1] > 0.0) is seen
     assert len(hum) == 6
-
-
-def test_hum_is_looked_for_in_the_first_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked: list[int] = []
-
-    def hum(volts: FloatArray, rate: float, noise: FloatArray) -> tuple[float, FloatArray]:
-        looked.append(len(volts))
-        return rate, noise
-
-    monkeypatch.setattr(module, '_hum', hum)
-    rig = load_rig(overrides={'converter.sample_rate_hz': 200.0})
-    assert levels(rig, noisy(13_000)).hum_hz == 200.0
-    levels(rig, noisy(11_999))
-    assert looked == [12_000, 11_999]

@@ -395,7 +395,7 @@ def test_free_times_are_settled_again_if_an_effect_beside_which_they_were_does_n
     assert ws.free is not None
     # As beside a lag of 0.25 ms.
     more = [(d, 1.0) for d in ws.free.directions]
-    off = ws._loaded(more).replaced(free=replace(ws.free, directions=moved(more)))
+    off = ws.with_loads(more).replaced(free=replace(ws.free, directions=moved(more)))
     fit = refit(off, ())
     assert off.gap(fit.difference) > 3.0 * off.floor()
     dropped = replace(problem, search=problem.search.at(off), fit=fit)
@@ -449,10 +449,10 @@ def test_a_motion_that_nobody_noted_changes_no_load_that_was() -> None:
     change = np.zeros_like(HUNG)
     change[7000, 0] = 1.0
     swings = LoadDirection(0, change, 1.0, 'x', 0, swings=True)
-    (o,) = ws._loaded([(swings, 2.0), (swings, 1.0)]).observations
+    (o,) = ws.with_loads([(swings, 2.0), (swings, 1.0)]).observations
     np.testing.assert_array_equal(o.loads, HUNG)
     np.testing.assert_array_equal(o.acting - o.loads, 3.0 * change)
-    assert ws._loaded([(replace(swings, swings=False), 2.0)]).observations[0].loads[7000, 0] == HUNG[7000, 0] + 2.0
+    assert ws.with_loads([(replace(swings, swings=False), 2.0)]).observations[0].loads[7000, 0] == HUNG[7000, 0] + 2.0
 
 
 def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> None:

@@ -10,12 +10,11 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
 
-from blind.next import table
 from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._next import how, limits_from_words
 from psd_deflection.cli.main import main
@@ -289,26 +288,6 @@ def test_options_that_would_be_ignored_are_refused(
 ) -> None:
     assert main(['discover', str(soft), '--out', str(tmp_path), '--quiet', *words]) == 2
     assert part in capsys.readouterr().err
-
-
-def row(**values: Any) -> dict[str, Any]:
-    whole = {'effect': 'creep', 'design': 'torque', 'kind': 'confounded', 'outcome': 'unique', 'recordings': 1}
-    return {**whole, 'named': ['creep'], 'together': [], 'left': [['x']], 'planned': ['do'], 'right': True, **values}
-
-
-@pytest.mark.parametrize(
-    ('rows', 'met'),
-    [
-        ([row(), row(recordings=2), row(recordings=1)], True),
-        ([row(), row(right=False)], False),
-        ([row(recordings=2), row(recordings=3)], False),
-        ([row(), row(outcome='recordings', recordings=3)], False),
-        ([row(), row(outcome='limits', separable=False)], True),
-        ([row(), row(outcome='limits', separable=True)], False),
-    ],
-)
-def test_the_campaign_wants_every_separable_case_settled(rows: list[dict[str, Any]], met: bool) -> None:
-    assert table(rows)[1] == met
 
 
 def test_a_plan_is_told_in_words() -> None:

@@ -8,7 +8,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -448,7 +447,7 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     plant.done = {'u': [np.arange(n) / n for n in LENGTHS]}
     ws = PlantComparison(plant)
     fit = refit(ws, ())
-    found = plant_search._where(ws, fit, None)
+    found = plant_search.localise_cases(ws, fit, None)
     cells = {(c.channel, c.recording): c for c in found.cells}
     assert set(cells) == {('force', 0), ('force', 1), ('force', 2), ('turn', 0), ('turn', 2)}
     for (channel, case), cell in cells.items():
@@ -474,26 +473,6 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     assert [c.statistic for c in found.cells] == sorted((c.statistic for c in found.cells), reverse=True)
     assert found.spans == tuple((i, 0.0, n * period) for i, n in enumerate(LENGTHS))
     assert (found.excess, found.p) == (found.dependences[0].gain, found.dependences[0].p)
-
-
-def test_words_for_a_channel_are_those_of_its_own_strongest_dependences(monkeypatch: pytest.MonkeyPatch) -> None:
-    depends = [
-        SimpleNamespace(channel=channel, regressor=name, gain=gain, p=p)
-        for channel, name, gain, p in (
-            ('force', 'u', 90.0, 1e-9),
-            ('force', 'u^2', 80.0, 0.009),
-            ('turn', 'time', 70.0, 1e-9),
-            ('force', 'u^3', 60.0, 1e-9),
-            ('turn', 'u', 50.0, 0.011),
-        )
-    ]
-    monkeypatch.setattr(plant_search, 'dependences', lambda *_: depends)
-    ws = PlantComparison(Pictures(tables(0), {}))
-    words = {c.channel: c.depends_on for c in plant_search._where(ws, refit(ws, ()), None).cells}
-    assert words == {'force': ('u', 'u^2'), 'turn': ('time',)}
-    monkeypatch.setattr(plant_search, 'dependences', lambda *_: [])
-    found = plant_search._where(ws, refit(ws, ()), None)
-    assert (found.excess, found.p, found.dependences) == (0.0, 1.0, ())
 
 
 # Whole answers.
@@ -562,27 +541,3 @@ def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
         f'<PlantDiscovery effects_found: b; gap {found.gap_before:.3g} N → {found.gap_after:.3g} N '
         '(noise alone: 0.02 N)>'
     )
-
-
-def test_noise_of_a_plant_is_nothing_missing() -> None:
-    found = discover_in(steel(0.0))
-    assert (found.verdict, found.effects, found.unknown) == ('nothing_missing', (), ())
-    assert found.gap_before == found.gap_after
-    # Nobody said how much noise there is.
-    assert math.isnan(found.gap_floor)
-    assert found.floors == 0.0
-    assert '(noise alone: not known)' in repr(found)
-    assert 'no effect' in repr(found)
-
-
-def test_what_no_effect_of_a_plant_explains_is_unknown() -> None:
-    plant = steel(0.4)
-    plant.library = (size_of('a'),)
-    plant.done = {'load': [np.mean(rows, axis=0) for rows in plant.shown['b']]}
-    found = discover_in(plant)
-    assert (found.verdict, found.effects) == ('unknown_effect', ())
-    (unknown,) = found.unknown
-    assert unknown.depends_on[0] == 'load'
-    assert unknown.remains
-    assert unknown.rms == pytest.approx(found.gap_after)
-    assert unknown.explains == 1.0

@@ -23,7 +23,7 @@ from psd_deflection.studies.discover.from_recordings import read_observation
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.cleaning import clean, outliers, stuck
+from psd_deflection.studies.discover.setup.cleaning import clean, outliers
 from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, wire
 
 RIG = load_rig()
@@ -216,19 +216,6 @@ def test_outliers_of_any_rate_and_size_are_left_out_and_movement_is_not(share: f
     # Neither a step of the load nor hum of a hundred times the noise.
     t = np.arange(len(o.volts))[:, None] / 1000.0
     assert not outliers(o.volts + 0.2 * np.sin(2.0 * np.pi * 50.0 * t), 5e-4).any()
-
-
-def test_a_stuck_channel_is_named_and_left_out() -> None:
-    o = recorded()
-    o.volts[2500:2600, 4] = o.volts[2500, 4]
-    cleaned, (finding,) = clean(o, ())
-    assert (finding.name, finding.where, finding.value) == ('stuck_channel', 'y2', 2.5)
-    assert np.isnan(cleaned.volts[2501:2600, 4]).all()
-    assert np.isnan(cleaned.volts).sum() <= 101
-    # At the rail a reading may rest, and without noise anywhere.
-    high = np.minimum(o.volts, np.quantile(o.volts[:, 0], 0.5))
-    assert not stuck(high[:, :1], 1e-3, np.full(1, 2e-3), 3e-4).any()
-    assert not stuck(np.zeros((500, 1)), 1e-3, np.zeros(1), 3e-4).any()
 
 
 def test_what_no_load_is_known_of_does_not_count() -> None:

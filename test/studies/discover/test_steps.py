@@ -33,7 +33,7 @@ from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.setup import _changes, _movement, _noise_energy, _sizes, _words, wire
+from psd_deflection.studies.discover.setup.setup import load_sizes, movement_sums, noise_energy, wire
 from psd_deflection.studies.discover.steps import alternatives
 
 from .test_formulas import RIG, observed
@@ -452,19 +452,6 @@ def test_three_sizes_that_agree_a_little_are_tied_though_no_two_are() -> None:
     assert 20.0 < tie.odds < 200.0
 
 
-def test_turned_loads_are_changes_as_wirings_are() -> None:
-    file = Wiring.from_rig(RIG)
-    assert _changes(file, file, np.array([0.5, -1.0, math.nan])) == 1
-    assert _changes(file, file, np.zeros(3)) == 0
-    assert _changes(file, file, np.array([-0.5, -1.0, -2.0])) == 3
-    other = dataclasses.replace(file, axes=(('-x', 'y'), *file.axes[1:]))
-    assert _changes(other, file, np.array([1.0, 1.0, -1.0])) == 2
-    assert _words(file, file, np.array([1.0, 0.5, math.nan])) == 'as the rig file says'
-    assert _words(other, file, np.array([-1.0, 0.5, -1.0])) == (
-        'channel_sign of x1 and load_sign of fx and load_sign of tz'
-    )
-
-
 @pytest.mark.parametrize(('least', 'most', 'sign'), [(0.0, 1.0, 1.0), (-1.0, 0.0, -1.0)])
 def test_a_size_leaves_its_bound_for_however_little_it_gains(least: float, most: float, sign: float) -> None:
     """Half a standard deviation inside; outside it stays."""
@@ -513,12 +500,12 @@ def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> 
     volts = whole.volts.copy()
     volts[60:] = np.nan
     poor = dataclasses.replace(whole, volts=volts)
-    (one, both) = (_movement(o, ()) for o in ([whole], [poor, whole]))
+    (one, both) = (movement_sums(o, ()) for o in ([whole], [poor, whole]))
     assert both.squared == one.squared > 0.0
     np.testing.assert_array_equal(both.cross, one.cross)
     np.testing.assert_array_equal(both.own, one.own)
     volts[60:80] = whole.volts[60:80]
-    assert _movement([dataclasses.replace(whole, volts=volts), whole], ()).squared > one.squared
+    assert movement_sums([dataclasses.replace(whole, volts=volts), whole], ()).squared > one.squared
     # Sums over the blocks of what the dots moved about their mean, m^2.
     dots = whole.volts[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
     blocks = dots.reshape(60, 20, 4).mean(axis=1)
@@ -535,10 +522,10 @@ def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> 
         np.testing.assert_allclose(
             np.diag(one.cross[k]).sum(), float((moved * (blocks - blocks.mean(axis=0))).sum()), rtol=2e-2
         )
-    left, sizes = _sizes(one, Wiring.from_rig(RIG))
+    left, sizes = load_sizes(one, Wiring.from_rig(RIG))
     assert sizes == pytest.approx([1.0, 1.0, 1.0], abs=0.02)
     assert left < 1e-3 * one.squared
-    assert _noise_energy([whole, whole]) == pytest.approx(2 * noise_of_dots * 4 * 1200 / 400)
+    assert noise_energy([whole, whole]) == pytest.approx(2 * noise_of_dots * 4 * 1200 / 400)
 
 
 @pytest.mark.parametrize(('values', 'seen'), [(4, True), (3, False)])
@@ -548,23 +535,6 @@ def test_of_so_coarse_steps_four_values_are_enough(values: int, seen: bool) -> N
     k = np.resize(np.arange(values) - 1.0, (2000, 6))
     o = dataclasses.replace(observed(warm=None), volts=k * 2000.0 * lsb, loads=np.zeros((2000, 3)))
     assert (coarse_step(o) is not None) == seen
-
-
-def test_a_step_that_makes_it_worse_is_shortened_five_times() -> None:
-    """A plant that answers to the small step of the derivative alone: one start, one derivative, five trials."""
-    shown = pictures(A)
-
-    class Kink(Plant):
-        def simulate(self, effects: Sequence[ActiveEffect]) -> list[FloatArray]:
-            self.tally.count += 1
-            (value,) = (a.values['x'] for a in effects)
-            return [shown[A] * (0.0 if value == 0.0 else value if abs(value - 5e-5) < 1e-12 else -1.0)]
-
-    plant = Kink(shown, without_noise((shown[A], 900.0)))
-    fit = refit(plant, [active('a', x=0.0)])
-    assert fit.effects[0].values['x'] == 0.0
-    assert fit.chi2 == pytest.approx(900.0)
-    assert plant.simulations == 7
 
 
 @pytest.mark.parametrize(('loss', 'is_rival'), [(6.9, True), (7.1, False)])
@@ -600,14 +570,14 @@ def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
     assert unit.evidence == pytest.approx(1.0)
     turned = dataclasses.replace(o, volts=o.volts * [1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
     _, (sign,), _ = wire([turned], ())
-    m, file = _movement([turned], ()), Wiring.from_rig(RIG)
+    m, file = movement_sums([turned], ()), Wiring.from_rig(RIG)
     right = dataclasses.replace(file, axes=(('x', '-y'), file.axes[1]))
-    energy = _noise_energy([turned])
-    told, sizes = _sizes(m, file)
+    energy = noise_energy([turned])
+    told, sizes = load_sizes(m, file)
     # With the file's wiring a load seems to pull the wrong way: then it explains nothing.
     assert (sizes < 0.0).any()
     assert told < m.squared
-    assert sign.evidence == pytest.approx((m.squared + energy) / (_sizes(m, right)[0] + energy))
+    assert sign.evidence == pytest.approx((m.squared + energy) / (load_sizes(m, right)[0] + energy))
 
 
 @pytest.mark.parametrize(('efforts', 'taken'), [((0.0, 0.05), 'first'), ((0.05, 0.0), 'second'), ((0.0, 0.0), 'first')])

@@ -13,7 +13,7 @@ import pytest
 from psd_deflection.arms.shapers import recommended, shaper
 from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.result import Identified, _close, _pm
+from psd_deflection.studies.identify.result import Identified, close_modes, interval_words
 
 
 def mode(frequency: float = 14.0, damping: float = 0.02, *, sd: float = 1e-4, damping_sd: float = 1e-4) -> Mode:
@@ -61,12 +61,12 @@ def found(*axes: tuple[Mode, ...], stretches: int = 1) -> Identified:
 )
 def test_why_the_rig_file_does_not_get_a_mode(x: tuple[Mode, ...], y: tuple[Mode, ...], why: str | None) -> None:
     answer = found(x, y, ())
-    said = answer._withheld('bending')
+    said = answer.withheld_reason('bending')
     assert (said is None) is (why is None)
     assert why is None or (said is not None and why in said)
     assert bool(answer.values) is bool((x or y) and why is None)
-    assert answer._nothing() == ([f'Nothing for dynamics.bending_*: {said}.'] if why else [])
-    assert answer._withheld('torsion') is None
+    assert answer.withheld_sentences() == ([f'Nothing for dynamics.bending_*: {said}.'] if why else [])
+    assert answer.withheld_reason('torsion') is None
 
 
 def test_the_surer_axis_is_the_one_that_the_rig_file_gets() -> None:
@@ -84,8 +84,8 @@ def test_the_surer_axis_is_the_one_that_the_rig_file_gets() -> None:
 
 def test_only_modes_near_the_loudest_are_close() -> None:
     modes = [mode(10.0), mode(12.99), mode(13.01), mode(7.01), mode(6.99)]
-    assert _close(modes) == [modes[0], modes[1], modes[3]]
-    assert _close([]) == []
+    assert close_modes(modes) == [modes[0], modes[1], modes[3]]
+    assert close_modes([]) == []
 
 
 @pytest.mark.parametrize(('sd', 'name'), [(0.03, 'mzv'), (0.05, 'zvd')])
@@ -135,7 +135,7 @@ def test_a_shaper_needs_a_damping_ratio_within_a_third(modes: tuple[Mode, ...], 
     ],
 )
 def test_an_interval_has_two_digits(value: float, sd: float, words: str) -> None:
-    assert _pm(value, sd) == words
+    assert interval_words(value, sd) == words
 
 
 def test_a_mode_in_words() -> None:
@@ -143,10 +143,10 @@ def test_a_mode_in_words() -> None:
     twist = Mode(21.0, 0.02, 0.03, 0.001, math.radians(0.0125))
     answer = found((x, mode(40.0)), (), (twist,))
     words = ('14.000 ± 0.020', '0.0200 ± 0.0020', '12.3 µm', '1 ring-down')
-    assert answer._mode_words(0, x) == words
-    assert answer._mode_words(2, twist)[2:] == ('12.5 mdeg', '1 ring-down')
-    assert found((x,), (), (), stretches=2)._mode_words(0, x)[3] == '2 ring-downs'
-    assert found((x,), (), (), stretches=0)._mode_words(0, x)[3] == 'the spectrum in operation'
+    assert answer.mode_words(0, x) == words
+    assert answer.mode_words(2, twist)[2:] == ('12.5 mdeg', '1 ring-down')
+    assert found((x,), (), (), stretches=2).mode_words(0, x)[3] == '2 ring-downs'
+    assert found((x,), (), (), stretches=0).mode_words(0, x)[3] == 'the spectrum in operation'
     best = answer.shaper_of(0)
     assert best is not None
     impulses = ', '.join(f'{s:.4f} at {1000.0 * t:.1f} ms' for s, t in zip(best.sizes, best.times, strict=True))
@@ -165,9 +165,9 @@ def test_a_mode_in_words() -> None:
 
 def test_a_shaper_in_words_has_sizes_and_milliseconds() -> None:
     """ZVD of 0.5 Hz without damping: a quarter, a half and a quarter, half a turn apart."""
-    words = found((mode(0.5, 1e-9, sd=1e-9, damping_sd=1e-12),), (), ())._shaper_words(0)
+    words = found((mode(0.5, 1e-9, sd=1e-9, damping_sd=1e-12),), (), ()).shaper_words(0)
     assert words == 'ZVD: 0.2500 at 0.0 ms, 0.5000 at 1000.0 ms, 0.2500 at 2000.0 ms'
-    assert found((), (), ())._shaper_words(0) == ''
+    assert found((), (), ()).shaper_words(0) == ''
 
 
 def test_how_many_modes_there_are() -> None:

@@ -12,7 +12,7 @@ from scipy.signal import lsim
 
 from blind.modes import CASES, RATE, Link, bound, driven, noise, rung, scored
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.identify.modes import _ringing, modes_of
+from psd_deflection.studies.identify.modes import modes_of, ringing_levels
 
 
 @pytest.mark.statistics
@@ -157,7 +157,7 @@ def test_where_the_link_rests_and_how_it_drifts_does_not_hide_that_it_rings() ->
     rate, window = 1000.0, 400
     t = np.arange(1200) / rate
     rings = 1e-5 * np.exp(-0.02 * 88.0 * t) * np.cos(88.0 * t) + 1e-7 * np.random.default_rng(8).normal(size=1200)
-    alone = _ringing(rings, rate, [(14.0, 0.02)], [0, 300], window)
-    drifts = _ringing(rings + 1e-3 + 5e-3 * t, rate, [(14.0, 0.02)], [0, 300], window)
+    alone = ringing_levels(rings, rate, [(14.0, 0.02)], [0, 300], window)
+    drifts = ringing_levels(rings + 1e-3 + 5e-3 * t, rate, [(14.0, 0.02)], [0, 300], window)
     np.testing.assert_allclose(drifts, alone, rtol=1e-6)
     assert alone[0, 0] > 20.0 * alone[0, 1]

@@ -87,10 +87,10 @@ def test_the_deepest_valley_is_found_though_it_begins_higher() -> None:
 
     starts = [(float(at), 0.0) for at in np.arange(-0.5, 1.5, 0.09)]
     assert min(starts, key=lambda s: left(np.array(s)))[0] == pytest.approx(0.0, abs=0.1)
-    value, (at, took) = steps_module._least(left, starts, 0.02)
+    value, (at, took) = steps_module.best_time(left, starts, 0.02)
     assert at == pytest.approx(1.0, abs=1e-3)
     assert took == 0.0
     assert value < 0.1
     # One that begins more than ten times higher is left alone.
-    far = steps_module._least(lambda x: min(0.1 + 20.0 * x[0] ** 2, 90.0 * abs(x[0] - 1.0)), starts, 0.02)
+    far = steps_module.best_time(lambda x: min(0.1 + 20.0 * x[0] ** 2, 90.0 * abs(x[0] - 1.0)), starts, 0.02)
     assert far[1][0] == pytest.approx(0.0, abs=0.02)

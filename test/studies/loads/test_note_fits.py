@@ -131,7 +131,7 @@ def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_i
         asked.append((starts, reach))
         return (1.0, (3.01, 0.0)) if len(asked) % 2 else (slowly[0], (2.5, -1.1))
 
-    monkeypatch.setattr(steps_module, '_least', least)
+    monkeypatch.setattr(steps_module, 'best_time', least)
     step = steps_module.DotStep(3000.0, 1e-4, 2800, 3200)
     for left, found in ((0.49, (2.5, 1.1)), (0.5, (3.01, 0.0)), (1.2, (3.01, 0.0))):
         slowly[0] = left
@@ -152,7 +152,7 @@ def test_the_search_begins_with_a_reach_to_either_side_and_ends_after_120_looks(
         looks.append((float(x[0]), float(x[1])))
         return float(-x[0] - 2.0 * x[1])
 
-    steps_module._least(down, [(1.0, 0.5), (2.0, 1.0)], 0.25)
+    steps_module.best_time(down, [(1.0, 0.5), (2.0, 1.0)], 0.25)
     assert looks[2:5] == [(2.0, 1.0), (2.25, 1.0), (2.0, 1.25)]
     assert len(looks) == 2 + 120
 
@@ -161,15 +161,15 @@ def test_the_least_of_a_valley_is_found_from_the_best_start() -> None:
     def valley(x: FloatArray) -> float:
         return float((x[0] - 1.23) ** 2 + 4.0 * (x[1] - 0.61) ** 2 + 2.0)
 
-    least, (at, took) = steps_module._least(valley, [(0.0, 0.3), (1.2, 0.6), (5.0, 1.0)], 0.05)
+    least, (at, took) = steps_module.best_time(valley, [(0.0, 0.3), (1.2, 0.6), (5.0, 1.0)], 0.05)
     assert (least, at, took) == pytest.approx((2.0, 1.23, 0.61), abs=1e-3)
     # Without a duration it keeps none, and looks six reaches about.
-    least, (at, took) = steps_module._least(valley, [(0.0, 0.0), (1.2, 0.0), (5.0, 0.0)], 0.01)
+    least, (at, took) = steps_module.best_time(valley, [(0.0, 0.0), (1.2, 0.0), (5.0, 0.0)], 0.01)
     assert at == pytest.approx(1.23, abs=2e-5)
     assert took == 0.0
     assert least == pytest.approx(2.0 + 4.0 * 0.61**2)
     for begun, end in ((1.1, 1.16), (1.4, 1.34)):
-        assert steps_module._least(valley, [(begun, 0.0)], 0.01)[1][0] == pytest.approx(end, abs=5e-5)
+        assert steps_module.best_time(valley, [(begun, 0.0)], 0.01)[1][0] == pytest.approx(end, abs=5e-5)
 
 
 # ---- what is left
@@ -191,7 +191,7 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
     there = np.asarray(np.isfinite(dots).all(axis=1))
     rest = np.where(there[:, None], dots - design @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0], np.nan)
     with np.errstate(invalid='raise', divide='raise'):
-        left, means = noted_times._left(RIG, dots, loads)
+        left, means = noted_times.residual_of_dots(RIG, dots, loads)
     assert left == pytest.approx(float(np.nansum(rest**2)), rel=1e-6)
     assert means.shape == dots.shape
     for first in range(0, 1010, 20):
@@ -199,12 +199,12 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
         wanted = np.nanmean(part, axis=0) if np.isfinite(part).any() else np.full(4, np.nan)
         assert means[first : first + 20] == pytest.approx(np.tile(wanted, (len(part), 1)), rel=1e-4, nan_ok=True)
     # A millionth of the loads moves the dots alike.
-    assert noted_times._left(RIG, dots, 1e-6 * loads)[0] == pytest.approx(left, rel=1e-6)
+    assert noted_times.residual_of_dots(RIG, dots, 1e-6 * loads)[0] == pytest.approx(left, rel=1e-6)
     # And one axis that is never loaded does nothing.
     loads[:, 1] = 0.0
     design[:, 3] = 0.0
     rest = dots[there] - design[there] @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0]
-    assert noted_times._left(RIG, dots, loads)[0] == pytest.approx(float((rest**2).sum()), rel=1e-6)
+    assert noted_times.residual_of_dots(RIG, dots, loads)[0] == pytest.approx(float((rest**2).sum()), rel=1e-6)
 
 
 def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
@@ -213,13 +213,13 @@ def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
     # 1 / (2 pi f ratio): 0.568 s of 14 Hz at 0.02, 0.318 s of 10 Hz at 0.05.
     wanted = 5.0 / (2.0 * math.pi * 14.0 * 0.02)
     for took in (0.0, 0.7):
-        moving = np.flatnonzero(noted_times._moving(rig, note(3.0, 2.0, took), t))
+        moving = np.flatnonzero(noted_times.in_motion(rig, note(3.0, 2.0, took), t))
         assert moving[0] == 1980
         assert moving[-1] == math.floor(1000.0 * (2.0 + took + wanted))
         assert len(moving) == moving[-1] - moving[0] + 1
     # Without damping of a thousandth or more it would never end.
     free = load_rig(overrides={'dynamics.torsion_frequency': 200.0, 'dynamics.torsion_damping_ratio': 0.0})
-    assert np.flatnonzero(noted_times._moving(free, note(3.0, 2.0), t))[-1] == math.floor(
+    assert np.flatnonzero(noted_times.in_motion(free, note(3.0, 2.0), t))[-1] == math.floor(
         2000.0 + 5e6 / (400.0 * math.pi)
     )
 
@@ -237,21 +237,21 @@ def test_ringing_is_rough_beyond_three_times_the_noise() -> None:
     # Six that are s off their mean, of four dots: 4 s^2, above 9 * 2 if s is above 2.1.
     for size, rough in ((2.1, False), (2.14, True)):
         rest = rest_of([*quiet, *[size, -size] * 3])
-        assert noted_times._rough(rest, rings, 4) is rough
+        assert noted_times.is_rough(rest, rings, 4) is rough
         # About their own mean.
         rest[-24:] += 50.0
-        assert noted_times._rough(rest, rings, 4) is rough
+        assert noted_times.is_rough(rest, rings, 4) is rough
     # Exactly three times is not beyond: 1.5 of two dots, beside quiet ones of which one differs by 1.
     rest = rest_of([*quiet, *[1.5, -1.5] * 3]) * (1.0, 0.0, 0.0, 0.0)
     rest[-24:, 1] = rest[-24:, 0]
-    assert not noted_times._rough(rest, rings, 4)
-    assert noted_times._rough(1.01 * rest - 0.01 * rest * ~rings[:, None], rings, 4)
+    assert not noted_times.is_rough(rest, rings, 4)
+    assert noted_times.is_rough(1.01 * rest - 0.01 * rest * ~rings[:, None], rings, 4)
     # A lost block counts as none, and of three nothing is told.
     rest = rest_of([*quiet, *[5.0, -5.0] * 3])
     rest[-8:] = np.nan
-    assert noted_times._rough(rest, rings, 4)
+    assert noted_times.is_rough(rest, rings, 4)
     rest[-12:, 2] = np.nan
-    assert not noted_times._rough(rest, rings, 4)
+    assert not noted_times.is_rough(rest, rings, 4)
 
 
 def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_rough() -> None:
@@ -261,8 +261,8 @@ def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_r
     rest[2500:4000] += 20.0 * np.sin(np.arange(1500) / 40.0)[:, None]
     slow, sudden = note(2.0, 2.0, 0.5), note(2.5, 2.5)
     rough = note(2.0, 2.0, 0.5, settled_only=True)
-    assert noted_times._without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
-    found = noted_times._without_rough_motion(RIG, loads, [sudden, slow], rest)
+    assert noted_times.without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
+    found = noted_times.without_rough_motion(RIG, loads, [sudden, slow], rest)
     assert found.loads is loads
     assert found.notes == (sudden, rough)
     ends = 2.5 + 5.0 / (2.0 * math.pi * 14.0 * 0.02)
@@ -271,32 +271,11 @@ def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_r
     rest = quiet.copy()
     rest[1000:2520] += 100.0 * np.sin(np.arange(1520) / 40.0)[:, None]
     rest[2500:2520] = 1000.0
-    found = noted_times._without_rough_motion(RIG, loads, [slow], rest)
+    found = noted_times.without_rough_motion(RIG, loads, [slow], rest)
     assert (found.notes, found.unused.sum(), len(found.unused)) == ((slow,), 0, count)
 
 
 # ---- all of it, with what it is made of told
-
-
-@pytest.mark.parametrize(('rate', 'width'), [(1000.0, 286), (200.0, 57), (10.0, 3), (5.0, 2)])
-def test_means_take_four_periods_of_bending_and_two_samples_at_least(
-    rate: float, width: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    widths: list[int] = []
-
-    def none(dots: FloatArray, width: int) -> list[steps_module.DotStep]:
-        widths.append(width)
-        return []
-
-    monkeypatch.setattr(noted_times, 'lasting_steps', none)
-    monkeypatch.setattr(steps_module, 'lasting_steps', none)
-    rig = load_rig(overrides={'converter.sample_rate_hz': rate, 'dynamics.bending_frequency': 14.0})
-    loads = np.zeros((100, 3))
-    loads[50:] = 1.0
-    assert unnoted_steps(rig, np.zeros((100, 4)), loads) == []
-    assert last_step(rig, np.zeros((100, 4)), 1.0 / rate) is None
-    assert mend_loads(rig, np.zeros((100, 4)), loads) is None
-    assert widths == [width] * 3
 
 
 def with_pieces(
@@ -318,7 +297,9 @@ def with_pieces(
     monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(noted_times, 'time_of_step', fit)
-    monkeypatch.setattr(noted_times, '_left', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4))))
+    monkeypatch.setattr(
+        noted_times, 'residual_of_dots', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4)))
+    )
     return between
 
 
@@ -373,7 +354,7 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
 
 def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(monkeypatch: pytest.MonkeyPatch) -> None:
     places = (3000.0, 8000.0, 15000.0)
-    sizes = noted_times._expected(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
+    sizes = noted_times.expected_movements(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
     steps = [
         steps_module.DotStep(at, size, int(at) - 200, int(at) + 200) for at, size in zip(places, sizes, strict=True)
     ]
@@ -417,22 +398,6 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     for left, told_late in (((1.0, 3.9), False), ((1.0, 4.0), True), ((1.0, 4.1), True), ((0.1, 0.41), True)):
         with_pieces(monkeypatch, steps, fitted, left)
         assert (mend_loads(RIG, dots, late) is not None) == told_late
-
-
-def test_the_size_of_a_change_is_what_came_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[FloatArray] = []
-
-    def expected(rig: Rig, changes: FloatArray) -> FloatArray:
-        asked.append(changes)
-        return np.zeros(len(changes))
-
-    monkeypatch.setattr(noted_times, '_expected', expected)
-    with_pieces(monkeypatch, as_steps((3000.0, 1.0)), {})
-    # From the second sample on, and the last with the last.
-    loads = np.zeros((1000, 3))
-    loads[1:], loads[500:], loads[999:] = (1.0, 0.0, 0.0), (1.0, 2.0, 0.0), (0.0, 2.0, -5.0)
-    assert mend_loads(RIG, np.zeros((1000, 4)), loads) is None
-    assert asked[0].tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-1.0, 0.0, -5.0]]
 
 
 def test_loads_of_a_cell_lose_their_noise_whether_times_are_mended_or_not(monkeypatch: pytest.MonkeyPatch) -> None:

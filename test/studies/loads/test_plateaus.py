@@ -355,23 +355,6 @@ def test_loads_are_asked_for_by_how_the_plate_moves_and_what_no_plate_does_is_to
     assert way * found.across == pytest.approx([0.0, 3e-6, -3e-6, 0.0], abs=1e-12)
 
 
-def test_the_link_moves_with_its_modes_under_what_is_hung_after_the_first_time() -> None:
-    listed = [Plateau(0, a, b, 0, False, np.zeros(3)) for a, b in ((0, 100), (1, 100), (100, 200))]
-    for axis, (frequency, ratio) in enumerate(((14.0, 0.1), (14.0, 0.1), (21.0, 0.2))):
-        first, second, third = plateaus._pulses(GIVEN, 300, listed, axis)
-        assert not first.any()
-        for pulse, (a, b) in ((second, (1, 100)), (third, (100, 200))):
-            acts = np.zeros(300)
-            acts[a:b] = 1.0
-            assert pulse == pytest.approx(Filter(mode_coefficients(frequency, ratio, 1e-3))(acts))
-
-
-def test_a_mean_of_nothing_is_0() -> None:
-    assert plateaus._mean(np.array([1.0, np.nan, 4.0])) == 2.5
-    assert plateaus._mean(np.array([np.nan])) == 0.0
-    assert plateaus._mean(np.array([])) == 0.0
-
-
 SPREAD = np.array(
     [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (20, 10, 5)], float
 )
@@ -437,7 +420,7 @@ def test_a_detector_at_fault_and_a_movement_that_no_load_makes_are_no_wrong_note
     far_off = plateaus.stand_out(seen({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
     assert (far_off.gone, far_off.softer) == ((6,), 0.0)
     # Nothing that moves is nothing to explain.
-    assert not plateaus._closes(seen({}))
+    assert not plateaus.closes(seen({}))
     for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
         assert plateaus.stand_out(seen(wrong, left=left), bent).gone == gone
 
@@ -483,7 +466,7 @@ def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fi
     softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
 
     def left(found: PlateauLoads, without: int) -> float:
-        return float(np.delete(plateaus._apart(found, (without,), 0.1), without).max())
+        return float(np.delete(plateaus.deviation_in_tolerances(found, (without,), 0.1), without).max())
 
     # Without any other one, the worst that is left is one and a half times the tolerance.
     found = seen({2: (0.0, 2.5, 0.0)}, everywhere=softened)
@@ -492,7 +475,7 @@ def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fi
     # Without the fourth it is 1.13 times, which may come from that one if a tenth of its 3.9 is allowed.
     found = seen({3: (0.0, 6.0, 0.0)}, everywhere=softened)
     assert left(found, 4) == pytest.approx(1.13, abs=0.01)
-    assert plateaus._apart(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
+    assert plateaus.deviation_in_tolerances(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
     assert plateaus.stand_out(found).gone == (3,)
     assert plateaus.stand_out(found, 0.025).gone == (3,)
     assert plateaus.stand_out(found, 0.1).gone == ()
@@ -505,13 +488,13 @@ def test_what_is_off_by_less_than_a_seventh_of_a_newton_is_right_whatever_the_ot
     )
     share = 0.1 * small
     share[6] = 0.0
-    assert plateaus._apart(seen({}, small, everywhere=share), (6,), 0.1)[6] > 5.5
+    assert plateaus.deviation_in_tolerances(seen({}, small, everywhere=share), (6,), 0.1)[6] > 5.5
     assert plateaus.stand_out(seen({}, small, everywhere=share)).gone == ()
 
 
 def test_what_stands_out_is_three_times_the_tolerance_and_five_times_the_others() -> None:
     def stands(wrong: list[float], others: list[float], bent: float = 0.0) -> bool:
-        return plateaus._stands(np.array(wrong), np.array(others), bent)
+        return plateaus.stands_out(np.array(wrong), np.array(others), bent)
 
     assert stands([3.01], [0.5])
     assert not stands([3.0], [0.5])
@@ -530,7 +513,7 @@ def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much()
     def known(k: list[int], more: tuple[float, float, float] = (0.0, 0.0, 1.0), largest: float = 1e9) -> bool:
         rows = [i for i in range(5) if i < 3 or i in k]
         here = [rows.index(i) for i in k]
-        return plateaus._known(seen(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
+        return plateaus.is_known(seen(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
 
     # A torque of 5 % of (3, 4) is as good as none.
     assert known([3])
@@ -552,14 +535,14 @@ def test_what_effects_do_is_the_likeliest_share_and_offset_of_all_other_loads() 
         pull = np.diag(0.03 / np.array([softer, softer, softer, 0.5]))
         rows, values = np.vstack((x, pull)), np.vstack((found.more[keep], np.zeros((4, 3))))
         wanted = np.linalg.lstsq(rows, values, rcond=None)[0]
-        slopes, offset = plateaus._proportion(found, gone, softer)
+        slopes, offset = plateaus.proportional_part(found, gone, softer)
         assert slopes == pytest.approx(wanted[:3], abs=1e-9)
         assert offset == pytest.approx(wanted[3], abs=1e-9)
         # Off by the largest of the three, in units of 0.3 and a hundredth of the load.
         off = np.abs(found.more - np.column_stack((SPREAD, np.ones(8))) @ wanted).max(axis=1)
         allowed = [0.3 + 0.01 * max(abs(v) for v in load) for load in SPREAD.tolist()]
-        assert plateaus._apart(found, gone, softer) == pytest.approx(off / allowed)
-    slopes, offset = plateaus._proportion(found, (), 0.0)
+        assert plateaus.deviation_in_tolerances(found, gone, softer) == pytest.approx(off / allowed)
+    slopes, offset = plateaus.proportional_part(found, (), 0.0)
     assert (slopes.tolist(), offset.tolist()) == (np.zeros((3, 3)).tolist(), [0.0] * 3)
 
 
@@ -572,13 +555,13 @@ def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> No
     assert not plateaus.all_free(seen({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, SPREAD[:3]), loads)
     # Two that are off by more than the tolerance are enough.
     two = seen({5: (0.0, 0.0, 0.9), 1: (0.0, 0.0, -0.9)})
-    apart = plateaus._apart(two, (), 0.1)
+    apart = plateaus.deviation_in_tolerances(two, (), 0.1)
     assert sorted(apart)[-3] < 1.0 < sorted(apart)[-2]
     assert max(apart) < 2.0
     assert plateaus.all_free(two, loads)
     # One alone is a wrong note, and others are needed to say so.
     found = seen({0: (0.0, 0.0, 0.6)})
-    assert int((plateaus._apart(found, (), 0.1) > 1.0).sum()) == 1
+    assert int((plateaus.deviation_in_tolerances(found, (), 0.1) > 1.0).sum()) == 1
     assert not plateaus.all_free(found, loads)
 
 
@@ -589,7 +572,7 @@ def test_loads_are_rounded_if_each_is_off_by_half_a_step_at_most_and_by_a_tenth_
     def rounded(*off: tuple[float, float, float], count: int = 5) -> bool:
         more = np.zeros((5, 3))
         more[: len(off)] = off
-        return plateaus._rounded(seen({}, noted[:count], everywhere=more[:count]), loads)
+        return plateaus.are_rounded(seen({}, noted[:count], everywhere=more[:count]), loads)
 
     # Forces in steps of 5 N, torques in steps of 2 N m.
     assert rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0, 0.0, 1.0))
@@ -647,13 +630,7 @@ def test_loads_may_be_rounded_if_they_are_in_whole_steps_and_off_by_less_than_on
     ],
 )
 def test_the_step_of_noted_numbers_is_the_largest_of_which_all_are_multiples(noted: list[float], step: float) -> None:
-    assert plateaus._step(np.array(noted)) == step
-
-
-def test_a_movement_counts_about_its_mean_and_an_angle_at_a_tenth_of_a_metre() -> None:
-    part = np.array([[1.0, 3.0, np.nan, 1.0, 3.0], [5.0, 5.0, 9.0, 5.0, 5.0], [20.0, 40.0, 1.0, 40.0, 20.0]])
-    # Squares: 1, 0 and (0.1 * 10)^2 = 1.
-    assert plateaus._rms(part) == pytest.approx((2.0 / 3.0) ** 0.5)
+    assert plateaus.largest_step(np.array(noted)) == step
 
 
 # ---- what is said
@@ -782,18 +759,6 @@ def test_each_round_allows_the_others_less(monkeypatch: pytest.MonkeyPatch) -> N
     assert note.hung == pytest.approx(truth[5])
     # A tenth, a fiftieth, nothing.
     assert allowed == pytest.approx([0.1, 0.02, 0.0, 0.0, 0.0])
-
-
-def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    periods: list[float] = []
-
-    def noted(loads: FloatArray, period: float, asked: object) -> list[WrongNote]:
-        periods.append(period)
-        return []
-
-    monkeypatch.setattr(plateaus, 'noted_wrong', noted)
-    wrong_notes(load_rig(overrides={'converter.sample_rate_hz': 200.0}), np.zeros((100, 6)), np.zeros((100, 3)))
-    assert periods == pytest.approx([0.005])
 
 
 def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -> None:

@@ -143,8 +143,8 @@ def test_the_time_is_left_out_until_the_link_has_come_to_rest() -> None:
 def test_the_top_of_three_powers_is_that_of_a_parabola_through_their_logarithms() -> None:
     f = np.array([0.5, 1.0, 1.5, 2.0])
     top = np.exp(-(((f - 1.1) / 0.4) ** 2))
-    assert sway._strongest(f, top) == pytest.approx(1.1)
-    assert sway._strongest(f, np.array([1.0, 0.5, 0.2, 0.1])) == pytest.approx(0.5, abs=0.01)
-    assert sway._strongest(f, np.zeros(4)) == 0.0
-    assert sway._strongest(f[:2], np.array([1.0, 3.0])) == 1.0
-    assert sway._strongest(np.zeros(0), np.zeros(0)) == 0.0
+    assert sway.peak_frequency(f, top) == pytest.approx(1.1)
+    assert sway.peak_frequency(f, np.array([1.0, 0.5, 0.2, 0.1])) == pytest.approx(0.5, abs=0.01)
+    assert sway.peak_frequency(f, np.zeros(4)) == 0.0
+    assert sway.peak_frequency(f[:2], np.array([1.0, 3.0])) == 1.0
+    assert sway.peak_frequency(np.zeros(0), np.zeros(0)) == 0.0

@@ -319,7 +319,7 @@ def switchings(found: Sequence[Response], targets: Sequence[str] = ()) -> list[L
         for of in ((), *((n,) for n in own)):
             v = _blocks(r, r.known[of[0]]) if of else np.ones(r.error.shape[1])
             error = _averaged(r.error[t], r.rings[int(name == 'theta')]) if on_link else r.error[t]
-            times = _two_levels(error, r.power[t] * v * v, v)
+            times = two_levels(error, r.power[t] * v * v, v)
             if 0 < len(times) <= MOST_TIMES:
                 term = LawTerm('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
                 places = (name, f'static_{name}') if on_link else (name,)
@@ -377,7 +377,7 @@ def with_better_level(found: Sequence[Response], s: Scored) -> Scored:
     return best
 
 
-def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int]:
+def two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int]:
     """Where the state changes: ``error`` (nf,) is A v s with s 0 or 1, each with ``weight`` in units of A."""
     own = np.where(np.abs(v) > 1e-12, error / np.where(np.abs(v) > 1e-12, v, 1.0), 0.0)
     # The best box, on a coarse grid, gives the first A.
@@ -391,7 +391,7 @@ def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[in
         return []
     level = float(top[a, b] / below[a, b])
     for _ in range(4):
-        state = _likeliest(weight * level * (2.0 * own - level))
+        state = likeliest_states(weight * level * (2.0 * own - level))
         on = state == 1
         if not on.any():
             return []
@@ -399,7 +399,7 @@ def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[in
     return [int(k) for k in np.flatnonzero(np.diff(state, prepend=0))]
 
 
-def _likeliest(gain: FloatArray) -> IntArray:
+def likeliest_states(gain: FloatArray) -> IntArray:
     """States (n,) 0 or 1 that gain most, each change for ``TOGGLE_COST``; 0 before the first."""
     off, on = 0.0, -TOGGLE_COST
     came = np.empty((len(gain), 2), dtype=np.int64)

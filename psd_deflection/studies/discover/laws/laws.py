@@ -102,29 +102,35 @@ class FoundLaw:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
+class LawTrial:
+    """Laws with the fit that has them; ``cost``: its chi-square with a penalty for each parameter."""
+
     laws: tuple[Law, ...]
     fit: Fit
     cost: float
 
     @property
     def beside(self) -> tuple[ActiveEffect, ...]:
+        """The effects of the fit without the laws."""
         return self.fit.effects[: len(self.fit.effects) - len(self.laws)]
 
     @property
     def terms(self) -> int:
+        """The number of terms of all laws."""
         return sum(len(law.terms) for law in self.laws)
 
     @property
     def variables(self) -> tuple[str, ...]:
+        """The variables of all laws, each once."""
         return tuple(dict.fromkeys(v for law in self.laws for v in law.variables))
 
 
-def _on(target: str, *listed: LawTerm) -> Law:
+def law_on(target: str, *listed: LawTerm) -> Law:
+    """Return the law on a quantity that has these terms."""
     return Law(f'law_{target}', TARGETS[target].stage, target, listed)
 
 
-def _covariance(fit: Fit) -> FloatArray:
+def term_covariance(fit: Fit) -> FloatArray:
     """(p, p) of the parameters of ``fit``; those that the recording does not determine get large values.
 
     A threshold below which only one level of a load lies is such a one.
@@ -135,7 +141,7 @@ def _covariance(fit: Fit) -> FloatArray:
     return np.asarray((vectors / np.maximum(values, 1e-9)) @ vectors.T / np.outer(lengths, lengths))
 
 
-def _fitted(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
+def fitted_law(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
     """The law with the values and standard deviations of effect ``index`` of ``fit``."""
     values = fit.effects[index].values
     sd = {fit.free[j][1]: math.sqrt(max(covariance[j, j], 0.0)) for j in fit.columns_of(index)}
@@ -152,7 +158,7 @@ def _fitted(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
     return dataclasses.replace(law, terms=tuple(out))
 
 
-class _Seeker:
+class LawSearch:
     """The search beside one set of effects."""
 
     def __init__(self, ws: Workspace, start: Fit, penalty: float) -> None:
@@ -170,11 +176,11 @@ class _Seeker:
         more = sum(len(FORMS[t.form].fixed) + len(t.times) for law in laws for t in law.terms)
         return fit.chi2 + self.penalty * (fit.parameters + more)
 
-    def trial(self, laws: Sequence[Law], beside: Sequence[ActiveEffect], iterations: int) -> _Trial:
+    def trial(self, laws: Sequence[Law], beside: Sequence[ActiveEffect], iterations: int) -> LawTrial:
         """The laws refitted in the simulation."""
         fit = refit(self.ws, [*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)], iterations)
-        covariance = _covariance(fit)
-        better = tuple(_fitted(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
+        covariance = term_covariance(fit)
+        better = tuple(fitted_law(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
         # A shape at its bound means that the form is not the right one; one that is not fitted has no room.
         fixed = {
             (len(beside) + i, f'{name}{k}')
@@ -183,14 +189,14 @@ class _Seeker:
             for name in FORMS[t.form].fixed
         }
         bound = any(i >= len(beside) and (i, name) not in fixed for i, name in fit.at_bound)
-        return _Trial(better, fit, math.inf if bound else self.cost(better, fit))
+        return LawTrial(better, fit, math.inf if bound else self.cost(better, fit))
 
-    def done(self, trial: _Trial) -> bool:
+    def done(self, trial: LawTrial) -> bool:
         """Whether no more than noise is left, or enough has been tried."""
         size = float(self.ws.size)
         return trial.fit.chi2 < size + 4.0 * math.sqrt(2.0 * size) or self.ws.simulations > self.last
 
-    def first(self) -> list[_Trial]:
+    def first(self) -> list[LawTrial]:
         """Laws of one term, the best first."""
         scored = score(self.found, self.listed)
         seen: set[tuple[str, str, tuple[str, ...]]] = set()
@@ -200,12 +206,12 @@ class _Seeker:
             if key not in seen and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
                 seen.add(key)
                 picked.append(with_better_level(self.found, s))
-        quick = [self.trial([_on(s.target, s.term)], self.start.effects, 3) for s in picked]
+        quick = [self.trial([law_on(s.target, s.term)], self.start.effects, 3) for s in picked]
         quick.sort(key=lambda t: t.cost)
         full = [self.trial(t.laws, t.beside, 8) for t in quick[:FOLLOWED]]
         return sorted([*full, *quick[FOLLOWED:]], key=lambda t: t.cost)
 
-    def grown(self, trial: _Trial) -> _Trial:
+    def grown(self, trial: LawTrial) -> LawTrial:
         """Further terms while BIC improves by enough; then terms that it does not miss go."""
         while trial.terms < MAX_TERMS and not self.done(trial):
             more = responses(self.ws, trial.fit)
@@ -216,20 +222,20 @@ class _Seeker:
                     continue
             scored = score(more, [t for t in self.listed if t.form != 'switched'])
             better = [with_better_level(more, s) for s in scored[:2]]
-            tries = [self.trial(_with(trial.laws, s), trial.beside, 4) for s in better]
+            tries = [self.trial(with_term(trial.laws, s), trial.beside, 4) for s in better]
             best = min(tries, key=lambda t: t.cost, default=trial)
             if best.cost > trial.cost - BIC_ACCEPT:
                 break
             trial = best
         while trial.terms > 1:
-            fewer = [self.trial(laws, trial.beside, 5) for laws in _fewer(trial.laws)]
+            fewer = [self.trial(laws, trial.beside, 5) for laws in one_term_fewer(trial.laws)]
             best = min(fewer, key=lambda t: t.cost)
             if best.cost > trial.cost + BIC_ACCEPT:
                 break
             trial = best
         return trial
 
-    def _switched_again(self, trial: _Trial, left: Sequence[Response]) -> _Trial:
+    def _switched_again(self, trial: LawTrial, left: Sequence[Response]) -> LawTrial:
         """With the further times of switching that show once the law is in the model."""
         (law,), best = trial.laws, trial
         term = law.terms[0]
@@ -242,7 +248,7 @@ class _Seeker:
                 best = min(best, self.trial([now], trial.beside, 4), key=lambda t: t.cost)
         return best
 
-    def lean(self, trial: _Trial) -> _Trial:
+    def lean(self, trial: LawTrial) -> LawTrial:
         """Without the effects that only stood in for the law."""
         while trial.beside:
             fewer = [self.trial(trial.laws, [a for a in trial.beside if a is not gone], 5) for gone in trial.beside]
@@ -252,7 +258,7 @@ class _Seeker:
             trial = best
         return trial
 
-    def same_elsewhere(self, trial: _Trial) -> list[_Trial]:
+    def same_elsewhere(self, trial: LawTrial) -> list[LawTrial]:
         """The first law at the other stages that show alike: a beam for a dot, a load for a static pose."""
         law, others = trial.laws[0], trial.laws[1:]
         moved: list[Law] = []
@@ -267,20 +273,20 @@ class _Seeker:
         out = [self.trial([m, *others], trial.beside, 4) for m in moved]
         if law.acts_on in DOTS:
             # A voltage is a dot over a constant: by no recording can the two be told apart.
-            out.append(_Trial((dataclasses.replace(law, stage='electronics'), *others), trial.fit, trial.cost))
+            out.append(LawTrial((dataclasses.replace(law, stage='electronics'), *others), trial.fit, trial.cost))
         return out
 
 
-def _with(laws: Sequence[Law], s: Scored) -> tuple[Law, ...]:
+def with_term(laws: Sequence[Law], s: Scored) -> tuple[Law, ...]:
     """The laws and one more term, in the law on its target if there is one."""
     if any(law.acts_on == s.target for law in laws):
         return tuple(
             dataclasses.replace(law, terms=(*law.terms, s.term)) if law.acts_on == s.target else law for law in laws
         )
-    return (*laws, _on(s.target, s.term))
+    return (*laws, law_on(s.target, s.term))
 
 
-def _fewer(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
+def one_term_fewer(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
     """Each way to leave out one term."""
     out = []
     for gone in (t for law in laws for t in law.terms):
@@ -312,16 +318,16 @@ def _law_of_the_mean(
     ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float, rng: np.random.Generator
 ) -> FoundLaw | None:
     starts = [fit, null] if fit.effects else [null]
-    trials: list[tuple[_Trial, _Seeker]] = []
+    trials: list[tuple[LawTrial, LawSearch]] = []
     for start in starts:
-        seeker = _Seeker(ws, start, penalty)
+        seeker = LawSearch(ws, start, penalty)
         trials += [(t, seeker) for t in seeker.first()]
     trials = [(t, s) for t, s in trials if t.cost < math.inf]
     if not trials:
         return None
     trials.sort(key=lambda t: t[0].cost)
     # Where one law leaves nothing but noise, others get no further terms.
-    followed: list[tuple[_Trial, _Seeker]] = []
+    followed: list[tuple[LawTrial, LawSearch]] = []
     for t, s in trials[:FOLLOWED]:
         followed.append((t if s.done(t) else s.grown(t), s))
         if s.done(followed[-1][0]):
@@ -329,7 +335,7 @@ def _law_of_the_mean(
     best, seeker = min(followed, key=lambda t: t[0].cost)
     best = seeker.lean(best)
     others = [t for t, _ in (*followed, *trials)]
-    best = _simplest(best, others)
+    best = simplest(best, others)
     found = best.fit
     without = refit(ws, best.beside, 6) if best.beside else null
     gain = without.chi2 - found.chi2
@@ -351,8 +357,8 @@ def _law_of_the_mean(
         best.laws[1:],
         found,
         without,
-        _channels(ws, best),
-        _tied(best, [*others, *seeker.same_elsewhere(best)]),
+        channels_shown(ws, best),
+        tied_laws(best, [*others, *seeker.same_elsewhere(best)]),
         p,
         bic,
         held,
@@ -434,7 +440,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     )
 
 
-def _simplest(best: _Trial, others: Sequence[_Trial]) -> _Trial:
+def simplest(best: LawTrial, others: Sequence[LawTrial]) -> LawTrial:
     """Of the laws beside the same effects that this recording cannot tell apart, the one with the fewest variables.
 
     A sensor's own dot goes before the pose, on which its dot depends.
@@ -448,14 +454,14 @@ def _simplest(best: _Trial, others: Sequence[_Trial]) -> _Trial:
         and [a.effect.name for a in t.beside] == beside
     ]
 
-    def rank(t: _Trial) -> tuple[int, int, int, float]:
+    def rank(t: LawTrial) -> tuple[int, int, int, float]:
         foreign = sum(v in POSE for law in t.laws if law.acts_on in DOTS for v in law.variables)
         return t.terms, len(t.variables), foreign, t.cost
 
     return min(near, key=rank)
 
 
-def _tied(best: _Trial, others: Sequence[_Trial]) -> tuple[Law, ...]:
+def tied_laws(best: LawTrial, others: Sequence[LawTrial]) -> tuple[Law, ...]:
     """Each other first law, by stage, target and variables, that the recording cannot exclude."""
 
     def key(law: Law) -> tuple[str, str, tuple[str, ...]]:
@@ -468,7 +474,7 @@ def _tied(best: _Trial, others: Sequence[_Trial]) -> tuple[Law, ...]:
     return tuple(out.values())[1:]
 
 
-def _channels(ws: Workspace, best: _Trial) -> tuple[str, ...]:
+def channels_shown(ws: Workspace, best: LawTrial) -> tuple[str, ...]:
     """Where the law shows: the channels with more than a twentieth of its energy."""
     _, alone = ws.residual([*ws.base, *best.fit.nuisance, *best.beside])
     moved = ws.whiten([a - b for a, b in zip(alone, best.fit.difference, strict=True)])

@@ -60,7 +60,7 @@ class Smooth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Remains:
+class Remainders:
     """``values`` (d,), whitened, of ``channel`` (d,); ``sizes`` (d, p): what the effects can do there; ``fold`` (d,).
     ``apart``: of each variable the squared distances (d, d).
     """
@@ -71,10 +71,10 @@ class _Remains:
     fold: IntArray
     apart: Mapping[str, FloatArray]
 
-    def part(self, keep: BoolArray) -> _Remains:
+    def part(self, keep: BoolArray) -> Remainders:
         """Some of the values."""
         apart = {name: d[np.ix_(keep, keep)] for name, d in self.apart.items()}
-        return _Remains(self.values[keep], self.channel[keep], self.sizes[keep], self.fold[keep], apart)
+        return Remainders(self.values[keep], self.channel[keep], self.sizes[keep], self.fold[keep], apart)
 
 
 def smooth_of(ws: Comparison, fit: Fit, variables: Variables) -> Smooth | None:
@@ -88,13 +88,13 @@ def smooth_of(ws: Comparison, fit: Fit, variables: Variables) -> Smooth | None:
         return None
     free = np.array([name not in fit.at_bound for name in fit.free], dtype=bool)
     apart = {name: _distances(ws, values) for name, values in variables.items()}
-    remains = _Remains(fit.residual, channel, fit.jacobian[:, free], folds, apart)
+    remains = Remainders(fit.residual, channel, fit.jacobian[:, free], folds, apart)
     chosen, shapes = _chosen(remains.part(there))
     if not chosen:
         return None
 
     def gap(shaped: bool) -> float:
-        change = ws.unwhitened(_unseen(remains, chosen, shapes, there, shaped) - fit.residual)
+        change = ws.unwhitened(unseen_residual(remains, chosen, shapes, there, shaped) - fit.residual)
         return ws.gap([d + c for d, c in zip(fit.difference, change, strict=True)])
 
     heldout, before = gap(shaped=False), heldout_gap(ws, fit)
@@ -114,7 +114,7 @@ def _distances(ws: Comparison, values: Sequence[FloatArray]) -> FloatArray:
     return np.asarray(((x[:, None, :] - x[None, :, :]) ** 2).sum(axis=2))
 
 
-def _chosen(remains: _Remains) -> tuple[tuple[str, ...], FloatArray]:
+def _chosen(remains: Remainders) -> tuple[tuple[str, ...], FloatArray]:
     """The variables that the likelihood asks for, one after the other, and the logarithms of the shapes."""
     names: tuple[str, ...] = ()
     shapes, likelihood = _shaped(remains, names)
@@ -127,28 +127,30 @@ def _chosen(remains: _Remains) -> tuple[tuple[str, ...], FloatArray]:
         shapes, likelihood, names = best
 
 
-def _shaped(remains: _Remains, names: Sequence[str], start: FloatArray | None = None) -> tuple[FloatArray, float]:
+def _shaped(remains: Remainders, names: Sequence[str], start: FloatArray | None = None) -> tuple[FloatArray, float]:
     """Logarithms (channels, 1 + 2 len(names)) of noise, then size and length of each, and the likelihood of all."""
     channels = np.unique(remains.channel)
     usual = np.log([START[2], *(START[0], START[1]) * len(names)])
     low, high = np.log([NOISES, *(SIZES, LENGTHS) * len(names)]).T
     begin = np.tile(usual, (len(channels), 1)) if start is None else start
     bounds = Bounds(np.tile(low, len(channels)), np.tile(high, len(channels)))
-    basis = _span(remains.sizes)
+    basis = orthonormal_basis(remains.sizes)
     parts = [(remains.part(own), basis[own]) for own in (remains.channel == c for c in channels)]
-    surprise: Callable[[FloatArray], tuple[float, FloatArray]] = partial(_surprise, parts=parts, names=names)
+    surprise: Callable[[FloatArray], tuple[float, FloatArray]] = partial(
+        negative_log_likelihood, parts=parts, names=names
+    )
     found = minimize(surprise, begin.ravel(), jac=True, method='L-BFGS-B', bounds=bounds, options={'maxiter': 60})
     return np.reshape(found.x, begin.shape), -float(found.fun)
 
 
-def _span(columns: FloatArray) -> FloatArray:
+def orthonormal_basis(columns: FloatArray) -> FloatArray:
     """An orthonormal basis of ``columns``, which may depend on each other."""
     left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
 
 
-def _surprise(
-    shapes: FloatArray, parts: Sequence[tuple[_Remains, FloatArray]], names: Sequence[str]
+def negative_log_likelihood(
+    shapes: FloatArray, parts: Sequence[tuple[Remainders, FloatArray]], names: Sequence[str]
 ) -> tuple[float, FloatArray]:
     """Minus the restricted log-likelihood, up to a constant, and its gradient. ``parts``: each channel, with what the
     effects can do there (d, p), of an orthonormal basis over all of them.
@@ -184,7 +186,7 @@ def _surprise(
     return loss, gradient.ravel()
 
 
-def _covariance(shape: FloatArray, own: _Remains, names: Sequence[str]) -> FloatArray:
+def _covariance(shape: FloatArray, own: Remainders, names: Sequence[str]) -> FloatArray:
     """Of the function of one channel (d, d)."""
     out = np.zeros((len(own.values), len(own.values)))
     for name, (size, length) in zip(names, shape[1:].reshape(-1, 2).tolist(), strict=True):
@@ -193,7 +195,7 @@ def _covariance(shape: FloatArray, own: _Remains, names: Sequence[str]) -> Float
 
 
 def _known(
-    remains: _Remains, names: Sequence[str], shapes: FloatArray, seen: BoolArray
+    remains: Remainders, names: Sequence[str], shapes: FloatArray, seen: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """What is left (d,) of all values, the function there (d,), and by what the sizes (p,) move, from the ``seen``."""
     function = np.zeros((len(remains.values), len(remains.values)))
@@ -211,8 +213,8 @@ def _known(
     return remains.values - remains.sizes @ more - value, value, more
 
 
-def _unseen(
-    remains: _Remains, names: Sequence[str], shapes: FloatArray, there: BoolArray, shaped: bool = False
+def unseen_residual(
+    remains: Remainders, names: Sequence[str], shapes: FloatArray, there: BoolArray, shaped: bool = False
 ) -> FloatArray:
     """What is left (d,) of each value by sizes, shapes and a function that were found without its part. ``shaped``: the
     shapes are ``shapes``.

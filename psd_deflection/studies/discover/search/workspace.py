@@ -182,7 +182,7 @@ class Workspace(Comparison):
         for d in directions:
             if isinstance(d, LoadDirection):
                 # A free load is large: the change by one of its unit, in proportion.
-                more = self._loaded([(d, 1.0)]).simulate(beside)
+                more = self.with_loads([(d, 1.0)]).simulate(beside)
                 tables.append([d.sd * (a - b) for a, b in zip(more, nominal, strict=True)])
             else:
                 tables.append(d.table(nominal, self.observations[d.recording].rig.sensitivities))
@@ -201,7 +201,7 @@ class Workspace(Comparison):
         back = np.array([d.sd for d in free.directions])[:, None] * vectors
         return Free(free.directions, free.tables, rows, energy, back)
 
-    def _loaded(self, more: Sequence[tuple[Direction, float]]) -> Self:
+    def with_loads(self, more: Sequence[tuple[Direction, float]]) -> Self:
         """With the loads changed."""
         out = self
         for recording, change, swings in added(more):
@@ -242,14 +242,14 @@ class Workspace(Comparison):
         if self.free is None or not self.free_loads:
             return self
         more = self._asked(self.free, difference)
-        return self._loaded(more).replaced(free=dataclasses.replace(self.free, directions=moved(more)))
+        return self.with_loads(more).replaced(free=dataclasses.replace(self.free, directions=moved(more)))
 
     def settled_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
         """The same, with what one more of each does beside the ``effects``, if more than noise is left to settle."""
         if self.free is None or not self.free_loads or self.gap(difference) <= UNSETTLED * self.floor():
             return self
         more = self._asked(self.free, difference)
-        return self._loaded(more).freed(moved(more), effects)
+        return self.with_loads(more).freed(moved(more), effects)
 
     def _asked(self, free: Free, difference: Sequence[FloatArray]) -> list[tuple[Direction, float]]:
         sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * (free.rows @ self._white(difference)))

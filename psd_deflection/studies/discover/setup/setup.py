@@ -77,7 +77,8 @@ def _blocks(rows: FloatArray, size: int) -> FloatArray:
     return np.where(count >= size // 2, np.where(there, cut, 0.0).sum(axis=2) / np.maximum(count, 1), np.nan)
 
 
-def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> _Movement:
+def movement_sums(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> _Movement:
+    """Return the sums over blocks of what dots and simulated loads moved, m^2."""
     count = 2 * observations[0].psds
     squared, cross, own = 0.0, np.zeros((3, count, count)), np.zeros((3, 3))
     for o in observations:
@@ -108,7 +109,7 @@ def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect])
     return _Movement(squared, cross, own, noise)
 
 
-def _sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
+def load_sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     """What ``wiring`` leaves of the movement, and the size of each load (3,) over the noted one; NaN for none."""
     dots = dot_channels(len(wiring.axes))
     columns = [dots.index(wiring.columns[c]) for c in dots]
@@ -157,13 +158,13 @@ def wire(
 ) -> tuple[list[Observation], list[Finding], dict[str, object]]:
     """The recordings as they would be if wiring, signs and units were right; what was wrong; lines for the rig file."""
     file = Wiring.from_rig(observations[0].rig)
-    m = _movement(observations, base)
+    m = movement_sums(observations, base)
     if m.squared <= 0.0 or float(np.trace(m.own)) <= 0.0:
         return list(observations), [], {}
-    noise = _noise_energy(observations)
+    noise = noise_energy(observations)
     tried = []
     for wiring in wirings_of(file):
-        left, sizes = _sizes(m, wiring)
+        left, sizes = load_sizes(m, wiring)
         tried.append((left + noise, wiring, sizes))
     best = min(left for left, _, _ in tried)
     as_good = [(_changes(w, file, s), left, i) for i, (left, w, s) in enumerate(tried) if left <= AS_GOOD * best]
@@ -201,7 +202,7 @@ def wire(
     return [_mended(o, lines, crossed, loads) for o in observations], findings, lines
 
 
-def _noise_energy(observations: Sequence[Observation]) -> float:
+def noise_energy(observations: Sequence[Observation]) -> float:
     """What noise adds to the sum over block means, by the rig file, m^2."""
     out = 0.0
     for o in observations:
