@@ -23,7 +23,7 @@ from psd_deflection.studies.discover import experiment
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, nothing_of, pieces, settings
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.localise import regressors
+from psd_deflection.studies.discover.search.localise import plain_word, regressors
 from psd_deflection.studies.discover.search.trust import energies, gain_beyond
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, outliers, stuck
@@ -486,3 +486,20 @@ def test_what_is_known_of_a_recording_is_told() -> None:
     assert findings == []
     assert np.isnan(quiet.volts).all(axis=1).sum() == 60
     assert clean(o, ())[0] is o
+
+
+@pytest.mark.parametrize(
+    ('regressor', 'word'),
+    [
+        ('load_fx^2', 'load_fx'),
+        ('history of load_fy', 'load_fy'),
+        ('load_tz', 'load_tz'),
+        ('|rate of dot_x|', 'rate'),
+        ('dot_x dot_y', 'dot_position'),
+        ('temperature^2', 'temperature'),
+        ('time', 'time'),
+        ('constant', 'constant'),
+    ],
+)
+def test_a_regressor_has_a_plain_word(regressor: str, word: str) -> None:
+    assert plain_word(regressor) == word

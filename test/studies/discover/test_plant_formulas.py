@@ -541,3 +541,14 @@ def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
         f'<PlantDiscovery effects_found: b; gap {found.gap_before:.3g} N → {found.gap_after:.3g} N '
         '(noise alone: 0.02 N)>'
     )
+
+
+def test_noise_of_a_plant_is_nothing_missing() -> None:
+    found = discover_in(steel(0.0))
+    assert (found.verdict, found.effects, found.unknown) == ('nothing_missing', (), ())
+    assert found.gap_before == found.gap_after
+    # Nobody said how much noise there is.
+    assert math.isnan(found.gap_floor)
+    assert found.floors == 0.0
+    assert '(noise alone: not known)' in repr(found)
+    assert 'no effect' in repr(found)

@@ -414,3 +414,24 @@ def test_loads_of_a_cell_lose_their_noise_whether_times_are_mended_or_not(monkey
     assert found is not None
     assert [m.first for m in found.measured] == [0, 1500]
     assert [n.hung for n in found.notes] == [0.4]
+
+
+@pytest.mark.parametrize(('rate', 'width'), [(1000.0, 286), (200.0, 57), (10.0, 3), (5.0, 2)])
+def test_means_take_four_periods_of_bending_and_two_samples_at_least(
+    rate: float, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    widths: list[int] = []
+
+    def none(dots: FloatArray, width: int) -> list[steps_module.DotStep]:
+        widths.append(width)
+        return []
+
+    monkeypatch.setattr(noted_times, 'lasting_steps', none)
+    monkeypatch.setattr(steps_module, 'lasting_steps', none)
+    rig = load_rig(overrides={'converter.sample_rate_hz': rate, 'dynamics.bending_frequency': 14.0})
+    loads = np.zeros((100, 3))
+    loads[50:] = 1.0
+    assert unnoted_steps(rig, np.zeros((100, 4)), loads) == []
+    assert last_step(rig, np.zeros((100, 4)), 1.0 / rate) is None
+    assert mend_loads(rig, np.zeros((100, 4)), loads) is None
+    assert widths == [width] * 3

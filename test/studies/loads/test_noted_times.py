@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
-from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import DOT_CHANNELS, FloatArray
-from psd_deflection.rig.config import Rig, load_rig, replace_values
+from psd_deflection.rig.config import Rig
 from psd_deflection.studies.calibrate.from_recordings import as_acted
 from psd_deflection.studies.calibrate.observation import CalibrationRun
-from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads.noted_times import (
@@ -26,8 +24,8 @@ from psd_deflection.studies.loads.noted_times import (
     ordinal,
     shifted,
 )
+from test.studies.held_loads import RIG, answers, read
 
-RIG = load_rig()
 LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, 0, 0)], float)
 DWELL = 5000
 COUNT = DWELL * len(LEVELS)
@@ -55,9 +53,7 @@ def noted(late: tuple[float, ...]) -> FloatArray:
 
 def volts(loads: FloatArray, seed: int = 0, **true: object) -> FloatArray:
     """What the device reads (n, 6), V, of a rig that differs by ``true`` from the rig file."""
-    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
-    counts = RigSimulator(rig, seed).step(loads).counts
-    return np.asarray(counts * RIG.converter.volts_per_count, dtype=np.float64)
+    return read(loads, seed=seed, **true)
 
 
 QUIET = volts(hung())
@@ -69,12 +65,24 @@ def mended(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> MendedLoads |
 
 
 @pytest.mark.parametrize(
-    'late',
-    [LATE, (0, 0, 3, 0, 0, 0), (2.0,) * 6, (-1.5, 0.4, -2.0, 0.2, -0.3, 1.0), (4.5, 3.0, 4.8, 4.0, 2.0, 4.0), JITTER],
+    ('late', 'turned'),
+    [
+        (LATE, True),
+        *(
+            (late, False)
+            for late in (
+                LATE,
+                (0, 0, 3, 0, 0, 0),
+                (2.0,) * 6,
+                (-1.5, 0.4, -2.0, 0.2, -0.3, 1.0),
+                (4.5, 3.0, 4.8, 4.0, 2.0, 4.0),
+                JITTER,
+            )
+        ),
+    ],
 )
-@pytest.mark.parametrize('read', [QUIET, TURNED], ids=['quiet', 'turned'])
-def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], read: FloatArray) -> None:
-    found = mended(read, noted(late))
+def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], turned: bool) -> None:
+    found = mended(TURNED if turned else QUIET, noted(late))
     assert found is not None
     wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > ALIKE_S}
     assert {n.number: n.late for n in found.notes} == pytest.approx(wrong, abs=0.002)
@@ -172,20 +180,16 @@ def test_check_and_calibrate_say_the_same() -> None:
     expected = mended(QUIET, noted(LATE))
     assert expected is not None
     words = [n.words('x') for n in expected.notes]
-    checked = check(of_recording(RIG, QUIET, noted(LATE), 'x'))
+    checked, again, log, _ = answers(QUIET, noted(LATE))
     assert [f.fix for f in checked.findings if f.name == 'load_time'] == words
     assert {f.name for f in checked.findings} == {'load_time'}
     assert checked.sizes == pytest.approx([1.0] * 3, abs=0.01)
-    told: list[str] = []
-    t = np.arange(COUNT) / 1000.0
-    run = CalibrationRun('x', t, QUIET, np.zeros(0), np.zeros((0, 3)), noted(LATE))
-    again = as_acted(run, RIG, told.append)
-    assert told == words
+    assert log == words
     assert again.loads is not None
     # The correction gives dots in 32 bits: a time differs by some microseconds.
     assert np.abs(again.loads - expected.loads).max() < 0.5
-    right = CalibrationRun('x', t, QUIET, np.zeros(0), np.zeros((0, 3)), hung())
-    assert as_acted(right, RIG, told.append) is right
+    right = CalibrationRun('x', np.arange(COUNT) / 1000.0, QUIET, np.zeros(0), np.zeros((0, 3)), hung())
+    assert as_acted(right, RIG, log.append) is right
 
 
 def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:

@@ -11,14 +11,9 @@ import numpy as np
 import pytest
 
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
-from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.calibrate.from_recordings import as_acted
-from psd_deflection.studies.calibrate.observation import CalibrationRun
-from psd_deflection.studies.check.checkup import check, of_recording
-from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import plateaus
 from psd_deflection.studies.loads.fine import fine_means
 from psd_deflection.studies.loads.noted_times import mend_loads, unnoted_steps
@@ -34,29 +29,9 @@ from psd_deflection.studies.loads.plateaus import (
     as_hung,
     wrong_notes,
 )
+from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, answers, noted_as, read
 
-RIG = load_rig()
-DWELL = 4000
-LEVELS = np.array(
-    [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (0, 0, 0)], float
-)
-HUNG = np.repeat(LEVELS, DWELL, axis=0)
-
-
-def read(acting: FloatArray, **true: object) -> FloatArray:
-    """What the device reads (n, 6), V, under ``acting`` loads, of a rig that differs by ``true``."""
-    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
-    return np.asarray(RigSimulator(rig, 3).step(acting).counts * RIG.converter.volts_per_count, dtype=np.float64)
-
-
-def noted_as(number: int, load: tuple[float, float, float]) -> FloatArray:
-    """The loads with another one in plateau ``number``."""
-    out = HUNG.copy()
-    out[number * DWELL : (number + 1) * DWELL] = load
-    return out
-
-
-QUIET = read(HUNG)
+QUIET = read(HELD)
 TWICE = noted_as(5, (80, -80, 40))
 NEVER = noted_as(2, (0, -20, 0))
 WORDS = {
@@ -71,18 +46,14 @@ WORDS = {
     ('noted', 'name', 'where'), [(TWICE, 'load_value', 'load 5'), (NEVER, 'missing_load', '8.000 s')]
 )
 def test_check_calibrate_and_discover_say_what_hung_in_the_same_words(noted: FloatArray, name: str, where: str) -> None:
-    checked = check(of_recording(RIG, QUIET, noted, 'x'))
+    checked, run, log, found = answers(QUIET, noted)
     assert [(f.name, f.where) for f in checked.findings] == [(name, where)]
     assert _rounded(checked.findings[0].fix) == WORDS[name]
     assert checked.verdict == 'wrong'
     assert checked.sizes == pytest.approx([1.0] * 3, abs=0.01)
-    told: list[str] = []
-    t = np.arange(len(HUNG)) / 1000.0
-    run = as_acted(CalibrationRun('x', t, QUIET, np.zeros(0), np.zeros((0, 3)), noted), RIG, told.append)
-    assert [_rounded(words) for words in told] == [WORDS[name]]
+    assert [_rounded(words) for words in log] == [WORDS[name]]
     assert run.loads is not None
-    assert np.abs(run.loads - HUNG).max(axis=0) == pytest.approx([0.0] * 3, abs=0.1)
-    found = discover([Observation('x', RIG, QUIET, noted)])
+    assert np.abs(run.loads - HELD).max(axis=0) == pytest.approx([0.0] * 3, abs=0.1)
     assert [_rounded(f.fix) for f in found.setup] == [WORDS[name]]
 
 
@@ -105,7 +76,7 @@ def _rounded(words: str) -> str:
     ],
 )
 def test_no_note_is_called_wrong_for_what_the_rig_does(true: dict[str, object]) -> None:
-    assert wrong_notes(RIG, read(HUNG, **true), HUNG) == []
+    assert wrong_notes(RIG, read(HELD, **true), HELD) == []
 
 
 def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
@@ -113,7 +84,7 @@ def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
     both[DWELL : 2 * DWELL] = (0, -30, 0)
     found = wrong_notes(RIG, QUIET, both)
     assert [n.where for n in found] == ['load 1', 'load 5']
-    assert as_hung(both, found) == pytest.approx(HUNG, abs=0.1)
+    assert as_hung(both, found) == pytest.approx(HELD, abs=0.1)
     assert as_hung(both, found) is not both
     assert len(wrong_notes(RIG, QUIET[: 7 * DWELL], both[: 7 * DWELL])) == 2
     assert wrong_notes(RIG, QUIET[: 6 * DWELL], both[: 6 * DWELL]) == []
@@ -177,12 +148,12 @@ def test_a_load_that_no_other_is_like_may_be_a_sign_a_unit_or_an_effect() -> Non
 
 def test_nobody_is_accused_if_another_load_may_be_the_wrong_one() -> None:
     # Without the third load a link that is soft by chance would explain the fourth.
-    soft = read(HUNG, link__youngs_modulus=0.97 * RIG.link.youngs_modulus)
+    soft = read(HELD, link__youngs_modulus=0.97 * RIG.link.youngs_modulus)
     assert wrong_notes(RIG, soft, noted_as(4, (28.5, 0, 0))) == []
     # A fault of one reading under one load is none of the load.
     reading = QUIET.copy()
     reading[4 * DWELL : 5 * DWELL, 0] += 0.1
-    assert wrong_notes(RIG, reading, HUNG) == []
+    assert wrong_notes(RIG, reading, HELD) == []
 
 
 def test_beside_an_effect_what_hung_is_told_as_if_there_were_none() -> None:
@@ -232,9 +203,9 @@ def test_loads_are_asked_for_if_what_hung_rounds_to_the_notes_and_not_if_it_is_f
 
 
 def test_a_step_without_a_note_has_its_time() -> None:
-    dots = read(HUNG)[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
+    dots = read(HELD)[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
     assert unnoted_steps(RIG, dots, noted_as(2, (0, -20, 0))) == pytest.approx([8.0], abs=2e-3)
-    assert unnoted_steps(RIG, dots, HUNG) == []
+    assert unnoted_steps(RIG, dots, HELD) == []
     assert mend_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
 
 
@@ -821,3 +792,15 @@ def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> No
     )
     assert not free.exact
     assert free.hung == pytest.approx((24.0, -35.0, 0.0))
+
+
+def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    periods: list[float] = []
+
+    def noted(loads: FloatArray, period: float, asked: object) -> list[WrongNote]:
+        periods.append(period)
+        return []
+
+    monkeypatch.setattr(plateaus, 'noted_wrong', noted)
+    wrong_notes(load_rig(overrides={'converter.sample_rate_hz': 200.0}), np.zeros((100, 6)), np.zeros((100, 3)))
+    assert periods == pytest.approx([0.005])

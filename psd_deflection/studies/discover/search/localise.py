@@ -263,7 +263,7 @@ def localise(
     main: dict[str, list[str]] = {}
     for d in depends:
         if d.p < 0.01 and len(main.setdefault(d.channel, [])) < 2:
-            name = _plain(d.regressor)
+            name = plain_word(d.regressor)
             if name not in main[d.channel]:
                 main[d.channel].append(name)
     order, channels = np.argsort(-z, axis=None), channel_names(workspace.psds)
@@ -288,7 +288,7 @@ def localise(
     return Localisation(tuple(cells), tuple(depends), total, p, raw_z, spans)
 
 
-def _plain(regressor: str) -> str:
+def plain_word(regressor: str) -> str:
     """The word of result.json for a regressor: a load, its rate, the dot's position, temperature, time."""
     for word in ('load_fx', 'load_fy', 'load_tz'):
         if word in regressor:
