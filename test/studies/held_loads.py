@@ -33,7 +33,7 @@ OTHERS = tuple(name for name in effect_names() if name not in FEW)
 """What a search leaves out where a test is about loads and words."""
 
 
-def read(acting: FloatArray, *, seed: int = 3, **true: object) -> FloatArray:
+def read(acting: FloatArray, seed: int = 3, /, **true: object) -> FloatArray:
     """Return the readings (n, 6), V, under ``acting`` loads of a rig that differs by ``true`` from the rig file."""
     rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
     return np.asarray(RigSimulator(rig, seed).step(acting).counts * RIG.converter.volts_per_count, dtype=np.float64)

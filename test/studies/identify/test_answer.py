@@ -13,7 +13,7 @@ import pytest
 from psd_deflection.arms.shapers import recommended, shaper
 from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.result import Identified, close_modes, interval_words
+from psd_deflection.studies.identify.result import Identified, interval_words
 
 
 def mode(frequency: float = 14.0, damping: float = 0.02, *, sd: float = 1e-4, damping_sd: float = 1e-4) -> Mode:
@@ -82,12 +82,6 @@ def test_the_surer_axis_is_the_one_that_the_rig_file_gets() -> None:
     assert twist == {'dynamics.torsion_frequency': 21.0, 'dynamics.torsion_damping_ratio': 0.02}
 
 
-def test_only_modes_near_the_loudest_are_close() -> None:
-    modes = [mode(10.0), mode(12.99), mode(13.01), mode(7.01), mode(6.99)]
-    assert close_modes(modes) == [modes[0], modes[1], modes[3]]
-    assert close_modes([]) == []
-
-
 @pytest.mark.parametrize(('sd', 'name'), [(0.03, 'mzv'), (0.05, 'zvd')])
 def test_the_shaper_suits_all_close_modes_and_their_scatter(sd: float, name: str) -> None:
     """It works from three standard deviations below the lowest to as far above the highest: for 0.69 or 0.75 Hz.
@@ -104,20 +98,6 @@ def test_the_shaper_suits_all_close_modes_and_their_scatter(sd: float, name: str
     assert both.sizes == pytest.approx(middle.sizes)
     assert answer.shaper_of(1) == shaper('zvd', 14.0, 0.02)
     assert answer.shaper_of(2) is None
-
-
-@pytest.mark.parametrize(
-    ('modes', 'known'),
-    [
-        ((mode(damping_sd=0.0067),), True),
-        ((mode(damping_sd=0.0069),), False),
-        ((mode(damping_sd=0.0),), False),
-        ((mode(damping_sd=0.001), mode(15.0, damping_sd=0.0069)), False),
-        ((mode(damping_sd=0.001), mode(30.0, damping_sd=0.0069)), True),
-    ],
-)
-def test_a_shaper_needs_a_damping_ratio_within_a_third(modes: tuple[Mode, ...], known: bool) -> None:
-    assert (found(modes, (), ()).shaper_of(0) is not None) is known
 
 
 @pytest.mark.parametrize(
@@ -170,20 +150,6 @@ def test_a_shaper_in_words_has_sizes_and_milliseconds() -> None:
     assert found((), (), ()).shaper_words(0) == ''
 
 
-def test_how_many_modes_there_are() -> None:
-    assert found((mode(), mode(40.0)), (), (mode(),)).page_sentences() == ['Modes: 2 along ΔX, 1 along θ.']
-    assert found((), (), ()).page_sentences() == ['No mode stands out of the noise.']
-    assert len(found((mode(sd=1.0),), (), ()).page_sentences()) == 2
-
-
-def test_lines_for_the_rig_file_follow_the_sentences() -> None:
-    answer = found((mode(14.25),), (), ())
-    tail = ['    dynamics.bending_frequency: 14.25', '    dynamics.bending_damping_ratio: 0.02']
-    assert answer.lines() == [*answer.sentences(), '', 'Lines for the rig file, below ros__parameters:', '', *tail]
-    nothing = found((), (), ())
-    assert nothing.lines() == nothing.sentences()
-
-
 def test_numbers_for_machines_are_in_si_units() -> None:
     x = Mode(14.0, 0.01, 0.02, 0.001, 12e-6)
     tree = found((x,), (), (mode(21.0), mode(30.0)), stretches=2).tree()
@@ -203,13 +169,3 @@ def test_numbers_for_machines_are_in_si_units() -> None:
     }
     assert dx['modes'] == [expected]
     assert len(tree['axes']['theta']['modes']) == 2
-
-
-def test_the_table_has_a_row_for_each_mode() -> None:
-    x = Mode(14.0, 0.01, 0.02, 0.001, 12e-6)
-    columns = {c.name: list(c.values) for c in found((x,), (), (mode(21.0), mode(30.0))).table().columns}
-    assert columns['frequency'] == [14.0, 21.0, 30.0]
-    assert columns['frequency_sd'] == [0.01, 1e-4, 1e-4]
-    assert columns['damping_ratio'] == [0.02, 0.02, 0.02]
-    assert columns['damping_ratio_sd'] == [0.001, 1e-4, 1e-4]
-    assert columns['amplitude'] == [12e-6, 1e-3, 1e-3]

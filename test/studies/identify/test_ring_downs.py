@@ -105,27 +105,6 @@ def test_the_root_of_the_mean_square() -> None:
     assert RingFit([(16.0, 0.02)], np.array([3.0, -4.0]), np.eye(2)).deviation == pytest.approx(math.sqrt(12.5))
 
 
-@pytest.mark.parametrize(('damping', 'bounded'), [(0.96e-5, True), (1.04e-5, False), (0.69, False), (0.695, True)])
-def test_a_damping_ratio_at_its_bound_is_no_answer(damping: float, bounded: bool) -> None:
-    """Below ten times 1e-6, or above 0.99 of 0.7."""
-    assert RingFit([(16.0, 0.02), (40.0, damping)], np.zeros(3), np.eye(4)).bounded is bounded
-
-
-def test_two_modes_are_fitted_to_the_last_digits() -> None:
-    t = times(900)
-    samples = 2e-4 + 1e-4 * t + ring(t, size=1e-6) + ring(t, 40.0, 0.01, 5e-7)
-    for steps in (100, 12):
-        fit = fit_modes([stretch(samples)], [(16.3, 0.01), (39.5, 0.03)], steps)
-        np.testing.assert_allclose(fit.modes, [(16.0, 0.02), (40.0, 0.01)], rtol=1e-6)
-        assert fit.deviation < 1e-12
-
-
-def test_of_rest_nothing_is_left() -> None:
-    fit = fit_modes([stretch(np.zeros(100))], [(16.0, 0.02)])
-    assert fit.deviation == 0.0
-    assert np.all(np.isfinite(fit.modes))
-
-
 def test_the_scatter_of_a_fit_is_that_of_its_slopes() -> None:
     """Of all that is fitted, the linear terms of each stretch too, by differences of the motion."""
     rng = np.random.default_rng(2)
@@ -239,16 +218,6 @@ def test_windows_to_begin_with_ring_do_not_overlap_by_half_and_are_there() -> No
     assert max(firsts) > 2900
 
 
-def test_a_window_to_begin_with_swings_eight_times_the_noise() -> None:
-    t = times(1000)
-    for factor, count in ((7.9, 0), (8.1, 2)):
-        # The amplitude of a steady swing is sqrt(2) times its deviation; whole turns, so that no line takes any.
-        samples = factor * 1e-6 * np.cos(2.0 * math.pi * 16.0 * t)
-        level = 1e-6 * float(ringing_levels(samples, RATE, [(16.0, 0.01)], [0], 384)[0, 0]) / (factor * 1e-6)
-        found = seed_windows(samples, samples, RATE, [(16.0, 0.01)], level, 384, 384)
-        assert len(found) == count
-
-
 def test_at_most_thirty_windows_are_tried() -> None:
     t = times(9000)
     samples = 1e-3 * np.cos(2.0 * math.pi * 16.0 * t)
@@ -278,29 +247,6 @@ def test_half_a_window_at_the_end_fits_by_itself(early: bool) -> None:
     assert not ends_well(s, left, 100, 1e-6, early)
 
 
-@pytest.mark.parametrize(
-    ('left', 'level', 'damping', 'good'),
-    [
-        # 1.25 of the noise, and three thousandths of a swing of 2 mm.
-        (1.24e-6 + 6e-6, 1e-6, 0.02, True),
-        (1.27e-6 + 6e-6, 1e-6, 0.02, False),
-        (0.0, 1e-6, 0.8, False),
-        # Eight times as loud as the noise.
-        (0.0, 1e-3 / 8.05, 0.02, True),
-        (0.0, 1e-3 / 7.95, 0.02, False),
-    ],
-)
-def test_a_stretch_is_good_if_little_is_left_of_loud_ringing(
-    left: float, level: float, damping: float, good: bool
-) -> None:
-    t = times(640)
-    s = stretch(1e-3 * np.cos(2.0 * math.pi * 16.0 * t))
-    if damping < 0.1:
-        assert s.loud([(16.0, 0.0)]) == pytest.approx(1e-3)
-        damping = 2e-5
-    assert is_good(s, RingFit([(16.0, damping)], np.full(640, left), np.eye(2)), level) is good
-
-
 def test_a_stretch_grows_by_half_a_window_or_a_third_until_a_blow() -> None:
     """From 384 forward to 576, 768 and 1024 samples, then back to 1365; more would reach into the blows."""
     n = 3000
@@ -325,14 +271,6 @@ def test_a_stretch_grows_by_half_a_window_or_a_third_until_a_blow() -> None:
         grown, _ = grow_stretch(cut, Stretch(cut, 1000 - low, 1384 - low, RATE), start, window, 1e-6)
         assert grown.first + low == max(expected[0], low) or expected[0] < 1000
         assert grown.last + low == expected[1]
-
-
-def test_a_stretch_ends_where_the_recording_ends() -> None:
-    samples = 1e-3 * np.exp(-0.02 * 100.0 * times(400)) * np.cos(100.0 * times(400))
-    samples += 1e-6 * np.random.default_rng(16).normal(size=400)
-    seed = Stretch(samples, 8, 392, RATE)
-    grown, _ = grow_stretch(samples, seed, fit_modes([seed], [(16.0, 0.02)]), 384, 1e-6)
-    assert (grown.first, grown.last) == (8, 392)
 
 
 @pytest.mark.parametrize('split', [True, False])
@@ -573,19 +511,6 @@ def test_a_further_mode_has_a_hundredth_of_the_loudest_and_saves_enough(
     assert len(asked) == count
 
 
-def test_three_modes_are_the_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    t = times(600)
-    s = stretch(ring(t) + ring(t, 50.0, 0.01) + ring(t, 90.0, 0.01) + 1e-6 * np.random.default_rng(15).normal(size=600))
-    more = [fit_modes([s], [(16.0, 0.02), (50.0, 0.01), (90.0, 0.01)][:k]) for k in (1, 2, 3)]
-    monkeypatch.setattr(module, 'hints_at_pair', lambda stretches, fit, enough: True)
-    monkeypatch.setattr(module, 'split_mode', lambda stretches, modes: more[len(modes)])
-    assert with_right_order([s], more[0], RATE) is more[2]
-    # One too much is dropped: the one that makes no difference, not the loudest.
-    noise = fit_modes([s], [(90.0, 0.01), (16.0, 0.02), (50.0, 0.01), (130.0, 0.01)])
-    monkeypatch.setattr(module, 'hints_at_pair', lambda stretches, fit, enough: False)
-    assert [round(f) for f, _ in with_right_order([s], noise, RATE).modes] == [90, 16, 50]
-
-
 def trimmed(
     scatter: Sequence[float],
     monkeypatch: pytest.MonkeyPatch,
@@ -613,18 +538,6 @@ def test_the_ends_that_fit_worse_are_cut(monkeypatch: pytest.MonkeyPatch) -> Non
     assert trimmed([1.0, 9.0, 1.0, 9.0, *usual[7:], 9.0, 1.0, 1.0], monkeypatch) == (100 + 64, 740 - 48)
     assert trimmed([*usual[:20], 9.0, *usual[21:]], monkeypatch) == (100, 420)
     assert trimmed([*usual[:19], 9.0, *usual[20:]], monkeypatch) == (420, 740)
-
-
-def test_errors_that_remember_are_worth_fewer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four of a sign and four of the other: neighbours correlate by a half, which leaves a third of 16."""
-    alike = (1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0)
-    limit = 1.0 + 4.0 / math.sqrt(2.0 * 16.0 / 3.0)
-    assert trimmed([*[1.0] * 39, limit * 0.98], monkeypatch, alike) == (100, 740)
-    assert trimmed([*[1.0] * 39, limit * 1.03], monkeypatch, alike) == (100, 724)
-    # All of one sign: a correlation of 0.95 is the most that is believed, and one sample is left at least.
-    limit = 1.0 + 4.0 / math.sqrt(2.0)
-    assert trimmed([*[1.0] * 39, limit * 0.98], monkeypatch, (1.0,)) == (100, 740)
-    assert trimmed([*[1.0] * 39, limit * 1.03], monkeypatch, (1.0,)) == (100, 724)
 
 
 def test_however_errors_remember_a_fortieth_of_the_samples_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -679,19 +592,6 @@ def test_four_periods_are_left_at_least(monkeypatch: pytest.MonkeyPatch) -> None
     assert trimmed([1.0] * 15, monkeypatch) is None
     assert trimmed([*[1.0] * 16, 9.0, *[1.0] * 3], monkeypatch) == (100, 356)
     assert trimmed([*[1.0] * 15, 9.0, *[1.0] * 4], monkeypatch) is None
-
-
-def test_a_piece_without_samples_is_no_bad_one() -> None:
-    """And what is lost does not change the usual."""
-    rng = np.random.default_rng(12)
-    samples = ring(times(900)) + 1e-6 * rng.normal(size=900)
-    samples[200:420] = math.nan
-    samples[-40:] += 1e-4
-    s = Stretch(samples, 0, 900, RATE)
-    kept = trim(s, samples, RATE, [(16.0, 0.02)])
-    assert kept is not None
-    assert kept.first == 0
-    assert 840 <= kept.last <= 864
 
 
 def test_the_variance_of_what_is_left_is_for_its_freedom() -> None:
@@ -843,10 +743,3 @@ def test_with_the_mode_that_was_missing_the_stretches_are_longer() -> None:
     assert len(found.modes) == 2
     assert found.modes[0].amplitude > found.modes[1].amplitude
     assert sum(last - first for first, last in found.stretches) > 2000
-
-
-def test_a_fit_at_its_bounds_is_no_mode() -> None:
-    samples = 1e-3 * np.cos(2.0 * math.pi * 16.0 * times(1000))
-    found = fit_ring_downs(samples, RATE, [(16.0, 0.01)], [Stretch(samples, 0, 1000, RATE)])
-    assert (found.modes, found.how, found.stretches) == ((), 'none', ())
-    assert np.all(np.isnan(found.fitted))

@@ -10,23 +10,6 @@ from scipy.optimize import brentq
 
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.loads.load_cell import MeasuredLoad, without_cell_noise
-from test.studies.held_loads import DWELL, HELD, LEVELS
-
-NUMBER = np.arange(len(HELD))
-
-
-def test_a_load_cell_is_averaged_between_steps_and_motion_is_not() -> None:
-    noise = np.random.default_rng(1).normal(size=HELD.shape) * (0.05, 0.05, 0.0)
-    calm, measured = without_cell_noise(HELD + noise)
-    assert np.abs(calm - HELD).max() < 5.0 * 0.05 / np.sqrt(DWELL)
-    # The first two have no step between them that stands out of nothing.
-    assert [m.first for m in measured] == [i * DWELL for i in range(len(LEVELS))]
-    assert measured[0].sd == pytest.approx([0.05 / np.sqrt(DWELL)] * 2 + [0.0], rel=0.1)
-    swept = HELD + np.sin(NUMBER / 30.0)[:, None]
-    still, none = without_cell_noise(swept)
-    assert np.array_equal(still, swept)
-    assert none == ()
-    assert without_cell_noise(HELD)[1] == ()
 
 
 def measured_along_y(values: FloatArray, *, held: int = 2) -> tuple[FloatArray, tuple[MeasuredLoad, ...]]:
@@ -112,38 +95,3 @@ def test_a_channel_without_noise_has_steps_and_a_billionth_of_a_newton_is_none()
         loads[:, 1] = noise
         loads[300:, 2] = step
         assert [m.first for m in without_cell_noise(loads)[1]] == [0, 300][:parts]
-
-
-@pytest.mark.parametrize(('short', 'told'), [(19, False), (20, True)])
-def test_less_than_twenty_values_between_steps_stay_as_they_are(short: int, told: bool) -> None:
-    values = np.random.default_rng(7).normal(size=200)
-    values[100 : 100 + short] += 1000.0
-    loads, measured = measured_along_y(values, held=3)
-    edges = [(0, 300), (300, 300 + 3 * short), (300 + 3 * short, 600)]
-    assert [(m.first, m.last) for m in measured] == [e for e in edges if told or e[0] != 300]
-    middle = loads[300 : 300 + 3 * short, 1]
-    kept = values[100 : 100 + short]
-    assert middle == pytest.approx(np.full(3 * short, kept.mean()) if told else np.repeat(kept, 3))
-
-
-def test_the_mean_is_over_the_time_that_each_value_held_and_its_deviation_over_the_values() -> None:
-    chance = np.random.default_rng(8)
-    held = chance.integers(1, 9, 300)
-    values = chance.normal(size=(300, 3)) * (1.0, 0.0, 0.1) + (5.0, 0.0, 1.0)
-    values[150:] += (100.0, 0.0, 0.0)
-    loads = np.repeat(values, held, axis=0)
-    edge = int(held[:150].sum())
-    with np.errstate(invalid='raise', divide='raise'):
-        calm, (first, second) = without_cell_noise(loads)
-    assert (first.first, first.last, second.first, second.last) == (0, edge, edge, len(loads))
-    assert calm[:edge] == pytest.approx(np.tile(loads[:edge].mean(axis=0), (edge, 1)))
-    assert calm[edge:] == pytest.approx(np.tile(loads[edge:].mean(axis=0), (len(loads) - edge, 1)))
-    assert first.sd == pytest.approx(values[:150].std(axis=0) / 150.0**0.5, abs=1e-12)
-    assert second.sd == pytest.approx(values[150:].std(axis=0) / 150.0**0.5, abs=1e-12)
-
-
-def test_motion_in_one_part_leaves_the_noise_of_the_next() -> None:
-    values = np.concatenate((with_memory(400, 0.4), 1000.0 + with_memory(400, 0.0)))
-    loads, (found,) = measured_along_y(values)
-    assert (found.first, found.last) == (800, 1600)
-    assert loads[:800, 1] == pytest.approx(np.repeat(values[:400], 2))

@@ -157,21 +157,6 @@ def test_the_search_begins_with_a_reach_to_either_side_and_ends_after_120_looks(
     assert len(looks) == 2 + 120
 
 
-def test_the_least_of_a_valley_is_found_from_the_best_start() -> None:
-    def valley(x: FloatArray) -> float:
-        return float((x[0] - 1.23) ** 2 + 4.0 * (x[1] - 0.61) ** 2 + 2.0)
-
-    least, (at, took) = steps_module.best_time(valley, [(0.0, 0.3), (1.2, 0.6), (5.0, 1.0)], 0.05)
-    assert (least, at, took) == pytest.approx((2.0, 1.23, 0.61), abs=1e-3)
-    # Without a duration it keeps none, and looks six reaches about.
-    least, (at, took) = steps_module.best_time(valley, [(0.0, 0.0), (1.2, 0.0), (5.0, 0.0)], 0.01)
-    assert at == pytest.approx(1.23, abs=2e-5)
-    assert took == 0.0
-    assert least == pytest.approx(2.0 + 4.0 * 0.61**2)
-    for begun, end in ((1.1, 1.16), (1.4, 1.34)):
-        assert steps_module.best_time(valley, [(begun, 0.0)], 0.01)[1][0] == pytest.approx(end, abs=5e-5)
-
-
 # ---- what is left
 
 

@@ -20,7 +20,6 @@ from psd_deflection.studies.loads.noted_times import (
     ordinal,
     shifted,
 )
-from psd_deflection.studies.loads.steps import LEAST_SHARE
 
 
 def note(noted: float, hung: float, took: float = 0.0, *, settled_only: bool = False, number: int = 3) -> MendedNote:
@@ -164,16 +163,6 @@ def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
     assert steps_module.steps_among_samples(np.zeros((200, 4)), 10) == []
 
 
-@pytest.mark.parametrize(('times', 'seen'), [(13.5, 1), (13.0, 0)])
-def test_a_step_stands_out_ten_times_of_what_is_there_without_one(times: float, seen: int) -> None:
-    # A drift of 0.01 a sample is 1 between two means of 100, everywhere. Half of the stretch, 51 samples, must be above
-    # 10: three quarters of the step, and the drift across it.
-    dots = stepped(2000, {900: times})
-    dots[:, 3] = 0.01 * np.arange(2000.0)
-    assert (0.75 * times) ** 2 + 1.0 != pytest.approx(100.0, abs=2.0)
-    assert len(steps_module.steps_among_samples(dots, 100)) == seen
-
-
 def test_places_without_a_mean_have_no_step() -> None:
     # Fifty of a hundred places have none: their middle one is half of the least that the drift makes of the others,
     # 0.55, as three samples after the last are left. Ten times of that are more than the step.
@@ -183,18 +172,6 @@ def test_places_without_a_mean_have_no_step() -> None:
     assert list(sizes_of(dots, 10).values()).count(0.0) == 50
     assert steps_module.steps_among_samples(dots, 10) == []
     assert len(steps_module.steps_among_samples(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
-
-
-def test_a_step_is_more_than_three_per_cent_of_the_largest() -> None:
-    for size, seen in ((2.9, 1), (4.0, 2)):
-        assert len(steps_module.steps_among_samples(stepped(100, {30: 100.0, 70: size}), 2)) == seen
-
-
-@pytest.mark.parametrize(('share', 'seen'), [(0.0395, 1), (0.0400, 2)])
-def test_a_stretch_above_three_per_cent_of_the_largest_is_half_a_width_long(share: float, seen: int) -> None:
-    # A triangle of 102 to either side: 25 on either side of the middle one are half of it, 51, and 24 are less.
-    assert len(steps_module.steps_among_samples(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
-    assert len(steps_module.steps_among_samples(stepped(2000, {500: share, 1200: 1.0}), 102)) == seen
 
 
 @pytest.mark.parametrize(
@@ -285,22 +262,6 @@ def test_a_note_that_half_of_the_others_show_to_be_on_time_keeps_the_step_at_its
     # If the others are late, that one is at a step by chance.
     late = np.array([1400, 3600, 5000])
     assert noted_times.matched_notes(late, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 2)]
-
-
-def test_a_note_without_a_step_near_it_has_none() -> None:
-    changes = np.array([1000, 9000])
-    # Thirty seconds away is the farthest.
-    for away, pairs in ((2999.0, [(0, 0)]), (3000.0, [(0, 0)]), (3001.0, [])):
-        assert noted_times.matched_notes(changes[:1], np.array([1e-4]), as_steps((1000.0 + away, 1e-4)), 0.01) == pairs
-    # What moves the dots by no more than 3 % of the largest does not count.
-    sizes = np.array([1.0, LEAST_SHARE])
-    assert noted_times.matched_notes(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.04)), 0.01) == [(0, 0)]
-    sizes[1] = 0.04
-    assert noted_times.matched_notes(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.04)), 0.01) == [(0, 0), (1, 1)]
-    assert noted_times.matched_notes(changes, np.zeros(2), as_steps((1000.0, 1.0)), 0.01) == []
-    assert noted_times.matched_notes(changes, sizes, [], 0.01) == []
-    # A step of no size is paired with the one that it is nearest to.
-    assert noted_times.matched_notes(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.0)), 0.01) == [(0, 0), (1, 1)]
 
 
 # ---- loads between samples

@@ -10,14 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import plateaus
-from psd_deflection.studies.loads.fine import fine_means
 from psd_deflection.studies.loads.noted_times import mend_loads, unnoted_steps
-from psd_deflection.studies.loads.plate_motion import across_of
 from psd_deflection.studies.loads.plateaus import (
     EXACT,
     STANDS_OUT,
@@ -275,55 +272,6 @@ GIVEN = load_rig(
         'dynamics.torsion_damping_ratio': 0.2,
     }
 )
-PLATE = np.array([[-1.0, 0.0, 0.07], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.1]])
-"""Rows x1 y1 x2 y2 of PSDs at (0, 70) and (-100, 0) mm: x_i = -X + ly θ, y_i = -Y - lx θ."""
-ACROSS = np.linalg.svd(PLATE)[0][:, 3]
-
-
-def compliance() -> FloatArray:
-    """m/N, m/N, rad/(N m) of a cantilever and a shaft."""
-    link = RIG.link
-    fourth = link.outer_radius**4 - link.inner_radius**4
-    bend = link.length**3 / (3.0 * link.youngs_modulus * np.pi / 4.0 * fourth)
-    return np.array([bend, bend, link.length / (link.shear_modulus * np.pi / 2.0 * fourth)])
-
-
-def test_loads_are_asked_for_by_how_the_plate_moves_and_what_no_plate_does_is_told_apart() -> None:
-    size, samples = 4, 6002
-    ends = [(0, 1500), (1500, 3000), (3302, 4504), (4504, samples)]
-    listed = [Plateau(0, a, b, k, False, np.zeros(3)) for k, (a, b) in enumerate(ends)]
-    more = np.array([(0.0, 0.0, 0.0), (1.0, -2.0, 3.0), (0.5, 0.0, -1.0), (-4.0, 1.0, 0.5)])
-    poses = np.tile([[1e-5], [-2e-5], [3e-5]], samples)
-    for (a, b), load in zip(ends[1:], more[1:], strict=True):
-        acts = np.zeros(samples)
-        acts[a:b] = 1.0
-        for axis, (frequency, ratio) in enumerate(((14.0, 0.1), (14.0, 0.1), (21.0, 0.2))):
-            moved = Filter(mode_coefficients(frequency, ratio, 1e-3))(acts)
-            poses[axis] += load[axis] * compliance()[axis] * moved
-    beside = np.zeros(samples)
-    for (a, b), far in zip(ends, (2e-6, 5e-6, -1e-6, 2e-6), strict=True):
-        beside[a:b] = far
-    dots = PLATE @ poses + np.outer(ACROSS, beside)
-    # What is in no time of the list counts for nothing.
-    dots[:, 3000:3302] += 1e-3
-    volts = np.zeros((6, samples))
-    volts[[0, 1, 3, 4]] = dots / np.array([[4e-4], [6e-4], [5e-4], [8e-4]])
-    there = np.ones((6, samples))
-    there[3, 2000:2100] = 0.0
-    count = fine_means(there, size)
-    found = plateaus.asked_for(GIVEN, fine_means(volts, size), count, samples, size, listed)
-    assert found.more == pytest.approx(more, abs=1e-6)
-    assert found.plateaus == tuple(listed)
-    assert found.compliance == pytest.approx(compliance())
-    blocks = np.arange(samples // size) * size
-    known = ((blocks < 3000) | (blocks >= 3302)) & ((blocks < 2000) | (blocks >= 2100))
-    assert np.isfinite(found.moved).all(axis=0).tolist() == known.tolist()
-    assert found.moved[:, known] == pytest.approx(fine_means(poses, size)[:, known], abs=1e-12)
-    assert found.rest[:, known] == pytest.approx(0.0, abs=1e-9)
-    assert np.isnan(found.rest[:, ~known]).all()
-    # Against the first time; its sign is that of a direction that may be turned around.
-    way = np.sign(across_of(GIVEN) @ ACROSS)
-    assert way * found.across == pytest.approx([0.0, 3e-6, -3e-6, 0.0], abs=1e-12)
 
 
 SPREAD = np.array(
@@ -416,23 +364,6 @@ def test_beside_loads_that_are_off_by_less_than_the_tolerance_two_may_be_wrong_i
     assert plateaus.stand_out(seen(more, twelve[:count], everywhere=slightly)).gone == gone
 
 
-def test_one_wrong_load_is_found_beside_what_effects_do_in_proportion() -> None:
-    softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
-    found = plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=softened))
-    assert (found.gone, found.softer) == ((5,), 0.1)
-    assert plateaus.stand_out(seen({}, everywhere=softened)).gone == ()
-    # Of six, and if effects would have to do more than three times what they do, nobody is accused.
-    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, SPREAD[:6], everywhere=softened[:6])).gone == ()
-    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=4.0 * softened)).gone == ()
-    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=2.6 * softened)).gone == (5,)
-    for more, gone in ((2.0, ()), (1.6, (5,))):
-        offset = np.add(softened, (0.0, more, 0.0))
-        assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=offset)).gone == gone
-    # The first after a change may be wrong, the time before all of them may not.
-    assert plateaus.stand_out(seen({1: (2.0, 0.0, 0.0)}, everywhere=softened)).gone == (1,)
-    assert plateaus.stand_out(seen({0: (2.0, 0.0, 0.0)}, everywhere=softened)).gone == ()
-
-
 def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fits() -> None:
     softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
 
@@ -452,32 +383,6 @@ def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fi
     assert plateaus.stand_out(found, 0.1).gone == ()
 
 
-def test_what_is_off_by_less_than_a_seventh_of_a_newton_is_right_whatever_the_others_suggest() -> None:
-    # Small loads are a tenth too small, so the large one would be off by 5 N.
-    small = np.array(
-        [(0, 0, 0), (1, 0, 0), (0, 1, 0), (-1, 1, 0), (0, -1, 1), (1, -1, 1), (50, 0, 0), (1, 1, -1)], float
-    )
-    share = 0.1 * small
-    share[6] = 0.0
-    assert plateaus.deviation_in_tolerances(seen({}, small, everywhere=share), (6,), 0.1)[6] > 5.5
-    assert plateaus.stand_out(seen({}, small, everywhere=share)).gone == ()
-
-
-def test_what_stands_out_is_three_times_the_tolerance_and_five_times_the_others() -> None:
-    def stands(wrong: list[float], others: list[float], bent: float = 0.0) -> bool:
-        return plateaus.stands_out(np.array(wrong), np.array(others), bent)
-
-    assert stands([3.01], [0.5])
-    assert not stands([3.0], [0.5])
-    assert not stands([4.0], [0.8])
-    assert stands([4.01], [0.8])
-    assert stands([5.1, 9.0], [0.2, 1.0])
-    assert not stands([5.1, 3.0], [0.2, 0.5])
-    assert not stands([9.0], [1.01])
-    assert stands([9.0], [1.01], 0.01)
-    assert not stands([9.0], [1.1], 0.01)
-
-
 def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much() -> None:
     noted = np.array([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 20.0, 0.0), (3.0, 4.0, 0.24), (3.0, 4.0, 0.26)])
 
@@ -494,27 +399,6 @@ def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much()
     assert known([4], (0.0, 6.1, 8.1), 2.0)
     assert not known([4], (0.0, 5.9, 7.9), 2.0)
     assert known([3, 4], (0.0, 6.1, 8.1), 2.0)
-
-
-def test_what_effects_do_is_the_likeliest_share_and_offset_of_all_other_loads() -> None:
-    chance = np.random.default_rng(1)
-    found = seen({}, everywhere=chance.normal(size=SPREAD.shape))
-    for gone, softer in (((), 0.1), ((2,), 0.1), ((1, 5), 0.2)):
-        keep = [k for k in range(8) if k not in gone]
-        x = np.column_stack((SPREAD, np.ones(8)))[keep]
-        # A tenth of the tolerance, 0.03, is the deviation of a load; those of a share and of an offset are the prior's.
-        pull = np.diag(0.03 / np.array([softer, softer, softer, 0.5]))
-        rows, values = np.vstack((x, pull)), np.vstack((found.more[keep], np.zeros((4, 3))))
-        wanted = np.linalg.lstsq(rows, values, rcond=None)[0]
-        slopes, offset = plateaus.proportional_part(found, gone, softer)
-        assert slopes == pytest.approx(wanted[:3], abs=1e-9)
-        assert offset == pytest.approx(wanted[3], abs=1e-9)
-        # Off by the largest of the three, in units of 0.3 and a hundredth of the load.
-        off = np.abs(found.more - np.column_stack((SPREAD, np.ones(8))) @ wanted).max(axis=1)
-        allowed = [0.3 + 0.01 * max(abs(v) for v in load) for load in SPREAD.tolist()]
-        assert plateaus.deviation_in_tolerances(found, gone, softer) == pytest.approx(off / allowed)
-    slopes, offset = plateaus.proportional_part(found, (), 0.0)
-    assert (slopes.tolist(), offset.tolist()) == (np.zeros((3, 3)).tolist(), [0.0] * 3)
 
 
 def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> None:
@@ -585,23 +469,6 @@ def test_loads_may_be_rounded_if_they_are_in_whole_steps_and_off_by_less_than_on
     assert not may_be((0.0, 0.0, 0.0), loads=noted + 0.3 * np.eye(3)[0])
     assert not may_be((0.0, 0.0, 0.0), loads=noted * [0.0, 0.0, 1.0])
     assert not may_be((0.0, 0.0, 0.0), loads=noted[1:])
-
-
-@pytest.mark.parametrize(
-    ('noted', 'step'),
-    [
-        ([10.0, -30.0], 10.0),
-        ([10.0, -35.0], 5.0),
-        ([4.0, -6.0], 2.0),
-        ([4.0, 7.0], 1.0),
-        ([4.0, 7.5], 0.0),
-        ([4.0, 7.0 + 5e-7], 1.0),
-        ([4.0, 0.0001], 0.0),
-        ([0.0, 0.0], np.inf),
-    ],
-)
-def test_the_step_of_noted_numbers_is_the_largest_of_which_all_are_multiples(noted: list[float], step: float) -> None:
-    assert plateaus.largest_step(np.array(noted)) == step
 
 
 # ---- what is said

@@ -11,7 +11,7 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads.acted import loads_that_acted
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads
-from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
+from psd_deflection.studies.loads.unnoted import unnoted_times
 from test.studies.held_loads import RIG, answers, read
 
 LEVELS = np.array(
@@ -85,32 +85,6 @@ def test_a_recording_without_any_noted_load_stays_as_it_is() -> None:
     assert np.isfinite(acted.volts).all()
 
 
-@pytest.mark.parametrize(
-    'true',
-    [
-        {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3},
-        {
-            'effects__e__name': 'laser_pointing_drift',
-            'effects__e__psd': 2,
-            'effects__e__rate_x': 5e-5,
-            'effects__e__rate_y': 0.0,
-        },
-        TURNED,
-        {'link__length': 0.6},
-    ],
-)
-def test_what_effects_do_is_no_load(true: dict[str, object]) -> None:
-    assert not any(isinstance(n, UnnotedTime) for n in loads_that_acted(RIG, read(HELD, **true), HELD).notes)
-
-
-def test_a_beam_that_jumps_three_times_is_no_load() -> None:
-    volts = VOLTS.copy()
-    for i, at in enumerate((21_000, 22_300, 22_700)):
-        volts[at:, 3] += 0.2 * (-1) ** i
-    noted = HELD.copy()
-    assert not any(isinstance(n, UnnotedTime) for n in loads_that_acted(RIG, volts, noted).notes)
-
-
 def asked(more: list[float], *, alone: int, across: float = 0.0, noted: float = 10.0) -> PlateauLoads:
     """Plateaus of 2 s under one noted load; all but the first ``alone`` are unnoted. ``more``: N along Y."""
     rows = np.array([(0.0, y, 0.0) for y in more])
@@ -142,17 +116,3 @@ def test_a_change_counts_by_three_times_what_effects_may_do_to_the_load() -> Non
 def test_two_changes_are_too_few_and_noted_ones_do_not_count() -> None:
     assert unnoted_times(asked([0.0, 9.0, 0.0], alone=1), 20_000, 0.001) == []
     assert unnoted_times(asked([0.0, 9.0, 0.0, 9.0], alone=2), 20_000, 0.001) == []
-
-
-def test_the_readings_are_those_of_a_plate() -> None:
-    """Within 5 % of how far the largest of these loads moves it, and 0.2 µm."""
-    limit = 0.05 * 9.0 * 4e-5 + 2e-7
-    assert unnoted_times(asked([0.0, 9.0, 0.0, 9.0], alone=1, across=0.99 * limit), 20_000, 0.001)
-    assert unnoted_times(asked([0.0, 9.0, 0.0, 9.0], alone=1, across=-1.01 * limit), 20_000, 0.001) == []
-
-
-def test_the_times_are_taken_out_and_nothing_else() -> None:
-    volts = np.ones((100, 6))
-    out = without_times(volts, [UnnotedTime(10, 20, 100, 3, 0.001), UnnotedTime(90, 100, 100, 4, 0.001)])
-    assert np.flatnonzero(np.isnan(out).all(axis=1)).tolist() == [*range(10, 20), *range(90, 100)]
-    assert np.isfinite(volts).all()
