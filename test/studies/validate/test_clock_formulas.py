@@ -33,7 +33,6 @@ from psd_deflection.studies.validate.motion import Motion
 Array = npt.NDArray[Any]
 
 
-
 def first_three(dots: FloatArray) -> FloatArray:
     poses: FloatArray = dots[:, :3].copy()
     return poses
