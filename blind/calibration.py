@@ -232,7 +232,7 @@ def score(seed: int, lit: bool = False) -> Score:
         unsaid,
         said,
         group,
-        '' if checked.holds else checked.groups[0].group,
+        '' if checked.unchanged else checked.groups[0].group,
         checked.like,
     )
 

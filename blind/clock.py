@@ -117,7 +117,7 @@ def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
         low, high = found.interval
         score.errors.append(found.value - run.offset)
         score.inside += low <= run.offset <= high
-        score.told += found.told
+        score.told += found.determined
     return score
 
 

@@ -26,7 +26,7 @@ from blind.generator import Array, Generator
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, proposals
-from psd_deflection.studies.discover.loop import settle
+from psd_deflection.studies.discover.loop import run_loop
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan
 
@@ -90,15 +90,15 @@ def one(job: tuple[str, str, float]) -> dict[str, Any]:
     left: list[list[str]] = []
 
     def record(plan: Plan, number: int) -> Observation:
-        left.append(sorted({t.rival for t in plan.told}))
+        left.append(sorted({t.alternative for t in plan.discriminations}))
         length = float(str(plan.setting.changes.get('link.length', RIG.link.length)))
         warm = plan.setting.temperature(len(plan.loads))
         made.append(observed([hidden], plan.loads, warm, length, seed + number, f'next {number}'))
         return made[-1]
 
-    done = settle([first], lambda known: discover(known, RIG), record, most=MOST)
-    named = [*(e.active.effect.name for e in done.found.effects), *(f.name for f in done.found.setup)]
-    together = sorted(done.found.unsettled)
+    done = run_loop([first], lambda known: discover(known, RIG), record, most=MOST)
+    named = [*(e.active.effect.name for e in done.discovery.effects), *(f.name for f in done.discovery.setup)]
+    together = sorted(done.discovery.unsettled)
     row |= {
         'outcome': done.outcome,
         'recordings': len(done.plans),
@@ -106,7 +106,7 @@ def one(job: tuple[str, str, float]) -> dict[str, Any]:
         'together': together,
         'left': left,
         'planned': [p.words for p in done.plans],
-        'verdict': done.found.verdict,
+        'verdict': done.discovery.verdict,
         'right': named == [name] or (done.outcome != 'unique' and name in (*named, *together)),
     }
     confounded = bool(done.plans) or done.outcome != 'unique'

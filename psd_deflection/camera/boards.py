@@ -97,7 +97,7 @@ class Board(Target):
         """(k, 2): from corner to the inside of what it belongs to, in the board's axes; of k corners in turn."""
 
     @abc.abstractmethod
-    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+    def _detected(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
         """Numbers of what is seen, corners in OpenCV's axes (n, 2) m and in the image px, and if any marker is seen."""
 
     def drawing(self) -> Drawing:
@@ -170,7 +170,7 @@ class Board(Target):
 
     def corners(self, grey: Any) -> tuple[FloatArray, FloatArray]:
         """Corners on the plate (n, 2) m and in the image (n, 2) px. Raises NoPoseError."""
-        numbers, at, pixels, any_marker = self._found(grey)
+        numbers, at, pixels, any_marker = self._detected(grey)
         if len(set(numbers)) < len(numbers):
             raise NoPoseError(Status.DOUBLED)
         if not any_marker:
@@ -294,7 +294,7 @@ class Charuco(Board):
         # A crossing has no inside.
         return np.ones((1, 2))
 
-    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+    def _detected(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
         pixels, numbers, any_marker = self._find(grey)
         flat = [] if numbers is None else np.ravel(numbers).tolist()
         at = np.array([self._corners[i] for i in flat], dtype=float).reshape(-1, 3)[:, :2]
@@ -336,7 +336,7 @@ class AprilTags(Board):
         corners = [[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]]
         return np.array(corners) * [self._mirror, 1.0]
 
-    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+    def _detected(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
         corners, numbers = self._find(grey)
         flat = [] if numbers is None else np.ravel(numbers).tolist()
         ours = [(self._by_id[i], c) for i, c in zip(flat, corners, strict=True) if i in self._by_id]

@@ -30,7 +30,7 @@ class Intrinsics(NamedTuple):
     distortion: FloatArray
     rms: float
     used: int
-    left_out: list[tuple[str, str]]
+    excluded: list[tuple[str, str]]
 
     def as_yaml(self, name: str) -> str:
         """The text of a ``camera_info`` file, which ``--params-file`` of ``camera`` reads too."""
@@ -53,7 +53,7 @@ class Intrinsics(NamedTuple):
             'sd': self.deviation.tolist(),
             'rms': self.rms,
             'used': self.used,
-            'left_out': dict(self.left_out),
+            'left_out': dict(self.excluded),
         }
 
     def lines(self) -> list[str]:

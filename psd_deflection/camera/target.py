@@ -57,9 +57,9 @@ class Target(abc.ABC):
 
     def describe(self) -> list[str]:
         """The lines of ``CAMERA.yaml`` that describe it."""
-        lines = [f'{SETTINGS.parameters[own].name}: {_shown(getattr(self.settings, own))}' for own in self.own]
+        lines = [f'{SETTINGS.parameters[own].name}: {_setting_words(getattr(self.settings, own))}' for own in self.own]
         return [f'target.kind: {self.kind}', *lines]
 
 
-def _shown(value: object) -> str:
+def _setting_words(value: object) -> str:
     return f'{value:g}' if isinstance(value, float) else str(value)

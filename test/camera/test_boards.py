@@ -104,7 +104,7 @@ def test_the_lens_is_found_again() -> None:
     images = [(f'{i}.png', shot(scene, BOARD, Pose(phi=a, omega=b), rng)) for i, (a, b) in enumerate(tilts)]
     found = calibrated(BOARD, [*images, ('broken.png', None)])
     assert found.used == len(tilts)
-    assert found.left_out == [('broken.png', 'unreadable image')]
+    assert found.excluded == [('broken.png', 'unreadable image')]
     assert found.matrix[0, 0] == pytest.approx(scene.focal, rel=0.01)
     lens, true = (
         Lens(found.matrix, found.distortion),

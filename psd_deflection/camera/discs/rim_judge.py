@@ -22,8 +22,8 @@ from psd_deflection.camera.discs.rim_model import (
     after,
     beforehand,
     covariance_of,
+    eigenvalues,
     motion_of,
-    spread,
 )
 from psd_deflection.camera.lens import Lens
 from psd_deflection.records import FloatArray, IntArray
@@ -88,7 +88,7 @@ class Judge:
         if contrast.min() <= 0.0 or contrast.min() < 0.3 * contrast.max():
             raise NoPoseError(Status.HIDDEN)
         motion = motion_of(shape.blur)
-        sharp = math.sqrt(spread(shape.blur)[0])
+        sharp = math.sqrt(eigenvalues(shape.blur)[0])
         if math.sqrt(12.0) * motion > MOST_BLUR * pixel_radius:
             raise NoPoseError(Status.BLURRED)
         if sharp > MOST_DEFOCUS * pixel_radius:

@@ -189,7 +189,7 @@ def moved(shape: Shape, step: FloatArray, light: FloatArray) -> Shape:
     """``shape`` after ``step`` of the parameters, within their bounds, with these lights."""
     by_xx, by_xy, by_yy = step[7:10].tolist()
     blur = np.add(shape.blur, [[by_xx, by_xy], [by_xy, by_yy]])
-    small, large = spread(blur)
+    small, large = eigenvalues(blur)
     if small < _SHARPEST**2 or large > 900.0:
         values, vectors = np.linalg.eigh(blur)
         blur = (vectors * np.clip(values, _SHARPEST**2, 900.0)) @ vectors.T
@@ -222,16 +222,16 @@ def turned(v: FloatArray) -> FloatArray:
 
 def motion_of(blur: FloatArray) -> float:
     """Standard deviation of the motion within the exposure, px: what the blur has more along one axis."""
-    small, large = spread(blur)
+    small, large = eigenvalues(blur)
     return math.sqrt(large - small)
 
 
 def width(blur: FloatArray) -> float:
     """How far from a rim its pixels are used, px: up to where a rise of this blur has ended."""
-    return max(3.2 * math.sqrt(spread(blur)[1]) + 1.7, 3.5)
+    return max(3.2 * math.sqrt(eigenvalues(blur)[1]) + 1.7, 3.5)
 
 
-def spread(blur: FloatArray) -> tuple[float, float]:
+def eigenvalues(blur: FloatArray) -> tuple[float, float]:
     """The eigenvalues of a variance (2, 2), the smaller first."""
     (xx, xy), (_, yy) = blur.tolist()
     half, apart = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)

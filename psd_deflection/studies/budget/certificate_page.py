@@ -29,7 +29,7 @@ from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, columns, columns_of
 from psd_deflection.studies.budget.certificate import Certificate, CertificateProblem, Conformity, verdict_of
 from psd_deflection.studies.budget.expanded import PROBABILITY
-from psd_deflection.studies.budget.result import SHOWN, UNITS, freedom_words, in_words, shown
+from psd_deflection.studies.budget.result import SHOWN, UNITS, display_values, freedom_words, in_words
 from psd_deflection.studies.study import PageSection, StudyResult
 
 OBJECT = {
@@ -184,9 +184,9 @@ class Certified(StudyResult):
         for n, (pose, error, said) in enumerate(
             zip(self.found.poses, self.found.found, self.found.stated, strict=True)
         ):
-            row = [str(n + 1), *shown(pose), *shown(error), *shown(said.standard)]
+            row = [str(n + 1), *display_values(pose), *display_values(error), *display_values(said.standard)]
             row += map(freedom_words, said.freedom.tolist())
-            row += [f'{k:.3f}' for k in said.factor.tolist()] + shown(said.uncertainty)
+            row += [f'{k:.3f}' for k in said.factor.tolist()] + display_values(said.uncertainty)
             rows.append(row + (list(judged[n]) if judged else []))
         return rows
 
@@ -234,7 +234,7 @@ class Certified(StudyResult):
 
     def _range(self) -> str:
         seen, rig = self.problem.calibration['range'], self.problem.rig
-        low, high = (shown(np.array(seen[key])) for key in ('low', 'high'))
+        low, high = (display_values(np.array(seen[key])) for key in ('low', 'high'))
         ends = (f'{unit} {a} to {b}' for unit, a, b in zip(UNITS, low, high, strict=True))
         rate, size = rig.converter.sample_rate_hz, rig.estimator.block_size
         words = (

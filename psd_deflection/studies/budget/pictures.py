@@ -30,7 +30,7 @@ class DrawnCause(NamedTuple):
     values: FloatArray
 
 
-def shown(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
+def plotted_causes(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
     """Every cause that does something, the largest first, and the total (3,)."""
     factors = np.array(SHOWN)
     total = budget.total().rms * factors
@@ -47,7 +47,7 @@ def shown(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
 
 def bars_of(budget: Budget) -> Bars:
     """Every cause, the largest first, below the total."""
-    causes, total = shown(budget)
+    causes, total = plotted_causes(budget)
     names = ['total', *(one.name for one in causes)]
     colours: list[Colour] = ['text', *(COLOURS[one.kind] for one in causes)]
     columns = [

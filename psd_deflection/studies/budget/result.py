@@ -175,13 +175,13 @@ class Budgeted(StudyResult):
     def expanded_rows(self) -> list[list[str]]:
         """u_c, nu_eff, k, U, and what the draws say."""
         said = self.budget.expanded()
-        rows = [['', *UNITS], ['standard uncertainty u_c', *shown(said.standard)]]
+        rows = [['', *UNITS], ['standard uncertainty u_c', *display_values(said.standard)]]
         rows.append(['effective degrees of freedom ν_eff', *map(freedom_words, said.freedom.tolist())])
         rows.append(['coverage factor k, 95 %', *(f'{k:.3f}' for k in said.factor.tolist())])
-        rows.append(['known bias b, not corrected', *shown(said.bias)])
-        rows.append(['expanded uncertainty U = k u_c + |b|', *shown(said.uncertainty)])
+        rows.append(['known bias b, not corrected', *display_values(said.bias)])
+        rows.append(['expanded uncertainty U = k u_c + |b|', *display_values(said.uncertainty)])
         if self.interval is not None:
-            rows.append(['Monte Carlo: half of the 95 % interval', *shown(self.interval.half)])
+            rows.append(['Monte Carlo: half of the 95 % interval', *display_values(self.interval.half)])
             off = difference(said, self.interval).tolist()
             rows.append(['k u_c beside it, %', *(f'{100.0 * v:+.1f}' for v in off)])
         return rows
@@ -236,7 +236,7 @@ def parameter_rows(budget: Budget) -> list[list[str]]:
         for s in sensitivities:
             head = [cause.name, s.name, type_of(cause), cause.distribution.value, f'{s.deviation:.6g}', cause.unit]
             slopes = [f'{c:.6g}' for c in s.coefficient.tolist()]
-            rows.append([*head, freedom, *slopes, *shown(np.abs(s.coefficient) * s.deviation)])
+            rows.append([*head, freedom, *slopes, *display_values(np.abs(s.coefficient) * s.deviation)])
     return rows
 
 
@@ -245,7 +245,7 @@ def _split(rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
     return head, others
 
 
-def shown(values: FloatArray) -> list[str]:
+def display_values(values: FloatArray) -> list[str]:
     """(3,) m, m, rad in µm, µm and mdeg."""
     return [f'{v:.3f}' for v in (values * SHOWN).tolist()]
 
@@ -257,7 +257,7 @@ def in_words(values: FloatArray) -> str:
 
 
 def _figures(line: Contribution) -> list[str]:
-    return shown(line.rms)
+    return display_values(line.rms)
 
 
 def _words(line: Contribution) -> str:

@@ -39,7 +39,7 @@ from psd_deflection.studies.calibrate.fit import (
     refitted,
     residual_at,
     weight_matrices,
-    with_one_zero,
+    with_common_zero,
 )
 from psd_deflection.studies.calibrate.observation import (
     LEAST_HOLD,
@@ -47,8 +47,8 @@ from psd_deflection.studies.calibrate.observation import (
     Rows,
     joined,
     noise_of,
+    rest_means,
     rows_of,
-    settled,
     smoothed,
     usable_dots,
 )
@@ -133,7 +133,7 @@ class Calibration:
         return before_of(self.vector, self.prior)
 
     @property
-    def seen(self) -> FloatArray | None:
+    def reference_range(self) -> FloatArray | None:
         """Least and largest pose (2, 3), m, m, rad, of the reference where it counted; None without a reference."""
         poses = self.rows.pose[self.fit.weights > 0.0]
         return np.stack([poses.min(axis=0), poses.max(axis=0)]) if self.kind == 'reference' and len(poses) else None
@@ -160,7 +160,7 @@ def calibrate(
     vector = vector_of_rig(rig)
     prior = prior_of_rig(rig, vector)
     progress('rows')
-    clock = roughly_late(runs, rig, noise) if kind == 'reference' else 0.0
+    clock = coarse_delay(runs, rig, noise) if kind == 'reference' else 0.0
     parts = [rows_of(run, rig, noise, late=clock, blocks=kind != 'reference') for run in runs]
     rows = joined(parts)
     if kind == 'loads':
@@ -169,10 +169,10 @@ def calibrate(
                 f'{runs[0].name}: no load is held for {LEAST_HOLD} s; hold each for some seconds, '
                 f'or give a recording with a reference'
             )
-        rows = settled(rows, rig, noise)
+        rows = rest_means(rows, rig, noise)
     progress('fitting')
     free = fitted_parameters(kind)
-    rows, first = with_one_zero(rows, rig, prior, kind, free)
+    rows, first = with_common_zero(rows, rig, prior, kind, free)
     first, prior, widened = believed_fit(first, rows, rig, prior, kind, free)
     free = _determined(first, prior, free)
     whole = fit(rows, rig, prior, kind, free=free, start=first)
@@ -237,7 +237,7 @@ def before_of(vector: RigVector, prior: Prior) -> FloatArray:
     return out
 
 
-def roughly_late(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) -> float:
+def coarse_delay(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) -> float:
     """Seconds to add to the reference's times so that it fits the dots best, in steps; 0 if nothing moves."""
     costs = np.zeros(2 * round(CLOCK_RANGE / CLOCK_STEP) + 1)
     lates = (np.arange(len(costs)) - len(costs) // 2) * CLOCK_STEP
@@ -316,7 +316,7 @@ def _misfit(
     """Weighted and plain squares (n,) of ``residual`` (n, 4)."""
     weighted = np.einsum('ni,nij,nj->n', residual, inverse, residual) * whole.weights
     if kind == 'self':
-        across = np.linalg.svd(whole.linear.by_pose)[0][:, :, 3]
+        across = np.linalg.svd(whole.linear.pose_slopes)[0][:, :, 3]
         return weighted, np.einsum('ni,ni->n', across, residual) ** 2 * whole.weights
     return weighted, np.mean(residual**2, axis=1) * whole.weights
 

@@ -25,7 +25,7 @@ from psd_deflection.model.misalignment.model import COUNT, PARAMETERS, TOLERANCE
 from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.calibrate.calibrate import fitted_parameters, kind_of, roughly_late
+from psd_deflection.studies.calibrate.calibrate import coarse_delay, fitted_parameters, kind_of
 from psd_deflection.studies.calibrate.fit import (
     NAMES,
     CalibrationFit,
@@ -35,9 +35,9 @@ from psd_deflection.studies.calibrate.fit import (
     explained,
     prior_of_rig,
     score_at,
-    with_one_zero,
+    with_common_zero,
 )
-from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows, joined, noise_of, rows_of, settled
+from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows, joined, noise_of, rest_means, rows_of
 
 LEVEL = 0.05
 """Share of rigs that did not move and are said to have moved."""
@@ -67,11 +67,11 @@ class MovedGroup(NamedTuple):
 
 
 class CalibrationCheck(NamedTuple):
-    """``holds``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the
+    """``unchanged``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the
     first cannot be told from. ``zero``: the unloaded readings less the file's, (4,) m, and their deviations.
     """
 
-    holds: bool
+    unchanged: bool
     p: float
     groups: list[MovedGroup]
     like: list[str]
@@ -90,10 +90,10 @@ def check(
     kind = kind_of(runs, alone)
     progress('rows')
     noise = np.median([noise_of(run, rig) for run in runs], axis=0)
-    clock = roughly_late(runs, rig, noise) if kind == 'reference' else 0.0
+    clock = coarse_delay(runs, rig, noise) if kind == 'reference' else 0.0
     rows = joined([rows_of(run, rig, noise, late=clock, blocks=kind != 'reference') for run in runs])
     if kind == 'loads':
-        rows = settled(rows, rig, noise)
+        rows = rest_means(rows, rig, noise)
     progress('fitting')
     vector = vector_of_rig(rig)
     told = prior_of_rig(rig, vector)
@@ -102,7 +102,7 @@ def check(
     wide = told.covariance.copy()
     wide[:COUNT, :COUNT] += np.diag((3.0 * TOLERANCES) ** 2)
     free = fitted_parameters(kind)
-    rows, best = with_one_zero(rows, rig, Prior(told.mean, wide), kind, free)
+    rows, best = with_common_zero(rows, rig, Prior(told.mean, wide), kind, free)
     # Gradient and information at the file's values: from a rig that far off k and the heights would not be linear.
     z = told.mean.copy()
     z[ZERO:] = best.values[ZERO:]
@@ -177,10 +177,10 @@ def fitted_group(
 def result(found: CalibrationCheck) -> dict[str, Any]:
     """As JSON."""
     return {
-        'verdict': 'holds' if found.holds else 'moved',
+        'verdict': 'holds' if found.unchanged else 'moved',
         'level': LEVEL,
         'p': found.p,
-        'moved': None if found.holds else found.groups[0].group,
+        'moved': None if found.unchanged else found.groups[0].group,
         'or': found.like,
         'groups': [
             {
@@ -200,7 +200,7 @@ def result(found: CalibrationCheck) -> dict[str, Any]:
 
 def sentence(found: CalibrationCheck) -> str:
     """The answer in one sentence."""
-    if found.holds:
+    if found.unchanged:
         return f'The calibration holds: nothing moved (p {found.p:.2g}; false alarms at most {LEVEL:.0%}).'
     first = found.groups[0]
     shifts = ', '.join(f'{name} by {v:+.3g} ± {sd:.1g}' for name, (v, sd) in first.shifts.items())

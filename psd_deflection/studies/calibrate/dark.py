@@ -48,7 +48,7 @@ CHANNEL_WORDS = ('x', 'y', 'sum')
 class DarkLevel(NamedTuple):
     """One PSD with its laser off. ``psd``: its number, from 1. ``volts``, ``sd`` (3,): x, y, sum, V.
 
-    ``before`` (3,): what the rig file said, V. ``whole``: the sum with its laser on, V. ``place`` (2,): where the other
+    ``before`` (3,): as in the rig file, V. ``lit_sum``: the sum with its laser on, V. ``place`` (2,): where the other
     light pulls to, m. ``half``: half the length of the active area, m. ``seconds``, ``recording``, ``digest``: of what
     it was measured from.
     """
@@ -57,7 +57,7 @@ class DarkLevel(NamedTuple):
     volts: FloatArray
     sd: FloatArray
     before: tuple[float, float, float]
-    whole: float
+    lit_sum: float
     place: FloatArray
     half: float
     seconds: float
@@ -67,15 +67,15 @@ class DarkLevel(NamedTuple):
     @property
     def share(self) -> float:
         """Part of the light that is not the laser's, by which dots move less."""
-        return max(float(self.volts[2]), 0.0) / self.whole
+        return max(float(self.volts[2]), 0.0) / self.lit_sum
 
     @property
     def share_sd(self) -> float:
         """Its standard deviation."""
-        return float(self.sd[2]) / self.whole
+        return float(self.sd[2]) / self.lit_sum
 
     @property
-    def left(self) -> float:
+    def residual(self) -> float:
         """What its uncertainty does to a dot at the edge of the active area, m."""
         return self.share_sd * self.half
 
@@ -126,7 +126,7 @@ def words_of_level(one: DarkLevel) -> str:
     x, y = one.place * 1e3
     return (
         f'{sums} (file {one.before[2]:g} V): {one.share:.3%} of the light pulls to ({x:+.2f}, {y:+.2f}) mm; '
-        f'what is left of it moves a dot at the edge by {one.left * 1e6:.2g} µm'
+        f'what is left of it moves a dot at the edge by {one.residual * 1e6:.2g} µm'
     )
 
 

@@ -100,11 +100,11 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """Rows about one set of parameters: ``residual`` (n, 4) m, ``slopes`` (n, 4, SIZE), ``by_pose`` (n, 4, 3)."""
+    """Rows about one set of parameters: ``residual`` (n, 4) m, ``slopes`` (n, 4, SIZE), ``pose_slopes`` (n, 4, 3)."""
 
     residual: FloatArray
     slopes: FloatArray
-    by_pose: FloatArray
+    pose_slopes: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,7 +176,7 @@ def pose_of_readings(dots: FloatArray, variances: FloatArray, p: FloatArray, len
 
 def weight_matrices(linear: Linear, rows: Rows, noise: Noise) -> FloatArray:
     """C^-1 (n, 4, 4), 1/m^2."""
-    spread = linear.by_pose * (noise.reference * rows.sd)[:, None, :]
+    spread = linear.pose_slopes * (noise.reference * rows.sd)[:, None, :]
     covariance = np.einsum('nij,nkj->nik', spread, spread)
     covariance[:, range(4), range(4)] += noise.dots**2 * rows.variances
     return np.asarray(np.linalg.inv(covariance)) / noise.fewer
@@ -263,7 +263,7 @@ def refitted(whole: CalibrationFit, rows: Rows, prior: Prior, kept: FloatArray, 
     inverse = weight_matrices(whole.linear, rows, whole.noise)
     z = whole.values.copy()
     z[~free] = prior.mean[~free]
-    shifted = Linear(residual_at(whole, z), whole.linear.slopes, whole.linear.by_pose)
+    shifted = Linear(residual_at(whole, z), whole.linear.slopes, whole.linear.pose_slopes)
     return z + _step(shifted, inverse, whole.weights * kept, z, prior, free, rows)[0]
 
 
@@ -319,7 +319,7 @@ def _of_zero(linear: Linear, weighted: FloatArray, own: Mask) -> tuple[FloatArra
     return shared[:, zero] + np.diag(TOLERANCES[zero] ** -2), shared, pull
 
 
-def with_one_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Rows, CalibrationFit]:
+def with_common_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Rows, CalibrationFit]:
     """The rows as if all recordings had the zero of the first one, and their fit.
 
     The beams may have been aimed anew between two recordings, and a camera takes its rest anew. The offset is a
@@ -395,10 +395,10 @@ def variance_components(
 ) -> Noise:
     """The variance components from the residuals."""
     good = robust > 0.0 if number else np.ones(len(rows), dtype=bool)
-    inverse = np.linalg.pinv(linear.by_pose)
+    inverse = np.linalg.pinv(linear.pose_slopes)
     errors = (np.einsum('nij,nj->ni', inverse, linear.residual) / rows.sd)[good]
     # Two PSDs leave one direction that no pose reaches.
-    across = np.linalg.svd(linear.by_pose)[0][:, :, 3]
+    across = np.linalg.svd(linear.pose_slopes)[0][:, :, 3]
     redundant = np.einsum('ni,ni->n', across, linear.residual)[good]
     expected = np.sqrt(np.einsum('ni,ni->n', across**2, rows.variances))[good]
     scale = prior.sd

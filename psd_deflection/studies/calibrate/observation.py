@@ -217,17 +217,17 @@ def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, late: float = 0
         sd,
     ).at(s.good)
     if len(rows) > 1 and float(np.median(np.diff(rows.t))) < (size - 0.5) * period:
-        rows = _by_block(rows, rig, size * period, sample / size)
+        rows = _block_means(rows, rig, size * period, sample / size)
     if len(rows) < LEAST_ROWS:
         what = 'blocks' if blocks else 'reference measurements with good samples about them'
         raise RecordingError(f'{run.name}: {len(rows)} {what}; a calibration needs at least {LEAST_ROWS}')
     return rows
 
 
-def settled(rows: Rows, rig: Rig, noise: FloatArray) -> Rows:
+def rest_means(rows: Rows, rig: Rig, noise: FloatArray) -> Rows:
     """Means over ``CALM`` of a link at rest under a known load, in which what still rings is small."""
     sample = rig.sensitivities.ravel() ** 2 * noise**2
-    return _by_block(rows.at(rows.rest), rig, CALM, sample * CALM_LEAST)
+    return _block_means(rows.at(rows.rest), rig, CALM, sample * CALM_LEAST)
 
 
 def _pose_of_dots(rig: Rig) -> FloatArray:
@@ -239,7 +239,7 @@ def _pose_of_dots(rig: Rig) -> FloatArray:
     return np.asarray(np.linalg.pinv(design))
 
 
-def _by_block(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) -> Rows:
+def _block_means(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) -> Rows:
     """Means over blocks of ``seconds``. What the mean of a curved function differs by is taken off the dots."""
     block = np.floor((rows.t - rows.t[0]) / seconds).astype(np.int64)
     # Never over a change of the load.

@@ -112,7 +112,7 @@ def _dark(found: Calibration) -> str:
         sums = f'{one.volts[2]:.5f} ± {one.sd[2]:.1g}'
         file = ', '.join(f'{v:g}' for v in one.before)
         place = ', '.join(f'{v * 1e3:+.2f}' for v in one.place)
-        rows.append((f'psd_{one.psd}', x, y, sums, file, f'{one.share:.3%}', place, f'{one.left * 1e6:.2g}'))
+        rows.append((f'psd_{one.psd}', x, y, sums, file, f'{one.share:.3%}', place, f'{one.residual * 1e6:.2g}'))
     words = (
         'With its laser off each PSD shows the other light: the estimate is freed of it by x, y and sum together. The '
         'calibration above is that of the laser alone. Measure the dark levels again when the light has changed.'

@@ -111,7 +111,7 @@ def result(found: Calibration, date: str) -> dict[str, Any]:
         return {'value': value, 'sd': float(sd[i]), 'unit': UNITS[i], 'file': file, 'used': used}
 
     at = list(REPORTED)
-    seen = found.seen
+    seen = found.reference_range
     reference = found.fit.noise.reference
     return {
         'parameters': {NAMES[i]: one(i) for i in at},
@@ -173,7 +173,11 @@ def values_of(found: Calibration, date: str) -> tuple[dict[str, object], list[Ac
             float(f'{np.clip(correlation[i, j], -1.0, 1.0):.12f}') for i in range(1, len(at)) for j in range(i)
         ],
         'calibration.source': source_of(found, date),
-        **({} if found.seen is None else {'calibration.range': [float(f'{v:.6g}') for v in found.seen.ravel()]}),
+        **(
+            {}
+            if found.reference_range is None
+            else {'calibration.range': [float(f'{v:.6g}') for v in found.reference_range.ravel()]}
+        ),
     }, effects
 
 

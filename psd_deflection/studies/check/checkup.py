@@ -34,7 +34,7 @@ from psd_deflection.studies.check.wirings import (
     misfit,
 )
 from psd_deflection.studies.loads.acted import LoadNote, loads_that_acted
-from psd_deflection.studies.loads.noted_times import MendedNote, mend_loads
+from psd_deflection.studies.loads.noted_times import CorrectedNote, mend_loads
 
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
@@ -70,7 +70,7 @@ def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '
     """
     check_two_psds(rig, 'check')
     mended = mend_loads(rig, volts[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
-    late: Sequence[MendedNote] = ()
+    late: Sequence[CorrectedNote] = ()
     moved = volts
     if mended is not None:
         loads, late = mended.loads, mended.notes
@@ -87,7 +87,7 @@ def check(problem: CheckProblem) -> Checkup:
     """Hold the pushes, the noise and the light against the rig file."""
     rig, pushes, measured = problem.rig, problem.pushes, problem.levels
     file = Wiring.from_rig(rig)
-    seen = tuple(p for p in pushes if p.seen)
+    seen = tuple(p for p in pushes if p.observed)
     dead = [*measured.stuck, *(c for c in _dead(seen) if c not in measured.stuck)]
     found = fitting_wirings(seen) if seen else []
     findings = [note_finding(n, problem.source) for n in problem.notes]
@@ -106,7 +106,7 @@ def check(problem: CheckProblem) -> Checkup:
     # Pushes that are not there yet are no mistake.
     wrong = light or problem.notes or any(f.name != 'load_coverage' for f in findings)
     verdict = WRONG if wrong else RIGHT if told else CANNOT_TELL
-    sizes = tuple(p.misfit(best.wiring)[1] if p.seen else math.nan for p in pushes)
+    sizes = tuple(p.misfit(best.wiring)[1] if p.observed else math.nan for p in pushes)
     return Checkup(
         rig=rig,
         verdict=verdict,
@@ -114,7 +114,7 @@ def check(problem: CheckProblem) -> Checkup:
         values=lines,
         pushes=tuple(pushes),
         sizes=sizes,
-        found=tuple(found),
+        wirings=tuple(found),
         levels=measured,
         drift=problem.drift,
         drift_sd=problem.drift_sd,
@@ -206,7 +206,7 @@ def _coverage(
     pushes: Sequence[PushResponse], seen: Sequence[PushResponse], found: Sequence[WiringFit]
 ) -> list[Finding]:
     missing = [load for load in ALONE if (load,) not in {p.loads for p in seen}]
-    weak = [p.name for p in pushes if not p.seen]
+    weak = [p.name for p in pushes if not p.observed]
     if seen and not found:
         text = 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +θ'
     elif weak:

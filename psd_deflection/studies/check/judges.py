@@ -146,7 +146,7 @@ def _of_torque(size: float, force: float) -> tuple[float, str] | None:
     if not force:
         return _nearest([size], TORQUE_UNITS, 'N m')
     pounds = OF_POUNDS if _is('lbf', force) else {}
-    alike = {f: unit for f, unit in TORQUE_UNITS.items() if _whole_decades(f / force) or _whole_decades(f * force)}
+    alike = {f: unit for f, unit in TORQUE_UNITS.items() if _full_decades(f / force) or _full_decades(f * force)}
     return _nearest([size], {**alike, **pounds}, 'N m') or _nearest([size], TORQUE_UNITS, 'N m')
 
 
@@ -154,7 +154,7 @@ def _is(unit: str, factor: float) -> bool:
     return any(name == unit and factor in (f, 1.0 / f) for f, name in FORCE_UNITS.items())
 
 
-def _whole_decades(ratio: float) -> bool:
+def _full_decades(ratio: float) -> bool:
     return abs(math.log10(ratio) - round(math.log10(ratio))) < 1e-3
 
 

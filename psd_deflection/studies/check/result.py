@@ -90,7 +90,7 @@ def finding_tree(finding: Finding) -> dict[str, Any]:
 @dataclass(frozen=True, eq=False, repr=False)
 class Checkup(StudyResult):
     """``findings``: what is wrong. ``values``: parameters for the rig file. ``sizes``: movement of
-    each push over the expected one, NaN if it was not seen. ``found``: the wirings that explain the
+    each push over the expected one, NaN if it was not seen. ``wirings``: the wirings that explain the
     pushes. ``drift``, ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``light``: of a PSD,
     in words, that it has too little or too much of it. ``notes``: what else is worth a look. ``source``: the recording.
     """
@@ -104,7 +104,7 @@ class Checkup(StudyResult):
     values: Mapping[str, object]
     pushes: tuple[PushResponse, ...]
     sizes: tuple[float, ...]
-    found: tuple[WiringFit, ...]
+    wirings: tuple[WiringFit, ...]
     levels: Levels
     drift: FloatArray
     drift_sd: FloatArray
@@ -166,11 +166,11 @@ class Checkup(StudyResult):
             'verdict': self.verdict,
             'setup': [finding_tree(f) for f in self.findings],
             'lines': dict(self.values),
-            'wirings_that_fit': [_wiring_json(c.wiring) for c in self.found],
+            'wirings_that_fit': [_wiring_json(c.wiring) for c in self.wirings],
             'pushes': [
                 {
                     'loads': list(p.loads),
-                    'seen': p.seen,
+                    'seen': p.observed,
                     'channels': _by(DOTS, p.channels.tolist()),
                     'sd': _by(DOTS, p.sd.tolist()),
                     'size': size if p.sized else None,
@@ -225,7 +225,7 @@ def arrow(value: float, size: float) -> str:
 
 
 def _verdict(found: Checkup) -> str:
-    fit = len(found.found)
+    fit = len(found.wirings)
     if found.verdict == RIGHT:
         return f'RIGHT: of {len(WIRINGS)} wirings only that of the rig file fits.'
     if found.verdict == CANNOT_TELL:

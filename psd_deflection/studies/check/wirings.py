@@ -106,7 +106,7 @@ class PushResponse:
         return ' with '.join(_BY_PUSH[load] for load in self.loads)
 
     @property
-    def seen(self) -> bool:
+    def observed(self) -> bool:
         """Whether it stands out of the noise. What a turn moves both dots alike does not count."""
         moved = _pattern(self.channels, self.only_twist)
         variance = float(np.mean(self.sd**2)) * (2.0 if self.only_twist else 1.0)

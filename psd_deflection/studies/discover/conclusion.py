@@ -69,7 +69,7 @@ class Conclusion(StudyResult):
     effects: tuple[NamedEffect, ...]
     unknown: tuple[Unknown, ...]
     where: Localisation
-    left: Localisation
+    residual: Localisation
     gap_before: float
     gap_after: float
     gap_floor: float
@@ -114,19 +114,19 @@ class Conclusion(StudyResult):
         return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.beyond]
 
     @property
-    def remains(self) -> bool:
+    def unexplained(self) -> bool:
         """Whether more terms would lower the error on unseen cases than the named effects do."""
-        return self.prediction is not None and self.prediction.remains
+        return self.prediction is not None and self.prediction.unexplained
 
     @property
     def beyond(self) -> list[str]:
         """What small terms beyond the named effects do together, in a sentence; nothing if they do nothing."""
-        return [self.prediction.sentence(self.workspace)] if self.prediction is not None and self.remains else []
+        return [self.prediction.sentence(self.workspace)] if self.prediction is not None and self.unexplained else []
 
     @property
     def predicting(self) -> tuple[ActiveEffect, ...]:
         """The effects of the model that predicts best: at least the nuisance and the named ones."""
-        return self.fit.whole if self.prediction is None else self.prediction.effects
+        return self.fit.coefficients_with_nuisance if self.prediction is None else self.prediction.effects
 
     def lines(self) -> list[str]:
         """The sentences in one line, then what is unknown."""
@@ -156,7 +156,7 @@ class Conclusion(StudyResult):
             'remainder': None if self.remainder is None else self.remainder.tree(),
             'setup': [],
             'moves': None,
-            'remains': self.remains,
+            'remains': self.unexplained,
             'predictive': None if self.prediction is None else self.prediction.tree(),
             'remaining': {'rms': self.gap_after, 'floors': self.floors},
             'gap': self._gap(),
@@ -233,8 +233,8 @@ class RigConclusion(Conclusion):
 
     ``setup``: mistakes of the set-up and the recording, with ``values`` that put the rig file right; ``known``: the
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
-    ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
-    set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
+    ``alternative_fits``: complete models that these recordings do not exclude beside ``fit``, also those of mistakes of
+    the set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
     ``moves``: by how much at most an estimate is wrong that is not corrected for the effects: dX m, dY m, theta rad.
     ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
     became, '' if it is none. ``tell``: takes warnings.
@@ -245,7 +245,7 @@ class RigConclusion(Conclusion):
     values: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
     law: FoundLaw | None
-    rivals: tuple[Fit, ...]
+    alternative_fits: tuple[Fit, ...]
     unsettled: tuple[str, ...]
     moves: tuple[float, float, float]
     rig: Rig
@@ -385,7 +385,7 @@ def model_yaml(
     return edited_rig_file(params_file, 'model.yaml', lambda: described(rig, given), edit, tell)
 
 
-def _left(discovery: Conclusion) -> str:
+def _residual_words(discovery: Conclusion) -> str:
     """What remains, and how many floors it is."""
     after, floor = (
         discovery.workspace.worded(v, discovery.workspace.digits) for v in (discovery.gap_after, discovery.gap_floor)
@@ -445,8 +445,8 @@ def law_sentence(discovery: RigConclusion) -> str:
 
 
 def _missing(discovery: Conclusion, besides: str = '') -> str:
-    ws, left = discovery.workspace, _left(discovery)
-    before = f'{ws.scale_shown[0] * discovery.gap_before:{ws.digits}}'
+    ws, left = discovery.workspace, _residual_words(discovery)
+    before = f'{ws.display_scale[0] * discovery.gap_before:{ws.digits}}'
     if discovery.verdict == 'nothing_missing':
         if not math.isfinite(discovery.gap_floor):
             # Without a stated noise nobody knows how large what remains should be.
@@ -467,7 +467,7 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
     if discovery.verdict == 'effects_found':
         is_are, them = ('is', 'it') if len(parts) == 1 else ('are', 'them')
         return f'{named} {is_are} missing from the model; adding {them} closes the gap from {before} to {left}.{fitted}'
-    if not any(u.remains for u in discovery.unknown):
+    if not any(u.unexplained for u in discovery.unknown):
         return (
             f'{named} close the gap from {before} to {left}, but their sizes '
             f'are tied: one effect that is not in the catalogue is likelier.'
@@ -476,6 +476,6 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
         explains = 'explains' if len(parts) == 1 else 'explain'
         return (
             f'{named} {explains} part, but an unknown effect remains: the gap goes from {before} '
-            f'{ws.scale_shown[1]} to {left}.{fitted}'
+            f'{ws.display_scale[1]} to {left}.{fitted}'
         )
     return f'An effect that is not in the catalogue: the gap is {left}.'

@@ -252,7 +252,7 @@ def nothing_of(models: Sequence[Fit]) -> ModelSums:
     )
 
 
-def shown(
+def expected_sums(
     workspace: Workspace, models: Sequence[Fit], setting: Setting, loads: FloatArray, rig: Rig | None = None
 ) -> ModelSums:
     """What a recording with ``loads`` (n, 3) in ``setting`` would show of ``models``.

@@ -32,7 +32,7 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import TELLS_APART
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
-from psd_deflection.studies.discover.search.screen import Screen, solve_seen
+from psd_deflection.studies.discover.search.screen import Screen, solve_observable
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.trials import BIC_ACCEPT
@@ -77,7 +77,7 @@ HEAD = ('effect', 'size', 'seen from', 'named from', 'most like')
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Isolability(StudyResult):
-    """``found``: each effect that shows under ``loads``, in words. ``hidden``: the others, and what each needs.
+    """``effects``: each effect that shows under ``loads``, in words. ``hidden``: the others, and what each needs.
 
     ``matrix`` (n, n): how much of the signature of each the other imitates, 0 to 1.
     """
@@ -87,7 +87,7 @@ class Isolability(StudyResult):
 
     loads: str
     seconds: float
-    found: tuple[Isolable, ...]
+    effects: tuple[Isolable, ...]
     hidden: Mapping[str, str]
     matrix: FloatArray
     params_file: str
@@ -99,13 +99,13 @@ class Isolability(StudyResult):
 
     def sentences(self) -> list[str]:
         """How many can be named, which imitate each other, which do not show."""
-        named = [f for f in self.found if f.named is not None]
-        count = len(self.found) + len(self.hidden)
+        named = [f for f in self.effects if f.named is not None]
+        count = len(self.effects) + len(self.hidden)
         out = [
             f'Under {self.loads}, {self.seconds:.0f} s, {len(named)} of {count} effects can be named, '
             f'each from its own size on.'
         ]
-        lost = [f for f in self.found if f.named is None]
+        lost = [f for f in self.effects if f.named is None]
         if lost:
             out.append('Seen, but not told apart: ' + '; '.join(f'{f.label} from {f.alike}' for f in lost) + '.')
         if self.hidden:
@@ -114,20 +114,20 @@ class Isolability(StudyResult):
 
     def lines(self) -> list[str]:
         """The table, then the sentences."""
-        return [*columns([HEAD, *(f.row for f in self.found)], left=5).split('\n'), '', *self.sentences()]
+        return [*columns([HEAD, *(f.row for f in self.effects)], left=5).split('\n'), '', *self.sentences()]
 
     def tree(self) -> dict[str, Any]:
         """The answer for programs; sizes in SI units."""
         return {
             'loads': self.loads,
             'seconds': self.seconds,
-            'effects': [f.tree() for f in self.found],
+            'effects': [f.tree() for f in self.effects],
             'hidden': dict(self.hidden),
         }
 
     def table(self) -> Table:
         """One row an effect: the least sizes at which it is ``seen`` and ``named``, NaN: never, and its ``unit``."""
-        found = self.found
+        found = self.effects
         sizes = np.array([(f.seen, f.named) for f in found], dtype=np.float64)
         sizes = sizes.reshape(-1, 2)
         return Table(
@@ -143,9 +143,9 @@ class Isolability(StudyResult):
 
     def sections(self) -> Iterable[PageSection]:
         """The table, and the picture of all pairs."""
-        rows = table(HEAD, [f.row for f in self.found])
+        rows = table(HEAD, [f.row for f in self.effects])
         yield PageSection('From which size', (wide(rows, 'the least sizes'),))
-        labels = [f.label for f in self.found]
+        labels = [f.label for f in self.effects]
         words = 'how much of the signature of each effect another one imitates'
         shown = Matrix(words, self.matrix, labels, labels, most=1.0)
         note = '<p class=quiet>Each row an effect; dark: the effect of the column imitates it.</p>'
@@ -177,7 +177,7 @@ def isolable(
         variants.setdefault(_label(candidate), []).append(candidate)
     found, matrix = [], []
     for label, shapes in variants.items():
-        one, shares = min((_one(screen, label, c, variants, accepts) for c in shapes), key=_easiest)
+        one, shares = min((_isolable(screen, label, c, variants, accepts) for c in shapes), key=_easiest)
         if shapes[0].effect.finite:
             one = _of_probes(screen, one, shapes, accepts(1))
         found.append(one)
@@ -193,7 +193,7 @@ def isolable(
     return Isolability(
         loads=words,
         seconds=len(loads) / rig.converter.sample_rate_hz,
-        found=tuple(found),
+        effects=tuple(found),
         hidden=hidden,
         matrix=np.array(matrix).reshape(len(found), -1),
         params_file=params_file,
@@ -214,7 +214,7 @@ def _easiest(one: tuple[Isolable, list[float]]) -> float:
     return math.inf if one[0].named is None else one[0].named
 
 
-def _one(
+def _isolable(
     screen: Screen,
     label: str,
     candidate: Candidate,
@@ -248,7 +248,7 @@ def _one(
 
 def _imitated(screen: Screen, own: int, other: slice) -> float:
     """The share, 0 to 1, of the squared length of a column that those of another candidate make up."""
-    gain = solve_seen(screen.fisher[other, other], screen.fisher[other, own], screen.lengths[other])[0]
+    gain = solve_observable(screen.fisher[other, other], screen.fisher[other, own], screen.lengths[other])[0]
     return min(gain / float(screen.fisher[own, own]), 1.0)
 
 

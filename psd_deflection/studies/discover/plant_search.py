@@ -24,7 +24,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.conclusion import Conclusion
-from psd_deflection.studies.discover.plants import Model, Plant, check_plant, measured_by, table_of
+from psd_deflection.studies.discover.plants import Model, Plant, check_plant, measured_tables, table_of
 from psd_deflection.studies.discover.problem import Machine, Progress
 from psd_deflection.studies.discover.report import sections
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
@@ -79,7 +79,7 @@ class PlantComparison(Comparison):
         self.tally = SimulationCount()
         self.base = ()
         self.nuisance = tuple(ActiveEffect(e, e.off_values(plant.physics, next(e.variants()))) for e in plant.nuisance)
-        self.measured = measured_by(plant)
+        self.measured = measured_tables(plant)
         check_plant(plant)
         exact = _exact(plant, self.measured, self.nuisance)
         # Readings that are the simulation's to the last digit are no measurement: nothing can be held against them.
@@ -277,16 +277,16 @@ class PlantComparison(Comparison):
         return 'share of the gap before' if self.shares else self.plant.units[0]
 
     @property
-    def scale_shown(self) -> tuple[float, str]:
+    def display_scale(self) -> tuple[float, str]:
         """The unit of the channels if they have one, else shares."""
         return (100.0, '% of the gap before') if self.shares else (1.0, self.plant.units[0])
 
     @property
-    def units_shown(self) -> tuple[str, ...]:
+    def display_units(self) -> tuple[str, ...]:
         """Those of the channels."""
         return self.plant.units
 
-    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+    def displayed(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
         """As they are."""
         return [np.where(t, x, np.nan) for x, t in zip(tables, self.there, strict=True)]
 
@@ -314,7 +314,7 @@ class PlantComparison(Comparison):
     def begun(self, null: Fit) -> Self:
         """With what the fit without any effect leaves as the gap before."""
         whole = np.maximum(self.gap_per_channel(null.difference), 1e-300)
-        return self.replaced(whole=whole).renoised([*self.base, *null.whole])
+        return self.replaced(whole=whole).renoised([*self.base, *null.coefficients_with_nuisance])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

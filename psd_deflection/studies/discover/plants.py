@@ -38,10 +38,12 @@ def plant_effect(
     for p in parameters:
         if p.of_rig or p.within is not None or p.propose:
             raise ConfigError(f'{name}: {p.name}: of_rig, within and propose are for effects of the PSD rig; leave out')
-    return Effect(name, 'link', summary, equation, source, '', tuple(parameters), 'configure', _by_plant, finite=finite)
+    return Effect(
+        name, 'link', summary, equation, source, '', tuple(parameters), 'configure', _per_plant, finite=finite
+    )
 
 
-def _by_plant(physics: Physics, values: Values) -> None:
+def _per_plant(physics: Physics, values: Values) -> None:
     raise TypeError('an effect of a plant is simulated by its plant')
 
 
@@ -110,7 +112,7 @@ def table_of(rows: object, source: str) -> FloatArray:
     return table
 
 
-def measured_by(plant: Plant) -> list[FloatArray]:
+def measured_tables(plant: Plant) -> list[FloatArray]:
     """The tables of ``plant``. Raises ConfigError if they do not fit its channels and cases."""
     tables = plant.measured()
     if len(tables) != len(plant.cases):

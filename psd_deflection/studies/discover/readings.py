@@ -116,7 +116,7 @@ class ReadingsPlant(Plant):
         self.library = tuple(
             e
             for effect in effects_for(tables[0].psds)
-            if effect.name not in without and not effect.lattice and (e := self._shown(effect)) is not None
+            if effect.name not in without and not effect.lattice and (e := self._observable(effect)) is not None
         )
 
     def measured(self) -> Sequence[FloatArray]:
@@ -168,7 +168,7 @@ class ReadingsPlant(Plant):
         pose = solver_from_rig(rig.estimator.solver, rig).solve_many(dots.T, dot_noise_variances(rig)).pose
         return np.asarray(MICRO * pose.T[:, back])
 
-    def _shown(self, effect: Effect) -> Effect | None:
+    def _observable(self, effect: Effect) -> Effect | None:
         """``effect`` without the choices that make no difference here; None if a table cannot show it."""
         table = self.tables[0]
         forward = np.arange(len(table.loads))

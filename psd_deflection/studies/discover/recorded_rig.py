@@ -85,7 +85,7 @@ class RecordedRig(Machine):
             return comparison
         return comparison.replaced(base=tuple(a for a in comparison.base if a is not self.recorded.lattice))
 
-    def seen(self, comparison: Comparison) -> float:
+    def chi_square_explained(self, comparison: Comparison) -> float:
         """Chi-square that the coarse steps explain."""
         lattice = self.recorded.lattice
         return 0.0 if lattice is None else 2.0 * lattice_gain(workspace_of(comparison), lattice)

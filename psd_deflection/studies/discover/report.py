@@ -38,7 +38,7 @@ AFTER: Final = 'blue'
 
 def _residual_chart(discovery: Conclusion) -> Chart:
     ws = discovery.workspace
-    before, after = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
+    before, after = ws.displayed(discovery.search.null.difference), ws.displayed(discovery.fit.difference)
     along, times = ws.along()
     # A gap between recordings.
     t = np.concatenate([np.append(part, part[-1]) for part in times])
@@ -58,14 +58,14 @@ def _joined(parts: Iterable[FloatArray]) -> FloatArray:
 
 
 def _labels(ws: Comparison) -> list[str]:
-    pairs = zip(ws.channels, ws.units_shown, strict=True)
+    pairs = zip(ws.channels, ws.display_units, strict=True)
     return [f'{name} / {unit}' if unit else name for name, unit in pairs]
 
 
 def _against_chart(discovery: Conclusion) -> Chart | None:
     """What was missing against each input and position, in the channel where the effects changed most."""
     ws = discovery.workspace
-    tables = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
+    tables = ws.displayed(discovery.search.null.difference), ws.displayed(discovery.fit.difference)
     gaps = list(discovery.per_channel.values())
     row = max(range(len(gaps)), key=lambda c: (gaps[c][0] ** 2 - gaps[c][1] ** 2) / max(gaps[c][0] ** 2, 1e-300))
     before, after = (np.concatenate([t[row] for t in table]) for table in tables)
@@ -88,7 +88,7 @@ def _function_chart(discovery: Conclusion, function: Smooth) -> Chart:
     against: list[tuple[str | TimeAxis, list[FloatArray]]] = list(ws.against().items())
     # The last ones are the readings.
     inputs = against[: len(against) - len(ws.channels)] or [ws.along()]
-    value, left = ws.shown(function.tables), ws.shown(discovery.fit.difference)
+    value, left = ws.displayed(function.tables), ws.displayed(discovery.fit.difference)
     panels = []
     for row, label in enumerate(_labels(ws)):
         remains, smooth = (np.concatenate([t[row] for t in table]) for table in (left, value))
@@ -134,7 +134,7 @@ def _spectrum_chart(discovery: RigConclusion) -> Chart:
 
 
 def _waterfall(discovery: Conclusion) -> Bars:
-    scale, unit = discovery.workspace.scale_shown
+    scale, unit = discovery.workspace.display_scale
     steps: list[tuple[str, float, Colour]] = [(n, scale * v, AFTER) for n, v in discovery.waterfall]
     steps[0] = (*steps[0][:2], BEFORE)
     steps[-1] = (*steps[-1][:2], 'quiet')
@@ -186,8 +186,8 @@ def _effect_section(effect: NamedEffect) -> str:
         else:
             rows.append((name, v, '', ''))
     out.append(table(('parameter', 'value', '± sd', 'unit'), rows))
-    if effect.rivals:
-        fitted = [(r.active.label, size_of(r), f'{r.delta_bic:+.1f}') for r in effect.rivals]
+    if effect.fitted_alternatives:
+        fitted = [(r.active.label, size_of(r), f'{r.delta_bic:+.1f}') for r in effect.fitted_alternatives]
         out.append('<p>What explains these recordings nearly as well in its place:</p>')
         out.append(table(('rival', 'fitted', 'BIC worse by'), fitted))
     if effect.suggestion is not None:
@@ -284,7 +284,7 @@ def sections(discovery: Conclusion) -> list[PageSection]:
     effects = [_effect_section(e) for e in discovery.effects] or ['<p>No effect is named.</p>']
     out.append(PageSection('What', (*effects, *_nuisance(discovery))))
     law = [] if of_rig is None or of_rig.law is None else _law_section(of_rig, of_rig.law)
-    if discovery.remains and discovery.prediction is not None:
+    if discovery.unexplained and discovery.prediction is not None:
         out.append(PageSection('What predicts', tuple(_predicts(discovery, discovery.prediction))))
     if discovery.unknown or law:
         function = None if discovery.remainder is None else discovery.remainder.function
@@ -315,7 +315,7 @@ def _nuisance(discovery: Conclusion) -> list[str]:
 
 
 def _unknown(u: Unknown) -> str:
-    where = 'is not in the model' if u.remains else 'the effects stand in for it in the model'
+    where = 'is not in the model' if u.unexplained else 'the effects stand in for it in the model'
     share = f'{100 * u.explains:.0f} % of what was to be explained'
     return f'<p>{html.escape(u.signature)}. It is {share}; {where}.</p>'
 
@@ -328,10 +328,10 @@ def _before_and_after(discovery: Conclusion) -> list[str | Drawing]:
     factor = 1.0
     if isinstance(discovery, RigConclusion):
         out.append(_spectrum_chart(discovery))
-        factor = discovery.workspace.scale_shown[0]
+        factor = discovery.workspace.display_scale[0]
     channels = [
         (n, *(f'{factor * v:.4g}' for v in (*gaps, discovery.heldout_per_channel[n])), unit)
-        for (n, gaps), unit in zip(discovery.per_channel.items(), discovery.workspace.units_shown, strict=True)
+        for (n, gaps), unit in zip(discovery.per_channel.items(), discovery.workspace.display_units, strict=True)
     ]
     return [*out, table(('gap, rms', 'before', 'after', 'on unseen load cases', 'unit'), channels)]
 

@@ -23,14 +23,14 @@ from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldou
 from psd_deflection.studies.discover.search.predictive import predictive_of
 from psd_deflection.studies.discover.search.remainder import Remainder, remainder_of
 from psd_deflection.studies.discover.search.search import Search
-from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, by_its_size, unphysical
+from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, unphysical, wald_chi_square
 from psd_deflection.studies.discover.search.weighing import (
     EQUIVALENT,
     EQUIVALENT_BIC,
     RIVAL_BIC,
     UNSAID,
+    Alternative,
     NamedEffect,
-    Rival,
     Unknown,
     heldout_per_channel_of,
     no_noise,
@@ -106,7 +106,7 @@ def accepted(problem: Problem) -> Problem:
             chi2 = without.chi2 - fit.chi2
             bic = chi2 - found.penalty * len(columns)
             if (
-                not gain.holds
+                not gain.significant
                 or unphysical(ws, fit, i)
                 or found.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
                 or bic <= BIC_ACCEPT
@@ -116,7 +116,7 @@ def accepted(problem: Problem) -> Problem:
         problem = replace(problem, heldout=tuple(heldout))
         if not fails:
             return problem
-        problem = without_one(problem, min(fails)[1], 'fails the joint rule')
+        problem = without_effect(problem, min(fails)[1], 'fails the joint rule')
 
 
 def _in_sds(ws: Comparison, fit: Fit, index: int) -> float:
@@ -129,15 +129,15 @@ def _in_sds(ws: Comparison, fit: Fit, index: int) -> float:
 
 def _gain(ws: Comparison, fit: Fit, index: int, chi2: float) -> float:
     """What effect ``index`` explains: the ``chi2`` that is lost without it, or less if its size says less."""
-    return chi2 if ws.open_level else min(chi2, by_its_size(ws, fit, index))
+    return chi2 if ws.open_level else min(chi2, wald_chi_square(ws, fit, index))
 
 
 def credible(problem: Problem) -> Problem:
     """Without effects that explain less than the unknown remainder: they probably stand in for it."""
     while True:
         left = problem.machine.look(problem.comparison, problem.fit, problem.result.null, problem.rng)
-        problem = replace(problem, left=left)
-        steps = problem.machine.seen(problem.comparison)
+        problem = replace(problem, residual=left)
+        steps = problem.machine.chi_square_explained(problem.comparison)
         if not problem.fit.effects or not unknown_of(left, 0.0, steps=steps):
             return problem
         closer = _of_another_shape(problem)
@@ -147,7 +147,7 @@ def credible(problem: Problem) -> Problem:
         weakest = int(np.argmin(problem.result.delta_chi2))
         if problem.result.delta_chi2[weakest] >= left.excess:
             return problem
-        problem = without_one(problem, weakest, 'explains less than what remains unknown')
+        problem = without_effect(problem, weakest, 'explains less than what remains unknown')
 
 
 def _of_another_shape(problem: Problem) -> Problem:
@@ -159,13 +159,13 @@ def _of_another_shape(problem: Problem) -> Problem:
     better = found.of_another_shape(fit)
     if better is fit:
         return problem
-    found.say('another shape: ' + ', '.join(a.label for a in better.effects))
+    found.log('another shape: ' + ', '.join(a.label for a in better.effects))
     p, delta_bic, delta_chi2 = found.weigh(result.null, better)
     result = replace(result, fit=better, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2)
     return accepted(replace(problem, fit=better, result=result))
 
 
-def without_one(problem: Problem, index: int, why: str) -> Problem:
+def without_effect(problem: Problem, index: int, why: str) -> Problem:
     """``problem`` without one effect of its fit, the rest fitted and weighed anew; ``why`` goes into the trace."""
     found, null, fit = problem.search, problem.result.null, problem.fit
     found.trace.append(f'{fit.effects[index].label} {why}')
@@ -194,7 +194,7 @@ def alternatives(problem: Problem) -> Problem:
     return replace(
         problem,
         named=tuple(named),
-        rivals=tuple(r.fit for e in named for r in e.rivals),
+        alternative_fits=tuple(r.fit for e in named for r in e.fitted_alternatives),
         unsettled=tuple(dict.fromkeys(name for e in named for name in e.equivalent)),
     )
 
@@ -209,7 +209,7 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
         if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
             equal.append(f)
         if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
-            rivals.append(Rival(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
+            rivals.append(Alternative(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
     return NamedEffect(
         active=fit.effects[index],
         sd=sd_of(ws, fit, index),
@@ -217,7 +217,7 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
         delta_bic=result.delta_bic[index],
         heldout=problem.heldout[index],
         equivalent=tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal)),
-        rivals=tuple(sorted(rivals, key=lambda r: r.delta_bic)),
+        fitted_alternatives=tuple(sorted(rivals, key=lambda r: r.delta_bic)),
         alternatives=tuple(rows),
         suggestion=problem.machine.suggest(ws, fit, equal) if equal else None,
     )
@@ -226,14 +226,14 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
 def where(problem: Problem) -> Problem:
     """Where the described model and the fit leave structure, and what of it remains unknown."""
     problem.progress('where')
-    ws, null, fit, left = problem.bare, problem.null, problem.fit, problem.left
+    ws, null, fit, left = problem.bare, problem.null, problem.fit, problem.residual
     before = left if fit is null else problem.machine.look(ws, null, None, problem.rng)
     # Coarse steps cause noise that varies with the signal; compare what they explain with it.
-    steps = problem.machine.seen(ws)
+    steps = problem.machine.chi_square_explained(ws)
     explained = max(null.chi2 - fit.chi2, 0.0) + steps
     gap_after = ws.gap(fit.difference)
     unknown = (
-        unknown_of(left, explained, gap_after, ws.floor(), ws.most_by_noise(), steps, ws.worded)
+        unknown_of(left, explained, gap_after, ws.floor(), ws.noise_limit(), steps, ws.worded)
         or unsaid(ws, problem.gap_before, gap_after)
         or (() if fit.effects else no_noise(ws, left, problem.gap_before, gap_after))
         or tied(coincidences(fit, ws.physics), fit, problem.result, before)
@@ -256,7 +256,7 @@ def predict(problem: Problem) -> Problem:
     problem.progress('predicting')
     predictive = predictive_of(ws, fit, found.screen, problem.rng)
     problem = replace(problem, predictive=predictive)
-    if predictive is None or not predictive.remains or problem.unknown:
+    if predictive is None or not predictive.unexplained or problem.unknown:
         return problem
     before = max(problem.gap_before, 1e-300)
     rms = float(np.sqrt(max(predictive.unseen_named**2 - predictive.unseen**2, 0.0)))
@@ -273,7 +273,7 @@ def fields_of(problem: Problem) -> dict[str, Any]:
         'effects': problem.named,
         'unknown': problem.unknown,
         'where': problem.before,
-        'left': problem.left,
+        'residual': problem.residual,
         'gap_before': problem.gap_before,
         'gap_after': after,
         'gap_floor': ws.floor(),

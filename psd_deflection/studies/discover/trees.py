@@ -11,7 +11,7 @@ from typing import Any
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, covariance_of
+from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect, covariance_of
 
 
 def number(value: float) -> float:
@@ -21,7 +21,7 @@ def number(value: float) -> float:
     return float(min(max(value, -1e300), 1e300))
 
 
-def parameters_of(effect: NamedEffect | Rival) -> dict[str, Any]:
+def parameters_of(effect: NamedEffect | Alternative) -> dict[str, Any]:
     """Choices as numbers, the rest with standard deviation and unit."""
     return fitted(effect.active, effect.sd)
 
@@ -64,7 +64,7 @@ def effect_tree(e: NamedEffect) -> dict[str, Any]:
                 'parameters': parameters_of(r),
                 'delta_bic': number(r.delta_bic),
             }
-            for r in e.rivals
+            for r in e.fitted_alternatives
         ],
     }
 
@@ -95,7 +95,7 @@ def law_tree(found: FoundLaw) -> dict[str, Any]:
     }
 
 
-def size_of(effect: NamedEffect | Rival) -> str:
+def size_of(effect: NamedEffect | Alternative) -> str:
     """The fitted amplitudes with their standard deviations, for a person: ``angle 0.00399 ± 2e-05 rad``."""
     out = []
     for p in effect.active.effect.parameters:

@@ -29,7 +29,7 @@ from scipy.optimize import least_squares
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify.axis_modes import LEAST_DAMPING, MOST_DAMPING, AxisModes, Mode
 from psd_deflection.studies.identify.operation import mode_in_operation
-from psd_deflection.studies.identify.spectra import coloured_noise, filled_up, loudest_peak, stands_above, white_noise
+from psd_deflection.studies.identify.spectra import coloured_noise, exceeds_noise, filled_up, loudest_peak, white_noise
 
 MOST_MODES = 3
 WINDOW = 6.0
@@ -72,7 +72,7 @@ def modes_of(samples: FloatArray, rate: float) -> AxisModes:
     if not peaks:
         return AxisModes((), 'none', (), nothing, white)
     noise = coloured_noise(filled, rate, peaks)
-    modes = [(f, 0.01) for f in peaks if stands_above(filled, rate, f, noise)]
+    modes = [(f, 0.01) for f in peaks if exceeds_noise(filled, rate, f, noise)]
     if not modes:
         return AxisModes((), 'none', (), nothing, white)
     level = noise.deviation(modes[0][0] / 3.0, rate)
@@ -124,13 +124,13 @@ class RingFit(NamedTuple):
     """``modes``, what they leave, and the covariance of (frequency, damping, ...) for a unit of variance left."""
 
     modes: Modes
-    left: FloatArray
+    residual: FloatArray
     covariance: FloatArray
 
     @property
     def deviation(self) -> float:
         """The rms of the residual."""
-        return rms_of(self.left)
+        return rms_of(self.residual)
 
     @property
     def bounded(self) -> bool:
@@ -183,7 +183,7 @@ def hints_at_pair(stretches: Sequence[Stretch], fit: RingFit, enough: float) -> 
         for apart in APART:
             pair = [(f * (1.0 - apart), max(z, 0.01)), (f * (1.0 + apart), max(z, 0.01))]
             left = np.concatenate([s.solved([*fit.modes, *pair])[0] for s in stretches])
-            if float(fit.left @ fit.left - left @ left) > enough:
+            if float(fit.residual @ fit.residual - left @ left) > enough:
                 return True
     return False
 
@@ -248,12 +248,12 @@ def grow_stretch(
                 break
             longer = Stretch(samples, *ends, stretch.rate)
             tried = fit_modes([longer], fit.modes)
-            if not is_good(longer, tried, level) or not ends_well(longer, tried.left, window, level, early):
-                worth = 0.25 * float(tried.left @ tried.left)
+            if not is_good(longer, tried, level) or not ends_well(longer, tried.residual, window, level, early):
+                worth = 0.25 * float(tried.residual @ tried.residual)
                 if len(fit.modes) == MOST_MODES or not hints_at_pair([longer], tried, worth):
                     break
                 tried = split_mode([longer], fit.modes)
-                if not is_good(longer, tried, level) or not ends_well(longer, tried.left, window, level, early):
+                if not is_good(longer, tried, level) or not ends_well(longer, tried.residual, window, level, early):
                     break
             stretch, fit = longer, tried
     return stretch, fit
@@ -375,7 +375,7 @@ def with_right_order(stretches: Sequence[Stretch], fit: RingFit, rate: float) ->
     odds = 30.0 + 4.0 * len(stretches)
 
     def needs(more: RingFit, fewer: RingFit, frequency: float) -> bool:
-        saved = float(fewer.left @ fewer.left - more.left @ more.left)
+        saved = float(fewer.residual @ fewer.residual - more.residual @ more.residual)
         return saved > odds * variance_at(more, stretches, rate, frequency)
 
     while len(fit.modes) > 1:
@@ -427,7 +427,7 @@ def trim(stretch: Stretch, samples: FloatArray, rate: float, modes: Sequence[tup
 def variance_of(fit: RingFit, stretches: Sequence[Stretch]) -> float:
     """Of what is left, for the freedom that it has."""
     taken = sum(2 + 2 * len(fit.modes) for _ in stretches) + 2 * len(fit.modes)
-    return float(fit.left @ fit.left) / max(len(fit.left) - taken, 1)
+    return float(fit.residual @ fit.residual) / max(len(fit.residual) - taken, 1)
 
 
 def variance_at(fit: RingFit, stretches: Sequence[Stretch], rate: float, frequency: float) -> float:
@@ -438,8 +438,8 @@ def variance_at(fit: RingFit, stretches: Sequence[Stretch], rate: float, frequen
     """
     from scipy.signal import periodogram
 
-    f, p = periodogram(fit.left, rate)
-    near = np.abs(f - frequency) < max(0.3 * frequency, 5.0 * rate / len(fit.left))
+    f, p = periodogram(fit.residual, rate)
+    near = np.abs(f - frequency) < max(0.3 * frequency, 5.0 * rate / len(fit.residual))
     close = sum(abs(k - frequency) < 0.3 * frequency for k, _ in fit.modes)
     free = 2 * int(near.sum()) - 2 * close * (len(stretches) + 1)
     share = 2 * int(near.sum()) / max(free, 2)

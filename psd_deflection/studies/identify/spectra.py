@@ -113,7 +113,7 @@ def coloured_noise(filled: FloatArray, rate: float, peaks: Sequence[float]) -> C
     return ColouredNoise(float(white), float(walk))
 
 
-def stands_above(filled: FloatArray, rate: float, frequency: float, noise: ColouredNoise) -> bool:
+def exceeds_noise(filled: FloatArray, rate: float, frequency: float, noise: ColouredNoise) -> bool:
     """Whether the motion at ``frequency``, Hz, exceeds the ``noise`` there."""
     f, p = _spectrum(filled, rate)
     floor = noise.density(f[1:], rate) * rate**2 * (2.0 - 2.0 * np.cos(2.0 * np.pi * f[1:] / rate))

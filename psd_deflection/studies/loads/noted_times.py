@@ -58,28 +58,30 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class MendedNote:
-    """One noted load: ``number`` from 1; ``load`` fx N, fy N, tz N m; ``noted``, ``hung``: s from the first sample.
+class CorrectedNote:
+    """One noted load: ``number`` from 1; ``load`` fx N, fy N, tz N m.
 
-    ``took``: time that it was applied over, s, 0 for a step. ``settled_only``: the motion is left out.
+    ``annotated``, ``applied``: s from the first sample.
+
+    ``took``: time that it was applied over, s, 0 for a step. ``rest_only``: the motion is left out.
     """
 
     number: int
     load: tuple[float, float, float]
-    noted: float
-    hung: float
+    annotated: float
+    applied: float
     took: float
-    settled_only: bool = False
+    rest_only: bool = False
 
     @property
-    def late(self) -> float:
+    def delay(self) -> float:
         """s; below 0 if it was noted early."""
-        return self.noted - self.hung
+        return self.annotated - self.applied
 
     @property
     def name(self) -> str:
         """Of the finding: ``load_time``, or ``load_ramp`` if it was noted in time and applied slowly."""
-        return 'load_time' if self._is_late else 'load_ramp'
+        return 'load_time' if self._is_delayed else 'load_ramp'
 
     @property
     def where(self) -> str:
@@ -89,45 +91,45 @@ class MendedNote:
     @property
     def value(self) -> float:
         """s by which it was noted late, or in which it was applied."""
-        return self.late if self._is_late else self.took
+        return self.delay if self._is_delayed else self.took
 
     @property
     def size(self) -> float:
         """s by which it was noted late or early."""
-        return abs(self.late)
+        return abs(self.delay)
 
     @property
     def wrong(self) -> bool:
         """Whether it was noted otherwise than it was hung."""
-        return abs(self.late) > ALIKE_S or self.took > 0.0
+        return abs(self.delay) > ALIKE_S or self.took > 0.0
 
-    def moved(self, moments: Sequence[float], period: float) -> MendedNote:
+    def moved(self, moments: Sequence[float], period: float) -> CorrectedNote:
         """It acted so many moments later and, the second number, took so many longer. A moment is a quarter of a
         sample, of which one comes every ``period``, s.
         """
         later, slower = (*moments, 0.0, 0.0)[:2]
         moment = 0.25 * period
-        return replace(self, hung=self.hung + later * moment, took=max(self.took + slower * moment, 0.0))
+        return replace(self, applied=self.applied + later * moment, took=max(self.took + slower * moment, 0.0))
 
     @property
-    def _is_late(self) -> bool:
-        return abs(self.late) > ALIKE_S and abs(self.late) > self.took
+    def _is_delayed(self) -> bool:
+        return abs(self.delay) > ALIKE_S and abs(self.delay) > self.took
 
     def words(self, name: str) -> str:
         """What was wrong, and what to do; ``name``: of the recording."""
         fx, fy, tz = self.load
         how = ' and '.join(self._how())
-        until = f', as a ramp until {self.hung + self.took:.3f} s' if self.took > 0.0 else ''
-        left = '; here only the link at rest under it is used' if self.settled_only else ''
+        until = f', as a ramp until {self.applied + self.took:.3f} s' if self.took > 0.0 else ''
+        left = '; here only the link at rest under it is used' if self.rest_only else ''
         return (
             f'the {ordinal(self.number)} load of {name} ({fx:g} N, {fy:g} N, {tz:g} N m) was noted {how}: note it '
-            f'{self.hung:.3f} s after the first sample{until}, not {self.noted:.3f} s{left}'
+            f'{self.applied:.3f} s after the first sample{until}, not {self.annotated:.3f} s{left}'
         ).replace('was noted applied', 'was applied')
 
     def _how(self) -> list[str]:
         out = []
-        if self._is_late:
-            out.append(f'{abs(self.late):.3f} s {"late" if self.late > 0.0 else "early"}')
+        if self._is_delayed:
+            out.append(f'{abs(self.delay):.3f} s {"late" if self.delay > 0.0 else "early"}')
         if self.took > 0.0:
             out.append(f'applied over {self.took:.2g} s')
         return out
@@ -141,10 +143,10 @@ class MendedLoads:
     """
 
     loads: FloatArray
-    notes: tuple[MendedNote, ...]
+    notes: tuple[CorrectedNote, ...]
     unused: BoolArray
     measured: tuple[MeasuredLoad, ...] = ()
-    timed: tuple[MendedNote, ...] = ()
+    timed: tuple[CorrectedNote, ...] = ()
 
 
 def ordinal(number: int) -> str:
@@ -160,7 +162,7 @@ def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | N
     ``dots`` (n, 2P) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as noted, held.
     """
     calm, measured = without_cell_noise(loads)
-    mended = _mended_times(rig, dots, calm)
+    mended = _corrected_times(rig, dots, calm)
     if mended is None:
         return MendedLoads(calm, (), np.zeros(len(loads), dtype=bool), measured) if measured else None
     return replace(mended, measured=measured)
@@ -187,7 +189,7 @@ def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
     return out
 
 
-def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
+def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
     period = 1.0 / rig.converter.sample_rate_hz
     changes = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
     if len(changes) == 0 or np.any(np.diff(changes) * period < APART_S):
@@ -218,7 +220,7 @@ def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads 
 
 def loads_with_times(
     loads: FloatArray, changes: IntArray, fitted: Mapping[int, tuple[float, float]], period: float
-) -> tuple[FloatArray, list[MendedNote]]:
+) -> tuple[FloatArray, list[CorrectedNote]]:
     """The loads with change ``i`` from the time ``fitted[i]`` says, in the time that it took; the notes of these."""
     mended = np.tile(loads[0], (len(loads), 1))
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
@@ -229,11 +231,11 @@ def loads_with_times(
         mended += applied(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
         if i in fitted:
             fx, fy, tz = loads[at].tolist()
-            notes.append(MendedNote(i + 1, (fx, fy, tz), noted, start, took if took > GRADUAL_S else 0.0))
+            notes.append(CorrectedNote(i + 1, (fx, fy, tz), noted, start, took if took > GRADUAL_S else 0.0))
     return mended, notes
 
 
-def without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNote], rest: FloatArray) -> MendedLoads:
+def without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[CorrectedNote], rest: FloatArray) -> MendedLoads:
     """The mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
     t: FloatArray = np.arange(len(mended), dtype=np.float64) / rig.converter.sample_rate_hz
     unused = np.zeros(len(mended), dtype=bool)
@@ -242,24 +244,24 @@ def without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNot
         moving = in_motion(rig, note, t)
         told.append(note)
         # A step is the simplest motion: if the link rings otherwise, that is the rig's.
-        if note.took > 0.0 and is_rough(rest, moving & (t > note.hung + note.took), rig.estimator.block_size):
+        if note.took > 0.0 and is_rough(rest, moving & (t > note.applied + note.took), rig.estimator.block_size):
             unused |= moving
-            told[-1] = MendedNote(note.number, note.load, note.noted, note.hung, note.took, settled_only=True)
+            told[-1] = CorrectedNote(note.number, note.load, note.annotated, note.applied, note.took, rest_only=True)
     return MendedLoads(mended, tuple(told), unused)
 
 
-def shifted(note: MendedNote, loads: FloatArray, period: float) -> Callable[[Sequence[float]], FloatArray]:
+def shifted(note: CorrectedNote, loads: FloatArray, period: float) -> Callable[[Sequence[float]], FloatArray]:
     """What so many moments more do to ``loads`` (n, 3): of the time at which the load of ``note`` began to act and, the
     second number if it was applied slowly, of how long that took.
     """
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
-    before, after = np.searchsorted(t, (note.hung - period, note.hung + note.took + 2.0 * period))
+    before, after = np.searchsorted(t, (note.applied - period, note.applied + note.took + 2.0 * period))
     step = loads[min(int(after), len(loads) - 1)] - loads[max(int(before) - 1, 0)]
-    now = applied(t, note.hung, note.took, period)
+    now = applied(t, note.applied, note.took, period)
 
     def more(moments: Sequence[float]) -> FloatArray:
         then = note.moved(moments, period)
-        return np.asarray((applied(t, then.hung, then.took, period) - now)[:, None] * step)
+        return np.asarray((applied(t, then.applied, then.took, period) - now)[:, None] * step)
 
     return more
 
@@ -329,11 +331,11 @@ def residual_of_dots(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[flo
     return float((rest**2).sum()), np.repeat(blocks, size, axis=0)[: len(dots)]
 
 
-def in_motion(rig: Rig, note: MendedNote, t: FloatArray) -> BoolArray:
+def in_motion(rig: Rig, note: CorrectedNote, t: FloatArray) -> BoolArray:
     """Samples (n,) in which the link moves by the load of ``note``."""
     slowest = max(1.0 / (2.0 * math.pi * f * max(ratio, 1e-3)) for f, ratio in link_modes(rig))
-    ends = note.hung + note.took + SETTLED_S * slowest
-    return np.asarray((t >= note.hung - 0.02) & (t < ends))
+    ends = note.applied + note.took + SETTLED_S * slowest
+    return np.asarray((t >= note.applied - 0.02) & (t < ends))
 
 
 def is_rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:

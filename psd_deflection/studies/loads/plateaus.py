@@ -68,7 +68,7 @@ class Plateau:
     """One time between two changes of the load: samples ``first`` to ``last`` of recording ``recording``.
 
     ``number``: of the noted change that began it, from 1; 0 before the first. ``unnoted``: nothing was noted when it
-    began; ``left``: nor when it ended. ``noted`` (3,): N, N, N m.
+    began; ``end_unnoted``: nor when it ended. ``annotated`` (3,): N, N, N m.
     """
 
     recording: int
@@ -76,8 +76,8 @@ class Plateau:
     last: int
     number: int
     unnoted: bool
-    noted: FloatArray
-    left: bool = False
+    annotated: FloatArray
+    end_unnoted: bool = False
 
     def of(self, loads: FloatArray) -> FloatArray:
         """(3,): the load in its middle, of ``loads`` (n, 3)."""
@@ -131,9 +131,9 @@ class PlateauLoads:
     size: int
 
     @property
-    def noted(self) -> FloatArray:
+    def annotated(self) -> FloatArray:
         """(k, 3) N, N, N m."""
-        return np.array([p.noted for p in self.plateaus]).reshape(-1, 3)
+        return np.array([p.annotated for p in self.plateaus]).reshape(-1, 3)
 
     @property
     def sizes(self) -> FloatArray:
@@ -141,7 +141,7 @@ class PlateauLoads:
         return np.asarray(np.linalg.norm(self.more * self.compliance * AXES, axis=1))
 
 
-def asked_for(
+def implied_loads(
     rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: Sequence[Plateau]
 ) -> PlateauLoads:
     """The loads that readings ask for: ``difference`` (3P, m), V, measured minus simulated.
@@ -168,14 +168,14 @@ def asked_for(
     return PlateauLoads(tuple(listed), more, rest, moved, beside, far, compliance, size)
 
 
-def asked_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Plateau]], PlateauLoads]:
+def implied_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Plateau]], PlateauLoads]:
     """The same, of ``volts`` (n, 3P) held against the rig as its file says under ``acting`` loads (n, 3)."""
     size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
     difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
     there = np.isfinite(difference).astype(np.float64)
     means = fine_means(np.where(there > 0.0, difference, 0.0), size, there)
     count = fine_means(there, size)
-    return lambda listed: asked_for(rig, means, count, len(acting), size, listed)
+    return lambda listed: implied_loads(rig, means, count, len(acting), size, listed)
 
 
 def _mean(values: FloatArray) -> float:
@@ -213,7 +213,7 @@ class StandingOut:
     softer: float = 0.0
 
 
-def stand_out(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
+def outliers(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
     """The few plateaus with another load than noted; none if it is none or are many.
 
     ``bent``: share of what is wrong by which the others may seem to be, too. ``largest``: share by which an effect, a
@@ -229,7 +229,7 @@ def stand_out(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> S
     for share, right, most in ((EXACT, FEWEST_EXACT, count - FEWEST_EXACT), (1.0, FEWEST_RIGHT, 2)):
         for wrong in range(1, min(most, count - right) + 1):
             gone = order[:wrong]
-            stands = stands_out(off[gone] / share, off[order[wrong:]] / share, bent)
+            stands = are_outliers(off[gone] / share, off[order[wrong:]] / share, bent)
             if stands and (share == 1.0 or as_plate[gone].all()) and is_known(found, gone, largest):
                 return StandingOut(tuple(sorted(gone.tolist())))
     # Two wrong ones of seven leave too few to tell what effects do.
@@ -241,7 +241,7 @@ def stand_out(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> S
         apart = deviation_in_tolerances(found, (k,), SOFTER)
         others = np.delete(apart, k)
         fitting += bool(others.max() <= 1.0 + bent * apart[k])
-        if stands_out(apart[k : k + 1], others, bent) and is_known(found, np.array([k]), largest):
+        if are_outliers(apart[k : k + 1], others, bent) and is_known(found, np.array([k]), largest):
             tried.append(k)
     # If the others are in proportion whichever is left out, nobody knows which one is wrong.
     return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
@@ -251,26 +251,26 @@ def is_known(found: PlateauLoads, gone: IntArray, largest: float) -> bool:
     """Whether the other loads say what effects in proportion do to those of ``gone``, or no effect does so much, or a
     change was noted twice.
     """
-    twice = np.array([_noted_twice(found, int(k)) is not None for k in gone])
-    far = np.linalg.norm(found.more[gone], axis=1) > largest * np.linalg.norm(found.noted[gone], axis=1)
+    twice = np.array([_annotated_twice(found, int(k)) is not None for k in gone])
+    far = np.linalg.norm(found.more[gone], axis=1) > largest * np.linalg.norm(found.annotated[gone], axis=1)
     return bool(np.all(_alike(found, gone) | far | twice))
 
 
 def _alike(found: PlateauLoads, gone: IntArray) -> BoolArray:
     """Of each of ``gone`` whether it is a sum of the other loads, nearly."""
-    noted = found.noted
+    noted = found.annotated
     right = np.delete(noted, gone, axis=0)
     own = noted[gone]
     rest = own - own @ np.linalg.pinv(right, rcond=ALONE) @ right
     return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(own, axis=1))
 
 
-def _noted_twice(found: PlateauLoads, k: int) -> FloatArray | None:
+def _annotated_twice(found: PlateauLoads, k: int) -> FloatArray | None:
     """(3,): what hung in plateau ``k`` if the change that began it was noted twice; None if something else did.
 
     Of the first load that is ambiguous: half of it may be another unit, or another stiffness.
     """
-    noted, before = found.noted[k], found.noted[k - 1]
+    noted, before = found.annotated[k], found.annotated[k - 1]
     if k == 0 or found.plateaus[k].unnoted or not np.any(before != 0.0):
         return None
     hung = 0.5 * (before + noted)
@@ -279,7 +279,7 @@ def _noted_twice(found: PlateauLoads, k: int) -> FloatArray | None:
     return hung if np.all(off <= allowed) and np.any(np.abs(hung - noted) > STANDS_OUT * allowed) else None
 
 
-def stands_out(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
+def are_outliers(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
     """Return whether the ``wrong`` are far off and the others are not, in tolerances."""
     rest, least = float(others.max()), float(wrong.min())
     return rest <= 1.0 + bent * least and least > max(STANDS_OUT, 5.0 * rest)
@@ -290,7 +290,7 @@ def proportional_part(found: PlateauLoads, gone: Sequence[int], softer: float) -
     if softer == 0.0:
         return np.zeros((3, 3)), np.zeros(3)
     keep = np.setdiff1d(np.arange(len(found.plateaus)), gone)
-    x = np.column_stack((found.noted[keep], np.ones(len(keep))))
+    x = np.column_stack((found.annotated[keep], np.ones(len(keep))))
     prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
     both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ found.more[keep]), dtype=np.float64)
     return both[:3], both[3]
@@ -299,8 +299,8 @@ def proportional_part(found: PlateauLoads, gone: Sequence[int], softer: float) -
 def deviation_in_tolerances(found: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
     """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
     slopes, offset = proportional_part(found, gone, softer)
-    off = np.abs(found.more - found.noted @ slopes - offset)
-    allowed = TOLERANCE + SHARE * np.abs(found.noted).max(axis=1, keepdims=True)
+    off = np.abs(found.more - found.annotated @ slopes - offset)
+    allowed = TOLERANCE + SHARE * np.abs(found.annotated).max(axis=1, keepdims=True)
     return np.asarray((off / allowed).max(axis=1))
 
 
@@ -316,7 +316,7 @@ def all_free(found: PlateauLoads, loads: FloatArray) -> bool:
 
 def may_be_rounded(found: PlateauLoads) -> bool:
     """Whether the noted forces are multiples of a whole step, and ``found`` asks for others by less than a step."""
-    held = found.noted[np.any(found.noted != 0.0, axis=1)]
+    held = found.annotated[np.any(found.annotated != 0.0, axis=1)]
     if len(held) < FEWEST:
         return False
     forces = float(steps_of(held)[0])
@@ -325,7 +325,7 @@ def may_be_rounded(found: PlateauLoads) -> bool:
 
 def are_rounded(found: PlateauLoads, loads: FloatArray) -> bool:
     """Whether the loads that ``found`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
-    return rounded(found.noted, np.array([p.of(loads) for p in found.plateaus]).reshape(-1, 3) + found.more)
+    return rounded(found.annotated, np.array([p.of(loads) for p in found.plateaus]).reshape(-1, 3) + found.more)
 
 
 def rounded(noted: FloatArray, hung: FloatArray) -> bool:
@@ -370,12 +370,12 @@ def _rms(part: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrongNote:
-    """A load that was noted wrong, or not at all: ``hung`` (3,) N, N, N m in ``plateau``. ``period``: s from one sample
-    to the next. ``exact``: by what was noted, not by what the readings say.
+    """A load that was noted wrong, or not at all: ``applied`` (3,) N, N, N m in ``plateau``. ``period``: s between
+    samples. ``exact``: from the other notes, not from the readings.
     """
 
     plateau: Plateau
-    hung: FloatArray
+    applied: FloatArray
     period: float
     exact: bool = False
 
@@ -393,12 +393,12 @@ class WrongNote:
     @property
     def value(self) -> tuple[float, ...]:
         """What hung: N, N, N m."""
-        return tuple(self.hung.tolist())
+        return tuple(self.applied.tolist())
 
     @property
     def off(self) -> FloatArray:
         """(3,): by what it differs from the noted load, N, N, N m."""
-        return np.asarray(np.abs(self.hung - self.plateau.noted))
+        return np.asarray(np.abs(self.applied - self.plateau.annotated))
 
     @property
     def size(self) -> float:
@@ -410,7 +410,7 @@ class WrongNote:
         p = self.plateau
         return (
             f'{_begun(p, name)}: from {p.first * self.period:.3f} s to {p.last * self.period:.3f} s '
-            f'({_worded(self.hung)}) hung, not ({_worded(p.noted)}): note that'
+            f'({_worded(self.applied)}) hung, not ({_worded(p.annotated)}): note that'
         )
 
 
@@ -423,12 +423,12 @@ def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNot
     listed = plateaus(rig, volts, loads)
 
     def asked(acting: FloatArray) -> PlateauLoads:
-        return asked_beside_rig(rig, volts, acting)(listed)
+        return implied_beside_rig(rig, volts, acting)(listed)
 
-    return noted_wrong(loads, 1.0 / rig.converter.sample_rate_hz, asked)
+    return wrong_notes_against(loads, 1.0 / rig.converter.sample_rate_hz, asked)
 
 
-def noted_wrong(
+def wrong_notes_against(
     loads: FloatArray, period: float, asked: Callable[[FloatArray], PlateauLoads], largest: float = ANY
 ) -> list[WrongNote]:
     """The same of any simulation: ``asked`` holds the recording against that under other loads (n, 3).
@@ -440,18 +440,18 @@ def noted_wrong(
         return []
     # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
     # the readings themselves say hung is simulated, then judged.
-    noted = first.noted
+    noted = first.annotated
     said = asked(np.zeros_like(loads)).more
     far = np.abs(said - noted).max(axis=1) > FAR + FAR_SHARE * np.abs(said).max(axis=1)
     hung = np.where(far[:, None], said, noted)
 
     def against() -> PlateauLoads:
         off = np.flatnonzero((hung != noted).any(axis=1)).tolist()
-        found = asked(as_hung(loads, [WrongNote(first.plateaus[k], hung[k], period) for k in off]))
+        found = asked(as_applied(loads, [WrongNote(first.plateaus[k], hung[k], period) for k in off]))
         return replace(found, more=found.more + hung - noted, moved=first.moved)
 
     found = against()
-    which = stand_out(found, BENT, largest)
+    which = outliers(found, BENT, largest)
     for bent in (0.2 * BENT, 0.0, 0.0, 0.0):
         if not which.gone:
             return []
@@ -459,20 +459,20 @@ def noted_wrong(
         for k in which.gone:
             hung[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + found.more[k] - offset)
         found = against()
-        which = stand_out(found, bent, largest)
+        which = outliers(found, bent, largest)
     out = []
     for k in which.gone:
         # What effects do to a load that no other is like, the readings alone do not tell from the load.
-        twice = None if _alike(found, np.array([k]))[0] else _noted_twice(found, k)
+        twice = None if _alike(found, np.array([k]))[0] else _annotated_twice(found, k)
         out.append(WrongNote(first.plateaus[k], hung[k] if twice is None else twice, period, twice is not None))
     return out
 
 
-def as_hung(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:
+def as_applied(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:
     """``loads`` (n, 3) with what hung in place of what was noted."""
     out = loads.copy()
     for note in wrong:
-        out[note.plateau.first : note.plateau.last] = note.hung
+        out[note.plateau.first : note.plateau.last] = note.applied
     return out
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.noted_times import SETTLED_S
-from psd_deflection.studies.loads.plateaus import FEWEST, Plateau, PlateauLoads, asked_beside_rig, plateaus
+from psd_deflection.studies.loads.plateaus import FEWEST, Plateau, PlateauLoads, implied_beside_rig, plateaus
 
 SWAYS, SLOWEST_HZ, FASTEST_HZ = 8.0, 0.3, 6.0
 """A weight that sways makes so much more slow movement than any other, in this band."""
@@ -156,14 +156,14 @@ def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[Swayin
     ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, as they acted.
     """
     period = 1.0 / rig.converter.sample_rate_hz
-    asked = asked_beside_rig(rig, volts, loads)
+    asked = implied_beside_rig(rig, volts, loads)
     listed = plateaus(rig, volts, loads)
     if len(listed) < FEWEST:
         return []
     return swaying(asked(listed), plateaus(rig, volts, loads, noted=True), asked, period)
 
 
-def left_out(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> FloatArray:
+def excluded(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> FloatArray:
     """``volts`` (n, 3P) without the times in which a weight swayed, and until the link has come to rest after it."""
     out = volts.copy()
     d = rig.dynamics

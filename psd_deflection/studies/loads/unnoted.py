@@ -68,7 +68,7 @@ def unnoted_times(found: PlateauLoads, samples: int, period: float) -> list[Unno
 
     A change counts if the plate moves with it by what no effect does to the noted load.
     """
-    allowed = STANDS_OUT * (TOLERANCE + SHARE * np.abs(found.noted).max(initial=0.0))
+    allowed = STANDS_OUT * (TOLERANCE + SHARE * np.abs(found.annotated).max(initial=0.0))
     out = []
     numbered = groupby(range(len(found.plateaus)), key=lambda k: found.plateaus[k].number)
     for _, group in numbered:
@@ -80,7 +80,9 @@ def unnoted_times(found: PlateauLoads, samples: int, period: float) -> list[Unno
         if len(alone) >= MANY and as_plate:
             first, last = found.plateaus[alone[0]].first, found.plateaus[own[-1]].last
             out.append(UnnotedTime(first, last, samples, len(alone), period))
-    left = [p for p in found.plateaus if not any(u.first <= p.first < u.last for u in out) and np.any(p.noted != 0.0)]
+    left = [
+        p for p in found.plateaus if not any(u.first <= p.first < u.last for u in out) and np.any(p.annotated != 0.0)
+    ]
     return out if left else []
 
 

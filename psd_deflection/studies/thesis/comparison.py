@@ -85,15 +85,15 @@ def thesis_geometry() -> Geometry:
 
 def methods() -> tuple[Method, ...]:
     """The rows of the table: ``VARIANTS``, then every other method that solves the thesis's rig."""
-    return (*VARIANTS, *(Method(name, name, {}) for name, why in _others().items() if not why))
+    return (*VARIANTS, *(Method(name, name, {}) for name, why in _other_methods().items() if not why))
 
 
 def refused() -> dict[str, str]:
     """The methods that cannot solve the thesis's rig, and why."""
-    return {name: why for name, why in _others().items() if why}
+    return {name: why for name, why in _other_methods().items() if why}
 
 
-def _others() -> dict[str, str]:
+def _other_methods() -> dict[str, str]:
     """Methods that ``VARIANTS`` does not name: name to the reason of a refusal, '' if there is none."""
     reasons = {}
     for name in registry.SOLVERS:

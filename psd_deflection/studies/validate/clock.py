@@ -61,7 +61,7 @@ class Offset:
     used: int
 
     @property
-    def told(self) -> bool:
+    def determined(self) -> bool:
         """Whether the motion tells the offset."""
         return self.explained and self.sd < VAGUE and not self.rivals
 
@@ -73,7 +73,7 @@ class Offset:
     @property
     def sentence(self) -> str:
         """Which clock is ahead, and what to add to what."""
-        if not self.told:
+        if not self.determined:
             if self.explained and self.rivals:
                 others = ', '.join(f'{1e3 * r:+.1f}' for r in self.rivals)
                 return (
@@ -104,18 +104,18 @@ class Offset:
 
 @dataclass
 class OffsetFit:
-    """``left``: what the fit leaves (k, 3), m, m, rad; ``sizes`` (3,): its scatter."""
+    """``residual``: what the fit leaves (k, 3), m, m, rad; ``sizes`` (3,): its scatter."""
 
     value: float
     sd: float
     drift: float
     drift_sd: float
-    left: FloatArray
+    residual: FloatArray
     sizes: FloatArray
 
     def chi_square(self, sizes: FloatArray) -> float:
         """Mean over the references of what the fit leaves, in ``sizes``; an outlier counts like any other."""
-        return biweight_sum(self.left / sizes)
+        return biweight_sum(self.residual / sizes)
 
 
 def biweight_sum(u: FloatArray) -> float:
@@ -157,7 +157,7 @@ def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float
             f'the reference and the samples do not overlap enough: fewer than {FEWEST} of the references lie within '
             f'the recording at any offset up to {largest:g} s'
         )
-    used = len(best.left)
+    used = len(best.residual)
     least = best.chi_square(best.sizes)
     near = APART * motion.period
     rivals = tuple(
@@ -236,7 +236,7 @@ def refined_offset(
         value += step
         fit.value = value
         if passed > 0 and best is not None:
-            worse = len(fit.left) * (fit.chi_square(best.sizes) - best.chi_square(best.sizes))
+            worse = len(fit.residual) * (fit.chi_square(best.sizes) - best.chi_square(best.sizes))
             if worse > 10.0 * RIVAL:
                 break
         if passed > 1 and abs(step) < SETTLED:
@@ -250,15 +250,15 @@ class UsedReferences:
 
     t: FloatArray
     poses: FloatArray
-    seen: FloatArray
+    motion: FloatArray
     rates: FloatArray
 
     def solved(self, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
         """The step of the offset, s, the fit there, and the weights of the next pass (k, 3)."""
         k = len(self.t)
         # Of an axis that does not move, the readings are noise and explain nothing.
-        moving = [i for i in range(3) if np.ptp(self.seen[:, i]) > 0.0]
-        causes = np.column_stack([np.ones(k), *(self.seen[:, i] - self.seen[:, i].mean() for i in moving)])
+        moving = [i for i in range(3) if np.ptp(self.motion[:, i]) > 0.0]
+        causes = np.column_stack([np.ones(k), *(self.motion[:, i] - self.motion[:, i].mean() for i in moving)])
         scale = np.sqrt((causes * causes).mean(axis=0))
         causes = causes / scale
         left = np.empty((k, 3))

@@ -23,7 +23,7 @@ def validate(problem: ValidateProblem) -> Validated:
     """
     motion, t = problem.motion, problem.t
     offset = clock_offset(motion, t, problem.reference, largest=problem.largest, exposure=problem.exposure)
-    applied = problem.align and offset.told
+    applied = problem.align and offset.determined
     at = t + offset.value if applied else t
     dots, _, _ = motion.dots_at(at, problem.exposure)
     there = np.isfinite(dots).all(axis=1)
@@ -51,7 +51,7 @@ def validate(problem: ValidateProblem) -> Validated:
         offset=offset,
         applied=applied,
         covered=covered,
-        left_out=int((~there).sum()),
+        excluded=int((~there).sum()),
     )
 
 

@@ -18,7 +18,14 @@ from psd_deflection.studies.budget.budget import BudgetProblem, budget
 from psd_deflection.studies.budget.evaluate import CAUSES, draws, monte_carlo
 from psd_deflection.studies.budget.expanded import Interval, difference, expanded, interval_of
 from psd_deflection.studies.budget.inputs import read_inputs
-from psd_deflection.studies.budget.result import Budgeted, freedom_words, in_words, parameter_rows, shown, type_of
+from psd_deflection.studies.budget.result import (
+    Budgeted,
+    display_values,
+    freedom_words,
+    in_words,
+    parameter_rows,
+    type_of,
+)
 from psd_deflection.studies.budget.term import Contribution, Kind
 
 RIG = replace_values(load_rig(), {'psd_2.noise': [4e-3, 2e-3]})
@@ -38,7 +45,7 @@ def plain() -> Budgeted:
 
 
 def test_values_are_shown_in_micrometres_and_millidegrees() -> None:
-    assert shown(np.array([1.5e-6, -2e-3, math.radians(0.25)])) == ['1.500', '-2000.000', '250.000']
+    assert display_values(np.array([1.5e-6, -2e-3, math.radians(0.25)])) == ['1.500', '-2000.000', '250.000']
     assert in_words(np.array([1.5e-6, 2.3456e-6, math.radians(0.25)])) == 'ΔX 1.5 µm, ΔY 2.35 µm, θ 250 mdeg'
     assert (freedom_words(math.inf), freedom_words(8.0)) == ('∞', '8')
 
@@ -147,7 +154,7 @@ def test_the_sentences_name_the_largest_cause(answer: Budgeted, plain: Budgeted)
     assert answer.sampled is not None
     size = np.sqrt(answer.sampled.bias**2 + np.diag(answer.sampled.covariance))
     assert f'400 random draws of all causes at once give {in_words(size)}.' in answer.sentences()
-    dx, dy, theta = shown(size)
+    dx, dy, theta = display_values(size)
     assert f'total     ΔX {dx} µm  ΔY {dy} µm  θ {theta} mdeg' in answer.lines()
     assert 'Monte Carlo, 400 draws of everything at once (seed 3):' in answer.lines()
 

@@ -17,8 +17,8 @@ from psd_deflection.studies.calibrate.observation import (
     at_rest,
     joined,
     noise_of,
+    rest_means,
     rows_of,
-    settled,
     smoothed,
 )
 
@@ -142,7 +142,7 @@ def test_settled_rows_are_means_no_better_than_the_calmest() -> None:
     noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
     for variances in (small, large):
         rows = Rows(t, run, zeros, dots, variances, zeros, loads, t >= 0.5, np.ones((100, 3)))
-        found = settled(rows, RIG, noise)
+        found = rest_means(rows, RIG, noise)
         assert len(found) >= 6
         assert {tuple(row) for row in found.loads.tolist()} == {(0.0, 0.0, 0.0), (0.0, -10.0, 0.0)}
         if variances is small:

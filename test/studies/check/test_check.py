@@ -122,7 +122,7 @@ def test_each_of_the_127_wrong_wirings_is_named_from_three_pushes_at_ten_times_t
         loads = pushes(10.0 if seed % 8 == 7 else 10.0 * BLOCK)
         found = checked(recorded(loads, seed, turn), loads)
         wanted = lines_of(turn)
-        if found.verdict != (WRONG if wanted else RIGHT) or found.values != wanted or len(found.found) != 1:
+        if found.verdict != (WRONG if wanted else RIGHT) or found.values != wanted or len(found.wirings) != 1:
             misnamed.append((turn, found.verdict, found.values))
     assert not misnamed
 
@@ -162,7 +162,7 @@ def test_coloured_heavy_and_unequal_noise_accuse_no_wiring(noise: dict[str, Any]
     for seed in range(5):
         found = checked(recorded(loads, seed, **noise), loads)
         assert [f.name for f in found.findings if f.name != 'noise_level'] == []
-        assert [c.wiring for c in found.found] == [Wiring()]
+        assert [c.wiring for c in found.wirings] == [Wiring()]
 
 
 def test_a_rig_file_that_knows_its_wiring_is_right_and_the_nominal_one_is_then_wrong() -> None:

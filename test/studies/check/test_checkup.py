@@ -19,7 +19,7 @@ from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.levels import Levels
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
 from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFit, on_channels
-from psd_deflection.studies.loads.noted_times import MendedNote
+from psd_deflection.studies.loads.noted_times import CorrectedNote
 
 RIG = load_rig()
 STATED = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))
@@ -56,7 +56,7 @@ def checked(
     drift: Sequence[float] = (0.0,) * 4,
     drift_sd: float = 1e-9,
     rig: Rig = RIG,
-    notes: Sequence[MendedNote] = (),
+    notes: Sequence[CorrectedNote] = (),
 ) -> Checkup:
     drifting = np.array(drift), np.full(4, drift_sd)
     return check(CheckProblem(rig, pushes, levels or of_levels(), *drifting, source='x', notes=notes))
@@ -70,13 +70,13 @@ def test_three_pushes_of_a_rig_as_its_file_says_are_right() -> None:
     found = checked()
     assert (found.verdict, found.findings, dict(found.values), found.light, found.notes) == (RIGHT, (), {}, {}, ())
     assert found.sizes == pytest.approx([1.0] * 3)
-    assert [f.wiring for f in found.found] == [Wiring()]
+    assert [f.wiring for f in found.wirings] == [Wiring()]
     assert found.source == 'x'
     assert CheckProblem(RIG, (), of_levels(), np.zeros(4), np.zeros(4)).source == ''
 
 
 def test_notes_that_are_wrong_come_first_and_are_wrong() -> None:
-    late = MendedNote(2, (1.0, 0.0, 0.0), 3.0, 1.0, 0.0)
+    late = CorrectedNote(2, (1.0, 0.0, 0.0), 3.0, 1.0, 0.0)
     found = checked(notes=[late])
     assert found.verdict == WRONG
     assert [(f.name, f.where, f.value, f.fix, f.evidence) for f in found.findings] == [
@@ -133,10 +133,10 @@ def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
     two = checked(three[:2])
     assert two.verdict == WRONG
     assert dict(two.values) == {}
-    assert len(two.found) == 2
+    assert len(two.wirings) == 2
     assert two.findings[0].equivalent == ('1 other wiring, which these pushes cannot tell apart',)
     one = checked(three[:1])
-    others = len(one.found) - 1
+    others = len(one.wirings) - 1
     assert others > 1
     assert one.findings[0].equivalent == (f'{others} other wirings, which these pushes cannot tell apart',)
 
@@ -259,14 +259,14 @@ def test_what_is_missing_is_asked_for(pushes: list[PushResponse], where: str, fi
     found = checked(pushes)
     assert found.verdict == CANNOT_TELL
     assert [(f.name, f.where, f.value, f.fix) for f in found.findings] == [('load_coverage', where, None, fix)]
-    assert [math.isnan(s) for s in found.sizes] == [not p.seen for p in pushes]
+    assert [math.isnan(s) for s in found.sizes] == [not p.observed for p in pushes]
 
 
 def test_pushes_that_no_wiring_explains_are_asked_for_again() -> None:
     odd = [replace(push('fx'), channels=np.array([-1.0, 1.0, 1.0, 1.0]) * 1e-4), push('fy'), push('tz')]
     odd[0] = replace(odd[0], channels=np.array([-1.0, 1.0, -1.0, 1.0]) * 1e-4)
     found = checked(odd)
-    assert found.found == ()
+    assert found.wirings == ()
     assert found.verdict == CANNOT_TELL
     assert [(f.where, f.fix) for f in found.findings] == [
         ('fx fy tz', 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +θ')

@@ -59,7 +59,7 @@ CHECKUP = Checkup(
     values={},
     pushes=PUSHES,
     sizes=(1.5, -0.5),
-    found=(WiringFit(Wiring(), 0.1),),
+    wirings=(WiringFit(Wiring(), 0.1),),
     levels=LEVELS,
     drift=np.array([1.0, -2.0, 0.0, -1e-4]) * 1e-6 / 60.0,
     drift_sd=np.array([0.1, 0.2, 0.3, 0.44]) * 1e-6 / 60.0,
@@ -90,7 +90,7 @@ def fits(count: int) -> tuple[WiringFit, ...]:
 )
 def test_the_verdict_is_a_sentence(verdict: str, names: tuple[str, ...], count: int, words: str) -> None:
     some = tuple(finding(name, 'x1') for name in names)
-    found = replace(CHECKUP, verdict=verdict, findings=some, found=fits(count))
+    found = replace(CHECKUP, verdict=verdict, findings=some, wirings=fits(count))
     assert found.sentences()[0] == words
     assert words in found.lines()
 

@@ -89,7 +89,7 @@ def test_a_push_has_the_names_of_its_loads() -> None:
 def test_a_push_is_seen_beyond_six_deviations(
     channels: list[float], sd: list[float], only_twist: bool, seen: bool
 ) -> None:
-    assert push(channels, sd=sd, only_twist=only_twist).seen is seen
+    assert push(channels, sd=sd, only_twist=only_twist).observed is seen
 
 
 def test_the_misfit_is_the_share_of_the_square_that_the_pattern_leaves() -> None:

@@ -26,7 +26,7 @@ from psd_deflection.studies.discover import planning, trees
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Setting
 from psd_deflection.studies.discover.laws.laws import FoundLaw
-from psd_deflection.studies.discover.planning import Plan, Suggestion, Told
+from psd_deflection.studies.discover.planning import Discrimination, Plan, Suggestion
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals, weighing
 from psd_deflection.studies.discover.search.fit import Fit
@@ -35,13 +35,13 @@ from psd_deflection.studies.discover.search.localise import Cell, Dependence, Lo
 from psd_deflection.studies.discover.search.screen import promising
 from psd_deflection.studies.discover.search.signatures import Candidate, candidates, signature_columns
 from psd_deflection.studies.discover.search.trials import far, slot, unbound, unphysical
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown, unknown_of
+from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect, Unknown, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes, only_in
 from psd_deflection.studies.discover.setup.setup import (
+    finding_of_effect,
     likely_delays,
     likely_jumps,
-    said,
 )
 
 from .test_formulas import RIG, observed
@@ -174,7 +174,7 @@ def test_an_effect_of_one_recording_acts_in_that_alone() -> None:
 def test_a_mistake_is_said_with_its_line(workspace: Workspace) -> None:
     def words(name: str, **values: float) -> tuple[Any, dict[str, object]]:
         fit = cast(Fit, SimpleNamespace(effects=(None, ActiveEffect(of_setup(name), values))))
-        (finding,), lines = said(workspace, fit, 1, 33.0)
+        (finding,), lines = finding_of_effect(workspace, fit, 1, 33.0)
         assert (finding.name, finding.evidence) == (name, 33.0)
         return finding, lines
 
@@ -421,8 +421,8 @@ def test_the_best_of_each_variant_is_tried() -> None:
 # Plans.
 
 
-def told_of(rival: str, separation: float, reverse: float, possible: float) -> Told:
-    return Told(rival, 'creep', separation, reverse, possible)
+def told_of(rival: str, separation: float, reverse: float, possible: float) -> Discrimination:
+    return Discrimination(rival, 'creep', separation, reverse, possible)
 
 
 def test_a_plan_says_what_it_tells_apart() -> None:
@@ -440,10 +440,12 @@ def test_a_plan_says_what_it_tells_apart() -> None:
         'Record next, 9 s: push, 2 times; then wait, while it is warm. It tells creep from damping, tip_mass '
         '(chi-square 40 at least, 21.6 needed); nothing within the limits tells x apart.'
     )
-    assert dataclasses.replace(plan, told=tells[:1]).sentence.endswith(
+    assert dataclasses.replace(plan, discriminations=tells[:1]).sentence.endswith(
         'from damping (chi-square 40 at least, 21.6 needed).'
     )
-    idle = dataclasses.replace(plan, setting=Setting(), told=(tells[2], dataclasses.replace(tells[2], rival='y')))
+    idle = dataclasses.replace(
+        plan, setting=Setting(), discriminations=(tells[2], dataclasses.replace(tells[2], alternative='y'))
+    )
     assert not idle.useful
     assert idle.words == 'push, 2 times; then wait'
     assert idle.sentence == 'No recording within the limits would tell creep from x, y.'
@@ -548,7 +550,7 @@ def test_a_gap_that_remains_is_never_left_unsaid() -> None:
     assert u.signature == '1.25 µm remain, 1.6 times the noise, in no single place or band'
     assert u.rms == pytest.approx(math.sqrt(1.56) * 1e-6)
     assert u.explains == pytest.approx((1.6 / 3) ** 2)
-    assert u.remains
+    assert u.unexplained
 
 
 def test_a_waterfall_falls_effect_by_effect() -> None:
@@ -574,7 +576,7 @@ def test_a_waterfall_falls_effect_by_effect() -> None:
 
 
 def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
-    whole = {'sd': {}, 'p': 1e-9, 'delta_bic': 50.0, 'heldout': HeldOut(20.0, 2.0), 'equivalent': (), 'rivals': ()}
+    whole = {'sd': {}, 'p': 1e-9, 'delta_bic': 50.0, 'heldout': HeldOut(20.0, 2.0), 'equivalent': (), 'fitted_alternatives': ()}
     return NamedEffect(active, **{**whole, 'alternatives': (), 'suggestion': None, **given})
 
 
@@ -649,7 +651,7 @@ def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> No
         ('noise alone', found.gap_floor),
     )
     assert (found.verdict, found.unknown, found.setup, found.law, found.values) == ('effects_found', (), (), None, {})
-    assert (found.seed, found.known, found.rivals, found.unsettled) == (0, (), (), ())
+    assert (found.seed, found.known, found.alternative_fits, found.unsettled) == (0, (), (), ())
     assert found.active_effects == [named.active]
     # One picture, whose length is the deviation: of the turn about the centre of the PSD.
     h = 1e-4
@@ -823,7 +825,7 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
         f'model; adding them closes the gap from {before} to {left}.'
     )
     assert said_of_two.count('Fitted') == 1
-    assert sentence(effects=two, verdict='unknown_effect', unknown=(Unknown('', (), 1.0, remains=False),)).endswith(
+    assert sentence(effects=two, verdict='unknown_effect', unknown=(Unknown('', (), 1.0, unexplained=False),)).endswith(
         f' close the gap from {before} to {left}, but their sizes are tied: '
         'one effect that is not in the catalogue is likelier.'
     )
@@ -837,8 +839,10 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     assert tree['setup'] == [
         {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
     ]
-    rival = Rival(named.active, {'angle': 1e-3}, 4.0, found.fit)
-    listed_rivals = dataclasses.replace(found, effects=(dataclasses.replace(named, rivals=(rival,)),)).tree()
+    rival = Alternative(named.active, {'angle': 1e-3}, 4.0, found.fit)
+    listed_rivals = dataclasses.replace(
+        found, effects=(dataclasses.replace(named, fitted_alternatives=(rival,)),)
+    ).tree()
     assert listed_rivals['effects'][0]['rivals'] == [
         {
             'name': 'sensor_rotation',

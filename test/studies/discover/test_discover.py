@@ -30,7 +30,7 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.coincidence import coincidences
 from psd_deflection.studies.discover.search.fit import refit
-from psd_deflection.studies.discover.search.screen import solve_seen
+from psd_deflection.studies.discover.search.screen import solve_observable
 from psd_deflection.studies.discover.search.signatures import SignatureBank
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.study import described
@@ -239,7 +239,7 @@ def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
     found = discover([lag], RIG, without=[n for n in effect_names() if n not in near], bank=BANK)
     assert [e.active.effect.name for e in found.effects] == ['channel_skew', 'channel_skew']
     assert found.verdict == 'unknown_effect'
-    assert not found.unknown[0].remains
+    assert not found.unknown[0].unexplained
     assert 'agree in size (delay 3' in found.unknown[0].signature
     assert found.unknown[0].explains > 0.9
     assert 'their sizes are tied' in found.sentence
@@ -267,7 +267,7 @@ def test_a_parameter_stays_where_the_rig_lets_it() -> None:
 
 def test_directions_that_cannot_be_seen_are_left_alone() -> None:
     fisher = np.array([[1.0, 1.0], [1.0, 1.0]])
-    gain, rank, c = solve_seen(fisher, np.array([2.0, 2.0]), np.diag(fisher))
+    gain, rank, c = solve_observable(fisher, np.array([2.0, 2.0]), np.diag(fisher))
     assert rank == 1
     assert gain == pytest.approx(4.0)
     np.testing.assert_allclose(c, [1.0, 1.0])

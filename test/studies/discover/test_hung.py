@@ -17,7 +17,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.parameter_files import flat_parameters
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.free_loads import settled
+from psd_deflection.studies.discover.free_loads import refitted
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
@@ -29,7 +29,7 @@ from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hung import ringing_on, unseen
 from psd_deflection.studies.discover.setup.redundant import excess
-from psd_deflection.studies.loads.noted_times import MendedNote
+from psd_deflection.studies.loads.noted_times import CorrectedNote
 from psd_deflection.studies.loads.steps import applied
 from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, noted_as, read
 
@@ -380,12 +380,12 @@ def test_free_times_are_settled_again_if_an_effect_beside_which_they_were_does_n
     fit = refit(off, ())
     assert off.gap(fit.difference) > 3.0 * off.floor()
     dropped = replace(problem, search=problem.search.at(off), fit=fit)
-    again = settled(dropped)
+    again = refitted(dropped)
     assert again.comparison.gap(again.fit.difference) < 1.05 * off.floor()
     assert again.fit is again.null
     # If all effects hold, they were settled beside these.
     same = replace(dropped, result=SearchResult(fit, fit))
-    assert settled(same) is same
+    assert refitted(same) is same
 
 
 @pytest.mark.statistics
@@ -442,7 +442,7 @@ def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> No
     volts[3900:4100, 0] = np.nan
     ws = Workspace([Observation('x', RIG, volts, HELD)])
     nothing = np.zeros_like(HELD)
-    notes = [MendedNote(i, (0.0, 0.0, 0.0), t, t, 0.0) for i, t in enumerate((4.0, 8.0, 12.0, 40.0), start=1)]
+    notes = [CorrectedNote(i, (0.0, 0.0, 0.0), t, t, 0.0) for i, t in enumerate((4.0, 8.0, 12.0, 40.0), start=1)]
     assert [unseen(ws, LoadDirection(0, nothing, 1.0, n, 0)) for n in notes] == [False, True, False, False]
     assert not unseen(ws, LoadDirection(0, nothing, 1.0, 'x', 0))
     assert not unseen(ws, ZeroDirection(0, 0, 1e-6))

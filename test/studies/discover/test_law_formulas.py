@@ -307,7 +307,7 @@ def test_terms_are_added_to_the_law_on_their_quantity_and_left_out_one_by_one() 
     two = laws.with_term([both], law_features.Scored('static_dx', c, 1.0))
     assert two == (both, Law('law_static_dx', 'link', 'static_dx', (c,)))
     x1 = Law('law_static_dx', 'link', 'static_dx', (c,))
-    assert laws.one_term_fewer(two) == [
+    assert laws.subsets_without_a_term(two) == [
         (dataclasses.replace(both, terms=(b,)), x1),
         (dataclasses.replace(both, terms=(a,)), x1),
         (both,),
@@ -426,7 +426,7 @@ def test_a_law_shows_where_a_twentieth_of_its_energy_is(seen: tuple[Workspace, F
         small = Law('small', 'psd', 'x1', (LawTerm('product', ('load_fy',), 1e-5 * ratio),))
         effects = tuple(ActiveEffect(effect_of(law), values_of(law)) for law in (big, small))
         fit = refit(workspace, effects, 0)
-        assert laws.channels_shown(workspace, laws.LawTrial((big, small), fit, 0.0)) == shown
+        assert laws.dominant_channels(workspace, laws.LawTrial((big, small), fit, 0.0)) == shown
 
 
 # The search for a law, with costs that are given.

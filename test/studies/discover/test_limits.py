@@ -326,7 +326,7 @@ def test_tied_effects_explain_none_to_all_of_the_gap(gains: tuple[float, float],
         [tie], cast(Fit, fit), cast(SearchResult, found), cast(Any, SimpleNamespace(dependences=()))
     )
     assert unknown.explains == pytest.approx(share)
-    assert not unknown.remains
+    assert not unknown.unexplained
 
 
 @pytest.mark.parametrize('channel', range(6))

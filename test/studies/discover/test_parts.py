@@ -189,7 +189,9 @@ def test_a_slow_change_is_unwhitened_by_what_is_left_of_a_constant() -> None:
 def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> None:
     dots = gappy.block_dots(gappy.measured)
     assert [d.shape for d in dots] == [(4, 60), (4, 40)]
-    for (row, shown), o in zip(zip(dots, gappy.shown(gappy.measured), strict=True), gappy.observations, strict=True):
+    for (row, shown), o in zip(
+        zip(dots, gappy.displayed(gappy.measured), strict=True), gappy.observations, strict=True
+    ):
         np.testing.assert_array_equal(shown, 1e6 * row)
         n = row.shape[1]
         blocks = o.volts[: 20 * n, DOTS].reshape(n, 20, 4)
@@ -199,7 +201,7 @@ def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> Non
         np.testing.assert_allclose(row, want, rtol=1e-9)
     # Two blocks of the first have none of their samples.
     assert np.isnan(dots[0]).all(axis=0).sum() == 2
-    assert (gappy.unit, gappy.scale_shown, gappy.units_shown) == ('m', (1e6, 'µm'), ('µm',) * 4)
+    assert (gappy.unit, gappy.display_scale, gappy.display_units) == ('m', (1e6, 'µm'), ('µm',) * 4)
     assert gappy.worded(1.2345e-6) == '1.23 µm'
     beside = gappy.against()
     assert list(beside) == [
@@ -536,7 +538,7 @@ def test_what_is_tied_is_told_in_words() -> None:
         'a and c agree in size (x 0.1235, y 0.1235 V) as independent effects hardly would (odds 123 to 1): '
         'one cause that is not in the catalogue'
     )
-    assert (u.depends_on, u.remains, u.rms) == (('u', 'w', 'p', 'q'), False, 0.0)
+    assert (u.depends_on, u.unexplained, u.rms) == (('u', 'w', 'p', 'q'), False, 0.0)
     assert u.explains == pytest.approx(80.0 / 200.0)
     (u,) = weighing.tied(ties[1:], fit, result, nowhere())
     assert 'a and b agree in size (x 0.5, x 0.5) as' in u.signature
@@ -577,7 +579,7 @@ def test_a_recording_shows_the_distance_of_its_models_in_units_of_the_noise() ->
     setting = Setting('', {'converter.sample_rate_hz': 500.0}, swing=3.0)
     loads = HISTORY[:400]
     before = ws.simulations
-    got = experiment.shown(ws, models, setting, loads)
+    got = experiment.expected_sums(ws, models, setting, loads)
     assert ws.simulations - before == sum(1 + len(m.free) for m in models)
     rig = replace_values(RIG, setting.changes)
     # Two samples are 4 ms here, and were four.
@@ -598,7 +600,7 @@ def test_a_recording_shows_the_distance_of_its_models_in_units_of_the_noise() ->
     # At its greatest value a parameter is moved downward, which gives the same slope.
     top = warm.effect.parameter('angle').maximum
     high = refit(ws, [ActiveEffect(warm.effect, {**warm.values, 'angle': top})], iterations=0)
-    assert np.isfinite(experiment.shown(ws, [high], setting, loads, rig).fisher[0]).all()
+    assert np.isfinite(experiment.expected_sums(ws, [high], setting, loads, rig).fisher[0]).all()
 
 
 @pytest.mark.parametrize('seconds', [3.0, 6.1, 30.0])
@@ -614,7 +616,7 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
         return ModelSums(apart * len(loads) / 3000.0, none, [np.zeros((0, 0))] * 3, len(loads) / 1000.0)
 
     monkeypatch.setattr(planning, 'proposals', lambda *_: offered)
-    monkeypatch.setattr(planning, 'shown', shown)
+    monkeypatch.setattr(planning, 'expected_sums', shown)
     fits = [
         cast(Fit, SimpleNamespace(jacobian=np.zeros((5, 0)), free=(), effects=(active(name, x=0.1),))) for name in 'abc'
     ]
@@ -622,9 +624,13 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
     plan = planning.plan_next(ws, fits[0], fits[1:], Limits(seconds=seconds))
     assert plan is not None
     times = int(seconds // 3.0)
-    first, second = plan.told
-    assert (first.rival, first.separation, first.reverse) == ('b', 4.0 * len(plan.pieces), 3.0 * len(plan.pieces))
-    assert (second.rival, second.separation, second.reverse) == ('c', 1.0 * len(plan.pieces), 0.5 * len(plan.pieces))
+    first, second = plan.discriminations
+    assert (first.alternative, first.separation, first.reverse) == ('b', 4.0 * len(plan.pieces), 3.0 * len(plan.pieces))
+    assert (second.alternative, second.separation, second.reverse) == (
+        'c',
+        1.0 * len(plan.pieces),
+        0.5 * len(plan.pieces),
+    )
     assert [first.possible, second.possible] == pytest.approx([4.0 * times, 1.0 * times])
     assert 1 <= len(plan.pieces) <= times
     found = planning.suggest(ws, fits[0], fits[1:], Limits(seconds=seconds))

@@ -105,10 +105,10 @@ def test_a_plant_is_measured_by_its_own_level() -> None:
     assert float(vector @ vector) == pytest.approx(50.0)
     for part, rows in zip(ws.unwhitened(vector), seen, strict=True):
         np.testing.assert_allclose(part, np.nan_to_num(rows), rtol=1e-12)
-    for part, rows in zip(ws.shown(seen), seen, strict=True):
+    for part, rows in zip(ws.displayed(seen), seen, strict=True):
         np.testing.assert_array_equal(part, rows)
     # What is simulated where nothing was measured is not shown.
-    assert np.isnan(ws.shown([np.zeros_like(rows) for rows in seen])[1][1]).all()
+    assert np.isnan(ws.displayed([np.zeros_like(rows) for rows in seen])[1][1]).all()
     assert ws.provenance() == [
         {'name': 'a', 'values': 18, 'lost': 2},
         {'name': 'b', 'values': 7, 'lost': 7},
@@ -137,7 +137,7 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     assert ws.gap(left) == pytest.approx(0.5)
     mixed = [rows * [[1.0], [0.5]] for rows in seen]
     assert ws.gap(mixed) == pytest.approx(math.sqrt((1.0 + 0.25) / 2.0))
-    assert (ws.unit, ws.scale_shown, ws.units_shown) == (
+    assert (ws.unit, ws.display_scale, ws.display_units) == (
         'share of the gap before',
         (100.0, '% of the gap before'),
         ('N', 'rad'),
@@ -162,7 +162,7 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     both = np.concatenate((forces, turns))
     assert same.gap(seen) == pytest.approx(rms(both))
     assert same.floor() == pytest.approx(math.sqrt((28 * 0.3**2 + 22 * 0.1**2) / 50))
-    assert (same.unit, same.scale_shown, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
+    assert (same.unit, same.display_scale, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
     # A number without a unit has none behind it.
     assert PlantComparison(Pictures(seen, {}, units=('', ''))).worded(0.5) == '0.5'
 
@@ -534,8 +534,8 @@ def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
         'where',
     ]
     # Where it was before the effect, and where nothing is left after it.
-    assert max(c.statistic for c in found.where.cells) > 8.0 > max(c.statistic for c in found.left.cells)
-    assert found.left.p > 1e-4
+    assert max(c.statistic for c in found.where.cells) > 8.0 > max(c.statistic for c in found.residual.cells)
+    assert found.residual.p > 1e-4
     assert found.sentence.startswith('b is missing from the model; adding it closes the gap from')
     assert repr(found) == (
         f'<PlantDiscovery effects_found: b; gap {found.gap_before:.3g} N → {found.gap_after:.3g} N '

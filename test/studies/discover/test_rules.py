@@ -43,7 +43,7 @@ from psd_deflection.studies.discover.search.remainder import Table
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search, SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate
-from psd_deflection.studies.discover.search.trials import by_its_size
+from psd_deflection.studies.discover.search.trials import wald_chi_square
 from psd_deflection.studies.discover.search.weighing import covariance_of, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.noise import (
@@ -359,7 +359,7 @@ def test_an_effect_whose_size_may_be_none_is_not_named_whatever_is_lost_without_
     result = result_of(search, [active('a', x=0.0, y=0.0)])
     fit = dataclasses.replace(result.fit, jacobian=weaker * result.fit.jacobian)
     lost = result.null.chi2 - fit.chi2
-    assert by_its_size(plant, fit, 0) == pytest.approx(weaker**2 * lost, rel=1e-3)
+    assert wald_chi_square(plant, fit, 0) == pytest.approx(weaker**2 * lost, rel=1e-3)
     after = accepted(problem_of(search, dataclasses.replace(result, fit=fit)))
     assert bool(after.fit.effects) is named
 
@@ -368,7 +368,7 @@ def test_where_the_size_of_none_is_no_number_what_is_lost_without_it_decides() -
     endless = EffectParameter('x', 'V', -1.0, 1.0, 1e-3, '', nominal=math.inf)
     plant = Plant(pictures(A), noise())
     active = ActiveEffect(dataclasses.replace(effect('a', 'x'), parameters=(endless,)), {'x': 0.0})
-    assert by_its_size(plant, refit(plant, [active]), 0) == math.inf
+    assert wald_chi_square(plant, refit(plant, [active]), 0) == math.inf
 
 
 @pytest.mark.parametrize(('cases', 'named'), [(range(8), True), ((0, 4), False)])
@@ -574,9 +574,9 @@ def test_the_error_of_an_unseen_gain_is_the_smaller_of_two() -> None:
     fit = dataclasses.replace(fit, jacobian=np.zeros_like(fit.jacobian))
     gain = heldout_gain(plant, null, fit, np.random.default_rng(0))
     assert gain.error == pytest.approx(math.sqrt(2.0 * 200.0), rel=1e-3)
-    assert gain.holds
-    assert not HeldOut(2.0, 1.0).holds
-    assert HeldOut(2.1, 1.0).holds
+    assert gain.significant
+    assert not HeldOut(2.0, 1.0).significant
+    assert HeldOut(2.1, 1.0).significant
 
 
 # The screen.
@@ -715,7 +715,7 @@ def test_a_remainder_is_unknown_from_stated_limits_on(p: float, excess: float, e
     assert bool(got) == unknown
     if unknown:
         assert got[0].explains == pytest.approx(excess / (excess + explained))
-        assert got[0].remains
+        assert got[0].unexplained
 
 
 @pytest.mark.parametrize(('gap', 'unknown'), [(0.5, False), (2.0, False), (2.01, True)])
@@ -736,7 +736,7 @@ def test_nothing_is_unknown_that_noise_alone_would_leave(gap: float, unknown: bo
 def test_one_recording_of_a_thousand_has_a_larger_gap_from_noise_alone() -> None:
     rng = np.random.default_rng(7)
     plant = Plant({}, noise())
-    above = [plant.gap([SIGMA * rng.standard_normal((6, FINE))]) > plant.most_by_noise() for _ in range(4000)]
+    above = [plant.gap([SIGMA * rng.standard_normal((6, FINE))]) > plant.noise_limit() for _ in range(4000)]
     assert 1 <= sum(above) <= 10
 
 
@@ -911,7 +911,7 @@ def test_an_experiment_separates_by_what_no_size_of_the_other_explains(monkeypat
     # A parabola, to first order.
     curve = np.polynomial.Polynomial.fit(trials, [apart(float(c)) for c in trials], 2)
     low = float(curve(curve.deriv().roots()[0].real))
-    (told,) = plan.told
+    (told,) = plan.discriminations
     assert told.separation == pytest.approx(low, rel=0.05)
     assert found.separation == pytest.approx(max(told.separation, told.reverse), rel=1e-9)
     assert planning.suggest(workspace, named, []) is None

@@ -552,14 +552,16 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None
     result = steps.SearchResult(null, fit, [0.0], [99.0], [500.0], alternatives=[[other]])
     (found,) = alternatives(problem_of(search, result, [HeldOut(9.0, 1.0)])).named
     assert found.equivalent == ()
-    assert [(r.active.effect.name, r.delta_bic, r.fit) for r in found.rivals] == [('b', loss + 3.0, other)] * is_rival
+    assert [(r.active.effect.name, r.delta_bic, r.fit) for r in found.fitted_alternatives] == [
+        ('b', loss + 3.0, other)
+    ] * is_rival
     if is_rival:
-        assert found.rivals[0].sd == pytest.approx({'x': 1.0, 'y': 1.0})
+        assert found.fitted_alternatives[0].sd == pytest.approx({'x': 1.0, 'y': 1.0})
     # One that ran into its bound is none.
     stopped = dataclasses.replace(other, at_bound=((0, 'x'), (0, 'y')))
     without = dataclasses.replace(result, alternatives=[[stopped]])
     (found,) = alternatives(problem_of(search, without, [HeldOut(9.0, 1.0)])).named
-    assert found.rivals == ()
+    assert found.fitted_alternatives == ()
 
 
 def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
@@ -591,7 +593,7 @@ def test_of_recordings_of_the_same_value_the_easier_one_is_planned(
     apart = np.array([[0.0, 40.0], [30.0, 0.0]])
     none = [[np.zeros(0)] * 2] * 2
     monkeypatch.setattr(planning, 'proposals', lambda *_: offered)
-    monkeypatch.setattr(planning, 'shown', lambda *_: ModelSums(apart, none, [np.zeros((0, 0))] * 2, 3.0))
+    monkeypatch.setattr(planning, 'expected_sums', lambda *_: ModelSums(apart, none, [np.zeros((0, 0))] * 2, 3.0))
     fits = [
         cast(Fit, SimpleNamespace(jacobian=np.zeros((5, 0)), free=(), effects=(active(name, x=0.1),))) for name in 'ab'
     ]
@@ -599,6 +601,6 @@ def test_of_recordings_of_the_same_value_the_easier_one_is_planned(
     plan = planning.plan_next(ws, fits[0], fits[1:], Limits(seconds=6.0))
     assert plan is not None
     assert plan.setting.words == taken
-    (told,) = plan.told
+    (told,) = plan.discriminations
     # The same for as long as a recording may be shows twice as much.
-    assert (told.rival, told.named, told.separation, told.reverse, told.possible) == ('b', 'a', 40.0, 30.0, 80.0)
+    assert (told.alternative, told.named, told.separation, told.reverse, told.possible) == ('b', 'a', 40.0, 30.0, 80.0)

@@ -113,7 +113,7 @@ def test_what_stands_above_the_noise_is_looked_for(
     noise = ColouredNoise(3e-15, 0.0)
     monkeypatch.setattr(module, 'loudest_peak', loudest)
     monkeypatch.setattr(module, 'coloured_noise', lambda *a: noise)
-    monkeypatch.setattr(module, 'stands_above', lambda filled, rate, f, noise: f in above)
+    monkeypatch.setattr(module, 'exceeds_noise', lambda filled, rate, f, noise: f in above)
     monkeypatch.setattr(module, 'find_stretches', stretches)
     monkeypatch.setattr(module, 'mode_in_operation', lambda filled, rate, f: driven.append(f))
     samples = 2e-6 * np.random.default_rng(4).normal(size=2000)

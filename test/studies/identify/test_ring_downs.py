@@ -131,10 +131,10 @@ def test_the_scatter_of_a_fit_is_that_of_its_slopes() -> None:
     expected = np.linalg.inv(jacobian.T @ jacobian)[:2, :2]
     np.testing.assert_allclose(fit.covariance.diagonal(), expected.diagonal(), rtol=0.02)
     left = np.concatenate([s.solved(fit.modes)[0] for s in (stretch(y) for y in both)])
-    np.testing.assert_allclose(fit.left, left)
+    np.testing.assert_allclose(fit.residual, left)
     # Least squares: along its slopes nothing is left to gain.
     along = jacobian[:, :2] / np.linalg.norm(jacobian[:, :2], axis=0)
-    assert np.max(np.abs(along.T @ fit.left)) < 1e-3 * np.linalg.norm(fit.left)
+    assert np.max(np.abs(along.T @ fit.residual)) < 1e-3 * np.linalg.norm(fit.residual)
 
 
 @pytest.mark.parametrize(('start', 'end'), [(11.2, 15.68), (23.5, 16.45), (11.5, 16.0), (22.8, 16.0)])
@@ -294,7 +294,7 @@ def test_a_small_blow_that_is_lost_in_the_mean_ends_a_stretch(split: bool, monke
     grown, _ = grow_stretch(samples, seed, fit_modes([seed], [(16.0, 0.01)]), 384, 1e-6)
     assert grown.last == 1768
     # Two modes are tried if they may take off a quarter of the squares.
-    assert asked[0] == pytest.approx(0.25 * float(np.sum(bad.left**2)), rel=1e-3)
+    assert asked[0] == pytest.approx(0.25 * float(np.sum(bad.residual**2)), rel=1e-3)
     # Not if there are three modes already.
     asked.clear()
     three = fit_modes([seed], [(16.0, 0.02), (40.0, 0.02), (90.0, 0.02)])
@@ -455,7 +455,7 @@ def test_a_mode_stays_if_it_saves_30_variances_and_4_each_stretch(monkeypatch: p
     both = [stretch(ring(t, size=s) + ring(t, 50.0, 0.01, 5e-6) + 1e-6 * rng.normal(size=800)) for s in (1e-3, -7e-4)]
     two = fit_modes(both, [(50.0, 0.01), (16.0, 0.02)])
     one = fit_modes(both, [(16.0, 0.02)])
-    saved = float(np.sum(one.left**2) - np.sum(two.left**2))
+    saved = float(np.sum(one.residual**2) - np.sum(two.residual**2))
     for factor, count in ((37.9, 1), (38.1, 2)):
         asked: list[float] = []
 
@@ -491,7 +491,7 @@ def test_a_further_mode_has_a_hundredth_of_the_loudest_and_saves_enough(
     t = times(600)
     s = stretch(ring(t, size=1e-3) + ring(t, 50.0, 0.01, size) + 1e-9 * np.random.default_rng(11).normal(size=600))
     one, two = fit_modes([s], [(16.0, 0.02)]), fit_modes([s], [(16.0, 0.02), (50.0, 0.01)])
-    variance = float(np.sum(one.left**2) - np.sum(two.left**2)) / saves
+    variance = float(np.sum(one.residual**2) - np.sum(two.residual**2)) / saves
     asked: list[float] = []
 
     def hints(stretches: Sequence[Stretch], fit: RingFit, enough: float) -> bool:
@@ -580,7 +580,7 @@ def test_the_ends_are_cut_three_times_at_most(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(module, 'trim', cut)
     kept, fit = fit_trimmed(samples, RATE, both, [(16.0, 0.02)])
     assert [(s.first, s.last) for s in kept] == [(30, 1000)]
-    assert len(fit.left) == 970
+    assert len(fit.residual) == 970
     # If nothing would be left, all is.
     kept, fit = fit_trimmed(samples, RATE, both[1:], [(16.0, 0.02)])
     assert [(s.first, s.last) for s in kept] == [(1000, 1500)]

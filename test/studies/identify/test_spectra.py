@@ -18,8 +18,8 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify.spectra import (
     ColouredNoise,
     coloured_noise,
+    exceeds_noise,
     loudest_peak,
-    stands_above,
     white_noise,
 )
 
@@ -145,7 +145,7 @@ def test_a_mode_exceeds_the_noise_at_its_frequency_25_times(frequency: float) ->
         # Half of it is white, half remembers.
         half = 0.5 * top / factor / (RATE**2 * abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2)
         noise = ColouredNoise(half, half * float(abs(1.0 - np.exp(-2j * np.pi * frequency / RATE)) ** 2))
-        assert stands_above(samples, RATE, frequency, noise) is expected
+        assert exceeds_noise(samples, RATE, frequency, noise) is expected
 
 
 def fitted_bands(samples: FloatArray, peaks: list[float], monkeypatch: pytest.MonkeyPatch) -> list[FloatArray]:

@@ -32,7 +32,7 @@ def noted() -> FloatArray:
 def told(dots: FloatArray) -> list[float]:
     mended = mend_loads(RIG, dots, noted())
     assert mended is not None
-    return [note.late for note in mended.timed]
+    return [note.delay for note in mended.timed]
 
 
 @pytest.mark.parametrize(('lost', 'share'), [(80, 0.98), (150, 0.5), (450, 0.02), (1500, 0.5)])
@@ -58,7 +58,7 @@ def test_notes_that_are_alike_late_since_their_samples_are_lost_are_mended_and_r
         after[at : at + 200] = HUNG[at - 1]
     mended = mend_loads(RIG, dots, after)
     assert mended is not None
-    assert [note.late for note in mended.notes] == pytest.approx([0.2] * 5, abs=2e-3)
+    assert [note.delay for note in mended.notes] == pytest.approx([0.2] * 5, abs=2e-3)
     assert mend_loads(RIG, dots, HUNG) is None
 
 

@@ -245,7 +245,7 @@ def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_r
     rest = quiet.copy()
     rest[2500:4000] += 20.0 * np.sin(np.arange(1500) / 40.0)[:, None]
     slow, sudden = note(2.0, 2.0, 0.5), note(2.5, 2.5)
-    rough = note(2.0, 2.0, 0.5, settled_only=True)
+    rough = note(2.0, 2.0, 0.5, rest_only=True)
     assert noted_times.without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
     found = noted_times.without_rough_motion(RIG, loads, [sudden, slow], rest)
     assert found.loads is loads
@@ -349,7 +349,7 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     late = noted_at(3000, 9500, 15000)
     found = mend_loads(RIG, dots, late)
     assert found is not None
-    assert [(n.number, n.noted, n.hung, n.took) for n in found.notes] == [(2, 9.5, 8.0, 0.0)]
+    assert [(n.number, n.annotated, n.applied, n.took) for n in found.notes] == [(2, 9.5, 8.0, 0.0)]
     assert [n.number for n in found.timed] == [1, 2, 3]
     assert found.loads == pytest.approx(noted_at(3000, 8000, 15000))
     assert between == [(0.0, 8000.0), (3000.0, 15000.0), (8000.0, 20000.0)]
@@ -398,7 +398,7 @@ def test_loads_of_a_cell_lose_their_noise_whether_times_are_mended_or_not(monkey
     found = mend_loads(RIG, dots, noisy)
     assert found is not None
     assert [m.first for m in found.measured] == [0, 1500]
-    assert [n.hung for n in found.notes] == [0.4]
+    assert [n.applied for n in found.notes] == [0.4]
 
 
 @pytest.mark.parametrize(('rate', 'width'), [(1000.0, 286), (200.0, 57), (10.0, 3), (5.0, 2)])

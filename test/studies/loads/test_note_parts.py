@@ -16,14 +16,14 @@ from psd_deflection.studies.loads import noted_times
 from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.noted_times import (
     ALIKE_S,
-    MendedNote,
+    CorrectedNote,
     ordinal,
     shifted,
 )
 
 
-def note(noted: float, hung: float, took: float = 0.0, *, settled_only: bool = False, number: int = 3) -> MendedNote:
-    return MendedNote(number, (1.5, -2.0, 0.25), noted, hung, took, settled_only)
+def note(noted: float, hung: float, took: float = 0.0, *, rest_only: bool = False, number: int = 3) -> CorrectedNote:
+    return CorrectedNote(number, (1.5, -2.0, 0.25), noted, hung, took, rest_only)
 
 
 @pytest.mark.parametrize(
@@ -44,11 +44,11 @@ def note(noted: float, hung: float, took: float = 0.0, *, settled_only: bool = F
     ],
 )
 def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_took(
-    one: MendedNote, name: str, value: float, size: float, wrong: bool
+    one: CorrectedNote, name: str, value: float, size: float, wrong: bool
 ) -> None:
     assert (one.name, one.value, one.size, one.wrong) == (name, value, size, wrong)
     assert one.where == 'load 3'
-    assert MendedNote(3, one.load, one.noted, one.hung, one.took) == one
+    assert CorrectedNote(3, one.load, one.annotated, one.applied, one.took) == one
 
 
 @pytest.mark.parametrize(
@@ -62,13 +62,13 @@ def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_
         (note(1.125, 1.0), 'was noted 0.125 s late: note it 1.000 s after the first sample, not 1.125 s'),
         (note(1.0, 1.125), 'was noted 0.125 s early: note it 1.125 s after the first sample, not 1.000 s'),
         (
-            note(1.0, 1.0, 0.5, settled_only=True),
+            note(1.0, 1.0, 0.5, rest_only=True),
             'was applied over 0.5 s: note it 1.000 s after the first sample, as a ramp until 1.500 s, not 1.000 s; '
             'here only the link at rest under it is used',
         ),
     ],
 )
-def test_a_wrong_time_is_told_in_words_and_so_is_what_to_do(one: MendedNote, words: str) -> None:
+def test_a_wrong_time_is_told_in_words_and_so_is_what_to_do(one: CorrectedNote, words: str) -> None:
     assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
 
 
@@ -323,7 +323,7 @@ def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_a
     wanted[19:] += 0.5 * np.array((-1.0, 2.0, 3.0))
     assert acted == pytest.approx(wanted, abs=1e-5)
     assert [(n.number, n.load) for n in notes] == [(1, (1.0, 0.0, 0.0)), (3, (0.0, 0.0, 3.0))]
-    assert [(n.noted, n.hung, n.took) for n in notes] == [
+    assert [(n.annotated, n.applied, n.took) for n in notes] == [
         pytest.approx((0.5, 0.3, 0.0)),
         pytest.approx((2.0, 1.8, 0.2)),
     ]

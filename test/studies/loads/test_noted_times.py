@@ -18,8 +18,8 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads.noted_times import (
     ALIKE_S,
+    CorrectedNote,
     MendedLoads,
-    MendedNote,
     mend_loads,
     ordinal,
     shifted,
@@ -85,7 +85,7 @@ def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, 
     found = mended(TURNED if turned else QUIET, noted(late))
     assert found is not None
     wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > ALIKE_S}
-    assert {n.number: n.late for n in found.notes} == pytest.approx(wrong, abs=0.002)
+    assert {n.number: n.delay for n in found.notes} == pytest.approx(wrong, abs=0.002)
     assert not found.unused.any()
     assert np.count_nonzero(np.abs(found.loads - hung()).max(axis=1) > 0.1) <= 2 * len(LEVELS)
 
@@ -118,7 +118,7 @@ def test_wiring_signs_and_units_change_no_time() -> None:
     other = QUIET[:, [1, 0, 2, 4, 3, 5]] * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
     found = mended(other, noted(LATE) * np.array([-0.102, 0.102, 0.102]))
     assert found is not None
-    assert [n.late for n in found.notes] == pytest.approx(LATE, abs=0.002)
+    assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.002)
 
 
 def test_lost_samples_change_no_time() -> None:
@@ -127,7 +127,7 @@ def test_lost_samples_change_no_time() -> None:
     read[2 * DWELL - 20 : 2 * DWELL + 20] = np.nan
     found = mended(read, noted(LATE))
     assert found is not None
-    assert [n.late for n in found.notes] == pytest.approx(LATE, abs=0.003)
+    assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.003)
 
 
 def test_a_load_applied_over_a_second_and_noted_as_a_step_is_a_ramp() -> None:
@@ -148,7 +148,7 @@ def test_motion_that_no_ramp_describes_is_left_out() -> None:
         smooth[part] = LEVELS[i - 1] + (LEVELS[i] - LEVELS[i - 1]) * (share**2 * (3.0 - 2.0 * share))[:, None]
     found = mended(volts(smooth), noted((1.0, 2.0, 1.5, 1.0, 0.5, 2.0)))
     assert found is not None
-    assert found.notes[0].settled_only
+    assert found.notes[0].rest_only
     assert found.unused[DWELL + 300]
     assert not found.unused[DWELL - 500]
     assert 'at rest' in found.notes[0].words('x.csv')
@@ -202,7 +202,7 @@ def test_a_load_between_two_samples_moves_the_link_as_one_at_that_time(moments: 
     frequency, ratio, first = 14.0, 0.02, 100
     loads = np.zeros((1000, 3))
     loads[first:, 1] = -50.0
-    note = MendedNote(1, (0.0, -50.0, 0.0), 0.1, 0.1, 0.0)
+    note = CorrectedNote(1, (0.0, -50.0, 0.0), 0.1, 0.1, 0.0)
     later = shifted(note, loads, 1e-3)
     moved = Filter(mode_coefficients(frequency, ratio, 1e-3))((loads + later([moments]))[:, 1] / -50.0)
     # The step response of an oscillator, from the time of the step on.
@@ -229,7 +229,7 @@ def test_a_late_note_beside_channels_that_are_read_after_one_another() -> None:
 def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
     loads = np.tile([0.0, -20.0, 0.0], (100, 1))
     loads[0] = 0.0
-    note = MendedNote(1, (0.0, -20.0, 0.0), 0.001, 0.001, 0.0)
+    note = CorrectedNote(1, (0.0, -20.0, 0.0), 0.001, 0.001, 0.0)
     later = shifted(note, loads, 0.001)
     # Four quarters of a sample later nothing acts in the second sample.
     assert later([4.0])[1] == pytest.approx([0.0, 20.0, 0.0])
@@ -239,7 +239,7 @@ def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
 def test_a_step_between_two_samples_has_its_time_and_turns_back_before_it_not_behind() -> None:
     """Half a sample later than sample 10: the sum over the samples is -1/2, the moment about sample 10 is 1/8."""
     loads = np.where(np.arange(20)[:, None] < 10, 0.0, [[4.0, -8.0, 2.0]])
-    later = shifted(MendedNote(1, (4.0, -8.0, 2.0), 0.01, 0.01, 0.0), loads, 1e-3)
+    later = shifted(CorrectedNote(1, (4.0, -8.0, 2.0), 0.01, 0.01, 0.0), loads, 1e-3)
     for more in (2.0, -2.0):
         changed = later([more]) / [4.0, -8.0, 2.0]
         assert changed.sum(axis=0) == pytest.approx(-0.25 * more)

@@ -23,7 +23,7 @@ from psd_deflection.studies.loads.plateaus import (
     PlateauLoads,
     WrongNote,
     all_free,
-    as_hung,
+    as_applied,
     wrong_notes,
 )
 from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, answers, noted_as, read
@@ -81,8 +81,8 @@ def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
     both[DWELL : 2 * DWELL] = (0, -30, 0)
     found = wrong_notes(RIG, QUIET, both)
     assert [n.where for n in found] == ['load 1', 'load 5']
-    assert as_hung(both, found) == pytest.approx(HELD, abs=0.1)
-    assert as_hung(both, found) is not both
+    assert as_applied(both, found) == pytest.approx(HELD, abs=0.1)
+    assert as_applied(both, found) is not both
     assert len(wrong_notes(RIG, QUIET[: 7 * DWELL], both[: 7 * DWELL])) == 2
     assert wrong_notes(RIG, QUIET[: 6 * DWELL], both[: 6 * DWELL]) == []
     assert len(wrong_notes(RIG, QUIET[: 6 * DWELL], TWICE[: 6 * DWELL])) == 1
@@ -103,7 +103,7 @@ def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
 def test_a_note_that_is_far_off_is_wrong_however_far(number: int, load: tuple[float, float, float]) -> None:
     (note,) = wrong_notes(RIG, QUIET, noted_as(number, load))
     assert note.where == f'load {number}'
-    assert note.hung == pytest.approx(LEVELS[number], abs=0.1)
+    assert note.applied == pytest.approx(LEVELS[number], abs=0.1)
     assert note.size == pytest.approx(np.abs(LEVELS[number] - load).max(), abs=0.1)
 
 
@@ -157,14 +157,14 @@ def test_beside_an_effect_what_hung_is_told_as_if_there_were_none() -> None:
     soft = read(np.repeat(LONG, DWELL, axis=0), link__youngs_modulus=0.95 * RIG.link.youngs_modulus)
     (note,) = wrong_notes(RIG, soft, long_as(p5=(40, -80, 20)))
     assert note.where == 'load 5'
-    assert note.hung == pytest.approx((40.0, -40.0, 20.0), abs=0.3)
+    assert note.applied == pytest.approx((40.0, -40.0, 20.0), abs=0.3)
 
 
 def test_lost_samples_are_no_load() -> None:
     lost = QUIET.copy()
     lost[5 * DWELL + 1000 : 5 * DWELL + 1500] = np.nan
     (note,) = wrong_notes(RIG, lost, TWICE)
-    assert note.hung == pytest.approx((40.0, -40.0, 20.0), abs=0.2)
+    assert note.applied == pytest.approx((40.0, -40.0, 20.0), abs=0.2)
     assert note.size == pytest.approx(40.0, abs=0.2)
 
 
@@ -223,7 +223,7 @@ def test_times_of_a_second_or_more_between_changes_are_listed_with_the_number_of
     loads[5049:] = (1.0, 2.0, 0.0)
     listed = plateaus.plateaus(RIG, np.zeros((9000, 6)), loads, 7)
     assert told(listed) == [(0, 1500, 0, False), (1500, 2500, 1, False), (3499, 5000, 3, False), (5049, 9000, 4, False)]
-    assert [tuple(p.noted) for p in listed] == [(0, 0, 0), (1, 0, 0), (1, 2, 3), (1, 2, 0)]
+    assert [tuple(p.annotated) for p in listed] == [(0, 0, 0), (1, 0, 0), (1, 2, 3), (1, 2, 0)]
     assert {p.recording for p in listed} == {7}
     # From the second sample on, and two that follow each other in two samples.
     loads[1:] += (5.0, 0.0, 0.0)
@@ -303,7 +303,7 @@ def seen(
 def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> None:
     found = seen({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
     assert found.sizes[:4] == pytest.approx([0.0, 5e-5, 5e-5, 1e-4])
-    assert found.noted.tolist() == SPREAD.tolist()
+    assert found.annotated.tolist() == SPREAD.tolist()
 
 
 @pytest.mark.parametrize(
@@ -325,7 +325,7 @@ def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> 
 def test_loads_that_are_off_beside_exact_ones_are_wrong_if_five_are_right(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
-    found = plateaus.stand_out(seen(more, SPREAD[:count]))
+    found = plateaus.outliers(seen(more, SPREAD[:count]))
     assert (found.gone, found.softer) == (gone, 0.0)
 
 
@@ -333,15 +333,15 @@ def test_a_detector_at_fault_and_a_movement_that_no_load_makes_are_no_wrong_note
     wrong = {6: (0.0, 1.0, 0.0)}
     # A load of 1 N moves the plate by 10 um: a twentieth of that and 0.2 um are 0.7 um.
     for far, gone in ((6.9e-7, (6,)), (-6.9e-7, (6,)), (7.1e-7, ()), (-7.1e-7, ())):
-        assert plateaus.stand_out(seen(wrong, across={6: far})).gone == gone
-    assert plateaus.stand_out(seen(wrong, across={1: 1e-3})).gone == (6,)
+        assert plateaus.outliers(seen(wrong, across={6: far})).gone == gone
+    assert plateaus.outliers(seen(wrong, across={1: 1e-3})).gone == (6,)
     # Far beyond the tolerance no plate is asked for.
-    far_off = plateaus.stand_out(seen({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
+    far_off = plateaus.outliers(seen({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
     assert (far_off.gone, far_off.softer) == ((6,), 0.0)
     # Nothing that moves is nothing to explain.
     assert not plateaus.closes(seen({}))
     for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
-        assert plateaus.stand_out(seen(wrong, left=left), bent).gone == gone
+        assert plateaus.outliers(seen(wrong, left=left), bent).gone == gone
 
 
 @pytest.mark.parametrize(
@@ -361,7 +361,7 @@ def test_beside_loads_that_are_off_by_less_than_the_tolerance_two_may_be_wrong_i
 ) -> None:
     twelve = np.vstack((SPREAD, SPREAD[1:5]))
     slightly = np.where(np.arange(count)[:, None] % 2, 0.1, -0.1) * (1.0, 0.0, 0.0)
-    assert plateaus.stand_out(seen(more, twelve[:count], everywhere=slightly)).gone == gone
+    assert plateaus.outliers(seen(more, twelve[:count], everywhere=slightly)).gone == gone
 
 
 def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fits() -> None:
@@ -373,14 +373,14 @@ def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fi
     # Without any other one, the worst that is left is one and a half times the tolerance.
     found = seen({2: (0.0, 2.5, 0.0)}, everywhere=softened)
     assert all(1.3 < left(found, k) < 1.8 for k in (1, 3, 4, 5, 6, 7))
-    assert plateaus.stand_out(found).gone == (2,)
+    assert plateaus.outliers(found).gone == (2,)
     # Without the fourth it is 1.13 times, which may come from that one if a tenth of its 3.9 is allowed.
     found = seen({3: (0.0, 6.0, 0.0)}, everywhere=softened)
     assert left(found, 4) == pytest.approx(1.13, abs=0.01)
     assert plateaus.deviation_in_tolerances(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
-    assert plateaus.stand_out(found).gone == (3,)
-    assert plateaus.stand_out(found, 0.025).gone == (3,)
-    assert plateaus.stand_out(found, 0.1).gone == ()
+    assert plateaus.outliers(found).gone == (3,)
+    assert plateaus.outliers(found, 0.025).gone == (3,)
+    assert plateaus.outliers(found, 0.1).gone == ()
 
 
 def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much() -> None:
@@ -449,7 +449,7 @@ def test_loads_of_which_none_held_were_not_rounded() -> None:
     """As those of a sweep."""
     none = np.zeros((0, 3))
     found = plateaus.PlateauLoads((), none, none.T, none.T, none[:, 0], none[:, 0], np.ones(3), 4)
-    assert found.noted.shape == (0, 3)
+    assert found.annotated.shape == (0, 3)
     assert not plateaus.may_be_rounded(found)
     assert not plateaus.all_free(found, none)
 
@@ -530,10 +530,10 @@ def test_what_hung_is_what_readings_say_without_what_effects_do(
         noted[k] = load
     slopes = share * np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
     asked = world(SPREAD, noted, slopes, offset, bend)
-    found = plateaus.noted_wrong(np.repeat(noted, DWELL, axis=0), 1e-3, asked)
+    found = plateaus.wrong_notes_against(np.repeat(noted, DWELL, axis=0), 1e-3, asked)
     assert [n.plateau.number for n in found] == sorted(wrong)
     for one in found:
-        assert one.hung == pytest.approx(SPREAD[one.plateau.number], abs=0.05)
+        assert one.applied == pytest.approx(SPREAD[one.plateau.number], abs=0.05)
         assert one.period == 1e-3
 
 
@@ -549,8 +549,8 @@ def test_a_load_that_is_off_by_two_newtons_and_a_tenth_is_simulated_as_the_readi
         asked_with.append(acting[5 * DWELL + 5].tolist())
         return inner(acting)
 
-    (note,) = plateaus.noted_wrong(np.repeat(SPREAD, DWELL, axis=0), 1e-3, asked)
-    assert note.hung == pytest.approx(truth[5])
+    (note,) = plateaus.wrong_notes_against(np.repeat(SPREAD, DWELL, axis=0), 1e-3, asked)
+    assert note.applied == pytest.approx(truth[5])
     assert asked_with[:2] == [[40.0, -40.0, 20.0], [0.0, 0.0, 0.0]]
     assert asked_with[2] == pytest.approx(truth[5] if far else [40.0, -40.0, 20.0])
 
@@ -566,7 +566,7 @@ def test_readings_are_held_against_the_simulation_in_fine_means_of_what_is_there
         held.append((difference, count, samples, size))
         return seen({}, SPREAD[:0])
 
-    monkeypatch.setattr(plateaus, 'asked_for', asked_for)
+    monkeypatch.setattr(plateaus, 'implied_loads', asked_for)
     loads = np.tile((1.0, -5.0, 2.0), (400, 1))
     for rate, size in ((1000.0, 4), (625.0, 2), (200.0, 1), (100.0, 1)):
         rig = load_rig(overrides={'converter.sample_rate_hz': rate})
@@ -591,10 +591,12 @@ def test_each_round_allows_the_others_less(monkeypatch: pytest.MonkeyPatch) -> N
         allowed.append(bent)
         return plateaus.StandingOut((5,))
 
-    monkeypatch.setattr(plateaus, 'stand_out', stand_out)
+    monkeypatch.setattr(plateaus, 'outliers', stand_out)
     truth = SPREAD + np.where(np.arange(8)[:, None] == 5, 3.0, 0.0)
-    (note,) = plateaus.noted_wrong(np.repeat(SPREAD, DWELL, axis=0), 1e-3, world(truth, SPREAD, np.zeros((3, 3))))
-    assert note.hung == pytest.approx(truth[5])
+    (note,) = plateaus.wrong_notes_against(
+        np.repeat(SPREAD, DWELL, axis=0), 1e-3, world(truth, SPREAD, np.zeros((3, 3)))
+    )
+    assert note.applied == pytest.approx(truth[5])
     # A tenth, a fiftieth, nothing.
     assert allowed == pytest.approx([0.1, 0.02, 0.0, 0.0, 0.0])
 
@@ -612,9 +614,9 @@ def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -
     # A seventh of a newton: 0.15 of three times 0.3.
     for size, asks in ((0.134, 1), (EXACT * STANDS_OUT * TOLERANCE, 3), (0.136, 3)):
         asked_with.clear()
-        assert plateaus.noted_wrong(loads, 1e-3, of_size(size)) == []
+        assert plateaus.wrong_notes_against(loads, 1e-3, of_size(size)) == []
         assert len(asked_with) == asks
-    assert plateaus.noted_wrong(loads, 1e-3, lambda acting: seen({}, SPREAD[:0])) == []
+    assert plateaus.wrong_notes_against(loads, 1e-3, lambda acting: seen({}, SPREAD[:0])) == []
 
 
 ONE_TORQUE = np.array(
@@ -628,14 +630,14 @@ def test_the_only_torque_is_accused_if_its_change_was_noted_twice() -> None:
     more = HUNG_ONCE - ONE_TORQUE[4]
     for allowed in ((0.0, 0.0, 0.0), (1.0, -1.5, 1.5)):
         off = tuple((more + allowed).tolist())
-        assert plateaus.stand_out(seen({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
+        assert plateaus.outliers(seen({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
     # Another torque, and half of the torque alone: another unit or stiffness may make that.
-    assert plateaus.stand_out(seen({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
-    assert plateaus.stand_out(seen({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
+    assert plateaus.outliers(seen({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
+    assert plateaus.outliers(seen({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
     # The first load that was hung: half of it may be another unit, too.
     first = ONE_TORQUE.copy()
     first[3] = 0.0
-    assert plateaus.stand_out(seen({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
+    assert plateaus.outliers(seen({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
 
 
 def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> None:
@@ -648,17 +650,17 @@ def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> No
         hung = ONE_TORQUE + listed.more
         return replace(listed, more=hung - held)
 
-    (note,) = plateaus.noted_wrong(noted, 1e-3, asked)
+    (note,) = plateaus.wrong_notes_against(noted, 1e-3, asked)
     assert note.exact
-    assert note.hung.tolist() == HUNG_ONCE.tolist()
+    assert note.applied.tolist() == HUNG_ONCE.tolist()
     assert note.where == 'load 4'
     # One that others are like is what the readings say.
     other = seen({3: (0.0, 5.0, 0.0)}, ONE_TORQUE)
-    (free,) = plateaus.noted_wrong(
+    (free,) = plateaus.wrong_notes_against(
         noted, 1e-3, lambda acting: replace(other, more=ONE_TORQUE + other.more - acting[DWELL // 2 :: DWELL])
     )
     assert not free.exact
-    assert free.hung == pytest.approx((24.0, -35.0, 0.0))
+    assert free.applied == pytest.approx((24.0, -35.0, 0.0))
 
 
 def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -668,6 +670,6 @@ def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> 
         periods.append(period)
         return []
 
-    monkeypatch.setattr(plateaus, 'noted_wrong', noted)
+    monkeypatch.setattr(plateaus, 'wrong_notes_against', noted)
     wrong_notes(load_rig(overrides={'converter.sample_rate_hz': 200.0}), np.zeros((100, 6)), np.zeros((100, 3)))
     assert periods == pytest.approx([0.005])

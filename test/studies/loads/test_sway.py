@@ -15,8 +15,8 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads import sway
-from psd_deflection.studies.loads.plateaus import Plateau, asked_beside_rig, plateaus
-from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
+from psd_deflection.studies.loads.plateaus import Plateau, implied_beside_rig, plateaus
+from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swaying_loads
 from test.studies.held_loads import DWELL, HELD, RIG, T, answers, read
 
 
@@ -64,7 +64,7 @@ def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: flo
 
 
 def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
-    asked, noted = asked_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, noted=True)
+    asked, noted = implied_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, noted=True)
     cut = 3 * DWELL + 1200
     pieces = [
         *noted[:3],
@@ -102,7 +102,7 @@ def test_the_time_is_left_out_until_the_link_has_come_to_rest() -> None:
     volts = np.zeros((9000, 6))
     swayed = [SwayingLoad(Plateau(0, 2000, 5000, 1, False, np.zeros(3)), 1.0, 1.0, 1e-3)]
     rest = round(5.0 / (2.0 * math.pi * 10.0 * 0.05) / 1e-3)
-    gone = np.flatnonzero(np.isnan(left_out(rig, volts, swayed)).all(axis=1))
+    gone = np.flatnonzero(np.isnan(excluded(rig, volts, swayed)).all(axis=1))
     assert gone.tolist() == list(range(2000, 5000 + rest))
     assert not volts.any()
 

@@ -57,13 +57,13 @@ def test_clocks_that_count_from_different_days() -> None:
     run = seen(7)
     found = clock_offset(motion_of(run), run.stamps + 1.7e9, run.poses, exposure=0.008)
     assert found.value == pytest.approx(run.offset - 1.7e9, abs=0.3e-3)
-    assert found.told
+    assert found.determined
 
 
 def test_a_link_at_rest_tells_nothing() -> None:
     run = seen(8, steps=())
     found = clock_offset(motion_of(run), run.stamps, run.poses)
-    assert not found.told
+    assert not found.determined
     assert 'moves too little' in found.sentence
 
 
@@ -76,6 +76,6 @@ def test_a_motion_that_repeats_has_rivals() -> None:
     at = run.stamps + run.offset
     poses = np.column_stack([1e-3 * np.sin(2 * np.pi * 5.0 * at), np.zeros((len(at), 2))]) + noise
     found = clock_offset(motion, at, poses)
-    assert not found.told
+    assert not found.determined
     assert any(abs(abs(r - found.value) - 0.2) < 2e-3 for r in found.rivals)
     assert 'repeats itself' in found.sentence

@@ -322,7 +322,7 @@ def test_step_and_deviations_are_those_of_dense_least_squares(outliers: int, sti
         sizes[axis] = median_abs_deviation(left[:, axis], scale='normal')
         columns[rows, axis * causes.shape[1] : (axis + 1) * causes.shape[1]] = causes
         does[rows] = rates[:, moving] @ terms[1:]
-    np.testing.assert_allclose(fit.left, left, atol=1e-9)
+    np.testing.assert_allclose(fit.residual, left, atol=1e-9)
     np.testing.assert_allclose(fit.sizes, sizes, rtol=1e-3)
     tukey = np.where(np.abs(left / sizes) < 4.685, (1.0 - (left / sizes / 4.685) ** 2) ** 2, 0.0)
     np.testing.assert_allclose(weights, tukey, atol=1e-3)
@@ -393,7 +393,7 @@ def test_what_is_ten_rivals_above_the_best_is_not_finished(
         second = refined_offset(motion, at, poses, 0.03, 0.0, None)
     assert second is not None
     sizes = 0.5 * second.sizes
-    level = sum(biweight(u) for u in (second.left / sizes).ravel()) - above
+    level = sum(biweight(u) for u in (second.residual / sizes).ravel()) - above
     even = brentq(lambda u: 180.0 * biweight(u) - level, 0.0, 4.6)
     best = OffsetFit(0.0, 1e-3, 0.0, 0.0, even * np.resize(sizes, (60, 3)), sizes)
     passes = []

@@ -59,7 +59,7 @@ def test_the_offset_is_removed_if_asked(problem: ValidateProblem) -> None:
     assert found.reference.tolist() == problem.reference.tolist()
     assert [a.bias for a in found.agreements['exact']] == pytest.approx([0.1, -0.2, 0.3], abs=2e-3)
     assert [a.noise for a in found.agreements['exact']] == pytest.approx(NOISE.std(axis=0).tolist(), rel=0.1)
-    assert found.left_out == 0
+    assert found.excluded == 0
     assert np.isnan(found.covered).all()
     assert found.problem is problem
 
@@ -67,7 +67,7 @@ def test_the_offset_is_removed_if_asked(problem: ValidateProblem) -> None:
 def test_an_offset_that_is_not_told_is_not_removed(problem: ValidateProblem) -> None:
     noise = np.random.default_rng(1).normal(0.0, 1.0, (90, 3))
     found = validate(replace(problem, reference=noise))
-    assert not found.offset.told
+    assert not found.offset.determined
     assert not found.applied
     assert found.t.tolist() == problem.t.tolist()
 
@@ -87,7 +87,7 @@ def test_references_without_samples_are_left_out(problem: ValidateProblem) -> No
     reference = np.concatenate([np.zeros((7, 3)), problem.reference])
     sd = np.concatenate([np.zeros((7, 3)), np.ones((90, 3))])
     found = validate(replace(problem, t=t, reference=reference, sd=sd, align=False))
-    assert found.left_out == 7
+    assert found.excluded == 7
     assert found.t.tolist() == problem.t.tolist()
     assert found.reference.tolist() == problem.reference.tolist()
     assert found.estimates['exact'].shape == (90, 3)

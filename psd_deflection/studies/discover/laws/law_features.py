@@ -164,7 +164,7 @@ def known_fine(ws: Workspace, effects: Sequence[ActiveEffect], name: str) -> lis
     return [fine_means(known(_variables(ws, effects, i)[1], name)[None, :], size)[0] for i, size in enumerate(ws.fine)]
 
 
-def _spread(parts: Sequence[FloatArray]) -> float:
+def _deviation(parts: Sequence[FloatArray]) -> float:
     return float(np.max(np.abs(np.concatenate(parts))))
 
 
@@ -180,7 +180,7 @@ def _levels(parts: Sequence[FloatArray], count: int) -> list[float]:
 def terms(found: Sequence[Response]) -> Iterator[LawTerm]:
     """Every term that is tried, with a grid for its shapes; variables that never change are left out."""
     parts = {name: [r.known[name] for r in found] for name in found[0].known}
-    size = {name: _spread(values) for name, values in parts.items()}
+    size = {name: _deviation(values) for name, values in parts.items()}
     moving = [n for n in parts if size[n] > 0.0]
     placed = [n for n in moving if n != 'time']
     for k in (1, 2, 3):

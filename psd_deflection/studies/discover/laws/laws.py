@@ -228,7 +228,7 @@ class LawSearch:
                 break
             trial = best
         while trial.terms > 1:
-            fewer = [self.trial(laws, trial.beside, 5) for laws in one_term_fewer(trial.laws)]
+            fewer = [self.trial(laws, trial.beside, 5) for laws in subsets_without_a_term(trial.laws)]
             best = min(fewer, key=lambda t: t.cost)
             if best.cost > trial.cost + BIC_ACCEPT:
                 break
@@ -286,7 +286,7 @@ def with_term(laws: Sequence[Law], s: Scored) -> tuple[Law, ...]:
     return (*laws, law_on(s.target, s.term))
 
 
-def one_term_fewer(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
+def subsets_without_a_term(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
     """Each way to leave out one term."""
     out = []
     for gone in (t for law in laws for t in law.terms):
@@ -350,14 +350,14 @@ def _law_of_the_mean(
     enough = fit.chi2 - found.chi2 > EXPLAINS * excess and _predicts(ws, fit, left)
     enough &= not _at_changes(ws, best.laws)
     enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_ACCEPT
-    if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.holds or not enough:
+    if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.significant or not enough:
         return None
     return FoundLaw(
         best.laws[0],
         best.laws[1:],
         found,
         without,
-        channels_shown(ws, best),
+        dominant_channels(ws, best),
         tied_laws(best, [*others, *seeker.same_elsewhere(best)]),
         p,
         bic,
@@ -405,7 +405,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
         held.append(likelihood(squares[own], a + b * v2[own]) - likelihood(squares[own], flat))
     heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
     p = tried * float(chi2_law.sf(gain, 1))
-    if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.holds or slope <= 0.0:
+    if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.significant or slope <= 0.0:
         return None
     # Noise that grows with the motion explains no gap: what remains in means is a movement.
     if ws.gap(fit.difference) > MOVES * ws.floor():
@@ -474,7 +474,7 @@ def tied_laws(best: LawTrial, others: Sequence[LawTrial]) -> tuple[Law, ...]:
     return tuple(out.values())[1:]
 
 
-def channels_shown(ws: Workspace, best: LawTrial) -> tuple[str, ...]:
+def dominant_channels(ws: Workspace, best: LawTrial) -> tuple[str, ...]:
     """Where the law shows: the channels with more than a twentieth of its energy."""
     _, alone = ws.residual([*ws.base, *best.fit.nuisance, *best.beside])
     moved = ws.whiten([a - b for a, b in zip(alone, best.fit.difference, strict=True)])

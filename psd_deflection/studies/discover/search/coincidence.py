@@ -64,7 +64,7 @@ def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
     sizes = _amplitudes(fit, physics, covariance)
     out = []
     for count in (2, 3):
-        compared = [group for group in itertools.combinations(sizes, count) if _may_be_one(fit, group)]
+        compared = [group for group in itertools.combinations(sizes, count) if _may_coincide(fit, group)]
         for group in compared:
             odds = _odds(group, covariance) / len(compared)
             if odds >= ODDS:
@@ -73,7 +73,7 @@ def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
     return sorted(out, key=lambda c: -c.odds)
 
 
-def _may_be_one(fit: Fit, group: Sequence[tuple[int, float, str]]) -> bool:
+def _may_coincide(fit: Fit, group: Sequence[tuple[int, float, str]]) -> bool:
     """Whether these amplitudes are of different effects and of one unit, and no known cause ties them."""
     effects = [fit.free[column][0] for column, _, _ in group]
     # What ties two stiffnesses is known, and told by :mod:`.ties`.

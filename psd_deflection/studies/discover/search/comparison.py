@@ -108,7 +108,7 @@ class Comparison(ABC):
     def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
         """With the noise as it is with ``effects`` in the model; this one if that is the same."""
 
-    def settled_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
+    def refitted_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
         """With what is free besides the effects as ``difference`` of a fit of these asks for; this one if little is."""
         return self
 
@@ -128,7 +128,7 @@ class Comparison(ABC):
     def floor(self) -> float:
         """The gap from noise alone; NaN if nobody knows the noise."""
 
-    def most_by_noise(self) -> float:
+    def noise_limit(self) -> float:
         """The gap that noise alone exceeds in one of a thousand recordings; NaN if nobody knows the noise."""
         size = self.effective_size() * len(self.channels) / len(self.measured[0])
         return self.floor() * float(np.sqrt(chi2_law.isf(EXCEEDED, size) / size))
@@ -152,25 +152,25 @@ class Comparison(ABC):
 
     @property
     @abstractmethod
-    def scale_shown(self) -> tuple[float, str]:
+    def display_scale(self) -> tuple[float, str]:
         """By what a gap is multiplied for people, and the unit that it has then."""
 
     @property
     @abstractmethod
-    def units_shown(self) -> tuple[str, ...]:
-        """Of the rows of ``shown``."""
+    def display_units(self) -> tuple[str, ...]:
+        """Of the rows of ``displayed``."""
 
     @abstractmethod
-    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+    def displayed(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
         """A residual by ``channels``, as the gap counts it, for pictures; NaN where nothing was measured."""
 
     @abstractmethod
     def along(self) -> tuple[str | TimeAxis, list[FloatArray]]:
-        """The time of what is ``shown``, or the number of the reading."""
+        """The time of what is ``displayed``, or the number of the reading."""
 
     @abstractmethod
     def against(self) -> dict[str, list[FloatArray]]:
-        """What else ``shown`` may be held against in a picture, by name with unit."""
+        """What else ``displayed`` may be held against in a picture, by name with unit."""
 
     @abstractmethod
     def provenance(self) -> list[dict[str, object]]:
@@ -178,7 +178,7 @@ class Comparison(ABC):
 
     def worded(self, size: float, digits: str = '.3g') -> str:
         """A gap with its unit, for people."""
-        scale, unit = self.scale_shown
+        scale, unit = self.display_scale
         return f'{scale * size:{digits}} {unit}'.rstrip() if np.isfinite(size) else 'not known'
 
     def sd(self, jacobian: FloatArray, covariance: FloatArray) -> FloatArray:

@@ -116,7 +116,7 @@ class HeldOut:
     error: float
 
     @property
-    def holds(self) -> bool:
+    def significant(self) -> bool:
         """Whether the gain exceeds two standard errors."""
         return self.gain > 2.0 * self.error
 

@@ -63,18 +63,18 @@ class PredictingTerm:
 class Predictive:
     """``effects``: the model that predicts best, nuisance first. ``terms``: beyond the named effects, the largest
     first. ``unseen``: the gap on cases for which terms and sizes were chosen without them; ``unseen_named``: that of
-    the named effects, refitted without them. ``remains``: whether the difference is beyond chance.
+    the named effects, refitted without them. ``unexplained``: whether the difference is beyond chance.
     """
 
     effects: tuple[ActiveEffect, ...]
     terms: tuple[PredictingTerm, ...]
     unseen: float
     unseen_named: float
-    remains: bool
+    unexplained: bool
 
     def tree(self) -> dict[str, Any] | None:
         """As result.json has it; None if nothing remains."""
-        if not self.remains:
+        if not self.unexplained:
             return None
         terms = [{'name': t.name, 'value': t.value, 'unit': t.unit, 'weight': t.weight} for t in self.terms]
         return {'terms': terms, 'unseen': self.unseen, 'unseen_named': self.unseen_named, 'nested': True}
@@ -145,7 +145,7 @@ class _Library:
 
 def _library(ws: Comparison, fit: Fit, screen: Screen) -> tuple[_Library, FloatArray]:
     """What may take part, and the numbers of ``fit``."""
-    effects, places, x = list(fit.whole), list[_Number](), list[float]()
+    effects, places, x = list(fit.coefficients_with_nuisance), list[_Number](), list[float]()
     fixed = len(fit.nuisance)
 
     def add(index: int, name: str) -> None:
@@ -183,7 +183,7 @@ def _shape(candidate: Candidate) -> dict[str, float]:
 
 def _best_shapes(ws: Comparison, fit: Fit, screen: Screen) -> list[Candidate]:
     """Of each further effect whose sizes count in proportion the candidate that explains most beside ``fit``."""
-    taken = {slot(a.effect, a.values) for a in fit.whole}
+    taken = {slot(a.effect, a.values) for a in fit.coefficients_with_nuisance}
     best: dict[tuple[object, ...], Candidate] = {}
     for score in screen.score(fit.residual, unbound(fit)):
         c = score.candidate
@@ -359,7 +359,7 @@ def predictive_of(ws: Comparison, fit: Fit, screen: Screen, rng: np.random.Gener
     library, x = _library(ws, fit, screen)
     if len(library.places) == library.always or len(np.unique(ws.folds())) < 2:
         return None
-    named = np.arange(len(x)) < len(x) - sum(p.index >= len(fit.whole) for p in library.places)
+    named = np.arange(len(x)) < len(x) - sum(p.index >= len(fit.coefficients_with_nuisance) for p in library.places)
     start = x
     line = _line(library, x, named)
     weights = np.zeros(len(x))

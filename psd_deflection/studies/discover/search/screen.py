@@ -53,7 +53,7 @@ def promising(scores: Sequence[Score], penalty: float, share: float, limit: int)
     return out
 
 
-def solve_seen(fisher: FloatArray, score: FloatArray, original: FloatArray) -> tuple[float, int, FloatArray]:
+def solve_observable(fisher: FloatArray, score: FloatArray, original: FloatArray) -> tuple[float, int, FloatArray]:
     """Gain, rank and coefficients of F c = g, without directions that cannot be seen.
 
     ``original`` (k,): squared lengths of the columns before projection.
@@ -117,7 +117,7 @@ class Screen:
         count = len(self.candidates)
         out = []
         for candidate, s in zip(self.candidates, self.slices, strict=True):
-            gain, dof, c = solve_seen(fisher[s, s], g[s], self.lengths[s])
+            gain, dof, c = solve_observable(fisher[s, s], g[s], self.lengths[s])
             if candidate.one_sided and dof and c[0] < 0.0:
                 gain = 0.0
             p = -np.expm1(count * np.log1p(-min(float(chi2.sf(gain, max(dof, 1))), 1.0 - 1e-16)))
@@ -140,7 +140,7 @@ class Screen:
         for a, b in itertools.combinations(best.values(), 2):
             sa, sb = where[id(a.candidate)], where[id(b.candidate)]
             index = np.r_[sa, sb]
-            gain, dof, c = solve_seen(fisher[np.ix_(index, index)], g[index], self.lengths[index])
+            gain, dof, c = solve_observable(fisher[np.ix_(index, index)], g[index], self.lengths[index])
             na = sa.stop - sa.start
             if (a.candidate.one_sided and c[0] < 0.0) or (b.candidate.one_sided and c[na] < 0.0):
                 continue

@@ -27,12 +27,12 @@ from psd_deflection.studies.discover.search.trials import (
     NEAR,
     STANDS_IN,
     Trials,
-    by_its_size,
     counted,
     far,
     key_of,
     slot,
     unbound,
+    wald_chi_square,
 )
 
 ROUNDS = 3
@@ -87,14 +87,14 @@ class Search(Trials):
         """What :meth:`run` gives beside itself; it changes this search."""
         scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
-        null, grown = self._settled(null, mistake(self, null, scores) if begun is None else begun)
+        null, grown = self._refitted(null, mistake(self, null, scores) if begun is None else begun)
         grown = self._without_weak(grown)
         current, others = self.swap(null, grown)
         if self._much_closer(grown, current):
             # Beside the wrong effect nothing held that holds beside the right one; what that cost is not counted.
             self._begun = self.workspace.simulations
             self._screen_anew(current)
-            null, more = self._settled(null, current)
+            null, more = self._refitted(null, current)
             more = self._without_weak(more)
             if len(more.effects) > len(current.effects):
                 current, others = self.swap(null, more)
@@ -102,7 +102,7 @@ class Search(Trials):
         limits = self._limits(current)
         return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace, limits)
 
-    def _settled(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
+    def _refitted(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
         """The fit of no effect, and ``current`` with all that passes, beside the noise that is estimated then."""
         for _ in range(ROUNDS):
             null, current = self._grown(null, current)
@@ -124,11 +124,11 @@ class Search(Trials):
         """
         while len(current.effects) > 1 and not self.workspace.open_level:
             left = current.chi2 - self.workspace.size
-            sizes = [by_its_size(self.workspace, current, i) for i in range(len(current.effects))]
+            sizes = [wald_chi_square(self.workspace, current, i) for i in range(len(current.effects))]
             weakest = int(np.argmin(sizes))
             if left <= NEAR * self.workspace.size or sizes[weakest] >= left:
                 break
-            self.say(f'{current.effects[weakest].label} explains less than what remains')
+            self.log(f'{current.effects[weakest].label} explains less than what remains')
             rest = [a for i, a in enumerate(current.effects) if i != weakest]
             current = refit(self.workspace, rest, iterations=6)
         return current
@@ -161,7 +161,7 @@ class Search(Trials):
                 better = self._added(null, current)
             if better is None:
                 break
-            null, current = self.settle(null, better)
+            null, current = self.refit(null, better)
             if not renoised or self.workspace.open_level:
                 renoised = True
                 current = self.renoise(current)
@@ -202,8 +202,8 @@ class Search(Trials):
         better = self.further(current, scores)
         passes = better is not None and self.passes(current, better, null)
         if better is not None and passes:
-            if not self.stands_in(current, better):
-                self.say('adding ' + better.effects[-1].label)
+            if not self.is_substitute(current, better):
+                self.log('adding ' + better.effects[-1].label)
                 return better
             self._stopped = (
                 f'{better.effects[-1].effect.name} beside {counted(current)} explains less than '
@@ -214,7 +214,7 @@ class Search(Trials):
             return None
         better = self._try_pairs(null, current)
         holds = better is not current and self.passes(current, better, null)
-        return better if holds and not self.stands_in(current, better) else None
+        return better if holds and not self.is_substitute(current, better) else None
 
     def _chosen_anew(self, current: Fit, screened: Sequence[Score], least: float) -> Fit | None:
         """``current`` with another choice of one of its effects, another axis of the clamp, if that is the better one.
@@ -235,7 +235,7 @@ class Search(Trials):
                 best = min(best, refit(self.workspace, [*rest, moved], iterations=8), key=self.bic)
         if self.bic(best) > self.bic(current) - BIC_ACCEPT:
             return None
-        self.say(f'choosing {best.effects[-1].label}')
+        self.log(f'choosing {best.effects[-1].label}')
         return best
 
     def swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
@@ -252,7 +252,7 @@ class Search(Trials):
             spent = self.spent > 1.5 * self.budget_of(current)
             if swaps == 2 or spent or self.bic(best) > self.bic(current) - 2.0:
                 break
-            self.say('swapping to ' + ', '.join(a.label for a in best.effects))
+            self.log('swapping to ' + ', '.join(a.label for a in best.effects))
             current = refit(self.workspace, best.effects, iterations=8)
             current = self._drop(null, current)
         return current, others
@@ -275,7 +275,7 @@ class Search(Trials):
                 )
         best = self.best_of(starts, 2, 8)
         if best is not None and self.bic(best) < self.bic(current) - 2.0:
-            self.say('a better pair: ' + ', '.join(a.label for a in best.effects))
+            self.log('a better pair: ' + ', '.join(a.label for a in best.effects))
             return best
         return current
 
@@ -284,7 +284,7 @@ class Search(Trials):
             best = min(self.without_each(current, null), key=self.bic)
             if self.passes(best, current, null):
                 break
-            self.say('dropping to ' + ', '.join(a.label for a in best.effects))
+            self.log('dropping to ' + ', '.join(a.label for a in best.effects))
             current = best
         return current
 

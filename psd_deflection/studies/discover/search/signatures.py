@@ -148,7 +148,7 @@ def signature_columns(
 
 def signatures_beside(workspace: Comparison, listed: Iterable[Candidate], fit: Fit) -> list[tuple[Candidate, Columns]]:
     """The signatures of the candidates beside what ``fit`` has already."""
-    beside = [*workspace.base, *fit.whole]
+    beside = [*workspace.base, *fit.coefficients_with_nuisance]
     now = workspace.simulate(beside)
     return [(c, signature_columns(c, workspace, now, beside)) for c in listed]
 

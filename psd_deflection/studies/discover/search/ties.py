@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from psd_deflection.model.simulation.declaration import MOVES_FREQUENCY
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival
+from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect
 
 SAME = 3.0
 """Standard deviations of their difference up to which two shares count as the same."""
@@ -87,7 +87,7 @@ class _Share(NamedTuple):
 def _shares(effects: Sequence[NamedEffect]) -> Iterator[_Share]:
     """The changes of stiffnesses, wherever they are named or a rival."""
     for named in effects:
-        either: tuple[NamedEffect | Rival, ...] = (named, *named.rivals)
+        either: tuple[NamedEffect | Alternative, ...] = (named, *named.fitted_alternatives)
         for e in either:
             effect = e.active.effect
             if MOVES_FREQUENCY not in effect.parameters:

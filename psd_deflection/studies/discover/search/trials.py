@@ -67,7 +67,7 @@ def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
     return not on
 
 
-def by_its_size(workspace: Comparison, fit: Fit, index: int) -> float:
+def wald_chi_square(workspace: Comparison, fit: Fit, index: int) -> float:
     """Chi-square by which the size of effect ``index`` of ``fit`` is another than none, by its own covariance.
 
     Infinite if the size of none is no number. What is free beside it may take its place; a refit
@@ -160,7 +160,7 @@ class Trials:
             kept = self.dropped[id(fit)] = (fit, fits)
         return kept[1]
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """Keep a step of the search, with the simulations so far, and tell it."""
         self.trace.append(f'{text} [{self.workspace.simulations}]')
         self._progress(text)
@@ -220,7 +220,7 @@ class Trials:
         more = self.penalty * (larger.parameters - smaller.parameters)
         return gain - more > BIC_ACCEPT
 
-    def stands_in(self, smaller: Fit, larger: Fit) -> bool:
+    def is_substitute(self, smaller: Fit, larger: Fit) -> bool:
         """Whether what ``larger`` adds only stands in for something that the library lacks."""
         size = self.workspace.size
         if not smaller.effects or self.workspace.open_level or larger.chi2 <= (1.0 + NEAR) * size:
@@ -243,7 +243,7 @@ class Trials:
 
     def renoise(self, fit: Fit) -> Fit:
         """Estimate the noise again, now that most of the discrepancy is explained; refit if it differs."""
-        renoised = self.workspace.renoised([*self.workspace.base, *fit.whole])
+        renoised = self.workspace.renoised([*self.workspace.base, *fit.coefficients_with_nuisance])
         if renoised is self.workspace:
             return fit
         self.workspace = renoised
@@ -254,9 +254,9 @@ class Trials:
         self.screen = self.screen_beside(fit)
         return fit
 
-    def settle(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
+    def refit(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
         """Both fits again, with free loads and times as ``fit`` asks for: else a small effect stands in for these."""
-        settled = self.workspace.settled_beside(fit.difference, fit.whole)
+        settled = self.workspace.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
         if settled is self.workspace:
             return null, fit
         better = refit(settled, fit.effects, iterations=6)

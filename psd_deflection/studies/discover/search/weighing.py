@@ -44,7 +44,7 @@ RIVAL_BIC = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rival:
+class Alternative:
     """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better.
     ``fit``: the whole model with it.
     """
@@ -59,7 +59,7 @@ class Rival:
 class NamedEffect:
     """One effect of the answer. ``sd``: per fitted parameter. ``alternatives``: (name, loss in
     chi-square, difference of BIC), the closest first; ``equivalent``: those that this data cannot exclude;
-    ``rivals``: those and what else comes close in BIC.
+    ``fitted_alternatives``: those and what else comes close in BIC.
     """
 
     active: ActiveEffect
@@ -68,7 +68,7 @@ class NamedEffect:
     delta_bic: float
     heldout: HeldOut
     equivalent: tuple[str, ...]
-    rivals: tuple[Rival, ...]
+    fitted_alternatives: tuple[Alternative, ...]
     alternatives: tuple[tuple[str, float, float], ...]
     suggestion: Suggestion | None
 
@@ -86,14 +86,14 @@ class NamedEffect:
 @dataclass(frozen=True, slots=True)
 class Unknown:
     """A discrepancy that no effect explains, or only several tied effects: ``signature`` in words,
-    ``explains``: its fraction of the gap's energy. ``remains``: whether it is still present with all effects added.
+    ``explains``: its fraction of the gap's energy. ``unexplained``: whether it is still present with all effects added.
     ``rms``: its size, as the gap counts it, without noise.
     """
 
     signature: str
     depends_on: tuple[str, ...]
     explains: float
-    remains: bool = True
+    unexplained: bool = True
     rms: float = 0.0
 
 
@@ -244,7 +244,7 @@ def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Lo
     )
     names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < 1e-3))
     share = sum(result.delta_chi2[i] for i, _ in tie.members) / max(result.null.chi2 - fit.chi2, 1e-300)
-    return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), remains=False),)
+    return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), unexplained=False),)
 
 
 def _even(regressor: str) -> bool:

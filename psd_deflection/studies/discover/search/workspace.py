@@ -171,7 +171,7 @@ class Workspace(Comparison):
         parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
         return np.concatenate(parts)
 
-    def freed(self, directions: Sequence[Direction], effects: Sequence[ActiveEffect] = ()) -> Self:
+    def with_free(self, directions: Sequence[Direction], effects: Sequence[ActiveEffect] = ()) -> Self:
         """With what ``directions`` say free; loads are simulated beside ``effects``."""
         if not directions:
             return self
@@ -237,21 +237,21 @@ class Workspace(Comparison):
         """Whether a load or its time is free."""
         return any(isinstance(d, LoadDirection) for d in self.directions)
 
-    def settled(self, difference: Sequence[FloatArray]) -> Self:
+    def refitted(self, difference: Sequence[FloatArray]) -> Self:
         """With the free loads as the ``difference`` of a fit, measured minus simulated, asks for."""
         if self.free is None or not self.free_loads:
             return self
-        more = self._asked(self.free, difference)
+        more = self._implied_loads(self.free, difference)
         return self.with_loads(more).replaced(free=dataclasses.replace(self.free, directions=moved(more)))
 
-    def settled_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
+    def refitted_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
         """The same, with what one more of each does beside the ``effects``, if more than noise is left to settle."""
         if self.free is None or not self.free_loads or self.gap(difference) <= UNSETTLED * self.floor():
             return self
-        more = self._asked(self.free, difference)
-        return self.with_loads(more).freed(moved(more), effects)
+        more = self._implied_loads(self.free, difference)
+        return self.with_loads(more).with_free(moved(more), effects)
 
-    def _asked(self, free: Free, difference: Sequence[FloatArray]) -> list[tuple[Direction, float]]:
+    def _implied_loads(self, free: Free, difference: Sequence[FloatArray]) -> list[tuple[Direction, float]]:
         sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * (free.rows @ self._white(difference)))
         return list(zip(free.directions, sizes.tolist(), strict=True))
 
@@ -339,16 +339,16 @@ class Workspace(Comparison):
         return 'm'
 
     @property
-    def scale_shown(self) -> tuple[float, str]:
+    def display_scale(self) -> tuple[float, str]:
         """Micrometres."""
         return 1e6, 'µm'
 
     @property
-    def units_shown(self) -> tuple[str, ...]:
+    def display_units(self) -> tuple[str, ...]:
         """Micrometres."""
         return ('µm',) * len(self.channels)
 
-    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+    def displayed(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
         """Block means of the dots (2P, blocks), µm."""
         return [1e6 * d for d in self.block_dots(tables)]
 

@@ -186,7 +186,7 @@ def _filled(values: FloatArray, there: BoolArray) -> FloatArray:
     return np.interp(at, at[there], values[there])
 
 
-def _kept(there: BoolArray, upper: BoolArray) -> float:
+def _power_share(there: BoolArray, upper: BoolArray) -> float:
     """Share of the power of white noise that straight lines across the missing samples leave at ``upper`` frequencies.
 
     Measured on white noise of a fixed seed.
@@ -244,7 +244,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
     for c in range(channels):
         there = np.isfinite(residual[:, c])
         filled = _filled(residual[:, c], there)
-        power = np.abs(np.fft.rfft(filled * np.hanning(n))) ** 2 / (0.375 * n) / _kept(there, upper)
+        power = np.abs(np.fft.rfft(filled * np.hanning(n))) ** 2 / (0.375 * n) / _power_share(there, upper)
         level = _level(power[upper])
         floor = float(floors[c])
         white = max(np.sqrt(level), floor)

@@ -192,14 +192,14 @@ def wire(
     if unit_findings(sizes)[0]:
         # kg mm and N cm are 2 % apart, and a large movement is not in proportion to its load.
         sizes = np.abs(sizes) * _over_simulated(
-            [_mended(o, lines, crossed, np.nan_to_num(sizes, nan=1.0)) for o in observations], base
+            [_corrected(o, lines, crossed, np.nan_to_num(sizes, nan=1.0)) for o in observations], base
         )
     units, factors = unit_findings(sizes, plain / left)
     findings += units
     loads = loads * factors
     if not findings:
         return list(observations), [], {}
-    return [_mended(o, lines, crossed, loads) for o in observations], findings, lines
+    return [_corrected(o, lines, crossed, loads) for o in observations], findings, lines
 
 
 def noise_energy(observations: Sequence[Observation]) -> float:
@@ -222,7 +222,7 @@ def _words(wiring: Wiring, file: Wiring, sizes: FloatArray) -> str:
     return ' and '.join(out) or 'as the rig file says'
 
 
-def _mended(o: Observation, lines: dict[str, object], crossed: tuple[int, ...], loads: FloatArray) -> Observation:
+def _corrected(o: Observation, lines: dict[str, object], crossed: tuple[int, ...], loads: FloatArray) -> Observation:
     rig, volts = o.rig, o.volts
     if lines or crossed:
         rig = replace_values(o.rig, lines)
@@ -279,7 +279,9 @@ def likely_jumps(workspace: Workspace, residual: FloatArray) -> list[tuple[int, 
     return out
 
 
-def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[list[Finding], dict[str, object]]:
+def finding_of_effect(
+    workspace: Workspace, fit: Fit, index: int, evidence: float
+) -> tuple[list[Finding], dict[str, object]]:
     """Effect ``index`` of ``fit``, a mistake of the set-up, in words, and the lines for the rig file."""
     active = fit.effects[index]
     v, rig = active.values, workspace.observations[0].rig
