@@ -114,10 +114,10 @@ class Board(Target):
         rotation, place = self.first_pose(plane, lens.rays(pixels))
         rotation, place, _, _ = _fitted(points, pixels, lens, rotation, place)
         pixels, shared_blur = self._refined(image, points, pixels, lens, rotation, place)
-        kept = np.isfinite(pixels[:, 0])
-        if kept.sum() < max(LEAST_CORNERS, 0.6 * len(points)):
+        finite = np.isfinite(pixels[:, 0])
+        if finite.sum() < max(LEAST_CORNERS, 0.6 * len(points)):
             raise NoPoseError(Status.MISFIT)
-        plane, points, pixels = plane[kept], points[kept], pixels[kept]
+        plane, points, pixels = plane[finite], points[finite], pixels[finite]
         good = np.ones(len(points), dtype=bool)
         for _ in range(3):
             rotation, place, inverse, residual = _fitted(points[good], pixels[good], lens, rotation, place)
@@ -162,11 +162,11 @@ class Board(Target):
         free = self._free * lens.focal / float(place[2])
         if free < LEAST_REACH:
             raise NoPoseError(Status.SMALL)
-        found = refined(image, pixels, np.stack(edges, axis=1), 0.95 * free, self.crossings)
-        blur = np.sort(np.nanmedian(found.blur, axis=0))
+        corners = refined(image, pixels, np.stack(edges, axis=1), 0.95 * free, self.crossings)
+        blur = np.sort(np.nanmedian(corners.blur, axis=0))
         if blur[1] > MOST_BLUR * free:
             raise NoPoseError(Status.BLURRED)
-        return found.pixels, math.sqrt(max(float(blur[1] ** 2 - blur[0] ** 2), 0.0))
+        return corners.pixels, math.sqrt(max(float(blur[1] ** 2 - blur[0] ** 2), 0.0))
 
     def corners(self, grey: Any) -> tuple[FloatArray, FloatArray]:
         """Corners on the plate (n, 2) m and in the image (n, 2) px. Raises NoPoseError."""

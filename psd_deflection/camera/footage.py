@@ -69,8 +69,8 @@ def _of_camera_info(tree: Mapping[str, Any], path: Path) -> dict[str, object]:
         if not isinstance(body, dict) or 'data' not in body:
             raise ConfigError(f'{path}: {theirs}.data is missing: not a camera_info file')
         values[ours] = body['data']
-    own = {k: v for k, v in tree.items() if str(k).partition('.')[0] in {'target', 'camera', 'rest'}}
-    return values | flattened(own, str(path))
+    settings = {k: v for k, v in tree.items() if str(k).partition('.')[0] in {'target', 'camera', 'rest'}}
+    return values | flattened(settings, str(path))
 
 
 def read_settings(path: str | Path | None) -> CameraSettings:
@@ -175,10 +175,10 @@ def _listed(folder: Path) -> list[tuple[Path, int, int]]:
 def _seconds(row: Row, column: str) -> int:
     """Seconds as ns, exactly for as many decimals as there are. Raises RecordingError."""
     value = row.number(column, _MOST_SECONDS)
-    whole, point, part = row.text(column).partition('.')
-    if point and whole.lstrip('-').isdecimal() and part.isdecimal():
-        sign = -1 if whole.startswith('-') else 1
-        return sign * (abs(int(whole)) * 1_000_000_000 + int(part[:9].ljust(9, '0')))
+    seconds, point, part = row.text(column).partition('.')
+    if point and seconds.lstrip('-').isdecimal() and part.isdecimal():
+        sign = -1 if seconds.startswith('-') else 1
+        return sign * (abs(int(seconds)) * 1_000_000_000 + int(part[:9].ljust(9, '0')))
     return round(value * 1e9)
 
 
@@ -246,10 +246,10 @@ _ENCODINGS = {
 
 def of_ros_image(height: int, width: int, encoding: str, big_endian: bool, step: int, content: bytes) -> Any:
     """The grey image of a sensor_msgs/Image; None if it is of an encoding without brightness, or damaged."""
-    found = _ENCODINGS.get(encoding)
-    if found is None:
+    encoding_found = _ENCODINGS.get(encoding)
+    if encoding_found is None:
         return None
-    kind, channels, conversion = found
+    kind, channels, conversion = encoding_found
     wide = width * channels * np.dtype(kind).itemsize
     if not (
         0 < wide <= step

@@ -57,7 +57,9 @@ class Target(abc.ABC):
 
     def describe(self) -> list[str]:
         """The lines of ``CAMERA.yaml`` that describe it."""
-        lines = [f'{SETTINGS.parameters[own].name}: {_setting_words(getattr(self.settings, own))}' for own in self.own]
+        lines = [
+            f'{SETTINGS.parameters[name].name}: {_setting_words(getattr(self.settings, name))}' for name in self.own
+        ]
         return [f'target.kind: {self.kind}', *lines]
 
 

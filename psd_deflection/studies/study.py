@@ -101,9 +101,9 @@ class StudyResult(abc.ABC):
 
     def report(self) -> str:
         """The page as HTML, with its pictures inside."""
-        first, *others = self.page_sentences()
+        first, *remaining = self.page_sentences()
         body = [f'<h1>{html.escape(self.title)}</h1><p class=verdict>{html.escape(first)}</p>']
-        body += [f'<p>{html.escape(text)}</p>' for text in others]
+        body += [f'<p>{html.escape(text)}</p>' for text in remaining]
         for section in self.sections():
             body += [f'<h2>{html.escape(section.title)}</h2>'] if section.title else []
             body += map(in_page, section.parts)
@@ -124,7 +124,7 @@ class StudyResult(abc.ABC):
 
         shown = self.drawings()
         if not 0 <= number < len(shown):
-            there = '; '.join(f'{i}: {one.words}' for i, one in enumerate(shown)) or 'none, for nothing was found'
+            there = '; '.join(f'{i}: {drawn.words}' for i, drawn in enumerate(shown)) or 'none, for nothing was found'
             raise ConfigError(f'number: {number}: no such drawing; there are {there}')
         return figure_of(shown[number])
 

@@ -105,10 +105,10 @@ def certify(problem: CertificateProblem) -> Certificate:
     sights = [_situation(problem, pose) for pose in poses]
     gains = np.stack([at.estimator.response(at.pose, at.chain.zeros)[0] for at in sights])
     rows, correlations = _of_calibration(problem, poses, gains)
-    found = _as_found(problem, rows)
+    as_found = _as_found(problem, rows)
     every = (*rows, *_of_reference(problem, poses), *_since_zero(problem.inputs, sights))
     stated = tuple(_expanded(every, correlations, n) for n in range(len(poses)))
-    return Certificate(poses, every, correlations, found, stated)
+    return Certificate(poses, every, correlations, as_found, stated)
 
 
 def default_poses(tree: Mapping[str, Any]) -> list[tuple[float, float, float]]:
@@ -213,12 +213,12 @@ class Conformity(NamedTuple):
 CONFORMS, FAILS, OPEN = 'conforms', 'does not conform', 'not decided'
 
 
-def verdict_of(found: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> Conformity:
+def verdict_of(as_found: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> Conformity:
     """Guarded acceptance with a guard band of U (JCGM 106:2012, 8.3.2): |error| + U within the limit on every axis.
 
     It does not conform if |error| - U is beyond the limit on any axis.
     """
-    return Conformity(*(_judged(np.abs(error), uncertainty, limits) for error in (found, np.zeros(3))))
+    return Conformity(*(_judged(np.abs(error), uncertainty, limits) for error in (as_found, np.zeros(3))))
 
 
 def _judged(error: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> str:

@@ -53,8 +53,8 @@ class Budget:
 
         They add to 1 except for products of biases, which belong to no single line.
         """
-        whole = self.total().rms ** 2
-        return np.asarray(np.divide(line.rms**2, whole, out=np.zeros(3), where=whole > 0.0))
+        total_variance = self.total().rms ** 2
+        return np.asarray(np.divide(line.rms**2, total_variance, out=np.zeros(3), where=total_variance > 0.0))
 
 
 def evaluate(at: Situation) -> Budget:

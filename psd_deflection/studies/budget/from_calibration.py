@@ -64,9 +64,9 @@ def _check(tree: Any, path: Path) -> None:
     _check_provenance(_map(tree, 'provenance', path), path)
 
 
-def _check_range(seen: Mapping[str, Any], path: Path) -> None:
+def _check_range(calibrated_range: Mapping[str, Any], path: Path) -> None:
     for key in ('low', 'high'):
-        ends = seen.get(key)
+        ends = calibrated_range.get(key)
         if not isinstance(ends, list) or len(ends) != 3 or not all(map(_is_number, ends)):
             raise ConfigError(f'{path}: range.{key}: must be three numbers; calibrate again')
 
@@ -87,10 +87,10 @@ def _words(value: object) -> str:
 
 
 def _map(tree: Mapping[str, Any], key: str, path: Path) -> dict[str, Any]:
-    found = tree.get(key)
-    if not isinstance(found, dict):
+    value = tree.get(key)
+    if not isinstance(value, dict):
         raise ConfigError(f'{path}: {key}: not there; calibrate again with this version')
-    return found
+    return value
 
 
 def _is_number(value: object) -> bool:

@@ -163,8 +163,8 @@ INPUT_BY_NAME: Mapping[str, Input] = MappingProxyType({i.parameter.name: i for i
 
 def is_assumed(name: str, value: float) -> bool:
     """Whether ``value`` of an input is a guess: the default, whose source is an assumption."""
-    found = INPUT_BY_NAME[name]
-    return found.source.startswith('assumption') and value == found.parameter.default
+    input_quantity = INPUT_BY_NAME[name]
+    return input_quantity.source.startswith('assumption') and value == input_quantity.parameter.default
 
 
 def read_inputs(
@@ -183,11 +183,11 @@ def read_inputs(
     values = {i.parameter.name: float(i.parameter.default) for i in declared}
     for place, given in ((str(path), _read(Path(path)) if path is not None else {}), (source, settings or {})):
         for name, value in given.items():
-            found = INPUT_BY_NAME.get(str(name))
-            if found is None or found.parameter.name not in values:
+            input_quantity = INPUT_BY_NAME.get(str(name))
+            if input_quantity is None or input_quantity.parameter.name not in values:
                 hint = did_you_mean(str(name), values)
                 raise ConfigError(f'{place}: {name} = {value!r}: no such input{hint}')
-            values[str(name)] = cast(float, check_value(found.parameter, value, place))
+            values[str(name)] = cast(float, check_value(input_quantity.parameter, value, place))
     return values
 
 

@@ -101,11 +101,11 @@ class Budgeted(StudyResult):
         totals['total'] = _si(budget.total())
         if self.sampled is not None:
             totals['monte_carlo'] = _si(self.sampled)
-        said = self.budget.expanded()
+        expanded = self.budget.expanded()
         stated = {
             'probability': PROBABILITY,
-            **{name: value.tolist() for name, value in said._asdict().items()},
-            'freedom': [_or_none(value) for value in said.freedom.tolist()],
+            **{name: value.tolist() for name, value in expanded._asdict().items()},
+            'freedom': [_or_none(value) for value in expanded.freedom.tolist()],
         }
         if self.interval is not None:
             stated['monte_carlo'] = {'half': self.interval.half.tolist(), 'middle': self.interval.middle.tolist()}
@@ -174,15 +174,15 @@ class Budgeted(StudyResult):
 
     def expanded_rows(self) -> list[list[str]]:
         """u_c, nu_eff, k, U, and what the draws say."""
-        said = self.budget.expanded()
-        rows = [['', *UNITS], ['standard uncertainty u_c', *display_values(said.standard)]]
-        rows.append(['effective degrees of freedom ν_eff', *map(freedom_words, said.freedom.tolist())])
-        rows.append(['coverage factor k, 95 %', *(f'{k:.3f}' for k in said.factor.tolist())])
-        rows.append(['known bias b, not corrected', *display_values(said.bias)])
-        rows.append(['expanded uncertainty U = k u_c + |b|', *display_values(said.uncertainty)])
+        expanded = self.budget.expanded()
+        rows = [['', *UNITS], ['standard uncertainty u_c', *display_values(expanded.standard)]]
+        rows.append(['effective degrees of freedom ν_eff', *map(freedom_words, expanded.freedom.tolist())])
+        rows.append(['coverage factor k, 95 %', *(f'{k:.3f}' for k in expanded.factor.tolist())])
+        rows.append(['known bias b, not corrected', *display_values(expanded.bias)])
+        rows.append(['expanded uncertainty U = k u_c + |b|', *display_values(expanded.uncertainty)])
         if self.interval is not None:
             rows.append(['Monte Carlo: half of the 95 % interval', *display_values(self.interval.half)])
-            off = difference(said, self.interval).tolist()
+            off = difference(expanded, self.interval).tolist()
             rows.append(['k u_c beside it, %', *(f'{100.0 * v:+.1f}' for v in off)])
         return rows
 

@@ -112,12 +112,12 @@ def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
     """
     if run.loads is None:
         return run
-    mended = mend_loads(rig, usable_dots(run, rig), run.loads)
-    loads, late = (run.loads, ()) if mended is None else (mended.loads, mended.notes)
+    corrected = mend_loads(rig, usable_dots(run, rig), run.loads)
+    loads, notes = (run.loads, ()) if corrected is None else (corrected.loads, corrected.notes)
     acted = loads_that_acted(rig, run.volts, loads)
-    for note in (*late, *acted.notes):
+    for note in (*notes, *acted.notes):
         tell(note.words(run.name))
-    if mended is None and not acted.notes:
+    if corrected is None and not acted.notes:
         return run
     return replace(run, volts=acted.volts, loads=acted.loads)
 
@@ -180,5 +180,5 @@ class CalibrationOptions:
         """The answer; ``tell`` gets a warning if a load was noted late, or if the rig file cannot be edited."""
         runs = [as_acted(run, rig, tell) for run in runs]
         lit = replace_values(rig, values_of_levels(levels))
-        found = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
-        return Calibrated(found, lit, self.params_file, self.date, tell)
+        calibration = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
+        return Calibrated(calibration, lit, self.params_file, self.date, tell)

@@ -86,7 +86,7 @@ class Rows:
 
     def at(self, which: np.ndarray[tuple[int], np.dtype[np.bool_]] | IntArray) -> Rows:
         """Some of the rows."""
-        return Rows(*(getattr(self, one.name)[which] for one in fields(self)))
+        return Rows(*(getattr(self, column.name)[which] for column in fields(self)))
 
 
 @dataclass(slots=True)
@@ -181,10 +181,10 @@ def at_rest(loads: FloatArray | None, t: FloatArray) -> np.ndarray[tuple[int], n
     return out
 
 
-def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, late: float = 0.0, blocks: bool = False) -> Rows:
+def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, delay: float = 0.0, blocks: bool = False) -> Rows:
     """The rows of one recording: one for each reference, or one a block if the reference is as fast as that.
 
-    ``noise`` (4,) V. ``late``: seconds to add to the reference's times. ``blocks``: one a block, without reference.
+    ``noise`` (4,) V. ``delay``: seconds to add to the reference's times. ``blocks``: one a block, without reference.
     Raises RecordingError if there are too few.
     """
     period = float(np.median(np.diff(run.t)))
@@ -193,7 +193,7 @@ def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, late: float = 0
     if blocks or not len(run.reference_t):
         times, poses = run.t[size // 2 :: size], None
     else:
-        times, poses = run.reference_t + late, run.reference
+        times, poses = run.reference_t + delay, run.reference
     places = np.interp(times, run.t, np.arange(len(run.t)), left=-np.inf, right=np.inf)
     inside = np.isfinite(places)
     places, times = places[inside], times[inside]
@@ -271,7 +271,7 @@ def _block_means(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) ->
 
 def joined(parts: Sequence[Rows]) -> Rows:
     """All rows, each with the number of its recording."""
-    every = {one.name: np.concatenate([getattr(p, one.name) for p in parts]) for one in fields(Rows)}
+    every = {column.name: np.concatenate([getattr(p, column.name) for p in parts]) for column in fields(Rows)}
     every['run'] = np.concatenate([np.full(len(p), i) for i, p in enumerate(parts)])
     sd = every['sd']
     # Only their proportions are believed: the fit finds their size. Recordings that do not state them have no part.

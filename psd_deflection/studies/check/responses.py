@@ -58,7 +58,7 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
     shown = _simulated(rig, loads)[: n * size].reshape(n, size, 4).mean(axis=1)
     t = np.arange(n) * size * period
     design = np.column_stack((shown - shown[present].mean(axis=0), np.ones(n), t - t.mean()))[present]
-    slopes, spread, variance = least_squares_fit(design, dots[present])
+    slopes, covariance, variance = least_squares_fit(design, dots[present])
     pushes = []
     for group in load_groups(held[present], means[present], pattern(rig)):
         most = int(np.argmax(np.abs(held[present][:, group[0]])))
@@ -69,9 +69,9 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
         expected = np.sign(alone[1, group[0]]) * (after - before)
         moved = np.append(expected, (0.0, 0.0))
         names = tuple(LOADS[k] for k in group)
-        sd = np.sqrt(moved @ spread @ moved * variance)
+        sd = np.sqrt(moved @ covariance @ moved * variance)
         pushes.append(PushResponse(names, moved @ slopes, sd, expected, scales=scales_of(rig)))
-    return Responses(tuple(pushes), slopes[-1], np.sqrt(spread[-1, -1] * variance))
+    return Responses(tuple(pushes), slopes[-1], np.sqrt(covariance[-1, -1] * variance))
 
 
 def _simulated(rig: Rig, loads: FloatArray, *, settled: bool = False) -> FloatArray:

@@ -147,14 +147,14 @@ class Checkup(StudyResult):
 
     def table(self) -> Table:
         """One row a finding: ``where``, ``value`` (a number, numbers, or None), ``fix``, ``evidence``."""
-        found = self.findings
+        findings = self.findings
         return Table(
-            text_column('finding', [f.name for f in found], 'what is wrong'),
+            text_column('finding', [f.name for f in findings], 'what is wrong'),
             [
-                text_column('where', [f.where for f in found], 'channel, PSD, load, or when'),
-                text_column('value', [f.value for f in found], 'as it is'),
-                text_column('fix', [f.fix for f in found], 'what puts it right'),
-                Column('evidence', np.array([f.evidence for f in found], dtype=np.float64), '', 'for it'),
+                text_column('where', [f.where for f in findings], 'channel, PSD, load, or when'),
+                text_column('value', [f.value for f in findings], 'as it is'),
+                text_column('fix', [f.fix for f in findings], 'what puts it right'),
+                Column('evidence', np.array([f.evidence for f in findings], dtype=np.float64), '', 'for it'),
             ],
             {'verdict': self.verdict},
         )
@@ -187,11 +187,11 @@ class Checkup(StudyResult):
         }
 
 
-def push_rows(found: Checkup) -> list[list[str]]:
+def push_rows(checkup: Checkup) -> list[list[str]]:
     """How each channel answered, beside what the rig file expects of it."""
     rows = [['push', *(f'{c} µm' for c in DOTS), '', *DOTS, 'size']]
-    for push, size in zip(found.pushes, found.sizes, strict=True):
-        expected = on_channels(Wiring.from_rig(found.rig), push.expected)
+    for push, size in zip(checkup.pushes, checkup.sizes, strict=True):
+        expected = on_channels(Wiring.from_rig(checkup.rig), push.expected)
         told_size = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
         words = [arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
         rows.append(
@@ -202,18 +202,18 @@ def push_rows(found: Checkup) -> list[list[str]]:
     return rows
 
 
-def answers_chart(found: Checkup) -> Chart:
+def answers_chart(checkup: Checkup) -> Chart:
     """How each channel moved at each push, and how it would by the rig file."""
-    wiring = Wiring.from_rig(found.rig)
-    at = np.arange(1.0, len(found.pushes) + 1.0)
-    expected = np.array([on_channels(wiring, push.expected) for push in found.pushes]) * 1e6
-    moved = np.array([push.channels for push in found.pushes]) * 1e6
-    spread = np.array([push.sd for push in found.pushes]) * 1e6
+    wiring = Wiring.from_rig(checkup.rig)
+    at = np.arange(1.0, len(checkup.pushes) + 1.0)
+    expected = np.array([on_channels(wiring, push.expected) for push in checkup.pushes]) * 1e6
+    moved = np.array([push.channels for push in checkup.pushes]) * 1e6
+    deviations = np.array([push.sd for push in checkup.pushes]) * 1e6
     panels = []
     for i, name in enumerate(DOTS):
         curves = (
             Series('by the rig file', at, expected[:, i], 'red', 'rings'),
-            Series('measured', at, moved[:, i], 'blue', 'points', spread[:, i]),
+            Series('measured', at, moved[:, i], 'blue', 'points', deviations[:, i]),
         )
         panels.append(Panel(curves, 'push', f'{name} / µm', height=SMALL))
     return Chart('how each channel moved at each push', panels, beside=2)
@@ -224,37 +224,37 @@ def arrow(value: float, size: float) -> str:
     return '0' if abs(value) < 0.1 * size else '+' if value > 0.0 else '-'
 
 
-def _verdict(found: Checkup) -> str:
-    fit = len(found.wirings)
-    if found.verdict == RIGHT:
+def _verdict(checkup: Checkup) -> str:
+    fit = len(checkup.wirings)
+    if checkup.verdict == RIGHT:
         return f'RIGHT: of {len(WIRINGS)} wirings only that of the rig file fits.'
-    if found.verdict == CANNOT_TELL:
+    if checkup.verdict == CANNOT_TELL:
         if not fit:
             return 'CANNOT TELL: these pushes fit no wiring.'
         verb = 'does' if fit == 2 else 'do'
         return f"CANNOT TELL: the rig file's wiring fits, and so {verb} {fit - 1} of the other {len(WIRINGS) - 1}."
-    if not any(f.name in WIRED for f in found.findings):
+    if not any(f.name in WIRED for f in checkup.findings):
         return 'WRONG, but not in the wiring: that of the rig file fits.' if fit == 1 else 'WRONG, as follows:'
     fits = f'one wiring of {len(WIRINGS)} fits' if fit == 1 else f'{fit} wirings of {len(WIRINGS)} fit'
     return f'WRONG: {fits}, and that of the rig file does not.'
 
 
-def _findings(found: Checkup) -> list[tuple[str, str]]:
+def _findings(checkup: Checkup) -> list[tuple[str, str]]:
     """What is wrong, and what to do about it."""
     rows = []
-    for f in found.findings:
+    for f in checkup.findings:
         where, name = f.where, NAMES[f.name]
         if f.name == 'psd_swap':
             where = where.replace(' ', ' and ')
         elif f.name == 'load_coverage' and f.value is None:
             where, name = 'pushes', 'not enough to tell'
         rows.append((f'{where}: {name}', f.fix))
-    return [*rows, *((f'{psd}: light', text) for psd, text in found.light.items())]
+    return [*rows, *((f'{psd}: light', text) for psd, text in checkup.light.items())]
 
 
-def other_causes(found: Checkup) -> list[str]:
+def other_causes(checkup: Checkup) -> list[str]:
     """What else would look the same."""
-    return [f'or else: {_other(text)}' for text in dict.fromkeys(t for f in found.findings for t in f.equivalent)]
+    return [f'or else: {_other(text)}' for text in dict.fromkeys(t for f in checkup.findings for t in f.equivalent)]
 
 
 def _other(text: str) -> str:
@@ -266,16 +266,16 @@ def _other(text: str) -> str:
     return f'the rig file is right, and {pushes} went the other way (sign of the load); this would look the same'
 
 
-def level_rows(found: Checkup) -> list[tuple[str, str]]:
+def level_rows(checkup: Checkup) -> list[tuple[str, str]]:
     """Return noise, hum, light and drift as pairs of a title and words."""
-    measured = found.levels
+    measured = checkup.levels
     noise = '  '.join(f'{c} {v * 1e3:.2f}' for c, v in zip(CHANNELS, measured.noise.tolist(), strict=True))
     drift = '  '.join(
         f'{c} {v * 60e6:+z.1f} ± {sd * 60e6:.1f}'
-        for c, v, sd in zip(DOTS, found.drift.tolist(), found.drift_sd.tolist(), strict=True)
+        for c, v, sd in zip(DOTS, checkup.drift.tolist(), checkup.drift_sd.tolist(), strict=True)
     )
     drift += '  µm a minute'
-    if found.drift_sd.max() > TELLING_DRIFT:
+    if checkup.drift_sd.max() > TELLING_DRIFT:
         drift = 'cannot be told: the recording is too short'
     hum = 'none at 50 or 60 Hz'
     if measured.hum.max() > 0.0:
@@ -285,7 +285,7 @@ def level_rows(found: Checkup) -> list[tuple[str, str]]:
     return [
         ('noise', f'{noise}  mV rms a sample (rig file {measured.stated * 1e3:.2f})'),
         ('hum', hum),
-        ('light', f'{sums}  V (rig file {found.rig.amplifier.sum_nominal:g})'),
+        ('light', f'{sums}  V (rig file {checkup.rig.amplifier.sum_nominal:g})'),
         ('drift', drift),
     ]
 

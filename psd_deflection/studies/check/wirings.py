@@ -117,11 +117,11 @@ class PushResponse:
 
         The size is negative if the push went the other way.
         """
-        seen = _pattern(_dots(wiring, self.channels) * np.array(self.scales), self.only_twist)
+        pattern = _pattern(_dots(wiring, self.channels) * np.array(self.scales), self.only_twist)
         expected = _pattern(self.expected, self.only_twist)
-        size = float(seen @ expected / (expected @ expected))
-        left = seen - size * expected
-        return float(left @ left / (seen @ seen)), size
+        size = float(pattern @ expected / (expected @ expected))
+        residual = pattern - size * expected
+        return float(residual @ residual / (pattern @ pattern)), size
 
 
 def on_channels(wiring: Wiring, dots: FloatArray) -> FloatArray:
@@ -173,18 +173,18 @@ def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
 
     First with the loads as they are said to be. Only if no wiring explains these, with the sign of loads turned.
     """
-    told = [response.loads for response in responses]
-    for turned in range(len(told) + 1):
-        found: list[WiringFit] = []
-        for some in itertools.combinations(told, turned):
+    loads_of_responses = [response.loads for response in responses]
+    for turned in range(len(loads_of_responses) + 1):
+        fits: list[WiringFit] = []
+        for some in itertools.combinations(loads_of_responses, turned):
             loads = tuple(itertools.chain.from_iterable(some))
             for wiring in WIRINGS:
                 total, worst = misfit(wiring, responses, loads)
                 if worst <= LIMIT:
-                    found.append(WiringFit(wiring, total, loads))
-        if found:
-            found.sort(key=lambda c: c.misfit)
-            return [c for c in found if c.misfit <= found[0].misfit + MARGIN]
+                    fits.append(WiringFit(wiring, total, loads))
+        if fits:
+            fits.sort(key=lambda c: c.misfit)
+            return [c for c in fits if c.misfit <= fits[0].misfit + MARGIN]
     return []
 
 

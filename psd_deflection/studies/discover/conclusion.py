@@ -100,8 +100,10 @@ class Conclusion(StudyResult):
     @property
     def sources(self) -> Mapping[str, str]:
         """Version and recordings, with their digests."""
-        seen = self.workspace.provenance()
-        of = {f'recording {n}': named(str(r['name']), str(r.get('sha256', '')), 64) for n, r in enumerate(seen, 1)}
+        provenance = self.workspace.provenance()
+        of = {
+            f'recording {n}': named(str(r['name']), str(r.get('sha256', '')), 64) for n, r in enumerate(provenance, 1)
+        }
         return {'version': __version__, 'seed': str(self.seed), **of}
 
     @property
@@ -288,14 +290,14 @@ class RigConclusion(Conclusion):
 
     def lines(self) -> list[str]:
         """The sentences in one line, what puts the set-up right, what would decide, what is unknown."""
-        first, *others = super().lines()
+        first, *remaining_lines = super().lines()
         out = [first, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
         numbers = [RIG_NUMBERS[e.name] for e in self.effects if e.name in RIG_NUMBERS]
         out += [f'rig file: {line(key, self.values[key])}' for key in numbers]
         for e in self.effects:
             if e.suggestion is not None:
                 out.append(f'to tell {e.active.effect.name} from {", ".join(e.equivalent)}: {e.suggestion.text}')
-        return out + others
+        return out + remaining_lines
 
     def tree(self) -> dict[str, Any]:
         """As for any machine, with set-up, moves and law."""
@@ -417,8 +419,8 @@ def _moved(discovery: RigConclusion) -> str:
     if not discovery.effects:
         return ''
     dx, dy, theta = (1e6 * v for v in discovery.moves)
-    found = [e.active.effect for e in discovery.effects]
-    stays = dict.fromkeys(effect.name for effect in found if effect.stage in STAGES and not effect.corrected)
+    effects = [e.active.effect for e in discovery.effects]
+    stays = dict.fromkeys(effect.name for effect in effects if effect.stage in STAGES and not effect.corrected)
     uncorrected = f'An estimate is not corrected for {", ".join(stays)}.' if stays else ''
     if max(dx, dy, theta) < SHOWN and uncorrected:
         return uncorrected
@@ -434,27 +436,27 @@ def law_sentence(discovery: RigConclusion) -> str:
     """The law for what is unknown, in a sentence, or nothing."""
     if discovery.law is None:
         return ''
-    found = discovery.law
-    expressions = '; '.join(e.expression for e in found.laws)
-    words = f'What remains follows a law ({found.law.stage}, {found.law.kind}): {expressions}'
-    beside = [a.effect.name for a in found.beside]
+    law = discovery.law
+    expressions = '; '.join(e.expression for e in law.laws)
+    words = f'What remains follows a law ({law.law.stage}, {law.law.kind}): {expressions}'
+    beside = [a.effect.name for a in law.beside]
     named = {e.active.effect.name for e in discovery.effects}
-    with_law = f'; on unseen load cases it leaves {1e6 * found.heldout_gap:.3f} µm'
+    with_law = f'; on unseen load cases it leaves {1e6 * law.heldout_gap:.3f} µm'
     also = f', beside {", ".join(beside)}' if beside and set(beside) != named else ''
     return f'{words}{also}{with_law}.'
 
 
 def _missing(discovery: Conclusion, besides: str = '') -> str:
-    ws, left = discovery.workspace, _residual_words(discovery)
+    ws, residual = discovery.workspace, _residual_words(discovery)
     before = f'{ws.display_scale[0] * discovery.gap_before:{ws.digits}}'
     if discovery.verdict == 'nothing_missing':
         if not math.isfinite(discovery.gap_floor):
             # Without a stated noise nobody knows how large what remains should be.
             return (
-                f'Nothing is missing{besides} as far as these readings show: {left} remains and follows nothing, '
+                f'Nothing is missing{besides} as far as these readings show: {residual} remains and follows nothing, '
                 'as noise does. How exact the readings are is not stated.'
             )
-        return f'Nothing is missing{besides}: the gap is {left}.'
+        return f'Nothing is missing{besides}: the gap is {residual}.'
     parts = []
     for e in discovery.effects:
         text = e.active.label
@@ -466,16 +468,19 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
     named = ' and '.join(parts)
     if discovery.verdict == 'effects_found':
         is_are, them = ('is', 'it') if len(parts) == 1 else ('are', 'them')
-        return f'{named} {is_are} missing from the model; adding {them} closes the gap from {before} to {left}.{fitted}'
+        return (
+            f'{named} {is_are} missing from the model; adding {them} closes the gap '
+            f'from {before} to {residual}.{fitted}'
+        )
     if not any(u.unexplained for u in discovery.unknown):
         return (
-            f'{named} close the gap from {before} to {left}, but their sizes '
+            f'{named} close the gap from {before} to {residual}, but their sizes '
             f'are tied: one effect that is not in the catalogue is likelier.'
         )
     if named:
         explains = 'explains' if len(parts) == 1 else 'explain'
         return (
             f'{named} {explains} part, but an unknown effect remains: the gap goes from {before} '
-            f'{ws.display_scale[1]} to {left}.{fitted}'
+            f'{ws.display_scale[1]} to {residual}.{fitted}'
         )
-    return f'An effect that is not in the catalogue: the gap is {left}.'
+    return f'An effect that is not in the catalogue: the gap is {residual}.'

@@ -79,20 +79,20 @@ def law(problem: Problem) -> Problem:
     much = ws.gap(fit.difference) > UNSAID * ws.floor()
     if not (unknown_of(problem.residual, 1.0) or much or coincidences(fit, ws.physics)):
         return problem
-    found = find_law(
+    found_law = find_law(
         ws, problem.null, fit, problem.search.penalty, problem.residual.excess, problem.rng, problem.progress
     )
-    if found is None:
+    if found_law is None:
         return problem
-    problem = _beside(replace(problem, law=found), found)
+    problem = _beside(replace(problem, law=found_law), found_law)
     return replace(problem, residual=problem.machine.look(ws, problem.fit, problem.result.null, problem.rng))
 
 
-def _beside(problem: Problem, found: FoundLaw) -> Problem:
-    kept = {(a.effect.name, a.choices) for a in found.beside}
+def _beside(problem: Problem, found_law: FoundLaw) -> Problem:
+    known = {(a.effect.name, a.choices) for a in found_law.beside}
     for i in reversed(range(len(problem.fit.effects))):
         active = problem.fit.effects[i]
-        if (active.effect.name, active.choices) not in kept:
+        if (active.effect.name, active.choices) not in known:
             problem = without_effect(problem, i, 'only stood in for the law')
     return problem
 

@@ -50,14 +50,14 @@ def effective_loads(problem: Problem) -> Problem:
     ws, fit = _in_turns(ws, fit)
     null = refit(ws, ())
     fit = fit if fit.effects else null
-    found = problem.search.at(ws)
-    found.dropped = {}
-    p, delta_bic, delta_chi2 = found.weigh(null, fit)
-    others = [found.alternatives(null, fit, i, delta_chi2[i]) for i in range(len(fit.effects))]
+    search = problem.search.at(ws)
+    search.dropped = {}
+    p, delta_bic, delta_chi2 = search.weigh(null, fit)
+    alternatives = [search.alternatives(null, fit, i, delta_chi2[i]) for i in range(len(fit.effects))]
     result = replace(
-        problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others
+        problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=alternatives
     )
-    return replace(problem, search=found, result=result, fit=fit, null=null)
+    return replace(problem, search=search, result=result, fit=fit, null=null)
 
 
 def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
@@ -68,11 +68,11 @@ def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
         turned, better = _refitted(ws, fit)
         if fit.effects:
             turned, better = _refitted(turned, refit(turned, fit.effects, 6))
-        left, gap = gap, turned.gap(better.difference)
-        if gap > left:
+        previous_gap, gap = gap, turned.gap(better.difference)
+        if gap > previous_gap:
             break
         ws, fit = turned, better
-        if gap > SETTLED * left or gap < AT_FLOOR * ws.floor():
+        if gap > SETTLED * previous_gap or gap < AT_FLOOR * ws.floor():
             break
     return ws, fit
 
@@ -117,15 +117,15 @@ def searched(problem: Problem) -> Problem:
         return problem
     problem.progress('how the link rang on after what is left out')
     # What rings on is all that is seen of loads that were hung in what is left out.
-    seen = [d for d in ws.directions if not unseen(ws, d)]
-    free = ws.with_free((*seen, *ringing), effects)
+    observable = [d for d in ws.directions if not unseen(ws, d)]
+    free = ws.with_free((*observable, *ringing), effects)
     begun = refit(free, effects, 12)
     # Else the noise beside it would be that of a link that does not ring as it did.
     free, begun = _in_turns(free, begun)
-    other = replace(problem, search=problem.search.at(free), fit=begun, null=refit(free, ()))
+    alternative = replace(problem, search=problem.search.at(free), fit=begun, null=refit(free, ()))
     for step in (partial(search, begun=begun), *SEARCH[1:]):
-        other = step(other)
-    return other if other.comparison.gap(other.fit.difference) < UNSAID * ws.floor() else problem
+        alternative = step(alternative)
+    return alternative if alternative.comparison.gap(alternative.fit.difference) < UNSAID * ws.floor() else problem
 
 
 def _searched(problem: Problem) -> Problem:
@@ -181,8 +181,8 @@ def _follows_nothing(problem: Problem) -> bool:
 def _residual_gap(ws: Comparison, fit: Fit, columns: Sequence[FloatArray]) -> float:
     """The gap that ``columns`` (D,), whitened, leave of ``fit``, to first order."""
     moved = np.column_stack(columns)
-    left = fit.residual - moved @ np.linalg.lstsq(moved, fit.residual, rcond=1e-9)[0]
-    return ws.gap([d + c for d, c in zip(fit.difference, ws.unwhitened(left - fit.residual), strict=True)])
+    residual = fit.residual - moved @ np.linalg.lstsq(moved, fit.residual, rcond=1e-9)[0]
+    return ws.gap([d + c for d, c in zip(fit.difference, ws.unwhitened(residual - fit.residual), strict=True)])
 
 
 def _rounded_beside_effect(problem: Problem) -> bool:
@@ -191,13 +191,13 @@ def _rounded_beside_effect(problem: Problem) -> bool:
     gap = ws.gap(fit.difference)
     if gap < FREED_FROM * ws.floor():
         return False
-    hung = []
+    implied = []
     for i, (o, difference) in enumerate(zip(ws.observations, fit.difference, strict=True)):
         asked = levels(ws, i, difference, times(o, i))
         if not may_be_rounded(asked):
             return False
-        hung += [p for p in asked.plateaus if np.any(p.annotated != 0.0)]
-    free = ws.with_free((*ws.directions, *directions(ws, hung))).free
+        implied += [p for p in asked.plateaus if np.any(p.annotated != 0.0)]
+    free = ws.with_free((*ws.directions, *directions(ws, implied))).free
     loads = [] if free is None else [*free.rows]
     alone, beside = (_residual_gap(ws, fit, [*known, *_best_beside(problem, known)]) for known in ([], loads))
     return beside < FOLLOWS * gap and beside < CLOSED * alone
@@ -217,12 +217,12 @@ def _rounded(problem: Problem) -> bool:
     if ws.gap(problem.fit.difference) >= UNSAID * ws.floor():
         return False
     observations = ws.observations
-    own = [[p for p in free if p.recording == i] for i in range(len(observations))]
+    free_of_recording = [[p for p in free if p.recording == i] for i in range(len(observations))]
     return all(
         rounded(
             *(np.array(of).reshape(-1, 3) for of in ([p.annotated for p in listed], [p.of(o.loads) for p in listed]))
         )
-        for o, listed in zip(observations, own, strict=True)
+        for o, listed in zip(observations, free_of_recording, strict=True)
     )
 
 
@@ -239,8 +239,8 @@ def _with_all_loads_free(
         return None
     wrong, observations = [], []
     for i, (o, difference) in enumerate(zip(ws.observations, problem.fit.difference, strict=True)):
-        noted = {p.first: p.annotated for p in machine.recorded.wrong if p.recording == i}
-        listed = [replace(p, annotated=noted.get(p.first, p.annotated)) for p in times(o, i)]
+        annotated = {p.first: p.annotated for p in machine.recorded.wrong if p.recording == i}
+        listed = [replace(p, annotated=annotated.get(p.first, p.annotated)) for p in times(o, i)]
         asked = levels(ws, i, difference, listed)
         if not (may_be_rounded(asked) if maybe_rounded else all_free(asked, o.loads)):
             return None
@@ -258,5 +258,7 @@ def _with_all_loads_free(
     recorded = replace(recorded, stated_gap=recorded.stated_gap or problem.gap_before)
     freed = recordings_ready.with_free(recorded, recordings_ready.beside(ws, observations, recorded.known))
     recorded = replace(recorded, fourth=fourth_reading(freed, freed.residual(freed.base)[0]))
-    other = replace(machine, recorded=recorded, workspace=freed, bank=SignatureBank(), proposals=proposals_of(freed))
-    return solve(other, SEARCH, problem.seed, problem.progress, problem.rng)
+    with_free_loads = replace(
+        machine, recorded=recorded, workspace=freed, bank=SignatureBank(), proposals=proposals_of(freed)
+    )
+    return solve(with_free_loads, SEARCH, problem.seed, problem.progress, problem.rng)

@@ -355,9 +355,9 @@ class DiscoverOptions:
         tell: Tell = warn_caller,
     ) -> Discovery:
         """The answer; ``tell`` gets a warning if the rig file cannot be edited."""
-        found = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
+        discovery = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
         source = GIVEN_RIG if self.known else 'the parameters in each recording, the nominal rig if it has none'
-        return replace(found, params_file=self.params_file, tell=tell, rig_source=source)
+        return replace(discovery, params_file=self.params_file, tell=tell, rig_source=source)
 
     def discovered_in_tables(self, tables: Sequence[Readings], tell: Tell = warn_caller) -> PlantDiscovery:
         """The answer of tables of readings; ``tell`` gets a warning if the rig file cannot be edited.

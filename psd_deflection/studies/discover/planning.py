@@ -125,9 +125,9 @@ class Plan:
     @property
     def sentence(self) -> str:
         """The plan in one sentence."""
-        rivals = ', '.join(dict.fromkeys(t.alternative for t in self.discriminations))
+        alternatives = ', '.join(dict.fromkeys(t.alternative for t in self.discriminations))
         if not self.useful:
-            return f'No recording within the limits would tell {self.discriminations[0].named} from {rivals}.'
+            return f'No recording within the limits would tell {self.discriminations[0].named} from {alternatives}.'
         apart = [t for t in self.discriminations if t.separable]
         least = min(max(t.separation, t.reverse) for t in apart)
         others = ', '.join(dict.fromkeys(t.alternative for t in apart))
@@ -146,13 +146,13 @@ class Plan:
             kind, loads, *rest = script.split(':')
             words = 'hold' if kind != 'chirp' else f'sweep {rest[0].replace(",", " to ")} Hz, up to'
             rows += [(words, *load.split(','), rest[-1]) for load in loads.split(';')]
-        rivals = [('instead of', 'rival', 'expected chi-square', 'if the rival is true', 'at most')]
-        rivals += [
+        rows_of_alternatives = [('instead of', 'rival', 'expected chi-square', 'if the rival is true', 'at most')]
+        rows_of_alternatives += [
             (t.named, t.alternative, f'{t.separation:.0f}', f'{t.reverse:.0f}', f'{t.possible:.0f}')
             for t in self.discriminations
         ]
         held = f'{columns(rows)}\n\n' if self.useful else ''
-        return held + columns(rivals, left=2)
+        return held + columns(rows_of_alternatives, left=2)
 
     @property
     def loads_csv(self) -> str:
@@ -188,12 +188,14 @@ class Plan:
         }
 
 
-def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: Limits | None = None) -> Plan | None:
-    """The recording within ``limits`` that best tells ``named`` from ``rivals``; None without rivals."""
-    if not rivals:
+def plan_next(
+    workspace: Workspace, named: Fit, alternatives: Sequence[Fit], limits: Limits | None = None
+) -> Plan | None:
+    """The recording within ``limits`` that best tells ``named`` from ``alternatives``; None without rivals."""
+    if not alternatives:
         return None
     limits = limits or Limits()
-    models = [named, *rivals]
+    models = [named, *alternatives]
     known = [m.jacobian.T @ m.jacobian for m in models]
     # One of the rivals may be true: then it is to be told from the other rivals too.
     pairs = list(itertools.permutations(range(len(models)), 2))
@@ -207,29 +209,33 @@ def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: L
     for _, group in itertools.groupby(proposals(rig, limits), key=lambda p: id(p.setting)):
         offered = list(group)
         setting = offered[0].setting
-        seen = [
+        expected = [
             (p.piece, expected_sums(workspace, models, setting, p.piece.loads(rate_of(rig, setting)))) for p in offered
         ]
-        for _, s in seen:
+        for _, s in expected:
             # The same for as long as a recording may be.
             possible = np.maximum(possible, separations(s * max(limits.seconds // s.seconds, 1.0)))
-        value, chosen = best_combination(seen, nothing_of(models), separations, limits.seconds)
+        value, chosen = best_combination(expected, nothing_of(models), separations, limits.seconds)
         if chosen and value - setting.effort > best[0]:
             best = (value - setting.effort, setting, chosen)
     _, setting, chosen = best
     plan = Plan(setting, tuple(chosen), (), limits, rate_of(rig, setting))
     final = separations(expected_sums(workspace, models, setting, plan.loads))
     possible = np.maximum(possible, final)
-    told = []
-    for k, rival in enumerate(rivals, start=1):
+    discriminations = []
+    for k, alternative in enumerate(alternatives, start=1):
         there, back = pairs.index((0, k)), pairs.index((k, 0))
         most = float(max(possible[there], possible[back]))
-        told.append(
+        discriminations.append(
             Discrimination(
-                rival.effects[-1].label, _replaced(named, rival), float(final[there]), float(final[back]), most
+                alternative.effects[-1].label,
+                _replaced(named, alternative),
+                float(final[there]),
+                float(final[back]),
+                most,
             )
         )
-    return dataclasses.replace(plan, discriminations=tuple(told))
+    return dataclasses.replace(plan, discriminations=tuple(discriminations))
 
 
 def suggest(workspace: Workspace, named: Fit, others: Sequence[Fit], limits: Limits | None = None) -> Suggestion | None:
@@ -249,7 +255,7 @@ def rate_of(rig: Rig, setting: Setting) -> float:
 
 
 def best_combination(
-    seen: Sequence[tuple[Piece, ModelSums]],
+    expected: Sequence[tuple[Piece, ModelSums]],
     total: ModelSums,
     separations: Callable[[ModelSums], FloatArray],
     seconds: float,
@@ -259,7 +265,7 @@ def best_combination(
     value = 0.0
     while True:
         trials: list[tuple[float, int, Piece, ModelSums]] = []
-        for piece, s in seen:
+        for piece, s in expected:
             more = total + s
             if more.seconds <= seconds + 1e-6:
                 worth = float(np.mean(np.minimum(separations(more) / SURE, 1.0)))
@@ -274,7 +280,7 @@ def best_combination(
         chosen.append(piece)
 
 
-def _replaced(named: Fit, rival: Fit) -> str:
-    """The label of the effect of ``named`` that ``rival`` does without."""
-    kept = {(a.effect.name, a.choices) for a in rival.effects[:-1]}
-    return ', '.join(a.label for a in named.effects if (a.effect.name, a.choices) not in kept)
+def _replaced(named: Fit, alternative: Fit) -> str:
+    """The label of the effect of ``named`` that ``alternative`` does without."""
+    common = {(a.effect.name, a.choices) for a in alternative.effects[:-1]}
+    return ', '.join(a.label for a in named.effects if (a.effect.name, a.choices) not in common)

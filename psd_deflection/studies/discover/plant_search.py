@@ -182,16 +182,16 @@ class PlantComparison(Comparison):
             return max(float(self.total[channel]), 1.0)
         count = 0.0
         for d, there in zip(difference, self.there, strict=True):
-            seen = there[channel]
-            if not seen.any():
+            valid = there[channel]
+            if not valid.any():
                 continue
-            x = np.where(seen, d[channel] - d[channel][seen].mean(), 0.0)
+            x = np.where(valid, d[channel] - d[channel][valid].mean(), 0.0)
             n = len(x)
             found = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2, 2 * n)[:n]
             correlation = found / max(float(found[0]), 1e-300)
             negative = np.flatnonzero(correlation < 0.0)
             stop = int(negative[0]) if len(negative) else n
-            count += float(seen.sum()) / (1.0 + 2.0 * float(correlation[1:stop].sum()))
+            count += float(valid.sum()) / (1.0 + 2.0 * float(correlation[1:stop].sum()))
         return max(count, 2.0)
 
     def sd(self, jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -200,11 +200,11 @@ class PlantComparison(Comparison):
         The degrees of freedom of a parameter that several channels tell of are those of Welch (1947).
         """
         rows = np.concatenate([np.repeat(np.arange(len(m)), m.shape[1]) for m in self.measured])
-        told = jacobian @ covariance
-        fitted = np.bincount(rows, (told * jacobian).sum(axis=1), len(self.channels))
+        propagated = jacobian @ covariance
+        fitted = np.bincount(rows, (propagated * jacobian).sum(axis=1), len(self.channels))
         left = np.maximum(self.independent - fitted, 1.0)
         by_channel = np.zeros((len(self.channels), len(covariance)))
-        np.add.at(by_channel, rows, told**2)
+        np.add.at(by_channel, rows, propagated**2)
         open_level = self.level > self.known
         by_channel *= np.where(open_level, self.independent / left, 1.0)[:, None]
         variance = by_channel.sum(axis=0)
@@ -313,8 +313,8 @@ class PlantComparison(Comparison):
 
     def begun(self, null: Fit) -> Self:
         """With what the fit without any effect leaves as the gap before."""
-        whole = np.maximum(self.gap_per_channel(null.difference), 1e-300)
-        return self.replaced(whole=whole).renoised([*self.base, *null.coefficients_with_nuisance])
+        gap_before = np.maximum(self.gap_per_channel(null.difference), 1e-300)
+        return self.replaced(whole=gap_before).renoised([*self.base, *null.coefficients_with_nuisance])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -89,8 +89,8 @@ class Recorded:
         """Loads that acted at another time than noted; ``workspace``: where their times were fitted."""
         sizes = {id(d.of): d.sizes for d in workspace.directions if isinstance(d, LoadDirection) and d.exact}
         out = []
-        for o, mended in zip(workspace.observations, self.corrected, strict=True):
-            for note in mended.notes if mended is not None else ():
+        for o, corrected in zip(workspace.observations, self.corrected, strict=True):
+            for note in corrected.notes if corrected is not None else ():
                 out.append(note_finding(note.moved(sizes.get(id(note), ()), o.period), o.name))
         return out
 
@@ -112,7 +112,7 @@ def put_right(recorded: Recorded) -> Recorded:
     timed = [time_loads(o) for o in recorded.observations]
     observations, wrong, lines = wire([o for o, _ in timed], recorded.known)
     gap = 0.0
-    if wrong or any(mended is not None and mended.notes for _, mended in timed):
+    if wrong or any(corrected is not None and corrected.notes for _, corrected in timed):
         stated = Workspace(recorded.observations, recorded.known)
         gap = stated.gap(stated.residual(recorded.known)[1])
     values = {**recorded.values, **lines}
@@ -123,7 +123,7 @@ def put_right(recorded: Recorded) -> Recorded:
         findings=(*recorded.findings, *wrong),
         values=values,
         stated_gap=gap,
-        corrected=tuple(mended for _, mended in timed),
+        corrected=tuple(corrected for _, corrected in timed),
     )
 
 
@@ -267,16 +267,16 @@ def with_free(recorded: Recorded, workspace: Workspace) -> Workspace:
     for i, o in enumerate(workspace.observations):
         sds = np.sqrt(o.zero_variances).tolist()
         free += [ZeroDirection(i, axis, sd) for axis, sd in enumerate(sds) if sd > 0.0]
-    for i, mended in enumerate(recorded.corrected):
-        if mended is None:
+    for i, corrected in enumerate(recorded.corrected):
+        if corrected is None:
             continue
         o = workspace.observations[i]
-        for note in mended.timed:
+        for note in corrected.timed:
             free += in_time(o, i, note)
         # In whatever unit they were measured.
-        unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(mended.loads).max(axis=0), 1e-30)
-        if len(mended.measured) <= MOST_MEASURED:
-            free += [d for m in mended.measured for d in of_plateau(o, i, m, m.sd * unit)]
+        unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(corrected.loads).max(axis=0), 1e-30)
+        if len(corrected.measured) <= MOST_MEASURED:
+            free += [d for m in corrected.measured for d in of_plateau(o, i, m, m.sd * unit)]
     workspace = workspace.with_free(free)
     # What a large load bends is no change in proportion.
     for _ in range(2 if recorded.wrong else 0):

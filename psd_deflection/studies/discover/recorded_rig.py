@@ -68,12 +68,12 @@ class RecordedRig(Machine):
         recorded, workspace = recordings_ready.compared(recorded)
         # Signatures that are kept are those of recordings as they were, from rest.
         changed = recorded.mistaken or bool(workspace.nuisance) or any(d > 0.0 for d in recorded.delays)
-        kept = SignatureBank() if bank is None or changed else bank
-        kept.nominal(workspace)
+        bank_of_rig = SignatureBank() if bank is None or changed else bank
+        bank_of_rig.nominal(workspace)
         found = proposals_of(workspace)
         if recorded.lattice is not None:
             workspace = workspace.replaced(base=(*workspace.base, recorded.lattice))
-        return cls(recorded=recorded, workspace=workspace, proposals=found, bank=kept)
+        return cls(recorded=recorded, workspace=workspace, proposals=found, bank=bank_of_rig)
 
     def compared(self) -> Workspace:
         """The recordings against the simulation."""

@@ -89,10 +89,10 @@ def _rows(
     of, means, celsius = list[FloatArray](), list[FloatArray](), list[float]()
     for load, start, stop in zip(changed, starts, stops, strict=True):
         end = min(stop, float(t[-1]))
-        hung = there & (t >= start) & (t < stop)
-        if np.count_nonzero(hung) < FEWEST:
+        applied = there & (t >= start) & (t < stop)
+        if np.count_nonzero(applied) < FEWEST:
             continue
-        own = hung & _near(poses, hung) & (t >= start + min(settling(rig), MOST_OF_IT * max(end - start, 0.0)))
+        own = applied & _near(poses, applied) & (t >= start + min(settling(rig), MOST_OF_IT * max(end - start, 0.0)))
         if np.count_nonzero(own) >= FEWEST:
             of.append(load)
             means.append(np.median(poses[own], axis=0))
@@ -102,7 +102,7 @@ def _rows(
     return Resting(np.array(of), np.array(means), None if warm is None else np.array(celsius))
 
 
-def _near(poses: FloatArray, hung: BoolArray) -> BoolArray:
-    """(n,): whether ``poses`` (n, 3) are about as near to the median of those that ``hung`` as most of them."""
-    off = np.abs(poses - np.median(poses[hung], axis=0))
-    return np.asarray((off <= FAR * 1.4826 * np.median(off[hung], axis=0)).all(axis=1))
+def _near(poses: FloatArray, applied: BoolArray) -> BoolArray:
+    """(n,): whether ``poses`` (n, 3) are about as near to the median of those that ``applied`` as most of them."""
+    off = np.abs(poses - np.median(poses[applied], axis=0))
+    return np.asarray((off <= FAR * 1.4826 * np.median(off[applied], axis=0)).all(axis=1))

@@ -61,19 +61,19 @@ def solve(
 def search(problem: Problem, begun: Fit | None = None) -> Problem:
     """The model that the search chooses, beside its alternatives; from the effects of ``begun`` on, if given."""
     start = problem.comparison
-    found, result = problem.search.run(problem.null, begun)
+    search_used, result = problem.search.run(problem.null, begun)
     names = {a.effect.name for a in result.fit.effects}
     if names & start.first and names - start.setup:
         # A mistake that needs an effect beside it must be much better than effects alone.
-        plain = found.workspace.replaced(first=frozenset())
+        plain = search_used.workspace.replaced(first=frozenset())
         other = Search(plain, problem.machine.screen, problem.progress)
         other, others = other.run(refit(plain, ()))
         cost = others.fit.chi2 + other.penalty * others.fit.parameters
-        if cost < result.fit.chi2 + found.penalty * result.fit.parameters + BIC_ACCEPT:
-            found, result = other, others
+        if cost < result.fit.chi2 + search_used.penalty * result.fit.parameters + BIC_ACCEPT:
+            search_used, result = other, others
     if not start.open_level:
-        found = found.at(found.workspace.replaced(nuisance=result.fit.nuisance))
-    return replace(problem, search=found, result=result, fit=result.fit, null=result.null)
+        search_used = search_used.at(search_used.workspace.replaced(nuisance=result.fit.nuisance))
+    return replace(problem, search=search_used, result=result, fit=result.fit, null=result.null)
 
 
 def weigh(problem: Problem) -> Problem:
@@ -84,9 +84,9 @@ def weigh(problem: Problem) -> Problem:
         if problem.fit is problem.result.fit or not problem.fit.effects:
             break
         # Without what did not hold, another effect may be the better one.
-        null, found = problem.result.null, problem.search
-        fit, others = found.swap(null, problem.fit)
-        p, delta_bic, delta_chi2 = found.weigh(null, fit)
+        null, search_used = problem.result.null, problem.search
+        fit, others = search_used.swap(null, problem.fit)
+        p, delta_bic, delta_chi2 = search_used.weigh(null, fit)
         result = replace(problem.result, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others)
         problem = accepted(replace(problem, result=result, fit=fit))
     problem = credible(problem)
@@ -98,17 +98,17 @@ def accepted(problem: Problem) -> Problem:
     """The joint rule: without the effects that fail it, the weakest first, the rest fitted anew."""
     while True:
         heldout, fails = [], []
-        ws, found, fit = problem.comparison, problem.search, problem.fit
-        for i, without in enumerate(found.without_each(fit, problem.result.null)):
+        ws, search_used, fit = problem.comparison, problem.search, problem.fit
+        for i, without in enumerate(search_used.without_each(fit, problem.result.null)):
             gain = heldout_gain(ws, without, fit, problem.rng)
             heldout.append(gain)
             columns = fit.columns_of(i)
             chi2 = without.chi2 - fit.chi2
-            bic = chi2 - found.penalty * len(columns)
+            bic = chi2 - search_used.penalty * len(columns)
             if (
                 not gain.significant
                 or unphysical(ws, fit, i)
-                or found.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
+                or search_used.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
                 or bic <= BIC_ACCEPT
                 or _in_sds(ws, fit, i) < LEAST_SDS
             ):
@@ -135,46 +135,46 @@ def _gain(ws: Comparison, fit: Fit, index: int, chi2: float) -> float:
 def credible(problem: Problem) -> Problem:
     """Without effects that explain less than the unknown remainder: they probably stand in for it."""
     while True:
-        left = problem.machine.look(problem.comparison, problem.fit, problem.result.null, problem.rng)
-        problem = replace(problem, residual=left)
+        residual = problem.machine.look(problem.comparison, problem.fit, problem.result.null, problem.rng)
+        problem = replace(problem, residual=residual)
         steps = problem.machine.chi_square_explained(problem.comparison)
-        if not problem.fit.effects or not unknown_of(left, 0.0, steps=steps):
+        if not problem.fit.effects or not unknown_of(residual, 0.0, steps=steps):
             return problem
         closer = _of_another_shape(problem)
         if closer is not problem:
             problem = closer
             continue
         weakest = int(np.argmin(problem.result.delta_chi2))
-        if problem.result.delta_chi2[weakest] >= left.excess:
+        if problem.result.delta_chi2[weakest] >= residual.excess:
             return problem
         problem = without_effect(problem, weakest, 'explains less than what remains unknown')
 
 
 def _of_another_shape(problem: Problem) -> Problem:
     """``problem`` with a better fit of its effects, if another shape explains the little that this one leaves."""
-    ws, found, fit, result = problem.comparison, problem.search, problem.fit, problem.result
+    ws, search_used, fit, result = problem.comparison, problem.search, problem.fit, problem.result
     little = max(UNSAID * ws.floor(), LITTLE * problem.gap_before)
     if ws.open_level or ws.gap(fit.difference) > little:
         return problem
-    better = found.of_another_shape(fit)
+    better = search_used.of_another_shape(fit)
     if better is fit:
         return problem
-    found.log('another shape: ' + ', '.join(a.label for a in better.effects))
-    p, delta_bic, delta_chi2 = found.weigh(result.null, better)
+    search_used.log('another shape: ' + ', '.join(a.label for a in better.effects))
+    p, delta_bic, delta_chi2 = search_used.weigh(result.null, better)
     result = replace(result, fit=better, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2)
     return accepted(replace(problem, fit=better, result=result))
 
 
 def without_effect(problem: Problem, index: int, why: str) -> Problem:
     """``problem`` without one effect of its fit, the rest fitted and weighed anew; ``why`` goes into the trace."""
-    found, null, fit = problem.search, problem.result.null, problem.fit
-    found.trace.append(f'{fit.effects[index].label} {why}')
+    search_used, null, fit = problem.search, problem.result.null, problem.fit
+    search_used.trace.append(f'{fit.effects[index].label} {why}')
     rest = [a for j, a in enumerate(fit.effects) if j != index]
-    left = refit(problem.comparison, rest, iterations=6) if rest else null
-    p, delta_bic, delta_chi2 = found.weigh(null, left)
+    remaining = refit(problem.comparison, rest, iterations=6) if rest else null
+    p, delta_bic, delta_chi2 = search_used.weigh(null, remaining)
     result = replace(problem.result, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2)
     heldout = tuple(h for j, h in enumerate(problem.heldout) if j != index)
-    return replace(problem, result=result, fit=left, heldout=heldout)
+    return replace(problem, result=result, fit=remaining, heldout=heldout)
 
 
 def alternatives(problem: Problem) -> Problem:
@@ -201,7 +201,7 @@ def alternatives(problem: Problem) -> Problem:
 
 def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
     ws, result, fit = problem.comparison, problem.result, problem.fit
-    rows, equal, rivals = [], [], []
+    rows, equal, fitted_alternatives = [], [], []
     for f in fits:
         loss = f.chi2 - fit.chi2
         bic = loss + problem.search.penalty * (f.parameters - fit.parameters)
@@ -209,7 +209,7 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
         if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
             equal.append(f)
         if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
-            rivals.append(Alternative(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
+            fitted_alternatives.append(Alternative(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
     return NamedEffect(
         active=fit.effects[index],
         sd=sd_of(ws, fit, index),
@@ -217,7 +217,7 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
         delta_bic=result.delta_bic[index],
         heldout=problem.heldout[index],
         equivalent=tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal)),
-        fitted_alternatives=tuple(sorted(rivals, key=lambda r: r.delta_bic)),
+        fitted_alternatives=tuple(sorted(fitted_alternatives, key=lambda r: r.delta_bic)),
         alternatives=tuple(rows),
         suggestion=problem.machine.suggest(ws, fit, equal) if equal else None,
     )
@@ -226,19 +226,19 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
 def where(problem: Problem) -> Problem:
     """Where the described model and the fit leave structure, and what of it remains unknown."""
     problem.progress('where')
-    ws, null, fit, left = problem.bare, problem.null, problem.fit, problem.residual
-    before = left if fit is null else problem.machine.look(ws, null, None, problem.rng)
+    ws, null, fit, residual = problem.bare, problem.null, problem.fit, problem.residual
+    before = residual if fit is null else problem.machine.look(ws, null, None, problem.rng)
     # Coarse steps cause noise that varies with the signal; compare what they explain with it.
     steps = problem.machine.chi_square_explained(ws)
     explained = max(null.chi2 - fit.chi2, 0.0) + steps
     gap_after = ws.gap(fit.difference)
     unknown = (
-        unknown_of(left, explained, gap_after, ws.floor(), ws.noise_limit(), steps, ws.worded)
+        unknown_of(residual, explained, gap_after, ws.floor(), ws.noise_limit(), steps, ws.worded)
         or unsaid(ws, problem.gap_before, gap_after)
-        or (() if fit.effects else no_noise(ws, left, problem.gap_before, gap_after))
+        or (() if fit.effects else no_noise(ws, residual, problem.gap_before, gap_after))
         or tied(coincidences(fit, ws.physics), fit, problem.result, before)
     )
-    remainder = remainder_of(ws, fit, left, problem.machine.regressors(ws, fit)) if unknown else None
+    remainder = remainder_of(ws, fit, residual, problem.machine.regressors(ws, fit)) if unknown else None
     smooth = problem.machine.smooth(ws, fit)
     if smooth is not None and (remainder is None or smooth.heldout < remainder.heldout):
         remainder = Remainder.of(smooth)
@@ -249,12 +249,12 @@ def where(problem: Problem) -> Problem:
 
 def predict(problem: Problem) -> Problem:
     """The model that predicts best beside the named effects; what it explains beyond them is unknown."""
-    ws, fit, found = problem.comparison, problem.fit, problem.search
+    ws, fit, search_used = problem.comparison, problem.fit, problem.search
     little = not ws.open_level and ws.gap(fit.difference) <= UNSAID * ws.floor()
     if little and not problem.unknown and not problem.result.limits:
         return problem
     problem.progress('predicting')
-    predictive = predictive_of(ws, fit, found.screen, problem.rng)
+    predictive = predictive_of(ws, fit, search_used.screen, problem.rng)
     problem = replace(problem, predictive=predictive)
     if predictive is None or not predictive.unexplained or problem.unknown:
         return problem

@@ -69,28 +69,28 @@ def effect_tree(e: NamedEffect) -> dict[str, Any]:
     }
 
 
-def law_tree(found: FoundLaw) -> dict[str, Any]:
+def law_tree(found_law: FoundLaw) -> dict[str, Any]:
     """The tree of ``law``."""
-    law = found.law
+    law = found_law.law
     return {
         'stage': law.stage,
         'acts_on': law.acts_on,
-        'channels': list(found.channels),
+        'channels': list(found_law.channels),
         'variables': list(law.variables),
         'kind': law.kind,
         'expression': law.expression,
-        'further': [e.expression for e in found.further],
-        'heldout_after': found.heldout_gap,
-        'beside': [a.label for a in found.beside],
+        'further': [e.expression for e in found_law.further],
+        'heldout_after': found_law.heldout_gap,
+        'beside': [a.label for a in found_law.beside],
         'equivalent': [
             {'stage': e.stage, 'acts_on': e.acts_on, 'variables': list(e.variables), 'expression': e.expression}
-            for e in found.equivalent
+            for e in found_law.equivalent
         ],
         'evidence': {
-            'delta_bic': number(found.delta_bic),
-            'p': number(found.p),
-            'heldout_gain': number(found.heldout.gain),
-            'heldout_gain_error': number(found.heldout.error),
+            'delta_bic': number(found_law.delta_bic),
+            'p': number(found_law.p),
+            'heldout_gain': number(found_law.heldout.gain),
+            'heldout_gain_error': number(found_law.heldout.error),
         },
     }
 

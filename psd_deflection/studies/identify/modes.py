@@ -111,8 +111,8 @@ class Stretch:
         sizes = np.sqrt((basis * basis).sum(axis=0)) + 1e-300
         scaled = basis / sizes
         terms = np.linalg.solve(scaled.T @ scaled + 1e-12 * np.eye(len(sizes)), scaled.T @ self.y) / sizes
-        left: FloatArray = self.y - basis @ terms
-        return left, np.asarray(terms, dtype=np.float64)
+        residual: FloatArray = self.y - basis @ terms
+        return residual, np.asarray(terms, dtype=np.float64)
 
     def loud(self, modes: Modes) -> float:
         """The amplitude of the loudest mode at the start."""
@@ -160,10 +160,10 @@ def fit_modes(stretches: Sequence[Stretch], start: Modes, steps: int = 100) -> R
         return left(x) / size
 
     x0 = np.clip(x0, low * 1.001, high * 0.999)
-    found = least_squares(scaled, x0, x_scale=scale, bounds=(low, high), xtol=1e-13, max_nfev=steps)
-    jacobian = np.asarray(found.jac, dtype=np.float64) * size
+    solution = least_squares(scaled, x0, x_scale=scale, bounds=(low, high), xtol=1e-13, max_nfev=steps)
+    jacobian = np.asarray(solution.jac, dtype=np.float64) * size
     covariance = np.asarray(np.linalg.pinv(jacobian.T @ jacobian), dtype=np.float64)
-    return RingFit([(float(f), float(z)) for f, z in found.x.reshape(-1, 2)], left(found.x), covariance)
+    return RingFit([(float(f), float(z)) for f, z in solution.x.reshape(-1, 2)], left(solution.x), covariance)
 
 
 def split_mode(stretches: Sequence[Stretch], modes: Modes) -> RingFit:
@@ -182,8 +182,8 @@ def hints_at_pair(stretches: Sequence[Stretch], fit: RingFit, enough: float) -> 
     for f, z in fit.modes:
         for apart in APART:
             pair = [(f * (1.0 - apart), max(z, 0.01)), (f * (1.0 + apart), max(z, 0.01))]
-            left = np.concatenate([s.solved([*fit.modes, *pair])[0] for s in stretches])
-            if float(fit.residual @ fit.residual - left @ left) > enough:
+            residual = np.concatenate([s.solved([*fit.modes, *pair])[0] for s in stretches])
+            if float(fit.residual @ fit.residual - residual @ residual) > enough:
                 return True
     return False
 
@@ -225,11 +225,11 @@ def seed_windows(
     return out
 
 
-def ends_well(stretch: Stretch, left: FloatArray, window: int, level: float, early: bool = False) -> bool:
+def ends_well(stretch: Stretch, residual: FloatArray, window: int, level: float, early: bool = False) -> bool:
     """Whether the last half of a window fits by itself too, or the first: a small blow would be lost in the mean."""
     half = 0.5 * window / stretch.rate
     end = stretch.t < stretch.t[0] + half if early else stretch.t > stretch.t[-1] - half
-    return rms_of(left[end]) < 1.5 * MISFIT * level + SHARE * float(np.ptp(stretch.y[end]))
+    return rms_of(residual[end]) < 1.5 * MISFIT * level + SHARE * float(np.ptp(stretch.y[end]))
 
 
 def grow_stretch(
@@ -296,12 +296,12 @@ def scan_windows(samples: FloatArray, rate: float, modes: Modes, level: float, w
     def fits(stretch: Stretch) -> bool:
         if len(stretch.y) < 0.5 * (stretch.last - stretch.first) or len(stretch.y) < 12:
             return False
-        left, _ = stretch.solved(modes)
+        residual, _ = stretch.solved(modes)
         loud = stretch.loud(modes)
         allowed = MISFIT * level + SHARE * loud * math.exp(-modes[0][1] * 2.0 * math.pi * WINDOW / 2.0)
-        return rms_of(left) < allowed and loud > LOUD * level and ends_well(stretch, left, window, level)
+        return rms_of(residual) < allowed and loud > LOUD * level and ends_well(stretch, residual, window, level)
 
-    found: list[Stretch] = []
+    stretches: list[Stretch] = []
     at = 0
     while at + window < len(samples):
         stretch = Stretch(samples, at, at + window, rate)
@@ -313,9 +313,9 @@ def scan_windows(samples: FloatArray, rate: float, modes: Modes, level: float, w
             if not fits(longer):
                 break
             stretch = longer
-        found.append(stretch)
+        stretches.append(stretch)
         at = stretch.last
-    return found
+    return stretches
 
 
 def fit_ring_downs(samples: FloatArray, rate: float, start: Modes, stretches: list[Stretch]) -> AxisModes:
@@ -355,10 +355,10 @@ def fit_trimmed(
     """The stretches without their bad ends, and the fit to them with as many modes as it needs."""
     fit = fit_modes(stretches, start)
     for _ in range(TRIMS):
-        kept = [k for k in (trim(s, samples, rate, fit.modes) for s in stretches) if k is not None]
-        if not kept or [(s.first, s.last) for s in kept] == [(s.first, s.last) for s in stretches]:
+        trimmed = [k for k in (trim(s, samples, rate, fit.modes) for s in stretches) if k is not None]
+        if not trimmed or [(s.first, s.last) for s in trimmed] == [(s.first, s.last) for s in stretches]:
             break
-        stretches = kept
+        stretches = trimmed
         fit = fit_modes(stretches, fit.modes)
     return stretches, with_right_order(stretches, fit, rate)
 
@@ -381,10 +381,10 @@ def with_right_order(stretches: Sequence[Stretch], fit: RingFit, rate: float) ->
     while len(fit.modes) > 1:
         # The loudest stays.
         loudest = int(np.argmax(mode_sizes(stretches, fit.modes)))
-        others = [i for i in range(len(fit.modes)) if i != loudest]
-        without = [fit_modes(stretches, [m for k, m in enumerate(fit.modes) if k != i]) for i in others]
+        other_modes = [i for i in range(len(fit.modes)) if i != loudest]
+        without = [fit_modes(stretches, [m for k, m in enumerate(fit.modes) if k != i]) for i in other_modes]
         least = int(np.argmin([w.deviation for w in without]))
-        if needs(fit, without[least], fit.modes[others[least]][0]):
+        if needs(fit, without[least], fit.modes[other_modes[least]][0]):
             break
         fit = without[least]
     while len(fit.modes) < MOST_MODES and hints_at_pair(
@@ -405,13 +405,13 @@ def trim(stretch: Stretch, samples: FloatArray, rate: float, modes: Sequence[tup
     """
     period = rate / modes[0][0]
     piece = max(4, round(0.25 * period))
-    left, _ = stretch.solved(modes)
+    residual, _ = stretch.solved(modes)
     # Noise that remembers has fewer samples than it seems.
-    memory = min(max(float(left[1:] @ left[:-1]) / float(left @ left), 0.0), 0.95)
+    memory = min(max(float(residual[1:] @ residual[:-1]) / float(residual @ residual), 0.0), 0.95)
     worth = max(piece * (1.0 - memory) / (1.0 + memory), 1.0)
     at = np.rint(stretch.t * rate).astype(np.int64) // piece
     count = np.bincount(at)
-    scatter = np.sqrt(np.bincount(at, left * left) / np.maximum(count, 1))
+    scatter = np.sqrt(np.bincount(at, residual * residual) / np.maximum(count, 1))
     usual = float(np.median(scatter[count > 0]))
     # Of a piece worth n samples the scatter itself scatters by 1/sqrt(2 n).
     bad = (scatter > usual * (1.0 + 4.0 / math.sqrt(2.0 * worth))) & (count > 0)

@@ -120,8 +120,8 @@ class Identified(StudyResult):
 
     def page_sentences(self) -> list[str]:
         """How many modes there are; what they are stands in a table."""
-        found = [f'{len(axis.modes)} along {SYMBOLS[i]}' for i, axis in enumerate(self.axes) if axis.modes]
-        first = f'Modes: {", ".join(found)}.' if found else 'No mode stands out of the noise.'
+        counts = [f'{len(axis.modes)} along {SYMBOLS[i]}' for i, axis in enumerate(self.axes) if axis.modes]
+        first = f'Modes: {", ".join(counts)}.' if counts else 'No mode stands out of the noise.'
         return [first, *self.withheld_sentences()]
 
     def rows(self) -> list[list[str]]:

@@ -108,8 +108,8 @@ def coloured_noise(filled: FloatArray, rate: float, peaks: Sequence[float]) -> C
     shapes += [1.0 / ((k * k - f * f) ** 2 + 1e-2 * k**4) for k in peaks]
     matrix = np.array([[shape[at].mean() / power for shape in shapes] for at, power in bands])
     sizes = np.linalg.norm(matrix, axis=0)
-    found, _ = nnls(matrix / sizes, np.ones(len(bands)))
-    white, walk = (found / sizes)[:2]
+    weights, _ = nnls(matrix / sizes, np.ones(len(bands)))
+    white, walk = (weights / sizes)[:2]
     return ColouredNoise(float(white), float(walk))
 
 

@@ -38,8 +38,8 @@ def loads_that_acted(rig: Rig, volts: FloatArray, loads: FloatArray) -> ActedLoa
     wrong = wrong_notes(rig, steady, loads)
     listed = plateaus(rig, volts, loads)
     if not wrong and sum(p.unnoted for p in listed) >= MANY:
-        found = implied_beside_rig(rig, volts, loads)(listed)
-        if unnoted := unnoted_times(found, len(loads), period):
+        implied = implied_beside_rig(rig, volts, loads)(listed)
+        if unnoted := unnoted_times(implied, len(loads), period):
             # What seemed to sway there was hung and taken off.
             rest = loads_that_acted(rig, without_times(volts, unnoted), loads)
             return ActedLoads(rest.loads, rest.volts, (*unnoted, *rest.notes))

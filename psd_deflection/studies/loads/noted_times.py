@@ -162,10 +162,10 @@ def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | N
     ``dots`` (n, 2P) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as noted, held.
     """
     calm, measured = without_cell_noise(loads)
-    mended = _corrected_times(rig, dots, calm)
-    if mended is None:
+    corrected = _corrected_times(rig, dots, calm)
+    if corrected is None:
         return MendedLoads(calm, (), np.zeros(len(loads), dtype=bool), measured) if measured else None
-    return replace(mended, measured=measured)
+    return replace(corrected, measured=measured)
 
 
 def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
@@ -200,54 +200,58 @@ def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoa
     matched = matched_notes(changes, sizes, steps, period)
     if not matched:
         return None
-    late = np.array([(changes[i] - steps[j].at) * period for i, j in matched])
+    delays = np.array([(changes[i] - steps[j].at) * period for i, j in matched])
     long = np.array([steps[j].last - steps[j].first > 2.0 * width + GRADUAL_S / period for _, j in matched])
-    if are_alike(late, ALIKE_S) and not long.any():
+    if are_alike(delays, ALIKE_S) and not long.any():
         return None
     edges = [0.0, *(s.at for s in steps), float(len(dots))]
     fitted = {i: time_of_step(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}
-    late = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
+    delays = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
     # One delay is left to a search, unless it would have to find it from what was lost.
-    unseen = abs(float(np.median(late))) > ALIKE_S and any(steps[j].lost for _, j in matched)
-    if not unseen and are_alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
+    unseen = abs(float(np.median(delays))) > ALIKE_S and any(steps[j].lost for _, j in matched)
+    if not unseen and are_alike(delays, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
         return None
-    mended, timed = loads_with_times(loads, changes, fitted, period)
-    left, rest = residual_of_dots(rig, dots, mended)
-    if BETTER * left > residual_of_dots(rig, dots, loads)[0]:
+    corrected, timed = loads_with_times(loads, changes, fitted, period)
+    residual, rest = residual_of_dots(rig, dots, corrected)
+    if BETTER * residual > residual_of_dots(rig, dots, loads)[0]:
         return None
-    return replace(without_rough_motion(rig, mended, [n for n in timed if n.wrong], rest), timed=tuple(timed))
+    return replace(without_rough_motion(rig, corrected, [n for n in timed if n.wrong], rest), timed=tuple(timed))
 
 
 def loads_with_times(
     loads: FloatArray, changes: IntArray, fitted: Mapping[int, tuple[float, float]], period: float
 ) -> tuple[FloatArray, list[CorrectedNote]]:
     """The loads with change ``i`` from the time ``fitted[i]`` says, in the time that it took; the notes of these."""
-    mended = np.tile(loads[0], (len(loads), 1))
+    corrected = np.tile(loads[0], (len(loads), 1))
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
     notes = []
     for i, at in enumerate(changes.tolist()):
-        noted = at * period
-        start, took = fitted.get(i, (noted, 0.0))
-        mended += applied(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
+        annotated = at * period
+        start, took = fitted.get(i, (annotated, 0.0))
+        corrected += applied(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
         if i in fitted:
             fx, fy, tz = loads[at].tolist()
-            notes.append(CorrectedNote(i + 1, (fx, fy, tz), noted, start, took if took > GRADUAL_S else 0.0))
-    return mended, notes
+            notes.append(CorrectedNote(i + 1, (fx, fy, tz), annotated, start, took if took > GRADUAL_S else 0.0))
+    return corrected, notes
 
 
-def without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[CorrectedNote], rest: FloatArray) -> MendedLoads:
+def without_rough_motion(
+    rig: Rig, corrected: FloatArray, notes: Sequence[CorrectedNote], rest: FloatArray
+) -> MendedLoads:
     """The mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
-    t: FloatArray = np.arange(len(mended), dtype=np.float64) / rig.converter.sample_rate_hz
-    unused = np.zeros(len(mended), dtype=bool)
-    told = []
+    t: FloatArray = np.arange(len(corrected), dtype=np.float64) / rig.converter.sample_rate_hz
+    unused = np.zeros(len(corrected), dtype=bool)
+    notes_used = []
     for note in notes:
         moving = in_motion(rig, note, t)
-        told.append(note)
+        notes_used.append(note)
         # A step is the simplest motion: if the link rings otherwise, that is the rig's.
         if note.took > 0.0 and is_rough(rest, moving & (t > note.applied + note.took), rig.estimator.block_size):
             unused |= moving
-            told[-1] = CorrectedNote(note.number, note.load, note.annotated, note.applied, note.took, rest_only=True)
-    return MendedLoads(mended, tuple(told), unused)
+            notes_used[-1] = CorrectedNote(
+                note.number, note.load, note.annotated, note.applied, note.took, rest_only=True
+            )
+    return MendedLoads(corrected, tuple(notes_used), unused)
 
 
 def shifted(note: CorrectedNote, loads: FloatArray, period: float) -> Callable[[Sequence[float]], FloatArray]:
@@ -266,10 +270,10 @@ def shifted(note: CorrectedNote, loads: FloatArray, period: float) -> Callable[[
     return more
 
 
-def are_alike(late: FloatArray, within: float) -> bool:
+def are_alike(delays: FloatArray, within: float) -> bool:
     """Return whether all delays, s, are ``within`` s of the middle one, and that is one delay of all."""
-    middle = float(np.median(late))
-    return abs(middle) <= ONE_DELAY_S and bool(np.all(np.abs(late - middle) <= within))
+    middle = float(np.median(delays))
+    return abs(middle) <= ONE_DELAY_S and bool(np.all(np.abs(delays - middle) <= within))
 
 
 def expected_movements(rig: Rig, changes: FloatArray) -> FloatArray:
@@ -282,30 +286,30 @@ def matched_notes(changes: IntArray, sizes: FloatArray, steps: list[DotStep], pe
     """Pairs of a noted change and a step, both in their order, at least cost; changes that move nothing have none."""
     if not steps or float(sizes.sum()) <= 0.0:
         return []
-    seen = [i for i in range(len(changes)) if sizes[i] > LEAST_SHARE * float(sizes.max())]
-    factor = sum(s.size for s in steps) / float(sizes[seen].sum())
-    apart = np.abs(np.array([step.at for step in steps]) - changes[seen, None]) * period
+    significant = [i for i in range(len(changes)) if sizes[i] > LEAST_SHARE * float(sizes.max())]
+    factor = sum(s.size for s in steps) / float(sizes[significant].sum())
+    apart = np.abs(np.array([step.at for step in steps]) - changes[significant, None]) * period
     on_time = apart <= _ON_TIME_S
-    own = _ON_TIME if 2 * np.count_nonzero(on_time.any(axis=1)) >= len(seen) else 0.0
-    cost = np.zeros((len(seen) + 1, len(steps) + 1))
+    least_share = _ON_TIME if 2 * np.count_nonzero(on_time.any(axis=1)) >= len(significant) else 0.0
+    cost = np.zeros((len(significant) + 1, len(steps) + 1))
     way = np.zeros(cost.shape, dtype=np.int64)
-    cost[:, 0], cost[0] = _SKIP_NOTE * np.arange(len(seen) + 1), _SKIP_STEP * np.arange(len(steps) + 1)
+    cost[:, 0], cost[0] = _SKIP_NOTE * np.arange(len(significant) + 1), _SKIP_STEP * np.arange(len(steps) + 1)
     way[1:, 0], way[0, 1:] = 1, 2
-    for a, i in enumerate(seen, start=1):
+    for a, i in enumerate(significant, start=1):
         for b, step in enumerate(steps, start=1):
             away = float(apart[a - 1, b - 1])
             unlike = math.log(max(step.size, 1e-12) / (factor * float(sizes[i]))) / 0.5
             pair = math.inf if away > FARTHEST_S else _PER_SECOND * away + min(unlike**2, 8.0)
-            pair -= own * float(on_time[a - 1, b - 1])
+            pair -= least_share * float(on_time[a - 1, b - 1])
             ways = (cost[a - 1, b - 1] + pair, cost[a - 1, b] + _SKIP_NOTE, cost[a, b - 1] + _SKIP_STEP)
             way[a, b] = int(np.argmin(ways))
             cost[a, b] = ways[way[a, b]]
     out = []
-    a, b = len(seen), len(steps)
+    a, b = len(significant), len(steps)
     while a > 0 or b > 0:
         chosen = way[a, b]
         if chosen == 0:
-            out.append((seen[a - 1], b - 1))
+            out.append((significant[a - 1], b - 1))
         a, b = a - (chosen != 2), b - (chosen != 1)
     return out[::-1]
 
@@ -342,7 +346,7 @@ def is_rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
     """Whether the link rings otherwise than the mended load makes it; ``rest`` (n, 2P): means of blocks of ``size``."""
     blocks, rings = rest[::size], ringing[::size]
     noise = 0.5 * np.nanmedian((np.diff(blocks, axis=0) ** 2).sum(axis=1))
-    seen = blocks[rings & np.all(np.isfinite(blocks), axis=1)]
-    if len(seen) < 4:
+    valid = blocks[rings & np.all(np.isfinite(blocks), axis=1)]
+    if len(valid) < 4:
         return False
-    return bool(((seen - seen.mean(axis=0)) ** 2).sum(axis=1).mean() > ROUGH**2 * noise)
+    return bool(((valid - valid.mean(axis=0)) ** 2).sum(axis=1).mean() > ROUGH**2 * noise)

@@ -156,9 +156,9 @@ def implied_loads(
         columns = np.array(
             [np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in _pulses(rig, samples, listed, axis))]
         )
-        found = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
-        more[:, axis] = found[1:] / compliance[axis]
-        rest[axis, there] = moved[axis, there] - found @ columns[:, there]
+        solution = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
+        more[:, axis] = solution[1:] / compliance[axis]
+        rest[axis, there] = moved[axis, there] - solution @ columns[:, there]
     beside = np.where(there, across_plate(rig, difference), np.nan)
     across = np.array([[_mean(row[p.first // size : p.last // size]) for p in listed] for row in beside])
     across = across - across[:, :1]
@@ -213,70 +213,70 @@ class StandingOut:
     softer: float = 0.0
 
 
-def outliers(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
+def outliers(implied: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
     """The few plateaus with another load than noted; none if it is none or are many.
 
     ``bent``: share of what is wrong by which the others may seem to be, too. ``largest``: share by which an effect, a
     sign or another unit may change a load that no other is like.
     """
-    count = len(found.plateaus)
-    if np.abs(found.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not closes(found, CLOSES + bent):
+    count = len(implied.plateaus)
+    if np.abs(implied.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not closes(implied, CLOSES + bent):
         return StandingOut()
     # A detector at fault moves its dots as no plate does.
-    as_plate = np.abs(found.across) <= PLATE * found.sizes + PLATE_M
-    off = deviation_in_tolerances(found, (), 0.0)
+    as_plate = np.abs(implied.across) <= PLATE * implied.sizes + PLATE_M
+    off = deviation_in_tolerances(implied, (), 0.0)
     order = np.argsort(-off, kind='stable')
     for share, right, most in ((EXACT, FEWEST_EXACT, count - FEWEST_EXACT), (1.0, FEWEST_RIGHT, 2)):
         for wrong in range(1, min(most, count - right) + 1):
             gone = order[:wrong]
             stands = are_outliers(off[gone] / share, off[order[wrong:]] / share, bent)
-            if stands and (share == 1.0 or as_plate[gone].all()) and is_known(found, gone, largest):
+            if stands and (share == 1.0 or as_plate[gone].all()) and is_known(implied, gone, largest):
                 return StandingOut(tuple(sorted(gone.tolist())))
     # Two wrong ones of seven leave too few to tell what effects do.
     fitting, tried = 0, []
     for k in range(1, count if count > FEWEST_RIGHT else 0):
-        slopes, offset = proportional_part(found, (k,), SOFTER)
+        slopes, offset = proportional_part(implied, (k,), SOFTER)
         if np.abs(slopes).max() > MOST * SOFTER or np.abs(offset).max() > MOST * OFFSET:
             continue
-        apart = deviation_in_tolerances(found, (k,), SOFTER)
+        apart = deviation_in_tolerances(implied, (k,), SOFTER)
         others = np.delete(apart, k)
         fitting += bool(others.max() <= 1.0 + bent * apart[k])
-        if are_outliers(apart[k : k + 1], others, bent) and is_known(found, np.array([k]), largest):
+        if are_outliers(apart[k : k + 1], others, bent) and is_known(implied, np.array([k]), largest):
             tried.append(k)
     # If the others are in proportion whichever is left out, nobody knows which one is wrong.
     return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
 
 
-def is_known(found: PlateauLoads, gone: IntArray, largest: float) -> bool:
+def is_known(implied: PlateauLoads, gone: IntArray, largest: float) -> bool:
     """Whether the other loads say what effects in proportion do to those of ``gone``, or no effect does so much, or a
     change was noted twice.
     """
-    twice = np.array([_annotated_twice(found, int(k)) is not None for k in gone])
-    far = np.linalg.norm(found.more[gone], axis=1) > largest * np.linalg.norm(found.annotated[gone], axis=1)
-    return bool(np.all(_alike(found, gone) | far | twice))
+    twice = np.array([_annotated_twice(implied, int(k)) is not None for k in gone])
+    far = np.linalg.norm(implied.more[gone], axis=1) > largest * np.linalg.norm(implied.annotated[gone], axis=1)
+    return bool(np.all(_alike(implied, gone) | far | twice))
 
 
-def _alike(found: PlateauLoads, gone: IntArray) -> BoolArray:
+def _alike(implied: PlateauLoads, gone: IntArray) -> BoolArray:
     """Of each of ``gone`` whether it is a sum of the other loads, nearly."""
-    noted = found.annotated
+    noted = implied.annotated
     right = np.delete(noted, gone, axis=0)
-    own = noted[gone]
-    rest = own - own @ np.linalg.pinv(right, rcond=ALONE) @ right
-    return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(own, axis=1))
+    outlying = noted[gone]
+    rest = outlying - outlying @ np.linalg.pinv(right, rcond=ALONE) @ right
+    return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(outlying, axis=1))
 
 
-def _annotated_twice(found: PlateauLoads, k: int) -> FloatArray | None:
+def _annotated_twice(implied: PlateauLoads, k: int) -> FloatArray | None:
     """(3,): what hung in plateau ``k`` if the change that began it was noted twice; None if something else did.
 
     Of the first load that is ambiguous: half of it may be another unit, or another stiffness.
     """
-    noted, before = found.annotated[k], found.annotated[k - 1]
-    if k == 0 or found.plateaus[k].unnoted or not np.any(before != 0.0):
+    noted, before = implied.annotated[k], implied.annotated[k - 1]
+    if k == 0 or implied.plateaus[k].unnoted or not np.any(before != 0.0):
         return None
-    hung = 0.5 * (before + noted)
-    off = np.abs(found.more[k] - (hung - noted))
-    allowed = TOLERANCE + SHARE * np.abs(noted).max() + SOFTER * np.abs(hung)
-    return hung if np.all(off <= allowed) and np.any(np.abs(hung - noted) > STANDS_OUT * allowed) else None
+    applied = 0.5 * (before + noted)
+    off = np.abs(implied.more[k] - (applied - noted))
+    allowed = TOLERANCE + SHARE * np.abs(noted).max() + SOFTER * np.abs(applied)
+    return applied if np.all(off <= allowed) and np.any(np.abs(applied - noted) > STANDS_OUT * allowed) else None
 
 
 def are_outliers(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
@@ -285,51 +285,51 @@ def are_outliers(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
     return rest <= 1.0 + bent * least and least > max(STANDS_OUT, 5.0 * rest)
 
 
-def proportional_part(found: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
+def proportional_part(implied: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
     """What effects do to all loads but ``gone``: (3, 3) and (3,), the likeliest if it is a share of ``softer``."""
     if softer == 0.0:
         return np.zeros((3, 3)), np.zeros(3)
-    keep = np.setdiff1d(np.arange(len(found.plateaus)), gone)
-    x = np.column_stack((found.annotated[keep], np.ones(len(keep))))
+    keep = np.setdiff1d(np.arange(len(implied.plateaus)), gone)
+    x = np.column_stack((implied.annotated[keep], np.ones(len(keep))))
     prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
-    both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ found.more[keep]), dtype=np.float64)
+    both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ implied.more[keep]), dtype=np.float64)
     return both[:3], both[3]
 
 
-def deviation_in_tolerances(found: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
+def deviation_in_tolerances(implied: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
     """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
-    slopes, offset = proportional_part(found, gone, softer)
-    off = np.abs(found.more - found.annotated @ slopes - offset)
-    allowed = TOLERANCE + SHARE * np.abs(found.annotated).max(axis=1, keepdims=True)
+    slopes, offset = proportional_part(implied, gone, softer)
+    off = np.abs(implied.more - implied.annotated @ slopes - offset)
+    allowed = TOLERANCE + SHARE * np.abs(implied.annotated).max(axis=1, keepdims=True)
     return np.asarray((off / allowed).max(axis=1))
 
 
-def all_free(found: PlateauLoads, loads: FloatArray) -> bool:
+def all_free(implied: PlateauLoads, loads: FloatArray) -> bool:
     """Whether other loads than noted, at most of the times, leave next to nothing of the movement.
 
-    ``loads`` (n, 3): as the movement of ``found`` counts them; those that were already put right differ from the noted.
+    ``loads`` (n, 3): as the movement of ``implied`` counts them; corrected ones differ from the annotated.
     """
-    if len(found.plateaus) < FEWEST or not closes(found):
+    if len(implied.plateaus) < FEWEST or not closes(implied):
         return False
-    return int(np.count_nonzero(deviation_in_tolerances(found, (), SOFTER) > 1.0)) >= 2 or are_rounded(found, loads)
+    return int(np.count_nonzero(deviation_in_tolerances(implied, (), SOFTER) > 1.0)) >= 2 or are_rounded(implied, loads)
 
 
-def may_be_rounded(found: PlateauLoads) -> bool:
-    """Whether the noted forces are multiples of a whole step, and ``found`` asks for others by less than a step."""
-    held = found.annotated[np.any(found.annotated != 0.0, axis=1)]
+def may_be_rounded(implied: PlateauLoads) -> bool:
+    """Whether the noted forces are multiples of a whole step, and ``implied`` asks for others by less than a step."""
+    held = implied.annotated[np.any(implied.annotated != 0.0, axis=1)]
     if len(held) < FEWEST:
         return False
     forces = float(steps_of(held)[0])
-    return 0.0 < forces < np.inf and bool(np.all(np.abs(found.more[:, :2]) < forces))
+    return 0.0 < forces < np.inf and bool(np.all(np.abs(implied.more[:, :2]) < forces))
 
 
-def are_rounded(found: PlateauLoads, loads: FloatArray) -> bool:
-    """Whether the loads that ``found`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
-    return rounded(found.annotated, np.array([p.of(loads) for p in found.plateaus]).reshape(-1, 3) + found.more)
+def are_rounded(implied: PlateauLoads, loads: FloatArray) -> bool:
+    """Whether the loads that ``implied`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
+    return rounded(implied.annotated, np.array([p.of(loads) for p in implied.plateaus]).reshape(-1, 3) + implied.more)
 
 
-def rounded(noted: FloatArray, hung: FloatArray) -> bool:
-    """Whether the ``noted`` loads (k, 3) are what ``hung`` (k, 3), N, N, N m, rounded to a whole step.
+def rounded(noted: FloatArray, applied: FloatArray) -> bool:
+    """Whether the ``noted`` loads (k, 3) are what ``applied`` (k, 3), N, N, N m, rounded to a whole step.
 
     They are off by up to half of it, and by no less.
 
@@ -338,7 +338,7 @@ def rounded(noted: FloatArray, hung: FloatArray) -> bool:
     held = np.any(noted != 0.0, axis=1)
     if np.count_nonzero(held) < FEWEST:
         return False
-    off, noted = (hung - noted)[held], noted[held]
+    off, noted = (applied - noted)[held], noted[held]
     steps = steps_of(noted)
     if np.any(np.abs(off) > (0.5 + SHARE) * steps):
         return False
@@ -357,9 +357,9 @@ def largest_step(noted: FloatArray) -> float:
     return max((s for s in STEPS if np.allclose(noted, s * np.round(noted / s), atol=1e-6)), default=0.0)
 
 
-def closes(found: PlateauLoads, share: float = CLOSES) -> bool:
+def closes(implied: PlateauLoads, share: float = CLOSES) -> bool:
     """Whether other loads, constant between changes, leave next to nothing of the movement."""
-    return _rms(found.rest) < share * _rms(found.moved)
+    return _rms(implied.rest) < share * _rms(implied.moved)
 
 
 def _rms(part: FloatArray) -> float:
@@ -441,30 +441,30 @@ def wrong_notes_against(
     # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
     # the readings themselves say hung is simulated, then judged.
     noted = first.annotated
-    said = asked(np.zeros_like(loads)).more
-    far = np.abs(said - noted).max(axis=1) > FAR + FAR_SHARE * np.abs(said).max(axis=1)
-    hung = np.where(far[:, None], said, noted)
+    readings_ask = asked(np.zeros_like(loads)).more
+    far = np.abs(readings_ask - noted).max(axis=1) > FAR + FAR_SHARE * np.abs(readings_ask).max(axis=1)
+    applied = np.where(far[:, None], readings_ask, noted)
 
     def against() -> PlateauLoads:
-        off = np.flatnonzero((hung != noted).any(axis=1)).tolist()
-        found = asked(as_applied(loads, [WrongNote(first.plateaus[k], hung[k], period) for k in off]))
-        return replace(found, more=found.more + hung - noted, moved=first.moved)
+        off = np.flatnonzero((applied != noted).any(axis=1)).tolist()
+        implied = asked(as_applied(loads, [WrongNote(first.plateaus[k], applied[k], period) for k in off]))
+        return replace(implied, more=implied.more + applied - noted, moved=first.moved)
 
-    found = against()
-    which = outliers(found, BENT, largest)
+    implied = against()
+    which = outliers(implied, BENT, largest)
     for bent in (0.2 * BENT, 0.0, 0.0, 0.0):
         if not which.gone:
             return []
-        slopes, offset = proportional_part(found, which.gone, which.softer)
+        slopes, offset = proportional_part(implied, which.gone, which.softer)
         for k in which.gone:
-            hung[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + found.more[k] - offset)
-        found = against()
-        which = outliers(found, bent, largest)
+            applied[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + implied.more[k] - offset)
+        implied = against()
+        which = outliers(implied, bent, largest)
     out = []
     for k in which.gone:
         # What effects do to a load that no other is like, the readings alone do not tell from the load.
-        twice = None if _alike(found, np.array([k]))[0] else _annotated_twice(found, k)
-        out.append(WrongNote(first.plateaus[k], hung[k] if twice is None else twice, period, twice is not None))
+        twice = None if _alike(implied, np.array([k]))[0] else _annotated_twice(implied, k)
+        out.append(WrongNote(first.plateaus[k], applied[k] if twice is None else twice, period, twice is not None))
     return out
 
 

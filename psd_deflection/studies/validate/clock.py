@@ -75,10 +75,10 @@ class Offset:
         """Which clock is ahead, and what to add to what."""
         if not self.determined:
             if self.explained and self.rivals:
-                others = ', '.join(f'{1e3 * r:+.1f}' for r in self.rivals)
+                alternatives = ', '.join(f'{1e3 * r:+.1f}' for r in self.rivals)
                 return (
                     'The offset between the clocks is not told: the motion repeats itself, so that '
-                    f'{1e3 * self.value:+.1f} and {others} ms fit alike. '
+                    f'{1e3 * self.value:+.1f} and {alternatives} ms fit alike. '
                     'Record an event that comes once, such as a push or a step of the load.'
                 )
             return (
@@ -138,8 +138,8 @@ def clock_offset(
     if t[0] - largest > motion.t[-1] or t[-1] + largest < motion.t[0]:
         base = float(motion.t[0] - t[0])
         largest = float(max(t[-1] - t[0], motion.t[-1] - motion.t[0]))
-    found = offset_near(motion, t + base, poses, largest, exposure)
-    return replace(found, value=found.value + base, rivals=tuple(r + base for r in found.rivals))
+    fitted = offset_near(motion, t + base, poses, largest, exposure)
+    return replace(fitted, value=fitted.value + base, rivals=tuple(r + base for r in fitted.rivals))
 
 
 def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
@@ -147,11 +147,11 @@ def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float
     fits: list[OffsetFit] = []
     best: OffsetFit | None = None
     for start in coarse_offsets(motion, t, poses, largest):
-        found = refined_offset(motion, t, poses, start, exposure, best)
-        if found is not None and abs(found.value) <= largest + APART * motion.period:
-            fits.append(found)
-            if best is None or found.chi_square(best.sizes) < best.chi_square(best.sizes):
-                best = found
+        fitted = refined_offset(motion, t, poses, start, exposure, best)
+        if fitted is not None and abs(fitted.value) <= largest + APART * motion.period:
+            fits.append(fitted)
+            if best is None or fitted.chi_square(best.sizes) < best.chi_square(best.sizes):
+                best = fitted
     if best is None:
         raise RecordingError(
             f'the reference and the samples do not overlap enough: fewer than {FEWEST} of the references lie within '
@@ -160,11 +160,11 @@ def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float
     used = len(best.residual)
     least = best.chi_square(best.sizes)
     near = APART * motion.period
-    rivals = tuple(
+    alternatives = tuple(
         f.value for f in fits if abs(f.value - best.value) > near and used * (f.chi_square(best.sizes) - least) < RIVAL
     )
     explained = used * (biweight_sum((poses - np.median(poses, axis=0)) / best.sizes) - least)
-    return Offset(best.value, best.sd, best.drift, best.drift_sd, explained > MOVES, rivals, used)
+    return Offset(best.value, best.sd, best.drift, best.drift_sd, explained > MOVES, alternatives, used)
 
 
 def coarse_offsets(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) -> list[float]:
@@ -227,11 +227,11 @@ def refined_offset(
     weights = np.ones((len(t), 3))
     fit: OffsetFit | None = None
     for passed in range(PASSES):
-        seen, rates = motion.poses_at(t + value, exposure)
-        good = np.isfinite(seen).all(axis=1)
+        poses_of_motion, rates = motion.poses_at(t + value, exposure)
+        good = np.isfinite(poses_of_motion).all(axis=1)
         if good.sum() < FEWEST:
             return None
-        used = UsedReferences(t[good], poses[good], seen[good], rates[good])
+        used = UsedReferences(t[good], poses[good], poses_of_motion[good], rates[good])
         step, fit, weights[good] = used.solved(weights[good])
         value += step
         fit.value = value
@@ -261,36 +261,38 @@ class UsedReferences:
         causes = np.column_stack([np.ones(k), *(self.motion[:, i] - self.motion[:, i].mean() for i in moving)])
         scale = np.sqrt((causes * causes).mean(axis=0))
         causes = causes / scale
-        left = np.empty((k, 3))
+        residual = np.empty((k, 3))
         own = np.empty((k, 3))
         ramp = np.empty((k, 3))
         sizes = np.empty(3)
         for axis in range(3):
             root = np.sqrt(weights[:, axis])[:, None]
             terms = np.linalg.lstsq(causes * root, self.poses[:, axis, None] * root, rcond=1e-10)[0][:, 0]
-            left[:, axis] = self.poses[:, axis] - causes @ terms
-            sizes[axis] = max(1.4826 * float(np.median(np.abs(left[:, axis] - np.median(left[:, axis])))), 1e-12)
+            residual[:, axis] = self.poses[:, axis] - causes @ terms
+            sizes[axis] = max(
+                1.4826 * float(np.median(np.abs(residual[:, axis] - np.median(residual[:, axis])))), 1e-12
+            )
             # What the offset does to this axis, without what bias and scales could do as well.
             does = sum((terms[1 + c] / scale[1 + c] * self.rates[:, i] for c, i in enumerate(moving)), np.zeros(k))
             # Beside it what an offset that grows with time does.
             both = np.column_stack([does, does * self.t])
             both -= causes @ np.linalg.lstsq(causes * root, both * root, rcond=1e-10)[0]
             own[:, axis], ramp[:, axis] = both.T
-        next_weights = np.clip(1.0 - (left / (BIWEIGHT * sizes)) ** 2, 0.0, None) ** 2
+        next_weights = np.clip(1.0 - (residual / (BIWEIGHT * sizes)) ** 2, 0.0, None) ** 2
         w = next_weights / sizes**2
         information = float((w * own * own).sum())
         if information <= 0.0:
-            return 0.0, OffsetFit(0.0, math.inf, 0.0, math.inf, left, sizes), next_weights
-        step = float((w * own * left).sum()) / information
-        scores = (w * own * left).sum(axis=1)
-        spread = max(variance_of_sum(scores) / information**2, 1.0 / information)
+            return 0.0, OffsetFit(0.0, math.inf, 0.0, math.inf, residual, sizes), next_weights
+        step = float((w * own * residual).sum()) / information
+        scores = (w * own * residual).sum(axis=1)
+        variance = max(variance_of_sum(scores) / information**2, 1.0 / information)
         # The offset's growth with time, by what is left.
         ramp = ramp - own * (float((w * own * ramp).sum()) / information)
         grows = float((w * ramp * ramp).sum())
-        drift = float((w * ramp * left).sum()) / grows if grows > 0.0 else 0.0
-        drift_spread = variance_of_sum((w * ramp * left).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf
+        drift = float((w * ramp * residual).sum()) / grows if grows > 0.0 else 0.0
+        drift_spread = variance_of_sum((w * ramp * residual).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf
         drift_sd = math.sqrt(max(drift_spread, 1.0 / grows)) if grows > 0.0 else math.inf
-        return step, OffsetFit(0.0, math.sqrt(spread), drift, drift_sd, left, sizes), next_weights
+        return step, OffsetFit(0.0, math.sqrt(variance), drift, drift_sd, residual, sizes), next_weights
 
 
 def variance_of_sum(scores: FloatArray) -> float:
@@ -300,10 +302,10 @@ def variance_of_sum(scores: FloatArray) -> float:
     alone give half of the deviation of scores that remember nine tenths.
     """
     power = float(scores @ scores)
-    kept = min(max(float(scores[1:] @ scores[:-1]) / power, 0.0), LONGEST_MEMORY) if power > 0.0 else 0.0
-    new = scores[1:] - kept * scores[:-1] if kept > 0.0 else scores
+    correlation = min(max(float(scores[1:] @ scores[:-1]) / power, 0.0), LONGEST_MEMORY) if power > 0.0 else 0.0
+    new = scores[1:] - correlation * scores[:-1] if correlation > 0.0 else scores
     lags = math.floor(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0))
     total = float(new @ new)
     for lag in range(1, lags + 1):
         total += 2.0 * (1.0 - lag / (lags + 1.0)) * float(new[lag:] @ new[:-lag])
-    return max(total, 0.0) * len(scores) / max(len(new), 1) / (1.0 - kept) ** 2
+    return max(total, 0.0) * len(scores) / max(len(new), 1) / (1.0 - correlation) ** 2

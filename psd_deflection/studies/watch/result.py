@@ -79,12 +79,12 @@ class WatchedRun(StudyResult):
         along = TimeAxis(FROM_FIRST, self.marks)
         panels = []
         for channel in dict.fromkeys(a.channel for a in self.alarms):
-            own = [a for a in self.alarms if a.channel == channel]
-            t, shift, sd = np.array([(self.since_s(a), 1e6 * a.shift, 1e6 * a.sd) for a in own]).T
-            one = Series('', t, shift, 'red', 'points', 1.96 * sd)
+            alarms_of_channel = [a for a in self.alarms if a.channel == channel]
+            t, shift, sd = np.array([(self.since_s(a), 1e6 * a.shift, 1e6 * a.sd) for a in alarms_of_channel]).T
+            series = Series('', t, shift, 'red', 'points', 1.96 * sd)
             label = f'{channel} / {"µrad" if channel == "theta" else "µm"}'
             model = Series('', np.array([0.0, max(self.seconds, *t)]), np.zeros(2), 'quiet')
-            panels.append(Panel((model, one), along, label))
+            panels.append(Panel((model, series), along, label))
         return Chart('what shifted, since when and by how much (95 %)', panels)
 
     @property
@@ -97,14 +97,14 @@ class WatchedRun(StudyResult):
 
         Shifts are in m, of ``theta`` in rad.
         """
-        found = self.alarms
+        alarms = self.alarms
         return Table(
-            Column('since', np.array([self.since_s(a) for a in found], dtype=np.float64), 's', 'when it began'),
+            Column('since', np.array([self.since_s(a) for a in alarms], dtype=np.float64), 's', 'when it began'),
             [
-                Column('seen', np.array([(a.seen_ns - self.start_ns) / 1e9 for a in found]), 's', 'when it was sure'),
-                text_column('channel', [a.channel for a in found], 'what shifted'),
-                Column('shift', np.array([a.shift for a in found], dtype=np.float64), 'm, rad', 'by how much'),
-                Column('sd', np.array([a.sd for a in found], dtype=np.float64), 'm, rad', 'its standard deviation'),
+                Column('seen', np.array([(a.seen_ns - self.start_ns) / 1e9 for a in alarms]), 's', 'when it was sure'),
+                text_column('channel', [a.channel for a in alarms], 'what shifted'),
+                Column('shift', np.array([a.shift for a in alarms], dtype=np.float64), 'm, rad', 'by how much'),
+                Column('sd', np.array([a.sd for a in alarms], dtype=np.float64), 'm, rad', 'its standard deviation'),
             ],
             {'watched': self.watched},
         )

@@ -576,7 +576,14 @@ def test_a_waterfall_falls_effect_by_effect() -> None:
 
 
 def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
-    whole = {'sd': {}, 'p': 1e-9, 'delta_bic': 50.0, 'heldout': HeldOut(20.0, 2.0), 'equivalent': (), 'fitted_alternatives': ()}
+    whole = {
+        'sd': {},
+        'p': 1e-9,
+        'delta_bic': 50.0,
+        'heldout': HeldOut(20.0, 2.0),
+        'equivalent': (),
+        'fitted_alternatives': (),
+    }
     return NamedEffect(active, **{**whole, 'alternatives': (), 'suggestion': None, **given})
 
 

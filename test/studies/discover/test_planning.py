@@ -184,7 +184,9 @@ class Searches:
         self.seen.append(len(known))
         left = ('other',) * max(self.equivalents - len(known) + 1, 0)
         rivals = [SimpleNamespace(parameters=self.free)] * len(left)
-        return cast(Discovery, SimpleNamespace(unsettled=left, alternative_fits=rivals, fit=SimpleNamespace(parameters=1)))
+        return cast(
+            Discovery, SimpleNamespace(unsettled=left, alternative_fits=rivals, fit=SimpleNamespace(parameters=1))
+        )
 
     def settle(self, most: int | None = None) -> loop.LoopResult:
         first, made = cast(Observation, object()), cast(Observation, object())

@@ -130,6 +130,6 @@ def heldout_gain(workspace: Comparison, without: Fit, fit: Fit, rng: np.random.G
     """
     piece = workspace.pieces(heldout_residual(workspace, without, False), heldout_residual(workspace, fit, False))
     draws = rng.integers(0, len(piece), size=(BOOTSTRAPS, len(piece)))
-    spread = float(np.std(piece[draws].sum(axis=1)))
+    deviation = float(np.std(piece[draws].sum(axis=1)))
     gain = float(piece.sum())
-    return HeldOut(gain, min(spread, float(np.sqrt(2.0 * max(abs(gain), 1.0)))))
+    return HeldOut(gain, min(deviation, float(np.sqrt(2.0 * max(abs(gain), 1.0)))))

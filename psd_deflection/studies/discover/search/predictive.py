@@ -160,8 +160,8 @@ def _library(ws: Comparison, fit: Fit, screen: Screen) -> tuple[_Library, FloatA
         i >= fixed and not effects[i].effect.finite and effects[i].effect.parameter(name).kind == 'amplitude'
         for i, name in named
     ]
-    kept = [place not in fit.at_bound for place in fit.free]
-    for (i, name), is_term, is_kept in zip(named, straight, kept, strict=True):
+    inside_bounds = [place not in fit.at_bound for place in fit.free]
+    for (i, name), is_term, is_kept in zip(named, straight, inside_bounds, strict=True):
         if is_kept and not is_term:
             add(i, name)
     always = len(places)
@@ -223,25 +223,25 @@ def _solved(f: FloatArray, g: FloatArray) -> FloatArray:
 
 
 def averaged(
-    f: FloatArray, g: FloatArray, whole: float, size: float, rng: np.random.Generator
+    f: FloatArray, g: FloatArray, energy: float, size: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Mean sizes (k,) of the terms over all subsets, and how likely each takes part (k,).
 
-    ``f`` (k, k), ``g`` (k,), ``whole``: products of terms and target, whose ``size`` is a number of independent values;
+    ``f`` (k, k), ``g`` (k,), ``energy``: products of terms and target, of ``size`` independent values;
     terms of unit rms have ``f`` about ``size`` on the diagonal. Noise: Jeffreys' prior; each number of terms is as
     likely.
     """
     count = len(g)
     diagonal = np.diag(f).copy()
     usable = diagonal > LEAST_LENGTH * size
-    if not usable.any() or whole <= 0.0:
+    if not usable.any() or energy <= 0.0:
         return np.zeros(count), np.zeros(count)
     inside = np.zeros(count, dtype=bool)
     slab = 1.0
     steps = min(max(WALK[0], WALK[1] * count), WALK[2])
     sizes, weights, total = np.zeros(count), np.zeros(count), 0.0
     for step in range(steps):
-        odds, chosen, mean = _flips(f, g, whole, size, diagonal, inside, slab)
+        odds, chosen, mean = _flips(f, g, energy, size, diagonal, inside, slab)
         odds[~usable] = -50.0
         flip = 1.0 / (1.0 + np.exp(-np.clip(odds, -500.0, 500.0)))
         member = np.where(inside, 1.0 - flip, flip)
@@ -252,39 +252,39 @@ def averaged(
             weights += weight * member
             total += weight
         if step % 5 == 4:
-            slab = _slab(f, g, whole, size, chosen, rng)
+            slab = _slab(f, g, energy, size, chosen, rng)
         turned = int(rng.choice(count, p=pull * weight))
         inside[turned] = not inside[turned]
     return sizes / total, weights / total
 
 
 def _flips(
-    f: FloatArray, g: FloatArray, whole: float, size: float, diagonal: FloatArray, inside: BoolArray, slab: float
+    f: FloatArray, g: FloatArray, energy: float, size: float, diagonal: FloatArray, inside: BoolArray, slab: float
 ) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
     """Logarithms (k,) of the odds for each term being turned on or off; the terms that are on, and their sizes."""
     chosen = np.flatnonzero(inside)
     n, count = len(chosen), len(g)
-    left, room, pull = whole, diagonal + slab, g
-    mean, spread = np.zeros(0), np.zeros(0)
+    left, room, pull = energy, diagonal + slab, g
+    mean, deviation = np.zeros(0), np.zeros(0)
     if n:
         inverse = np.linalg.inv(f[np.ix_(chosen, chosen)] + slab * np.eye(n))
-        mean, spread = inverse @ g[chosen], np.diag(inverse)
+        mean, deviation = inverse @ g[chosen], np.diag(inverse)
         across = f[chosen]
-        left = max(whole - float(mean @ g[chosen]), 1e-12 * whole)
+        left = max(energy - float(mean @ g[chosen]), 1e-12 * energy)
         room = np.maximum(room - np.einsum('ij,ij->j', across, inverse @ across), slab)
         pull = g - mean @ across
-    with_it = np.maximum(left - pull**2 / room, 1e-12 * whole)
+    with_it = np.maximum(left - pull**2 / room, 1e-12 * energy)
     odds = 0.5 * np.log(slab / room) - 0.5 * size * np.log(with_it / left) + np.log((1.0 + n) / max(count - n, 1))
     if n:
-        without = left + mean**2 / spread
+        without = left + mean**2 / deviation
         odds[chosen] = (
-            -0.5 * np.log(slab * spread) - 0.5 * size * np.log(without / left) - np.log(n / (count - n + 1.0))
+            -0.5 * np.log(slab * deviation) - 0.5 * size * np.log(without / left) - np.log(n / (count - n + 1.0))
         )
     return odds, chosen, mean
 
 
 def _slab(
-    f: FloatArray, g: FloatArray, whole: float, size: float, chosen: npt.NDArray[np.intp], rng: np.random.Generator
+    f: FloatArray, g: FloatArray, energy: float, size: float, chosen: npt.NDArray[np.intp], rng: np.random.Generator
 ) -> float:
     """A precision of the sizes, drawn by how likely it is with the ``chosen`` terms."""
     if not len(chosen):
@@ -292,7 +292,7 @@ def _slab(
     values, vectors = np.linalg.eigh(f[np.ix_(chosen, chosen)])
     along = vectors.T @ g[chosen]
     room = values[None, :] + SLABS[:, None]
-    left = np.maximum(whole - (along**2 / room).sum(axis=1), 1e-12 * whole)
+    left = np.maximum(energy - (along**2 / room).sum(axis=1), 1e-12 * energy)
     logs = 0.5 * np.log(SLABS[:, None] / room).sum(axis=1) - 0.5 * size * np.log(left)
     p = np.exp(logs - logs.max())
     return float(rng.choice(SLABS, p=p / p.sum()))
@@ -316,14 +316,14 @@ class _Line:
 
     def moments(self, without: int = -1) -> _Moments:
         """Of all folds but one."""
-        seen = [t for i, t in enumerate(self.tables) if i != without]
+        tables_used = [t for i, t in enumerate(self.tables) if i != without]
         share = float(np.mean(self.fold != without))
-        return _Moments(np.sum(seen, axis=0), self.library.always, self.size * share)
+        return _Moments(np.sum(tables_used, axis=0), self.library.always, self.size * share)
 
     def solved(self, moments: _Moments, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Sizes (p,) of everything, columns being of unit rms, and how likely each takes part."""
-        f, g, whole = moments.beside()
-        sizes, weights = averaged(f, g, whole, max(moments.size - moments.always, 2.0), rng)
+        f, g, energy = moments.beside()
+        sizes, weights = averaged(f, g, energy, max(moments.size - moments.always, 2.0), rng)
         return moments.with_always(sizes), np.concatenate([np.ones(moments.always), weights])
 
     def refitted(self, moments: _Moments) -> FloatArray:

@@ -82,13 +82,13 @@ def persistent(
             scaled = residual[: 4 * n] / sigma
             there = np.any(scaled != 0.0, axis=1)
             shares = there.reshape(4, n).mean(axis=1)
-            told = shares >= LEAST_THERE
-            if told.sum() < FEWEST_QUARTERS:
+            persistent_terms = shares >= LEAST_THERE
+            if persistent_terms.sum() < FEWEST_QUARTERS:
                 steady = False
                 break
             centred = np.where(there[:, None], scaled - scaled[there].mean(axis=0), 0.0)
             turned = np.exp(-2j * np.pi * f * t)[:, None] * centred
-            quarters = turned.reshape(4, n, -1).mean(axis=1)[told] / shares[told, None]
+            quarters = turned.reshape(4, n, -1).mean(axis=1)[persistent_terms] / shares[persistent_terms, None]
             strongest = int(np.argmax(np.abs(quarters).sum(axis=0)))
             q = quarters[:, strongest]
             size = np.abs(q)

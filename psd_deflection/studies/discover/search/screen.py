@@ -41,12 +41,12 @@ class Score:
 def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
     """The best candidate of each variant, those that gain at least ``share`` of the best gain."""
     out: list[Score] = []
-    seen: set[tuple[object, ...]] = set()
+    visited: set[tuple[object, ...]] = set()
     best = max((s.gain for s in scores), default=0.0)
     for s in sorted(scores, key=lambda s: -(s.gain - penalty * s.dof)):
-        if s.candidate.variant in seen or s.gain < share * best or s.gain <= 0.0:
+        if s.candidate.variant in visited or s.gain < share * best or s.gain <= 0.0:
             continue
-        seen.add(s.candidate.variant)
+        visited.add(s.candidate.variant)
         out.append(s)
         if len(out) == limit:
             break

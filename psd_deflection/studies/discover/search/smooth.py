@@ -195,21 +195,21 @@ def _covariance(shape: FloatArray, own: Remainders, names: Sequence[str]) -> Flo
 
 
 def _known(
-    remains: Remainders, names: Sequence[str], shapes: FloatArray, seen: BoolArray
+    remains: Remainders, names: Sequence[str], shapes: FloatArray, training: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What is left (d,) of all values, the function there (d,), and by what the sizes (p,) move, from the ``seen``."""
+    """Return residual (d,) of all values, the function there (d,), the move of the sizes (p,), from ``training``."""
     function = np.zeros((len(remains.values), len(remains.values)))
     noise = np.zeros(len(remains.values))
     for shape, c in zip(shapes, np.unique(remains.channel).tolist(), strict=True):
         own = remains.channel == c
         function[np.ix_(own, own)] = _covariance(shape, remains.part(own), names)
         noise[own] = np.exp(2.0 * shape[0])
-    factor = cho_factor((function + np.diag(noise))[np.ix_(seen, seen)])
-    sizes, values = remains.sizes[seen], remains.values[seen]
+    factor = cho_factor((function + np.diag(noise))[np.ix_(training, training)])
+    sizes, values = remains.sizes[training], remains.values[training]
     lengths = np.maximum(np.linalg.norm(sizes, axis=0), 1e-150)
     f = (sizes / lengths).T @ cho_solve(factor, sizes / lengths)
     more = np.linalg.lstsq(f, (sizes / lengths).T @ cho_solve(factor, values), rcond=1e-9)[0] / lengths
-    value = function[:, seen] @ cho_solve(factor, values - sizes @ more)
+    value = function[:, training] @ cho_solve(factor, values - sizes @ more)
     return remains.values - remains.sizes @ more - value, value, more
 
 
@@ -221,7 +221,7 @@ def unseen_residual(
     """
     out = np.zeros(len(remains.values))
     for fold in np.unique(remains.fold[there]):
-        seen = there & (remains.fold != fold)
-        own = shapes if shaped else _shaped(remains.part(seen), names, shapes)[0]
-        out[~seen & there] = _known(remains, names, own, seen)[0][~seen & there]
+        training = there & (remains.fold != fold)
+        own = shapes if shaped else _shaped(remains.part(training), names, shapes)[0]
+        out[~training & there] = _known(remains, names, own, training)[0][~training & there]
     return out

@@ -49,9 +49,9 @@ class Tie:
     @property
     def sentence(self) -> str:
         """Why they are tied, the causes with their sizes, and what tells these apart."""
-        spread = f'{100.0 * self.share:.3g} ± {100.0 * self.sd:.1g} %'
+        share_words = f'{100.0 * self.share:.3g} ± {100.0 * self.sd:.1g} %'
         factors = {c.name: f'{c.factor:.5g} ± {c.sd:.1g}' for c in self.causes}
-        words = f'Both stiffnesses, EI and GJ, differ by the same share ({spread}), as one cause makes them: '
+        words = f'Both stiffnesses, EI and GJ, differ by the same share ({share_words}), as one cause makes them: '
         radius = f"the link's radii times {factors['link_radius']} (EI and GJ grow with their fourth power)"
         if self.moves:
             return (

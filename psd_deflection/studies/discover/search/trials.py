@@ -150,15 +150,15 @@ class Trials:
 
     def without_each(self, fit: Fit, null: Fit) -> list[Fit]:
         """``fit`` refitted without each of its effects in turn; ``null``: the fit of no effect."""
-        kept = self.dropped.get(id(fit))
-        if kept is None:
+        cached = self.dropped.get(id(fit))
+        if cached is None:
             fits = []
             for i in range(len(fit.effects)):
                 rest = [a for j, a in enumerate(fit.effects) if j != i]
                 fits.append(refit(self.workspace, rest, iterations=6) if rest else null)
             # Keep the fit itself too, so that no other object gets its id.
-            kept = self.dropped[id(fit)] = (fit, fits)
-        return kept[1]
+            cached = self.dropped[id(fit)] = (fit, fits)
+        return cached[1]
 
     def log(self, text: str) -> None:
         """Keep a step of the search, with the simulations so far, and tell it."""

@@ -120,12 +120,12 @@ def covariance_of(fit: Fit, effects: Sequence[NamedEffect]) -> tuple[tuple[str, 
     columns = [fit.free.index((index[id(e.active)], n)) if id(e.active) in index else -1 for e, n in places]
     sd = np.array([e.sd[name] for e, name in places])
     fitted = fit.covariance()
-    spread = np.sqrt(np.maximum(np.diag(fitted), 0.0))
+    deviations = np.sqrt(np.maximum(np.diag(fitted), 0.0))
     out = np.diag(sd**2)
     for a, i in enumerate(columns):
         for b, j in enumerate(columns):
-            if a != b and min(i, j) >= 0 and min(spread[i], spread[j]) > 0.0:
-                out[a, b] = fitted[i, j] / (spread[i] * spread[j]) * sd[a] * sd[b]
+            if a != b and min(i, j) >= 0 and min(deviations[i], deviations[j]) > 0.0:
+                out[a, b] = fitted[i, j] / (deviations[i] * deviations[j]) * sd[a] * sd[b]
     return tuple(f'{e.active.effect.name}.{name}' for e, name in places), out
 
 

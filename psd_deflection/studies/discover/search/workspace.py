@@ -195,8 +195,8 @@ class Workspace(Comparison):
             return None
         white = np.array([self._white(t) for t in free.tables])
         energy, vectors = np.linalg.eigh(white @ white.T)
-        seen = energy > max(1e-6, 1e-14 * float(energy.max()))
-        energy, vectors = energy[seen], vectors[:, seen]
+        observable = energy > max(1e-6, 1e-14 * float(energy.max()))
+        energy, vectors = energy[observable], vectors[:, observable]
         rows = (vectors / np.sqrt(energy)).T @ white
         back = np.array([d.sd for d in free.directions])[:, None] * vectors
         return Free(free.directions, free.tables, rows, energy, back)

@@ -165,9 +165,9 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
 def time_loads(observation: Observation) -> tuple[Observation, MendedLoads | None]:
     """The recording with its loads at the times at which they acted, by the motion, and what was noted otherwise."""
     o = observation
-    mended = mend_loads(o.rig, o.volts[:, dot_channels(o.psds)] * o.rig.sensitivities.ravel(), o.loads)
-    if mended is None:
+    corrected = mend_loads(o.rig, o.volts[:, dot_channels(o.psds)] * o.rig.sensitivities.ravel(), o.loads)
+    if corrected is None:
         return o, None
     volts = o.volts.copy()
-    volts[mended.unused] = np.nan
-    return dataclasses.replace(o, volts=volts, loads=mended.loads, digest=o.digest or o.hashed()), mended
+    volts[corrected.unused] = np.nan
+    return dataclasses.replace(o, volts=volts, loads=corrected.loads, digest=o.digest or o.hashed()), corrected

@@ -58,11 +58,11 @@ def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequen
     return implied_loads(o.rig, difference, ws.count[recording], len(o.loads), ws.fine[recording], listed)
 
 
-def swayed(ws: Workspace, recording: int, difference: FloatArray, found: PlateauLoads) -> list[SwayingLoad]:
-    """Loads that swayed; ``found``: what ``difference`` asks for between all steps."""
+def swayed(ws: Workspace, recording: int, difference: FloatArray, implied: PlateauLoads) -> list[SwayingLoad]:
+    """Loads that swayed; ``implied``: what ``difference`` asks for between all steps."""
     o = ws.observations[recording]
-    noted = plateaus(o.rig, o.volts, o.loads, recording, noted=True)
-    return swaying(found, noted, partial(levels, ws, recording, difference), o.period)
+    annotated = plateaus(o.rig, o.volts, o.loads, recording, noted=True)
+    return swaying(implied, annotated, partial(levels, ws, recording, difference), o.period)
 
 
 def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:

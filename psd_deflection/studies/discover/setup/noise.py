@@ -214,10 +214,10 @@ def _memories(residual: FloatArray, rest: list[slice], floors: FloatArray) -> li
         filled = _filled(residual[:, c], there)
         # A residual is 0 where a sample is missing, so that each product counts two that were measured.
         rows = [strip_lines(detrend(filled[w])) * there[w] for w in rest]
-        seen = [there[w].astype(np.float64) for w in rest]
-        count = int(sum(s.sum() for s in seen))
+        valid = [there[w].astype(np.float64) for w in rest]
+        count = int(sum(s.sum() for s in valid))
         if count > LEAST_REST:
-            pooled[c] = [_product(rows, k) / max(_product(seen, k), 1.0) for k in range(ORDER + 1)]
+            pooled[c] = [_product(rows, k) / max(_product(valid, k), 1.0) for k in range(ORDER + 1)]
             if pooled[c, 0] > floor**2:
                 significant[c] = abs(pooled[c, 1]) / pooled[c, 0] * np.sqrt(count)
     most = 2 * int(np.sum(significant > SIGNIFICANT)) > len(significant)

@@ -127,9 +127,9 @@ def _moved(recording: int, count: int, by: FloatArray) -> ActiveEffect:
 def visible(ws: Workspace, columns: Sequence[Sequence[FloatArray]]) -> float:
     """The least share of its energy that an effect with signatures ``columns`` shows in the fourth reading."""
     white = np.array([ws.whiten(c) for c in columns])
-    own = fourth(ws, white)
-    whole = white @ white.T
-    lengths = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-    whole = whole / np.outer(lengths, lengths) + 1e-9 * np.eye(len(white))
-    seen = (own @ own.T) / np.outer(lengths, lengths)
-    return float(eigh(seen, whole, eigvals_only=True)[0])
+    patterns = fourth(ws, white)
+    gram = white @ white.T
+    lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    gram = gram / np.outer(lengths, lengths) + 1e-9 * np.eye(len(white))
+    cosines = (patterns @ patterns.T) / np.outer(lengths, lengths)
+    return float(eigh(cosines, gram, eigvals_only=True)[0])
