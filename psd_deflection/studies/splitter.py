@@ -74,13 +74,13 @@ def dots_apart(separation: float, focal: tuple[float, float], between: float | N
 
 
 class SplitterRule(NamedTuple):
-    """One rule. ``value`` and ``limit``: what is compared; ``unit`` of both; ``satisfied``: whether it holds."""
+    """One rule. ``value`` and ``limit``: what is compared; ``unit`` of both; ``kept``: whether it holds."""
 
     words: str
     value: float
     limit: float
     unit: str
-    satisfied: bool
+    kept: bool
 
 
 class LightPhase(NamedTuple):
@@ -88,7 +88,7 @@ class LightPhase(NamedTuple):
 
     ``estimates``: share of blocks with one; ``status`` of most blocks; ``deviations`` (3,): stated, m, m, rad;
     ``off``, ``scatter`` (3,): mean and standard deviation of the errors, m, m, rad; ``largest``: largest error about
-    their mean, in stated deviations (0 without estimates); ``message``: the finding, or ''.
+    their mean, in stated deviations (0 without estimates); ``said``: the finding, or ''.
     """
 
     name: str
@@ -98,7 +98,7 @@ class LightPhase(NamedTuple):
     off: FloatArray
     scatter: FloatArray
     largest: float
-    message: str
+    said: str
 
 
 def rules(rig: Rig, lasers: Lasers) -> list[SplitterRule]:

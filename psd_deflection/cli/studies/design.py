@@ -155,16 +155,14 @@ def splitter_of(args: argparse.Namespace) -> int:
         show_text(rules_text(rules))
         show()
         show_text(phases_text(phases))
-    return 0 if all(rule.satisfied for rule in rules) else 1
+    return 0 if all(rule.kept for rule in rules) else 1
 
 
 def rules_text(rules: Sequence[splitter.SplitterRule]) -> str:
     """A row for each rule."""
     rows = [['rule', 'is', 'limit', 'unit', 'kept']]
     for rule in rules:
-        rows.append(
-            [rule.words, f'{rule.value:.4g}', f'{rule.limit:.4g}', rule.unit, 'yes' if rule.satisfied else 'NO']
-        )
+        rows.append([rule.words, f'{rule.value:.4g}', f'{rule.limit:.4g}', rule.unit, 'yes' if rule.kept else 'NO'])
     return columns(rows)
 
 
@@ -175,7 +173,7 @@ def phases_text(phases: Sequence[splitter.LightPhase]) -> str:
         sds = (p.deviations * np.array([1e6, 1e6, MDEG])).tolist()
         numbers = [*(f'{v:.3f}' for v in sds), f'{1e6 * p.off[0]:.1f}', f'{p.largest:.1f}']
         rows.append([p.name, f'{p.estimates:.0%}', *(numbers if p.estimates else ['–'] * 5)])
-    said = [f'{p.name}: {p.message}' for p in phases if p.message]
+    said = [f'{p.name}: {p.said}' for p in phases if p.said]
     return '\n'.join([columns(rows), *(['', *said] if said else [])])
 
 

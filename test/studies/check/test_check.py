@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from blind import generator
-from psd_deflection.base.errors import ConfigError, RecordingError
+from psd_deflection.base.errors import RecordingError
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
@@ -27,7 +27,6 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.responses import responses
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, WRONG, Checkup
-from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.from_recordings import read_observation
 
 CLOUD = 2e-3 * 0.5e-3
@@ -247,12 +246,6 @@ def test_drift_is_told_with_its_sign() -> None:
     assert re.match(r'drift: \+(59|6\d)\.\d µm a minute on x2', note)
 
 
-def test_a_line_is_one_that_ros_reads_as_well() -> None:
-    # rcl takes a bare y for true.
-    assert line('psd_1.axes', ['-x', 'y']) == "psd_1.axes: [-x, 'y']"
-    assert line('psds_exchanged', True) == 'psds_exchanged: true'
-
-
 def test_loads_that_say_nothing_and_samples_with_gaps_are_no_accident() -> None:
     loads = pushes(10.0)
     volts = recorded(loads, 1)
@@ -269,13 +262,6 @@ def test_loads_that_say_nothing_and_samples_with_gaps_are_no_accident() -> None:
     assert checked(lost, loads).verdict == RIGHT
     with pytest.raises(RecordingError, match='at least 8 are needed'):
         checked(volts[:100], loads[:100])
-
-
-def test_psds_at_the_base_are_refused() -> None:
-    loads = pushes(10.0)
-    base = rig_from_values({'solver': 'base_pair', 'psd_1.height': -0.5, 'psd_2.height': -0.4})
-    with pytest.raises(ConfigError, match='PSDs on the tip plate only'):
-        checked(recorded(loads, 0), loads, base)
 
 
 # ---- the command

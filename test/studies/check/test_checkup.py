@@ -17,7 +17,7 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check import checkup
 from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.levels import Levels
-from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup
 from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFit, on_channels
 from psd_deflection.studies.loads.noted_times import CorrectedNote
 
@@ -64,24 +64,6 @@ def checked(
 
 def of(found: Checkup) -> list[tuple[str, str]]:
     return [(f.name, f.where) for f in found.findings]
-
-
-def test_three_pushes_of_a_rig_as_its_file_says_are_right() -> None:
-    found = checked()
-    assert (found.verdict, found.findings, dict(found.values), found.light, found.notes) == (RIGHT, (), {}, {}, ())
-    assert found.sizes == pytest.approx([1.0] * 3)
-    assert [f.wiring for f in found.wirings] == [Wiring()]
-    assert found.source == 'x'
-    assert CheckProblem(RIG, (), of_levels(), np.zeros(4), np.zeros(4)).source == ''
-
-
-def test_notes_that_are_wrong_come_first_and_are_wrong() -> None:
-    late = CorrectedNote(2, (1.0, 0.0, 0.0), 3.0, 1.0, 0.0)
-    found = checked(notes=[late])
-    assert found.verdict == WRONG
-    assert [(f.name, f.where, f.value, f.fix, f.evidence) for f in found.findings] == [
-        ('load_time', 'load 2', 2.0, late.words('x'), 2.0)
-    ]
 
 
 # ---- which channel does not answer
@@ -279,28 +261,6 @@ def test_pushes_that_no_wiring_explains_are_asked_for_again() -> None:
 # ---- levels
 
 
-def test_noise_is_judged_without_what_is_stuck_or_hidden_by_steps() -> None:
-    loud = np.full(6, 3.0 * STATED)
-    assert of(checked(levels=of_levels(loud))) == [('noise_level', 'x1 y1 x2 y2')]
-    assert checked(levels=of_levels(loud)).findings[0].value == pytest.approx(3.0, abs=2e-3)
-    assert list(checked(levels=of_levels(loud)).values) == ['amplifier.noise']
-    # What is louder on a stuck channel counts for nothing, and so does what is smaller than a step.
-    one = np.full(6, STATED)
-    one[3] = 100.0 * STATED
-    assert of(checked(levels=of_levels(one, stuck=('x2',)))) == [('stuck_channel', 'x2')]
-    steps = np.zeros(6)
-    steps[3] = 101.0 * STATED
-    assert of(checked(levels=of_levels(one, steps=steps.tolist()))) == [('converter_step', 'x2')]
-    steps[3] = 99.0 * STATED
-    assert of(checked(levels=of_levels(one, steps=steps.tolist())))[0] == ('noise_level', 'x1 y1 x2 y2')
-    # Exactly as large it is seen, and the sums have no say.
-    steps[3] = one[3]
-    assert of(checked(levels=of_levels(one, steps=steps.tolist())))[0] == ('noise_level', 'x1 y1 x2 y2')
-    one = np.full(6, STATED)
-    one[[2, 5]] = 100.0 * STATED
-    assert of(checked(levels=of_levels(one))) == []
-
-
 def test_noise_is_that_of_the_psds_whatever_inputs_they_are_on() -> None:
     rig = load_rig(
         overrides={
@@ -390,10 +350,3 @@ def test_drift_is_worth_a_look_beyond_five_micrometres_a_minute_and_five_deviati
         words = f'drift: {told}; let lasers and amplifier warm up'
         assert checked(drift=drift, drift_sd=deviation).notes == ((words,) if told else ())
     assert pytest.approx(5e-6 / 60.0) == TELLING_DRIFT
-
-
-def test_a_finding_has_no_evidence_and_nothing_like_it_unless_that_is_said() -> None:
-    one = Finding('jump', 'x1', None, 'look')
-    assert (one.evidence, one.equivalent) == (0.0, ())
-    with pytest.raises(ValueError, match=r'^odd: must be one of channel_sign, '):
-        Finding('odd', 'x1', None, 'look')

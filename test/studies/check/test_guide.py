@@ -219,13 +219,6 @@ def test_pieces_of_any_length_count_by_their_samples() -> None:
     assert len(moving.guide.rest()) == 2000
 
 
-def test_what_is_moved_is_against_the_last_rest_or_what_was_just_seen() -> None:
-    fed = Fed()
-    fed.feed(NOTHING)
-    fed.feed((8 * MICRO, 0.0, 0.0, 0.0))
-    assert fed.guide.moved == pytest.approx([4 * MICRO, 0.0, 0.0, 0.0])
-
-
 @pytest.mark.parametrize(('shaking', 'rests'), [(1.10 * MICRO, True), (1.14 * MICRO, False)])
 def test_rest_wanders_by_no_more_than_five_times_the_noise_of_a_block(shaking: float, rests: bool) -> None:
     # 2 mV are 1 um a sample; of a block of 20 five deviations are 1.118 um.
@@ -336,19 +329,6 @@ def test_a_push_is_against_the_rests_before_and_after_and_as_sure_as_these_were(
     assert sd == pytest.approx((np.array([rest, 1e-6, rest, rest]) + 2e-6) / 2.4)
     assert fed.guide.rest().shape == (2000, 6)
     assert fed.guide.rest()[:, 2].tolist() == [5.0] * 2000
-
-
-def test_a_piece_goes_when_the_pieces_after_it_are_enough() -> None:
-    fed = Fed()
-    for samples, place in ((1500, 10.0), (900, 20.0), (10, 60.0)):
-        volts = np.zeros((samples, 6))
-        volts[:, 0] = place * MICRO / 5e-4
-        fed.guide.feed(volts)
-    assert fed.guide.moved == pytest.approx([(60.0 - 30.0) * MICRO, 0.0, 0.0, 0.0])
-    volts = np.zeros((1095, 6))
-    fed.guide.feed(volts)
-    # 900, 10 and 1095 samples are enough for two seconds.
-    assert fed.guide.moved == pytest.approx([(0.0 - 80.0 / 3.0) * MICRO, 0.0, 0.0, 0.0])
 
 
 def test_a_push_at_the_end_of_the_range_is_filled_and_no_more() -> None:

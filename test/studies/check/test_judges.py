@@ -18,7 +18,6 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check import judges
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.levels import levels
-from psd_deflection.studies.check.wirings import WIRINGS
 
 RIG = load_rig()
 
@@ -42,28 +41,6 @@ def test_check_and_discover_say_the_same_of_the_noise(
         assert of_check['value'] == pytest.approx(of_search['value'], rel=0.03)
         levels_told = [float(f['fix'].removeprefix('amplifier.noise: ')) for f in (of_check, of_search)]
         assert levels_told == pytest.approx([noise, noise], rel=0.05)
-
-
-@pytest.mark.parametrize(('factor', 'told'), [(0.49, True), (0.51, False), (1.0, False), (1.99, False), (2.01, True)])
-def test_noise_is_reported_from_twice_or_half_of_the_files_on(factor: float, told: bool) -> None:
-    stated = math.hypot(RIG.amplifier.noise, RIG.converter.volts_per_count / math.sqrt(12.0))
-    findings, lines = judges.noise_findings(RIG, np.full(4, factor * stated))
-    assert [f.name for f in findings] == ['noise_level'] * told
-    assert list(lines) == ['amplifier.noise'] * told
-    # A stuck channel says nothing of the noise of the others.
-    some, _ = judges.noise_findings(RIG, np.array([math.nan, *[factor * stated] * 3]))
-    assert [f.value for f in some] == [f.value for f in findings]
-    assert judges.noise_findings(RIG, np.full(4, math.nan)) == ([], {})
-
-
-def test_a_wiring_is_told_by_its_differences_with_lines_that_put_it_right() -> None:
-    file = Wiring.from_rig(RIG)
-    assert judges.wiring_findings(file, file, 1.0) == ([], {})
-    for wiring in WIRINGS:
-        findings, lines = judges.wiring_findings(wiring, file, 7.0, ('another',))
-        assert Wiring.from_rig(load_rig(overrides=lines)) == wiring
-        assert all((f.evidence, f.equivalent) == (7.0, ('another',)) for f in findings)
-        assert bool(findings) == (wiring != file)
 
 
 def test_each_unit_has_its_factor() -> None:

@@ -56,13 +56,6 @@ def test_noise_is_what_third_differences_have_without_steps_glitches_and_lost_sa
     assert levels(RIG, still).noise == pytest.approx(math.sqrt((1 + 4 + 1) * 16 / 897 / 20) * STEP, rel=0.5)
 
 
-def test_only_the_begin_of_a_long_recording_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    volts = noisy(900)
-    volts[500:] = 3.0
-    monkeypatch.setattr(module, 'LONGEST', 500)
-    assert levels(RIG, volts).sums == pytest.approx(volts[:500, [2, 5]].mean(axis=0))
-
-
 def test_a_channel_on_which_no_bit_moves_is_stuck_if_noise_would_move_one() -> None:
     volts = noisy(200)
     volts[:, [1, 5]] = 0.25
@@ -77,13 +70,6 @@ def test_one_sample_has_no_noise() -> None:
     found = levels(RIG, noisy(1))
     assert found.noise.tolist() == [0.0] * 6
     assert found.sums == pytest.approx(noisy(1)[0, [2, 5]])
-
-
-def test_steps_are_seen_wherever_they_are() -> None:
-    volts = np.zeros((2500, 6))
-    volts[2000:] = 0.05 * np.random.default_rng(2).integers(-3, 4, (500, 6))
-    assert levels(RIG, volts).steps == pytest.approx([0.05] * 6, rel=1e-3)
-    assert not levels(RIG, noisy(2500)).steps.any()
 
 
 def test_the_longest_run_is_the_first_of_those_without_a_lost_sample() -> None:
