@@ -26,7 +26,7 @@ from psd_deflection.studies.calibrate.dark import DarkLevel, dark_levels, values
 from psd_deflection.studies.calibrate.observation import CalibrationRun, usable_dots
 from psd_deflection.studies.calibrate.result import Calibrated
 from psd_deflection.studies.loads.acted import loads_that_acted
-from psd_deflection.studies.loads.noted_times import mend_loads
+from psd_deflection.studies.loads.noted_times import correct_loads
 from psd_deflection.studies.study import Tell, opened
 
 
@@ -112,7 +112,7 @@ def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
     """
     if run.loads is None:
         return run
-    corrected = mend_loads(rig, usable_dots(run, rig), run.loads)
+    corrected = correct_loads(rig, usable_dots(run, rig), run.loads)
     loads, notes = (run.loads, ()) if corrected is None else (corrected.loads, corrected.notes)
     acted = loads_that_acted(rig, run.volts, loads)
     for note in (*notes, *acted.notes):

@@ -34,7 +34,7 @@ from psd_deflection.studies.check.wirings import (
     misfit,
 )
 from psd_deflection.studies.loads.acted import LoadNote, loads_that_acted
-from psd_deflection.studies.loads.noted_times import CorrectedNote, mend_loads
+from psd_deflection.studies.loads.noted_times import CorrectedNote, correct_loads
 
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
@@ -69,7 +69,7 @@ def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '
     Raises ConfigError for a rig of more than two PSDs.
     """
     check_two_psds(rig, 'check')
-    corrected = mend_loads(rig, volts[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
+    corrected = correct_loads(rig, volts[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
     late: Sequence[CorrectedNote] = ()
     moved = volts
     if corrected is not None:

@@ -173,15 +173,17 @@ class Conclusion(StudyResult):
 
     def table(self) -> Table:
         """One row a parameter of each effect that was named: ``value``, ``sd``, ``unit``, and what speaks for it."""
-        rows = [(e, name, told) for e in self.effects for name, told in parameters_of(e).items()]
-        told = [t if isinstance(t, dict) else {'value': t, 'sd': 0.0, 'unit': ''} for *_, t in rows]
+        rows = [(e, name, entries) for e in self.effects for name, entries in parameters_of(e).items()]
+        entries = [t if isinstance(t, dict) else {'value': t, 'sd': 0.0, 'unit': ''} for *_, t in rows]
         return Table(
             text_column('effect', [e.active.label for e, *_ in rows], 'that was missing'),
             [
                 text_column('parameter', [name for _, name, _ in rows], 'of the effect'),
-                Column('value', np.array([t['value'] for t in told], dtype=np.float64), '', 'in the unit of the row'),
-                Column('sd', np.array([t['sd'] for t in told], dtype=np.float64), '', 'its standard deviation'),
-                text_column('unit', [t['unit'] for t in told], 'of the row'),
+                Column(
+                    'value', np.array([t['value'] for t in entries], dtype=np.float64), '', 'in the unit of the row'
+                ),
+                Column('sd', np.array([t['sd'] for t in entries], dtype=np.float64), '', 'its standard deviation'),
+                text_column('unit', [t['unit'] for t in entries], 'of the row'),
                 Column('delta_bic', np.array([e.delta_bic for e, *_ in rows], dtype=np.float64), '', 'BIC better by'),
                 Column('p', np.array([e.p for e, *_ in rows], dtype=np.float64), '', 'over the whole library'),
             ],
@@ -410,8 +412,8 @@ def _seconds(finding: Finding) -> str:
     """How late a load was noted, or how long it took."""
     if not isinstance(finding.value, float) or finding.name not in ('load_time', 'load_ramp'):
         return ''
-    late = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
-    return f', {abs(finding.value):.3g} s{late}'
+    direction = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
+    return f', {abs(finding.value):.3g} s{direction}'
 
 
 def _moved(discovery: RigConclusion) -> str:

@@ -245,11 +245,13 @@ def _with_all_loads_free(
         if not (may_be_rounded(asked) if maybe_rounded else all_free(asked, o.loads)):
             return None
         # A person knows when nothing hangs.
-        own = [(p, more) for p, more in zip(asked.plateaus, asked.more, strict=True) if np.any(p.annotated != 0.0)]
+        implied_of_loads = [
+            (p, more) for p, more in zip(asked.plateaus, asked.more, strict=True) if np.any(p.annotated != 0.0)
+        ]
         loads = o.loads.copy()
-        for p, more in own:
+        for p, more in implied_of_loads:
             loads[p.first : p.last] += more
-        wrong += [p for p, _ in own]
+        wrong += [p for p, _ in implied_of_loads]
         observations.append(dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed()))
     if had is not None:
         return had

@@ -302,8 +302,8 @@ def read_tables(
     if not any(kinds):
         return []
     if not all(kinds):
-        other = next(s for (s, _, _), table in zip(listed, kinds, strict=True) if not table)
-        name = other.path if isinstance(other, Recording) else other
+        source_of_kind = next(s for (s, _, _), table in zip(listed, kinds, strict=True) if not table)
+        name = source_of_kind.path if isinstance(source_of_kind, Recording) else source_of_kind
         raise RecordingError(f'{name}: is no table of readings, but others are: search them one by one')
     if rig is None and None in alone:
         warn('a table of readings says nothing of its rig: the nominal rig is taken; give --params-file')

@@ -224,11 +224,13 @@ def _isolable(
     """One candidate, and the share of its signature that each of ``variants`` imitates at best."""
     column = screen.slice_of(candidate).start
     length = float(screen.fisher[column, column])
-    shares = [max(_imitated(screen, column, screen.slice_of(c)) for c in others) for others in variants.values()]
+    shares = [
+        max(_imitated(screen, column, screen.slice_of(c)) for c in other_choices) for other_choices in variants.values()
+    ]
     alternatives = [
         (share, name)
-        for (name, others), share in zip(variants.items(), shares, strict=True)
-        if others[0].effect is not candidate.effect and len(others[0].free) <= len(candidate.free)
+        for (name, other_choices), share in zip(variants.items(), shares, strict=True)
+        if other_choices[0].effect is not candidate.effect and len(other_choices[0].free) <= len(candidate.free)
     ]
     share, alike = max(alternatives, default=(0.0, ''))
     apart = 1.0 - share if 1.0 - share > ALIKE else 0.0

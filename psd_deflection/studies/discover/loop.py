@@ -112,14 +112,14 @@ def _listed(made: Sequence[tuple[str, Plan]]) -> str:
     return yaml.safe_dump(tree, sort_keys=False)
 
 
-def next_of(found: Discovery, limits: Limits | None = None) -> Plan | None:
+def next_of(discovery: Discovery, limits: Limits | None = None) -> Plan | None:
     """The next recording after a search; None if it left no rivals."""
-    return plan_next(found.workspace, found.fit, found.alternative_fits, limits)
+    return plan_next(discovery.workspace, discovery.fit, discovery.alternative_fits, limits)
 
 
-def planned(found: Discovery, limits: Limits | None = None) -> LoopResult:
+def planned(discovery: Discovery, limits: Limits | None = None) -> LoopResult:
     """The answer with the plan of the next recording, which nobody makes here."""
-    return LoopResult(found, (), next_of(found, limits), None)
+    return LoopResult(discovery, (), next_of(discovery, limits), None)
 
 
 def run_loop(
@@ -137,18 +137,18 @@ def run_loop(
     """
     known, plans = list(recordings), list[Plan]()
     while True:
-        found = search(known)
+        discovery = search(known)
         progress('planning')
-        plan = next_of(found, limits)
+        plan = next_of(discovery, limits)
         # A rival with more parameters that came out as the named effect would be has nothing left that could be tested:
         # nothing within the limits needs its further ones.
-        needed = any(rival.parameters <= found.fit.parameters for rival in found.alternative_fits)
-        if plan is None or not (plan.useful or (found.unsettled and needed)):
-            return LoopResult(found, tuple(plans), None, 'unique')
+        needed = any(rival.parameters <= discovery.fit.parameters for rival in discovery.alternative_fits)
+        if plan is None or not (plan.useful or (discovery.unsettled and needed)):
+            return LoopResult(discovery, tuple(plans), None, 'unique')
         if not plan.useful:
-            return LoopResult(found, tuple(plans), plan, 'limits')
+            return LoopResult(discovery, tuple(plans), plan, 'limits')
         if len(plans) == most:
-            return LoopResult(found, tuple(plans), plan, 'recordings')
+            return LoopResult(discovery, tuple(plans), plan, 'recordings')
         plans.append(plan)
         progress(f'recording {len(plans)}')
         known.append(record(plan, len(plans)))

@@ -238,9 +238,11 @@ def plan_next(
     return dataclasses.replace(plan, discriminations=tuple(discriminations))
 
 
-def suggest(workspace: Workspace, named: Fit, others: Sequence[Fit], limits: Limits | None = None) -> Suggestion | None:
-    """The experiment that best separates ``named`` from the worst of ``others``, added to the existing recordings."""
-    plan = plan_next(workspace, named, others, limits)
+def suggest(
+    workspace: Workspace, named: Fit, alternatives: Sequence[Fit], limits: Limits | None = None
+) -> Suggestion | None:
+    """Return the next experiment that best separates ``named`` from the closest of ``alternatives``."""
+    plan = plan_next(workspace, named, alternatives, limits)
     return (
         None
         if plan is None

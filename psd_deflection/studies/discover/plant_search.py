@@ -187,8 +187,8 @@ class PlantComparison(Comparison):
                 continue
             x = np.where(valid, d[channel] - d[channel][valid].mean(), 0.0)
             n = len(x)
-            found = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2, 2 * n)[:n]
-            correlation = found / max(float(found[0]), 1e-300)
+            autocorrelation = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2, 2 * n)[:n]
+            correlation = autocorrelation / max(float(autocorrelation[0]), 1e-300)
             negative = np.flatnonzero(correlation < 0.0)
             stop = int(negative[0]) if len(negative) else n
             count += float(valid.sum()) / (1.0 + 2.0 * float(correlation[1:stop].sum()))
@@ -202,14 +202,14 @@ class PlantComparison(Comparison):
         rows = np.concatenate([np.repeat(np.arange(len(m)), m.shape[1]) for m in self.measured])
         propagated = jacobian @ covariance
         fitted = np.bincount(rows, (propagated * jacobian).sum(axis=1), len(self.channels))
-        left = np.maximum(self.independent - fitted, 1.0)
+        freedom = np.maximum(self.independent - fitted, 1.0)
         by_channel = np.zeros((len(self.channels), len(covariance)))
         np.add.at(by_channel, rows, propagated**2)
         open_level = self.level > self.known
-        by_channel *= np.where(open_level, self.independent / left, 1.0)[:, None]
+        by_channel *= np.where(open_level, self.independent / freedom, 1.0)[:, None]
         variance = by_channel.sum(axis=0)
         share = by_channel / np.maximum(variance, 1e-300)
-        unsure = (share**2 * np.where(open_level, 1.0 / left, 0.0)[:, None]).sum(axis=0)
+        unsure = (share**2 * np.where(open_level, 1.0 / freedom, 0.0)[:, None]).sum(axis=0)
         return np.asarray(np.sqrt(variance) * stdtrit(1.0 / np.maximum(unsure, 1e-9), 0.975) / ndtri(0.975))
 
     def effective_size(self) -> float:
@@ -360,10 +360,10 @@ def regressors(ws: PlantComparison, fit: Fit) -> Table:
         shared.update(_powers(name, [np.asarray(v, dtype=np.float64) for v in values]))
     out = []
     for c, channel in enumerate(ws.channels):
-        own = [np.nan_to_num(s[c]) for s in simulated]
-        named = {**shared, **_powers(channel, own), f'|{channel}|': [np.abs(x) for x in own]}
-        if ws.plant.period > 0.0 and min(len(x) for x in own) > 1:
-            rate = [np.gradient(x) for x in own]
+        simulated_values = [np.nan_to_num(s[c]) for s in simulated]
+        named = {**shared, **_powers(channel, simulated_values), f'|{channel}|': [np.abs(x) for x in simulated_values]}
+        if ws.plant.period > 0.0 and min(len(x) for x in simulated_values) > 1:
+            rate = [np.gradient(x) for x in simulated_values]
             named.update({f'rate of {channel}': rate, f'sign of rate of {channel}': [np.sign(r) for r in rate]})
         out.append((channel, named))
     return out

@@ -96,10 +96,11 @@ class ReadingsPlant(Plant):
         if len(kinds) > 1:
             words = ' and '.join(','.join(CHANNELS[k]) for k in sorted(kinds))
             raise RecordingError(f'{", ".join(t.name for t in tables)}: one has {words}: search them one by one')
-        other = next((t for t in tables if t.psds != tables[0].psds), None)
-        if other is not None:
+        different = next((t for t in tables if t.psds != tables[0].psds), None)
+        if different is not None:
             raise RecordingError(
-                f'{other.name}: is of {other.psds} PSDs, {tables[0].name} of {tables[0].psds}: search them one by one'
+                f'{different.name}: is of {different.psds} PSDs, {tables[0].name} of {tables[0].psds}: '
+                'search them one by one'
             )
         self.tables = tuple(tables)
         self._params_file, self._tell = params_file, tell
@@ -182,8 +183,8 @@ class ReadingsPlant(Plant):
             if not np.allclose(rows, self._rows(table, [active], backward), rtol=1e-9, atol=1e-6):
                 return None
             by_choice.setdefault(tuple(choice[p.name] for p in choices), []).append(rows)
-        first, *others = by_choice.values()
-        if choices and all(np.array_equal(a, b) for other in others for a, b in zip(first, other, strict=True)):
+        first, *other_choices = by_choice.values()
+        if choices and all(np.array_equal(a, b) for other in other_choices for a, b in zip(first, other, strict=True)):
             return dataclasses.replace(effect, parameters=tuple(map(fixed_choice, effect.parameters)))
         return effect
 

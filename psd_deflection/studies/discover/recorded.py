@@ -32,7 +32,7 @@ from psd_deflection.studies.discover.setup.hidden import beginning
 from psd_deflection.studies.discover.setup.hung import directions, in_time, levels, of_plateau, swayed, times
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
-from psd_deflection.studies.loads.noted_times import MendedLoads
+from psd_deflection.studies.loads.noted_times import CorrectedLoads
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_applied, wrong_notes_against
 from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swung
 from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
@@ -66,7 +66,7 @@ class Recorded:
     lattice: ActiveEffect | None = None
     lattice_stated: bool = False
     delays: tuple[float, ...] = ()
-    corrected: tuple[MendedLoads | None, ...] = ()
+    corrected: tuple[CorrectedLoads | None, ...] = ()
     wrong: tuple[Plateau, ...] = ()
     fourth: FourthReading | None = None
 
@@ -97,12 +97,12 @@ class Recorded:
 
 def cleaned(recorded: Recorded) -> Recorded:
     """Without outliers, stuck channels and times without a known load."""
-    found = [clean(o, recorded.known) for o in recorded.observations]
+    results = [clean(o, recorded.known) for o in recorded.observations]
     rates = {o.rig.converter.sample_rate_hz for o in recorded.observations if o.stated_rate_hz}
     return replace(
         recorded,
-        observations=tuple(o for o, _ in found),
-        findings=tuple(f for _, own in found for f in own),
+        observations=tuple(o for o, _ in results),
+        findings=tuple(f for _, findings in results for f in findings),
         values={'converter.sample_rate_hz': rates.pop()} if len(rates) == 1 else {},
     )
 
@@ -195,13 +195,26 @@ def _corrected(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Work
     gap = workspace.gap(difference)
     if gap <= MUCH * min(workspace.floor(), _stated_floor(workspace)):
         return recorded, with_free(recorded, workspace)
-    noted = [_wrong_notes(workspace, i, part) for i, part in enumerate(difference)]
-    if not any(noted):
+    notes = [_wrong_notes(workspace, i, part) for i, part in enumerate(difference)]
+    if not any(notes):
         return recorded, with_free(recorded, workspace)
-    observations = [_with_effective_loads(o, own) for o, own in zip(workspace.observations, noted, strict=True)]
-    both = zip(noted, workspace.observations, strict=True)
-    free = [n.plateau for own in noted for n in own if isinstance(n, WrongNote) and not n.exact]
-    findings = [note_finding(n, o.name) for own, o in both for n in own if not isinstance(n, WrongNote) or n.exact]
+    observations = [
+        _with_effective_loads(o, notes_of_recording)
+        for o, notes_of_recording in zip(workspace.observations, notes, strict=True)
+    ]
+    both = zip(notes, workspace.observations, strict=True)
+    free = [
+        n.plateau
+        for notes_of_recording in notes
+        for n in notes_of_recording
+        if isinstance(n, WrongNote) and not n.exact
+    ]
+    findings = [
+        note_finding(n, o.name)
+        for notes_of_recording, o in both
+        for n in notes_of_recording
+        if not isinstance(n, WrongNote) or n.exact
+    ]
     recorded = replace(
         recorded,
         observations=tuple(observations),
@@ -210,7 +223,7 @@ def _corrected(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Work
         stated_gap=recorded.stated_gap or gap,
     )
     workspace = beside(workspace, observations, recorded.known)
-    if any(isinstance(n, UnnotedTime) for own in noted for n in own):
+    if any(isinstance(n, UnnotedTime) for notes_of_recording in notes for n in notes_of_recording):
         return _corrected(recorded, workspace)
     return recorded, with_free(recorded, workspace)
 
@@ -227,20 +240,20 @@ def _stated_floor(workspace: Workspace) -> float:
 def _wrong_notes(workspace: Workspace, i: int, difference: FloatArray) -> list[WrongNote | SwayingLoad | UnnotedTime]:
     """What of recording ``i`` was noted otherwise than it hung; ``difference`` (3P, m), V: measured minus simulated."""
     o = workspace.observations[i]
-    found = levels(workspace, i, difference, times(o, i))
-    wrong = wrong_notes_against(o.loads, o.period, partial(_implied_loads, workspace, i, found), MOST_AN_EFFECT_DOES)
-    if not wrong and (unnoted := unnoted_times(found, len(o.loads), o.period)):
+    implied = levels(workspace, i, difference, times(o, i))
+    wrong = wrong_notes_against(o.loads, o.period, partial(_implied_loads, workspace, i, implied), MOST_AN_EFFECT_DOES)
+    if not wrong and (unnoted := unnoted_times(implied, len(o.loads), o.period)):
         return [*unnoted]
-    return [*swayed(workspace, i, difference, found), *wrong]
+    return [*swayed(workspace, i, difference, implied), *wrong]
 
 
-def _implied_loads(workspace: Workspace, i: int, found: PlateauLoads, acting: FloatArray) -> PlateauLoads:
-    """The loads that recording ``i`` asks for under ``acting`` ones; ``found``: under those that it has."""
+def _implied_loads(workspace: Workspace, i: int, implied: PlateauLoads, acting: FloatArray) -> PlateauLoads:
+    """The loads that recording ``i`` asks for under ``acting`` ones; ``implied``: under those that it has."""
     o = workspace.observations[i]
     if acting is o.loads:
-        return found
+        return implied
     moved = workspace.loaded(i, acting)
-    return levels(workspace, i, moved.residual(moved.base)[1][i], found.plateaus)
+    return levels(workspace, i, moved.residual(moved.base)[1][i], implied.plateaus)
 
 
 def _with_effective_loads(o: Observation, notes: Sequence[WrongNote | SwayingLoad | UnnotedTime]) -> Observation:

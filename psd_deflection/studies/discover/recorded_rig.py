@@ -70,10 +70,10 @@ class RecordedRig(Machine):
         changed = recorded.mistaken or bool(workspace.nuisance) or any(d > 0.0 for d in recorded.delays)
         bank_of_rig = SignatureBank() if bank is None or changed else bank
         bank_of_rig.nominal(workspace)
-        found = proposals_of(workspace)
+        proposals = proposals_of(workspace)
         if recorded.lattice is not None:
             workspace = workspace.replaced(base=(*workspace.base, recorded.lattice))
-        return cls(recorded=recorded, workspace=workspace, proposals=found, bank=bank_of_rig)
+        return cls(recorded=recorded, workspace=workspace, proposals=proposals, bank=bank_of_rig)
 
     def compared(self) -> Workspace:
         """The recordings against the simulation."""
@@ -104,25 +104,25 @@ class RecordedRig(Machine):
             values = {name: [*seen, *(v for v in beside[name] if v not in seen)] for name, seen in values.items()}
         listed = candidates([*library, *more], self.recorded.physics, values)
         if fit is None or not far(fit):
-            found = [(c, self.bank.get(c, ws)) for c in listed]
+            signatures = [(c, self.bank.get(c, ws)) for c in listed]
         else:
             # A large effect changes the signatures of the others.
-            found = signatures_beside(ws, listed, fit)
-        return Screen(ws, self._not_acquitted(ws, found, residual, fit))
+            signatures = signatures_beside(ws, listed, fit)
+        return Screen(ws, self._not_acquitted(ws, signatures, residual, fit))
 
     def _not_acquitted(
-        self, ws: Workspace, found: list[tuple[Candidate, Columns]], residual: FloatArray, fit: Fit | None
+        self, ws: Workspace, signatures: list[tuple[Candidate, Columns]], residual: FloatArray, fit: Fit | None
     ) -> list[tuple[Candidate, Columns]]:
         """Without detectors and beams that would show in the fourth reading if they made much of ``residual`` (D,)."""
         reading = self.recorded.fourth if fit is None else fourth_reading(ws, residual)
         beyond, throughout = excess(ws, residual)
         if reading is None or not reading.acquits or throughout < FAR - 1.0:
-            return found
+            return signatures
         least = 2.0 * reading.allowed / (PART * beyond)
         # Mistakes of the set-up touch every channel; those of a detector are steps that the readings themselves show.
         return [
             (c, columns)
-            for c, columns in found
+            for c, columns in signatures
             if c.effect.stage not in STAGES or c.effect.name in SETUP or visible(ws, columns) < least
         ]
 

@@ -66,11 +66,11 @@ def search(problem: Problem, begun: Fit | None = None) -> Problem:
     if names & start.first and names - start.setup:
         # A mistake that needs an effect beside it must be much better than effects alone.
         plain = search_used.workspace.replaced(first=frozenset())
-        other = Search(plain, problem.machine.screen, problem.progress)
-        other, others = other.run(refit(plain, ()))
-        cost = others.fit.chi2 + other.penalty * others.fit.parameters
+        plain_search = Search(plain, problem.machine.screen, problem.progress)
+        plain_search, plain_result = plain_search.run(refit(plain, ()))
+        cost = plain_result.fit.chi2 + plain_search.penalty * plain_result.fit.parameters
         if cost < result.fit.chi2 + search_used.penalty * result.fit.parameters + BIC_ACCEPT:
-            search_used, result = other, others
+            search_used, result = plain_search, plain_result
     if not start.open_level:
         search_used = search_used.at(search_used.workspace.replaced(nuisance=result.fit.nuisance))
     return replace(problem, search=search_used, result=result, fit=result.fit, null=result.null)
@@ -85,9 +85,16 @@ def weigh(problem: Problem) -> Problem:
             break
         # Without what did not hold, another effect may be the better one.
         null, search_used = problem.result.null, problem.search
-        fit, others = search_used.swap(null, problem.fit)
+        fit, alternatives_of_effects = search_used.swap(null, problem.fit)
         p, delta_bic, delta_chi2 = search_used.weigh(null, fit)
-        result = replace(problem.result, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others)
+        result = replace(
+            problem.result,
+            fit=fit,
+            p=p,
+            delta_bic=delta_bic,
+            delta_chi2=delta_chi2,
+            alternatives=alternatives_of_effects,
+        )
         problem = accepted(replace(problem, result=result, fit=fit))
     problem = credible(problem)
     bare = problem.bare

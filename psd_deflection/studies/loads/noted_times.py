@@ -120,10 +120,10 @@ class CorrectedNote:
         fx, fy, tz = self.load
         how = ' and '.join(self._how())
         until = f', as a ramp until {self.applied + self.took:.3f} s' if self.took > 0.0 else ''
-        left = '; here only the link at rest under it is used' if self.rest_only else ''
+        remark = '; here only the link at rest under it is used' if self.rest_only else ''
         return (
             f'the {ordinal(self.number)} load of {name} ({fx:g} N, {fy:g} N, {tz:g} N m) was noted {how}: note it '
-            f'{self.applied:.3f} s after the first sample{until}, not {self.annotated:.3f} s{left}'
+            f'{self.applied:.3f} s after the first sample{until}, not {self.annotated:.3f} s{remark}'
         ).replace('was noted applied', 'was applied')
 
     def _how(self) -> list[str]:
@@ -136,7 +136,7 @@ class CorrectedNote:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MendedLoads:
+class CorrectedLoads:
     """``loads`` (n, 3) N, N, N m as they acted; ``notes``: those that were wrong; ``unused`` (n,): samples in motion
     that the mended loads do not describe; ``measured``: those that were measured; ``timed``: all whose time is fitted,
     also those that were right as noted: a fitted time is known no better than what else the dots do then.
@@ -155,7 +155,7 @@ def ordinal(number: int) -> str:
     return f'{number}{ending}'
 
 
-def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
+def correct_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> CorrectedLoads | None:
     """The loads with the times at which they acted and without the noise of a load cell; None if they are right as
     noted or the motion does not tell.
 
@@ -164,7 +164,7 @@ def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | N
     calm, measured = without_cell_noise(loads)
     corrected = _corrected_times(rig, dots, calm)
     if corrected is None:
-        return MendedLoads(calm, (), np.zeros(len(loads), dtype=bool), measured) if measured else None
+        return CorrectedLoads(calm, (), np.zeros(len(loads), dtype=bool), measured) if measured else None
     return replace(corrected, measured=measured)
 
 
@@ -189,7 +189,7 @@ def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
     return out
 
 
-def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
+def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> CorrectedLoads | None:
     period = 1.0 / rig.converter.sample_rate_hz
     changes = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
     if len(changes) == 0 or np.any(np.diff(changes) * period < APART_S):
@@ -237,7 +237,7 @@ def loads_with_times(
 
 def without_rough_motion(
     rig: Rig, corrected: FloatArray, notes: Sequence[CorrectedNote], rest: FloatArray
-) -> MendedLoads:
+) -> CorrectedLoads:
     """The mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
     t: FloatArray = np.arange(len(corrected), dtype=np.float64) / rig.converter.sample_rate_hz
     unused = np.zeros(len(corrected), dtype=bool)
@@ -251,7 +251,7 @@ def without_rough_motion(
             notes_used[-1] = CorrectedNote(
                 note.number, note.load, note.annotated, note.applied, note.took, rest_only=True
             )
-    return MendedLoads(corrected, tuple(notes_used), unused)
+    return CorrectedLoads(corrected, tuple(notes_used), unused)
 
 
 def shifted(note: CorrectedNote, loads: FloatArray, period: float) -> Callable[[Sequence[float]], FloatArray]:

@@ -85,19 +85,19 @@ class Plateau:
 
 
 def plateaus(
-    rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0, *, noted: bool = False
+    rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0, *, annotated_only: bool = False
 ) -> list[Plateau]:
     """The times between changes of ``loads`` (n, 3), also between those that only the motion shows.
 
-    ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost. ``recording``: which one it is. ``noted``: only between
-    changes that were noted.
+    ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost. ``recording``: its index. ``annotated_only``: only between
+    annotated changes.
     """
     period = 1.0 / rig.converter.sample_rate_hz
     changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
     # A load that was applied slowly changes from sample to sample: what counts is its end.
     ends = changed[np.append(np.diff(changed) > 1, True)].tolist() if len(changed) else []
     dots = volts[:, dot_rows(len(rig.psds))] * rig.sensitivities.ravel()
-    unnoted = [] if noted else [round(t / period) for t in unnoted_steps(rig, dots, loads)]
+    unnoted = [] if annotated_only else [round(t / period) for t in unnoted_steps(rig, dots, loads)]
     starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unnoted)])
     stops = np.append(np.union1d(changed, unnoted), len(loads))
     out, number = [], 0
@@ -239,9 +239,9 @@ def outliers(implied: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> 
         if np.abs(slopes).max() > MOST * SOFTER or np.abs(offset).max() > MOST * OFFSET:
             continue
         apart = deviation_in_tolerances(implied, (k,), SOFTER)
-        others = np.delete(apart, k)
-        fitting += bool(others.max() <= 1.0 + bent * apart[k])
-        if are_outliers(apart[k : k + 1], others, bent) and is_known(implied, np.array([k]), largest):
+        remaining = np.delete(apart, k)
+        fitting += bool(remaining.max() <= 1.0 + bent * apart[k])
+        if are_outliers(apart[k : k + 1], remaining, bent) and is_known(implied, np.array([k]), largest):
             tried.append(k)
     # If the others are in proportion whichever is left out, nobody knows which one is wrong.
     return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
@@ -258,9 +258,9 @@ def is_known(implied: PlateauLoads, gone: IntArray, largest: float) -> bool:
 
 def _alike(implied: PlateauLoads, gone: IntArray) -> BoolArray:
     """Of each of ``gone`` whether it is a sum of the other loads, nearly."""
-    noted = implied.annotated
-    right = np.delete(noted, gone, axis=0)
-    outlying = noted[gone]
+    annotated = implied.annotated
+    right = np.delete(annotated, gone, axis=0)
+    outlying = annotated[gone]
     rest = outlying - outlying @ np.linalg.pinv(right, rcond=ALONE) @ right
     return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(outlying, axis=1))
 
@@ -270,18 +270,18 @@ def _annotated_twice(implied: PlateauLoads, k: int) -> FloatArray | None:
 
     Of the first load that is ambiguous: half of it may be another unit, or another stiffness.
     """
-    noted, before = implied.annotated[k], implied.annotated[k - 1]
+    annotated, before = implied.annotated[k], implied.annotated[k - 1]
     if k == 0 or implied.plateaus[k].unnoted or not np.any(before != 0.0):
         return None
-    applied = 0.5 * (before + noted)
-    off = np.abs(implied.more[k] - (applied - noted))
-    allowed = TOLERANCE + SHARE * np.abs(noted).max() + SOFTER * np.abs(applied)
-    return applied if np.all(off <= allowed) and np.any(np.abs(applied - noted) > STANDS_OUT * allowed) else None
+    applied = 0.5 * (before + annotated)
+    off = np.abs(implied.more[k] - (applied - annotated))
+    allowed = TOLERANCE + SHARE * np.abs(annotated).max() + SOFTER * np.abs(applied)
+    return applied if np.all(off <= allowed) and np.any(np.abs(applied - annotated) > STANDS_OUT * allowed) else None
 
 
-def are_outliers(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
+def are_outliers(wrong: FloatArray, remaining: FloatArray, bent: float) -> bool:
     """Return whether the ``wrong`` are far off and the others are not, in tolerances."""
-    rest, least = float(others.max()), float(wrong.min())
+    rest, least = float(remaining.max()), float(wrong.min())
     return rest <= 1.0 + bent * least and least > max(STANDS_OUT, 5.0 * rest)
 
 
@@ -328,33 +328,33 @@ def are_rounded(implied: PlateauLoads, loads: FloatArray) -> bool:
     return rounded(implied.annotated, np.array([p.of(loads) for p in implied.plateaus]).reshape(-1, 3) + implied.more)
 
 
-def rounded(noted: FloatArray, applied: FloatArray) -> bool:
-    """Whether the ``noted`` loads (k, 3) are what ``applied`` (k, 3), N, N, N m, rounded to a whole step.
+def rounded(annotated: FloatArray, applied: FloatArray) -> bool:
+    """Whether the ``annotated`` loads (k, 3) are what ``applied`` (k, 3), N, N, N m, rounded to a whole step.
 
     They are off by up to half of it, and by no less.
 
     An effect of the catalogue changes loads by little against such a step, or in proportion to them.
     """
-    held = np.any(noted != 0.0, axis=1)
+    held = np.any(annotated != 0.0, axis=1)
     if np.count_nonzero(held) < FEWEST:
         return False
-    off, noted = (applied - noted)[held], noted[held]
-    steps = steps_of(noted)
+    off, annotated = (applied - annotated)[held], annotated[held]
+    steps = steps_of(annotated)
     if np.any(np.abs(off) > (0.5 + SHARE) * steps):
         return False
     return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > LEAST_STEP * float(steps[0])
 
 
-def steps_of(noted: FloatArray) -> FloatArray:
-    """(3,): to which steps the ``noted`` loads (k, 3) are rounded, N, N, N m; 0 for none, infinity if all are 0."""
-    return np.array([largest_step(noted[:, :2]), largest_step(noted[:, :2]), largest_step(noted[:, 2:])])
+def steps_of(annotated: FloatArray) -> FloatArray:
+    """(3,): to which steps the ``annotated`` loads (k, 3) are rounded, N, N, N m; 0 for none, infinity if all are 0."""
+    return np.array([largest_step(annotated[:, :2]), largest_step(annotated[:, :2]), largest_step(annotated[:, 2:])])
 
 
-def largest_step(noted: FloatArray) -> float:
-    """The largest step of which all ``noted`` numbers are multiples; infinity if all are 0, 0 if there is none."""
-    if not np.any(noted):
+def largest_step(annotated: FloatArray) -> float:
+    """The largest step of which all ``annotated`` numbers are multiples; infinity if all are 0, 0 if there is none."""
+    if not np.any(annotated):
         return np.inf
-    return max((s for s in STEPS if np.allclose(noted, s * np.round(noted / s), atol=1e-6)), default=0.0)
+    return max((s for s in STEPS if np.allclose(annotated, s * np.round(annotated / s), atol=1e-6)), default=0.0)
 
 
 def closes(implied: PlateauLoads, share: float = CLOSES) -> bool:
@@ -440,15 +440,15 @@ def wrong_notes_against(
         return []
     # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
     # the readings themselves say hung is simulated, then judged.
-    noted = first.annotated
+    annotated = first.annotated
     readings_ask = asked(np.zeros_like(loads)).more
-    far = np.abs(readings_ask - noted).max(axis=1) > FAR + FAR_SHARE * np.abs(readings_ask).max(axis=1)
-    applied = np.where(far[:, None], readings_ask, noted)
+    far = np.abs(readings_ask - annotated).max(axis=1) > FAR + FAR_SHARE * np.abs(readings_ask).max(axis=1)
+    applied = np.where(far[:, None], readings_ask, annotated)
 
     def against() -> PlateauLoads:
-        off = np.flatnonzero((applied != noted).any(axis=1)).tolist()
+        off = np.flatnonzero((applied != annotated).any(axis=1)).tolist()
         implied = asked(as_applied(loads, [WrongNote(first.plateaus[k], applied[k], period) for k in off]))
-        return replace(implied, more=implied.more + applied - noted, moved=first.moved)
+        return replace(implied, more=implied.more + applied - annotated, moved=first.moved)
 
     implied = against()
     which = outliers(implied, BENT, largest)
@@ -457,7 +457,7 @@ def wrong_notes_against(
             return []
         slopes, offset = proportional_part(implied, which.gone, which.softer)
         for k in which.gone:
-            applied[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + implied.more[k] - offset)
+            applied[k] = np.linalg.solve((np.eye(3) + slopes).T, annotated[k] + implied.more[k] - offset)
         implied = against()
         which = outliers(implied, bent, largest)
     out = []

@@ -162,7 +162,7 @@ def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[Swayin
     listed = plateaus(rig, volts, loads)
     if len(listed) < FEWEST:
         return []
-    return swaying(asked(listed), plateaus(rig, volts, loads, noted=True), asked, period)
+    return swaying(asked(listed), plateaus(rig, volts, loads, annotated_only=True), asked, period)
 
 
 def excluded(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> FloatArray:

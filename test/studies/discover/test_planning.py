@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 
 from psd_deflection.base.errors import UsageError
+
+# Of the command line, private to it: the words of limits are read nowhere else.
 from psd_deflection.cli._next import how, limits_from_words
 from psd_deflection.cli.main import main
 from psd_deflection.model.simulation import loads

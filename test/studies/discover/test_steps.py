@@ -489,6 +489,7 @@ def test_an_alternative_that_comes_close_is_refitted_in_full(
     assert other.chi2 == pytest.approx(short, rel=1e-3)
     assert asked == ([3, 8] if again else [3])
     # After twice the budget none is refitted in full, and none is dropped without a word.
+    # A search that has used all its simulations but 1401 would take an hour.
     search._begun = plant.simulations - 1401
     asked.clear()
     assert len(search.alternatives(null, fit, 0, gain)) == 1

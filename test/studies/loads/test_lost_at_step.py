@@ -11,7 +11,7 @@ from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.loads import steps as steps_module
-from psd_deflection.studies.loads.noted_times import mend_loads
+from psd_deflection.studies.loads.noted_times import correct_loads
 
 RIG = load_rig()
 LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, -50, -29), (30, 0, 0), (20, -40, 12), (0, 0, 0)], float)
@@ -30,7 +30,7 @@ def noted() -> FloatArray:
 
 
 def told(dots: FloatArray) -> list[float]:
-    mended = mend_loads(RIG, dots, noted())
+    mended = correct_loads(RIG, dots, noted())
     assert mended is not None
     return [note.delay for note in mended.timed]
 
@@ -56,10 +56,10 @@ def test_notes_that_are_alike_late_since_their_samples_are_lost_are_mended_and_r
     for at in range(DWELL, len(HUNG), DWELL):
         dots[at - 100 : at + 200] = np.nan
         after[at : at + 200] = HUNG[at - 1]
-    mended = mend_loads(RIG, dots, after)
+    mended = correct_loads(RIG, dots, after)
     assert mended is not None
     assert [note.delay for note in mended.notes] == pytest.approx([0.2] * 5, abs=2e-3)
-    assert mend_loads(RIG, dots, HUNG) is None
+    assert correct_loads(RIG, dots, HUNG) is None
 
 
 def test_a_step_among_lost_samples_is_in_their_middle_and_says_how_many_they_are() -> None:

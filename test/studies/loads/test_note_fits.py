@@ -16,7 +16,7 @@ from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import noted_times
 from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.noted_times import (
-    mend_loads,
+    correct_loads,
     unnoted_steps,
 )
 from psd_deflection.studies.loads.steps import last_step
@@ -327,7 +327,7 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     dots = np.zeros((20_000, 4))
     for apart, told in ((249, []), (250, [3.01])):
         assert unnoted_steps(RIG, dots, noted_at(8000, 8000 + apart)) == told
-        assert (mend_loads(RIG, dots, noted_at(3000, 9000, 9000 + apart)) is None) == (not told)
+        assert (correct_loads(RIG, dots, noted_at(3000, 9000, 9000 + apart)) is None) == (not told)
     # A ramp is one change, which ends once; one that comes two samples later is another.
     ramp = noted_at(*range(8000, 8100))
     assert unnoted_steps(RIG, dots, ramp) == [3.01]
@@ -347,7 +347,7 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     dots = np.zeros((20_000, 4))
     between = with_pieces(monkeypatch, steps, fitted)
     late = noted_at(3000, 9500, 15000)
-    found = mend_loads(RIG, dots, late)
+    found = correct_loads(RIG, dots, late)
     assert found is not None
     assert [(n.number, n.annotated, n.applied, n.took) for n in found.notes] == [(2, 9.5, 8.0, 0.0)]
     assert [n.number for n in found.timed] == [1, 2, 3]
@@ -358,7 +358,7 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     # Right as noted, all late alike, or two milliseconds off: nothing is fitted.
     for noted_so in (noted_at(3000, 8000, 15000), noted_at(3500, 8500, 15500), noted_at(3002, 8000, 14998)):
         between.clear()
-        assert mend_loads(RIG, dots, noted_so) is None
+        assert correct_loads(RIG, dots, noted_so) is None
         assert between == []
     # A step that is longer than two widths and a tenth of a second is looked at: 2 * 286 + 100 samples.
     for long, looks in ((672, 0), (673, 3)):
@@ -366,36 +366,36 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
         some = [steps[0], steps_module.DotStep(8000.0, sizes[1], 7700, 7700 + long), steps[2]]
         monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width, some=some: some)
         monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width, some=some: some)
-        assert mend_loads(RIG, dots, noted_at(3000, 8000, 15000)) is None
+        assert correct_loads(RIG, dots, noted_at(3000, 8000, 15000)) is None
         assert len(between) == looks
     # Applied over a tenth of a second is a step.
     for took, told in ((0.1, None), (0.101, [0.101])):
         fitted[8000.0] = (8.0, took)
-        ramp = mend_loads(RIG, dots, noted_at(3000, 8000, 15000))
+        ramp = correct_loads(RIG, dots, noted_at(3000, 8000, 15000))
         assert (None if ramp is None else [n.took for n in ramp.notes]) == told
     fitted[8000.0] = (8.0, 0.0)
     monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
     # Alike by the fitted times, though not by the middles of the steps.
     fitted.update({3000.0: (2.999, 0.0), 8000.0: (9.498, 0.0), 15000.0: (15.0, 0.0)})
-    assert mend_loads(RIG, dots, late) is None
+    assert correct_loads(RIG, dots, late) is None
     fitted.update({3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0)})
     for left, told_late in (((1.0, 3.9), False), ((1.0, 4.0), True), ((1.0, 4.1), True), ((0.1, 0.41), True)):
         with_pieces(monkeypatch, steps, fitted, left)
-        assert (mend_loads(RIG, dots, late) is not None) == told_late
+        assert (correct_loads(RIG, dots, late) is not None) == told_late
 
 
 def test_loads_of_a_cell_lose_their_noise_whether_times_are_mended_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
     dots, chance = np.zeros((2000, 4)), np.random.default_rng(1)
     noisy = np.where(np.arange(2000)[:, None] < 1500, 0.0, 50.0) + chance.normal(size=(2000, 3))
     with_pieces(monkeypatch, [], {})
-    found = mend_loads(RIG, dots, noisy)
+    found = correct_loads(RIG, dots, noisy)
     assert found is not None
     assert [m.first for m in found.measured] == [0, 1500]
     assert (found.notes, found.timed, found.unused.sum(), found.unused.shape) == ((), (), 0, (2000,))
     assert np.ptp(found.loads[:1500], axis=0).tolist() == [0.0] * 3
     with_pieces(monkeypatch, as_steps((400.0, 1e-4)), {400.0: (0.4, 0.0)})
-    found = mend_loads(RIG, dots, noisy)
+    found = correct_loads(RIG, dots, noisy)
     assert found is not None
     assert [m.first for m in found.measured] == [0, 1500]
     assert [n.applied for n in found.notes] == [0.4]
@@ -418,5 +418,5 @@ def test_means_take_four_periods_of_bending_and_two_samples_at_least(
     loads[50:] = 1.0
     assert unnoted_steps(rig, np.zeros((100, 4)), loads) == []
     assert last_step(rig, np.zeros((100, 4)), 1.0 / rate) is None
-    assert mend_loads(rig, np.zeros((100, 4)), loads) is None
+    assert correct_loads(rig, np.zeros((100, 4)), loads) is None
     assert widths == [width] * 3

@@ -18,9 +18,9 @@ from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads.noted_times import (
     ALIKE_S,
+    CorrectedLoads,
     CorrectedNote,
-    MendedLoads,
-    mend_loads,
+    correct_loads,
     ordinal,
     shifted,
 )
@@ -60,8 +60,8 @@ QUIET = volts(hung())
 TURNED = volts(hung(), effects__e__name='sensor_rotation', effects__e__psd=1, effects__e__angle=0.02)
 
 
-def mended(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> MendedLoads | None:
-    return mend_loads(rig, read[:, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity, loads)
+def mended(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedLoads | None:
+    return correct_loads(rig, read[:, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity, loads)
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import plateaus
-from psd_deflection.studies.loads.noted_times import mend_loads, unnoted_steps
+from psd_deflection.studies.loads.noted_times import correct_loads, unnoted_steps
 from psd_deflection.studies.loads.plateaus import (
     EXACT,
     STANDS_OUT,
@@ -203,7 +203,7 @@ def test_a_step_without_a_note_has_its_time() -> None:
     dots = read(HELD)[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
     assert unnoted_steps(RIG, dots, noted_as(2, (0, -20, 0))) == pytest.approx([8.0], abs=2e-3)
     assert unnoted_steps(RIG, dots, HELD) == []
-    assert mend_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
+    assert correct_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
 
 
 # ---- the pieces, by hand

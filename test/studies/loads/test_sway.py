@@ -64,7 +64,7 @@ def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: flo
 
 
 def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
-    asked, noted = implied_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, noted=True)
+    asked, noted = implied_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, annotated_only=True)
     cut = 3 * DWELL + 1200
     pieces = [
         *noted[:3],

@@ -98,6 +98,7 @@ def test_of_all_solvers_those_that_can_are_compared(run: Opened) -> None:
     with pytest.raises(ConfigError, match='bean'):
         read_validate(run, solvers=['bean'])
     # Both centres on one line through the middle.
+    # _replace is public: the one of named tuples.
     inline = run._replace(rig=load_rig(overrides={'psd_2.center': [0.0, -0.07]}))
     assert 'appendix_d' not in read_validate(inline, solvers=['all']).solvers
     for solvers in (['appendix_d'], ['all', 'appendix_d']):

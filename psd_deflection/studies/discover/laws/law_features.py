@@ -108,8 +108,8 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
         if noise.slow is not None:
             vectors = [noise.slow.whiten(v) for v in vectors]
         # Each vector, as it multiplies unwhitened fine blocks: (3P, 1 + p, nf).
-        own = [np.stack([v[c] * scale[c] for v in vectors]) for c in range(channels)]
-        back = np.stack([_unwhiten(rows, ar) for rows, ar in zip(own, noise.ar, strict=True)])
+        simulated = [np.stack([v[c] * scale[c] for v in vectors]) for c in range(channels)]
+        back = np.stack([_unwhiten(rows, ar) for rows, ar in zip(simulated, noise.ar, strict=True)])
         gain = (scale * (1.0 - noise.ar.sum(axis=1))[:, None]) ** 2
         mixing = np.zeros((len(targets), channels, nf))
         for t, name in enumerate(targets):
@@ -314,9 +314,9 @@ def switchings(responses_of_rig: Sequence[Response], targets: Sequence[str] = ()
     for t, name in enumerate(r.targets):
         if (targets and name not in targets) or TARGETS[name].point == 'static':
             continue
-        own = [n for n in DOTS if name in DOTS and (n[1] == name[1])]
+        dots_of_axis = [n for n in DOTS if name in DOTS and (n[1] == name[1])]
         on_link = TARGETS[name].point == 'pose'
-        for of in ((), *((n,) for n in own)):
+        for of in ((), *((n,) for n in dots_of_axis)):
             v = _blocks(r, r.known[of[0]]) if of else np.ones(r.error.shape[1])
             error = _averaged(r.error[t], r.rings[int(name == 'theta')]) if on_link else r.error[t]
             times = two_levels(error, r.power[t] * v * v, v)
@@ -379,10 +379,10 @@ def with_better_level(responses_of_rig: Sequence[Response], s: Scored) -> Scored
 
 def two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int]:
     """Where the state changes: ``error`` (nf,) is A v s with s 0 or 1, each with ``weight`` in units of A."""
-    own = np.where(np.abs(v) > 1e-12, error / np.where(np.abs(v) > 1e-12, v, 1.0), 0.0)
+    ratio = np.where(np.abs(v) > 1e-12, error / np.where(np.abs(v) > 1e-12, v, 1.0), 0.0)
     # The best box, on a coarse grid, gives the first A.
-    step = max(1, len(own) // 240)
-    p = np.concatenate(([0.0], np.cumsum(own * weight)))[::step]
+    step = max(1, len(ratio) // 240)
+    p = np.concatenate(([0.0], np.cumsum(ratio * weight)))[::step]
     n = np.concatenate(([0.0], np.cumsum(weight)))[::step]
     top, below = p[None, :] - p[:, None], n[None, :] - n[:, None]
     gain = np.where(below > 1e-9 * n[-1], top**2 / np.maximum(below, 1e-9 * n[-1] + 1e-300), 0.0)
@@ -391,11 +391,11 @@ def two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int
         return []
     level = float(top[a, b] / below[a, b])
     for _ in range(4):
-        state = likeliest_states(weight * level * (2.0 * own - level))
+        state = likeliest_states(weight * level * (2.0 * ratio - level))
         on = state == 1
         if not on.any():
             return []
-        level = float((own * weight)[on].sum() / max(float(weight[on].sum()), 1e-300))
+        level = float((ratio * weight)[on].sum() / max(float(weight[on].sum()), 1e-300))
     return [int(k) for k in np.flatnonzero(np.diff(state, prepend=0))]
 
 

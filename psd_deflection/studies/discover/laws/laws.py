@@ -147,14 +147,16 @@ def fitted_law(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
     sd = {fit.free[j][1]: math.sqrt(max(covariance[j, j], 0.0)) for j in fit.columns_of(index)}
     out = []
     for i, t in enumerate(law.terms, 1):
-        own = {'coefficient': sd.get(f'c{i}', 0.0)}
-        own.update({k: sd[f'{k}{i}'] for k in t.shapes if f'{k}{i}' in sd})
+        deviations = {'coefficient': sd.get(f'c{i}', 0.0)}
+        deviations.update({k: sd[f'{k}{i}'] for k in t.shapes if f'{k}{i}' in sd})
         shapes = {k: values[f'{k}{i}'] for k in t.shapes}
         sizes = {'coefficient': values[f'c{i}'], **shapes}
         # What the recording does not determine has no standard deviation.
-        own = {k: v for k, v in own.items() if v < UNDETERMINED * abs(sizes[k]) and k not in FORMS[t.form].fixed}
-        own.update({k: t.sd[k] for k in FORMS[t.form].fixed if k in t.sd})
-        out.append(dataclasses.replace(t, coefficient=values[f'c{i}'], shapes=shapes, sd=own))
+        deviations = {
+            k: v for k, v in deviations.items() if v < UNDETERMINED * abs(sizes[k]) and k not in FORMS[t.form].fixed
+        }
+        deviations.update({k: t.sd[k] for k in FORMS[t.form].fixed if k in t.sd})
+        out.append(dataclasses.replace(t, coefficient=values[f'c{i}'], shapes=shapes, sd=deviations))
     return dataclasses.replace(law, terms=tuple(out))
 
 
@@ -199,12 +201,12 @@ class LawSearch:
     def first(self) -> list[LawTrial]:
         """Laws of one term, the best first."""
         scored = score(self.found, self.listed)
-        seen: set[tuple[str, str, tuple[str, ...]]] = set()
+        known: set[tuple[str, str, tuple[str, ...]]] = set()
         picked: list[Scored] = []
         for s in scored:
             key = (s.target, s.term.form, s.term.of)
-            if key not in seen and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
-                seen.add(key)
+            if key not in known and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
+                known.add(key)
                 picked.append(with_better_level(self.found, s))
         quick = [self.trial([law_on(s.target, s.term)], self.start.effects, 3) for s in picked]
         quick.sort(key=lambda t: t.cost)
@@ -235,11 +237,11 @@ class LawSearch:
             trial = best
         return trial
 
-    def _switched_again(self, trial: LawTrial, left: Sequence[Response]) -> LawTrial:
+    def _switched_again(self, trial: LawTrial, residuals: Sequence[Response]) -> LawTrial:
         """With the further times of switching that show once the law is in the model."""
         (law,), best = trial.laws, trial
         term = law.terms[0]
-        for more in switchings(left, (law.acts_on.removeprefix('static_'),)):
+        for more in switchings(residuals, (law.acts_on.removeprefix('static_'),)):
             times = tuple(sorted({*term.times} ^ {*more.times}))
             if more.of == term.of and times:
                 better = with_better_times(self.found, law.acts_on, LawTerm(term.form, term.of, times=times))
@@ -260,7 +262,7 @@ class LawSearch:
 
     def same_elsewhere(self, trial: LawTrial) -> list[LawTrial]:
         """The first law at the other stages that show alike: a beam for a dot, a load for a static pose."""
-        law, others = trial.laws[0], trial.laws[1:]
+        law, further_laws = trial.laws[0], trial.laws[1:]
         moved: list[Law] = []
         if f'beam_{law.acts_on}' in TARGETS:
             moved.append(dataclasses.replace(law, acts_on=f'beam_{law.acts_on}', stage='optics'))
@@ -270,10 +272,10 @@ class LawSearch:
             per = p.torque_compliance if row == 2 else p.force_compliance
             of_load = tuple(dataclasses.replace(t, coefficient=t.coefficient / per) for t in law.terms)
             moved.append(dataclasses.replace(law, acts_on=LOADS[row], stage='load', terms=of_load))
-        out = [self.trial([m, *others], trial.beside, 4) for m in moved]
+        out = [self.trial([m, *further_laws], trial.beside, 4) for m in moved]
         if law.acts_on in DOTS:
             # A voltage is a dot over a constant: by no recording can the two be told apart.
-            out.append(LawTrial((dataclasses.replace(law, stage='electronics'), *others), trial.fit, trial.cost))
+            out.append(LawTrial((dataclasses.replace(law, stage='electronics'), *further_laws), trial.fit, trial.cost))
         return out
 
 
@@ -310,8 +312,8 @@ def find_law(
     ``excess``: chi-square beyond noise that ``fit`` leaves; ``penalty``: of BIC, for each parameter.
     """
     progress('a law for what remains')
-    found = _law_of_the_mean(ws, null, fit, penalty, excess, rng)
-    return found or find_jitter(ws, fit, penalty)
+    found_law = _law_of_the_mean(ws, null, fit, penalty, excess, rng)
+    return found_law or find_jitter(ws, fit, penalty)
 
 
 def _law_of_the_mean(
@@ -334,20 +336,20 @@ def _law_of_the_mean(
             break
     best, seeker = min(followed, key=lambda t: t[0].cost)
     best = seeker.lean(best)
-    others = [t for t, _ in (*followed, *trials)]
-    best = simplest(best, others)
-    found = best.fit
+    alternatives = [t for t, _ in (*followed, *trials)]
+    best = simplest(best, alternatives)
+    fit_with_law = best.fit
     without = refit(ws, best.beside, 6) if best.beside else null
-    gain = without.chi2 - found.chi2
-    parameters = found.parameters - without.parameters
+    gain = without.chi2 - fit_with_law.chi2
+    parameters = fit_with_law.parameters - without.parameters
     chosen = sum(len(t.times) for law in best.laws for t in law.terms)
     # Every term on every target might have been taken, and every block as a time of a switching.
     chances = best.terms * math.log(seeker.tried) + chosen * math.log(max(ws.size / (3.0 * ws.psds), 2.0))
     p = math.exp(chances + float(chi2_law.logsf(gain, max(parameters, 1))))
-    bic = gain - (best.cost - found.chi2 - penalty * without.parameters)
-    held = heldout_gain(ws, without, found, rng)
-    left = heldout_gap(ws, found)
-    enough = fit.chi2 - found.chi2 > EXPLAINS * excess and _predicts(ws, fit, left)
+    bic = gain - (best.cost - fit_with_law.chi2 - penalty * without.parameters)
+    held = heldout_gain(ws, without, fit_with_law, rng)
+    residual_gap = heldout_gap(ws, fit_with_law)
+    enough = fit.chi2 - fit_with_law.chi2 > EXPLAINS * excess and _predicts(ws, fit, residual_gap)
     enough &= not _at_changes(ws, best.laws)
     enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_ACCEPT
     if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.significant or not enough:
@@ -355,23 +357,23 @@ def _law_of_the_mean(
     return FoundLaw(
         best.laws[0],
         best.laws[1:],
-        found,
+        fit_with_law,
         without,
         dominant_channels(ws, best),
-        tied_laws(best, [*others, *seeker.same_elsewhere(best)]),
+        tied_laws(best, [*alternatives, *seeker.same_elsewhere(best)]),
         p,
         bic,
         held,
-        left,
+        residual_gap,
     )
 
 
-def _predicts(ws: Workspace, fit: Fit, left: float) -> bool:
-    """Whether a law that leaves a gap ``left``, m, on unseen load cases closes half of what ``fit`` leaves, as energies
+def _predicts(ws: Workspace, fit: Fit, residual_gap: float) -> bool:
+    """Whether a law with ``residual_gap``, m, on unseen load cases closes half of the gap of ``fit``, as energies
     beyond noise.
     """
     floor = ws.floor()
-    return left**2 - floor**2 <= (1.0 - EXPLAINS) * max(ws.gap(fit.difference) ** 2 - floor**2, 0.0)
+    return residual_gap**2 - floor**2 <= (1.0 - EXPLAINS) * max(ws.gap(fit.difference) ** 2 - floor**2, 0.0)
 
 
 def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
@@ -399,10 +401,10 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     v2 = np.concatenate(known[name]) ** 2 / full
     held = []
     for k in np.unique(fold):
-        other, own = (fold != k) & (squares > 0.0), (fold == k) & (squares > 0.0)
-        a, b = variance(squares[other], v2[other])
-        flat = float(squares[other].mean())
-        held.append(likelihood(squares[own], a + b * v2[own]) - likelihood(squares[own], flat))
+        training, held_out = (fold != k) & (squares > 0.0), (fold == k) & (squares > 0.0)
+        a, b = variance(squares[training], v2[training])
+        flat = float(squares[training].mean())
+        held.append(likelihood(squares[held_out], a + b * v2[held_out]) - likelihood(squares[held_out], flat))
     heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
     p = tried * float(chi2_law.sf(gain, 1))
     if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.significant or slope <= 0.0:
@@ -424,15 +426,15 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     more = ws.gap(fit.difference) ** 2 - ws.floor() ** 2
     if ws.gap(fit.difference) > NOTED * ws.floor() and added < EXPLAINS * more:
         return None
-    whole = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
-    others = [dataclasses.replace(law, stage='psd')]
+    with_jitter = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
+    alternatives = [dataclasses.replace(law, stage='psd')]
     return FoundLaw(
         law,
         (),
-        whole,
+        with_jitter,
         fit,
         (channel,),
-        tuple(others),
+        tuple(alternatives),
         p,
         gain - penalty,
         heldout,
@@ -440,7 +442,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     )
 
 
-def simplest(best: LawTrial, others: Sequence[LawTrial]) -> LawTrial:
+def simplest(best: LawTrial, alternatives: Sequence[LawTrial]) -> LawTrial:
     """Of the laws beside the same effects that this recording cannot tell apart, the one with the fewest variables.
 
     A sensor's own dot goes before the pose, on which its dot depends.
@@ -448,7 +450,7 @@ def simplest(best: LawTrial, others: Sequence[LawTrial]) -> LawTrial:
     beside = [a.effect.name for a in best.beside]
     near = [
         t
-        for t in (best, *others)
+        for t in (best, *alternatives)
         if t.fit.chi2 - best.fit.chi2 < TIED
         and t.cost - best.cost < BIC_ACCEPT
         and [a.effect.name for a in t.beside] == beside
@@ -461,14 +463,14 @@ def simplest(best: LawTrial, others: Sequence[LawTrial]) -> LawTrial:
     return min(near, key=rank)
 
 
-def tied_laws(best: LawTrial, others: Sequence[LawTrial]) -> tuple[Law, ...]:
+def tied_laws(best: LawTrial, alternatives: Sequence[LawTrial]) -> tuple[Law, ...]:
     """Each other first law, by stage, target and variables, that the recording cannot exclude."""
 
     def key(law: Law) -> tuple[str, str, tuple[str, ...]]:
         return law.stage, law.acts_on, law.variables
 
     out = {key(best.laws[0]): best.laws[0]}
-    for t in sorted(others, key=lambda t: t.cost):
+    for t in sorted(alternatives, key=lambda t: t.cost):
         if t.fit.chi2 - best.fit.chi2 < TIED and t.cost - best.cost < TIED:
             out.setdefault(key(t.laws[0]), t.laws[0])
     return tuple(out.values())[1:]

@@ -87,9 +87,9 @@ def _odds(group: Sequence[tuple[int, float, str]], covariance: FloatArray) -> fl
     of_logs = covariance[np.ix_(columns, columns)] / np.outer(sizes, sizes)
     # The logarithm of the first less those of the others.
     less = np.column_stack((np.ones(len(group) - 1), -np.eye(len(group) - 1)))
-    spread = less @ (of_logs + 0.5 * EXACT**2 * np.eye(len(group))) @ less.T
+    size_covariance = less @ (of_logs + 0.5 * EXACT**2 * np.eye(len(group))) @ less.T
     off = less @ np.log(np.abs(sizes))
-    density = math.exp(-0.5 * float(off @ np.linalg.solve(spread, off))) / math.sqrt(
-        np.linalg.det(2.0 * np.pi * spread)
+    density = math.exp(-0.5 * float(off @ np.linalg.solve(size_covariance, off))) / math.sqrt(
+        np.linalg.det(2.0 * np.pi * size_covariance)
     )
     return float((DECADES * math.log(10.0)) ** len(off) * density)

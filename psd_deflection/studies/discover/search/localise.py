@@ -149,7 +149,7 @@ def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArra
         time = np.arange(n) / n
         warmer = np.zeros(n) if o.temperature is None else fine_means(chunk.warmer[None, :], size)[0]
         axes = ('fx', 'fy', 'tz')
-        for psd, own in enumerate(out):
+        for psd, columns_of_psd in enumerate(out):
             x, y = dots[2 * psd], dots[2 * psd + 1]
             named = {
                 'constant': np.ones(n),
@@ -175,7 +175,7 @@ def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArra
                 'temperature^2': warmer**2,
             }
             for name, values in named.items():
-                own.setdefault(name, []).append(values)
+                columns_of_psd.setdefault(name, []).append(values)
     return [(channel, out[c // 3]) for c, channel in enumerate(channel_names(workspace.psds))]
 
 
@@ -194,7 +194,7 @@ def dependences(
     q = None
     if known is not None and known.shape[1]:
         q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
-    found: list[tuple[str, str, float]] = []
+    relations: list[tuple[str, str, float]] = []
     for c, (channel, named) in enumerate(table):
         names = list(named)
         matrix = np.stack([workspace.row(c, values) for values in named.values()], axis=1)
@@ -203,8 +203,8 @@ def dependences(
         g = matrix.T @ e
         wrong = 0.0
         if explained is not None:
-            own = np.concatenate([part[c] for part in workspace.split(explained)])
-            wrong = RELATIVE * np.sqrt(lengths) * np.linalg.norm(own)
+            channel_values = np.concatenate([part[c] for part in workspace.split(explained)])
+            wrong = RELATIVE * np.sqrt(lengths) * np.linalg.norm(channel_values)
         f = lengths.copy()
         if q is not None:
             fitted = np.stack([np.concatenate([part[c] for part in workspace.split(col)]) for col in q.T])
@@ -214,11 +214,11 @@ def dependences(
         g = np.maximum(np.abs(g) - wrong, 0.0)
         for k, name in enumerate(names):
             if lengths[k] > 0.0 and f[k] > 1e-6 * lengths[k]:
-                found.append((channel, name, float(g[k] ** 2 / f[k])))
-    count = len(found)
+                relations.append((channel, name, float(g[k] ** 2 / f[k])))
+    count = len(relations)
     out = [
         Dependence(ch, name, gain, float(-np.expm1(count * np.log1p(-min(float(chi2_law.sf(gain, 1)), 1 - 1e-16)))))
-        for ch, name, gain in found
+        for ch, name, gain in relations
     ]
     out.sort(key=lambda d: -d.gain)
     return out

@@ -34,27 +34,27 @@ def mistake(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit:
     """
     if not scores or min(s.p for s in scores) > trials.workspace.p_accept:
         return null
-    found = trials.best_of(_mistaken(trials, null, scores), 2, 12)
-    if not _nearly_all(trials, null, found):
-        found = _delays_beside_an_effect(trials, null, scores)
-    if found is None or not _nearly_all(trials, null, found) or _is_a_mass(found):
+    best = trials.best_of(_mistaken(trials, null, scores), 2, 12)
+    if not _nearly_all(trials, null, best):
+        best = _delays_beside_an_effect(trials, null, scores)
+    if best is None or not _nearly_all(trials, null, best) or _is_a_mass(best):
         return null
-    trials.log('the set-up: ' + ', '.join(a.label for a in found.effects))
-    return found
+    trials.log('the set-up: ' + ', '.join(a.label for a in best.effects))
+    return best
 
 
-def _nearly_all(trials: Trials, null: Fit, found: Fit | None) -> bool:
-    """Whether ``found`` passes and leaves next to nothing."""
+def _nearly_all(trials: Trials, null: Fit, fit: Fit | None) -> bool:
+    """Whether ``fit`` passes and leaves next to nothing."""
     size = trials.workspace.size
-    if found is None or not trials.passes(null, found, null):
+    if fit is None or not trials.passes(null, fit, null):
         return False
-    return found.chi2 - size <= NEARLY_ALL * (null.chi2 - size)
+    return fit.chi2 - size <= NEARLY_ALL * (null.chi2 - size)
 
 
 def _delays_beside_an_effect(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit | None:
     """Late loads with the best effect beside them."""
-    late = [s for s in scores if s.candidate.effect.name == LATE and s.p <= trials.workspace.p_accept]
-    alone = trials.best_of([[s.candidate.from_coefficients(s.coefficients)] for s in late], 1, 6)
+    delays = [s for s in scores if s.candidate.effect.name == LATE and s.p <= trials.workspace.p_accept]
+    alone = trials.best_of([[s.candidate.from_coefficients(s.coefficients)] for s in delays], 1, 6)
     if alone is None or not trials.passes(null, alone, null):
         return None
     both = _effect_beside_delays(trials, alone, trials.screen)
@@ -100,9 +100,9 @@ def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> lis
 def frequency(ws: Comparison, beside: Fit, score: Score) -> ActiveEffect:
     """The best start for another natural frequency: from far away a linear step does not reach it."""
     start = score.candidate.from_coefficients(score.coefficients)
-    others = OTHER_FREQUENCIES if far(beside) else ()
+    starts = OTHER_FREQUENCIES if far(beside) else ()
     return min(
-        [start, *(ActiveEffect(start.effect, {'error': v}) for v in others)],
+        [start, *(ActiveEffect(start.effect, {'error': v}) for v in starts)],
         key=lambda a: ws.loss(ws.residual([*ws.base, *beside.coefficients_with_nuisance, a])[0]),
     )
 

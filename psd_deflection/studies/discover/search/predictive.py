@@ -264,21 +264,27 @@ def _flips(
     """Logarithms (k,) of the odds for each term being turned on or off; the terms that are on, and their sizes."""
     chosen = np.flatnonzero(inside)
     n, count = len(chosen), len(g)
-    left, room, pull = energy, diagonal + slab, g
+    residual_energy, room, pull = energy, diagonal + slab, g
     mean, deviation = np.zeros(0), np.zeros(0)
     if n:
         inverse = np.linalg.inv(f[np.ix_(chosen, chosen)] + slab * np.eye(n))
         mean, deviation = inverse @ g[chosen], np.diag(inverse)
         across = f[chosen]
-        left = max(energy - float(mean @ g[chosen]), 1e-12 * energy)
+        residual_energy = max(energy - float(mean @ g[chosen]), 1e-12 * energy)
         room = np.maximum(room - np.einsum('ij,ij->j', across, inverse @ across), slab)
         pull = g - mean @ across
-    with_it = np.maximum(left - pull**2 / room, 1e-12 * energy)
-    odds = 0.5 * np.log(slab / room) - 0.5 * size * np.log(with_it / left) + np.log((1.0 + n) / max(count - n, 1))
+    with_it = np.maximum(residual_energy - pull**2 / room, 1e-12 * energy)
+    odds = (
+        0.5 * np.log(slab / room)
+        - 0.5 * size * np.log(with_it / residual_energy)
+        + np.log((1.0 + n) / max(count - n, 1))
+    )
     if n:
-        without = left + mean**2 / deviation
+        without = residual_energy + mean**2 / deviation
         odds[chosen] = (
-            -0.5 * np.log(slab * deviation) - 0.5 * size * np.log(without / left) - np.log(n / (count - n + 1.0))
+            -0.5 * np.log(slab * deviation)
+            - 0.5 * size * np.log(without / residual_energy)
+            - np.log(n / (count - n + 1.0))
         )
     return odds, chosen, mean
 
@@ -292,8 +298,8 @@ def _slab(
     values, vectors = np.linalg.eigh(f[np.ix_(chosen, chosen)])
     along = vectors.T @ g[chosen]
     room = values[None, :] + SLABS[:, None]
-    left = np.maximum(energy - (along**2 / room).sum(axis=1), 1e-12 * energy)
-    logs = 0.5 * np.log(SLABS[:, None] / room).sum(axis=1) - 0.5 * size * np.log(left)
+    residual_energy = np.maximum(energy - (along**2 / room).sum(axis=1), 1e-12 * energy)
+    logs = 0.5 * np.log(SLABS[:, None] / room).sum(axis=1) - 0.5 * size * np.log(residual_energy)
     p = np.exp(logs - logs.max())
     return float(rng.choice(SLABS, p=p / p.sum()))
 

@@ -51,10 +51,10 @@ def spectral_peaks(
                 return -float((np.cos(angle) @ x) ** 2 + (np.sin(angle) @ x) ** 2)
 
             step = 1.0 / (n * period)
-            found = minimize_scalar(
+            peak = minimize_scalar(
                 loss, bounds=((k - 1) * step, (k + 1) * step), method='bounded', options={'xatol': 1e-3 * step}
             )
-            best.append((float(power[k] / median), float(found.x)))
+            best.append((float(power[k] / median), float(peak.x)))
             power[max(0, k - 12) : k + 13] = 0.0
     best.sort(reverse=True)
     out: list[float] = []
@@ -123,12 +123,12 @@ def coarse_step(observation: Observation) -> CoarseStep | None:
     lsb = observation.rig.converter.volts_per_count
     volts = observation.volts[np.all(np.isfinite(observation.volts), axis=1)]
     volts = volts[:: max(1, len(volts) // 20_000)]
-    found = _common_step(volts, lsb)
-    if found is not None:
-        return CoarseStep(*found)
+    step = _common_step(volts, lsb)
+    if step is not None:
+        return CoarseStep(*step)
     # A sum signal may have another converter, or another range.
-    found = _common_step(volts[:, dot_channels(observation.psds)], lsb)
-    return None if found is None else CoarseStep(*found, sums=False)
+    step = _common_step(volts[:, dot_channels(observation.psds)], lsb)
+    return None if step is None else CoarseStep(*step, sums=False)
 
 
 def _common_step(volts: FloatArray, lsb: float) -> tuple[float, float] | None:

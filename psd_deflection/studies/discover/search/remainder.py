@@ -57,12 +57,12 @@ class Remainder:
         return Unknown(words, self.depends_on, share, rms=self.rms)
 
 
-def remainder_of(ws: Comparison, fit: Fit, left: Localisation, table: Table) -> Remainder | None:
-    """What ``fit`` leaves as a sum of those terms of ``table`` that ``left`` found strong.
+def remainder_of(ws: Comparison, fit: Fit, residual: Localisation, table: Table) -> Remainder | None:
+    """What ``fit`` leaves as a sum of those terms of ``table`` that ``residual`` found strong.
 
     None if there are none, or if they predict nothing on unseen load cases.
     """
-    strong = [d for d in left.dependences if d.p < STRONG_P][:MOST_REGRESSORS]
+    strong = [d for d in residual.dependences if d.p < STRONG_P][:MOST_REGRESSORS]
     if not strong:
         return None
     columns = [fit.jacobian[:, j] for j, name in enumerate(fit.free) if name not in fit.at_bound]

@@ -73,13 +73,13 @@ def solve_observable(fisher: FloatArray, score: FloatArray, original: FloatArray
 class Screen:
     """All candidates' signatures, whitened, side by side."""
 
-    def __init__(self, workspace: Comparison, found: Sequence[tuple[Candidate, Columns]]) -> None:
+    def __init__(self, workspace: Comparison, signatures: Sequence[tuple[Candidate, Columns]]) -> None:
         self.candidates: list[Candidate] = []
         self.slices: list[slice] = []
         # One array from the start: a recording of minutes has hundreds of megabytes of signatures.
-        rows = np.empty((sum(len(c) for _, c in found), sum(m.size for m in workspace.measured)), dtype=np.float32)
+        rows = np.empty((sum(len(c) for _, c in signatures), sum(m.size for m in workspace.measured)), dtype=np.float32)
         at = 0
-        for candidate, columns in found:
+        for candidate, columns in signatures:
             white = rows[at : at + len(columns)]
             for row, column in zip(white, columns, strict=True):
                 row[:] = workspace.whiten(column)
@@ -136,7 +136,7 @@ class Screen:
         for score in singles:
             best.setdefault(score.candidate.variant, score)
         where = {id(c): s for c, s in zip(self.candidates, self.slices, strict=True)}
-        found = []
+        scored = []
         for a, b in itertools.combinations(best.values(), 2):
             sa, sb = where[id(a.candidate)], where[id(b.candidate)]
             index = np.r_[sa, sb]
@@ -144,9 +144,9 @@ class Screen:
             na = sa.stop - sa.start
             if (a.candidate.one_sided and c[0] < 0.0) or (b.candidate.one_sided and c[na] < 0.0):
                 continue
-            found.append((gain - penalty * dof, a, b, gain, c, na))
-        found.sort(key=lambda item: -item[0])
+            scored.append((gain - penalty * dof, a, b, gain, c, na))
+        scored.sort(key=lambda item: -item[0])
         out = []
-        for _, a, b, gain, c, na in found[:limit]:
+        for _, a, b, gain, c, na in scored[:limit]:
             out.append((replace(a, coefficients=c[:na]), replace(b, coefficients=c[na:]), gain))
         return out

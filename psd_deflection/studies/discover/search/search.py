@@ -89,7 +89,7 @@ class Search(Trials):
         first_scores = scores
         null, grown = self._refitted(null, mistake(self, null, scores) if begun is None else begun)
         grown = self._without_weak(grown)
-        current, others = self.swap(null, grown)
+        current, alternatives = self.swap(null, grown)
         if self._much_closer(grown, current):
             # Beside the wrong effect nothing held that holds beside the right one; what that cost is not counted.
             self._begun = self.workspace.simulations
@@ -97,10 +97,10 @@ class Search(Trials):
             null, more = self._refitted(null, current)
             more = self._without_weak(more)
             if len(more.effects) > len(current.effects):
-                current, others = self.swap(null, more)
+                current, alternatives = self.swap(null, more)
         p, delta_bic, delta_chi2 = self.weigh(null, current)
         limits = self._limits(current)
-        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace, limits)
+        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, alternatives, self.trace, limits)
 
     def _refitted(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
         """The fit of no effect, and ``current`` with all that passes, beside the noise that is estimated then."""
@@ -123,10 +123,10 @@ class Search(Trials):
         What is put in their places is much work for nothing, and the right one may show beside the others alone.
         """
         while len(current.effects) > 1 and not self.workspace.open_level:
-            left = current.chi2 - self.workspace.size
+            excess = current.chi2 - self.workspace.size
             sizes = [wald_chi_square(self.workspace, current, i) for i in range(len(current.effects))]
             weakest = int(np.argmin(sizes))
-            if left <= NEAR * self.workspace.size or sizes[weakest] >= left:
+            if excess <= NEAR * self.workspace.size or sizes[weakest] >= excess:
                 break
             self.log(f'{current.effects[weakest].label} explains less than what remains')
             rest = [a for i, a in enumerate(current.effects) if i != weakest]
@@ -136,8 +136,8 @@ class Search(Trials):
     def _much_closer(self, before: Fit, current: Fit) -> bool:
         """Whether a swap closed most of what was open, and left something."""
         size = self.workspace.size
-        left = current.chi2 - size
-        return left < MOST_CLOSED * (before.chi2 - size) and left > NEAR * size
+        excess = current.chi2 - size
+        return excess < MOST_CLOSED * (before.chi2 - size) and excess > NEAR * size
 
     def _limits(self, current: Fit) -> tuple[Limit, ...]:
         """The limit that kept further effects out, with what lies beyond it."""
@@ -224,10 +224,12 @@ class Search(Trials):
         if self.workspace.open_level or current.chi2 <= (1.0 + NEAR) * self.workspace.size:
             return None
         known, best = {key_of(a) for a in current.effects}, current
-        others = [s for s in screened if s.gain >= CHOICE_REACH * least and s.candidate.variant not in known]
+        other_choices = [s for s in screened if s.gain >= CHOICE_REACH * least and s.candidate.variant not in known]
         for i, active in enumerate(current.effects):
             place = slot(active.effect, active.values)
-            mine = [s for s in others if self.may_pass(s) and slot(s.candidate.effect, s.candidate.start) == place]
+            mine = [
+                s for s in other_choices if self.may_pass(s) and slot(s.candidate.effect, s.candidate.start) == place
+            ]
             for chosen in {s.candidate.variant: s.candidate for s in mine}.values():
                 choices = {p.name: chosen.start[p.name] for p in active.effect.parameters if p.kind == 'choice'}
                 moved = ActiveEffect(active.effect, {**active.values, **choices})
@@ -240,14 +242,14 @@ class Search(Trials):
 
     def swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
         """Try to replace each effect by its alternatives and keep the better model; at most two rounds."""
-        others: list[list[Fit]] = []
+        alternatives: list[list[Fit]] = []
         for swaps in range(3):
-            others = []
+            alternatives = []
             _, _, gains = self.weigh(null, current)
             best = current
             for i in range(len(current.effects)):
                 fits = self.alternatives(null, current, i, gains[i])
-                others.append(fits)
+                alternatives.append(fits)
                 best = min([best, *fits], key=self.bic)
             spent = self.spent > 1.5 * self.budget_of(current)
             if swaps == 2 or spent or self.bic(best) > self.bic(current) - 2.0:
@@ -255,7 +257,7 @@ class Search(Trials):
             self.log('swapping to ' + ', '.join(a.label for a in best.effects))
             current = refit(self.workspace, best.effects, iterations=8)
             current = self._drop(null, current)
-        return current, others
+        return current, alternatives
 
     def _try_pairs(self, null: Fit, current: Fit) -> Fit:
         pairs = self.screen.pairs(
@@ -331,8 +333,10 @@ class Search(Trials):
         fits = []
         for s in ranked:
             ringing = s.candidate.effect.name in RINGING
-            other = frequency(self.workspace, without, s) if ringing else s.candidate.from_coefficients(s.coefficients)
-            quick = refit(self.workspace, [*rest, other], iterations=10 if self.workspace.open_level else 3)
+            alternative = (
+                frequency(self.workspace, without, s) if ringing else s.candidate.from_coefficients(s.coefficients)
+            )
+            quick = refit(self.workspace, [*rest, alternative], iterations=10 if self.workspace.open_level else 3)
             if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self.budget_of(current):
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)

@@ -170,8 +170,8 @@ class SignatureBank:
 
     def get(self, candidate: Candidate, workspace: Comparison) -> Columns:
         """The candidate's columns, simulated once."""
-        found = self._kept.get(candidate.key)
-        if found is None:
-            found = signature_columns(candidate, workspace, self.nominal(workspace), self._base)
-            self._kept[candidate.key] = found
-        return found
+        columns = self._kept.get(candidate.key)
+        if columns is None:
+            columns = signature_columns(candidate, workspace, self.nominal(workspace), self._base)
+            self._kept[candidate.key] = columns
+        return columns

@@ -120,8 +120,8 @@ def _chosen(remains: Remainders) -> tuple[tuple[str, ...], FloatArray]:
     shapes, likelihood = _shaped(remains, names)
     while True:
         tried = [(*names, name) for name in remains.apart if name not in names]
-        found = [(*_shaped(remains, more), more) for more in tried]
-        best = max(found, key=lambda row: row[1], default=None)
+        fitted = [(*_shaped(remains, more), more) for more in tried]
+        best = max(fitted, key=lambda row: row[1], default=None)
         if best is None or 2.0 * (best[1] - likelihood) < WORTH:
             return names, shapes
         shapes, likelihood, names = best
@@ -135,18 +135,18 @@ def _shaped(remains: Remainders, names: Sequence[str], start: FloatArray | None 
     begin = np.tile(usual, (len(channels), 1)) if start is None else start
     bounds = Bounds(np.tile(low, len(channels)), np.tile(high, len(channels)))
     basis = orthonormal_basis(remains.sizes)
-    parts = [(remains.part(own), basis[own]) for own in (remains.channel == c for c in channels)]
+    parts = [(remains.part(of_channel), basis[of_channel]) for of_channel in (remains.channel == c for c in channels)]
     surprise: Callable[[FloatArray], tuple[float, FloatArray]] = partial(
         negative_log_likelihood, parts=parts, names=names
     )
-    found = minimize(surprise, begin.ravel(), jac=True, method='L-BFGS-B', bounds=bounds, options={'maxiter': 60})
-    return np.reshape(found.x, begin.shape), -float(found.fun)
+    solution = minimize(surprise, begin.ravel(), jac=True, method='L-BFGS-B', bounds=bounds, options={'maxiter': 60})
+    return np.reshape(solution.x, begin.shape), -float(solution.fun)
 
 
 def orthonormal_basis(columns: FloatArray) -> FloatArray:
     """An orthonormal basis of ``columns``, which may depend on each other."""
-    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
 
 
 def negative_log_likelihood(
@@ -157,9 +157,9 @@ def negative_log_likelihood(
     """
     rows = np.reshape(shapes, (len(parts), -1))
     known, inverses, logs = list[FloatArray](), list[FloatArray](), 0.0
-    for shape, (own, _) in zip(rows, parts, strict=True):
-        known.append(_covariance(shape, own, names))
-        noise = np.exp(2.0 * shape[0]) * np.eye(len(own.values))
+    for shape, (of_channel, _) in zip(rows, parts, strict=True):
+        known.append(_covariance(shape, of_channel, names))
+        noise = np.exp(2.0 * shape[0]) * np.eye(len(of_channel.values))
         try:
             lower = cholesky(known[-1] + noise, lower=True)
         except LinAlgError:
@@ -167,30 +167,32 @@ def negative_log_likelihood(
         inverses.append(cho_solve((lower, True), np.eye(len(lower))))
         logs += float(np.log(np.diag(lower)).sum())
     weighed = [inverse @ basis for inverse, (_, basis) in zip(inverses, parts, strict=True)]
-    pulls = [inverse @ own.values for inverse, (own, _) in zip(inverses, parts, strict=True)]
+    pulls = [inverse @ of_channel.values for inverse, (of_channel, _) in zip(inverses, parts, strict=True)]
     f = np.sum([basis.T @ w for w, (_, basis) in zip(weighed, parts, strict=True)], axis=0)
     sizes = np.linalg.pinv(f, hermitian=True)
     moved = sizes @ np.sum([basis.T @ p for p, (_, basis) in zip(pulls, parts, strict=True)], axis=0)
     logs += 0.5 * float(np.linalg.slogdet(f)[1])
     loss, gradient = logs, np.zeros_like(rows)
-    for i, (shape, (own, _)) in enumerate(zip(rows, parts, strict=True)):
+    for i, (shape, (of_channel, _)) in enumerate(zip(rows, parts, strict=True)):
         pull = pulls[i] - weighed[i] @ moved
-        loss += 0.5 * float(own.values @ pull)
+        loss += 0.5 * float(of_channel.values @ pull)
         # The derivative by a covariance V is half of P - (P y)(P y)', with P the inverse beside the effects.
-        by = 0.5 * (inverses[i] - weighed[i] @ sizes @ weighed[i].T - np.outer(pull, pull))
-        gradient[i, 0] = 2.0 * np.exp(2.0 * shape[0]) * np.trace(by)
+        curvature = 0.5 * (inverses[i] - weighed[i] @ sizes @ weighed[i].T - np.outer(pull, pull))
+        gradient[i, 0] = 2.0 * np.exp(2.0 * shape[0]) * np.trace(curvature)
         for k, name in enumerate(names):
-            part = _covariance(np.array([shape[0], *shape[1 + 2 * k : 3 + 2 * k]]), own, (name,))
-            gradient[i, 1 + 2 * k] = 2.0 * float(np.sum(by * part))
-            gradient[i, 2 + 2 * k] = float(np.exp(-2.0 * shape[2 + 2 * k]) * np.sum(by * part * own.apart[name]))
+            part = _covariance(np.array([shape[0], *shape[1 + 2 * k : 3 + 2 * k]]), of_channel, (name,))
+            gradient[i, 1 + 2 * k] = 2.0 * float(np.sum(curvature * part))
+            gradient[i, 2 + 2 * k] = float(
+                np.exp(-2.0 * shape[2 + 2 * k]) * np.sum(curvature * part * of_channel.apart[name])
+            )
     return loss, gradient.ravel()
 
 
-def _covariance(shape: FloatArray, own: Remainders, names: Sequence[str]) -> FloatArray:
+def _covariance(shape: FloatArray, remains: Remainders, names: Sequence[str]) -> FloatArray:
     """Of the function of one channel (d, d)."""
-    out = np.zeros((len(own.values), len(own.values)))
+    out = np.zeros((len(remains.values), len(remains.values)))
     for name, (size, length) in zip(names, shape[1:].reshape(-1, 2).tolist(), strict=True):
-        out += np.exp(2.0 * size - 0.5 * np.exp(-2.0 * length) * own.apart[name])
+        out += np.exp(2.0 * size - 0.5 * np.exp(-2.0 * length) * remains.apart[name])
     return out
 
 
@@ -201,9 +203,9 @@ def _known(
     function = np.zeros((len(remains.values), len(remains.values)))
     noise = np.zeros(len(remains.values))
     for shape, c in zip(shapes, np.unique(remains.channel).tolist(), strict=True):
-        own = remains.channel == c
-        function[np.ix_(own, own)] = _covariance(shape, remains.part(own), names)
-        noise[own] = np.exp(2.0 * shape[0])
+        of_channel = remains.channel == c
+        function[np.ix_(of_channel, of_channel)] = _covariance(shape, remains.part(of_channel), names)
+        noise[of_channel] = np.exp(2.0 * shape[0])
     factor = cho_factor((function + np.diag(noise))[np.ix_(training, training)])
     sizes, values = remains.sizes[training], remains.values[training]
     lengths = np.maximum(np.linalg.norm(sizes, axis=0), 1e-150)
@@ -222,6 +224,6 @@ def unseen_residual(
     out = np.zeros(len(remains.values))
     for fold in np.unique(remains.fold[there]):
         training = there & (remains.fold != fold)
-        own = shapes if shaped else _shaped(remains.part(training), names, shapes)[0]
-        out[~training & there] = _known(remains, names, own, training)[0][~training & there]
+        shapes_used = shapes if shaped else _shaped(remains.part(training), names, shapes)[0]
+        out[~training & there] = _known(remains, names, shapes_used, training)[0][~training & there]
     return out

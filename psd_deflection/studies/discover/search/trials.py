@@ -195,8 +195,8 @@ class Trials:
         losses = [ws.loss(ws.residual([*ws.base, *fit.nuisance, *start])[0]) for start in starts]
         if not losses or min(losses) >= fit.chi2:
             return fit
-        other = refit(ws, starts[int(np.argmin(losses))], iterations, fit.nuisance)
-        return min(fit, other, key=self.bic)
+        restarted = refit(ws, starts[int(np.argmin(losses))], iterations, fit.nuisance)
+        return min(fit, restarted, key=self.bic)
 
     def of_another_shape(self, fit: Fit) -> Fit:
         """``fit``, or a better one with the shapes of an effect elsewhere: its frequency may be in a side valley."""

@@ -168,12 +168,12 @@ def unsaid(workspace: Comparison, before: float, after: float) -> tuple[Unknown,
     return (Unknown(words, (), float(min((after / before) ** 2, 1.0)), rms=size),)
 
 
-def no_noise(workspace: Comparison, left: Localisation, before: float, after: float) -> tuple[Unknown, ...]:
+def no_noise(workspace: Comparison, residual: Localisation, before: float, after: float) -> tuple[Unknown, ...]:
     """What remains where nobody states a noise, if it follows something or one value is like the next."""
     if not workspace.open_level or np.isfinite(workspace.floor()) or after <= 0.0:
         return ()
     most = MOST_OF_IT * workspace.size
-    follows = [d for d in left.dependences if d.p < FOLLOWS_P or d.gain > most][:3]
+    follows = [d for d in residual.dependences if d.p < FOLLOWS_P or d.gain > most][:3]
     if not follows and not workspace.correlated:
         return ()
     names = tuple(dict.fromkeys(d.regressor for d in follows))
@@ -183,7 +183,7 @@ def no_noise(workspace: Comparison, left: Localisation, before: float, after: fl
 
 
 def unknown_of(
-    left: Localisation,
+    residual: Localisation,
     explained: float,
     gap: float = 0.0,
     floor: float = 0.0,
@@ -194,26 +194,26 @@ def unknown_of(
     """``gap``: what remains; ``floor``: what noise leaves, ``by_noise``: at most. ``steps``: chi-square that coarse
     steps explain. ``worded``: a gap with its unit.
     """
-    if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
+    if residual.p > UNKNOWN_P or residual.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
         return ()
-    fast = any(c.p < 0.01 and c.band[0] >= BLOCKS_HZ for c in left.cells)
+    fast = any(c.p < 0.01 and c.band[0] >= BLOCKS_HZ for c in residual.cells)
     if 0.0 < gap <= max(floor, by_noise) < math.inf and not fast:
         # Noise alone may leave more.
         return ()
-    strong = [d for d in left.dependences if d.p < 1e-3][:6]
+    strong = [d for d in residual.dependences if d.p < 1e-3][:6]
     size = _beyond(gap, floor)
-    words = _place_of(left, strong)
+    words = _place_of(residual, strong)
     if size > 0.0:
         times = f' ({gap / floor:.1f} times the noise remain)' if floor > 0.0 else ''
         words.insert(1, f'{worded(size)} rms{times}')
-    share = left.excess / (left.excess + explained)
+    share = residual.excess / (residual.excess + explained)
     names = tuple(dict.fromkeys(d.regressor for d in strong))
     return (Unknown('; '.join(words), names, share, rms=size),)
 
 
-def _place_of(left: Localisation, strong: Sequence[Dependence]) -> list[str]:
+def _place_of(residual: Localisation, strong: Sequence[Dependence]) -> list[str]:
     """On which channels, what it follows and how, and when it is strongest."""
-    channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))
+    channels = list(dict.fromkeys([*(c.channel for c in residual.cells if c.p < 0.01), *(d.channel for d in strong)]))
     names = tuple(dict.fromkeys(d.regressor for d in strong))
     even = sum(d.gain for d in strong if _even(d.regressor))
     odd = sum(d.gain for d in strong if not _even(d.regressor))
@@ -224,8 +224,8 @@ def _place_of(left: Localisation, strong: Sequence[Dependence]) -> list[str]:
         words.append('mostly even' if even > 2.0 * odd else 'mostly odd' if odd > 2.0 * even else 'odd and even parts')
     if lagging:
         words.append('hysteretic: it depends on which way the load last changed')
-    if left.cells:
-        c = left.cells[0]
+    if residual.cells:
+        c = residual.cells[0]
         words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
     return words
 
@@ -235,11 +235,11 @@ def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Lo
     if not ties:
         return ()
     tie = ties[0]
-    *others, last = [fit.effects[i].label for i, _ in tie.members]
+    *labels, last = [fit.effects[i].label for i, _ in tie.members]
     unit = f' {tie.unit}' if tie.unit else ''
     sizes = ', '.join(f'{name} {size:.4g}' for (_, name), size in zip(tie.members, tie.sizes, strict=True))
     words = (
-        f'{", ".join(others)} and {last} agree in size ({sizes}{unit}) as '
+        f'{", ".join(labels)} and {last} agree in size ({sizes}{unit}) as '
         f'independent effects hardly would (odds {tie.odds:.0f} to 1): one cause that is not in the catalogue'
     )
     names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < 1e-3))

@@ -82,7 +82,7 @@ class Workspace(Comparison):
 
     def _noise_beside(self, effects: Sequence[ActiveEffect]) -> tuple[NoiseModel, ...]:
         """The noise, with the link's motion simulated with ``effects``."""
-        out, left = list[NoiseModel](), list[FloatArray]()
+        out, residuals = list[NoiseModel](), list[FloatArray]()
         self.tally.count += 1
         for i, (o, size) in enumerate(zip(self.observations, self.fine, strict=True)):
             chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.acting, o.temperature)
@@ -93,11 +93,11 @@ class Workspace(Comparison):
             noise = estimate_noise(o, difference, size, floors)
             present = self._present[i]
             rows = difference.T if present is None else np.where(present > 0.0, difference.T, 0.0)
-            left.append(noise.whiten(fine_means(rows, size, present), self.count[i]))
+            residuals.append(noise.whiten(fine_means(rows, size, present), self.count[i]))
             out.append(noise)
-        corners = corners_of(left, self.periods)
+        corners = corners_of(residuals, self.periods)
         blocks = [o.rig.estimator.block_size * o.period for o in self.observations]
-        both = zip(out, left, self.periods, blocks, strict=True)
+        both = zip(out, residuals, self.periods, blocks, strict=True)
         return tuple(w.with_slow_noise(corners, part.shape[1], period, block) for w, part, period, block in both)
 
     @property

@@ -61,7 +61,7 @@ def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequen
 def swayed(ws: Workspace, recording: int, difference: FloatArray, implied: PlateauLoads) -> list[SwayingLoad]:
     """Loads that swayed; ``implied``: what ``difference`` asks for between all steps."""
     o = ws.observations[recording]
-    annotated = plateaus(o.rig, o.volts, o.loads, recording, noted=True)
+    annotated = plateaus(o.rig, o.volts, o.loads, recording, annotated_only=True)
     return swaying(implied, annotated, partial(levels, ws, recording, difference), o.period)
 
 

@@ -74,8 +74,8 @@ def _orthonormal(rows: FloatArray) -> list[FloatArray]:
     out: list[FloatArray] = []
     for row in rows:
         # Twice: the first time leaves what rounding makes of it.
-        for other in (*out, *out):
-            row = row - (other @ row) * other
+        for basis_vector in (*out, *out):
+            row = row - (basis_vector @ row) * basis_vector
         out.append(row / np.linalg.norm(row))
     return out
 
@@ -110,12 +110,12 @@ def solved(ws: Workspace, difference: Sequence[FloatArray]) -> FloatArray:
     return residual
 
 
-def _moved(recording: int, count: int, by: FloatArray) -> ActiveEffect:
-    """The pose of one recording moved ``by`` (3, n)."""
+def _moved(recording: int, count: int, shift: FloatArray) -> ActiveEffect:
+    """The pose of one recording moved ``shift`` (3, n)."""
 
     def move(chunk: SimulatedSamples, values: Values, state: State) -> None:
-        n = min(chunk.pose.shape[1], by.shape[1])
-        chunk.pose[:, :n] += by[:, :n]
+        n = min(chunk.pose.shape[1], shift.shape[1])
+        chunk.pose[:, :n] += shift[:, :n]
 
     choices = tuple(range(1, count + 1))
     which = EffectParameter('recording', '', 1, count, 1, '', nominal=1, kind='choice', choices=choices, each=True)

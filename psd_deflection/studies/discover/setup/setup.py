@@ -80,7 +80,7 @@ def _blocks(rows: FloatArray, size: int) -> FloatArray:
 def movement_sums(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> _Movement:
     """Return the sums over blocks of what dots and simulated loads moved, m^2."""
     count = 2 * observations[0].psds
-    squared, cross, own = 0.0, np.zeros((3, count, count)), np.zeros((3, 3))
+    squared, cross, load_products = 0.0, np.zeros((3, count, count)), np.zeros((3, 3))
     for o in observations:
         size, physics = o.rig.estimator.block_size, Physics.of(o.rig)
         device = Wiring.from_rig(o.rig).to_device(o.volts)[:, dot_channels(o.psds)].T
@@ -103,10 +103,10 @@ def movement_sums(observations: Sequence[Observation], base: Sequence[ActiveEffe
         moves = moves / (o.rig.sensitivities.reshape(-1, 1) / o.rig.amplifier.sensitivity)
         squared += float((block_means**2).sum())
         cross += np.einsum('kdt,ct->kdc', moves, block_means)
-        own += np.einsum('kdt,jdt->kj', moves, moves)
+        load_products += np.einsum('kdt,jdt->kj', moves, moves)
     first = observations[0].rig
     noise = float(np.mean(first.noises[:, :2] ** 2)) * first.amplifier.sensitivity**2 / first.estimator.block_size
-    return _Movement(squared, cross, own, noise)
+    return _Movement(squared, cross, load_products, noise)
 
 
 def load_sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
@@ -301,8 +301,10 @@ def finding_of_effect(
         )
         return [Finding(name, f'psd_{int(v["psd"])}', 1e-6 * v['time_us'], words, evidence)], {}
     if name == 'load_delay':
-        late = 'late' if v['late_by'] > 0.0 else 'early'
-        words = f'the loads are noted {abs(v["late_by"]):.4g} s {late}: subtract {v["late_by"]:.4g} s from their times'
+        direction = 'late' if v['late_by'] > 0.0 else 'early'
+        words = (
+            f'the loads are noted {abs(v["late_by"]):.4g} s {direction}: subtract {v["late_by"]:.4g} s from their times'
+        )
         return [Finding(name, ' '.join(LOADS), v['late_by'], words, evidence)], {}
     if name == 'zero':
         o = workspace.observations[int(v['recording']) - 1]
