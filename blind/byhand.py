@@ -40,7 +40,7 @@ class Hand:
     """``acted``, ``noted`` (n, 3) N, N, N m. ``wrong``: what is to be told, one by one: its name, what is right."""
 
     acted: Array
-    noted: Array
+    annotated: Array
     temperature: Array
     wrong: tuple[dict[str, Any], ...]
 

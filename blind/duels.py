@@ -87,7 +87,7 @@ def worded(value: float) -> str:
     return f'{value:.3g}'
 
 
-def said(found: PlantDiscovery) -> str:
+def answer_words(found: PlantDiscovery) -> str:
     """The effects with their sizes, and whether something is unknown."""
     words = [f'`{e.active.effect.name}` {size_of(e)}' for e in found.effects]
     return '; '.join([*words, *(['the rest is called unknown'] if found.unknown else [])]) or 'nothing is missing'
@@ -125,7 +125,7 @@ def auxtel(folder: Path, progress: Progress) -> Answer:
         _subset_row(sizes, sky, best_subset(plant, is_linear=True), chosen),
     )
     words = '' if function is None else f'; a smooth function of {" and ".join(function.variables)}'
-    return Answer(said(found) + words, figures)
+    return Answer(answer_words(found) + words, figures)
 
 
 def silverbox(folder: Path, progress: Progress) -> Answer:
@@ -155,7 +155,7 @@ def silverbox(folder: Path, progress: Progress) -> Answer:
         for name in TESTS
         if name != 'multisine'
     ]
-    return Answer(said(found), figures)
+    return Answer(answer_words(found), figures)
 
 
 def tests_of(plant: Silverbox, simulated: Callable[[tuple[int, int]], FloatArray]) -> dict[str, tuple[float, float]]:
@@ -197,7 +197,7 @@ def emps(folder: Path, progress: Progress) -> Answer:
         lacking = Emps(('coulomb_friction', 'force_offset'), folder / 'emps', record=record, segment=EMPS_S)
         ours = 1e3 * _apart(lacking, model_of(found))
         figures.append(Figure(measure, 'published terms, simulated here', 1e3 * _apart(theirs, {}), ours))
-    return Answer(said(found), figures)
+    return Answer(answer_words(found), figures)
 
 
 def _apart(plant: Emps, model: Model) -> float:
@@ -218,7 +218,7 @@ def boom(folder: Path, progress: Progress) -> Answer:
         Figure(measure, 'their nominal model with their EI, simulated here', published, ours),
         _subset_row(f'{measure}; the peer chooses its terms with all lengths', 1e3, best_subset(plant), ours),
     )
-    return Answer(said(found), figures)
+    return Answer(answer_words(found), figures)
 
 
 def balls(folder: Path, progress: Progress) -> Answer:
@@ -245,7 +245,7 @@ def balls(folder: Path, progress: Progress) -> Answer:
     out.append(
         _subset_row('first drop, each ball left out, rms; m', 1.0, subset, found.gap_heldout_after),
     )
-    return Answer(said(found), out)
+    return Answer(answer_words(found), out)
 
 
 DUELS: Mapping[str, Duel] = {

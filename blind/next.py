@@ -65,7 +65,7 @@ def observed(
     return Observation(name, own, volts, loads, temperature)
 
 
-def one(job: tuple[str, str, float]) -> dict[str, Any]:
+def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
     """The effect ``name`` hidden in the first recording ``design``: what became of it."""
     name, design, gap = job
     start = time.perf_counter()
@@ -166,7 +166,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     effects = [n for n in EFFECTS if args.only in n and (n in MIMICKED or not args.mimicked)]
     jobs = [(n, d, args.gap) for d in first_recordings() if args.designs in d for n in effects]
     rows = []
-    for row in over(one, jobs, args.jobs):
+    for row in over(ask_next, jobs, args.jobs):
         rows.append(row)
         if args.out:
             Path(args.out).write_text(json.dumps(rows, indent=1))

@@ -142,7 +142,7 @@ def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array
     )
 
 
-def seen(scene: Scene, pose: Pose, points: Array) -> Array:
+def pixels_of(scene: Scene, pose: Pose, points: Array) -> Array:
     """Pixels (n, 2) of points (n, 2) of the tip plate."""
     rotation, origin = camera_of(scene)
     tip = rotation @ about(1, pose.omega) @ about(0, pose.phi) @ about(2, pose.theta)
@@ -151,9 +151,9 @@ def seen(scene: Scene, pose: Pose, points: Array) -> Array:
     return scene.focal * np.column_stack((a, b)) + scene.centre
 
 
-def seen_at(scene: Scene, pose: Pose, x: float, y: float) -> tuple[float, float]:
+def pixel_of(scene: Scene, pose: Pose, x: float, y: float) -> tuple[float, float]:
     """Pixel of a point (x, y) of the tip plate."""
-    u, v = seen(scene, pose, np.array([[x, y]]))[0]
+    u, v = pixels_of(scene, pose, np.array([[x, y]]))[0]
     return float(u), float(v)
 
 
@@ -169,7 +169,7 @@ def cover(out: Array, scene: Scene, pose: Pose, parts: int) -> None:
     du, dv = np.meshgrid(offsets, offsets)
     for cx, cy in centres_of(scene):
         turns = np.linspace(0, 2 * np.pi, 60)
-        rim = seen(scene, pose, (cx, cy) + scene.radius * np.column_stack((np.cos(turns), np.sin(turns))))
+        rim = pixels_of(scene, pose, (cx, cy) + scene.radius * np.column_stack((np.cos(turns), np.sin(turns))))
         u0, v0 = np.maximum(np.floor(rim.min(axis=0)).astype(int) - 2, 0)
         u1, v1 = np.ceil(rim.max(axis=0)).astype(int) + 3
         u1, v1 = min(u1, scene.width), min(v1, scene.height)

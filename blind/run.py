@@ -43,7 +43,7 @@ def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
     if case.kind == 'hand':
         hand = byhand.drawn(case.design)
         volts = designs(case.design)[0].record(truth, case.noise, case.seed)
-        return [Observation('recording 1', rig, volts, hand.noted, hand.temperature)]
+        return [Observation('recording 1', rig, volts, hand.annotated, hand.temperature)]
     if case.mistake[0]:
         return observed(case.mistake, designs(case.design)[0], rig, case.noise, case.seed)
     out = []
@@ -68,7 +68,7 @@ def _rig(case: Case, seen: Sequence[Observation]) -> Rig:
     return seen[0].rig if case.mistake[0] else load_rig()
 
 
-def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | None]) -> str:
+def _answer_case(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | None]) -> str:
     fields, truth, target, peer = job
     case = Case(
         **{
@@ -168,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not target.exists():
             sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
             jobs.append((sealed['case'], sealed['truth'], str(target), args.peer))
-    for _ in over(_one, jobs, args.jobs, 'answers'):
+    for _ in over(_answer_case, jobs, args.jobs, 'answers'):
         pass
     return conclude(*score.summary(score.load(folder, [c.key for c in cases], f'answers{whose}')), summary)
 

@@ -209,10 +209,10 @@ def test_an_effect_that_is_none_fails_the_suite_unless_it_cannot_be_told_from_th
     for names, false in (((), 0), (('creep',), 0), (('creep', 'damping'), 1)):
         effects = [{'name': n} for n in names]
         row = score.Row(
-            'pair', 'pair', 3.0, True, [{'name': 'creep'}, {'name': 'x'}], score.whole({'effects': effects})
+            'pair', 'pair', 3.0, True, [{'name': 'creep'}, {'name': 'x'}], score.complete({'effects': effects})
         )
         assert f'an effect named that is none: {100 * false:.1f} % ({false}/1;' in score.summary([row])[0]
-    alike = score.whole({'effects': [{'name': 'tip_force', 'equivalent': ['mount_tilt']}]})
+    alike = score.complete({'effects': [{'name': 'tip_force', 'equivalent': ['mount_tilt']}]})
     row = score.Row('single', 'single', 3.0, True, [{'name': 'mount_tilt'}], alike)
     assert 'an effect named that is none: 0.0 % (0/1;' in score.summary([row])[0]
 
@@ -225,7 +225,7 @@ def test_a_peer_answers_the_same_cases(peer: str) -> None:
     for name in ('single-creep-3-s', 'null-s0', 'single-quantisation-3-s'):
         case = next(c for c in short_cases() if c.key == name)
         found = suite_peers.answer(peer, run.observe(case, run.truth_of(case)), load_rig(), ())
-        row = score.Row(case.key, case.kind, 3.0, True, run.truth_of(case), score.whole(found))
+        row = score.Row(case.key, case.kind, 3.0, True, run.truth_of(case), score.complete(found))
         assert row.named == [n for n, _ in case.wanted], name
         assert row.answer['remaining']['floors'] < 1.1
 

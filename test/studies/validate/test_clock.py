@@ -7,14 +7,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blind.clock import Seen, dots, scored, seen
+from blind.clock import ClockRecording, dots, scored, simulated
 from blind.clock import motion_of as motion_of_samples
 from blind.generator import Array
 from psd_deflection.studies.validate.clock import clock_offset
 from psd_deflection.studies.validate.motion import Motion
 
 
-def motion_of(run: Seen, kept: Array | None = None) -> Motion:
+def motion_of(run: ClockRecording, kept: Array | None = None) -> Motion:
     index = np.arange(len(run.t)) if kept is None else np.flatnonzero(kept)
     return motion_of_samples(run.t[index], run.dots[index])
 
@@ -29,14 +29,14 @@ def test_intervals_hold_the_truth() -> None:
 
 
 def test_scale_turn_and_bias_of_the_reference_do_not_matter() -> None:
-    run = seen(3)
+    run = simulated(3)
     turned = run.poses @ np.array([[1.02, 0.03, 0.0], [-0.03, 0.97, 0.0], [0.0, 0.0, 1.1]]) + [1e-3, -2e-3, 0.05]
     found = clock_offset(motion_of(run), run.stamps, turned, exposure=0.008)
     assert abs(found.value - run.offset) < 4.0 * found.sd < 0.4e-3
 
 
 def test_outliers_do_not_move_it() -> None:
-    run = seen(4)
+    run = simulated(4)
     rng = np.random.default_rng(0)
     bad = rng.random(len(run.poses)) < 0.1
     run.poses[bad] += rng.normal(0.0, [2e-3, 2e-3, 0.02], (int(bad.sum()), 3))
@@ -45,7 +45,7 @@ def test_outliers_do_not_move_it() -> None:
 
 
 def test_a_drift_is_found() -> None:
-    run = seen(6, seconds=20.0, steps=(1.0, 6.0, 11.0, 17.0))
+    run = simulated(6, seconds=20.0, steps=(1.0, 6.0, 11.0, 17.0))
     middle = float(run.stamps.mean())
     drifting = run.stamps - 200e-6 * (run.stamps - middle)
     found = clock_offset(motion_of(run), drifting, run.poses, exposure=0.008)
@@ -54,21 +54,21 @@ def test_a_drift_is_found() -> None:
 
 
 def test_clocks_that_count_from_different_days() -> None:
-    run = seen(7)
+    run = simulated(7)
     found = clock_offset(motion_of(run), run.stamps + 1.7e9, run.poses, exposure=0.008)
     assert found.value == pytest.approx(run.offset - 1.7e9, abs=0.3e-3)
     assert found.determined
 
 
 def test_a_link_at_rest_tells_nothing() -> None:
-    run = seen(8, steps=())
+    run = simulated(8, steps=())
     found = clock_offset(motion_of(run), run.stamps, run.poses)
     assert not found.determined
     assert 'moves too little' in found.sentence
 
 
 def test_a_motion_that_repeats_has_rivals() -> None:
-    run = seen(9)
+    run = simulated(9)
     t = run.t
     steady = np.column_stack([1e-3 * np.sin(2 * np.pi * 5.0 * t), np.zeros((len(t), 2))])
     motion = motion_of_samples(t, dots(steady))
