@@ -99,14 +99,14 @@ def run_of(recorded: misaligned.Recorded) -> CalibrationRun:
 
 
 def darkened(rig: Rig, light: tuple[misaligned.Light, misaligned.Light], rng: np.random.Generator) -> Rig:
-    """The rig file's content after a recording of ten seconds with both lasers off."""
+    """Return the rig file's content after a recording of ten seconds with both lasers off."""
     volts = misaligned.darkness(light, 10.0, rng)
     run = CalibrationRun('dark', np.arange(len(volts)) / generator.RATE, volts, np.zeros(0), np.zeros((0, 3)))
     return replace_values(rig, values_of_levels(dark_levels([run], rig)))
 
 
 def calibrated_rig(rig: Rig, run: CalibrationRun) -> tuple[Rig, Calibration]:
-    """The rig file's content after the calibration, and what was found."""
+    """Return the rig file's content after the calibration, and what was found."""
     found = calibrate([run], rig)
     values, effects = values_of(found, 'today')
     more = flattened({'effects': effects_to_values(effects)}, 'effects') if effects else {}
@@ -173,7 +173,7 @@ def _tolerance(name: str) -> float:
 
 
 def shifted(truth: Mapping[str, float], group: str, rng: np.random.Generator) -> dict[str, float]:
-    """The rig after one group moved by three tolerances, each parameter of it to a side by chance."""
+    """Return the rig after one group moved by three tolerances, each parameter of it to a side by chance."""
     out = dict(truth)
     for name in out:
         if name.startswith(group):
@@ -280,7 +280,7 @@ class Certified(NamedTuple):
 
 
 def certified(seed: int) -> Certified:
-    """One rig: calibrated by a reference whose scale is wrong, certified, and measured after it has drifted."""
+    """Return one rig: calibrated by a reference whose scale is wrong, certified, and measured after it has drifted."""
     rng = np.random.default_rng([22, seed])
     truth = misaligned.draw(rng)
     # Half as long as the others: U is to hold of a short calibration, too.
@@ -325,7 +325,7 @@ def table_of_errors(scale: float, errors: Sequence[Mapping[str, float]]) -> Iter
 
 
 def later_motion(rng: np.random.Generator) -> Array:
-    """The motion of the recording that --check gets."""
+    """Return the motion of the recording that --check gets."""
     return misaligned.poses(misaligned.pushes(rng, 12, SECONDS))
 
 

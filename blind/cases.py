@@ -239,7 +239,7 @@ def gap_of(design: tuple[Generator, ...], effect: Mapping[str, Any]) -> float:
 
 
 def scaled(case_seed: int, name: str, gap: float, design: tuple[Generator, ...]) -> dict[str, Any]:
-    """The effect with its size such that its gap is ``gap`` floors, within 3 %; secant in logarithms."""
+    """Return the effect with its size such that its gap is ``gap`` floors, within 3 %; secant in logarithms."""
 
     def at(size: float) -> dict[str, Any]:
         rng = np.random.default_rng((case_seed, zlib.crc32(name.encode())))
@@ -392,7 +392,7 @@ UNSPREAD = frozenset(('amplifier_saturation', 'quantisation', 'plane_tilt', 'sen
 
 
 def short_cases() -> list[Case]:
-    """A small selection to run on every change: a few of each kind."""
+    """Return a small selection to run on every change: a few of each kind."""
     out = [
         Case(f'single-{name}-{gap:g}-s', 'single', 'one', ((name, gap),))
         for name, gap in (

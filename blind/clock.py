@@ -95,7 +95,7 @@ VARIANCES = dot_noise_variances(RIG) / RIG.estimator.block_size
 
 
 def motion_of(t: Array, readings: Array) -> Motion:
-    """The motion as the default solver sees it."""
+    """Return the motion as the default solver sees it."""
     return Motion(t, readings, 1e-3, lambda d: SOLVER.solve_many(d, VARIANCES).pose)
 
 
@@ -109,7 +109,7 @@ class Score:
 
 
 def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
-    """One run for each seed of ``runs``."""
+    """Return one run for each seed of ``runs``."""
     score = Score([])
     for seed in runs:
         run = simulated(seed, seconds=4.0, steps=(1.0, 2.7), exposure=exposure)

@@ -38,7 +38,7 @@ FOLDERS = {'boom': 'boom', 'emps': 'emps', 'arm': 'two_link_arm', 'auxtel': 'aux
 
 
 def lines(found: PlantDiscovery) -> list[str]:
-    """The answer in words."""
+    """Return the answer in words."""
     out = [found.sentence]
     for e in found.effects:
         unseen = f'unseen cases {e.heldout.gain:+.1f} ± {e.heldout.error:.1f}'

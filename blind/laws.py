@@ -65,17 +65,17 @@ def _seeds(number: int) -> Iterator[str]:
 
 
 def _shows(law: dict[str, Any]) -> bool:
-    """Whether the law acts in the experiment at all: a threshold may lie beyond all loads."""
+    """Return whether the law acts in the experiment at all: a threshold may lie beyond all loads."""
     return law['form'] == 'jitter' or gap_of(designs('one'), {**law, 'size': _small(law)}) > NOTHING
 
 
 def _small(law: dict[str, Any]) -> float:
-    """A size at which the readings answer in proportion."""
+    """Return a size at which the readings answer in proportion."""
     return {'law_load': 1.0, 'law_link': 1e-5}.get(str(law['name']), 1e-6)
 
 
 def sized(law: dict[str, Any]) -> dict[str, Any]:
-    """The law with the size that gives its gap: the readings answer to it nearly in proportion."""
+    """Return the law with the size that gives its gap: the readings answer to it nearly in proportion."""
     design = designs('one')
     if law['form'] == 'jitter':
         # The noise of the channel, at full deflection, is 1.5 to 4 times what it is at rest.
@@ -87,7 +87,7 @@ def sized(law: dict[str, Any]) -> dict[str, Any]:
 
 
 def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
-    """The recording with the law, or one in which nothing is missing."""
+    """Return the recording with the law, or one in which nothing is missing."""
     (g,) = designs('one')
     volts = g.record([] if law is None else [law], 'white', seed)
     return [Observation('recording', load_rig(), volts, g.loads, g.temperature)]
@@ -131,7 +131,7 @@ def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
 
 
 def _reported_as_jumps(law: dict[str, Any], got: dict[str, Any]) -> bool:
-    """Whether the check of the recording names each time of a dot's law, as a jump of its PSD."""
+    """Return whether the check of the recording names each time of a dot's law, as a jump of its PSD."""
     said = sorted(f['value'] for f in got['setup'] if f['name'] == 'jump' and f['where'] == f'psd_{law["where"][-1]}')
     jumps = law['form'] == 'events' and law['where'] in law_forms.DOTS and len(said) == len(law['times'])
     return jumps and bool(np.allclose(said, law['times'], atol=0.01))
@@ -162,7 +162,7 @@ def _answer_to_law(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
-    """The counts against what is wanted."""
+    """Return the counts against what is wanted."""
     laws, nulls = [r for r in rows if 'truth' in r], [r for r in rows if 'truth' not in r]
     lines, passed = [], True
     for name, words in (('stage', 'right stage'), ('variables', 'right variables')):

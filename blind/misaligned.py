@@ -51,7 +51,7 @@ def nominal() -> dict[str, float]:
 
 
 def draw(rng: np.random.Generator) -> dict[str, float]:
-    """One rig. ``beam_N.x``, ``.y``: where the beam meets the unloaded plate, from the nominal centre, m."""
+    """Return one rig. ``beam_N.x``, ``.y``: where the beam meets the unloaded plate, from the nominal centre, m."""
     out = nominal()
     for name in out:
         kind = name.partition('.')[2]
@@ -152,7 +152,7 @@ def draw_light(rng: np.random.Generator) -> tuple[Light, Light]:
 
 
 def relit(light: tuple[Light, Light], rng: np.random.Generator) -> tuple[Light, Light]:
-    """The same amplifiers in other light."""
+    """Return the same amplifiers in other light."""
     first, second = (
         new._replace(**{n: getattr(old, n) for n in OFFSETS}) for new, old in zip(draw_light(rng), light, strict=True)
     )

@@ -58,7 +58,7 @@ def first_recordings() -> dict[str, tuple[Array, Array]]:
 def observed(
     truth: Sequence[dict[str, Any]], loads: Array, temperature: Array | None, length: float, seed: int, name: str
 ) -> Observation:
-    """A recording of the second generator."""
+    """Return a recording of the second generator."""
     steady = np.full(len(loads), 20.0) if temperature is None else temperature
     volts = Generator(loads, steady, length).record(truth, 'white', seed)
     own = replace_values(RIG, {'link.length': length}) if length != RIG.link.length else RIG
@@ -66,7 +66,7 @@ def observed(
 
 
 def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
-    """The effect ``name`` hidden in the first recording ``design``: what became of it."""
+    """Return the effect ``name`` hidden in the first recording ``design``: what became of it."""
     name, design, gap = job
     start = time.perf_counter()
     seed = zlib.crc32(f'{name}-{design}'.encode())

@@ -125,7 +125,7 @@ class Bench:
 
 
 def bench(folder: Path, plan: Plan) -> Bench:
-    """A rig and a camera by chance. The folder gets their files: ``nominal.yaml`` and ``camera.yaml``."""
+    """Return a rig and a camera by chance. The folder gets their files: ``nominal.yaml`` and ``camera.yaml``."""
     rng = np.random.default_rng([5, plan.seed])
     truth = misaligned.draw(rng)
     scene = render.Scene(
@@ -215,7 +215,7 @@ def table(path: Path) -> dict[str, Array]:
 
 
 def zeroed(made: Bench, name: str) -> dict[str, object]:
-    """The zero before the load, as ~/zero takes it: the mean reading of the unloaded link, m."""
+    """Return the zero before the load, as ~/zero takes it: the mean reading of the unloaded link, m."""
     rows = table(made.folder / f'{name}.csv')
     rest = rows['t'] < 0.9 * made.plan.rest
     return {
@@ -250,7 +250,7 @@ def curves(made: Bench, hung: HeldLoad, stem: str) -> Curves:
 
 
 def judged(made: Bench, hung: HeldLoad, stem: str, by: str) -> Any:
-    """The answer of ``validate``: by the camera, its clock put right, or by the truth."""
+    """Return the answer of ``validate``: by the camera, its clock put right, or by the truth."""
     reference = f'{hung.name}_{by}.csv'
     align = ['--align', '--exposure', str(made.plan.exposure)] if by == 'camera' else []
     rig = ('--params-file', f'{stem}.yaml')
@@ -273,7 +273,7 @@ def calibrated(made: Bench, runs: Sequence[HeldLoad], stem: str) -> str:
 
 
 def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
-    """The whole experiment: the content of ``summary.json``. ``folder`` must be new or empty."""
+    """Return the whole experiment: the content of ``summary.json``. ``folder`` must be new or empty."""
     made = bench(folder, plan)
     sidebar = [HeldLoad(force, side) for side in (1, -1) for force in plan.forces]
     link = [HeldLoad(force, 0) for force in plan.forces]

@@ -32,13 +32,13 @@ _BANKS: dict[str, SignatureBank] = {}
 
 
 def truth_of(case: Case) -> list[dict[str, Any]]:
-    """The effects of a case, scaled to their gaps; none that no machine can have."""
+    """Return the effects of a case, scaled to their gaps; none that no machine can have."""
     effects = [scaled(case.seed, name, gap, designs(case.design)) for name, gap in case.wanted]
     return [e for e in effects if possible(e)]
 
 
 def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
-    """The input of discover."""
+    """Return the input of discover."""
     rig = load_rig()
     if case.kind == 'hand':
         hand = byhand.drawn(case.design)
@@ -120,7 +120,7 @@ def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:
 
 
 def selection(parser: argparse.ArgumentParser) -> Callable[[argparse.Namespace], list[Case]]:
-    """The options that choose cases, added to ``parser``, and what gives these of the parsed ones."""
+    """Return the options that choose cases, added to ``parser``, and what gives these of the parsed ones."""
     parser.add_argument('--out', default='build/blind', help='folder for truths and answers (default: build/blind)')
     parser.add_argument('--short', action='store_true', help='the slice that runs on every change')
     parser.add_argument('--seeds', type=int, default=4)

@@ -67,7 +67,7 @@ class Row:
 
 
 def complete(answer: dict[str, Any]) -> dict[str, Any]:
-    """An answer of any tool with all that is counted: what it leaves out is nothing, or not a number."""
+    """Return an answer of any tool with all that is counted: what it leaves out is nothing, or not a number."""
     effects = [{'equivalent': [], 'parameters': {}, **e} for e in answer.get('effects', ())]
     unknown = [{'law': None, **u} for u in answer.get('unknown', ())]
     said = 'unknown_effect' if unknown else 'effects_found' if effects else 'nothing_missing'
@@ -85,7 +85,7 @@ def complete(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 def load(folder: Path, keys: Sequence[str], answers: str = 'answers') -> list[Row]:
-    """Every case that has an answer in the folder ``answers``."""
+    """Return every case that has an answer in the folder ``answers``."""
     out = []
     for key in keys:
         answer = folder / answers / f'{key}.json'
@@ -275,7 +275,7 @@ HUNG = (0.25, 0.25, 0.12)
 
 
 def _reported(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[bool, bool]:
-    """Whether a wrong note is named, and with the right numbers."""
+    """Return whether a wrong note is named, and with the right numbers."""
     of = [s for s in setup if s['name'] == wrong['name']]
     if 'from' in wrong:
         of = [s for s in of if abs(float(s['where'].removesuffix(' s')) - wrong['from']) < 0.1]
@@ -371,7 +371,7 @@ def _confusion(rows: Sequence[Row]) -> list[str]:
 
 
 def _names_none(r: Row) -> bool:
-    """Whether an effect is named that is none: neither it nor one that cannot be told from it is hidden."""
+    """Return whether an effect is named that is none: neither it nor one that cannot be told from it is hidden."""
     return any(not any(t['name'] in s for t in r.truth) for s in r.sets)
 
 

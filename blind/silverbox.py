@@ -128,7 +128,7 @@ class Silverbox(Plant):
         return {'input': [self.u[span] for span in self._spans]}
 
     def simulate(self, model: Model) -> list[FloatArray]:
-        """All pieces side by side."""
+        """Return all pieces side by side."""
         out = self.run(model, self._first, BEFORE + COMPARED)[BEFORE:]
         return [piece.reshape(1, -1) for piece in np.split(out.T, len(self.cases))]
 

@@ -64,7 +64,7 @@ def knobs(rig: Rig) -> Iterator[tuple[str, Callable[[float], ActiveEffect], floa
 def closing(
     figure: Callable[[ActiveEffect], float], make: Callable[[float], ActiveEffect], low: float, high: float, off: float
 ) -> float | None:
-    """The size at which ``figure`` is zero: the nearest to ``off``, None if there is none."""
+    """Return the size at which ``figure`` is zero: the nearest to ``off``, None if there is none."""
 
     def f(value: float) -> float:
         out = figure(make(value))

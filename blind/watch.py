@@ -90,7 +90,7 @@ def read(clean: Array, rng: np.random.Generator) -> Array:
 
 
 def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
-    """One event of a kind, drawn by ``seed``: the load (3,), volts (n, 6) and the time of the event, s."""
+    """Return one event of a kind, drawn by ``seed``: the load (3,), volts (n, 6) and the time of the event, s."""
     rng = np.random.default_rng((seed, len(kind)))
     n, held = round(RUN_S * RATE), round(HELD_FROM_S * RATE)
     event = round(rng.uniform(11.0, 13.5) * RATE)
@@ -113,7 +113,7 @@ def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
 
 
 def watch_run(job: tuple[str, int]) -> Run:
-    """One event of a kind, drawn by ``seed``, seen by the whole chain."""
+    """Return one event of a kind, drawn by ``seed``, seen by the whole chain."""
     kind, seed = job
     load, volts, event = happened(kind, seed)
     held = round(HELD_FROM_S * RATE)

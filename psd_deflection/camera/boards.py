@@ -101,7 +101,7 @@ class Board(Target):
         """Numbers of what is seen, corners in OpenCV's axes (n, 2) m and in the image px, and if any marker is seen."""
 
     def drawing(self) -> Drawing:
-        """The board as OpenCV draws it."""
+        """Return the board as OpenCV draws it."""
         wide, high = self.size
         across = self.settings.columns * _PIXELS_A_COLUMN
         pixels = (across, round(across * high / wide))

@@ -41,7 +41,7 @@ class Frame(NamedTuple):
 
 
 def read_values(path: str | Path) -> dict[str, object]:
-    """The values in ``CAMERA.yaml`` by their names: plain keys, dotted or nested, or a ROS 2 parameter file.
+    """Return the values in ``CAMERA.yaml`` by their names: plain keys, dotted or nested, or a ROS 2 parameter file.
 
     Raises ConfigError.
     """
@@ -74,7 +74,7 @@ def _of_camera_info(tree: Mapping[str, Any], path: Path) -> dict[str, object]:
 
 
 def read_settings(path: str | Path | None) -> CameraSettings:
-    """The settings in ``CAMERA.yaml``; None: the defaults. Raises ConfigError."""
+    """Return the settings in ``CAMERA.yaml``; None: the defaults. Raises ConfigError."""
     return CameraSettings() if path is None else settings_from(read_values(path), str(path))
 
 
@@ -183,13 +183,13 @@ def _seconds(row: Row, column: str) -> int:
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of a file; one more than may be if there are more. Raises OSError."""
+    """Return the bytes of a file; one more than may be if there are more. Raises OSError."""
     with path.open('rb') as stream:
         return stream.read(MOST_BYTES + 1)
 
 
 def read_image(path: str | Path) -> Any:
-    """The image in a file, as of :func:`decoded`. Raises RecordingError if the file cannot be read."""
+    """Return the image in a file, as of :func:`decoded`. Raises RecordingError if the file cannot be read."""
     try:
         content = _content(Path(path))
     except OSError as error:
@@ -198,7 +198,7 @@ def read_image(path: str | Path) -> Any:
 
 
 def decoded(content: bytes, cv2: Any) -> Any:
-    """A grey image of the bytes of a file (PNG, JPEG …).
+    """Return a grey image of the bytes of a file (PNG, JPEG …).
 
     None if they are none; the NoPoseError that says so if they declare an image that is too large: nothing is unpacked
     then.
@@ -216,7 +216,7 @@ def decoded(content: bytes, cv2: Any) -> Any:
 
 
 def grey(image: Any) -> Any:
-    """An image as grey uint8 or uint16; None if it is of another kind."""
+    """Return an image as grey uint8 or uint16; None if it is of another kind."""
     cv2 = opencv()
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
@@ -245,7 +245,7 @@ _ENCODINGS = {
 
 
 def of_ros_image(height: int, width: int, encoding: str, big_endian: bool, step: int, content: bytes) -> Any:
-    """The grey image of a sensor_msgs/Image; None if it is of an encoding without brightness, or damaged."""
+    """Return the grey image of a sensor_msgs/Image; None if it is of an encoding without brightness, or damaged."""
     encoding_found = _ENCODINGS.get(encoding)
     if encoding_found is None:
         return None

@@ -33,7 +33,7 @@ class Intrinsics(NamedTuple):
     excluded: list[tuple[str, str]]
 
     def as_yaml(self, name: str) -> str:
-        """The text of a ``camera_info`` file, which ``--params-file`` of ``camera`` reads too."""
+        """Return the text of a ``camera_info`` file, which ``--params-file`` of ``camera`` reads too."""
         projection = np.column_stack([self.matrix, np.zeros(3)])
         head = f'image_width: {self.size[0]}\nimage_height: {self.size[1]}\ncamera_name: {name}\n'
         return (
@@ -72,7 +72,7 @@ def _matrix(name: str, values: FloatArray) -> str:
 
 
 def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> Intrinsics:
-    """The lens by named grey images of one size (None or a NoPoseError: unreadable).
+    """Return the lens by named grey images of one size (None or a NoPoseError: unreadable).
 
     Raises ConfigError if they do not determine it.
     """

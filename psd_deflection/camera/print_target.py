@@ -18,7 +18,7 @@ _DOTS_PER_INCH = 600
 
 
 def printed(target: Target, kind: str) -> bytes:
-    """The target as a file of ``kind`` (pdf, svg, png), with a scale of 50 mm to check the printer by."""
+    """Return the target as a file of ``kind`` (pdf, svg, png), with a scale of 50 mm to check the printer by."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Rectangle

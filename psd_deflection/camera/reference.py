@@ -59,7 +59,7 @@ class CameraReference:
         return self._lens
 
     def take(self, t_ns: int, image: Any) -> list[FrameAnswer]:
-        """The answers that are known now, in the order of the frames.
+        """Return the answers that are known now, in the order of the frames.
 
         ``t_ns``: middle of the exposure. ``image``: (rows, columns) of uint8 or uint16, None if it cannot be read,
         or the NoPoseError that says why.
@@ -85,7 +85,7 @@ class CameraReference:
         return []
 
     def finish(self) -> list[FrameAnswer]:
-        """The answers of the frames that still wait for the rest: there are no further frames."""
+        """Return the answers of the frames that still wait for the rest: there are no further frames."""
         good = [f for _, f in self._waiting if isinstance(f, TargetPose)]
         if self._rest is None and good:
             return self._decide(good)
@@ -172,7 +172,7 @@ def _cross(v: FloatArray) -> FloatArray:
 
 
 def mean_pose(poses: list[TargetPose]) -> TargetPose:
-    """The mean of poses that are near each other, with its covariance."""
+    """Return the mean of poses that are near each other, with its covariance."""
     summed = np.sum([p.rotation for p in poses], axis=0)
     u, _, vt = np.linalg.svd(summed)
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

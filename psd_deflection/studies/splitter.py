@@ -102,7 +102,7 @@ class LightPhase(NamedTuple):
 
 
 def rules(rig: Rig, lasers: Lasers) -> list[SplitterRule]:
-    """The three rules, the second and the third for each laser."""
+    """Return the three rules, the second and the third for each laser."""
     amplifier, least = rig.amplifier.sum_nominal, 0.5 * rig.estimator.sum_min
     both = sum(lasers.powers)
     out = [SplitterRule('both together', both, 2.0 * lasers.allowed, 'W', both <= 2.0 * lasers.allowed)]

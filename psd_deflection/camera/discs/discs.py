@@ -133,7 +133,7 @@ class Discs(Target):
         return best
 
     def _frontal(self, rays: FloatArray) -> FloatArray:
-        """The rotation of a plate that faces the camera, by the line of discs."""
+        """Return the rotation of a plate that faces the camera, by the line of discs."""
         x, y = (rays[0] - rays[2]).tolist()
         long, to = math.hypot(x, y), self._towards
         return np.array([[to * y / long, x / long, 0.0], [-to * x / long, y / long, 0.0], [0.0, 0.0, to]])

@@ -63,14 +63,14 @@ class Region(NamedTuple):
         return math.dist(self.centre, other.centre)
 
     def enlarged(self, factor: int) -> Region:
-        """The same in an image whose pixels were taken together ``factor`` x ``factor``."""
+        """Return the same in an image whose pixels were taken together ``factor`` x ``factor``."""
         x, y = (factor * c + (factor - 1) / 2 for c in self.centre)
         xx, xy, yy = (factor * factor * s for s in self.shape)
         return self._replace(centre=(x, y), shape=(xx, xy, yy), axes=(factor * self.axes[0], factor * self.axes[1]))
 
 
 def find_discs(grey: Any, ratio: float) -> list[Region]:
-    """The three discs in an 8-bit image, from one end of the line to the other; ``ratio``: spacing / radius.
+    """Return the three discs in an 8-bit image, from one end of the line to the other; ``ratio``: spacing / radius.
 
     Large discs show in an image made small, which takes less time; what is not found there is sought in all pixels.
     Raises RefusedError with the reason if there is no target, or more than one.
@@ -165,7 +165,7 @@ def _regions(binary: Any) -> list[Region]:
 
 
 def _lines(regions: list[Region], ratio: float) -> list[list[Region]]:
-    """Every three of ``regions`` that may be the target."""
+    """Return every three of ``regions`` that may be the target."""
     lines = []
     large = [r for r in regions if r.axes[0] >= 2.0][:60]
     for i, first in enumerate(large):
@@ -192,7 +192,7 @@ def _lines(regions: list[Region], ratio: float) -> list[list[Region]]:
 
 
 def _crowded(line: list[Region], regions: list[Region], clear: float) -> bool:
-    """Whether something as bright and not much smaller is so near to a disc that it lights its rim."""
+    """Return whether something as bright and not much smaller is so near to a disc that it lights its rim."""
     for disc in line:
         size = disc.axes[1]
         for other in regions:

@@ -193,7 +193,7 @@ def _misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: Rims, full_scale: fl
 
 
 def _doubled(normal: Normal, raw: Pixels, blur: FloatArray) -> bool:
-    """Whether the plate was seen in two places, not in motion: the places between were not exposed.
+    """Return whether the plate was seen in two places, not in motion: the places between were not exposed.
 
     The rims that lie across the blur show how long it was where, as the steepness of the grey level there.
     """
@@ -253,7 +253,7 @@ def _of_bent_rims(normal: Normal, rims: Rims) -> FloatArray:
 
 
 def sectors_of(side: tuple[Pixels, Pixels], rims: Rims) -> IntArray:
-    """The part of a rim to which each pixel belongs, counted through all discs: 16 parts of equal angle."""
+    """Return the part of a rim to which each pixel belongs, counted through all discs: 16 parts of equal angle."""
     x, y = np.abs(side[0]), np.abs(side[1])
     part = (np.minimum(x, y) > _HALF_OCTANT * np.maximum(x, y)).astype(np.uint8)
     for bit in (y > x, side[1] > 0, side[0] > 0):

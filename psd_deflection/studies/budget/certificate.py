@@ -88,7 +88,7 @@ class Certificate:
 
 
 def certify(problem: CertificateProblem) -> Certificate:
-    """Every input and the expanded uncertainty at each pose.
+    """Return every input and the expanded uncertainty at each pose.
 
     Raises ConfigError if the rig is not calibrated, if its calibration has no reference, for a solver that has no
     budget, or for a pose that no detector sees.
@@ -155,7 +155,7 @@ def _frames(tree: Mapping[str, Any]) -> float:
 
 
 def _as_found(problem: CertificateProblem, rows: Sequence[InputQuantity]) -> FloatArray:
-    """The error by the values that were in use before."""
+    """Return the error by the values that were in use before."""
     given = problem.calibration['parameters']
     moved = {name: one['used'] - one['value'] for name, one in given.items()}
     return np.asarray(np.sum([moved.get(row.parameter, 0.0) * row.coefficients for row in rows], axis=0))
@@ -176,7 +176,7 @@ def _of_reference(problem: CertificateProblem, poses: FloatArray) -> list[InputQ
 
 
 def _since_zero(inputs: Mapping[str, float], sights: Sequence[Situation]) -> list[InputQuantity]:
-    """The causes that no calibration measures."""
+    """Return the causes that no calibration measures."""
     out = []
     for cause in CAUSES:
         if cause.calibrated or cause.kind is Kind.KNOWN:

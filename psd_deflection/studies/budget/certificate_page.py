@@ -98,7 +98,7 @@ class Certified(StudyResult):
         return [verdict_of(error, uncertainty.uncertainty, limits) for error, uncertainty in pairs]
 
     def sentences(self) -> list[str]:
-        """The largest U, the largest error as found, the verdict."""
+        """Return the largest U, the largest error as found, the verdict."""
         largest = np.max([uncertainty.uncertainty for uncertainty in self.found.stated], axis=0)
         out = [f'Expanded uncertainty for 95 %, the largest of {len(self.found.poses)} poses: {in_words(largest)}.']
         out.append(f'As found the pose was wrong by up to {in_words(np.abs(self.found.found).max(axis=0))}.')
@@ -108,7 +108,7 @@ class Certified(StudyResult):
         return out
 
     def lines(self) -> list[str]:
-        """The sentences and the table of poses."""
+        """Return the sentences and the table of poses."""
         return [*self.sentences(), '', *columns(self.result_rows(), left=4).splitlines()]
 
     def tree(self) -> dict[str, Any]:
@@ -136,7 +136,7 @@ class Certified(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row a pose: what it was, how far the estimate was off as found, u_c and U; m, m, rad."""
+        """Return one row a pose: what it was, how far the estimate was off as found, u_c and U; m, m, rad."""
         stated = self.found.stated
         parts = (
             ('', self.found.poses, 'pose'),
@@ -150,7 +150,7 @@ class Certified(StudyResult):
         return Table(Column('number', np.arange(1, len(stated) + 1), '', 'of the pose'), out)
 
     def files(self) -> dict[str, str]:
-        """The page, the JSON, and the tables with all their digits."""
+        """Return the page, the JSON, and the tables with all their digits."""
         return {
             'certificate.html': self.report(),
             self.json_name: self.json(),
@@ -176,7 +176,7 @@ class Certified(StudyResult):
         return table(('', ''), [(words, given[name] or _OPEN) for name, words in names.items()])
 
     def result_rows(self) -> list[list[str]]:
-        """The head first."""
+        """Return the head first."""
         judged = self.verdicts
         head = ['pose', *UNITS, *(f'as found {u}' for u in UNITS), *(f'u_c {u}' for u in UNITS)]
         head += [f'ν_eff {a}' for a in SYMBOLS] + [f'k {a}' for a in SYMBOLS] + [f'U {u}' for u in UNITS]
@@ -191,7 +191,7 @@ class Certified(StudyResult):
         return rows
 
     def chart(self) -> Chart:
-        """The error of each pose as found with its expanded uncertainty, and the limits."""
+        """Return the error of each pose as found with its expanded uncertainty, and the limits."""
         number = np.arange(1.0, len(self.found.poses) + 1.0)
         limits = self.problem.limits
         panels = []

@@ -44,7 +44,7 @@ class Budget:
         return tuple(cause.sensitivities(self.at) for cause, _ in self.lines)
 
     def expanded(self) -> Expanded:
-        """The expanded uncertainty of an estimate, every cause as it is declared."""
+        """Return the expanded uncertainty of an estimate, every cause as it is declared."""
         variances = np.array([np.diag(line.covariance) for _, line in self.lines])
         return expanded(variances, [cause.freedom(self.at) for cause, _ in self.lines], self.total().bias)
 
@@ -58,7 +58,7 @@ class Budget:
 
 
 def evaluate(at: Situation) -> Budget:
-    """Every cause, to first order."""
+    """Return every cause, to first order."""
     return Budget(at, tuple((cause, cause.contribution(at)) for cause in CAUSES))
 
 

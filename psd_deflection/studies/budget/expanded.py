@@ -72,7 +72,7 @@ class Interval(NamedTuple):
 
 
 def interval_of(errors: FloatArray) -> Interval:
-    """The probabilistically symmetric interval (JCGM 101:2008, 7.7) of drawn ``errors`` (n, 3)."""
+    """Return the probabilistically symmetric interval (JCGM 101:2008, 7.7) of drawn ``errors`` (n, 3)."""
     tail = 0.5 - 0.5 * PROBABILITY
     low, high = np.quantile(errors, [tail, 1.0 - tail], axis=0)
     return Interval(0.5 * (high - low), 0.5 * (high + low))

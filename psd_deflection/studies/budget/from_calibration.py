@@ -24,7 +24,7 @@ LONGEST_WORDS = 200
 
 
 def read_calibration(folder: Path) -> tuple[Rig, dict[str, Any]]:
-    """The calibrated rig and the tree of calibration.json in ``folder``.
+    """Return the calibrated rig and the tree of calibration.json in ``folder``.
 
     Raises ConfigError if a file or a key is missing, if a value is none that calibrate writes, or if the calibration
     was refused.
@@ -98,7 +98,7 @@ def _is_number(value: object) -> bool:
 
 
 def read_fields(path: str | None) -> dict[str, str]:
-    """The fields of the page of a YAML file, printable; none without a file.
+    """Return the fields of the page of a YAML file, printable; none without a file.
 
     Raises ConfigError naming the file and the field.
     """

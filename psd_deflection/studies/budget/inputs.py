@@ -162,7 +162,7 @@ INPUT_BY_NAME: Mapping[str, Input] = MappingProxyType({i.parameter.name: i for i
 
 
 def is_assumed(name: str, value: float) -> bool:
-    """Whether ``value`` of an input is a guess: the default, whose source is an assumption."""
+    """Return whether ``value`` of an input is a guess: the default, whose source is an assumption."""
     input_quantity = INPUT_BY_NAME[name]
     return input_quantity.source.startswith('assumption') and value == input_quantity.parameter.default
 
@@ -173,7 +173,7 @@ def read_inputs(
     source: str = 'settings',
     declared: Sequence[Input] = INPUTS,
 ) -> dict[str, float]:
-    """All inputs that are ``declared``.
+    """Return all inputs that are ``declared``.
 
     ``settings`` override the YAML file (``name: value`` lines), which overrides the defaults. ``source``: where
     ``settings`` come from, for messages.

@@ -31,7 +31,7 @@ class DrawnCause(NamedTuple):
 
 
 def plotted_causes(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
-    """Every cause that does something, the largest first, and the total (3,)."""
+    """Return every cause that does something, the largest first, and the total (3,)."""
     factors = np.array(SHOWN)
     total = budget.total().rms * factors
     # What does nothing, or only rounds, has no place on a logarithmic axis.
@@ -46,7 +46,7 @@ def plotted_causes(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
 
 
 def bars_of(budget: Budget) -> Bars:
-    """Every cause, the largest first, below the total."""
+    """Return every cause, the largest first, below the total."""
     causes, total = plotted_causes(budget)
     names = ['total', *(one.name for one in causes)]
     colours: list[Colour] = ['text', *(COLOURS[one.kind] for one in causes)]

@@ -53,7 +53,7 @@ class Budgeted(StudyResult):
         return {'rig': self.rig_file} if self.rig_file else {}
 
     def sentences(self) -> list[str]:
-        """The total, and the cause that gives most of it."""
+        """Return the total, and the cause that gives most of it."""
         at, total = self.budget.at, self.budget.total()
         out = [f'A single estimate is wrong by {_words(total)} (rms), method {at.method}.']
         name, share = max(
@@ -69,7 +69,7 @@ class Budgeted(StudyResult):
         return out
 
     def lines(self) -> list[str]:
-        """The situation, the table of all causes, the totals."""
+        """Return the situation, the table of all causes, the totals."""
         out = [self._situation(), '', *columns(self.cause_rows(), left=4).splitlines()]
         out += ['', *columns(self.total_rows()).splitlines()]
         out += ['', *columns(self.expanded_rows()).splitlines()]
@@ -82,7 +82,7 @@ class Budgeted(StudyResult):
         return out
 
     def sections(self) -> Iterable[PageSection]:
-        """The chart, the totals, every cause."""
+        """Return the chart, the totals, every cause."""
         head, *rows = self.cause_rows()
         totals_head, *totals = self.total_rows()
         return [
@@ -138,7 +138,7 @@ class Budgeted(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row a cause: its kind, rms and share of the mean square for dX, dY, theta; m, m, rad."""
+        """Return one row a cause: its kind, rms and share of the mean square for dX, dY, theta; m, m, rad."""
         lines = self.budget.lines
         rms = np.array([line.rms for _, line in lines])
         share = np.array([self.budget.shares(line) for _, line in lines])
@@ -187,7 +187,7 @@ class Budgeted(StudyResult):
         return rows
 
     def _compared(self, interval: Interval) -> str:
-        """The GUM's interval beside that of the draws."""
+        """Return the GUM's interval beside that of the draws."""
         off = difference(self.budget.expanded(), interval).tolist()
         each = ', '.join(f'{name} {100.0 * v:+.1f} %' for name, v in zip(SYMBOLS, off, strict=True))
         return (
@@ -214,7 +214,7 @@ _RULES = (
 
 
 def type_of(cause: Cause) -> str:
-    """A or B."""
+    """Return a or B."""
     return 'A' if cause.observed else 'B'
 
 
@@ -224,7 +224,7 @@ def _or_none(freedom: float) -> float | None:
 
 
 def freedom_words(freedom: float) -> str:
-    """A number, or ∞."""
+    """Return a number, or ∞."""
     return '∞' if math.isinf(freedom) else f'{freedom:.0f}'
 
 

@@ -334,7 +334,7 @@ def _held_out(full_fit: CalibrationFit, rows: Rows, prior: Prior, free: Mask) ->
 def _heldout(
     full_fit: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before: FloatArray
 ) -> tuple[Gap, bool]:
-    """The gaps, and whether unseen motion is predicted worse than with the rig file."""
+    """Return the gaps, and whether unseen motion is predicted worse than with the rig file."""
     inverse = weight_matrices(full_fit.linear, rows, full_fit.noise)
     old, old_plain = _misfit(linearised(rows, before, rig, kind).residual, full_fit, inverse, rows, kind)
     _, new_plain = _misfit(full_fit.linear.residual, full_fit, inverse, rows, kind)
@@ -378,7 +378,7 @@ def _without_refused_terms(
 
 
 def with_clamp(full_fit: CalibrationFit, rows: Rows, rig: Rig, prior: Prior) -> CalibrationFit:
-    """The clamp's compliances from the reference's poses at rest under known loads, if there are any.
+    """Return the clamp's compliances from the reference's poses at rest under known loads, if there are any.
 
     The link's own stiffness is taken as the rig file has it: at one length a clamp that gives way is a softer link.
     """

@@ -199,7 +199,7 @@ def result(outcome: CalibrationCheck) -> dict[str, Any]:
 
 
 def sentence(outcome: CalibrationCheck) -> str:
-    """The answer in one sentence."""
+    """Return the answer in one sentence."""
     if outcome.unchanged:
         return f'The calibration holds: nothing moved (p {outcome.p:.2g}; false alarms at most {LEVEL:.0%}).'
     first = outcome.groups[0]

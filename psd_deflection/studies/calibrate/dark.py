@@ -81,7 +81,7 @@ class DarkLevel(NamedTuple):
 
 
 def dark_levels(runs: Sequence[CalibrationRun], rig: Rig, lit: Sequence[CalibrationRun] = ()) -> list[DarkLevel]:
-    """The dark level of each PSD, from the longest time in ``runs`` in which its laser is off.
+    """Return the dark level of each PSD, from the longest time in ``runs`` in which its laser is off.
 
     ``lit``: recordings with the lasers on, for the share; without them it is that of amplifier.sum_nominal. Raises
     RecordingError if a laser is never off for ``LEAST``, if x or y is saturated or a level drifts so that it matters;
@@ -114,12 +114,12 @@ def result_of_levels(levels: Sequence[DarkLevel]) -> dict[str, Any]:
 
 
 def source_of_levels(levels: Sequence[DarkLevel]) -> str:
-    """The recordings, in words."""
+    """Return the recordings, in words."""
     return ', '.join(dict.fromkeys(named(level.recording, level.digest) for level in levels))
 
 
 def words_of_level(level: DarkLevel) -> str:
-    """One PSD in a sentence."""
+    """Return one PSD in a sentence."""
     sums = f'psd_{level.psd} with its laser off: sum {level.volts[2]:.5f} ± {level.sd[2]:.1g} V'
     if level.volts[2] <= 0.0:
         return f'{sums}: no other light'
@@ -155,19 +155,19 @@ def _check(rig: Rig) -> None:
 
 
 def _limit(rig: Rig) -> float:
-    """The sum, V, below which the daemon takes a laser for lost."""
+    """Return the sum, V, below which the daemon takes a laser for lost."""
     return rig.estimator.sum_min * (0.5 if rig.estimator.splitter else 1.0)
 
 
 def _lit(lit: Sequence[CalibrationRun], rig: Rig, psd: int) -> float | None:
-    """The sum with the laser on, V; None if nothing tells."""
+    """Return the sum with the laser on, V; None if nothing tells."""
     sums = np.concatenate([np.empty(0), *(run.volts[:, 3 * psd + 2] for run in lit)])
     on = sums[sums >= _limit(rig)]
     return float(np.median(on)) if len(on) else None
 
 
 def longest(off: Mask) -> slice:
-    """The longest run of True."""
+    """Return the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], off, [False])).astype(np.int8)))
     starts, ends = edges[::2], edges[1::2]
     if not len(starts):
@@ -177,7 +177,7 @@ def longest(off: Mask) -> slice:
 
 
 def _dark_part(run: CalibrationRun, rig: Rig, psd: int) -> slice:
-    """The longest time without this laser; a lost sample does not end it."""
+    """Return the longest time without this laser; a lost sample does not end it."""
     with np.errstate(invalid='ignore'):
         lit = run.volts[:, 3 * psd + 2] >= _limit(rig)
     part = longest(~lit)

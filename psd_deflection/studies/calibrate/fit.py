@@ -320,7 +320,7 @@ def _of_zero(linear: Linear, weighted: FloatArray, rows_of_run: Mask) -> tuple[F
 
 
 def with_common_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Rows, CalibrationFit]:
-    """The rows as if all recordings had the zero of the first one, and their fit.
+    """Return the rows as if all recordings had the zero of the first one, and their fit.
 
     The beams may have been aimed anew between two recordings, and a camera takes its rest anew. The offset is a
     change of the unloaded readings; what it does to the others follows from the model.
@@ -393,7 +393,7 @@ def variance_components(
     information: FloatArray,
     prior: Prior,
 ) -> Noise:
-    """The variance components from the residuals."""
+    """Return the variance components from the residuals."""
     good = robust > 0.0 if number else np.ones(len(rows), dtype=bool)
     inverse = np.linalg.pinv(linear.pose_slopes)
     errors = (np.einsum('nij,nj->ni', inverse, linear.residual) / rows.sd)[good]

@@ -39,7 +39,7 @@ def read_run(
     namespace: str | None = None,
     span: Span = WHOLE,
 ) -> CalibrationRun:
-    """One recording: the recording or its path. Raises RecordingError if it cannot be read.
+    """Return one recording: the recording or its path. Raises RecordingError if it cannot be read.
 
     ``reference``: a table of it, or another recording; None: in the recording. ``exposure``: time over which each
     reference is a mean, s. ``span``: the part of the recording that is meant.
@@ -98,7 +98,7 @@ def read_runs(
     namespace: str | None = None,
     span: Span = WHOLE,
 ) -> list[CalibrationRun]:
-    """All of ``sources``; ``references``: none, or the reference of each."""
+    """Return all of ``sources``; ``references``: none, or the reference of each."""
     tables: Sequence[str | Path | None] = references or [None] * len(sources)
     return [
         read_run(source, rig, reference=table, exposure=exposure, namespace=namespace, span=span)
@@ -123,7 +123,7 @@ def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
 
 
 def today() -> str:
-    """The date of a calibration, UTC."""
+    """Return the date of a calibration, UTC."""
     return datetime.now(UTC).date().isoformat()
 
 
@@ -147,13 +147,13 @@ class CalibrationOptions:
     span: Span = WHOLE
 
     def rig(self, recordings: Sequence[Recording | str | Path], tell: Tell) -> Rig:
-        """The known rig; ``tell`` gets a warning if neither a file nor the recording names one."""
+        """Return the known rig; ``tell`` gets a warning if neither a file nor the recording names one."""
         if self.params_file is not None:
             return load_rig(self.params_file)
         return opened(recordings[0], namespace=self.namespace, span=self.span, tell=tell).rig
 
     def runs(self, recordings: Sequence[Recording | str | Path], rig: Rig) -> list[CalibrationRun]:
-        """The recordings with their references."""
+        """Return the recordings with their references."""
         return read_runs(
             recordings,
             rig,
@@ -164,7 +164,7 @@ class CalibrationOptions:
         )
 
     def levels(self, rig: Rig, runs: Sequence[CalibrationRun]) -> list[DarkLevel]:
-        """The light in the recordings of ``dark``; ``runs``: with the lasers on."""
+        """Return the light in the recordings of ``dark``; ``runs``: with the lasers on."""
         if not self.dark:
             return []
         return dark_levels([read_run(source, rig, namespace=self.namespace) for source in self.dark], rig, runs)
@@ -177,7 +177,7 @@ class CalibrationOptions:
         progress: Callable[[str], None],
         tell: Tell,
     ) -> Calibrated:
-        """The answer; ``tell`` gets a warning if a load was noted late, or if the rig file cannot be edited."""
+        """Return the answer; ``tell`` gets a warning if a load was noted late, or if the rig file cannot be edited."""
         runs = [as_acted(run, rig, tell) for run in runs]
         lit = replace_values(rig, values_of_levels(levels))
         calibration = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)

@@ -114,7 +114,7 @@ def usable_dots(run: CalibrationRun, rig: Rig) -> FloatArray:
 
 
 def smoothed(dots: FloatArray, period: float, places: FloatArray, exposure: float = 0.0) -> Smoothed:
-    """The polynomial through the samples about each of ``places`` (m,), in samples from the first.
+    """Return the polynomial through the samples about each of ``places`` (m,), in samples from the first.
 
     ``exposure``, s: the dots are the mean over so long about each place.
     """
@@ -182,7 +182,7 @@ def at_rest(loads: FloatArray | None, t: FloatArray) -> np.ndarray[tuple[int], n
 
 
 def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, delay: float = 0.0, blocks: bool = False) -> Rows:
-    """The rows of one recording: one for each reference, or one a block if the reference is as fast as that.
+    """Return the rows of one recording: one for each reference, or one a block if the reference is as fast as that.
 
     ``noise`` (4,) V. ``delay``: seconds to add to the reference's times. ``blocks``: one a block, without reference.
     Raises RecordingError if there are too few.
@@ -270,7 +270,7 @@ def _block_means(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) ->
 
 
 def joined(parts: Sequence[Rows]) -> Rows:
-    """All rows, each with the number of its recording."""
+    """Return all rows, each with the number of its recording."""
     every = {column.name: np.concatenate([getattr(p, column.name) for p in parts]) for column in fields(Rows)}
     every['run'] = np.concatenate([np.full(len(p), i) for i, p in enumerate(parts)])
     sd = every['sd']

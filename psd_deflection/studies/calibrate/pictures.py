@@ -23,7 +23,7 @@ from psd_deflection.studies.study import PageSection
 
 
 def sections(calibration: Calibration) -> list[PageSection]:
-    """The page below the sentence."""
+    """Return the page below the sentence."""
     open_words = (
         '<p class=quiet>Left open: the standard deviation over that of the rig file or its tolerance; 1: nothing was '
         'learnt, and the file keeps its value.</p>'

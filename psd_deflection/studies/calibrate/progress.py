@@ -22,7 +22,7 @@ _READ = {'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 's': (1e3, 'ms'), '': (1.0, '')
 
 
 def in_words(i: int, value: float, sd: float | None = None) -> str:
-    """The value of parameter ``i`` of ``NAMES`` in the unit that people use, with its ± if ``sd`` is given."""
+    """Return the value of parameter ``i`` of ``NAMES`` in the unit that people use, with its ± if ``sd`` is given."""
     factor, unit = _READ.get(UNITS[i], (1.0, UNITS[i]))
     number = f'{factor * value:.5g}' if sd is None else f'{factor * value:.5g} ± {factor * sd:.2g}'
     return f'{number} {unit}'.strip()

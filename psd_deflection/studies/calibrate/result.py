@@ -50,7 +50,7 @@ class Calibrated(StudyResult):
         return {'version': __version__, 'date': self.date, **runs}
 
     def sentences(self) -> list[str]:
-        """The answer in one sentence, the dark levels, and what is left open."""
+        """Return the answer in one sentence, the dark levels, and what is left open."""
         calibration = self.found
         statements = [sentence(calibration), *map(words_of_level, calibration.dark)]
         statements += [
@@ -86,7 +86,7 @@ class Calibrated(StudyResult):
         return sections(self.found)
 
     def rig_yaml(self) -> str:
-        """The user's parameter file with the calibration, comments kept; without one what describes the rig."""
+        """Return the user's parameter file with the calibration, comments kept; without one what describes the rig."""
         calibration = self.found
         values, effects = values_of(calibration, self.date)
 
@@ -99,12 +99,12 @@ class Calibrated(StudyResult):
         return edited_rig_file(self.params_file, 'rig.yaml', lambda: described(self.rig, kept_effects), edit, self.tell)
 
     def files(self) -> dict[str, str]:
-        """The rig file, the page and the JSON."""
+        """Return the rig file, the page and the JSON."""
         return {'rig.yaml': self.rig_yaml(), **super().files()}
 
 
 def result(calibration: Calibration, date: str) -> dict[str, Any]:
-    """The tree of calibration.json. ``date``: of the calibration, for the provenance."""
+    """Return the tree of calibration.json. ``date``: of the calibration, for the provenance."""
     sd = calibration.sd
 
     def one(i: int) -> dict[str, Any]:
@@ -190,7 +190,7 @@ def values_of(calibration: Calibration, date: str) -> tuple[dict[str, object], l
 
 
 def sentence(calibration: Calibration) -> str:
-    """The answer in one sentence."""
+    """Return the answer in one sentence."""
     if calibration.refused:
         return f'Refused: {calibration.refused}.'
     g = calibration.gap

@@ -64,7 +64,7 @@ class CheckProblem:
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
-    """The problem of a recording: ``volts`` (n, 6) of the device's channels, ``loads`` (n, 3), N, N, N m, held.
+    """Return the problem of a recording: ``volts`` (n, 6) of the device's channels, ``loads`` (n, 3), N, N, N m, held.
 
     Raises ConfigError for a rig of more than two PSDs.
     """
@@ -153,7 +153,7 @@ def _wiring_findings(
 
 
 def _same_to_first_order(file: Wiring, observed: Sequence[PushResponse], best: WiringFit) -> tuple[str, ...]:
-    """Whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
+    """Return whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
     turned = tuple(load for p in observed if p.misfit(file)[1] < 0.0 for load in p.loads)
     total, worst = misfit(file, observed, turned)
     same = worst <= LIMIT and total <= best.misfit + MARGIN
@@ -173,7 +173,7 @@ def _load_findings(observed: Sequence[PushResponse], wiring: WiringFit) -> list[
 
 
 def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str, object]) -> list[Finding]:
-    """The noise of each PSD's x and y, and the converter's steps, against the rig file."""
+    """Return the noise of each PSD's x and y, and the converter's steps, against the rig file."""
     columns = [wiring.columns[c] for c in DOT_CHANNELS]
     # Steps hide a noise that is smaller than they are.
     hidden = [CHANNELS[c] in measured.stuck or measured.noise[c] < measured.steps[c] for c in columns]

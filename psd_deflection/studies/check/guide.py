@@ -199,7 +199,7 @@ class Guide:
         return ''
 
     def rest(self) -> FloatArray:
-        """The samples (n, 6) of the first rest, V, of the device's channels."""
+        """Return the samples (n, 6) of the first rest, V, of the device's channels."""
         return np.concatenate(self._rest_volts)
 
     def drift(self) -> tuple[FloatArray, FloatArray]:

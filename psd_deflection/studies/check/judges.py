@@ -174,7 +174,7 @@ def both_ways(units: Mapping[float, str], stated_unit: str) -> list[tuple[float,
 
 
 def _power_of_ten(force: Sequence[float], torque: float) -> bool:
-    """Whether only the forces are off, and by ten: a digit of Young's modulus, not a unit."""
+    """Return whether only the forces are off, and by ten: a digit of Young's modulus, not a unit."""
     return abs(torque - 1.0) < 0.1 and all(min(abs(10.0 * s - 1.0), abs(0.1 * s - 1.0)) < 0.01 for s in force)
 
 

@@ -91,7 +91,7 @@ def _steps(rig: Rig, volts: FloatArray) -> FloatArray:
 
 
 def longest_run(volts: FloatArray) -> FloatArray:
-    """The longest stretch without a lost sample."""
+    """Return the longest stretch without a lost sample."""
     there = np.concatenate(([False], np.isfinite(volts).all(axis=1), [False]))
     edges: npt.NDArray[np.int64] = np.flatnonzero(np.diff(there.astype(np.int8)))
     starts, ends = edges[0::2], edges[1::2]

@@ -76,7 +76,7 @@ class Finding:
 
 
 def finding_tree(finding: Finding) -> dict[str, Any]:
-    """A finding as JSON has it."""
+    """Return a finding as JSON has it."""
     return {
         'name': finding.name,
         'where': finding.where,
@@ -118,7 +118,7 @@ class Checkup(StudyResult):
         return {'recording': self.source} if self.source else {}
 
     def sentences(self) -> list[str]:
-        """The verdict, then what is wrong, one line each, then what to look at."""
+        """Return the verdict, then what is wrong, one line each, then what to look at."""
         wrong = [f'{what}: {fix}' for what, fix in _findings(self)]
         return [_verdict(self), *wrong, *other_causes(self), *(f'note: {note}' for note in self.notes)]
 
@@ -146,7 +146,7 @@ class Checkup(StudyResult):
         return [*out, PageSection('Noise, light and drift', (table(('', ''), level_rows(self)),))]
 
     def table(self) -> Table:
-        """One row a finding: ``where``, ``value`` (a number, numbers, or None), ``fix``, ``evidence``."""
+        """Return one row a finding: ``where``, ``value`` (a number, numbers, or None), ``fix``, ``evidence``."""
         findings = self.findings
         return Table(
             text_column('finding', [f.name for f in findings], 'what is wrong'),
@@ -220,7 +220,7 @@ def answers_chart(checkup: Checkup) -> Chart:
 
 
 def arrow(value: float, size: float) -> str:
-    """A direction: + or -, or 0 for next to nothing."""
+    """Return a direction: + or -, or 0 for next to nothing."""
     return '0' if abs(value) < 0.1 * size else '+' if value > 0.0 else '-'
 
 

@@ -34,7 +34,7 @@ WIRINGS = tuple(
 
 
 def wirings_of(file: Wiring) -> Sequence[Wiring]:
-    """The wirings that are tried of a rig whose file says ``file``: of two PSDs all.
+    """Return the wirings that are tried of a rig whose file says ``file``: of two PSDs all.
 
     Of more, those in which at most two PSDs are wired otherwise than ``file`` says, and those in which all are wired
     alike; each with any two PSDs exchanged, and with none.
@@ -169,7 +169,7 @@ def misfit(
 
 
 def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
-    """The wirings that explain the pushes about as well as the best one does, best first; [] if none does.
+    """Return the wirings that explain the pushes about as well as the best one does, best first; [] if none does.
 
     First with the loads as they are said to be. Only if no wiring explains these, with the sign of loads turned.
     """
@@ -227,7 +227,7 @@ def _of_channels(wiring: Wiring) -> dict[str, tuple[int, str, bool]]:
 
 
 def parameters(wiring: Wiring, file: Wiring) -> dict[str, object]:
-    """The parameters of ``wiring`` that are others in the rig file."""
+    """Return the parameters of ``wiring`` that are others in the rig file."""
     out: dict[str, object] = {}
     if wiring.exchanged != file.exchanged:
         out['psds_exchanged'] = wiring.exchanged
@@ -238,7 +238,7 @@ def parameters(wiring: Wiring, file: Wiring) -> dict[str, object]:
 
 
 def fix_of(difference: Difference, wiring: Wiring, right: Mapping[str, object]) -> str:
-    """The line of the rig file that puts one difference right, or what else does."""
+    """Return the line of the rig file that puts one difference right, or what else does."""
     if difference.name == 'psd_swap' and difference.where != SWAP:
         both = difference.where.replace(' ', ' and ')
         return f'exchange the cables of {both} at the device, or what the rig file says of {both}'

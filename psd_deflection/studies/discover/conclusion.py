@@ -131,7 +131,7 @@ class Conclusion(StudyResult):
         return self.fit.coefficients_with_nuisance if self.prediction is None else self.prediction.effects
 
     def lines(self) -> list[str]:
-        """The sentences in one line, then what is unknown."""
+        """Return the sentences in one line, then what is unknown."""
         unknown = [f'unknown: {u.signature}' for u in self.unknown]
         limits = [f'limit: {x.limit}; {x.beyond}' for x in self.search.limits]
         return [self.sentence, *unknown, *limits, f'{self.simulations} forward simulations']
@@ -291,7 +291,7 @@ class RigConclusion(Conclusion):
         return [s for s in (_setup(self), missing, *tied, _moved(self), law_sentence(self), *self.beyond) if s]
 
     def lines(self) -> list[str]:
-        """The sentences in one line, what puts the set-up right, what would decide, what is unknown."""
+        """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""
         first, *remaining_lines = super().lines()
         out = [first, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
         numbers = [RIG_NUMBERS[e.name] for e in self.effects if e.name in RIG_NUMBERS]
@@ -311,7 +311,7 @@ class RigConclusion(Conclusion):
         return out
 
     def adopt(self, name: str) -> Self:
-        """The answer with its law as the effect ``name``, written to the folder of the user's effects.
+        """Return the answer with its law as the effect ``name``, written to the folder of the user's effects.
 
         Without a law nothing happens. Raises ConfigError for a name that cannot be, RecordingError if the disk refuses.
         """
@@ -328,7 +328,7 @@ class RigConclusion(Conclusion):
         return out
 
     def model_yaml(self) -> str:
-        """The user's parameter file with the effects, comments kept; without one what describes the rig."""
+        """Return the user's parameter file with the effects, comments kept; without one what describes the rig."""
         # Other numbers of the rig file are lines of it.
         effects = [a for a in self.active_effects if a.effect.name not in RIG_NUMBERS]
         if self.adopted and self.law is not None:
@@ -339,14 +339,14 @@ class RigConclusion(Conclusion):
         return model_yaml(self.params_file, self.rig, effects, self.values, self.tell)
 
     def files(self) -> dict[str, str]:
-        """The rig file with the effects, the page, the JSON, and the law as an effect that can be adopted."""
+        """Return the rig file with the effects, the page, the JSON, and the law as an effect that can be adopted."""
         law = self.model_of_law
         laws = {} if law is None else {'law.yaml': _law_file(law)}
         return {'model.yaml': self.model_yaml(), **super().files(), **laws}
 
 
 def adopting_folder(name: str) -> Path:
-    """The folder of the user's effects, for an effect ``name``. Raises ConfigError if there cannot be one."""
+    """Return the folder of the user's effects, for an effect ``name``. Raises ConfigError if there cannot be one."""
     if not name.isidentifier() or name.startswith('_'):
         raise ConfigError(f'{name}: must be a name of letters, digits and underscores, such as base_yields')
     if name in effect_names():
@@ -374,7 +374,7 @@ def model_yaml(
     values: Mapping[str, object],
     tell: Tell = warn_caller,
 ) -> str:
-    """The user's parameter file with ``effects``, comments kept; without one what describes ``rig``.
+    """Return the user's parameter file with ``effects``, comments kept; without one what describes ``rig``.
 
     ``values``: what was wrong in the rig file, put right. ``tell`` gets a warning if the file cannot be edited.
     """
@@ -435,7 +435,7 @@ def _moved(discovery: RigConclusion) -> str:
 
 
 def law_sentence(discovery: RigConclusion) -> str:
-    """The law for what is unknown, in a sentence, or nothing."""
+    """Return the law for what is unknown, in a sentence, or nothing."""
     if discovery.law is None:
         return ''
     law = discovery.law

@@ -71,7 +71,7 @@ def discover(
 
 
 def law(problem: Problem) -> Problem:
-    """A law for what remains, and the fit without the effects that only stood in for it."""
+    """Return a law for what remains, and the fit without the effects that only stood in for it."""
     ws, fit = workspace_of(problem.comparison), problem.fit
     # Coarse steps cause noise that varies with the signal, which is no law.
     if rig_of(problem).recorded.lattice is not None:
@@ -129,7 +129,7 @@ def set_up(problem: Problem) -> Problem:
 
 
 def noise_level(problem: Problem) -> Problem:
-    """Whether the noise is the rig file's. What is unknown may move faster than noise can be told from it."""
+    """Return whether the noise is the rig file's. What is unknown may move faster than noise can be told from it."""
     if problem.unknown or rig_of(problem).recorded.lattice is not None:
         return problem
     ws = workspace_of(problem.comparison)
@@ -161,7 +161,7 @@ def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
 
 
 def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
-    """The named effect of coarse steps, which the readings themselves show."""
+    """Return the named effect of coarse steps, which the readings themselves show."""
     gain = lattice_gain(workspace, lattice)
     sd = min(s.sd for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
     return NamedEffect(

@@ -185,7 +185,7 @@ def pieces(rig: Rig, limits: Limits) -> list[Piece]:
 
 
 def proposals(rig: Rig, limits: Limits) -> list[Proposal]:
-    """Every piece in every setting, those that fit into the longest recording."""
+    """Return every piece in every setting, those that fit into the longest recording."""
     out = []
     for setting in settings(rig, limits):
         changed = replace_values(rig, setting.changes) if setting.changes else rig
@@ -297,7 +297,7 @@ def expected_sums(
 
 
 def limits_to_tree(limits: Limits) -> dict[str, Any]:
-    """The limits as result.json has them."""
+    """Return the limits as result.json has them."""
     return {
         'force_n': limits.force,
         'torque_nm': limits.torque,

@@ -61,7 +61,7 @@ def effective_loads(problem: Problem) -> Problem:
 
 
 def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
-    """The free loads as ``fit`` asks for, and the sizes of its effects beside them, in turns."""
+    """Return the free loads as ``fit`` asks for, and the sizes of its effects beside them, in turns."""
     gap = ws.gap(fit.difference)
     for _ in range(MOST_SETTLED):
         # Loads and times are found to first order: at the sizes as they are, then the sizes beside them.
@@ -78,7 +78,7 @@ def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
 
 
 def _refitted(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
-    """The free loads as ``fit`` asks for, and what it leaves then: never more than before."""
+    """Return the free loads as ``fit`` asks for, and what it leaves then: never more than before."""
     for _ in range(TURNS):
         turned = ws.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
         turned = ws.refitted(fit.difference) if turned is ws else turned
@@ -163,7 +163,7 @@ def _as_annotated(problem: Problem, freed: Problem) -> Problem:
 
 
 def _follows_nothing(problem: Problem) -> bool:
-    """Whether some effects leave a good part of the gap, to first order: no simulation is made."""
+    """Return whether some effects leave a good part of the gap, to first order: no simulation is made."""
     ws, fit = problem.comparison, problem.fit
     gap = ws.gap(fit.difference)
     if gap < FREED_FROM * ws.floor():
@@ -179,7 +179,7 @@ def _follows_nothing(problem: Problem) -> bool:
 
 
 def _residual_gap(ws: Comparison, fit: Fit, columns: Sequence[FloatArray]) -> float:
-    """The gap that ``columns`` (D,), whitened, leave of ``fit``, to first order."""
+    """Return the gap that ``columns`` (D,), whitened, leave of ``fit``, to first order."""
     moved = np.column_stack(columns)
     residual = fit.residual - moved @ np.linalg.lstsq(moved, fit.residual, rcond=1e-9)[0]
     return ws.gap([d + c for d, c in zip(fit.difference, ws.unwhitened(residual - fit.residual), strict=True)])
@@ -204,7 +204,7 @@ def _rounded_beside_effect(problem: Problem) -> bool:
 
 
 def _best_beside(problem: Problem, columns: Sequence[FloatArray]) -> list[FloatArray]:
-    """The signatures of the effect that explains most beside ``columns`` (D,), whitened."""
+    """Return the signatures of the effect that explains most beside ``columns`` (D,), whitened."""
     screen, known = problem.search.screen, np.column_stack(columns) if columns else None
     return screen.columns_of(max(screen.score(problem.fit.residual, known), key=lambda s: s.gain).candidate)
 

@@ -113,11 +113,11 @@ class Isolability(StudyResult):
         return out
 
     def lines(self) -> list[str]:
-        """The table, then the sentences."""
+        """Return the table, then the sentences."""
         return [*columns([HEAD, *(f.row for f in self.effects)], left=5).split('\n'), '', *self.sentences()]
 
     def tree(self) -> dict[str, Any]:
-        """The answer for programs; sizes in SI units."""
+        """Return the answer for programs; sizes in SI units."""
         return {
             'loads': self.loads,
             'seconds': self.seconds,
@@ -142,7 +142,7 @@ class Isolability(StudyResult):
         )
 
     def sections(self) -> Iterable[PageSection]:
-        """The table, and the picture of all pairs."""
+        """Return the table, and the picture of all pairs."""
         rows = table(HEAD, [f.row for f in self.effects])
         yield PageSection('From which size', (wide(rows, 'the least sizes'),))
         labels = [f.label for f in self.effects]
@@ -221,7 +221,7 @@ def _isolable(
     variants: Mapping[str, Sequence[Candidate]],
     accepts: Callable[[int], float],
 ) -> tuple[Isolable, list[float]]:
-    """One candidate, and the share of its signature that each of ``variants`` imitates at best."""
+    """Return one candidate, and the share of its signature that each of ``variants`` imitates at best."""
     column = screen.slice_of(candidate).start
     length = float(screen.fisher[column, column])
     shares = [
@@ -249,7 +249,7 @@ def _isolable(
 
 
 def _imitated(screen: Screen, column: int, imitating: slice) -> float:
-    """The share, 0 to 1, of the squared length of a column that those of another candidate make up."""
+    """Return the share, 0 to 1, of the squared length of a column that those of another candidate make up."""
     gain = solve_observable(
         screen.fisher[imitating, imitating], screen.fisher[imitating, column], screen.lengths[imitating]
     )[0]
@@ -257,7 +257,7 @@ def _imitated(screen: Screen, column: int, imitating: slice) -> float:
 
 
 def _size(candidate: Candidate, length: float, wanted: float) -> float | None:
-    """The size with a chi-square of ``wanted``, if its probe has ``length``; None if it may not be so large."""
+    """Return the size with a chi-square of ``wanted``, if its probe has ``length``; None if it may not be so large."""
     p, off, times = candidate.effect.parameter(candidate.free[0]), candidate.off, math.sqrt(wanted / length)
     if not candidate.effect.finite:
         size, room = p.scale * times, max(p.maximum - off[p.name], off[p.name] - p.minimum)

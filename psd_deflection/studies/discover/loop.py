@@ -102,23 +102,23 @@ class LoopResult(StudyResult):
 
 
 def recorded_name(number: int) -> str:
-    """The file of a recording that was planned and made; ``number`` counts from 1."""
+    """Return the file of a recording that was planned and made; ``number`` counts from 1."""
     return f'next_{number}.csv'
 
 
 def _listed(made: Sequence[tuple[str, Plan]]) -> str:
-    """The list of recordings that were made or are to be made, with the parameters that differ in each."""
+    """Return the list of recordings that were made or are to be made, with the parameters that differ in each."""
     tree = [{'recording': name, 'overrides': dict(plan.setting.changes)} for name, plan in made]
     return yaml.safe_dump(tree, sort_keys=False)
 
 
 def next_of(discovery: Discovery, limits: Limits | None = None) -> Plan | None:
-    """The next recording after a search; None if it left no rivals."""
+    """Return the next recording after a search; None if it left no rivals."""
     return plan_next(discovery.workspace, discovery.fit, discovery.alternative_fits, limits)
 
 
 def planned(discovery: Discovery, limits: Limits | None = None) -> LoopResult:
-    """The answer with the plan of the next recording, which nobody makes here."""
+    """Return the answer with the plan of the next recording, which nobody makes here."""
     return LoopResult(discovery, (), next_of(discovery, limits), None)
 
 

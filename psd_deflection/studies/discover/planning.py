@@ -164,7 +164,7 @@ class Plan:
         return '\n'.join(lines) + '\n'
 
     def tree(self) -> dict[str, Any]:
-        """The plan as result.json has it."""
+        """Return the plan as result.json has it."""
         return {
             'sentence': self.sentence,
             'useful': self.useful,
@@ -191,7 +191,7 @@ class Plan:
 def plan_next(
     workspace: Workspace, named: Fit, alternatives: Sequence[Fit], limits: Limits | None = None
 ) -> Plan | None:
-    """The recording within ``limits`` that best tells ``named`` from ``alternatives``; None without rivals."""
+    """Return the recording within ``limits`` that best tells ``named`` from ``alternatives``; None without rivals."""
     if not alternatives:
         return None
     limits = limits or Limits()
@@ -251,7 +251,7 @@ def suggest(
 
 
 def rate_of(rig: Rig, setting: Setting) -> float:
-    """The sample rate in ``setting``, Hz."""
+    """Return the sample rate in ``setting``, Hz."""
     changed = replace_values(rig, setting.changes) if setting.changes else rig
     return changed.converter.sample_rate_hz
 
@@ -283,6 +283,6 @@ def best_combination(
 
 
 def _replaced(named: Fit, alternative: Fit) -> str:
-    """The label of the effect of ``named`` that ``alternative`` does without."""
+    """Return the label of the effect of ``named`` that ``alternative`` does without."""
     common = {(a.effect.name, a.choices) for a in alternative.effects[:-1]}
     return ', '.join(a.label for a in named.effects if (a.effect.name, a.choices) not in common)

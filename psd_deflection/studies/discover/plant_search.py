@@ -145,7 +145,7 @@ class PlantComparison(Comparison):
         return out
 
     def whiten(self, tables: Sequence[FloatArray]) -> FloatArray:
-        """One vector; the squares of a residual add up to the number of independent values."""
+        """Return one vector; the squares of a residual add up to the number of independent values."""
         scale = self.scale[:, None]
         parts = [np.where(t, x / scale, 0.0).ravel() for x, t in zip(tables, self.there, strict=True)]
         return np.concatenate(parts)
@@ -173,7 +173,7 @@ class PlantComparison(Comparison):
         return self.replaced(level=level, independent=independent, correlated=self._alike(independent))
 
     def _alike(self, independent: FloatArray) -> bool:
-        """Whether what remains is alike from one value to the next, and no noise is stated."""
+        """Return whether what remains is alike from one value to the next, and no noise is stated."""
         return not self.plant.noise and float(independent.sum()) < ALIKE * float(self.total.sum())
 
     def _independent(self, difference: Sequence[FloatArray], channel: int) -> float:
@@ -244,7 +244,7 @@ class PlantComparison(Comparison):
         return np.asarray((gained * count * (self.independent / np.maximum(self.total, 1))[:, None]).sum(axis=0))
 
     def unwhitened(self, white: FloatArray) -> list[FloatArray]:
-        """A vector in the units of the channels."""
+        """Return a vector in the units of the channels."""
         return [part * self.scale[:, None] for part in self.split(white)]
 
     def folds(self) -> IntArray:
@@ -268,7 +268,7 @@ class PlantComparison(Comparison):
         return self._joined(self.gap_per_channel(residual))
 
     def floor(self) -> float:
-        """The gap from the plant's noise; NaN if that is not known."""
+        """Return the gap from the plant's noise; NaN if that is not known."""
         return self._joined(self.known) if self.plant.noise else float('nan')
 
     @property
@@ -298,7 +298,7 @@ class PlantComparison(Comparison):
         return TimeAxis('(cases one after another)', ()) if period > 0.0 else 'number of the reading', along
 
     def against(self) -> dict[str, list[FloatArray]]:
-        """The inputs, and what was measured."""
+        """Return the inputs, and what was measured."""
         out = {name: [np.asarray(v) for v in values] for name, values in self.plant.inputs().items()}
         for c, (channel, unit) in enumerate(zip(self.channels, self.plant.units, strict=True)):
             out[f'{channel} / {unit}' if unit else channel] = [m[c] for m in self.measured]
@@ -326,11 +326,11 @@ class PlantDiscovery(Conclusion):
     workspace: PlantComparison
 
     def sections(self) -> Iterable[PageSection]:
-        """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
+        """Return the gap step by step, what is missing, what is unknown, before and after, how it was found."""
         return sections(self)
 
     def files(self) -> dict[str, str]:
-        """The page, the JSON, and what the plant itself writes of the effects."""
+        """Return the page, the JSON, and what the plant itself writes of the effects."""
         return {**self.workspace.plant.files([e.active for e in self.effects]), **super().files()}
 
     @property
@@ -419,7 +419,7 @@ class SimulatedPlant(Machine):
         return self.start
 
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
-        """The plant's library, always beside what the model has already: a rough machine is far from linear."""
+        """Return the plant's library, always beside what the model has already: a rough machine is far from linear."""
         beside = refit(comparison, (), nuisance=self.nuisance) if fit is None else fit
         listed = candidates(self.plant.library, self.plant.physics, {})
         return Screen(comparison, signatures_beside(comparison, listed, beside))

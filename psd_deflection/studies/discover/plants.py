@@ -29,7 +29,7 @@ def plant_effect(
     source: str = '',
     finite: bool = False,
 ) -> Effect:
-    """An effect of a plant, which its ``simulate`` finds in the model under ``name``.
+    """Return an effect of a plant, which its ``simulate`` finds in the model under ``name``.
 
     Each parameter's ``nominal`` is the value at which the effect is off, ``scale`` roughly its prior standard
     deviation. ``finite``: a small change at the nominal value shows nothing (a limit that is not reached), so exactly
@@ -74,7 +74,7 @@ class Plant(ABC):
 
     @abstractmethod
     def simulate(self, model: Model) -> Sequence[FloatArray]:
-        """The same with the effects of ``model`` on, without noise."""
+        """Return the same with the effects of ``model`` on, without noise."""
 
     def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
         """What was done to the machine, by name: of each case (n,). What remains is held against it."""
@@ -113,7 +113,7 @@ def table_of(rows: object, source: str) -> FloatArray:
 
 
 def measured_tables(plant: Plant) -> list[FloatArray]:
-    """The tables of ``plant``. Raises ConfigError if they do not fit its channels and cases."""
+    """Return the tables of ``plant``. Raises ConfigError if they do not fit its channels and cases."""
     tables = plant.measured()
     if len(tables) != len(plant.cases):
         raise ConfigError(f'measured: {len(tables)} tables for {len(plant.cases)} cases')

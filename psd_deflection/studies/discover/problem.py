@@ -41,7 +41,7 @@ class Machine(ABC):
 
     @abstractmethod
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
-        """The signatures of all that may be missing, beside ``fit``."""
+        """Return the signatures of all that may be missing, beside ``fit``."""
 
     @abstractmethod
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
@@ -64,7 +64,7 @@ class Machine(ABC):
         return 0.0
 
     def suggest(self, comparison: Comparison, fit: Fit, equal: Sequence[Fit]) -> Suggestion | None:
-        """The experiment that tells ``fit`` from others that are as good."""
+        """Return the experiment that tells ``fit`` from others that are as good."""
         return None
 
 

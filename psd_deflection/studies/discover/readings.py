@@ -121,11 +121,11 @@ class ReadingsPlant(Plant):
         )
 
     def measured(self) -> Sequence[FloatArray]:
-        """The readings, µm and µrad."""
+        """Return the readings, µm and µrad."""
         return [MICRO * t.values.T for t in self.tables]
 
     def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
-        """The loads, and the temperature where every table has it."""
+        """Return the loads, and the temperature where every table has it."""
         names = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
         out = {name: [t.loads[:, i] for t in self.tables] for i, name in enumerate(names)}
         warm = [t.temperature for t in self.tables if t.temperature is not None]
@@ -151,12 +151,12 @@ class ReadingsPlant(Plant):
         return out
 
     def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
-        """The rig file with the effects."""
+        """Return the rig file with the effects."""
         rig = self.tables[0].rig
         return {'model.yaml': model_yaml(self._params_file, rig, [*self.known, *effects], {}, self._tell)}
 
     def _rows(self, table: Readings, effects: Sequence[ActiveEffect], order: IntArray) -> FloatArray:
-        """The readings (channels, n) of the rows, which are simulated in ``order``."""
+        """Return the readings (channels, n) of the rows, which are simulated in ``order``."""
         rig, warm = table.rig, table.temperature
         model = ForwardModel(rig, sort_effects([*self.known, *effects]), settled=True)
         samples = model.expect(table.loads[order], None if warm is None else warm[order])

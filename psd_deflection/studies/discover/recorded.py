@@ -167,7 +167,7 @@ STEPS: Sequence[Callable[[Recorded], Recorded]] = (cleaned, put_right, snapped)
 
 
 def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
-    """The recordings against the simulation of the rig as it is described, from how each of them began.
+    """Return the recordings against the simulation of the rig as it is described, from how each of them began.
 
     Where loads may be noted late, without the last moments, whose loads are noted after the end.
     """
@@ -229,7 +229,7 @@ def _corrected(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Work
 
 
 def _stated_floor(workspace: Workspace) -> float:
-    """The gap that the noise of the rig file alone leaves, m: motion spoils any other estimate of it."""
+    """Return the gap that the noise of the rig file alone leaves, m: motion spoils any other estimate of it."""
     dots = [
         o.rig.noises[:, :2] * o.rig.sensitivities / math.sqrt(o.rig.estimator.block_size)
         for o in workspace.observations
@@ -248,7 +248,7 @@ def _wrong_notes(workspace: Workspace, i: int, difference: FloatArray) -> list[W
 
 
 def _implied_loads(workspace: Workspace, i: int, implied: PlateauLoads, acting: FloatArray) -> PlateauLoads:
-    """The loads that recording ``i`` asks for under ``acting`` ones; ``implied``: under those that it has."""
+    """Return the loads that recording ``i`` asks for under ``acting`` ones; ``implied``: under those that it has."""
     o = workspace.observations[i]
     if acting is o.loads:
         return implied
@@ -268,7 +268,7 @@ def _with_effective_loads(o: Observation, notes: Sequence[WrongNote | SwayingLoa
 
 
 def beside(workspace: Workspace, observations: Sequence[Observation], known: Sequence[ActiveEffect]) -> Workspace:
-    """The ``observations`` in place of those of ``workspace``, with its simulations counted on."""
+    """Return the ``observations`` in place of those of ``workspace``, with its simulations counted on."""
     out = Workspace(observations, known)
     workspace.tally.count += out.tally.count
     return out.replaced(tally=workspace.tally)

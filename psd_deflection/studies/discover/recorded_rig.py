@@ -58,7 +58,7 @@ class RecordedRig(Machine):
         bank: SignatureBank | None,
         progress: Progress,
     ) -> RecordedRig:
-        """The recordings made ready. ``bank``: see :func:`discover`."""
+        """Return the recordings made ready. ``bank``: see :func:`discover`."""
         check_same_psds(recordings, rig)
         progress('checking the recording')
         recorded = Recorded(tuple(recordings), rig, tuple(effects_of_rig(rig)), tuple(without))
@@ -76,7 +76,7 @@ class RecordedRig(Machine):
         return cls(recorded=recorded, workspace=workspace, proposals=proposals, bank=bank_of_rig)
 
     def compared(self) -> Workspace:
-        """The recordings against the simulation."""
+        """Return the recordings against the simulation."""
         return self.workspace
 
     def bare(self, comparison: Comparison) -> Comparison:
@@ -91,7 +91,7 @@ class RecordedRig(Machine):
         return 0.0 if lattice is None else 2.0 * lattice_gain(workspace_of(comparison), lattice)
 
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
-        """The catalogue's effects and the mistakes of the set-up, beside ``fit`` if that leaves much."""
+        """Return the catalogue's effects and the mistakes of the set-up, beside ``fit`` if that leaves much."""
         ws = workspace_of(comparison)
         residual = ws.residual([*ws.base, *ws.nuisance])[0] if fit is None else fit.residual
         more = mistakes(len(ws.observations), self.recorded.delays, likely_jumps(ws, residual), ws.psds)
@@ -138,7 +138,7 @@ class RecordedRig(Machine):
         return regressors(workspace_of(comparison))
 
     def suggest(self, comparison: Comparison, fit: Fit, equal: Sequence[Fit]) -> Suggestion | None:
-        """The recording that tells them apart."""
+        """Return the recording that tells them apart."""
         return suggest(workspace_of(comparison), fit, equal[: 3 if comparison.simulations < comparison.budget else 1])
 
 
@@ -150,7 +150,7 @@ def workspace_of(comparison: Comparison) -> Workspace:
 
 
 def rig_of(problem: Problem) -> RecordedRig:
-    """The machine of ``problem``, which is the rig."""
+    """Return the machine of ``problem``, which is the rig."""
     if not isinstance(problem.machine, RecordedRig):
         raise TypeError(f'{type(problem.machine).__name__}: not the rig with its recordings')
     return problem.machine

@@ -53,7 +53,7 @@ def _residual_chart(discovery: Conclusion) -> Chart:
 
 
 def _joined(parts: Iterable[FloatArray]) -> FloatArray:
-    """One after the other, with no value after each."""
+    """Return one after the other, with no value after each."""
     return np.concatenate([np.append(part, np.nan) for part in parts])
 
 
@@ -275,7 +275,7 @@ def _value(finding: Finding) -> str:
 
 
 def sections(discovery: Conclusion) -> list[PageSection]:
-    """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
+    """Return the gap step by step, what is missing, what is unknown, before and after, how it was found."""
     of_rig = discovery if isinstance(discovery, RigConclusion) else None
     out = [PageSection('', (_waterfall(discovery),))]
     if of_rig is not None and of_rig.setup:

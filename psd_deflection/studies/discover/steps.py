@@ -51,7 +51,7 @@ LITTLE = 0.1
 def solve(
     machine: Machine, steps: Sequence[Step], seed: int, progress: Progress, rng: np.random.Generator | None = None
 ) -> Problem:
-    """The problem of ``machine`` after ``steps``. The same ``seed`` gives the same answer."""
+    """Return the problem of ``machine`` after ``steps``. The same ``seed`` gives the same answer."""
     problem = Problem.of(machine, seed, progress, np.random.default_rng(seed) if rng is None else rng)
     for step in steps:
         problem = step(problem)
@@ -59,7 +59,7 @@ def solve(
 
 
 def search(problem: Problem, begun: Fit | None = None) -> Problem:
-    """The model that the search chooses, beside its alternatives; from the effects of ``begun`` on, if given."""
+    """Return the model that the search chooses, beside its alternatives; from the effects of ``begun`` on, if given."""
     start = problem.comparison
     search_used, result = problem.search.run(problem.null, begun)
     names = {a.effect.name for a in result.fit.effects}
@@ -77,7 +77,7 @@ def search(problem: Problem, begun: Fit | None = None) -> Problem:
 
 
 def weigh(problem: Problem) -> Problem:
-    """The effects that hold, with where what they leave has structure."""
+    """Return the effects that hold, with where what they leave has structure."""
     problem.progress('weighing')
     problem = accepted(problem)
     for _ in range(2 if problem.comparison.open_level else 0):
@@ -102,7 +102,7 @@ def weigh(problem: Problem) -> Problem:
 
 
 def accepted(problem: Problem) -> Problem:
-    """The joint rule: without the effects that fail it, the weakest first, the rest fitted anew."""
+    """Return the joint rule: without the effects that fail it, the weakest first, the rest fitted anew."""
     while True:
         heldout, fails = [], []
         ws, search_used, fit = problem.comparison, problem.search, problem.fit
@@ -127,7 +127,7 @@ def accepted(problem: Problem) -> Problem:
 
 
 def _in_sds(ws: Comparison, fit: Fit, index: int) -> float:
-    """The largest size of effect ``index``, in its own standard deviations; infinite if none is no number."""
+    """Return the largest size of effect ``index``, in its own standard deviations; infinite if none is no number."""
     effect, sds = fit.effects[index], sd_of(ws, fit, index)
     sizes = [p for p in effect.effect.parameters if p.kind == 'amplitude' and p.name in sds]
     apart = [(abs(effect.values[p.name] - p.off(ws.physics)), sds[p.name]) for p in sizes]
@@ -255,7 +255,7 @@ def where(problem: Problem) -> Problem:
 
 
 def predict(problem: Problem) -> Problem:
-    """The model that predicts best beside the named effects; what it explains beyond them is unknown."""
+    """Return the model that predicts best beside the named effects; what it explains beyond them is unknown."""
     ws, fit, search_used = problem.comparison, problem.fit, problem.search
     little = not ws.open_level and ws.gap(fit.difference) <= UNSAID * ws.floor()
     if little and not problem.unknown and not problem.result.limits:

@@ -27,7 +27,7 @@ def parameters_of(effect: NamedEffect | Alternative) -> dict[str, Any]:
 
 
 def fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
-    """The tree of an effect's parameters; ``sds``: their standard deviations."""
+    """Return the tree of an effect's parameters; ``sds``: their standard deviations."""
     out: dict[str, Any] = {}
     for p in active.effect.parameters:
         value = active.values[p.name]
@@ -39,13 +39,13 @@ def fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
 
 
 def covariance_tree(fit: Fit, effects: Iterable[NamedEffect]) -> dict[str, Any]:
-    """The covariance of all amplitudes that were fitted together."""
+    """Return the covariance of all amplitudes that were fitted together."""
     names, matrix = covariance_of(fit, tuple(effects))
     return {'names': list(names), 'matrix': [[number(v) for v in row] for row in matrix.tolist()]}
 
 
 def effect_tree(e: NamedEffect) -> dict[str, Any]:
-    """An effect of ``effects``."""
+    """Return an effect of ``effects``."""
     return {
         'name': e.active.effect.name,
         'stage': e.active.effect.stage,
@@ -70,7 +70,7 @@ def effect_tree(e: NamedEffect) -> dict[str, Any]:
 
 
 def law_tree(found_law: FoundLaw) -> dict[str, Any]:
-    """The tree of ``law``."""
+    """Return the tree of ``law``."""
     law = found_law.law
     return {
         'stage': law.stage,
@@ -96,7 +96,7 @@ def law_tree(found_law: FoundLaw) -> dict[str, Any]:
 
 
 def size_of(effect: NamedEffect | Alternative) -> str:
-    """The fitted amplitudes with their standard deviations, for a person: ``angle 0.00399 ± 2e-05 rad``."""
+    """Return the fitted amplitudes with their standard deviations, for a person: ``angle 0.00399 ± 2e-05 rad``."""
     out = []
     for p in effect.active.effect.parameters:
         value, sd = effect.active.values[p.name], effect.sd.get(p.name, 0.0)

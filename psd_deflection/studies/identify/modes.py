@@ -58,7 +58,7 @@ Modes = list[tuple[float, float]]
 
 
 def modes_of(samples: FloatArray, rate: float) -> AxisModes:
-    """The modes in ``samples`` (n,), m or rad, NaN if lost, taken ``rate`` times a second."""
+    """Return the modes in ``samples`` (n,), m or rad, NaN if lost, taken ``rate`` times a second."""
     nothing = np.full(len(samples), np.nan)
     if np.isfinite(samples).sum() < 100:
         return AxisModes((), 'none', (), nothing, math.nan)
@@ -115,7 +115,7 @@ class Stretch:
         return residual, np.asarray(terms, dtype=np.float64)
 
     def loud(self, modes: Modes) -> float:
-        """The amplitude of the loudest mode at the start."""
+        """Return the amplitude of the loudest mode at the start."""
         terms = self.solved(modes)[1]
         return max(math.hypot(*terms[2 + 2 * i : 4 + 2 * i]) for i in range(len(modes)))
 
@@ -167,7 +167,7 @@ def fit_modes(stretches: Sequence[Stretch], start: Modes, steps: int = 100) -> R
 
 
 def split_mode(stretches: Sequence[Stretch], modes: Modes) -> RingFit:
-    """The best fit with one more mode close to one of ``modes``."""
+    """Return the best fit with one more mode close to one of ``modes``."""
     starts = [
         [*modes[:i], (f * (1.0 - apart), z), (f * (1.0 + apart), z), *modes[i + 1 :]]
         for i, (f, z) in enumerate(modes)
@@ -178,7 +178,7 @@ def split_mode(stretches: Sequence[Stretch], modes: Modes) -> RingFit:
 
 
 def hints_at_pair(stretches: Sequence[Stretch], fit: RingFit, enough: float) -> bool:
-    """Whether modes to both sides of one of ``fit`` would take ``enough`` off the squares that are left."""
+    """Return whether modes to both sides of one of ``fit`` would take ``enough`` off the squares that are left."""
     for f, z in fit.modes:
         for apart in APART:
             pair = [(f * (1.0 - apart), max(z, 0.01)), (f * (1.0 + apart), max(z, 0.01))]
@@ -352,7 +352,7 @@ def fit_ring_downs(samples: FloatArray, rate: float, start: Modes, stretches: li
 def fit_trimmed(
     samples: FloatArray, rate: float, stretches: list[Stretch], start: Modes
 ) -> tuple[list[Stretch], RingFit]:
-    """The stretches without their bad ends, and the fit to them with as many modes as it needs."""
+    """Return the stretches without their bad ends, and the fit to them with as many modes as it needs."""
     fit = fit_modes(stretches, start)
     for _ in range(TRIMS):
         trimmed = [k for k in (trim(s, samples, rate, fit.modes) for s in stretches) if k is not None]
@@ -399,7 +399,7 @@ def with_right_order(stretches: Sequence[Stretch], fit: RingFit, rate: float) ->
 
 
 def trim(stretch: Stretch, samples: FloatArray, rate: float, modes: Sequence[tuple[float, float]]) -> Stretch | None:
-    """The stretch without the ends that fit worse than its middle: they reach into the blow before or after it.
+    """Return the stretch without the ends that fit worse than its middle: they reach into the blow before or after it.
 
     None if little is left.
     """

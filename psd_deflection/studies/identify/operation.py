@@ -29,7 +29,7 @@ ODDS = 1e-3
 
 
 def mode_in_operation(samples: FloatArray, rate: float, frequency: float) -> Mode | None:
-    """The mode from the spectrum of a link that is driven all the time."""
+    """Return the mode from the spectrum of a link that is driven all the time."""
     from scipy.signal import detrend, periodogram
 
     f, p = periodogram(detrend(samples), rate, detrend=False, window='hann')

@@ -37,7 +37,7 @@ class DrawnModes:
 
 
 def sections(drawn: DrawnModes) -> list[PageSection]:
-    """The page below the sentences."""
+    """Return the page below the sentences."""
     out = [PageSection('Spectra', (_spectra(drawn),))]
     if any(a.stretches for a in drawn.axes):
         out.append(PageSection('Ring-downs', (_ring_downs(drawn),)))

@@ -106,7 +106,7 @@ class Identified(StudyResult):
         return self.problem.opened.sources
 
     def sentences(self) -> list[str]:
-        """One line for each mode, and the shaper."""
+        """Return one line for each mode, and the shaper."""
         out = []
         for i, axis in enumerate(self.axes):
             if not axis.modes:
@@ -125,7 +125,7 @@ class Identified(StudyResult):
         return [first, *self.withheld_sentences()]
 
     def rows(self) -> list[list[str]]:
-        """The modes as a table: axis, frequency, damping ratio, amplitude, what from, and the shaper."""
+        """Return the modes as a table: axis, frequency, damping ratio, amplitude, what from, and the shaper."""
         out = []
         for i, axis in enumerate(self.axes):
             if not axis.modes:
@@ -148,7 +148,7 @@ class Identified(StudyResult):
         )
 
     def shaper_words(self, i: int) -> str:
-        """The recommended shaper of axis ``i``; '' if there is none."""
+        """Return the recommended shaper of axis ``i``; '' if there is none."""
         best = self.shaper_of(i)
         if best is None:
             return ''
@@ -161,7 +161,7 @@ class Identified(StudyResult):
         return [f'Nothing for dynamics.{name}_*: {why}.' for name, why in whys if why is not None]
 
     def lines(self) -> list[str]:
-        """The sentences, and the lines for the rig file."""
+        """Return the sentences, and the lines for the rig file."""
         if not self.values:
             return self.sentences()
         values = [f'    {name}: {value:g}' for name, value in self.values.items()]
@@ -195,7 +195,7 @@ class Identified(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row a mode: Hz and damping ratio with their standard deviations, amplitude in m or rad."""
+        """Return one row a mode: Hz and damping ratio with their standard deviations, amplitude in m or rad."""
         modes = [(AXES[i], mode, UNITS[i], axis.how) for i, axis in enumerate(self.axes) for mode in axis.modes]
 
         def column(name: str, values: list[float], unit: str, words: str) -> Column:
@@ -215,7 +215,7 @@ class Identified(StudyResult):
         )
 
     def sections(self) -> Iterable[PageSection]:
-        """The table of modes, spectra, ring-downs, shapers."""
+        """Return the table of modes, spectra, ring-downs, shapers."""
         from psd_deflection.studies.identify.pictures import DrawnModes, sections
 
         shapers = [self.shaper_of(i) for i in range(len(self.axes))]
@@ -224,7 +224,7 @@ class Identified(StudyResult):
         return [modes, *sections(DrawnModes(self.poses, self.rate, self.problem.marks, self.axes, shapers))]
 
     def rig_yaml(self) -> str:
-        """The user's parameter file with the modes, comments kept; without one what describes the rig."""
+        """Return the user's parameter file with the modes, comments kept; without one what describes the rig."""
         recording, rig, params_file, tell, _ = self.problem.opened
         date = datetime.now(UTC).date().isoformat()
         recorded = named(recording.name, recording.digest)
@@ -236,12 +236,12 @@ class Identified(StudyResult):
         return edited_rig_file(params_file, 'rig.yaml', lambda: described(rig, effects_of_rig(rig)), edit, tell)
 
     def files(self) -> dict[str, str]:
-        """The page, the JSON, and ``rig.yaml`` with the modes in it."""
+        """Return the page, the JSON, and ``rig.yaml`` with the modes in it."""
         return {**super().files(), 'rig.yaml': self.rig_yaml()}
 
 
 def close_modes(modes: Sequence[Mode]) -> list[Mode]:
-    """The loudest mode and those that are close to it; empty if there is none."""
+    """Return the loudest mode and those that are close to it; empty if there is none."""
     return [m for m in modes if abs(m.frequency - modes[0].frequency) < CLOSE * modes[0].frequency]
 
 

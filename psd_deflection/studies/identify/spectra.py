@@ -84,7 +84,7 @@ class ColouredNoise:
 
 
 def coloured_noise(filled: FloatArray, rate: float, peaks: Sequence[float]) -> ColouredNoise:
-    """The noise, from the spectrum of the quieter times above the modes that have their ``peaks`` there, Hz.
+    """Return the noise, from the spectrum of the quieter times above the modes that have their ``peaks`` there, Hz.
 
     A mode falls off faster above its frequency than noise that remembers.
     """
@@ -114,7 +114,7 @@ def coloured_noise(filled: FloatArray, rate: float, peaks: Sequence[float]) -> C
 
 
 def exceeds_noise(filled: FloatArray, rate: float, frequency: float, noise: ColouredNoise) -> bool:
-    """Whether the motion at ``frequency``, Hz, exceeds the ``noise`` there."""
+    """Return whether the motion at ``frequency``, Hz, exceeds the ``noise`` there."""
     f, p = _spectrum(filled, rate)
     floor = noise.density(f[1:], rate) * rate**2 * (2.0 - 2.0 * np.cos(2.0 * np.pi * f[1:] / rate))
     return bool(np.interp(frequency, f, p) > PEAK * np.interp(frequency, f[1:], floor))

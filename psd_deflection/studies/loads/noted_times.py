@@ -238,7 +238,7 @@ def loads_with_times(
 def without_rough_motion(
     rig: Rig, corrected: FloatArray, notes: Sequence[CorrectedNote], rest: FloatArray
 ) -> CorrectedLoads:
-    """The mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
+    """Return the mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
     t: FloatArray = np.arange(len(corrected), dtype=np.float64) / rig.converter.sample_rate_hz
     unused = np.zeros(len(corrected), dtype=bool)
     notes_used = []

@@ -87,7 +87,7 @@ class Plateau:
 def plateaus(
     rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0, *, annotated_only: bool = False
 ) -> list[Plateau]:
-    """The times between changes of ``loads`` (n, 3), also between those that only the motion shows.
+    """Return the times between changes of ``loads`` (n, 3), also between those that only the motion shows.
 
     ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost. ``recording``: its index. ``annotated_only``: only between
     annotated changes.
@@ -144,7 +144,7 @@ class PlateauLoads:
 def implied_loads(
     rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: Sequence[Plateau]
 ) -> PlateauLoads:
-    """The loads that readings ask for: ``difference`` (3P, m), V, measured minus simulated.
+    """Return the loads that readings ask for: ``difference`` (3P, m), V, measured minus simulated.
 
     Of a recording of so many ``samples``, in means of ``size``, of which the share ``count`` (3P, m) is there.
     """
@@ -169,7 +169,7 @@ def implied_loads(
 
 
 def implied_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Plateau]], PlateauLoads]:
-    """The same, of ``volts`` (n, 3P) held against the rig as its file says under ``acting`` loads (n, 3)."""
+    """Return the same, of ``volts`` (n, 3P) held against the rig as its file says under ``acting`` loads (n, 3)."""
     size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
     difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
     there = np.isfinite(difference).astype(np.float64)
@@ -214,7 +214,7 @@ class StandingOut:
 
 
 def outliers(implied: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
-    """The few plateaus with another load than noted; none if it is none or are many.
+    """Return the few plateaus with another load than noted; none if it is none or are many.
 
     ``bent``: share of what is wrong by which the others may seem to be, too. ``largest``: share by which an effect, a
     sign or another unit may change a load that no other is like.
@@ -305,7 +305,7 @@ def deviation_in_tolerances(implied: PlateauLoads, gone: Sequence[int], softer: 
 
 
 def all_free(implied: PlateauLoads, loads: FloatArray) -> bool:
-    """Whether other loads than noted, at most of the times, leave next to nothing of the movement.
+    """Return whether other loads than noted, at most of the times, leave next to nothing of the movement.
 
     ``loads`` (n, 3): as the movement of ``implied`` counts them; corrected ones differ from the annotated.
     """
@@ -358,7 +358,7 @@ def largest_step(annotated: FloatArray) -> float:
 
 
 def closes(implied: PlateauLoads, share: float = CLOSES) -> bool:
-    """Whether other loads, constant between changes, leave next to nothing of the movement."""
+    """Return whether other loads, constant between changes, leave next to nothing of the movement."""
     return _rms(implied.rest) < share * _rms(implied.moved)
 
 
@@ -415,7 +415,7 @@ class WrongNote:
 
 
 def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNote]:
-    """The few loads of a recording that are not what hung, of a rig that is nearly as its file says.
+    """Return the few loads of a recording that are not what hung, of a rig that is nearly as its file says.
 
     ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, at the times at which
     they acted. Effects of the catalogue are no reason: they change all loads in proportion, more or less.
@@ -431,7 +431,7 @@ def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNot
 def wrong_notes_against(
     loads: FloatArray, period: float, asked: Callable[[FloatArray], PlateauLoads], largest: float = ANY
 ) -> list[WrongNote]:
-    """The same of any simulation: ``asked`` holds the recording against that under other loads (n, 3).
+    """Return the same of any simulation: ``asked`` holds the recording against that under other loads (n, 3).
 
     ``largest``: share by which effects may change a load; signs and units are right then.
     """

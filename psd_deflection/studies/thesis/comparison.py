@@ -84,12 +84,12 @@ def thesis_geometry() -> Geometry:
 
 
 def methods() -> tuple[Method, ...]:
-    """The rows of the table: ``VARIANTS``, then every other method that solves the thesis's rig."""
+    """Return the rows of the table: ``VARIANTS``, then every other method that solves the thesis's rig."""
     return (*VARIANTS, *(Method(name, name, {}) for name, why in _other_methods().items() if not why))
 
 
 def refused() -> dict[str, str]:
-    """The methods that cannot solve the thesis's rig, and why."""
+    """Return the methods that cannot solve the thesis's rig, and why."""
     return {name: why for name, why in _other_methods().items() if why}
 
 
@@ -131,14 +131,14 @@ def dots_of(geometry: Geometry, poses: FloatArray) -> FloatArray:
 
 
 def solve(method: Method, geometry: Geometry, dots: FloatArray) -> Solutions:
-    """The answers of ``method`` for ``dots`` (n, 4)."""
+    """Return the answers of ``method`` for ``dots`` (n, 4)."""
     solutions = make_solver(method.name, geometry, **method.options).solve_many(dots, VARIANCES)
     solutions.pose[:, 2] *= method.sign
     return solutions
 
 
 def errors(method: Method, condition: str) -> Errors:
-    """One cell of the table; ``method`` is one of :func:`methods`."""
+    """Return one cell of the table; ``method`` is one of :func:`methods`."""
     return _cell(method.label, condition)
 
 

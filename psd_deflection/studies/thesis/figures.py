@@ -59,7 +59,7 @@ def drawn() -> Iterator[tuple[str, Figure]]:
 
 
 def comparison() -> Figure:
-    """The table of ``thesis compare-methods`` as a picture."""
+    """Return the table of ``thesis compare-methods`` as a picture."""
     figure, axes = plt.subplots(1, 2, figsize=(9.6, 5.0), sharey=True, layout='constrained')
     shown = methods()[::-1]
     rows = np.arange(len(shown))
@@ -82,7 +82,7 @@ def comparison() -> Figure:
 
 
 def iterative() -> Figure:
-    """The PSDs' disagreement against the trial angle, and where each criterion stops."""
+    """Return the PSDs' disagreement against the trial angle, and where each criterion stops."""
     geometry = thesis_geometry()
     pose = np.array([0.5e-3, -1.2e-3, np.radians(0.55), 0.0, 0.0])
     dots = dots_of(geometry, pose[None])[0]
@@ -109,7 +109,7 @@ def iterative() -> Figure:
 
 
 def linear() -> Figure:
-    """The error of linearising, and which channels the weights use."""
+    """Return the error of linearising, and which channels the weights use."""
     geometry = thesis_geometry()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout='constrained')
     theta = np.radians(np.linspace(-3, 3, 121))
@@ -232,7 +232,7 @@ def minimum_tilt() -> Figure:
 
 
 def beam() -> Figure:
-    """The error of a flat method due to the cantilever's tilt, by load and height of the sensors."""
+    """Return the error of a flat method due to the cantilever's tilt, by load and height of the sensors."""
     figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.4), sharey=True, layout='constrained')
     force = np.linspace(2.0, 50.0, 25)
     for ax, height in zip(axes, (0.0, 0.020), strict=True):
@@ -289,7 +289,7 @@ def pose() -> Figure:
 
 
 def base_pair() -> Figure:
-    """The error of section 5.3's method under twist, and its correction by tying the tilts to the deflection."""
+    """Return the error of section 5.3's method under twist, and its correction by tying the tilts to the deflection."""
     nominal = thesis_geometry()
     geometry = Geometry(nominal.centers, nominal.zeros, np.array([-0.585, -0.485]), nominal.link_length, 1.5)
     theta = np.radians(np.linspace(-1, 1, 81))

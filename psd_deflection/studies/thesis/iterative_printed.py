@@ -66,7 +66,7 @@ class IterativePrintedSolver(Solver):
         self._l = tuple(np.asarray(geometry.beams).ravel().tolist())
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
-        """One block, all trials at once. See :class:`Solver`."""
+        """Return one block, all trials at once. See :class:`Solver`."""
         q1x, q1y, q2x, q2y = (c + m for c, m in zip(self._c, dots, strict=True))
         l1x, l1y, l2x, l2y = self._l
         # The translation that each PSD gives at each trial.

@@ -46,7 +46,7 @@ class SpotRun(NamedTuple):
 
 @functools.cache
 def spot_run(force: float, diameter: float) -> SpotRun:
-    """The weight ``force``, N, hung on the sidebar, seen by dots of ``diameter``, m."""
+    """Return the weight ``force``, N, hung on the sidebar, seen by dots of ``diameter``, m."""
     rig = load_rig()
     rest, held = (round(s * rig.converter.sample_rate_hz) for s in (REST_S, HELD_S))
     loads = np.repeat([[0.0, 0.0, 0.0], [LEAN * force, -force, -ARM * force]], [rest, held], axis=0)

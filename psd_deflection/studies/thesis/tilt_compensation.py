@@ -47,7 +47,7 @@ def hats(geometry: Geometry, dots: tuple[float, ...], theta: float) -> FloatArra
 
 
 def tilt_branches(geometry: Geometry, dots: tuple[float, ...], theta: float) -> tuple[TiltBranch, ...]:
-    """All (dX, dY, phi, omega) that give exactly these dots at twist ``theta``: none, or four.
+    """Return all (dX, dY, phi, omega) that give exactly these dots at twist ``theta``: none, or four.
 
     (2.33) to (2.43), corrected:
 

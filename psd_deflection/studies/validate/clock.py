@@ -127,7 +127,7 @@ def biweight_sum(u: FloatArray) -> float:
 def clock_offset(
     motion: Motion, t: FloatArray, poses: FloatArray, *, largest: float = 1.0, exposure: float = 0.0
 ) -> Offset:
-    """The offset of a reference with stamps ``t`` (k,), s, and ``poses`` (k, 3), m, m, rad.
+    """Return the offset of a reference with stamps ``t`` (k,), s, and ``poses`` (k, 3), m, m, rad.
 
     ``largest``: offset that is looked for, s. If the stamps lie outside the motion by more, the clocks count from
     different days, and every offset is looked for at which half of the references lie within the motion.
@@ -219,7 +219,7 @@ def coarse_offsets(motion: Motion, t: FloatArray, poses: FloatArray, largest: fl
 def refined_offset(
     motion: Motion, t: FloatArray, poses: FloatArray, start: float, exposure: float, best: OffsetFit | None
 ) -> OffsetFit | None:
-    """The offset near ``start``, s; None if fewer than 20 references have samples about them.
+    """Return the offset near ``start``, s; None if fewer than 20 references have samples about them.
 
     ``best``: another fit. One that stays far above its chi-square is not finished.
     """
@@ -254,7 +254,7 @@ class UsedReferences:
     rates: FloatArray
 
     def solved(self, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
-        """The step of the offset, s, the fit there, and the weights of the next pass (k, 3)."""
+        """Return the step of the offset, s, the fit there, and the weights of the next pass (k, 3)."""
         k = len(self.t)
         # Of an axis that does not move, the readings are noise and explain nothing.
         moving = [i for i in range(3) if np.ptp(self.motion[:, i]) > 0.0]

@@ -98,7 +98,7 @@ def _seconds(t_ns: IntArray, start_ns: int) -> FloatArray:
 
 
 def _solvers(rig: Rig, beside: Sequence[str]) -> dict[str, Solve]:
-    """The rig's, then those ``beside`` it."""
+    """Return the rig's, then those ``beside`` it."""
     variances = dot_noise_variances(rig) / rig.estimator.block_size
     named = [rig.estimator.solver, *(name for name in beside if name != ALL)]
     out: dict[str, Solve] = {}

@@ -33,7 +33,7 @@ class DrawnAgreement:
 
 
 def sections(drawn: DrawnAgreement, rows: Sequence[Sequence[str]]) -> list[PageSection]:
-    """The page below the sentences; ``rows``: the table of solvers, its head first."""
+    """Return the page below the sentences; ``rows``: the table of solvers, its head first."""
     head, *cells = rows
     shares = (
         '<p class=quiet>Estimate minus reference. The last column is the rms in percent of the largest deflection.</p>'

@@ -85,7 +85,7 @@ class Validated(StudyResult):
         return out
 
     def lines(self) -> list[str]:
-        """The sentences and the table of solvers."""
+        """Return the sentences and the table of solvers."""
         return [*self.sentences(), '', *columns(self.rows(), left=3).splitlines()]
 
     def rows(self) -> list[list[str]]:
@@ -125,13 +125,13 @@ class Validated(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row a reference over ``t`` (s): the ``reference_`` pose, and that of each solver (m, m, rad)."""
+        """Return one row a reference over ``t`` (s): the ``reference_`` pose, and that of each solver (m, m, rad)."""
         parts = [('reference', self.reference), *self.estimates.items()]
         out = [c for name, pose in parts for c in columns_of(pose, [f'{name}_{a}' for a in AXES], UNITS, [name] * 3)]
         return Table(Column('t', self.t, 's', 'by the clock of the samples'), out, {'solver': self.solver})
 
     def sections(self) -> Iterable[PageSection]:
-        """The solvers, over time, agreement."""
+        """Return the solvers, over time, agreement."""
         from psd_deflection.studies.validate.pictures import DrawnAgreement, sections
 
         of = self.solver

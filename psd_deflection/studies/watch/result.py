@@ -43,12 +43,12 @@ class WatchedRun(StudyResult):
         return (alarm.since_ns - self.start_ns) / 1e9
 
     def sentences(self) -> list[str]:
-        """Each alarm with its time; or that there was none, and what was watched."""
+        """Return each alarm with its time; or that there was none, and what was watched."""
         lines = [f'since {self.since_s(a):.1f} s: {a.words}' for a in self.alarms]
         return lines or [f'the rig is its model; watched: {self.watched}']
 
     def tree(self) -> dict[str, Any]:
-        """The alarms: times in s from the first sample, shifts in m (of theta in rad)."""
+        """Return the alarms: times in s from the first sample, shifts in m (of theta in rad)."""
         return {
             'same': not self.alarms,
             'watched': self.watched,
@@ -66,7 +66,7 @@ class WatchedRun(StudyResult):
         }
 
     def sections(self) -> Iterable[PageSection]:
-        """The alarms as a table."""
+        """Return the alarms as a table."""
         rows = [
             (f'{self.since_s(a):.1f}', a.channel, f'{a.shift * 1e6:z.2f} ± {a.sd * 1e6:.2f}', ', '.join(a.also))
             for a in self.alarms

@@ -35,7 +35,7 @@ LOADS, POSE = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta')
 
 
 def sought(psds: int) -> tuple[str, ...]:
-    """The targets that are looked at of so many PSDs. A law on a load does what one on the static pose does."""
+    """Return the targets that are looked at of so many PSDs. A law on a load does what one on the static pose does."""
     sums = (f'sum{n}' for n in range(1, psds + 1))
     return (*(f'static_{n}' for n in POSE), *POSE, *dot_names(psds), *sums)
 
@@ -81,7 +81,7 @@ def _jacobian(pose: FloatArray, beams: FloatArray, model: ForwardModel) -> Float
 
 
 def _unwhiten(rows: FloatArray, ar: FloatArray) -> FloatArray:
-    """The adjoint of whitening, without its scale, of one channel's rows (k, nf)."""
+    """Return the adjoint of whitening, without its scale, of one channel's rows (k, nf)."""
     out = rows.copy()
     for j in range(1, len(ar) + 1):
         out[:, :-j] -= ar[j - 1] * rows[:, j:]
@@ -244,7 +244,7 @@ class Scored:
 
 
 def allowed(target: str, term: LawTerm) -> bool:
-    """Whether the term's variables are known where it acts."""
+    """Return whether the term's variables are known where it acts."""
     return all(v in TARGETS[target].variables for v in term.depends_on)
 
 
@@ -262,7 +262,7 @@ def _through(r: Response, way: int, row: FloatArray) -> FloatArray:
 
 
 def score(responses_of_rig: Sequence[Response], listed: Sequence[LawTerm], targets: Sequence[str] = ()) -> list[Scored]:
-    """Each term on each of ``targets``, by default all, the best first."""
+    """Return each term on each of ``targets``, by default all, the best first."""
     out: list[Scored] = []
     every = responses_of_rig[0].targets
     targets, count, k = targets or every, len(every), responses_of_rig[0].weight.shape[1] // len(every)
@@ -337,7 +337,7 @@ def _averaged(values: FloatArray, blocks: int) -> FloatArray:
 
 
 def with_better_times(responses_of_rig: Sequence[Response], target: str, term: LawTerm) -> LawTerm:
-    """Each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
+    """Return each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
     step = responses_of_rig[0].period
     for reach, pitch in ((0.08, 8.0 * step), (0.08, 8.0 * step), (8.0 * step, step)):
         for k in range(len(term.times)):
@@ -354,7 +354,7 @@ def with_better_times(responses_of_rig: Sequence[Response], target: str, term: L
 
 
 def with_better_level(responses_of_rig: Sequence[Response], s: Scored) -> Scored:
-    """The term with the threshold at which it explains most: no refit moves one at which the form jumps.
+    """Return the term with the threshold at which it explains most: no refit moves one at which the form jumps.
 
     It is the middle between the two values of the variable around it, which are as good; they are its uncertainty.
     """

@@ -92,7 +92,7 @@ class FoundLaw:
         return (self.law, *self.further)
 
     def adopted(self, name: str) -> Law:
-        """All of it as one law of that name."""
+        """Return all of it as one law of that name."""
         return dataclasses.replace(self.law, name=name, further=self.further)
 
     @property
@@ -142,7 +142,7 @@ def term_covariance(fit: Fit) -> FloatArray:
 
 
 def fitted_law(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
-    """The law with the values and standard deviations of effect ``index`` of ``fit``."""
+    """Return the law with the values and standard deviations of effect ``index`` of ``fit``."""
     values = fit.effects[index].values
     sd = {fit.free[j][1]: math.sqrt(max(covariance[j, j], 0.0)) for j in fit.columns_of(index)}
     out = []
@@ -179,7 +179,7 @@ class LawSearch:
         return fit.chi2 + self.penalty * (fit.parameters + more)
 
     def trial(self, laws: Sequence[Law], beside: Sequence[ActiveEffect], iterations: int) -> LawTrial:
-        """The laws refitted in the simulation."""
+        """Return the laws refitted in the simulation."""
         fit = refit(self.ws, [*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)], iterations)
         covariance = term_covariance(fit)
         better = tuple(fitted_law(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
@@ -194,7 +194,7 @@ class LawSearch:
         return LawTrial(better, fit, math.inf if bound else self.cost(better, fit))
 
     def done(self, trial: LawTrial) -> bool:
-        """Whether no more than noise is left, or enough has been tried."""
+        """Return whether no more than noise is left, or enough has been tried."""
         size = float(self.ws.size)
         return trial.fit.chi2 < size + 4.0 * math.sqrt(2.0 * size) or self.ws.simulations > self.last
 
@@ -261,7 +261,7 @@ class LawSearch:
         return trial
 
     def same_elsewhere(self, trial: LawTrial) -> list[LawTrial]:
-        """The first law at the other stages that show alike: a beam for a dot, a load for a static pose."""
+        """Return the first law at the other stages that show alike: a beam for a dot, a load for a static pose."""
         law, further_laws = trial.laws[0], trial.laws[1:]
         moved: list[Law] = []
         if f'beam_{law.acts_on}' in TARGETS:
@@ -280,7 +280,7 @@ class LawSearch:
 
 
 def with_term(laws: Sequence[Law], s: Scored) -> tuple[Law, ...]:
-    """The laws and one more term, in the law on its target if there is one."""
+    """Return the laws and one more term, in the law on its target if there is one."""
     if any(law.acts_on == s.target for law in laws):
         return tuple(
             dataclasses.replace(law, terms=(*law.terms, s.term)) if law.acts_on == s.target else law for law in laws
@@ -289,7 +289,7 @@ def with_term(laws: Sequence[Law], s: Scored) -> tuple[Law, ...]:
 
 
 def subsets_without_a_term(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
-    """Each way to leave out one term."""
+    """Return each way to leave out one term."""
     out = []
     for gone in (t for law in laws for t in law.terms):
         rest = [dataclasses.replace(law, terms=tuple(t for t in law.terms if t is not gone)) for law in laws]
@@ -306,7 +306,7 @@ def find_law(
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> FoundLaw | None:
-    """The law that explains what ``fit`` leaves, or None.
+    """Return the law that explains what ``fit`` leaves, or None.
 
     ``null``: the rig file's own model, tried as well, because effects of the catalogue may stand in for the law.
     ``excess``: chi-square beyond noise that ``fit`` leaves; ``penalty``: of BIC, for each parameter.
@@ -388,7 +388,7 @@ def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
 
 
 def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
-    """The channel and the variable that its noise grows with, or None: variance = a + b v^2."""
+    """Return the channel and the variable that its noise grows with, or None: variance = a + b v^2."""
     known = {name: known_fine(ws, fit.effects, name) for name in variables_of(ws.psds)}
     folds = [ws.folds()[case] for case in ws.case]
     fold = np.concatenate(folds)
@@ -464,7 +464,7 @@ def simplest(best: LawTrial, alternatives: Sequence[LawTrial]) -> LawTrial:
 
 
 def tied_laws(best: LawTrial, alternatives: Sequence[LawTrial]) -> tuple[Law, ...]:
-    """Each other first law, by stage, target and variables, that the recording cannot exclude."""
+    """Return each other first law, by stage, target and variables, that the recording cannot exclude."""
 
     def key(law: Law) -> tuple[str, str, tuple[str, ...]]:
         return law.stage, law.acts_on, law.variables

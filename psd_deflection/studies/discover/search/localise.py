@@ -186,7 +186,7 @@ def dependences(
     known: FloatArray | None,
     explained: FloatArray | None = None,
 ) -> list[Dependence]:
-    """Every channel against every regressor, after projecting out ``known`` (D, p).
+    """Return every channel against every regressor, after projecting out ``known`` (D, p).
 
     ``table``: the name of each channel, and its regressors. What the simulation of ``explained`` (D,) may be wrong by
     does not count.
@@ -289,7 +289,7 @@ def localise(
 
 
 def plain_word(regressor: str) -> str:
-    """The word of result.json for a regressor: a load, its rate, the dot's position, temperature, time."""
+    """Return the word of result.json for a regressor: a load, its rate, the dot's position, temperature, time."""
     for word in ('load_fx', 'load_fy', 'load_tz'):
         if word in regressor:
             return word

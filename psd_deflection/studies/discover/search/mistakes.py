@@ -28,7 +28,7 @@ FARTHEST_ERROR, HALVED = -0.7, -0.5
 
 
 def mistake(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit:
-    """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``.
+    """Return one of the mistakes that touch every channel if it explains nearly all by itself, else ``null``.
 
     Late loads may be taken with one effect, if they explain nearly all together: each would hide the other.
     """
@@ -44,7 +44,7 @@ def mistake(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit:
 
 
 def _nearly_all(trials: Trials, null: Fit, fit: Fit | None) -> bool:
-    """Whether ``fit`` passes and leaves next to nothing."""
+    """Return whether ``fit`` passes and leaves next to nothing."""
     size = trials.workspace.size
     if fit is None or not trials.passes(null, fit, null):
         return False
@@ -65,13 +65,13 @@ def _delays_beside_an_effect(trials: Trials, null: Fit, scores: Sequence[Score])
 
 
 def _effect_beside_delays(trials: Trials, alone: Fit, screen: Screen) -> Fit | None:
-    """The late loads of ``alone`` with the best effect of ``screen`` beside them."""
+    """Return the late loads of ``alone`` with the best effect of ``screen`` beside them."""
     scores = screen.score(alone.residual, unbound(alone))
     return trials.further(alone, [s for s in scores if s.candidate.effect.name not in trials.workspace.first])
 
 
 def _mistaken(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
-    """The starts of :meth:`mistake`."""
+    """Return the starts of :meth:`mistake`."""
     best = max((s.gain for s in scores), default=0.0)
     starts: list[list[ActiveEffect]] = []
     for s in scores:
@@ -98,7 +98,7 @@ def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> lis
 
 
 def frequency(ws: Comparison, beside: Fit, score: Score) -> ActiveEffect:
-    """The best start for another natural frequency: from far away a linear step does not reach it."""
+    """Return the best start for another natural frequency: from far away a linear step does not reach it."""
     start = score.candidate.from_coefficients(score.coefficients)
     starts = OTHER_FREQUENCIES if far(beside) else ()
     return min(

@@ -118,7 +118,7 @@ class _Library:
     always: int
 
     def at(self, x: FloatArray) -> list[ActiveEffect]:
-        """The effects with the numbers ``x``; those that are off are left out."""
+        """Return the effects with the numbers ``x``; those that are off are left out."""
         values = [dict(a.values) for a in self.effects]
         on = [i < self.fixed for i in range(len(values))]
         for place, v in zip(self.places, x.tolist(), strict=True):
@@ -292,7 +292,7 @@ def _flips(
 def _slab(
     f: FloatArray, g: FloatArray, energy: float, size: float, chosen: npt.NDArray[np.intp], rng: np.random.Generator
 ) -> float:
-    """A precision of the sizes, drawn by how likely it is with the ``chosen`` terms."""
+    """Return a precision of the sizes, drawn by how likely it is with the ``chosen`` terms."""
     if not len(chosen):
         return float(rng.choice(SLABS))
     values, vectors = np.linalg.eigh(f[np.ix_(chosen, chosen)])
@@ -361,7 +361,7 @@ def _line(library: _Library, x: FloatArray, named: BoolArray) -> _Line:
 
 
 def predictive_of(ws: Comparison, fit: Fit, screen: Screen, rng: np.random.Generator) -> Predictive | None:
-    """The model that predicts best, with its error on unseen cases; None if there is nothing to choose from."""
+    """Return the model that predicts best, with its error on unseen cases; None if there is nothing to choose from."""
     library, x = _library(ws, fit, screen)
     if len(library.places) == library.always or len(np.unique(ws.folds())) < 2:
         return None
@@ -412,7 +412,7 @@ def _reached(line: _Line, x: FloatArray, sizes: FloatArray) -> tuple[FloatArray,
 
 
 def _as_line(line: _Line, residual: FloatArray) -> FloatArray:
-    """A whitened residual in the scale of the line."""
+    """Return a whitened residual in the scale of the line."""
     ws = line.library.ws
     return residual if ws.open_level else residual * np.sqrt(line.size / max(ws.size, 1))
 

@@ -115,7 +115,7 @@ class CoarseStep(NamedTuple):
 
 
 def coarse_step(observation: Observation) -> CoarseStep | None:
-    """The step on whose multiples all readings lie, or all positions, if it is coarser than the converter's.
+    """Return the step on whose multiples all readings lie, or all positions, if it is coarser than the converter's.
 
     The gaps between neighbouring values are whole multiples of the step. The smallest common step
     is refined until all readings are multiples of it within the converter's own rounding.

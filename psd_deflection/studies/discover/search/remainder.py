@@ -41,7 +41,7 @@ class Remainder:
 
     @classmethod
     def of(cls, function: Smooth) -> Remainder:
-        """A smooth function."""
+        """Return a smooth function."""
         rms = float(np.sqrt(function.before**2 - function.heldout**2))
         return cls(function.variables, rms, function.heldout, function)
 
@@ -79,7 +79,7 @@ def remainder_of(ws: Comparison, fit: Fit, residual: Localisation, table: Table)
 
 
 def _as_vector(ws: Comparison, channel: int, row: FloatArray) -> FloatArray:
-    """The vector (D,) that is ``row``, whitened, on one channel and 0 on the others."""
+    """Return the vector (D,) that is ``row``, whitened, on one channel and 0 on the others."""
     parts = ws.split(np.zeros(sum(m.size for m in ws.measured)))
     at = 0
     for part in parts:

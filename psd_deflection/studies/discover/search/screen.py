@@ -39,7 +39,7 @@ class Score:
 
 
 def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
-    """The best candidate of each variant, those that gain at least ``share`` of the best gain."""
+    """Return the best candidate of each variant, those that gain at least ``share`` of the best gain."""
     out: list[Score] = []
     visited: set[tuple[object, ...]] = set()
     best = max((s.gain for s in scores), default=0.0)
@@ -94,11 +94,11 @@ class Screen:
         self.lengths = np.diag(self.fisher)
 
     def columns_of(self, candidate: Candidate) -> list[FloatArray]:
-        """The whitened signatures (D,) of one of its candidates."""
+        """Return the whitened signatures (D,) of one of its candidates."""
         return list(self.rows[self.slice_of(candidate)].astype(np.float64))
 
     def slice_of(self, candidate: Candidate) -> slice:
-        """The rows of one of its candidates."""
+        """Return the rows of one of its candidates."""
         return next(s for c, s in zip(self.candidates, self.slices, strict=True) if c is candidate)
 
     def _projected(self, residual: FloatArray, known: FloatArray | None) -> tuple[FloatArray, FloatArray]:
@@ -112,7 +112,7 @@ class Screen:
         return g, fisher
 
     def score(self, residual: FloatArray, known: FloatArray | None = None) -> list[Score]:
-        """Every candidate on ``residual`` (D,), the best first; ``known`` (D, p): columns in the model."""
+        """Return every candidate on ``residual`` (D,), the best first; ``known`` (D, p): columns in the model."""
         g, fisher = self._projected(residual, known)
         count = len(self.candidates)
         out = []
@@ -128,7 +128,7 @@ class Screen:
     def pairs(
         self, residual: FloatArray, penalty: float, limit: int, known: FloatArray | None = None
     ) -> list[tuple[Score, Score, float]]:
-        """The ``limit`` best pairs by joint gain minus ``penalty`` per column; greedy steps may miss these."""
+        """Return the ``limit`` best pairs by joint gain minus ``penalty`` per column; greedy steps may miss these."""
         g, fisher = self._projected(residual, known)
         singles = self.score(residual, known)
         # For each effect and its choices the best shape is enough; thousands of pairs take milliseconds.

@@ -134,13 +134,13 @@ class Search(Trials):
         return current
 
     def _much_closer(self, before: Fit, current: Fit) -> bool:
-        """Whether a swap closed most of what was open, and left something."""
+        """Return whether a swap closed most of what was open, and left something."""
         size = self.workspace.size
         excess = current.chi2 - size
         return excess < MOST_CLOSED * (before.chi2 - size) and excess > NEAR * size
 
     def _limits(self, current: Fit) -> tuple[Limit, ...]:
-        """The limit that kept further effects out, with what lies beyond it."""
+        """Return the limit that kept further effects out, with what lies beyond it."""
         little = current.chi2 <= (1.0 + NEAR) * self.workspace.size and not self.workspace.open_level
         if not self._stopped or little:
             return ()
@@ -149,7 +149,7 @@ class Search(Trials):
         return (Limit(self._stopped, beyond(self.workspace, current, terms)),) if terms is not None else ()
 
     def _grown(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
-        """The fit of no effect, and ``current`` with all that passes added."""
+        """Return the fit of no effect, and ``current`` with all that passes added."""
         renoised = bool(current.effects)
         while True:
             self._stopped = ''
@@ -301,7 +301,7 @@ class Search(Trials):
         return p, delta_bic, delta_chi2
 
     def _in_its_place(self, current: Fit, index: int, without: Fit, gain: float) -> list[Score]:
-        """The candidates in place of effect ``index``, the best eight: an exact confounder scores as high as it.
+        """Return the candidates in place of effect ``index``, the best eight: an exact confounder scores as high as it.
 
         If the search was already expensive, the case is complicated: two only.
         """

@@ -115,7 +115,7 @@ def _distances(ws: Comparison, values: Sequence[FloatArray]) -> FloatArray:
 
 
 def _chosen(remains: Remainders) -> tuple[tuple[str, ...], FloatArray]:
-    """The variables that the likelihood asks for, one after the other, and the logarithms of the shapes."""
+    """Return the variables that the likelihood asks for, one after the other, and the logarithms of the shapes."""
     names: tuple[str, ...] = ()
     shapes, likelihood = _shaped(remains, names)
     while True:
@@ -144,7 +144,7 @@ def _shaped(remains: Remainders, names: Sequence[str], start: FloatArray | None 
 
 
 def orthonormal_basis(columns: FloatArray) -> FloatArray:
-    """An orthonormal basis of ``columns``, which may depend on each other."""
+    """Return an orthonormal basis of ``columns``, which may depend on each other."""
     basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
 

@@ -65,7 +65,7 @@ class Tie:
 
 
 def ties(effects: Sequence[NamedEffect]) -> tuple[Tie, ...]:
-    """The tie of the two stiffnesses among ``effects`` and their rivals, if they differ by the same share."""
+    """Return the tie of the two stiffnesses among ``effects`` and their rivals, if they differ by the same share."""
     for first, second in itertools.combinations(sorted(_shares(effects), key=lambda share: share.effect), 2):
         apart = SAME * math.hypot(first.sd, second.sd, EXACT * first.value)
         clear = min(abs(first.value) / first.sd, abs(second.value) / second.sd) > CLEAR

@@ -50,7 +50,7 @@ def slot(effect: Effect, values: Mapping[str, float]) -> tuple[object, ...]:
 
 
 def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
-    """Whether effect ``index`` of ``fit`` has run into a bound: it fits only as something that it is not.
+    """Return whether effect ``index`` of ``fit`` has run into a bound: it fits only as something that it is not.
 
     An amplitude may end at the bound at which it is off, as long as another one is on.
     """
@@ -90,12 +90,12 @@ def counted(fit: Fit) -> str:
 
 
 def far(fit: Fit) -> bool:
-    """Whether ``fit`` leaves so much that small signatures beside it would mislead."""
+    """Return whether ``fit`` leaves so much that small signatures beside it would mislead."""
     return fit.chi2 > FAR * fit.residual.size
 
 
 def unbound(fit: Fit) -> FloatArray:
-    """The Jacobian's columns (D, k) of the parameters that are free to move."""
+    """Return the Jacobian's columns (D, k) of the parameters that are free to move."""
     keep = [j for j, name in enumerate(fit.free) if name not in fit.at_bound]
     return fit.jacobian[:, keep]
 
@@ -170,7 +170,7 @@ class Trials:
         return fit.chi2 + self.penalty * fit.parameters
 
     def screen_beside(self, fit: Fit) -> Screen:
-        """The signatures beside ``fit``."""
+        """Return the signatures beside ``fit``."""
         return self._make_screen(self.workspace, fit)
 
     def best_of(self, starts: Sequence[Sequence[ActiveEffect]], keep: int, iterations: int) -> Fit | None:
@@ -212,7 +212,7 @@ class Trials:
         return best if self.bic(best) < self.bic(fit) - BIC_ACCEPT else fit
 
     def passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
-        """Whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
+        """Return whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
         gain = smaller.chi2 - larger.chi2
         if not self.workspace.open_level:
             explained = null.residual - smaller.residual
@@ -221,7 +221,7 @@ class Trials:
         return gain - more > BIC_ACCEPT
 
     def is_substitute(self, smaller: Fit, larger: Fit) -> bool:
-        """Whether what ``larger`` adds only stands in for something that the library lacks."""
+        """Return whether what ``larger`` adds only stands in for something that the library lacks."""
         size = self.workspace.size
         if not smaller.effects or self.workspace.open_level or larger.chi2 <= (1.0 + NEAR) * size:
             return False
@@ -267,13 +267,13 @@ class Trials:
         return refit(settled, ()), better
 
     def at(self, workspace: Comparison) -> Self:
-        """The same search over another comparison of the same recordings."""
+        """Return the same search over another comparison of the same recordings."""
         out = copy.copy(self)
         out.workspace = workspace
         return out
 
     def may_pass(self, score: Score) -> bool:
-        """Whether one more effect would pass, to first order."""
+        """Return whether one more effect would pass, to first order."""
         return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_ACCEPT
 
     def further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:

@@ -154,7 +154,7 @@ def waterfall_of(ws: Comparison, fit: Fit, gap_before: float, gap_after: float) 
 
 
 def _beyond(gap: float, floor: float) -> float:
-    """The part of a gap that noise does not explain; all of it if nobody knows the noise."""
+    """Return the part of a gap that noise does not explain; all of it if nobody knows the noise."""
     return float(np.sqrt(max(gap**2 - floor**2, 0.0))) if np.isfinite(floor) else gap
 
 

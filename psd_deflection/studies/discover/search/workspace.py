@@ -81,7 +81,7 @@ class Workspace(Comparison):
         self.noise = self._noise_beside(self.base)
 
     def _noise_beside(self, effects: Sequence[ActiveEffect]) -> tuple[NoiseModel, ...]:
-        """The noise, with the link's motion simulated with ``effects``."""
+        """Return the noise, with the link's motion simulated with ``effects``."""
         out, residuals = list[NoiseModel](), list[FloatArray]()
         self.tally.count += 1
         for i, (o, size) in enumerate(zip(self.observations, self.fine, strict=True)):
@@ -157,7 +157,7 @@ class Workspace(Comparison):
         return out
 
     def whiten(self, fine: Sequence[FloatArray]) -> FloatArray:
-        """One vector of all recordings, white and of unit variance if the noise model holds.
+        """Return one vector of all recordings, white and of unit variance if the noise model holds.
 
         What is not known of the loads adds to the noise (errors in variables); a free load adds without bound.
         """
@@ -293,13 +293,13 @@ class Workspace(Comparison):
         return float(np.sqrt(np.mean(blocks**2))) if len(blocks) else 0.0
 
     def gap_per_channel(self, residual: Sequence[FloatArray]) -> FloatArray:
-        """The same for each of x1 y1 x2 y2 ..., (2P,) m."""
+        """Return the same for each of x1 y1 x2 y2 ..., (2P,) m."""
         blocks = np.concatenate(self.block_dots(residual), axis=1)
         there = np.isfinite(blocks)
         return np.asarray(np.sqrt(np.where(there, blocks**2, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)))
 
     def floor(self) -> float:
-        """The gap from noise alone, m."""
+        """Return the gap from noise alone, m."""
         total, count = 0.0, 0
         for w, o, c, s in zip(self.noise, self.observations, self.count, self.fine, strict=True):
             share = fine_means(c[self.rows], o.rig.estimator.block_size // s)

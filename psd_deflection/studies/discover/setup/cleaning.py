@@ -107,7 +107,7 @@ def stuck(volts: FloatArray, period: float, noise: FloatArray, step: float) -> B
 
 
 def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Observation, list[Finding]]:
-    """The recording without what is no measurement, and what was found. ``base``: effects of the rig file."""
+    """Return the recording without what is no measurement, and what was found. ``base``: effects of the rig file."""
     o = observation
     step = o.rig.converter.volts_per_count
     findings = []

@@ -133,7 +133,7 @@ def _factor(name: str, configure: Callable[[Physics, Values], None], stage: Stag
 def mistakes(
     recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int, int, float]], psds: int = 2
 ) -> list[Effect]:
-    """The mistakes of the set-up of a rig of so many ``psds`` that have a size.
+    """Return the mistakes of the set-up of a rig of so many ``psds`` that have a size.
 
     ``delays``: by how much the loads may be noted late, s. ``jumps``: recording, PSD, time, s, of steps that the
     readings seem to have.

@@ -53,7 +53,7 @@ def times(o: Observation, recording: int) -> list[Plateau]:
 
 
 def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Plateau]) -> PlateauLoads:
-    """The loads that ``difference`` (3P, m), V, measured minus simulated, asks for."""
+    """Return the loads that ``difference`` (3P, m), V, measured minus simulated, asks for."""
     o = ws.observations[recording]
     return implied_loads(o.rig, difference, ws.count[recording], len(o.loads), ws.fine[recording], listed)
 
@@ -81,12 +81,12 @@ def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
 
 
 def _unnoted(p: Plateau) -> list[int]:
-    """The samples at which it began and ended, if nothing was noted then."""
+    """Return the samples at which it began and ended, if nothing was noted then."""
     return [*([p.first] if p.unnoted else []), *([p.last] if p.end_unnoted else [])]
 
 
 def in_time(o: Observation, recording: int, note: CorrectedNote) -> list[LoadDirection]:
-    """The time of a ``note`` and, if its load was applied slowly, how long that took."""
+    """Return the time of a ``note`` and, if its load was applied slowly, how long that took."""
     acted = shifted(note, o.loads, o.period)
     none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
     changes = [acted([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
@@ -126,7 +126,7 @@ def ringing_on(o: Observation, recording: int, effects: Sequence[ActiveEffect]) 
 
 
 def unseen(ws: Workspace, direction: Direction) -> bool:
-    """Whether it is the time of a load that was hung in what is left out."""
+    """Return whether it is the time of a load that was hung in what is left out."""
     if not isinstance(direction, LoadDirection) or not isinstance(direction.of, CorrectedNote):
         return False
     o = ws.observations[direction.recording]

@@ -90,7 +90,7 @@ class NoiseModel:
         return np.zeros(len(self.sigma)) if self.slow is None else self.slow.corners
 
     def like(self, other: NoiseModel) -> bool:
-        """Whether a search need not tell it from ``other``."""
+        """Return whether a search need not tell it from ``other``."""
         return (
             self.coloured == other.coloured
             and np.allclose(self.innovation, other.innovation, rtol=0.02)

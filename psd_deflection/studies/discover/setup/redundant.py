@@ -99,7 +99,7 @@ def excess(ws: Workspace, residual: FloatArray) -> tuple[float, float]:
 
 
 def solved(ws: Workspace, difference: Sequence[FloatArray]) -> FloatArray:
-    """The whitened residual (D,) of the poses that the readings say; ``difference``: of the simulated ones."""
+    """Return the whitened residual (D,) of the poses that the readings say; ``difference``: of the simulated ones."""
     moves = [np.zeros((3, d.shape[1])) for d in difference]
     for _ in range(2):
         for i, (o, part) in enumerate(zip(ws.observations, difference, strict=True)):
@@ -111,7 +111,7 @@ def solved(ws: Workspace, difference: Sequence[FloatArray]) -> FloatArray:
 
 
 def _moved(recording: int, count: int, shift: FloatArray) -> ActiveEffect:
-    """The pose of one recording moved ``shift`` (3, n)."""
+    """Return the pose of one recording moved ``shift`` (3, n)."""
 
     def move(chunk: SimulatedSamples, values: Values, state: State) -> None:
         n = min(chunk.pose.shape[1], shift.shape[1])
@@ -125,7 +125,7 @@ def _moved(recording: int, count: int, shift: FloatArray) -> ActiveEffect:
 
 
 def visible(ws: Workspace, columns: Sequence[Sequence[FloatArray]]) -> float:
-    """The least share of its energy that an effect with signatures ``columns`` shows in the fourth reading."""
+    """Return the least share of its energy that an effect with signatures ``columns`` shows in the fourth reading."""
     white = np.array([ws.whiten(c) for c in columns])
     patterns = fourth(ws, white)
     gram = white @ white.T

@@ -55,7 +55,7 @@ def corners_of(parts: Sequence[FloatArray], periods: Sequence[float]) -> FloatAr
 
 
 def _gains(rows: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
-    """The log-likelihood that each of ``CORNERS`` gains over white noise, of one channel (P. Whittle, 1953)."""
+    """Return the log-likelihood that each of ``CORNERS`` gains over white noise, of one channel (P. Whittle, 1953)."""
     gains = np.zeros(len(CORNERS))
     for row, period in zip(rows, periods, strict=True):
         values = np.clip(row, -CLIP, CLIP)
