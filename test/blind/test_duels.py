@@ -102,7 +102,7 @@ def test_of_the_boom_every_subset_of_three_is_asked() -> None:
 
 
 @pytest.mark.skipif(not (DATA / 'silverbox').is_dir(), reason='the data of the Silverbox are not here')
-def test_with_the_sizes_that_were_found_the_silverbox_is_simulated_to_half_a_percent() -> None:
+def test_the_fitted_silverbox_is_simulated_to_half_a_percent() -> None:
     """The search itself takes minutes: python -m blind.duels --only silverbox."""
     plant = Silverbox(DATA / 'silverbox')
     model = {

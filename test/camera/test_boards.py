@@ -164,7 +164,7 @@ def test_a_printed_board_is_read_again(settings: CameraSettings) -> None:
         ('4.5.4', {'CharucoBoard_create': None}),  # Its boards have other axes.
     ],
 )
-def test_an_opencv_without_boards_is_refused_with_a_way_that_ubuntus_pip_takes(
+def test_an_opencv_without_boards_is_rejected_with_the_fix(
     kind: str, version: str, there: dict[str, None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = SimpleNamespace(__version__=version, aruco=SimpleNamespace(DICT_4X4_50=0, **there))

@@ -45,9 +45,7 @@ def with_memory(count: int, wanted: float) -> FloatArray:
         (10_000, -0.155, False),
     ],
 )
-def test_noise_is_what_has_next_to_no_memory_of_few_values_up_to_four_over_the_root_of_their_number(
-    count: int, memory: float, noise: bool
-) -> None:
+def test_noise_correlation_is_below_four_over_root_n(count: int, memory: float, noise: bool) -> None:
     values = with_memory(count, memory)
     loads, measured = measured_along_y(values)
     assert len(measured) == noise
@@ -66,9 +64,7 @@ def test_noise_is_what_has_next_to_no_memory_of_few_values_up_to_four_over_the_r
 
 
 @pytest.mark.parametrize(('changes', 'samples', 'told'), [(49, 400, 0), (50, 400, 1), (99, 5000, 0), (100, 5000, 1)])
-def test_loads_that_change_at_fifty_samples_and_at_a_fiftieth_of_them_were_measured(
-    changes: int, samples: int, told: int
-) -> None:
+def test_loads_that_change_at_a_fiftieth_are_measured(changes: int, samples: int, told: int) -> None:
     loads = np.zeros((samples, 3))
     at = np.arange(changes + 1) * (samples // (changes + 1))
     for first, value in zip(at.tolist(), np.random.default_rng(4).normal(size=changes + 1).tolist(), strict=True):
@@ -88,7 +84,7 @@ def test_a_step_is_a_change_by_more_than_eight_deviations_of_the_noise(times: fl
     assert len(measured_along_y(values)[1]) == parts
 
 
-def test_a_channel_without_noise_has_steps_and_a_billionth_of_a_newton_is_none() -> None:
+def test_a_step_of_1e_9_n_is_none() -> None:
     noise = np.random.default_rng(6).normal(size=600)
     for step, parts in ((0.5, 2), (2e-8, 2), (8.0 * 1e-9, 1), (5e-9, 1)):
         loads = np.zeros((600, 3))

@@ -50,7 +50,7 @@ def test_samples_lost_between_the_steps_change_no_time() -> None:
     assert told(dots) == pytest.approx(LATE, abs=1e-3)
 
 
-def test_notes_that_are_alike_late_since_their_samples_are_lost_are_mended_and_right_ones_stay() -> None:
+def test_equal_delays_after_lost_samples_are_corrected() -> None:
     """Rows of a CSV have the load: after a loss it seems to begin late."""
     dots, after = DOTS.copy(), HUNG.copy()
     for at in range(DWELL, len(HUNG), DWELL):
@@ -62,7 +62,7 @@ def test_notes_that_are_alike_late_since_their_samples_are_lost_are_mended_and_r
     assert correct_loads(RIG, dots, HUNG) is None
 
 
-def test_a_step_among_lost_samples_is_in_their_middle_and_says_how_many_they_are() -> None:
+def test_a_step_among_lost_samples_is_in_their_middle() -> None:
     dots = np.zeros((400, 4))
     dots[200:, 2] = 3.0
     # A quarter of the width is not yet a loss.

@@ -89,9 +89,7 @@ def test_one_time_is_fitted_beside_drift_and_the_ringing_of_before(start: float,
         ((4950.0, 5050.0), (4900, 5100)),
     ],
 )
-def test_a_time_is_fitted_to_a_second_before_and_two_after_without_the_neighbours(
-    between: tuple[float, float], window: tuple[int, int]
-) -> None:
+def test_a_time_is_fitted_without_its_neighbours(between: tuple[float, float], window: tuple[int, int]) -> None:
     looked = Looked(moved_by(5.0, 0.0, 9000))
     step = steps_module.DotStep(5000.0, 1e-4, 4900, 5100)
     steps_module.time_of_step(RIG, cast(FloatArray, looked), step, between, 1e-3)
@@ -121,7 +119,7 @@ def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
     assert found == pytest.approx((1003.0, 0.0), abs=3e-4)
 
 
-def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_it_leaves_less_than_half(
+def test_steps_every_6_ms_and_ramps_below_half_are_fitted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[list[tuple[float, float]], float]] = []
@@ -145,7 +143,7 @@ def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_i
     assert (by, seconds) == (1e-3, 0.05)
 
 
-def test_the_search_begins_with_a_reach_to_either_side_and_ends_after_120_looks() -> None:
+def test_the_time_search_ends_after_120_evaluations() -> None:
     looks: list[tuple[float, float]] = []
 
     def down(x: FloatArray) -> float:
@@ -239,7 +237,7 @@ def test_ringing_is_rough_beyond_three_times_the_noise() -> None:
     assert not noted_times.is_rough(rest, rings, 4)
 
 
-def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_rough() -> None:
+def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     loads, count = np.zeros((6000, 3)), 6000
     quiet = np.repeat(np.random.default_rng(1).normal(size=(300, 4)), 20, axis=0)
     rest = quiet.copy()

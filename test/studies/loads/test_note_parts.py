@@ -43,7 +43,7 @@ def note(noted: float, hung: float, took: float = 0.0, *, rest_only: bool = Fals
         (note(0.0021, 0.0), 'load_time', 0.0021, 0.0021, True),
     ],
 )
-def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_took(
+def test_a_late_note_is_late_by_2_ms_and_the_ramp_time(
     one: CorrectedNote, name: str, value: float, size: float, wrong: bool
 ) -> None:
     assert (one.name, one.value, one.size, one.wrong) == (name, value, size, wrong)
@@ -96,9 +96,7 @@ def test_numbers_up_to_a_thousand_have_the_ending_of_their_last_word() -> None:
         ([0.25, 0.25, 0.0, 0.25], False),
     ],
 )
-def test_delays_are_alike_within_so_much_of_the_middle_one_and_up_to_0_9_seconds(
-    late: list[float], alike: bool
-) -> None:
+def test_equal_delays_are_near_the_median_and_below_0_9_s(late: list[float], alike: bool) -> None:
     assert noted_times.are_alike(np.array(late), 0.125) is alike
 
 
@@ -178,9 +176,7 @@ def test_places_without_a_mean_have_no_step() -> None:
     ('width', 'lost', 'unit'), [(16, 0.3, 1.0), (16, 0.6, 1e-4), (16, 0.7, 1e-4), (16, 0.75, 1.0), (3, 0.4, 1e-4)]
 )
 @pytest.mark.parametrize('seed', range(4))
-def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample(
-    width: int, lost: float, unit: float, seed: int
-) -> None:
+def test_a_step_agrees_with_a_sample_by_sample_account(width: int, lost: float, unit: float, seed: int) -> None:
     dots = unit * stepped(600, {100: 1.0, 110: 0.5, 300: -2.0, 470: 0.3}, 0.01, 3)
     dots[np.random.default_rng(seed).random(600) < lost] = np.nan
     dots[296:304] = np.nan
@@ -253,7 +249,7 @@ def test_notes_and_steps_are_paired_at_the_least_cost_of_all_ways(seed: int) -> 
     assert noted_times.matched_notes(changes, sizes, steps, 0.01) == cheapest(changes, sizes, steps, 0.01)
 
 
-def test_a_note_that_half_of_the_others_show_to_be_on_time_keeps_the_step_at_its_time() -> None:
+def test_a_note_on_time_like_half_of_the_others_stays() -> None:
     # A load of 10 hung 12 s before the third note, which says that all came off: only the second step is at a note.
     sizes = np.array([40.0, 30.0, 40.0])
     steps = as_steps((1000.0, 40.0), (3000.0, 30.0), (3800.0, 35.0), (5000.0, 10.0))
@@ -310,7 +306,7 @@ def test_later_and_slower_shift_what_the_load_changed_by() -> None:
     assert last([4.0, 0.0])[38] == pytest.approx(-(loads[39] - loads[36]) / 2.0, rel=1e-5)
 
 
-def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_are_told() -> None:
+def test_effective_loads_change_at_the_fitted_times() -> None:
     loads = np.zeros((30, 3))
     loads[5:] = (1.0, 0.0, 0.0)
     loads[12:] = (1.0, -2.0, 0.0)

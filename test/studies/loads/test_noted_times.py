@@ -236,7 +236,7 @@ def test_a_load_that_acts_from_the_second_sample_on_is_shifted_whole() -> None:
     assert later([4.0])[2:] == pytest.approx(0.0)
 
 
-def test_a_step_between_two_samples_has_its_time_and_turns_back_before_it_not_behind() -> None:
+def test_a_step_between_two_samples_has_its_time() -> None:
     """Half a sample later than sample 10: the sum over the samples is -1/2, the moment about sample 10 is 1/8."""
     loads = np.where(np.arange(20)[:, None] < 10, 0.0, [[4.0, -8.0, 2.0]])
     later = shifted(CorrectedNote(1, (4.0, -8.0, 2.0), 0.01, 0.01, 0.0), loads, 1e-3)
@@ -250,7 +250,7 @@ def test_a_step_between_two_samples_has_its_time_and_turns_back_before_it_not_be
 
 
 @pytest.mark.statistics
-def test_ramps_beside_a_clamp_that_sticks_are_told_with_the_times_that_the_search_fitted() -> None:
+def test_ramps_beside_a_sticking_clamp_have_the_fitted_times() -> None:
     read = volts(hung(0.8), effects__e__name='clamp_friction', effects__e__axis=3, effects__e__width=2.3e-5)
     found = discover([Observation('x', RIG, read, noted((0.0,) * 6))])
     assert [e.active.label for e in found.effects] == ['clamp_friction (axis 3)']

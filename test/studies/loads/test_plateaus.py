@@ -125,7 +125,7 @@ def test_of_loads_that_follow_each_other_both_are_found() -> None:
     assert [n.where for n in found] == ['load 4', 'load 5']
 
 
-def test_three_that_are_wrong_and_one_that_is_off_by_a_newton_are_found_if_all_others_are_exact() -> None:
+def test_three_wrong_notes_and_one_off_by_1_n_are_reported() -> None:
     found = wrong_notes(RIG, LONG_QUIET, long_as(p5=(40, -80, 20), p4=(60, 0, 0), p6=(0, 0, 0)))
     assert [n.where for n in found] == ['load 4', 'load 5', 'load 6']
     (note,) = wrong_notes(RIG, QUIET, noted_as(4, (29, 0, 0)))
@@ -187,7 +187,7 @@ def asked(off: FloatArray, noted: FloatArray = ROUNDED, acting: FloatArray | Non
     return all_free(found, np.repeat(noted, DWELL, axis=0) if acting is None else acting)
 
 
-def test_loads_are_asked_for_if_what_hung_rounds_to_the_notes_and_not_if_it_is_far_nearer_or_farther() -> None:
+def test_rounded_notes_free_the_loads_exact_ones_do_not() -> None:
     assert asked(OFF)
     # What hung would be noted as another number, or the step is too coarse for so small an error.
     assert not asked(ROUNDED * 0.06)
@@ -213,7 +213,7 @@ def told(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
     return [(p.first, p.last, p.number, p.unnoted) for p in listed]
 
 
-def test_times_of_a_second_or_more_between_changes_are_listed_with_the_number_of_their_note() -> None:
+def test_holds_of_a_second_have_the_number_of_their_note() -> None:
     loads = np.zeros((9000, 3))
     loads[1500:] = (1.0, 0.0, 0.0)
     # A second is enough, a sample less is not, and a ramp ends once.
@@ -239,7 +239,7 @@ def test_times_of_a_second_or_more_between_changes_are_listed_with_the_number_of
     assert Plateau(0, 10, 21, 1, False, np.zeros(3)).of(np.arange(90.0).reshape(30, 3)).tolist() == [45.0, 46.0, 47.0]
 
 
-def test_a_time_that_only_the_motion_shows_has_the_number_of_the_note_before_it() -> None:
+def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
     acting = np.repeat([(0.0, 0.0, 0.0), (0.0, -20.0, 0.0), (0.0, -50.0, 0.0), (0.0, 0.0, 0.0)], 2000, axis=0)
     noted = acting.copy()
     noted[4000:6000] = (0.0, -20.0, 0.0)
@@ -329,7 +329,7 @@ def test_loads_that_are_off_beside_exact_ones_are_wrong_if_five_are_right(
     assert (found.gone, found.softer) == (gone, 0.0)
 
 
-def test_a_detector_at_fault_and_a_movement_that_no_load_makes_are_no_wrong_note() -> None:
+def test_a_faulty_detector_is_no_wrong_note() -> None:
     wrong = {6: (0.0, 1.0, 0.0)}
     # A load of 1 N moves the plate by 10 um: a twentieth of that and 0.2 um are 0.7 um.
     for far, gone in ((6.9e-7, (6,)), (-6.9e-7, (6,)), (7.1e-7, ()), (-7.1e-7, ())):
@@ -356,7 +356,7 @@ def test_a_detector_at_fault_and_a_movement_that_no_load_makes_are_no_wrong_note
         (7, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0)}, ()),
     ],
 )
-def test_beside_loads_that_are_off_by_less_than_the_tolerance_two_may_be_wrong_if_six_are_right(
+def test_two_of_eight_notes_beside_small_errors_are_wrong(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
     twelve = np.vstack((SPREAD, SPREAD[1:5]))
@@ -364,7 +364,7 @@ def test_beside_loads_that_are_off_by_less_than_the_tolerance_two_may_be_wrong_i
     assert plateaus.outliers(seen(more, twelve[:count], everywhere=slightly)).gone == gone
 
 
-def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fits() -> None:
+def test_a_note_beside_effects_is_wrong_only_if_no_other_fits() -> None:
     softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
 
     def left(found: PlateauLoads, without: int) -> float:
@@ -383,7 +383,7 @@ def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fi
     assert plateaus.outliers(found, 0.1).gone == ()
 
 
-def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much() -> None:
+def test_a_wrong_load_is_known_if_the_others_span_it() -> None:
     noted = np.array([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 20.0, 0.0), (3.0, 4.0, 0.24), (3.0, 4.0, 0.26)])
 
     def known(k: list[int], more: tuple[float, float, float] = (0.0, 0.0, 1.0), largest: float = 1e9) -> bool:
@@ -420,7 +420,7 @@ def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> No
     assert not plateaus.all_free(found, loads)
 
 
-def test_loads_are_rounded_if_each_is_off_by_half_a_step_at_most_and_by_a_tenth_on_average() -> None:
+def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
     noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
     loads = np.repeat(noted, DWELL, axis=0)
 
@@ -454,7 +454,7 @@ def test_loads_of_which_none_held_were_not_rounded() -> None:
     assert not plateaus.all_free(found, none)
 
 
-def test_loads_may_be_rounded_if_they_are_in_whole_steps_and_off_by_less_than_one() -> None:
+def test_loads_off_by_less_than_a_step_may_be_rounded() -> None:
     noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
 
     def may_be(*off: tuple[float, float, float], loads: FloatArray = noted) -> bool:
@@ -538,7 +538,7 @@ def test_what_hung_is_what_readings_say_without_what_effects_do(
 
 
 @pytest.mark.parametrize(('hung', 'far'), [(46.6, False), (46.8, True), (33.9, True), (34.1, False)])
-def test_a_load_that_is_off_by_two_newtons_and_a_tenth_is_simulated_as_the_readings_say(hung: float, far: bool) -> None:
+def test_a_load_off_by_2_n_is_simulated_as_the_readings_say(hung: float, far: bool) -> None:
     # 46.67 - 40 is 2 + 4.667; 40 - 34 is 2 + 4, as the other force is 40.
     truth = SPREAD.copy()
     truth[5] = (hung, -40.0, 20.0)
@@ -555,7 +555,7 @@ def test_a_load_that_is_off_by_two_newtons_and_a_tenth_is_simulated_as_the_readi
     assert asked_with[2] == pytest.approx(truth[5] if far else [40.0, -40.0, 20.0])
 
 
-def test_readings_are_held_against_the_simulation_in_fine_means_of_what_is_there(
+def test_readings_are_compared_in_fine_means(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     held: list[tuple[FloatArray, FloatArray, int, int]] = []

@@ -107,7 +107,7 @@ def test_the_time_is_left_out_until_the_link_has_come_to_rest() -> None:
     assert not volts.any()
 
 
-def test_the_top_of_three_powers_is_that_of_a_parabola_through_their_logarithms() -> None:
+def test_a_peak_is_the_vertex_of_a_log_parabola() -> None:
     f = np.array([0.5, 1.0, 1.5, 2.0])
     top = np.exp(-(((f - 1.1) / 0.4) ** 2))
     assert sway.peak_frequency(f, top) == pytest.approx(1.1)
