@@ -96,7 +96,7 @@ def test_the_noise_of_each_channel_is_found() -> None:
     assert noise_of(run_of(lit(20_000, noise)), RIG) == pytest.approx(noise, rel=0.05)
 
 
-def test_a_load_is_at_rest_in_the_second_half_of_its_time_if_that_is_long_enough() -> None:
+def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
     t = seconds(3000)
     loads = np.zeros((3000, 3))
     loads[1000:1500, 0] = 5.0

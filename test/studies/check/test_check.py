@@ -112,7 +112,7 @@ def lines_of(turn: Turn) -> dict[str, object]:
 
 
 @pytest.mark.statistics
-def test_each_of_the_127_wrong_wirings_is_named_from_three_pushes_at_ten_times_the_noise() -> None:
+def test_each_of_127_wrong_wirings_is_named_from_three_pushes() -> None:
     turns = every_turn()
     assert len(turns) == 128
     misnamed = []
@@ -147,7 +147,7 @@ def test_a_right_rig_is_accused_by_none_of_20_seeds() -> None:
     ],
     ids=lambda effects: effects[0]['name'],
 )
-def test_a_rig_that_is_wired_right_is_not_accused_for_what_else_is_wrong_with_it(effects: list[Any]) -> None:
+def test_a_right_wiring_beside_other_mistakes_is_not_accused(effects: list[Any]) -> None:
     loads = pushes(50.0)
     for seed in range(3):
         found = checked(recorded(loads, seed, effects=effects), loads)
@@ -164,7 +164,7 @@ def test_coloured_heavy_and_unequal_noise_accuse_no_wiring(noise: dict[str, Any]
         assert [c.wiring for c in found.wirings] == [Wiring()]
 
 
-def test_a_rig_file_that_knows_its_wiring_is_right_and_the_nominal_one_is_then_wrong() -> None:
+def test_the_nominal_file_of_a_rewired_rig_is_wrong() -> None:
     loads = pushes(10.0)
     for seed, turn in enumerate(every_turn()[1::9]):
         rig = rig_from_values(lines_of(turn))

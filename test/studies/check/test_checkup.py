@@ -186,7 +186,7 @@ def test_a_load_of_the_other_sign_is_told() -> None:
         (-1.05, ''),
     ],
 )
-def test_a_push_that_moves_the_dots_a_tenth_farther_than_the_file_says_is_worth_a_look(size: float, told: str) -> None:
+def test_a_push_a_tenth_too_large_is_noted(size: float, told: str) -> None:
     found = checked([push('fx'), push('fy'), push('tz', size)])
     words = (
         f'+θ: the dots move {told} times what the rig file expects; see its link and amplifier.sensitivity '
@@ -327,7 +327,7 @@ def test_hum_is_worth_a_look_where_it_is_largest() -> None:
         assert checked(levels=of_levels(hum=small)).notes[0].endswith(f'on {name}; look at shielding and ground')
 
 
-def test_drift_is_worth_a_look_beyond_five_micrometres_a_minute_and_five_deviations() -> None:
+def test_drift_beyond_5_um_a_minute_and_5_sd_is_noted() -> None:
     minute = 1e-6 / 60.0
     sd = 2.0**-24
     for drift, deviation, told in (

@@ -308,7 +308,7 @@ def test_a_push_is_let_go_within_a_seventh_of_it(size: float, shaking: float, fr
         assert [text for text in said if text] == ['Let go of the link.']
 
 
-def test_a_push_is_against_the_rests_before_and_after_and_as_sure_as_these_were() -> None:
+def test_a_push_is_relative_to_the_rests_around_it() -> None:
     fed = Fed().rested(MICRO)
     fed.feed(FAR, 30, 20 * MICRO)
     fed.feed((4 * MICRO, 0.0, 0.0, -6 * MICRO), 30)

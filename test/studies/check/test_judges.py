@@ -116,7 +116,7 @@ def test_check_and_discover_name_a_converter_that_is_coarser_than_the_file_says(
         assert steps[0]['fix'] == 'converter.bits: 10 (x1 steps by 19.5 mV, the rig file says 0.305 mV)'
 
 
-def test_a_channel_that_stands_within_a_coarse_step_is_neither_dead_nor_too_quiet() -> None:
+def test_a_channel_within_a_coarse_step_is_not_dead() -> None:
     rng = np.random.default_rng(3)
     volts = rng.normal((0.0, 0.0, 5.0, 0.0, 0.0, 5.0), 0.002, (3000, 6))
     volts[:, [0, 1, 3, 4]] += 0.2 * np.sin(np.arange(3000) / 300.0)[:, None]
@@ -148,7 +148,7 @@ def test_the_noise_of_steps_is_their_size_over_the_root_of_twelve() -> None:
     assert judges.noise_findings(RIG, np.zeros(4)) == ([], {})
 
 
-def test_the_noise_of_one_channel_is_told_with_its_factor_and_both_of_its_psd() -> None:
+def test_noise_of_a_channel_is_reported_with_its_factor() -> None:
     rig = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 2e-3]})
     step = 20.0 / 2**16 / math.sqrt(12.0)
     noise = np.array([2.34567 * math.hypot(1e-3, step), 2e-3, 4e-3, math.hypot(2e-3, step) / 3.21])

@@ -22,14 +22,14 @@ def noisy(n: int, sd: float = 2e-3, seed: int = 1) -> FloatArray:
     return np.array([1.0, 2.0, 5.0, -1.0, 0.5, 4.0]) + np.random.default_rng(seed).normal(0.0, sd, (n, 6))
 
 
-def test_the_noise_that_the_file_says_is_that_of_four_channels_and_of_the_converter() -> None:
+def test_stated_noise_has_four_channels_and_the_converter() -> None:
     assert levels(RIG, noisy(100)).stated == pytest.approx(math.hypot(2e-3, STEP / math.sqrt(12.0)))
     each = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 3e-3]})
     mean = math.sqrt((1.0 + 4.0 + 16.0 + 9.0) / 4.0) * 1e-3
     assert levels(each, noisy(100)).stated == pytest.approx(math.hypot(mean, STEP / math.sqrt(12.0)))
 
 
-def test_noise_is_what_third_differences_have_without_steps_glitches_and_lost_samples() -> None:
+def test_noise_is_that_of_third_differences() -> None:
     volts = noisy(800)
     volts[400:] += 0.3
     volts[::90] -= 0.5
@@ -149,7 +149,7 @@ def test_hum_below_a_quarter_of_the_noise_is_none(noise: float, seen: bool) -> N
 @pytest.mark.parametrize(
     ('n', 'rate', 'seen'), [(1000, 1000.0, True), (999, 1000.0, False), (600, 150.0, True), (600, 149.0, False)]
 )
-def test_hum_is_looked_for_in_a_second_and_at_two_and_a_half_samples_a_period(n: int, rate: float, seen: bool) -> None:
+def test_hum_needs_a_second_and_2_5_samples_a_period(n: int, rate: float, seen: bool) -> None:
     hz, hum = module.mains_hum(waves(n, rate, {50.0: 0.1}), rate, np.full(6, 1e-3))
     assert hz == 50.0
     assert bool(hum[1] > 0.0) is seen

@@ -58,7 +58,7 @@ def test_loads_that_always_came_together_are_one() -> None:
     assert groups(third, about, fourth, per=np.array([[9.0, 1.0, 1.0]])) == [[0, 1], [2]]
 
 
-def test_slopes_and_their_spread_are_those_of_least_squares_and_memory_widens_them() -> None:
+def test_slopes_are_least_squares_and_memory_widens_them() -> None:
     chance = np.random.default_rng(1)
     design = np.column_stack((chance.normal(size=(200, 4)) * 1e-4, np.ones(200), np.arange(200.0) - 99.5))
     # Noise that remembers half of itself, and one that turns around.

@@ -47,7 +47,7 @@ def push(
     )
 
 
-def test_a_pattern_is_of_a_plate_about_its_unloaded_dots_and_unknown_for_psds_at_the_base() -> None:
+def test_a_pattern_is_unknown_for_psds_at_the_base() -> None:
     rig = load_rig(overrides={'psd_1.zero': [0.002, -0.01], 'psd_2.zero': [0.01, 0.004]})
     # x_i = -X + ly θ, y_i = -Y - lx θ, of beams at (0 + 2, 70 - 10) and (-100 + 10, 0 + 4) mm.
     wanted = np.array([[-1, 0, 0.06], [0, -1, -0.002], [-1, 0, 0.004], [0, -1, 0.09]])

@@ -79,7 +79,7 @@ def test_rounded_loads_are_told_one_by_one_and_the_effect_beside_them() -> None:
 
 
 @pytest.mark.statistics
-def test_rounded_loads_are_told_beside_a_beam_that_drifts_by_more_than_they_move_the_plate() -> None:
+def test_rounded_loads_beside_beam_drift_are_reported() -> None:
     drift = {'effects__e__name': 'laser_pointing_drift', 'effects__e__psd': 2}
     rates = {'effects__e__rate_x': 5e-6, 'effects__e__rate_y': -5e-6}
     found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0), **drift, **rates), np.repeat(ROUNDED, DWELL, axis=0))
@@ -167,7 +167,7 @@ def prepared(volts: FloatArray, noted: FloatArray) -> Recorded:
     return compared(recorded)[0]
 
 
-def test_the_fourth_reading_acquits_detectors_whatever_hangs_and_convicts_one_that_is_turned() -> None:
+def test_the_fourth_reading_names_only_a_rotated_detector() -> None:
     soft = read(HELD, link__youngs_modulus=0.9 * RIG.link.youngs_modulus)
     for volts, noted in ((read(HELD), HELD), (read(HELD), 1.3 * HELD), (soft, HELD)):
         fourth = prepared(volts, noted).fourth
@@ -251,7 +251,7 @@ def test_positions_that_step_alone_accuse_no_cable(step: float) -> None:
 
 
 @pytest.mark.statistics
-def test_a_few_milliseconds_late_are_found_beside_a_clamp_that_twists_under_the_only_torque() -> None:
+def test_small_delays_beside_a_twisting_clamp_are_found() -> None:
     """What is found first is a stiffness; beside the delay, which is better, the clamp is looked for again."""
     levels = np.array([(0, 0, 0), (0, -50, 0), (0, -20, 0), (0, -40, 0), (20, -30, 17.55), (-25, -15, 0), (0, -40, 0)])
     acting = np.repeat(np.vstack((levels, np.zeros(3))), DWELL, axis=0).astype(np.float64)
@@ -267,7 +267,7 @@ def test_a_few_milliseconds_late_are_found_beside_a_clamp_that_twists_under_the_
 
 @pytest.mark.statistics
 @pytest.mark.parametrize(('late', 'angle'), [(1, 0.02), (2, 0.02), (5, 0.02), (2, 0.06)])
-def test_a_few_milliseconds_late_are_found_beside_a_detector_that_is_turned_far(late: int, angle: float) -> None:
+def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: float) -> None:
     """Neither leaves next to nothing without the other, and stiffnesses would stand in for the delay."""
     noted = np.vstack((np.zeros((late, 3)), HELD[:-late]))
     found = searched(read(HELD, **{**TURNED, 'effects__e__angle': angle}), noted)
@@ -280,7 +280,7 @@ def test_a_few_milliseconds_late_are_found_beside_a_detector_that_is_turned_far(
 
 
 @pytest.mark.statistics
-def test_a_few_milliseconds_late_are_found_beside_a_second_mode_whose_line_they_hide() -> None:
+def test_small_delays_beside_a_second_mode_are_found() -> None:
     mode = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
     found = searched(
         read(HELD, **{f'effects__e__{k}': v for k, v in mode.items()}), np.vstack((np.zeros((2, 3)), HELD[:-2]))
@@ -332,7 +332,7 @@ def test_a_spot_that_is_clipped_at_the_ends_of_the_swing_alone_is_found() -> Non
     assert found.effects[0].active.values['radius'] == pytest.approx(2e-3, rel=0.02)
 
 
-def test_a_dot_that_is_far_off_for_moments_is_nothing_that_the_fourth_reading_could_see() -> None:
+def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
     """Five values of 1000 sd among 4000 of dots: 5 (36 - 1) / 4000 of what an outlier counts; sums do not count."""
     table = np.zeros((6, 1000))
     comparison = cast(Workspace, SimpleNamespace(count=[np.ones((6, 1000))], split=lambda _: [table]))
@@ -366,7 +366,7 @@ def test_the_only_torque_noted_twice_is_told_with_the_clamp_that_twists() -> Non
     assert found.law is None
 
 
-def test_free_times_are_settled_again_if_an_effect_beside_which_they_were_does_not_hold() -> None:
+def test_free_times_are_settled_again_if_an_effect_fails() -> None:
     noted = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
         noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
@@ -405,7 +405,7 @@ def test_a_link_that_rings_on_through_loads_applied_slowly_has_its_damping() -> 
     assert found.floors < 1.1
 
 
-def test_what_rings_on_is_free_after_what_is_left_out_in_the_modes_that_decay_more_slowly() -> None:
+def test_what_rings_on_is_free_after_excluded_samples() -> None:
     volts = np.zeros((2000, 6))
     volts[500:900] = np.nan
     volts[1990:] = np.nan

@@ -202,7 +202,7 @@ def test_a_step_that_makes_it_worse_is_damped_twenty_times_more() -> None:
 # The screen.
 
 
-def test_a_candidate_counts_from_a_thousandth_of_sigma_on_and_on_its_own_side_only() -> None:
+def test_a_candidate_counts_from_a_thousandth_of_sigma() -> None:
     shown = pictures(A)
     unit = shown[A] / np.linalg.norm(shown[A]) * SIGMA
     plant = Plant(shown, 5.0 * unit)

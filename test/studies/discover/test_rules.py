@@ -348,7 +348,7 @@ def test_an_effect_is_named_from_stated_limits_on(gain: float, penalty: float, l
 @pytest.mark.parametrize(
     ('weaker', 'open_level', 'named'), [(1.0, False, True), (0.1, False, False), (1.0, True, True), (0.1, True, False)]
 )
-def test_an_effect_whose_size_may_be_none_is_not_named_whatever_is_lost_without_it(
+def test_an_effect_whose_size_may_be_zero_is_not_named(
     monkeypatch: pytest.MonkeyPatch, weaker: float, open_level: bool, named: bool
 ) -> None:
     """As if something that is free beside it could take nearly all of its place."""
@@ -384,7 +384,7 @@ def test_what_does_not_hold_on_unseen_load_cases_is_not_named(cases: Sequence[in
     assert bool(fit.effects) == named
 
 
-def test_an_effect_with_an_amplitude_at_a_bound_is_not_named_unless_it_is_off_there() -> None:
+def test_an_amplitude_at_its_bound_is_named_only_if_off_there() -> None:
     shown = pictures(('a', 'x'), ('a', 'y'))
     truth = 5e-3 * shown['a', 'x'] + 1e-3 * shown['a', 'y']
     search = search_of(Plant(shown, truth + noise()))
@@ -420,9 +420,7 @@ def test_a_step_of_the_search_passes_from_the_same_limit_on(gain: float, stays: 
 
 
 @pytest.mark.parametrize(('gain', 'channel', 'stays'), [(480.0, 0, True), (320.0, 0, False), (20.0, 1, True)])
-def test_what_the_simulation_may_be_wrong_by_counts_only_where_it_explains_something(
-    gain: float, channel: int, stays: bool
-) -> None:
+def test_simulation_error_counts_only_where_it_explains(gain: float, channel: int, stays: bool) -> None:
     """Two thousandths of the movement that the first effect explains, on its own channel and in its own band: 400."""
     at = np.arange(FINE)
     shown = {A: np.zeros((6, FINE)), B: np.zeros((6, FINE))}
@@ -516,9 +514,7 @@ def test_a_search_adds_what_passes_and_nothing_else() -> None:
 
 
 @pytest.mark.parametrize(('remains', 'kept'), [(200.0, ['a', 'c']), (420.0, ['a', 'c']), (1000.0, ['c'])])
-def test_what_explains_less_than_what_remains_is_dropped_before_others_are_tried_in_its_place(
-    remains: float, kept: list[str]
-) -> None:
+def test_weak_effects_are_dropped_before_alternatives(remains: float, kept: list[str]) -> None:
     shown = pictures(A, B, ('c', 'x'))
     plant = Plant(shown, without_noise((shown[A], 500.0), (shown['c', 'x'], 4000.0), (shown[B], remains)) + noise())
     found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'c')]
@@ -771,9 +767,7 @@ class Valleys(Plant):
     # It stays if nothing is unknown, if nobody knows the noise, and if much remains.
     [(2e-3, 100.0, False, 40.0), (2e-3, 0.0, False, 52.0), (2e-3, 100.0, True, 52.0), (4e-3, 100.0, False, 52.0)],
 )
-def test_a_fit_in_a_side_valley_is_begun_anew_if_it_leaves_little_that_is_unknown(
-    size: float, excess: float, open_level: bool, found: float
-) -> None:
+def test_a_fit_in_a_side_valley_is_restarted(size: float, excess: float, open_level: bool, found: float) -> None:
     shape = EffectParameter('f', 'Hz', 2.0, 190.0, 0.2, '', kind='shape')
     hums = effect('a', 'x')
     hums = dataclasses.replace(hums, parameters=(*hums.parameters, shape))

@@ -112,7 +112,7 @@ def test_the_nearest_of_two_units_that_are_alike_is_named(factor: float, unit: s
     assert f'it is noted in {unit} instead' in findings[0].fix
 
 
-def test_units_that_are_alike_are_told_apart_where_the_movement_is_not_in_proportion() -> None:
+def test_alike_units_differ_where_movement_is_nonlinear() -> None:
     """50 N at the end of a bar: what moves in proportion to the load is 1 % off, and the units are 2 % apart."""
     loads = np.repeat([(0, 0, 0), (0, -50, -29.25), (0, 0, 0)], 2000, axis=0).astype(np.float64)
     volts = np.asarray(RigSimulator(RIG, 1).step(loads).counts * RIG.converter.volts_per_count, dtype=np.float64)

@@ -84,7 +84,7 @@ def test_what_the_light_does_not_show_is_no_slow_noise_of_the_electronics() -> N
     assert corners_of([quiet], [PERIOD]).max() < 0.3
 
 
-def test_a_channel_that_moves_more_than_the_light_has_no_more_slow_noise_than_it() -> None:
+def test_slow_noise_of_a_channel_is_at_most_that_of_the_light() -> None:
     rows = flicker(6000, PERIOD, 2.0, 1).T
     usual = corners_of([rows], [PERIOD])
     rows[0] += 3.0 * np.sin(np.arange(6000) / 400.0)

@@ -81,7 +81,7 @@ def test_noise_alone_is_no_function(seed: int) -> None:
     assert smooth(Table(seed, 0.0)) is None
 
 
-def test_what_the_library_explains_is_no_function_and_neither_is_what_the_stated_noise_does() -> None:
+def test_library_effects_and_stated_noise_are_no_remainder() -> None:
     assert psd_deflection.discover_in(Table(1, 0.0)).tree()['remainder'] is None
     quiet = Table(1, 1.0)
     quiet.noise = (1.0,)
@@ -105,7 +105,7 @@ def test_a_reading_is_predicted_without_itself() -> None:
     assert float(np.std(left(values))) < 0.3
 
 
-def test_with_the_shapes_of_all_cases_a_reading_is_predicted_as_its_closed_form_says() -> None:
+def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
     """Left out one by one, with size, length and noise given: the residual of reading i is (P y)_i / P_ii, where P is
     the inverse covariance without what the free sizes can do (Dubrule 1983).
     """

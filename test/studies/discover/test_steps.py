@@ -176,7 +176,7 @@ def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_said
         assert left < 0.9 * of
 
 
-def test_beside_many_effects_a_small_share_is_enough_if_the_library_explains_the_rest() -> None:
+def test_a_small_share_counts_beside_many_effects() -> None:
     names = 'abcdefghijkl'
     sizes = [9e5, 3e5, 1e5, 4e4, *[3000.0] * 8]
     shown = pictures(*((n, 'x') for n in names))
@@ -243,7 +243,7 @@ def test_noise_estimated_beside_a_large_effect_hides_no_small_one() -> None:
     assert cast(Rough, search.workspace).estimates >= 2
 
 
-def test_of_two_that_explain_alike_the_better_one_stays_and_the_other_is_its_alternative() -> None:
+def test_the_better_of_two_alike_stays_the_other_is_listed() -> None:
     shown = pictures(A, B)
     shown[B] = shown[A] + 0.3 * across(shown[B], shown[A])
     plant = Plant(shown, without_noise((shown[A], 900.0)) + noise())
