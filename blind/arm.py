@@ -91,7 +91,7 @@ class Arm(Plant):
         return {'current': list(self._current)}
 
     def simulate(self, model: Model) -> list[FloatArray]:
-        """All segments at once, second-order Runge-Kutta with the current held over each sample."""
+        """Return all segments at once, second-order Runge-Kutta with the current held over each sample."""
 
         def of(name: str, parameter: str, default: float) -> float:
             return model[name][parameter] if name in model else default

@@ -78,7 +78,7 @@ class AuxTel(Plant):
         return [np.arange(len(self.azimuth))]
 
     def simulate(self, model: Model) -> list[FloatArray]:
-        """The sum of the terms."""
+        """Return the sum of the terms."""
         out = np.zeros_like(self._seen)
         for name, values in model.items():
             out += values['size'] * self._picture(name)

@@ -124,7 +124,7 @@ class Balls(Plant):
         return {'time': self.times}
 
     def simulate(self, model: Model) -> list[FloatArray]:
-        """All balls at once, with the midpoint rule."""
+        """Return all balls at once, with the midpoint rule."""
 
         def of(name: str, parameter: str) -> float:
             return model[name][parameter] if name in model else 0.0

@@ -66,7 +66,7 @@ class Boom(Plant):
         self.library = tuple(e for e in library if e.name not in without)
 
     def measured(self) -> list[FloatArray]:
-        """The deflection, m, of each reading, length by length."""
+        """Return the deflection, m, of each reading, length by length."""
         return [r[:, 3][None, :] for r in self._rows]
 
     def inputs(self) -> Mapping[str, list[FloatArray]]:

@@ -40,7 +40,7 @@ class Hand:
     """``acted``, ``noted`` (n, 3) N, N, N m. ``wrong``: what is to be told, one by one: its name, what is right."""
 
     acted: Array
-    noted: Array
+    annotated: Array
     temperature: Array
     wrong: tuple[dict[str, Any], ...]
 
@@ -72,7 +72,7 @@ def _held(levels: Array, times: Array, n: int) -> Array:
 
 
 def _moved(kind: str, times: Array, ends: float, rng: np.random.Generator) -> Array:
-    """The times of the notes."""
+    """Return the times of the notes."""
     noted = times.copy()
     edges = np.concatenate(([0.5], times, [ends]))
     which = [int(rng.integers(0, len(times)))] if kind == 'one' else range(len(times))
@@ -88,7 +88,7 @@ def _moved(kind: str, times: Array, ends: float, rng: np.random.Generator) -> Ar
 
 @functools.cache
 def drawn(name: str) -> Hand:
-    """The design of that name, always the same."""
+    """Return the design of that name, always the same."""
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     kind = name.split('-')[1]
     levels = _levels(rng, odd=kind == 'rounded')

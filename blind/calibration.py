@@ -73,8 +73,8 @@ class Score(NamedTuple):
 
     ``z``: by parameter, error over its standard deviation. ``inside``: share of published poses within their 95 %
     ellipsoid; ``axes`` (3,): within 1.96 standard deviations; ``noise_only``: within the ellipsoid of the noise.
-    ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``null_log``: parameters
-    that the Fisher information leaves open and calibrate does not report; ``said``: the reverse. ``moved``: the group
+    ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``unreported``:
+    parameters that the Fisher information leaves open and calibrate does not report; ``said``: the reverse. ``moved``: the group
     that was moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it cannot tell that from.
     """
 
@@ -85,7 +85,7 @@ class Score(NamedTuple):
     before: Array
     after: Array
     gap: tuple[float, float]
-    null_log: list[str]
+    unreported: list[str]
     said: list[str]
     moved: str
     named: str
@@ -99,14 +99,14 @@ def run_of(recorded: misaligned.Recorded) -> CalibrationRun:
 
 
 def darkened(rig: Rig, light: tuple[misaligned.Light, misaligned.Light], rng: np.random.Generator) -> Rig:
-    """The rig file's content after a recording of ten seconds with both lasers off."""
+    """Return the rig file's content after a recording of ten seconds with both lasers off."""
     volts = misaligned.darkness(light, 10.0, rng)
     run = CalibrationRun('dark', np.arange(len(volts)) / generator.RATE, volts, np.zeros(0), np.zeros((0, 3)))
     return replace_values(rig, values_of_levels(dark_levels([run], rig)))
 
 
 def calibrated_rig(rig: Rig, run: CalibrationRun) -> tuple[Rig, Calibration]:
-    """The rig file's content after the calibration, and what was found."""
+    """Return the rig file's content after the calibration, and what was found."""
     found = calibrate([run], rig)
     values, effects = values_of(found, 'today')
     more = flattened({'effects': effects_to_values(effects)}, 'effects') if effects else {}
@@ -173,7 +173,7 @@ def _tolerance(name: str) -> float:
 
 
 def shifted(truth: Mapping[str, float], group: str, rng: np.random.Generator) -> dict[str, float]:
-    """The rig after one group moved by three tolerances, each parameter of it to a side by chance."""
+    """Return the rig after one group moved by three tolerances, each parameter of it to a side by chance."""
     out = dict(truth)
     for name in out:
         if name.startswith(group):
@@ -213,7 +213,7 @@ def score(seed: int, lit: bool = False) -> Score:
     # Told alone, or as the largest part of what moves together.
     told = alone | {max(d.parts, key=lambda n: abs(d.parts[n])) for d in found.undetermined}
     every = {n for d in found.undetermined for n in d.parts}
-    null_log = [n for n, s in own.items() if s > OPEN + BORDER and n not in every]
+    unreported = [n for n, s in own.items() if s > OPEN + BORDER and n not in every]
     said = [n for n in told & alone if own.get(n, 1.0) < OPEN - BORDER]
     group = GROUPS[seed // 2 % len(GROUPS)] if seed % 2 else ''
     again = misaligned.record(
@@ -229,10 +229,10 @@ def score(seed: int, lit: bool = False) -> Score:
         np.sqrt(np.mean(error_0**2, axis=0)),
         np.sqrt(np.mean(error**2, axis=0)),
         (found.gap.heldout_before, found.gap.heldout_after),
-        null_log,
+        unreported,
         said,
         group,
-        '' if checked.holds else checked.groups[0].group,
+        '' if checked.unchanged else checked.groups[0].group,
         checked.like,
     )
 
@@ -280,7 +280,7 @@ class Certified(NamedTuple):
 
 
 def certified(seed: int) -> Certified:
-    """One rig: calibrated by a reference whose scale is wrong, certified, and measured after it has drifted."""
+    """Return one rig: calibrated by a reference whose scale is wrong, certified, and measured after it has drifted."""
     rng = np.random.default_rng([22, seed])
     truth = misaligned.draw(rng)
     # Half as long as the others: U is to hold of a short calibration, too.
@@ -325,7 +325,7 @@ def table_of_errors(scale: float, errors: Sequence[Mapping[str, float]]) -> Iter
 
 
 def later_motion(rng: np.random.Generator) -> Array:
-    """The motion of the recording that --check gets."""
+    """Return the motion of the recording that --check gets."""
     return misaligned.poses(misaligned.pushes(rng, 12, SECONDS))
 
 
@@ -335,7 +335,7 @@ class Summary(NamedTuple):
     parameters: float
     poses: float
     worse: int
-    null_log: int
+    unreported: int
     said: int
     named: float
     alarms: float
@@ -354,7 +354,7 @@ def summary(scores: Sequence[Score]) -> Summary:
             bool(s.gap[1] > s.gap[0] or np.linalg.norm(s.after * length) > np.linalg.norm(s.before * length))
             for s in scores
         ),
-        sum(len(s.null_log) for s in scores),
+        sum(len(s.unreported) for s in scores),
         sum(len(s.said) for s in scores),
         float(np.mean([s.named == s.moved for s in moved])) if moved else 1.0,
         float(np.mean([bool(s.named) for s in still])) if still else 0.0,
@@ -380,7 +380,7 @@ def table(scores: Sequence[Score]) -> Iterator[str]:
     yield ''
     yield f'- rigs that came out worse: {total.worse} of {len(scores)}'
     every = len(scores) * len(scores[0].z)
-    yield f'- parameters that the Fisher information leaves open and nothing reports: {total.null_log} of {every}'
+    yield f'- parameters that the Fisher information leaves open and nothing reports: {total.unreported} of {every}'
     yield f'- parameters reported as open that it does not leave open: {total.said}'
     moved = [s for s in scores if s.moved]
     like = sum(s.moved in (s.named, *s.like) for s in moved) / max(len(moved), 1)
@@ -408,9 +408,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     scores = list(over(partial(score, lit=args.light), range(args.rigs), args.jobs, 'rigs'))
     print('\n'.join(table(scores)))
     for number, s in enumerate(scores):
-        if s.moved != s.named or s.null_log or s.said:
+        if s.moved != s.named or s.unreported or s.said:
             told = f'moved {s.moved or "nothing"}, named {s.named or "nothing"} {s.like}'
-            print(f'rig {number}: {told}; {s.null_log} {s.said}')
+            print(f'rig {number}: {told}; {s.unreported} {s.said}')
     return 0
 
 

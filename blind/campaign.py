@@ -18,7 +18,7 @@ R = TypeVar('R')
 
 
 def options(about: str | None, jobs: int | None = None) -> argparse.ArgumentParser:
-    """The options of a campaign, whose help is ``about``; with --jobs, of ``jobs`` by default."""
+    """Return the options of a campaign, whose help is ``about``; with --jobs, of ``jobs`` by default."""
     parser = argparse.ArgumentParser(description=about, formatter_class=argparse.RawDescriptionHelpFormatter)
     if jobs is not None:
         parser.add_argument('--jobs', type=int, default=jobs, help='processes at once')
@@ -46,7 +46,7 @@ def over(work: Callable[[C], R], cases: Sequence[C], jobs: int = 1, words: str |
 
 
 def bound_line(met: bool, words: str) -> str:
-    """A line that says whether one thing that is wanted is met."""
+    """Return a line that says whether one thing that is wanted is met."""
     return f'{"ok  " if met else "MISS"} {words}'
 
 

@@ -52,7 +52,7 @@ def dots(poses: Array) -> Array:
 
 
 @dataclass
-class Seen:
+class ClockRecording:
     """``t`` and ``dots`` of the samples; ``stamps``, s, and ``poses`` of a reference; ``offset`` that it is behind."""
 
     t: Array
@@ -65,14 +65,14 @@ class Seen:
 REFERENCE_SD = np.array([10e-6, 10e-6, 3e-4])
 
 
-def seen(
+def simulated(
     seed: int,
     *,
     seconds: float = 6.0,
     rate: float = 30.0,
     exposure: float = 0.008,
     steps: tuple[float, ...] = (1.0, 3.7),
-) -> Seen:
+) -> ClockRecording:
     """Samples at 1 kHz with 2 µm of noise, and a camera at ``rate`` a second that takes means over ``exposure``, s."""
     rng = np.random.default_rng(seed)
     t: Array = np.arange(int(1000 * seconds)) * np.float64(1e-3)
@@ -80,7 +80,7 @@ def seen(
     middles = np.arange(0.0, seconds, 1.0 / rate) + float(rng.uniform(0.0, 1.0 / rate))
     within = np.linspace(-0.5, 0.5, 41) * exposure
     poses = np.mean([truth(middles + u, steps) for u in within], axis=0)
-    return Seen(
+    return ClockRecording(
         t,
         dots(truth(t, steps)) + rng.normal(0.0, 2e-6, (len(t), 4)),
         middles - offset,
@@ -95,7 +95,7 @@ VARIANCES = dot_noise_variances(RIG) / RIG.estimator.block_size
 
 
 def motion_of(t: Array, readings: Array) -> Motion:
-    """The motion as the default solver sees it."""
+    """Return the motion as the default solver sees it."""
     return Motion(t, readings, 1e-3, lambda d: SOLVER.solve_many(d, VARIANCES).pose)
 
 
@@ -109,15 +109,15 @@ class Score:
 
 
 def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
-    """One run for each seed of ``runs``."""
+    """Return one run for each seed of ``runs``."""
     score = Score([])
     for seed in runs:
-        run = seen(seed, seconds=4.0, steps=(1.0, 2.7), exposure=exposure)
+        run = simulated(seed, seconds=4.0, steps=(1.0, 2.7), exposure=exposure)
         found: Offset = clock_offset(motion_of(run.t, run.dots), run.stamps, run.poses, exposure=exposure)
         low, high = found.interval
         score.errors.append(found.value - run.offset)
         score.inside += low <= run.offset <= high
-        score.told += found.told
+        score.told += found.determined
     return score
 
 

@@ -111,7 +111,7 @@ def inside(error: Array, covariance: Array) -> Inside:
 
 
 def rig(row: Row, **overrides: object) -> Rig:
-    """The nominal rig with that converter; its noise stays 2 mV, white, unless the row's is stated."""
+    """Return the nominal rig with that converter; its noise stays 2 mV, white, unless the row's is stated."""
     values: dict[str, object] = {'solver': 'exact', 'solvers': ['exact'], 'converter.bits': min(row.bits, 16)}
     for i, (shift, place) in enumerate(zip(SHIFTS, generator.PLACES, strict=True), start=1):
         values[f'psd_{i}.center'] = [p + s for p, s in zip(place, shift, strict=True)]
@@ -172,7 +172,7 @@ def volts_of(row: Row, clean: Array, seed: int) -> Array:
 def estimates(
     pipeline: Pipeline, volts: Array, here: npt.NDArray[np.bool_], *, zero_at: int = 0
 ) -> list[DeflectionEstimate]:
-    """The primary estimates of samples (n, 6) V of which ``here`` (n,) arrive."""
+    """Return the primary estimates of samples (n, 6) V of which ``here`` (n,) arrive."""
     seq = np.flatnonzero(here)
     cut = int(np.searchsorted(seq, zero_at * SIZE))
     out: list[DeflectionEstimate] = []
@@ -184,7 +184,7 @@ def estimates(
 
 
 def score(row: Row, loss: str, *, rest_s: int = 100, steps: int = 16, seed: int = 1, **overrides: object) -> Scored:
-    """One cell of the table."""
+    """Return one cell of the table."""
     clean, truth = motion(rest_s, steps)
     share, burst = LOSSES[loss]
     here = generator.present(len(clean), seed + 1000, share, burst)
@@ -314,7 +314,7 @@ def false_alarms(seeds: int, rows: int | None = None) -> int:
 
 
 def coarse(poses: int = 150, seed: int = 1, *, told: bool = True, **overrides: object) -> Inside:
-    """A 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses.
+    """Return a 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses.
 
     ``told``: the rig file says so, not 16 bit.
     """

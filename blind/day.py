@@ -40,7 +40,7 @@ HELLO = {'serial': 'BLIND-1', 'firmware': 'day', 'sample_rate_hz': RATE, 'volts_
 
 
 def frame(kind: int, body: bytes) -> bytes:
-    """One frame of the contract."""
+    """Return one frame of the contract."""
     plain = bytes([kind]) + body
     return bytes(cobs.encode(plain + struct.pack('<I', zlib.crc32(plain)))) + b'\0'
 
@@ -121,7 +121,7 @@ def command(*words: str) -> str:
 
 
 def recorded(turn: float, seed: int, folder: Path) -> tuple[Path, list[tuple[float, float]]]:
-    """The recording of the day below ``folder``, and how late each load was noted, s, at least and at most."""
+    """Return the recording of the day below ``folder``, and how late each load was noted, s, at least and at most."""
     counts, times = measured(turn, seed)
     late = np.random.default_rng(seed).uniform(1.0, 5.0, len(times)).round(1).tolist()
     device = Device(counts)
@@ -171,7 +171,7 @@ def judged(out: Path, turn: float, late: list[tuple[float, float]]) -> list[str]
 
 
 def main() -> int:
-    """The day, and what was said."""
+    """Return the day, and what was said."""
     parser = options(__doc__)
     parser.add_argument('--turn', type=float, default=0.02, help='of the first detector, rad (default: 0.02)')
     parser.add_argument('--seed', type=int, default=1)

@@ -87,14 +87,14 @@ def worded(value: float) -> str:
     return f'{value:.3g}'
 
 
-def said(found: PlantDiscovery) -> str:
-    """The effects with their sizes, and whether something is unknown."""
+def answer_words(found: PlantDiscovery) -> str:
+    """Return the effects with their sizes, and whether something is unknown."""
     words = [f'`{e.active.effect.name}` {size_of(e)}' for e in found.effects]
     return '; '.join([*words, *(['the rest is called unknown'] if found.unknown else [])]) or 'nothing is missing'
 
 
 def model_of(found: PlantDiscovery) -> Model:
-    """The effects and the nuisance that were found."""
+    """Return the effects and the nuisance that were found."""
     return {
         a.effect.name: dict(a.values) for a in (*(e.active for e in found.effects), *(a for a, _ in found.nuisance))
     }
@@ -125,11 +125,11 @@ def auxtel(folder: Path, progress: Progress) -> Answer:
         _subset_row(sizes, sky, best_subset(plant, is_linear=True), chosen),
     )
     words = '' if function is None else f'; a smooth function of {" and ".join(function.variables)}'
-    return Answer(said(found) + words, figures)
+    return Answer(answer_words(found) + words, figures)
 
 
 def silverbox(folder: Path, progress: Progress) -> Answer:
-    """The official tests, each simulated in one piece from its first state."""
+    """Return the official tests, each simulated in one piece from its first state."""
     plant = Silverbox(folder / 'silverbox')
     found = discover_in(plant, progress=progress)
     ours = tests_of(plant, lambda span: plant.run(model_of(found), np.array([span[0]]), span[1] - span[0])[:, 0])
@@ -155,7 +155,7 @@ def silverbox(folder: Path, progress: Progress) -> Answer:
         for name in TESTS
         if name != 'multisine'
     ]
-    return Answer(said(found), figures)
+    return Answer(answer_words(found), figures)
 
 
 def tests_of(plant: Silverbox, simulated: Callable[[tuple[int, int]], FloatArray]) -> dict[str, tuple[float, float]]:
@@ -170,7 +170,7 @@ def tests_of(plant: Silverbox, simulated: Callable[[tuple[int, int]], FloatArray
 def _asked(
     plant: Silverbox, peer: Callable[[Silverbox], tuple[str, Answers]]
 ) -> str | tuple[str, dict[str, tuple[float, float]]]:
-    """The peer's name and figures, or why there are none."""
+    """Return the peer's name and figures, or why there are none."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter('ignore')
@@ -197,7 +197,7 @@ def emps(folder: Path, progress: Progress) -> Answer:
         lacking = Emps(('coulomb_friction', 'force_offset'), folder / 'emps', record=record, segment=EMPS_S)
         ours = 1e3 * _apart(lacking, model_of(found))
         figures.append(Figure(measure, 'published terms, simulated here', 1e3 * _apart(theirs, {}), ours))
-    return Answer(said(found), figures)
+    return Answer(answer_words(found), figures)
 
 
 def _apart(plant: Emps, model: Model) -> float:
@@ -218,7 +218,7 @@ def boom(folder: Path, progress: Progress) -> Answer:
         Figure(measure, 'their nominal model with their EI, simulated here', published, ours),
         _subset_row(f'{measure}; the peer chooses its terms with all lengths', 1e3, best_subset(plant), ours),
     )
-    return Answer(said(found), figures)
+    return Answer(answer_words(found), figures)
 
 
 def balls(folder: Path, progress: Progress) -> Answer:
@@ -245,7 +245,7 @@ def balls(folder: Path, progress: Progress) -> Answer:
     out.append(
         _subset_row('first drop, each ball left out, rms; m', 1.0, subset, found.gap_heldout_after),
     )
-    return Answer(said(found), out)
+    return Answer(answer_words(found), out)
 
 
 DUELS: Mapping[str, Duel] = {
@@ -303,19 +303,19 @@ FIGURES = 'duel | by the measure | peer | its figure | ours | better'
 
 
 def line(*cells: str) -> str:
-    """A row of a table."""
+    """Return a row of a table."""
     return '| ' + ' | '.join(c.replace('|', '/') for c in cells) + ' |'
 
 
 def checked(path: Path, sha256: str) -> str:
-    """The first digits of the file's SHA-256, and whether it is the one that is known."""
+    """Return the first digits of the file's SHA-256, and whether it is the one that is known."""
     is_read = hashlib.sha256(path.read_bytes()).hexdigest()
     words = 'as known' if is_read == sha256 else 'NOT the one that is known' if sha256 else 'none is known'
     return f'`{is_read[:12]}`, {words}'
 
 
 def rows(name: str, duel: Duel, folder: Path, progress: Progress) -> tuple[str, list[str]]:
-    """The row of the first table, and those of the second."""
+    """Return the row of the first table, and those of the second."""
     path = folder / duel.file
     if not path.is_file():
         why = f'not run: {duel.file} is not there'
@@ -330,7 +330,7 @@ def rows(name: str, duel: Duel, folder: Path, progress: Progress) -> tuple[str, 
 
 
 def figure_row(name: str, figure: Figure) -> str:
-    """A row of the second table."""
+    """Return a row of the second table."""
     theirs = figure.theirs if isinstance(figure.theirs, str) else worded(figure.theirs)
     ours = '' if math.isnan(figure.ours) else worded(figure.ours)
     return line(name, figure.measure, figure.peer, theirs, ours, figure.better())

@@ -104,7 +104,7 @@ class Emps(Plant):
         return {'voltage': list(self._voltage[:, ::KEPT])}
 
     def simulate(self, model: Model) -> list[FloatArray]:
-        """All segments at once, semi-implicit Euler at the sample rate."""
+        """Return all segments at once, semi-implicit Euler at the sample rate."""
 
         def of(name: str, parameter: str) -> float:
             return model[name][parameter] if name in model else 0.0

@@ -38,12 +38,14 @@ FOLDERS = {'boom': 'boom', 'emps': 'emps', 'arm': 'two_link_arm', 'auxtel': 'aux
 
 
 def lines(found: PlantDiscovery) -> list[str]:
-    """The answer in words."""
+    """Return the answer in words."""
     out = [found.sentence]
     for e in found.effects:
         unseen = f'unseen cases {e.heldout.gain:+.1f} ± {e.heldout.error:.1f}'
         out.append(f'  {e.active.label} ({size_of(e)}): BIC better by {e.delta_bic:.1f}, {unseen}')
-        out += [f'    or {r.active.label} ({size_of(r)}), BIC worse by {r.delta_bic:.1f}' for r in e.rivals]
+        out += [
+            f'    or {r.active.label} ({size_of(r)}), BIC worse by {r.delta_bic:.1f}' for r in e.fitted_alternatives
+        ]
     out += [f'  beside it {a.label}: {dict(a.values)} ± {dict(sd)}' for a, sd in found.nuisance]
     for name, (before, after) in found.per_channel.items():
         out.append(f'  {name}: {before:.4g} -> {after:.4g}, on unseen cases {found.heldout_per_channel[name]:.4g}')

@@ -39,12 +39,12 @@ SIGMA = 2e-3
 
 
 def find(effects: Sequence[Spec], name: str) -> list[Spec]:
-    """All effects of that name."""
+    """Return all effects of that name."""
     return [e for e in effects if e['name'] == name]
 
 
 def _rk4(a: Array, b: Array) -> tuple[Array, Array]:
-    """One step of classical Runge-Kutta for y' = a y + b u with u held: y <- p y + q u."""
+    """Return one step of classical Runge-Kutta for y' = a y + b u with u held: y <- p y + q u."""
     n = len(a)
     ha = STEP * a
     p = np.eye(n) + ha @ (np.eye(n) + ha / 2.0 @ (np.eye(n) + ha / 3.0 @ (np.eye(n) + ha / 4.0)))

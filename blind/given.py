@@ -41,7 +41,7 @@ def written(seen: Observation, stem: Path) -> None:
 
 
 def given(job: tuple[Case, str, str]) -> str:
-    """One case, from its sealed truth, into a folder of its own; its key."""
+    """Return one case, from its sealed truth, into a folder of its own; its key."""
     case, sealed, folder = job
     out = Path(folder) / case.key
     out.mkdir(parents=True, exist_ok=True)

@@ -59,7 +59,7 @@ KIND_OF = {
 
 
 def draw(seed: int, stage: str, form: str) -> dict[str, Any]:
-    """A law without its size: where it acts, on what it depends, its shapes."""
+    """Return a law without its size: where it acts, on what it depends, its shapes."""
     rng = np.random.default_rng((seed, len(stage), len(form)))
     where = str(rng.choice(LOADS if stage in ('load', 'link') else DOTS))
     if stage in ('load', 'link'):
@@ -118,7 +118,7 @@ def _lag(u: Array, tau: float, step: float) -> Array:
 
 
 def _mode(u: Array, frequency: float, step: float) -> Array:
-    """A resonance of damping ratio 0.02, by small steps of a rotation that fades."""
+    """Return a resonance of damping ratio 0.02, by small steps of a rotation that fades."""
     w, zeta = 2.0 * math.pi * frequency, 0.02
     turn = np.exp(step * (-zeta * w + 1j * w * math.sqrt(1.0 - zeta**2)))
     out = np.empty(len(u))

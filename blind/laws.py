@@ -65,17 +65,17 @@ def _seeds(number: int) -> Iterator[str]:
 
 
 def _shows(law: dict[str, Any]) -> bool:
-    """Whether the law acts in the experiment at all: a threshold may lie beyond all loads."""
+    """Return whether the law acts in the experiment at all: a threshold may lie beyond all loads."""
     return law['form'] == 'jitter' or gap_of(designs('one'), {**law, 'size': _small(law)}) > NOTHING
 
 
 def _small(law: dict[str, Any]) -> float:
-    """A size at which the readings answer in proportion."""
+    """Return a size at which the readings answer in proportion."""
     return {'law_load': 1.0, 'law_link': 1e-5}.get(str(law['name']), 1e-6)
 
 
 def sized(law: dict[str, Any]) -> dict[str, Any]:
-    """The law with the size that gives its gap: the readings answer to it nearly in proportion."""
+    """Return the law with the size that gives its gap: the readings answer to it nearly in proportion."""
     design = designs('one')
     if law['form'] == 'jitter':
         # The noise of the channel, at full deflection, is 1.5 to 4 times what it is at rest.
@@ -87,7 +87,7 @@ def sized(law: dict[str, Any]) -> dict[str, Any]:
 
 
 def observe(law: dict[str, Any] | None, seed: int) -> list[Observation]:
-    """The recording with the law, or one in which nothing is missing."""
+    """Return the recording with the law, or one in which nothing is missing."""
     (g,) = designs('one')
     volts = g.record([] if law is None else [law], 'white', seed)
     return [Observation('recording', load_rig(), volts, g.loads, g.temperature)]
@@ -108,10 +108,10 @@ def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
         return {**row, 'alarm': said is not None}
     truth = law_forms.truth_of(law)
     listed = [] if said is None else [said, *said['equivalent']]
-    if _told_as_jumps(law, got):
+    if _reported_as_jumps(law, got):
         # Of a PSD that jumps, a beam that jumps and a voltage that jumps no reading tells one from the other.
         listed = [{'stage': truth['stage'], 'variables': ['time']}]
-    elif _told_as_note(law, got):
+    elif _reported_as_note(law, got):
         listed = [truth]
     floor = got['gap']['floor']
     return {
@@ -123,21 +123,21 @@ def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
         'variables': any(sorted(e['variables']) == truth['variables'] for e in listed),
         'variables_alone': said is not None and sorted(said['variables']) == truth['variables'],
         'kind': said is not None and said['kind'] == truth['kind'],
-        'jumps': _told_as_jumps(law, got),
-        'note': _told_as_note(law, got),
+        'jumps': _reported_as_jumps(law, got),
+        'note': _reported_as_note(law, got),
         'set': len(listed),
         'floors': (got['gap']['heldout_after'] if said is None else said['heldout_after']) / floor,
     }
 
 
-def _told_as_jumps(law: dict[str, Any], got: dict[str, Any]) -> bool:
-    """Whether the check of the recording names each time of a dot's law, as a jump of its PSD."""
+def _reported_as_jumps(law: dict[str, Any], got: dict[str, Any]) -> bool:
+    """Return whether the check of the recording names each time of a dot's law, as a jump of its PSD."""
     said = sorted(f['value'] for f in got['setup'] if f['name'] == 'jump' and f['where'] == f'psd_{law["where"][-1]}')
     jumps = law['form'] == 'events' and law['where'] in law_forms.DOTS and len(said) == len(law['times'])
     return jumps and bool(np.allclose(said, law['times'], atol=0.01))
 
 
-def _told_as_note(law: dict[str, Any], got: dict[str, Any]) -> bool:
+def _reported_as_note(law: dict[str, Any], got: dict[str, Any]) -> bool:
     """Whether the law acts under one load only, and the answer is that another load hung there: no reading tells one
     from the other.
     """
@@ -153,7 +153,7 @@ def _told_as_note(law: dict[str, Any], got: dict[str, Any]) -> bool:
     return float(acts[changes[number - 1] : rings].sum()) > UNDER_ONE * float(acts.sum())
 
 
-def _one(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
+def _answer_to_law(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
     law, seed = job
     start = time.perf_counter()
     got, _ = answer(None if law is None else sized(law), seed)
@@ -162,7 +162,7 @@ def _one(job: tuple[dict[str, Any] | None, int]) -> dict[str, Any]:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> tuple[str, bool]:
-    """The counts against what is wanted."""
+    """Return the counts against what is wanted."""
     laws, nulls = [r for r in rows if 'truth' in r], [r for r in rows if 'truth' not in r]
     lines, passed = [], True
     for name, words in (('stage', 'right stage'), ('variables', 'right variables')):
@@ -207,7 +207,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     jobs += [(None, 100_000 + args.first + i) for i in range(args.nulls)]
     rows = []
     with (folder / f'answers-{args.first}.jsonl').open('w') as stream:
-        for row in over(_one, jobs, args.jobs, 'answers'):
+        for row in over(_answer_to_law, jobs, args.jobs, 'answers'):
             rows.append(row)
             stream.write(json.dumps(row) + '\n')
             stream.flush()

@@ -51,7 +51,7 @@ def nominal() -> dict[str, float]:
 
 
 def draw(rng: np.random.Generator) -> dict[str, float]:
-    """One rig. ``beam_N.x``, ``.y``: where the beam meets the unloaded plate, from the nominal centre, m."""
+    """Return one rig. ``beam_N.x``, ``.y``: where the beam meets the unloaded plate, from the nominal centre, m."""
     out = nominal()
     for name in out:
         kind = name.partition('.')[2]
@@ -124,7 +124,7 @@ class Light(NamedTuple):
     offset_y: float
     offset_sum: float
 
-    def seen(self, laser: float, x: Array, y: Array) -> tuple[Array, Array, Array]:
+    def measured(self, laser: float, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """x, y and sum, V, with a laser of so much light that alone would read ``x``, ``y`` V."""
         total = laser + self.level
         share = self.level / total
@@ -152,7 +152,7 @@ def draw_light(rng: np.random.Generator) -> tuple[Light, Light]:
 
 
 def relit(light: tuple[Light, Light], rng: np.random.Generator) -> tuple[Light, Light]:
-    """The same amplifiers in other light."""
+    """Return the same amplifiers in other light."""
     first, second = (
         new._replace(**{n: getattr(old, n) for n in OFFSETS}) for new, old in zip(draw_light(rng), light, strict=True)
     )
@@ -163,7 +163,7 @@ def darkness(light: tuple[Light, Light], seconds: float, rng: np.random.Generato
     """Volts (n, 6) with both lasers off: white noise, slower noise (20 ms) as large, the mains' flicker on the sums."""
     n = round(seconds * generator.RATE)
     flat = np.zeros(n)
-    volts = np.column_stack([column for one in light for column in one.seen(0.0, flat, flat)])
+    volts = np.column_stack([column for one in light for column in one.measured(0.0, flat, flat)])
     keep = math.exp(-1.0 / (0.020 * generator.RATE))
     kicks = rng.normal(0.0, generator.SIGMA * math.sqrt(1.0 - keep**2), (n, 6))
     volts += lfilter([1.0], [1.0, -keep], kicks, axis=0) + rng.normal(0.0, generator.SIGMA, (n, 6))
@@ -199,7 +199,9 @@ def record(
     """
     read = dots(rig, pose) / generator.MM_PER_V
     both = (DARK, DARK) if light is None else light
-    columns = [column for i, one in enumerate(both) for column in one.seen(LASER, read[:, 2 * i], read[:, 2 * i + 1])]
+    columns = [
+        column for i, one in enumerate(both) for column in one.measured(LASER, read[:, 2 * i], read[:, 2 * i + 1])
+    ]
     volts = np.column_stack(columns) + rng.normal(0.0, sigma, (len(pose), 6))
     frames = np.arange(17, len(pose) - 17, every)
     reference = pose[frames] + rng.normal(size=(len(frames), 3)) * spread

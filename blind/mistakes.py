@@ -163,7 +163,7 @@ def own_zeros(size: float, g: Generator, rig: Rig, noise: str, seed: int) -> lis
 
 
 def observed(mistake: tuple[str, float], g: Generator, rig: Rig, noise: str, seed: int) -> list[Observation]:
-    """A recording without any hidden effect, with one mistake."""
+    """Return a recording without any hidden effect, with one mistake."""
     name, size = mistake
     if name == 'own_zeros':
         return own_zeros(size, g, rig, noise, seed)

@@ -141,7 +141,7 @@ class Score:
 
 
 def by_pyoma2(samples: Array, hertz: float) -> tuple[Mode, ...]:
-    """The stable pole of pyOMA2 that is nearest to ``hertz``; it gives no interval of a single channel."""
+    """Return the stable pole of pyOMA2 that is nearest to ``hertz``; it gives no interval of a single channel."""
     from pyoma2.algorithms import SSI
     from pyoma2.setup import SingleSetup
 
@@ -184,7 +184,7 @@ CASES = {
 
 
 def scored(seeds: Iterable[int], case: Case, *, pyoma2: bool = False) -> Score:
-    """One rig for each seed, by ``identify`` or by pyOMA2."""
+    """Return one rig for each seed, by ``identify`` or by pyOMA2."""
     score = Score()
     for seed in seeds:
         rng = np.random.default_rng(seed)
@@ -200,7 +200,7 @@ def scored(seeds: Iterable[int], case: Case, *, pyoma2: bool = False) -> Score:
 
 
 def report(name: str, score: Score) -> str:
-    """One line."""
+    """Return one line."""
     f, z = np.abs(score.frequency), np.abs(score.damping)
     held = ['', '']
     if score.inside:

@@ -179,7 +179,7 @@ def swung(seconds: float, rng: np.random.Generator) -> tuple[Array, Array, tuple
 
 
 def make(kind: str, seconds: float, seed: int) -> Run:
-    """A run of ``kind``."""
+    """Return a run of ``kind``."""
     rng = np.random.default_rng(seed)
     if kind in ('joint', UNTOLD):
         pose, velocity, told = swung(seconds, rng)
@@ -189,13 +189,13 @@ def make(kind: str, seconds: float, seed: int) -> Run:
 
 
 def run_of(loads: Array, seed: int) -> Run:
-    """The run under ``loads`` (n, 3)."""
+    """Return the run under ``loads`` (n, 3)."""
     pose, velocity = moved(loads)
     return Run(loads, pose, velocity, volts_of(pose, np.random.default_rng([seed, 1])))
 
 
 def biased(run: Run, share: float) -> Run:
-    """The same run, with all that is told of the base too large by ``share``."""
+    """Return the same run, with all that is told of the base too large by ``share``."""
 
     def larger(vector: tuple[float, ...]) -> tuple[float, ...]:
         return tuple((1.0 + share) * v for v in vector)
@@ -244,7 +244,7 @@ def chunk(run: Run, block: int) -> RawChunk:
 
 
 def rig_of(changes: Mapping[str, object] | None = None) -> Rig:
-    """The thesis rig with its filter."""
+    """Return the thesis rig with its filter."""
     return load_rig(None, {'filter': 'modal', 'solvers': ['exact'], **(changes or {})})
 
 
@@ -280,7 +280,7 @@ def rms(errors: Array) -> float:
 
 
 def judge(run: Run, rig: Rig, late: int = 0) -> Result:
-    """The run through the pipeline, against the truth.
+    """Return the run through the pipeline, against the truth.
 
     What is told of the base comes ``late`` samples after its stamp.
     """
@@ -392,7 +392,7 @@ def by_frequency(results: Iterable[Result]) -> list[float]:
 
 
 def table(found: Mapping[str, list[Figures]]) -> str:
-    """A Markdown table."""
+    """Return a Markdown table."""
     rows = [
         '| motion | axis | velocity | own | / own | / Savitzky-Golay | NIS | inside | foretold | held |',
         '|---' * 10 + '|',

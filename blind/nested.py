@@ -80,7 +80,7 @@ def forward_backward(plant: Plant, left: Left, seen: BoolArray) -> FloatArray:
 
 
 def stlsq(plant: Plant, y: FloatArray, seen: BoolArray) -> FloatArray:
-    """The same by least squares over all terms, again without those whose contribution is below a threshold."""
+    """Return the same by least squares over all terms, again without those whose contribution is below a threshold."""
     nothing = _vector(plant.simulate({}))
     effects = [*plant.nuisance, *plant.library]
     table = np.column_stack([_vector(plant.simulate({e.name: {e.parameters[0].name: 1.0}})) - nothing for e in effects])

@@ -26,7 +26,7 @@ from blind.generator import Array, Generator
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, proposals
-from psd_deflection.studies.discover.loop import settle
+from psd_deflection.studies.discover.loop import run_loop
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import Plan
 
@@ -58,15 +58,15 @@ def first_recordings() -> dict[str, tuple[Array, Array]]:
 def observed(
     truth: Sequence[dict[str, Any]], loads: Array, temperature: Array | None, length: float, seed: int, name: str
 ) -> Observation:
-    """A recording of the second generator."""
+    """Return a recording of the second generator."""
     steady = np.full(len(loads), 20.0) if temperature is None else temperature
     volts = Generator(loads, steady, length).record(truth, 'white', seed)
     own = replace_values(RIG, {'link.length': length}) if length != RIG.link.length else RIG
     return Observation(name, own, volts, loads, temperature)
 
 
-def one(job: tuple[str, str, float]) -> dict[str, Any]:
-    """The effect ``name`` hidden in the first recording ``design``: what became of it."""
+def ask_next(job: tuple[str, str, float]) -> dict[str, Any]:
+    """Return the effect ``name`` hidden in the first recording ``design``: what became of it."""
     name, design, gap = job
     start = time.perf_counter()
     seed = zlib.crc32(f'{name}-{design}'.encode())
@@ -90,15 +90,15 @@ def one(job: tuple[str, str, float]) -> dict[str, Any]:
     left: list[list[str]] = []
 
     def record(plan: Plan, number: int) -> Observation:
-        left.append(sorted({t.rival for t in plan.told}))
+        left.append(sorted({t.alternative for t in plan.discriminations}))
         length = float(str(plan.setting.changes.get('link.length', RIG.link.length)))
         warm = plan.setting.temperature(len(plan.loads))
         made.append(observed([hidden], plan.loads, warm, length, seed + number, f'next {number}'))
         return made[-1]
 
-    done = settle([first], lambda known: discover(known, RIG), record, most=MOST)
-    named = [*(e.active.effect.name for e in done.found.effects), *(f.name for f in done.found.setup)]
-    together = sorted(done.found.unsettled)
+    done = run_loop([first], lambda known: discover(known, RIG), record, most=MOST)
+    named = [*(e.active.effect.name for e in done.discovery.effects), *(f.name for f in done.discovery.setup)]
+    together = sorted(done.discovery.unsettled)
     row |= {
         'outcome': done.outcome,
         'recordings': len(done.plans),
@@ -106,7 +106,7 @@ def one(job: tuple[str, str, float]) -> dict[str, Any]:
         'together': together,
         'left': left,
         'planned': [p.words for p in done.plans],
-        'verdict': done.found.verdict,
+        'verdict': done.discovery.verdict,
         'right': named == [name] or (done.outcome != 'unique' and name in (*named, *together)),
     }
     confounded = bool(done.plans) or done.outcome != 'unique'
@@ -166,7 +166,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     effects = [n for n in EFFECTS if args.only in n and (n in MIMICKED or not args.mimicked)]
     jobs = [(n, d, args.gap) for d in first_recordings() if args.designs in d for n in effects]
     rows = []
-    for row in over(one, jobs, args.jobs):
+    for row in over(ask_next, jobs, args.jobs):
         rows.append(row)
         if args.out:
             Path(args.out).write_text(json.dumps(rows, indent=1))

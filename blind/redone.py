@@ -88,7 +88,7 @@ SHORT = Plan(forces=(50.0,), rest=0.6, held=1.6, rate=12.0, limit=0.005)
 
 
 @dataclass(frozen=True)
-class Hung:
+class HeldLoad:
     """One recording: ``side`` +1 or -1 of the sidebar, 0 on the link itself."""
 
     force: float
@@ -125,7 +125,7 @@ class Bench:
 
 
 def bench(folder: Path, plan: Plan) -> Bench:
-    """A rig and a camera by chance. The folder gets their files: ``nominal.yaml`` and ``camera.yaml``."""
+    """Return a rig and a camera by chance. The folder gets their files: ``nominal.yaml`` and ``camera.yaml``."""
     rng = np.random.default_rng([5, plan.seed])
     truth = misaligned.draw(rng)
     scene = render.Scene(
@@ -151,7 +151,7 @@ def bench(folder: Path, plan: Plan) -> Bench:
     return Bench(plan, folder, truth, scene, rng)
 
 
-def motion(plan: Plan, hung: Hung) -> Array:
+def motion(plan: Plan, hung: HeldLoad) -> Array:
     """True poses (n, 3) at the samples: at rest, then a weight that a hand lets go of."""
     n = round((plan.rest + plan.held) * generator.RATE)
     t = np.arange(n) / generator.RATE
@@ -161,7 +161,7 @@ def motion(plan: Plan, hung: Hung) -> Array:
     return misaligned.poses(loads)
 
 
-def record(made: Bench, hung: Hung) -> None:
+def record(made: Bench, hung: HeldLoad) -> None:
     """``NAME.csv``, what the PSDs say; ``NAME/``, the camera's images; ``NAME_truth.csv``, the pose at the images."""
     plan, rng = made.plan, made.rng
     pose = motion(plan, hung)
@@ -215,7 +215,7 @@ def table(path: Path) -> dict[str, Array]:
 
 
 def zeroed(made: Bench, name: str) -> dict[str, object]:
-    """The zero before the load, as ~/zero takes it: the mean reading of the unloaded link, m."""
+    """Return the zero before the load, as ~/zero takes it: the mean reading of the unloaded link, m."""
     rows = table(made.folder / f'{name}.csv')
     rest = rows['t'] < 0.9 * made.plan.rest
     return {
@@ -234,7 +234,7 @@ def rig_files(made: Bench, stem: str, values: Mapping[str, object]) -> None:
         (made.folder / f'{stem}_{place}.yaml').write_text(with_values(text, tuned, words, path))
 
 
-def curves(made: Bench, hung: Hung, stem: str) -> Curves:
+def curves(made: Bench, hung: HeldLoad, stem: str) -> Curves:
     """What every method says of a recording with the rig file ``STEM.yaml``, by ``replay``."""
     found: dict[str, Array] = {}
     t = np.empty(0)
@@ -249,8 +249,8 @@ def curves(made: Bench, hung: Hung, stem: str) -> Curves:
     return Curves(t, found)
 
 
-def judged(made: Bench, hung: Hung, stem: str, by: str) -> Any:
-    """The answer of ``validate``: by the camera, its clock put right, or by the truth."""
+def judged(made: Bench, hung: HeldLoad, stem: str, by: str) -> Any:
+    """Return the answer of ``validate``: by the camera, its clock put right, or by the truth."""
     reference = f'{hung.name}_{by}.csv'
     align = ['--align', '--exposure', str(made.plan.exposure)] if by == 'camera' else []
     rig = ('--params-file', f'{stem}.yaml')
@@ -258,7 +258,7 @@ def judged(made: Bench, hung: Hung, stem: str, by: str) -> Any:
     return json.loads(made.run('validate', f'{hung.name}.csv', *words))
 
 
-def calibrated(made: Bench, runs: Sequence[Hung], stem: str) -> str:
+def calibrated(made: Bench, runs: Sequence[HeldLoad], stem: str) -> str:
     """``calibrate`` on some recordings: ``STEM.yaml``; what it says."""
     references = itertools.chain.from_iterable(('--reference', f'{h.name}_camera.csv') for h in runs)
     said = made.run(
@@ -273,10 +273,10 @@ def calibrated(made: Bench, runs: Sequence[Hung], stem: str) -> str:
 
 
 def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
-    """The whole experiment: the content of ``summary.json``. ``folder`` must be new or empty."""
+    """Return the whole experiment: the content of ``summary.json``. ``folder`` must be new or empty."""
     made = bench(folder, plan)
-    sidebar = [Hung(force, side) for side in (1, -1) for force in plan.forces]
-    link = [Hung(force, 0) for force in plan.forces]
+    sidebar = [HeldLoad(force, side) for side in (1, -1) for force in plan.forces]
+    link = [HeldLoad(force, 0) for force in plan.forces]
     every = [*sidebar, *link]
     bar = tqdm(total=3 * len(every) + 2, unit=' steps', disable=quiet, ncols=80)
     cameras: dict[str, dict[str, Array]] = {}
@@ -316,9 +316,9 @@ def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
     return summary
 
 
-def _summary(made: Bench, link: Sequence[Hung], answers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _summary(made: Bench, link: Sequence[HeldLoad], answers: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Largest errors of ``exact`` on the link, as shares of the deflection at 50 N, by rig file and judge."""
-    at = [motion(replace(made.plan, rest=0.0, held=5.0), Hung(50.0, side))[-1] for side in (0, 1)]
+    at = [motion(replace(made.plan, rest=0.0, held=5.0), HeldLoad(50.0, side))[-1] for side in (0, 1)]
     across, twist = float(np.hypot(*at[0][:2])), float(abs(at[1][2]))
     scale = dict(zip(AXES, (across, across, twist), strict=True))
     shares = {

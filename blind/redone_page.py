@@ -53,7 +53,7 @@ def page_of(
     truth: Mapping[str, float],
     typed: Sequence[str],
 ) -> str:
-    """The page, pictures inside."""
+    """Return the page, pictures inside."""
     return page(
         'The experiment of the thesis, redone',
         _body(folder, forces, summary, drawn, cameras, answers, truth, typed),
@@ -122,7 +122,7 @@ def _body(
 
 
 def verdict(summary: Mapping[str, Any]) -> str:
-    """The answer in two sentences."""
+    """Return the answer in two sentences."""
     after, before = (summary['shares'][stem] for stem in ('after', 'before_sidebar'))
     words = ', '.join(f'{SYMBOLS[axis]} {100 * after[axis]:.3f} %' for axis in SYMBOLS)
     old = ', '.join(f'{SYMBOLS[axis]} {100 * before[axis]:.1f} %' for axis in SYMBOLS)

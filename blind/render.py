@@ -70,7 +70,7 @@ class Scene:
 
 
 def about(axis: int, angle: float) -> Array:
-    """A turn about one axis."""
+    """Return a turn about one axis."""
     c, s = math.cos(angle), math.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
     out = np.eye(3)
@@ -129,7 +129,7 @@ def rays(
 
 
 def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array]:
-    """The point of the tip plate, in its own axes, that the ray (x, y) meets."""
+    """Return the point of the tip plate, in its own axes, that the ray (x, y) meets."""
     rotation, origin = camera_of(scene)
     tip = rotation @ about(1, pose.omega) @ about(0, pose.phi) @ about(2, pose.theta)
     at = origin + rotation @ np.array([pose.dx, pose.dy, pose.z])
@@ -142,7 +142,7 @@ def on_plate(scene: Scene, pose: Pose, x: Array, y: Array) -> tuple[Array, Array
     )
 
 
-def seen(scene: Scene, pose: Pose, points: Array) -> Array:
+def pixels_of(scene: Scene, pose: Pose, points: Array) -> Array:
     """Pixels (n, 2) of points (n, 2) of the tip plate."""
     rotation, origin = camera_of(scene)
     tip = rotation @ about(1, pose.omega) @ about(0, pose.phi) @ about(2, pose.theta)
@@ -151,9 +151,9 @@ def seen(scene: Scene, pose: Pose, points: Array) -> Array:
     return scene.focal * np.column_stack((a, b)) + scene.centre
 
 
-def seen_at(scene: Scene, pose: Pose, x: float, y: float) -> tuple[float, float]:
+def pixel_of(scene: Scene, pose: Pose, x: float, y: float) -> tuple[float, float]:
     """Pixel of a point (x, y) of the tip plate."""
-    u, v = seen(scene, pose, np.array([[x, y]]))[0]
+    u, v = pixels_of(scene, pose, np.array([[x, y]]))[0]
     return float(u), float(v)
 
 
@@ -169,7 +169,7 @@ def cover(out: Array, scene: Scene, pose: Pose, parts: int) -> None:
     du, dv = np.meshgrid(offsets, offsets)
     for cx, cy in centres_of(scene):
         turns = np.linspace(0, 2 * np.pi, 60)
-        rim = seen(scene, pose, (cx, cy) + scene.radius * np.column_stack((np.cos(turns), np.sin(turns))))
+        rim = pixels_of(scene, pose, (cx, cy) + scene.radius * np.column_stack((np.cos(turns), np.sin(turns))))
         u0, v0 = np.maximum(np.floor(rim.min(axis=0)).astype(int) - 2, 0)
         u1, v1 = np.ceil(rim.max(axis=0)).astype(int) + 3
         u1, v1 = min(u1, scene.width), min(v1, scene.height)
@@ -196,7 +196,7 @@ def cover(out: Array, scene: Scene, pose: Pose, parts: int) -> None:
 
 
 def cut(scene: Scene) -> Scene:
-    """The same scene by a camera whose pixels are smaller."""
+    """Return the same scene by a camera whose pixels are smaller."""
     return replace(
         scene,
         width=CUTS * scene.width,
@@ -208,7 +208,7 @@ def cut(scene: Scene) -> Scene:
 
 
 def together(fine: Array, scene: Scene) -> Array:
-    """The share that is white of each pixel of ``scene``, blurred, from that of the pixels of ``cut(scene)``."""
+    """Return the share that is white of each pixel of ``scene``, blurred, from that of the pixels of ``cut(scene)``."""
     out = np.zeros((scene.height, scene.width))
     lit = [np.flatnonzero(fine.any(axis=axis)) for axis in (1, 0)]
     if not lit[0].size:
@@ -237,7 +237,7 @@ def clean(scene: Scene, poses: Sequence[Pose]) -> Array:
 
 
 def photograph(scene: Scene, poses: Sequence[Pose], rng: np.random.Generator) -> npt.NDArray[np.uint8]:
-    """One frame as the camera gives it."""
+    """Return one frame as the camera gives it."""
     return developed(scene, clean(scene, poses), rng)
 
 
@@ -281,12 +281,12 @@ def board(scene: Scene, pose: Pose, texture: Array, size: tuple[float, float]) -
 
 
 def over_exposure(motion: Callable[[float], Pose], t: float, exposure: float, instants: int = 12) -> list[Pose]:
-    """The poses at the middles of equal parts of an exposure that begins at ``t``."""
+    """Return the poses at the middles of equal parts of an exposure that begins at ``t``."""
     return [motion(t + exposure * (i + 0.5) / instants) for i in range(instants)]
 
 
 def mean_of(poses: Sequence[Pose]) -> tuple[float, float, float]:
-    """The mean of dX, dY, theta."""
+    """Return the mean of dX, dY, theta."""
     return (
         float(np.mean([p.dx for p in poses])),
         float(np.mean([p.dy for p in poses])),

@@ -32,18 +32,18 @@ _BANKS: dict[str, SignatureBank] = {}
 
 
 def truth_of(case: Case) -> list[dict[str, Any]]:
-    """The effects of a case, scaled to their gaps; none that no machine can have."""
+    """Return the effects of a case, scaled to their gaps; none that no machine can have."""
     effects = [scaled(case.seed, name, gap, designs(case.design)) for name, gap in case.wanted]
     return [e for e in effects if possible(e)]
 
 
 def observe(case: Case, truth: Sequence[dict[str, Any]]) -> list[Observation]:
-    """The input of discover."""
+    """Return the input of discover."""
     rig = load_rig()
     if case.kind == 'hand':
         hand = byhand.drawn(case.design)
         volts = designs(case.design)[0].record(truth, case.noise, case.seed)
-        return [Observation('recording 1', rig, volts, hand.noted, hand.temperature)]
+        return [Observation('recording 1', rig, volts, hand.annotated, hand.temperature)]
     if case.mistake[0]:
         return observed(case.mistake, designs(case.design)[0], rig, case.noise, case.seed)
     out = []
@@ -68,7 +68,7 @@ def _rig(case: Case, seen: Sequence[Observation]) -> Rig:
     return seen[0].rig if case.mistake[0] else load_rig()
 
 
-def _one(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | None]) -> str:
+def _answer_case(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | None]) -> str:
     fields, truth, target, peer = job
     case = Case(
         **{
@@ -120,7 +120,7 @@ def seal(cases: Sequence[Case], folder: Path, jobs: int = 1) -> str:
 
 
 def selection(parser: argparse.ArgumentParser) -> Callable[[argparse.Namespace], list[Case]]:
-    """The options that choose cases, added to ``parser``, and what gives these of the parsed ones."""
+    """Return the options that choose cases, added to ``parser``, and what gives these of the parsed ones."""
     parser.add_argument('--out', default='build/blind', help='folder for truths and answers (default: build/blind)')
     parser.add_argument('--short', action='store_true', help='the slice that runs on every change')
     parser.add_argument('--seeds', type=int, default=4)
@@ -168,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if not target.exists():
             sealed = json.loads((folder / 'sealed' / f'{case.key}.json').read_text())
             jobs.append((sealed['case'], sealed['truth'], str(target), args.peer))
-    for _ in over(_one, jobs, args.jobs, 'answers'):
+    for _ in over(_answer_case, jobs, args.jobs, 'answers'):
         pass
     return conclude(*score.summary(score.load(folder, [c.key for c in cases], f'answers{whose}')), summary)
 

@@ -66,8 +66,8 @@ class Row:
         return [{e['name'], *e['equivalent']} for e in self.answer['effects']]
 
 
-def whole(answer: dict[str, Any]) -> dict[str, Any]:
-    """An answer of any tool with all that is counted: what it leaves out is nothing, or not a number."""
+def complete(answer: dict[str, Any]) -> dict[str, Any]:
+    """Return an answer of any tool with all that is counted: what it leaves out is nothing, or not a number."""
     effects = [{'equivalent': [], 'parameters': {}, **e} for e in answer.get('effects', ())]
     unknown = [{'law': None, **u} for u in answer.get('unknown', ())]
     said = 'unknown_effect' if unknown else 'effects_found' if effects else 'nothing_missing'
@@ -85,7 +85,7 @@ def whole(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 def load(folder: Path, keys: Sequence[str], answers: str = 'answers') -> list[Row]:
-    """Every case that has an answer in the folder ``answers``."""
+    """Return every case that has an answer in the folder ``answers``."""
     out = []
     for key in keys:
         answer = folder / answers / f'{key}.json'
@@ -103,7 +103,7 @@ def load(folder: Path, keys: Sequence[str], answers: str = 'answers') -> list[Ro
                 gap,
                 apart,
                 sealed['truth'],
-                whole(json.loads(answer.read_text())),
+                complete(json.loads(answer.read_text())),
                 mistake,
                 tuple(sealed.get('wrong', ())),
             )
@@ -161,7 +161,7 @@ class _Sheet:
     def rate(self, name: str, rows: Sequence[Row], hits: Sequence[bool], low: float, high: float, note: bool) -> None:
         """The share of ``hits``, wanted from ``low`` to ``high``; with ``note``, misses go to the failures."""
         if note:
-            self.failures += [f'{r.key}: {_said(r)}' for r, h in zip(rows, hits, strict=True) if not h]
+            self.failures += [f'{r.key}: {_row_words(r)}' for r, h in zip(rows, hits, strict=True) if not h]
         n, k = len(hits), sum(hits)
         if n == 0:
             self.lines.append(f'  --    {name}: no cases')
@@ -180,9 +180,9 @@ def summary(rows: Sequence[Row]) -> tuple[str, bool]:
     _false_alarms(sheet, rows)
     pair = [r for r in rows if r.kind == 'pair']
     sheet.rate('both of a pair in the answer', pair, [_both(r) for r in pair], THRESHOLDS['both_of_a_pair'], 1.0, True)
-    _spread(sheet, rows)
+    _score_spreads(sheet, rows)
     _mistakes(sheet, rows)
-    _by_hand(sheet, [r for r in rows if r.kind == 'hand'])
+    _score_by_hand(sheet, [r for r in rows if r.kind == 'hand'])
     _unknowns(sheet, rows)
     _held_out(sheet, rows)
     cover = [c for r in rows if r.kind == 'single' for c in covered(r)]
@@ -216,7 +216,7 @@ def _false_alarms(sheet: _Sheet, rows: Sequence[Row]) -> None:
     for kind, name in (('null', 'right'), ('wrong', 'wrong')):
         of = [r for r in rows if r.kind == kind]
         alarm = [r.answer['verdict'] != 'nothing_missing' for r in of]
-        sheet.failures += [f'{r.key}: {_said(r)}' for r, a in zip(of, alarm, strict=True) if a]
+        sheet.failures += [f'{r.key}: {_row_words(r)}' for r, a in zip(of, alarm, strict=True) if a]
         sheet.rate(f'false alarm, {name} noise', of, alarm, 0.0, THRESHOLDS[f'false_alarm_{name}_noise'], False)
 
 
@@ -231,10 +231,10 @@ def _unknowns(sheet: _Sheet, rows: Sequence[Row]) -> None:
     sheet.lines.append(
         f'        truth in the library, gap >= 3 floors, and yet something called unknown: {len(wrongly)}/{len(listed)}'
     )
-    sheet.lines += [f'          {r.key}: {_said(r)}' for r in wrongly]
+    sheet.lines += [f'          {r.key}: {_row_words(r)}' for r in wrongly]
 
 
-def _spread(sheet: _Sheet, rows: Sequence[Row]) -> None:
+def _score_spreads(sheet: _Sheet, rows: Sequence[Row]) -> None:
     """Effects of very different size: all are named, and nothing above the noise is left unsaid in any answer."""
     of = [r for r in rows if r.kind == 'spread']
     hits = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
@@ -245,11 +245,11 @@ def _spread(sheet: _Sheet, rows: Sequence[Row]) -> None:
         sheet.rate(f'all of {kind} effects at once, 3 to 30 floors', of, hits, THRESHOLDS[f'all_of_{kind}'], 1.0, True)
     of = [r for r in rows if r.kind in ('single', 'pair', 'spread', 'four', 'six')]
     sheet.rate('an effect named that is none', of, [_names_none(r) for r in of], 0.0, 0.0, False)
-    sheet.failures += [f'{r.key}: {_said(r)}' for r in of if _names_none(r)]
+    sheet.failures += [f'{r.key}: {_row_words(r)}' for r in of if _names_none(r)]
     most = THRESHOLDS['unsaid_floors']
-    null_log = [r for r in rows if r.answer['remaining']['floors'] > most and not r.answer['unknown']]
-    sheet.failures += [f'{r.key}: {_said(r)}' for r in null_log]
-    sheet.check(not null_log, f'answers that leave more than {most} floors unsaid: {len(null_log)}, wanted 0')
+    unreported = [r for r in rows if r.answer['remaining']['floors'] > most and not r.answer['unknown']]
+    sheet.failures += [f'{r.key}: {_row_words(r)}' for r in unreported]
+    sheet.check(not unreported, f'answers that leave more than {most} floors unsaid: {len(unreported)}, wanted 0')
 
 
 def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
@@ -264,7 +264,7 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
     sheet.rate('mistake named where there is none', sound, [bool(s) for s in said], 0.0, 0.0, False)
     odd = [r for r in rows if r.kind == 'faultless']
     alarm = [r.answer['verdict'] != 'nothing_missing' for r in odd]
-    sheet.failures += [f'{r.key}: {_said(r)}' for r, wrong in zip(odd, alarm, strict=True) if wrong]
+    sheet.failures += [f'{r.key}: {_row_words(r)}' for r, wrong in zip(odd, alarm, strict=True) if wrong]
     sheet.rate('false alarm, gaps, outliers, start under load, own zeros', odd, alarm, 0.0, 0.01, False)
 
 
@@ -274,8 +274,8 @@ HUNG = (0.25, 0.25, 0.12)
 """N, N, N m, and 2 %, by which a told load may be off."""
 
 
-def _told(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[bool, bool]:
-    """Whether a wrong note is named, and with the right numbers."""
+def _reported(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[bool, bool]:
+    """Return whether a wrong note is named, and with the right numbers."""
     of = [s for s in setup if s['name'] == wrong['name']]
     if 'from' in wrong:
         of = [s for s in of if abs(float(s['where'].removesuffix(' s')) - wrong['from']) < 0.1]
@@ -292,11 +292,11 @@ def _told(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[bool,
     return True, off < NEAR.get(wrong['name'], 0.03 * abs(wrong['value']))
 
 
-def _by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
+def _score_by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
     """Notes by hand: each wrong one is named, with the right line; nothing is unknown; no effect is lost."""
     if not of:
         return
-    told = [[_told(w, r.answer['setup']) for w in r.wrong] for r in of]
+    told = [[_reported(w, r.answer['setup']) for w in r.wrong] for r in of]
     found = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
     false = [_names_none(r) for r in of]
     unknown = [r.answer['verdict'] == 'unknown_effect' for r in of]
@@ -371,7 +371,7 @@ def _confusion(rows: Sequence[Row]) -> list[str]:
 
 
 def _names_none(r: Row) -> bool:
-    """Whether an effect is named that is none: neither it nor one that cannot be told from it is hidden."""
+    """Return whether an effect is named that is none: neither it nor one that cannot be told from it is hidden."""
     return any(not any(t['name'] in s for t in r.truth) for s in r.sets)
 
 
@@ -382,7 +382,7 @@ def _both(row: Row) -> bool:
     return any(a in sets[i] and b in sets[j] for i in range(len(sets)) for j in range(len(sets)) if i != j)
 
 
-def _said(row: Row) -> str:
+def _row_words(row: Row) -> str:
     truth = ', '.join(t['name'] for t in row.truth) or 'nothing'
     said = '; '.join('/'.join(sorted(s)) for s in row.sets) or 'no effect'
     gap = row.answer['gap']

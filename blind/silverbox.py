@@ -40,29 +40,29 @@ SPEED = 1e-3
 """V; Coulomb friction turns round within this speed over w."""
 
 
-def _one(
+def _effect_of(
     name: str, parameter: str, unit: str, most: float, scale: float, words: str, low: float | None = None
 ) -> Effect:
     return plant_effect(name, EffectParameter(parameter, unit, -most if low is None else low, most, scale, words))
 
 
 LIBRARY = (
-    _one('cubic_spring', 'stiffening', '1/V^2', 10.0, 0.2, 'y grows by stiffening y^3', -3.0),
-    _one('quadratic_spring', 'bend', '1/V', 2.0, 0.02, 'y grows by bend y^2'),
-    _one('quintic_spring', 'stiffening', '1/V^4', 200.0, 10.0, 'y grows by stiffening y^5', -50.0),
-    _one('quadratic_drag', 'drag', '1/V', 0.5, 0.01, 'grows with speed over w squared', 0.0),
-    _one('cubic_damping', 'damping', '1/V^2', 3.0, 0.05, 'grows with speed over w cubed', 0.0),
-    _one('coulomb_friction', 'force', 'V', 0.01, 1e-4, 'against the motion', 0.0),
-    _one('force_offset', 'shift', 'V', 0.05, 1e-3, 'of the input'),
-    _one('reading_offset', 'shift', 'V', 0.05, 1e-3, 'of the output'),
-    _one('input_delay', 'delay', 's', 1e-3, 2e-5, 'of the input', 0.0),
-    _one('input_compression', 'share', '1/V^2', 20.0, 0.5, 'the input falls by share u^3'),
-    _one('dead_zone', 'width', 'V', 0.01, 5e-4, 'of the input that shows nothing', 0.0),
+    _effect_of('cubic_spring', 'stiffening', '1/V^2', 10.0, 0.2, 'y grows by stiffening y^3', -3.0),
+    _effect_of('quadratic_spring', 'bend', '1/V', 2.0, 0.02, 'y grows by bend y^2'),
+    _effect_of('quintic_spring', 'stiffening', '1/V^4', 200.0, 10.0, 'y grows by stiffening y^5', -50.0),
+    _effect_of('quadratic_drag', 'drag', '1/V', 0.5, 0.01, 'grows with speed over w squared', 0.0),
+    _effect_of('cubic_damping', 'damping', '1/V^2', 3.0, 0.05, 'grows with speed over w cubed', 0.0),
+    _effect_of('coulomb_friction', 'force', 'V', 0.01, 1e-4, 'against the motion', 0.0),
+    _effect_of('force_offset', 'shift', 'V', 0.05, 1e-3, 'of the input'),
+    _effect_of('reading_offset', 'shift', 'V', 0.05, 1e-3, 'of the output'),
+    _effect_of('input_delay', 'delay', 's', 1e-3, 2e-5, 'of the input', 0.0),
+    _effect_of('input_compression', 'share', '1/V^2', 20.0, 0.5, 'the input falls by share u^3'),
+    _effect_of('dead_zone', 'width', 'V', 0.01, 5e-4, 'of the input that shows nothing', 0.0),
 )
 NUISANCE = (
-    _one('frequency', 'scale', '', 0.3, 0.01, 'relative change of w'),
-    _one('damping', 'scale', '', 0.6, 0.05, 'relative change of z'),
-    _one('gain', 'scale', '', 0.5, 0.01, 'relative change of g'),
+    _effect_of('frequency', 'scale', '', 0.3, 0.01, 'relative change of w'),
+    _effect_of('damping', 'scale', '', 0.6, 0.05, 'relative change of z'),
+    _effect_of('gain', 'scale', '', 0.5, 0.01, 'relative change of g'),
 )
 
 
@@ -128,7 +128,7 @@ class Silverbox(Plant):
         return {'input': [self.u[span] for span in self._spans]}
 
     def simulate(self, model: Model) -> list[FloatArray]:
-        """All pieces side by side."""
+        """Return all pieces side by side."""
         out = self.run(model, self._first, BEFORE + COMPARED)[BEFORE:]
         return [piece.reshape(1, -1) for piece in np.split(out.T, len(self.cases))]
 

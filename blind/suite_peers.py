@@ -47,7 +47,7 @@ class Pictures:
         self._penalty = math.log(self.ws.effective_size())
 
     def columns(self, chosen: Sequence[int]) -> list[int]:
-        """The rows of the screen of the candidates ``chosen``."""
+        """Return the rows of the screen of the candidates ``chosen``."""
         return [j for i in chosen for j in range(self.screen.slices[i].start, self.screen.slices[i].stop)]
 
     def sizes(self, chosen: Sequence[int]) -> FloatArray:
@@ -63,7 +63,7 @@ class Pictures:
         return self._penalty * len(at) - float(self.sizes(chosen) @ self._pull[at]) if at else 0.0
 
     def left(self, chosen: Sequence[int]) -> float:
-        """The gap that these leave, m."""
+        """Return the gap that these leave, m."""
         if not chosen:
             return self.ws.gap(self.null.difference)
         moved = self.sizes(chosen) @ self.screen.rows[self.columns(chosen)].astype(np.float64)

@@ -36,7 +36,7 @@ BENDING, TWIST, POINT_D = 3.38e-3, 0.022, 29.45e-3
 ARM = loads.SIDEBAR_ARM
 
 
-def settled(rig: Rig, load: tuple[float, float, float], effects: list[ActiveEffect]) -> tuple[FloatArray, FloatArray]:
+def at_rest(rig: Rig, load: tuple[float, float, float], effects: list[ActiveEffect]) -> tuple[FloatArray, FloatArray]:
     """Pose (3,) and dots (4,) at the end of a long hold, from rest."""
     history = loads.constant((0.0, 0.0, 0.0), 0.5).then(loads.constant(load, SETTLE))
     chunk = ForwardModel(rig, effects).run(history.loads, np.linspace(20.0, 21.0, len(history)))
@@ -64,7 +64,7 @@ def knobs(rig: Rig) -> Iterator[tuple[str, Callable[[float], ActiveEffect], floa
 def closing(
     figure: Callable[[ActiveEffect], float], make: Callable[[float], ActiveEffect], low: float, high: float, off: float
 ) -> float | None:
-    """The size at which ``figure`` is zero: the nearest to ``off``, None if there is none."""
+    """Return the size at which ``figure`` is zero: the nearest to ``off``, None if there is none."""
 
     def f(value: float) -> float:
         out = figure(make(value))
@@ -91,10 +91,10 @@ def table_b1() -> list[str]:
     """Which single effect closes which of the three gaps of the experimental row."""
     rig = load_rig()
     load = (0.0, -60.0, -60.0 * ARM)
-    pose, _ = settled(rig, load, [])
+    pose, _ = at_rest(rig, load, [])
 
     def figures(effects: list[ActiveEffect]) -> tuple[float, float, float]:
-        p, _ = settled(rig, load, effects)
+        p, _ = at_rest(rig, load, effects)
         return -p[1], -p[2], -p[1] + ARM * math.sin(-p[2])
 
     b, t, d = figures([])
@@ -132,7 +132,7 @@ def named_b1() -> list[str]:
     """discover on a recording whose link moves as the experimental row says."""
     rig = load_rig()
     load = (0.0, -60.0, -60.0 * ARM)
-    pose, _ = settled(rig, load, [])
+    pose, _ = at_rest(rig, load, [])
     truth = replace_values(
         rig,
         {
@@ -165,7 +165,7 @@ def table_51() -> list[str]:
     variances = np.full(4, 1e-12)
     lines = ['Table 5.1, 50 N on the sidebar: error in dX against the camera, no effect on:']
     for name in ('iterative_printed', 'appendix_d', 'wls', 'ols', 'exact'):
-        _, dots = settled(rig, load, [])
+        _, dots = at_rest(rig, load, [])
         x1, y1, x2, y2 = (float(v) for v in dots)
         s = solver_from_rig(name, rig).solve((x1, y1, x2, y2), tuple(float(v) for v in variances))
         errors = [100.0 * (a / b - 1.0) for a, b in zip((s.dx, s.dy, s.theta), camera, strict=True)]
@@ -173,10 +173,10 @@ def table_51() -> list[str]:
     solver = solver_from_rig('exact', rig)
 
     def errors_of(active: ActiveEffect) -> tuple[float, float, float]:
-        _, dots = settled(rig, load, [active])
+        _, dots = at_rest(rig, load, [active])
         x1, y1, x2, y2 = (float(v) for v in dots)
         s = solver.solve((x1, y1, x2, y2), (1e-12, 1e-12, 1e-12, 1e-12))
-        pose, _ = settled(rig, load, [active])
+        pose, _ = at_rest(rig, load, [active])
         # The camera sees the true pose, so an effect that moves the tip moves it for both.
         return s.dx / pose[0] - 1.0, s.dy / pose[1] - 1.0, s.theta / pose[2] - 1.0
 

@@ -90,7 +90,7 @@ def read(clean: Array, rng: np.random.Generator) -> Array:
 
 
 def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
-    """One event of a kind, drawn by ``seed``: the load (3,), volts (n, 6) and the time of the event, s."""
+    """Return one event of a kind, drawn by ``seed``: the load (3,), volts (n, 6) and the time of the event, s."""
     rng = np.random.default_rng((seed, len(kind)))
     n, held = round(RUN_S * RATE), round(HELD_FROM_S * RATE)
     event = round(rng.uniform(11.0, 13.5) * RATE)
@@ -112,8 +112,8 @@ def happened(kind: str, seed: int) -> tuple[Array, Array, float]:
     return load, read(volts, rng), event / RATE
 
 
-def one(job: tuple[str, int]) -> Run:
-    """One event of a kind, drawn by ``seed``, seen by the whole chain."""
+def watch_run(job: tuple[str, int]) -> Run:
+    """Return one event of a kind, drawn by ``seed``, seen by the whole chain."""
     kind, seed = job
     load, volts, event = happened(kind, seed)
     held = round(HELD_FROM_S * RATE)
@@ -210,7 +210,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parser.parse_args(argv)
     jobs = [(kind, args.first + i) for i in range(args.runs) for kind in SIZES]
     parts = [(args.hours / args.jobs, args.first + i) for i in range(args.jobs)] if args.hours else []
-    runs = list(over(one, jobs, args.jobs, 'events'))
+    runs = list(over(watch_run, jobs, args.jobs, 'events'))
     hours, alarms, costs = 0.0, 0, list[float]()
     said: list[str] = []
     for done, count, words, cost in over(quiet, parts, args.jobs, 'quiet hours'):

@@ -149,7 +149,7 @@ def adverse(
     grey = render.clean(scene, poses)
     rows, columns = grey.shape
     v, u = np.mgrid[:rows, :columns]
-    cx, cy = render.seen_at(scene, poses[0], 0.0, scene.spacing * rng.integers(-1, 2))
+    cx, cy = render.pixel_of(scene, poses[0], 0.0, scene.spacing * rng.integers(-1, 2))
     pixel = scene.focal / scene.distance
     r = scene.radius * pixel
     turn = rng.uniform(0, 2 * np.pi)
@@ -290,7 +290,7 @@ def accuracy_table(frames: int, seed: int) -> bool:
             assert answer.covariance is not None
             off.append([answer.dx - pose.dx, answer.dy - pose.dy, answer.theta - pose.theta])
             inside.append(np.abs(off[-1]) < 1.96 * np.sqrt(np.diag(answer.covariance)))
-            true = [render.seen_at(scene, pose, *c) for c in render.centres_of(scene)]
+            true = [render.pixel_of(scene, pose, *c) for c in render.centres_of(scene)]
             centres.append(answer.target.points - np.array(true))
         scales = np.array([1e6, 1e6, math.degrees(1e3)])
         rms = np.sqrt(np.mean(np.square(off), axis=0)) * scales
@@ -358,7 +358,7 @@ def near_corners(scene: render.Scene, settings: CameraSettings) -> Any:
     """The pixels around the inner corners of the chessboard that show nothing else."""
     size = _board(settings).size
     across, up = (np.arange(1, round(s / settings.square)) * settings.square - s / 2 for s in size)
-    at = render.seen(scene, render.Pose(), np.array([[x, y] for x in across for y in up]))
+    at = render.pixels_of(scene, render.Pose(), np.array([[x, y] for x in across for y in up]))
     reach = min(7.0, 0.5 * (settings.square - settings.marker) * scene.focal / scene.distance)
     v, u = np.mgrid[: scene.height, : scene.width]
     near = np.zeros(v.shape, dtype=bool)

@@ -103,7 +103,7 @@ class FrameAnswer(NamedTuple):
     words: str = str(Status.OK)
 
     def as_record(self) -> ReferenceWithCovariance | None:
-        """The record that is published and recorded; None without a pose."""
+        """Return the record that is published and recorded; None without a pose."""
         if self.covariance is None:
             return None
         covariance = tuple(map(float, self.covariance.ravel()))

@@ -18,7 +18,7 @@ Corners = Any
 
 
 def has_boards() -> bool:
-    """Whether this OpenCV makes and finds boards."""
+    """Return whether this OpenCV makes and finds boards."""
     aruco = getattr(opencv(), 'aruco', None)
     return hasattr(aruco, 'CharucoDetector') or (hasattr(aruco, 'CharucoBoard_create') and _version() >= (4, 6))
 
@@ -48,7 +48,7 @@ def tag_board(columns: int, rows: int, marker: float, gap: float, dictionary: An
 
 
 def picture(board: Any, pixels: tuple[int, int]) -> Any:
-    """The board as OpenCV draws it, (height, width) grey; ``pixels``: width and height."""
+    """Return the board as OpenCV draws it, (height, width) grey; ``pixels``: width and height."""
     draw = board.draw if _old() else board.generateImage
     return draw(pixels, None, 0, 1)
 

@@ -97,11 +97,11 @@ class Board(Target):
         """(k, 2): from corner to the inside of what it belongs to, in the board's axes; of k corners in turn."""
 
     @abc.abstractmethod
-    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+    def _detected(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
         """Numbers of what is seen, corners in OpenCV's axes (n, 2) m and in the image px, and if any marker is seen."""
 
     def drawing(self) -> Drawing:
-        """The board as OpenCV draws it."""
+        """Return the board as OpenCV draws it."""
         wide, high = self.size
         across = self.settings.columns * _PIXELS_A_COLUMN
         pixels = (across, round(across * high / wide))
@@ -111,13 +111,13 @@ class Board(Target):
         """See :class:`Target`."""
         plane, pixels = self.corners(grey)
         points = np.column_stack([plane, np.zeros(len(plane))])
-        rotation, place = self._guess(plane, lens.rays(pixels))
+        rotation, place = self.first_pose(plane, lens.rays(pixels))
         rotation, place, _, _ = _fitted(points, pixels, lens, rotation, place)
         pixels, shared_blur = self._refined(image, points, pixels, lens, rotation, place)
-        kept = np.isfinite(pixels[:, 0])
-        if kept.sum() < max(LEAST_CORNERS, 0.6 * len(points)):
+        finite = np.isfinite(pixels[:, 0])
+        if finite.sum() < max(LEAST_CORNERS, 0.6 * len(points)):
             raise NoPoseError(Status.MISFIT)
-        plane, points, pixels = plane[kept], points[kept], pixels[kept]
+        plane, points, pixels = plane[finite], points[finite], pixels[finite]
         good = np.ones(len(points), dtype=bool)
         for _ in range(3):
             rotation, place, inverse, residual = _fitted(points[good], pixels[good], lens, rotation, place)
@@ -162,15 +162,15 @@ class Board(Target):
         free = self._free * lens.focal / float(place[2])
         if free < LEAST_REACH:
             raise NoPoseError(Status.SMALL)
-        found = refined(image, pixels, np.stack(edges, axis=1), 0.95 * free, self.crossings)
-        blur = np.sort(np.nanmedian(found.blur, axis=0))
+        corners = refined(image, pixels, np.stack(edges, axis=1), 0.95 * free, self.crossings)
+        blur = np.sort(np.nanmedian(corners.blur, axis=0))
         if blur[1] > MOST_BLUR * free:
             raise NoPoseError(Status.BLURRED)
-        return found.pixels, math.sqrt(max(float(blur[1] ** 2 - blur[0] ** 2), 0.0))
+        return corners.pixels, math.sqrt(max(float(blur[1] ** 2 - blur[0] ** 2), 0.0))
 
     def corners(self, grey: Any) -> tuple[FloatArray, FloatArray]:
         """Corners on the plate (n, 2) m and in the image (n, 2) px. Raises NoPoseError."""
-        numbers, at, pixels, any_marker = self._found(grey)
+        numbers, at, pixels, any_marker = self._detected(grey)
         if len(set(numbers)) < len(numbers):
             raise NoPoseError(Status.DOUBLED)
         if not any_marker:
@@ -182,7 +182,7 @@ class Board(Target):
             raise NoPoseError(Status.HIDDEN)
         return plane * [self._mirror, -1.0], np.reshape(pixels, (-1, 2)).astype(float)
 
-    def _guess(self, plane: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def first_pose(self, plane: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rotation and place by the homography from the plane to the rays (Zhang 2000)."""
         scale = float(np.sqrt(np.mean(plane**2)))
         x, y = (plane / scale).T
@@ -294,7 +294,7 @@ class Charuco(Board):
         # A crossing has no inside.
         return np.ones((1, 2))
 
-    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+    def _detected(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
         pixels, numbers, any_marker = self._find(grey)
         flat = [] if numbers is None else np.ravel(numbers).tolist()
         at = np.array([self._corners[i] for i in flat], dtype=float).reshape(-1, 3)[:, :2]
@@ -336,7 +336,7 @@ class AprilTags(Board):
         corners = [[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]]
         return np.array(corners) * [self._mirror, 1.0]
 
-    def _found(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
+    def _detected(self, grey: Any) -> tuple[list[int], FloatArray, Any, bool]:
         corners, numbers = self._find(grey)
         flat = [] if numbers is None else np.ravel(numbers).tolist()
         ours = [(self._by_id[i], c) for i, c in zip(flat, corners, strict=True) if i in self._by_id]

@@ -41,7 +41,7 @@ class Frame(NamedTuple):
 
 
 def read_values(path: str | Path) -> dict[str, object]:
-    """The values in ``CAMERA.yaml`` by their names: plain keys, dotted or nested, or a ROS 2 parameter file.
+    """Return the values in ``CAMERA.yaml`` by their names: plain keys, dotted or nested, or a ROS 2 parameter file.
 
     Raises ConfigError.
     """
@@ -69,12 +69,12 @@ def _of_camera_info(tree: Mapping[str, Any], path: Path) -> dict[str, object]:
         if not isinstance(body, dict) or 'data' not in body:
             raise ConfigError(f'{path}: {theirs}.data is missing: not a camera_info file')
         values[ours] = body['data']
-    own = {k: v for k, v in tree.items() if str(k).partition('.')[0] in {'target', 'camera', 'rest'}}
-    return values | flattened(own, str(path))
+    settings = {k: v for k, v in tree.items() if str(k).partition('.')[0] in {'target', 'camera', 'rest'}}
+    return values | flattened(settings, str(path))
 
 
 def read_settings(path: str | Path | None) -> CameraSettings:
-    """The settings in ``CAMERA.yaml``; None: the defaults. Raises ConfigError."""
+    """Return the settings in ``CAMERA.yaml``; None: the defaults. Raises ConfigError."""
     return CameraSettings() if path is None else settings_from(read_values(path), str(path))
 
 
@@ -175,21 +175,21 @@ def _listed(folder: Path) -> list[tuple[Path, int, int]]:
 def _seconds(row: Row, column: str) -> int:
     """Seconds as ns, exactly for as many decimals as there are. Raises RecordingError."""
     value = row.number(column, _MOST_SECONDS)
-    whole, point, part = row.text(column).partition('.')
-    if point and whole.lstrip('-').isdecimal() and part.isdecimal():
-        sign = -1 if whole.startswith('-') else 1
-        return sign * (abs(int(whole)) * 1_000_000_000 + int(part[:9].ljust(9, '0')))
+    seconds, point, part = row.text(column).partition('.')
+    if point and seconds.lstrip('-').isdecimal() and part.isdecimal():
+        sign = -1 if seconds.startswith('-') else 1
+        return sign * (abs(int(seconds)) * 1_000_000_000 + int(part[:9].ljust(9, '0')))
     return round(value * 1e9)
 
 
 def _content(path: Path) -> bytes:
-    """The bytes of a file; one more than may be if there are more. Raises OSError."""
+    """Return the bytes of a file; one more than may be if there are more. Raises OSError."""
     with path.open('rb') as stream:
         return stream.read(MOST_BYTES + 1)
 
 
 def read_image(path: str | Path) -> Any:
-    """The image in a file, as of :func:`decoded`. Raises RecordingError if the file cannot be read."""
+    """Return the image in a file, as of :func:`decoded`. Raises RecordingError if the file cannot be read."""
     try:
         content = _content(Path(path))
     except OSError as error:
@@ -198,7 +198,7 @@ def read_image(path: str | Path) -> Any:
 
 
 def decoded(content: bytes, cv2: Any) -> Any:
-    """A grey image of the bytes of a file (PNG, JPEG …).
+    """Return a grey image of the bytes of a file (PNG, JPEG …).
 
     None if they are none; the NoPoseError that says so if they declare an image that is too large: nothing is unpacked
     then.
@@ -216,7 +216,7 @@ def decoded(content: bytes, cv2: Any) -> Any:
 
 
 def grey(image: Any) -> Any:
-    """An image as grey uint8 or uint16; None if it is of another kind."""
+    """Return an image as grey uint8 or uint16; None if it is of another kind."""
     cv2 = opencv()
     if image is None or image.dtype not in (np.uint8, np.uint16):
         return None
@@ -245,11 +245,11 @@ _ENCODINGS = {
 
 
 def of_ros_image(height: int, width: int, encoding: str, big_endian: bool, step: int, content: bytes) -> Any:
-    """The grey image of a sensor_msgs/Image; None if it is of an encoding without brightness, or damaged."""
-    found = _ENCODINGS.get(encoding)
-    if found is None:
+    """Return the grey image of a sensor_msgs/Image; None if it is of an encoding without brightness, or damaged."""
+    encoding_found = _ENCODINGS.get(encoding)
+    if encoding_found is None:
         return None
-    kind, channels, conversion = found
+    kind, channels, conversion = encoding_found
     wide = width * channels * np.dtype(kind).itemsize
     if not (
         0 < wide <= step

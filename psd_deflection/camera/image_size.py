@@ -90,15 +90,15 @@ def _tiff(content: bytes | memoryview) -> Size | None:
     at = struct.unpack_from(order + ('Q' if big else 'I'), content, 8 if big else 4)[0]
     count = struct.unpack_from(order + ('Q' if big else 'H'), content, at)[0]
     first, length = (at + 8, 20) if big else (at + 2, 12)
-    found: dict[int, int] = {}
+    tags: dict[int, int] = {}
     for entry in range(first, first + length * min(count, 4096), length):
         tag, kind = struct.unpack_from(order + 'HH', content, entry)
         if tag in (256, 257):
             form = {3: 'H', 4: 'I', 16: 'Q'}.get(kind)
             if form is None:
                 return None
-            found[tag] = struct.unpack_from(order + form, content, entry + (12 if big else 8))[0]
-    return (found[256], found[257]) if len(found) == 2 else None
+            tags[tag] = struct.unpack_from(order + form, content, entry + (12 if big else 8))[0]
+    return (tags[256], tags[257]) if len(tags) == 2 else None
 
 
 def _webp(content: bytes | memoryview) -> Size | None:
@@ -120,8 +120,8 @@ def _gif(content: bytes | memoryview) -> Size | None:
 
 
 def _pnm(content: bytes | memoryview) -> Size | None:
-    found = _PNM.match(bytes(content[:4096]))
-    return (int(found[1]), int(found[2])) if found is not None else None
+    header = _PNM.match(bytes(content[:4096]))
+    return (int(header[1]), int(header[2])) if header is not None else None
 
 
 _KINDS: tuple[tuple[bytes, Callable[[bytes | memoryview], Size | None]], ...] = (

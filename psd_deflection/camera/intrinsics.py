@@ -30,10 +30,10 @@ class Intrinsics(NamedTuple):
     distortion: FloatArray
     rms: float
     used: int
-    left_out: list[tuple[str, str]]
+    excluded: list[tuple[str, str]]
 
     def as_yaml(self, name: str) -> str:
-        """The text of a ``camera_info`` file, which ``--params-file`` of ``camera`` reads too."""
+        """Return the text of a ``camera_info`` file, which ``--params-file`` of ``camera`` reads too."""
         projection = np.column_stack([self.matrix, np.zeros(3)])
         head = f'image_width: {self.size[0]}\nimage_height: {self.size[1]}\ncamera_name: {name}\n'
         return (
@@ -53,7 +53,7 @@ class Intrinsics(NamedTuple):
             'sd': self.deviation.tolist(),
             'rms': self.rms,
             'used': self.used,
-            'left_out': dict(self.left_out),
+            'left_out': dict(self.excluded),
         }
 
     def lines(self) -> list[str]:
@@ -72,14 +72,14 @@ def _matrix(name: str, values: FloatArray) -> str:
 
 
 def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> Intrinsics:
-    """The lens by named grey images of one size (None or a NoPoseError: unreadable).
+    """Return the lens by named grey images of one size (None or a NoPoseError: unreadable).
 
     Raises ConfigError if they do not determine it.
     """
     board = target_of(settings)
     if not isinstance(board, Board):
         raise ConfigError(f'target.kind = {settings.target}: the lens is found by a board: charuco or apriltag')
-    points, pixels, left_out = [], [], []
+    points, pixels, excluded = [], [], []
     size: tuple[int, int] | None = None
     for name, image in images:
         try:
@@ -88,16 +88,16 @@ def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> I
             shape = (int(image.shape[1]), int(image.shape[0]))
             size = size or shape
             if shape != size:
-                left_out.append((name, f'has {shape[0]} x {shape[1]} pixels, the first has {size[0]} x {size[1]}'))
+                excluded.append((name, f'has {shape[0]} x {shape[1]} pixels, the first has {size[0]} x {size[1]}'))
                 continue
-            plane, seen = board.corners(image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8))
+            plane, corners = board.corners(image if image.dtype == np.uint8 else (image >> 8).astype(np.uint8))
         except NoPoseError as error:
-            left_out.append((name, str(error)))
+            excluded.append((name, str(error)))
             continue
         points.append(np.column_stack([plane, np.zeros(len(plane))]).astype(np.float32))
-        pixels.append(seen.astype(np.float32))
+        pixels.append(corners.astype(np.float32))
     if size is None or len(points) < LEAST_IMAGES:
-        why = ''.join(f'; {name}: {reason}' for name, reason in left_out[:3])
+        why = ''.join(f'; {name}: {reason}' for name, reason in excluded[:3])
         raise ConfigError(
             f'{len(points)} images show the board, at least {LEAST_IMAGES} are needed, tilted in all directions{why}'
         )
@@ -106,10 +106,10 @@ def calibrated(settings: CameraSettings, images: Iterable[tuple[str, Any]]) -> I
     rms, matrix, distortion, _, _, deviation, _, _ = cv2.calibrateCameraExtended(
         points, pixels, size, None, None, flags=cv2.CALIB_FIX_K3
     )
-    found = np.ravel(deviation)[:4]
-    if not (rms < _MOST_RMS and np.all(np.isfinite(matrix)) and np.all(found < 0.05 * matrix[0, 0])):
+    deviations = np.ravel(deviation)[:4]
+    if not (rms < _MOST_RMS and np.all(np.isfinite(matrix)) and np.all(deviations < 0.05 * matrix[0, 0])):
         raise ConfigError(
-            f'the images do not determine the lens (rms {rms:.2f} px, focal length ± {found[0]:.0f} px): '
+            f'the images do not determine the lens (rms {rms:.2f} px, focal length ± {deviations[0]:.0f} px): '
             'take ten or more with the board tilted by 20 to 40 degrees in all directions, up to the corners'
         )
-    return Intrinsics(size, np.asarray(matrix), found, np.ravel(distortion)[:5], float(rms), len(points), left_out)
+    return Intrinsics(size, np.asarray(matrix), deviations, np.ravel(distortion)[:5], float(rms), len(points), excluded)

@@ -14,7 +14,7 @@ from psd_deflection.camera.image_size import MOST_PIXELS
 
 @functools.cache
 def opencv() -> Any:
-    """The module ``cv2``. Raises ConfigError, with the fix, if it is not installed."""
+    """Return the module ``cv2``. Raises ConfigError, with the fix, if it is not installed."""
     # OpenCV reads it once, when it is imported; its own bound is 2^30.
     os.environ.setdefault('OPENCV_IO_MAX_IMAGE_PIXELS', str(MOST_PIXELS))
     try:

@@ -18,7 +18,7 @@ _DOTS_PER_INCH = 600
 
 
 def printed(target: Target, kind: str) -> bytes:
-    """The target as a file of ``kind`` (pdf, svg, png), with a scale of 50 mm to check the printer by."""
+    """Return the target as a file of ``kind`` (pdf, svg, png), with a scale of 50 mm to check the printer by."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle, Rectangle
@@ -49,8 +49,8 @@ def printed(target: Target, kind: str) -> bytes:
     for x in (-0.025, 0.025):
         axes.plot([x, x], [below - 0.0015, below + 0.0015], color='black', linewidth=0.8)
     axes.text(0.0, below - 0.002, '50 mm: print at 100 %, measure this line', ha='center', va='top', fontsize=6)
-    said = target.describe()
-    lines = ['; '.join(said[i : i + 2]) for i in range(0, len(said), 2)]
+    description = target.describe()
+    lines = ['; '.join(description[i : i + 2]) for i in range(0, len(description), 2)]
     axes.text(0.0, below - 0.0055, '\n'.join(lines), ha='center', va='top', fontsize=5)
     out = io.BytesIO()
     figure.savefig(out, format=kind, dpi=_DOTS_PER_INCH, metadata={'Date': None} if kind == 'svg' else None)

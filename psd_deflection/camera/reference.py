@@ -59,20 +59,20 @@ class CameraReference:
         return self._lens
 
     def take(self, t_ns: int, image: Any) -> list[FrameAnswer]:
-        """The answers that are known now, in the order of the frames.
+        """Return the answers that are known now, in the order of the frames.
 
         ``t_ns``: middle of the exposure. ``image``: (rows, columns) of uint8 or uint16, None if it cannot be read,
         or the NoPoseError that says why.
         """
-        found: TargetPose | NoPoseError
+        pose: TargetPose | NoPoseError
         try:
-            found = self._locate(image)
+            pose = self._locate(image)
         except NoPoseError as error:
-            found = error.with_traceback(None)
+            pose = error.with_traceback(None)
         # A frame without a target waits only behind one that waits for the rest.
-        if self._rest is not None or (not self._waiting and isinstance(found, NoPoseError)):
-            return [self._answer(t_ns, found)]
-        self._waiting.append((t_ns, found))
+        if self._rest is not None or (not self._waiting and isinstance(pose, NoPoseError)):
+            return [self._answer(t_ns, pose)]
+        self._waiting.append((t_ns, pose))
         good = [f for _, f in self._waiting if isinstance(f, TargetPose)]
         if self._settings.rest_frames:
             complete = len(good) >= self._settings.rest_frames
@@ -85,12 +85,12 @@ class CameraReference:
         return []
 
     def finish(self) -> list[FrameAnswer]:
-        """The answers of the frames that still wait for the rest: there are no further frames."""
+        """Return the answers of the frames that still wait for the rest: there are no further frames."""
         good = [f for _, f in self._waiting if isinstance(f, TargetPose)]
         if self._rest is None and good:
             return self._decide(good)
         waiting, self._waiting = self._waiting, []
-        return [self._answer(t_ns, found) for t_ns, found in waiting]
+        return [self._answer(t_ns, pose) for t_ns, pose in waiting]
 
     def _locate(self, image: Any) -> TargetPose:
         if isinstance(image, NoPoseError):
@@ -113,15 +113,15 @@ class CameraReference:
         self._rest = mean_pose(good)
         self.target.set_rest(self._rest)
         waiting, self._waiting = self._waiting, []
-        return [self._answer(t_ns, found) for t_ns, found in waiting]
+        return [self._answer(t_ns, pose) for t_ns, pose in waiting]
 
-    def _answer(self, t_ns: int, found: TargetPose | NoPoseError) -> FrameAnswer:
-        if isinstance(found, NoPoseError):
-            return FrameAnswer(t_ns, found.status, words=str(found))
+    def _answer(self, t_ns: int, pose: TargetPose | NoPoseError) -> FrameAnswer:
+        if isinstance(pose, NoPoseError):
+            return FrameAnswer(t_ns, pose.status, words=str(pose))
         if self._rest is None:
             raise RuntimeError('a pose is answered before the rest is known')
-        dx, dy, theta, phi, omega = relative(self._rest, found)
-        return FrameAnswer(t_ns, Status.OK, dx, dy, theta, phi, omega, relative_covariance(self._rest, found), found)
+        dx, dy, theta, phi, omega = relative(self._rest, pose)
+        return FrameAnswer(t_ns, Status.OK, dx, dy, theta, phi, omega, relative_covariance(self._rest, pose), pose)
 
 
 def relative(rest: TargetPose, pose: TargetPose) -> FloatArray:
@@ -172,7 +172,7 @@ def _cross(v: FloatArray) -> FloatArray:
 
 
 def mean_pose(poses: list[TargetPose]) -> TargetPose:
-    """The mean of poses that are near each other, with its covariance."""
+    """Return the mean of poses that are near each other, with its covariance."""
     summed = np.sum([p.rotation for p in poses], axis=0)
     u, _, vt = np.linalg.svd(summed)
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt

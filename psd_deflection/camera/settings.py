@@ -84,13 +84,13 @@ class CameraSettings:
     frame_prefix: str = parameter('', '', 'of the rig: put before link_tip_rest, the frame of the reference on ROS')
 
     def lens(self, shape: tuple[int, int]) -> Lens:
-        """The lens for images of ``shape`` (rows, columns). Raises ConfigError."""
+        """Return the lens for images of ``shape`` (rows, columns). Raises ConfigError."""
         if not self.matrix:
             return Lens.unknown(shape)
         return Lens(np.array(self.matrix).reshape(3, 3), np.array(self.distortion, dtype=float))
 
     def of_kind(self, target: str) -> CameraSettings:
-        """The same with another kind of target. Raises ConfigError."""
+        """Return the same with another kind of target. Raises ConfigError."""
         return replace(self, target=target)
 
     def __post_init__(self) -> None:
@@ -108,7 +108,7 @@ MATRIX = 'camera.matrix'
 
 
 def settings_from(values: Mapping[str, object], where: str) -> CameraSettings:
-    """The settings of flat ``values`` (``target.spacing`` …); the matrix may be in rows. Raises ConfigError.
+    """Return the settings of flat ``values`` (``target.spacing`` …); the matrix may be in rows. Raises ConfigError.
 
     ``where``: for messages.
     """

@@ -41,11 +41,11 @@ class Target(abc.ABC):
 
     @abc.abstractmethod
     def locate(self, image: Any, grey: Any, lens: Lens, full_scale: float) -> TargetPose:
-        """The target in one image; ``grey`` is its 8-bit form. Raises NoPoseError."""
+        """Return the target in one image; ``grey`` is its 8-bit form. Raises NoPoseError."""
 
     @abc.abstractmethod
     def drawing(self) -> Drawing:
-        """The picture to print."""
+        """Return the picture to print."""
 
     def set_rest(self, rest: TargetPose) -> None:
         """Remember where the target is at rest."""
@@ -56,10 +56,12 @@ class Target(abc.ABC):
         return []
 
     def describe(self) -> list[str]:
-        """The lines of ``CAMERA.yaml`` that describe it."""
-        lines = [f'{SETTINGS.parameters[own].name}: {_shown(getattr(self.settings, own))}' for own in self.own]
+        """Return the lines of ``CAMERA.yaml`` that describe it."""
+        lines = [
+            f'{SETTINGS.parameters[name].name}: {_setting_words(getattr(self.settings, name))}' for name in self.own
+        ]
         return [f'target.kind: {self.kind}', *lines]
 
 
-def _shown(value: object) -> str:
+def _setting_words(value: object) -> str:
     return f'{value:g}' if isinstance(value, float) else str(value)

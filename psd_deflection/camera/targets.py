@@ -10,6 +10,6 @@ from psd_deflection.camera.target import Target
 
 
 def target_of(settings: CameraSettings) -> Target:
-    """The finder of the target that ``settings`` name. Raises ConfigError."""
+    """Return the finder of the target that ``settings`` name. Raises ConfigError."""
     target: Target = target_class(settings.target)(settings)
     return target

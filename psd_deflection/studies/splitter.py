@@ -102,23 +102,23 @@ class LightPhase(NamedTuple):
 
 
 def rules(rig: Rig, lasers: Lasers) -> list[SplitterRule]:
-    """The three rules, the second and the third for each laser."""
+    """Return the three rules, the second and the third for each laser."""
     amplifier, least = rig.amplifier.sum_nominal, 0.5 * rig.estimator.sum_min
     both = sum(lasers.powers)
     out = [SplitterRule('both together', both, 2.0 * lasers.allowed, 'W', both <= 2.0 * lasers.allowed)]
     for i, power in enumerate(lasers.powers, 1):
-        left = amplifier * power / both
-        out.append(SplitterRule(f'laser {i} alone is enough: sum signal', left, least, 'V', left >= least))
+        sum_signal = amplifier * power / both
+        out.append(SplitterRule(f'laser {i} alone is enough: sum signal', sum_signal, least, 'V', sum_signal >= least))
     # The page and the covariance know of the failure by this.
     shares = [power / both for power in lasers.powers]
     low, high = HALF_LIGHT
     out.append(SplitterRule('one that is out is told: smaller share', min(shares), low, '', low < min(shares) <= high))
     for i, power in enumerate(lasers.powers, 1):
-        kept = power <= 2.0 * lasers.allowed
-        out.append(SplitterRule(f'as spares: laser {i}', power, 2.0 * lasers.allowed, 'W', kept))
+        satisfied = power <= 2.0 * lasers.allowed
+        out.append(SplitterRule(f'as spares: laser {i}', power, 2.0 * lasers.allowed, 'W', satisfied))
     spare = amplifier * lasers.powers[1] / lasers.powers[0]
-    kept = rig.estimator.sum_min <= spare <= rig.estimator.sum_max
-    out.append(SplitterRule('the spare is like the first: sum signal', spare, rig.estimator.sum_max, 'V', kept))
+    satisfied = rig.estimator.sum_min <= spare <= rig.estimator.sum_max
+    out.append(SplitterRule('the spare is like the first: sum signal', spare, rig.estimator.sum_max, 'V', satisfied))
     return out
 
 
@@ -131,8 +131,10 @@ def simulated(rig: Rig, lasers: Lasers, seed: int = 1) -> list[LightPhase]:
     first, second = lasers.powers
     both = first + second
     # Two lasers are read at the centroid of their light.
-    left = lasers.apart * first / both
-    together = _run(rig, (('both lasers', BEFORE_S, 1.0, 0.0), ('laser 1 out', AFTER_S, second / both, left)), seed)
+    sum_signal = lasers.apart * first / both
+    together = _run(
+        rig, (('both lasers', BEFORE_S, 1.0, 0.0), ('laser 1 out', AFTER_S, second / both, sum_signal)), seed
+    )
     cold = [('laser 1 out, its spare cold', lasers.warm_up, 0.0, 0.0)] if lasers.warm_up else []
     alone = (('laser 1 alone', BEFORE_S, 1.0, 0.0), *cold, ('its spare', AFTER_S, second / first, lasers.apart))
     return [*together, *_run(rig, alone, seed + 1)]
@@ -176,19 +178,21 @@ def lit(rig: Rig, volts: FloatArray, share: FloatArray, rng: np.random.Generator
 def _phase(name: str, blocks: range, records: Sequence[Record], pose: FloatArray, size: int) -> LightPhase:
     """What the ``records`` say of ``blocks`` of ``size`` samples, whose true poses are ``pose`` (n, 3)."""
     spots = [r for r in records if isinstance(r, SpotMeans) and r.index in blocks]
-    found = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary and r.block in blocks]
+    estimates = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary and r.block in blocks]
     statuses = [s.status for s in spots]
     status = max(set(statuses), key=statuses.count)
-    said = next((s.findings[0] for s in spots if s.findings), '')
-    if not found:
+    message = next((s.findings[0] for s in spots if s.findings), '')
+    if not estimates:
         none = np.full(3, np.nan)
-        why = next((s.reason for s in spots if s.reason), said)
+        why = next((s.reason for s in spots if s.reason), message)
         return LightPhase(name, 0.0, status, none, none, none, 0.0, why)
-    sds = np.sqrt([r.variances for r in found])
-    middle = np.array([size * r.block + (size - 1) // 2 for r in found])
+    sds = np.sqrt([r.variances for r in estimates])
+    middle = np.array([size * r.block + (size - 1) // 2 for r in estimates])
     # Between two samples if their number is even.
     there = 0.5 * (pose[middle] + pose[middle + 1 - size % 2])
-    errors = np.array([r.pose for r in found]) - there
+    errors = np.array([r.pose for r in estimates]) - there
     off, scatter = errors.mean(axis=0), errors.std(axis=0)
     largest = float((np.abs(errors - off) / sds).max())
-    return LightPhase(name, len(found) / len(blocks), status, np.median(sds, axis=0), off, scatter, largest, said)
+    return LightPhase(
+        name, len(estimates) / len(blocks), status, np.median(sds, axis=0), off, scatter, largest, message
+    )

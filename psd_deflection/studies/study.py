@@ -69,19 +69,19 @@ class StudyResult(abc.ABC):
 
     @abc.abstractmethod
     def tree(self) -> dict[str, Any]:
-        """The answer for programs: names, numbers in SI units, lists."""
+        """Return the answer for programs: names, numbers in SI units, lists."""
 
     @abc.abstractmethod
     def sentences(self) -> list[str]:
-        """The answer for a person, the most important first."""
+        """Return the answer for a person, the most important first."""
 
     @abc.abstractmethod
     def sections(self) -> Iterable[PageSection]:
-        """The page below the sentences."""
+        """Return the page below the sentences."""
 
     @abc.abstractmethod
     def table(self) -> Table:
-        """The answer as columns with units, a row for each thing that was found."""
+        """Return the answer as columns with units, a row for each thing that was found."""
 
     def __repr__(self) -> str:
         return f'<{type(self).__name__}: {sanitize(" ".join(self.sentences()), LONGEST_REPR)}>'
@@ -100,10 +100,10 @@ class StudyResult(abc.ABC):
         return self.sentences()
 
     def report(self) -> str:
-        """The page as HTML, with its pictures inside."""
-        first, *others = self.page_sentences()
+        """Return the page as HTML, with its pictures inside."""
+        first, *remaining = self.page_sentences()
         body = [f'<h1>{html.escape(self.title)}</h1><p class=verdict>{html.escape(first)}</p>']
-        body += [f'<p>{html.escape(text)}</p>' for text in others]
+        body += [f'<p>{html.escape(text)}</p>' for text in remaining]
         for section in self.sections():
             body += [f'<h2>{html.escape(section.title)}</h2>'] if section.title else []
             body += map(in_page, section.parts)
@@ -116,7 +116,7 @@ class StudyResult(abc.ABC):
         return [part for section in self.sections() for part in section.parts if not isinstance(part, str)]
 
     def plot(self, number: int = 0) -> ShownFigure:
-        """The drawing ``number`` of :meth:`drawings` as a matplotlib figure, which a notebook shows.
+        """Return the drawing ``number`` of :meth:`drawings` as a matplotlib figure, which a notebook shows.
 
         ``figure.savefig('a.png')`` writes it. Raises ConfigError if there is no such drawing.
         """
@@ -124,7 +124,7 @@ class StudyResult(abc.ABC):
 
         shown = self.drawings()
         if not 0 <= number < len(shown):
-            there = '; '.join(f'{i}: {one.words}' for i, one in enumerate(shown)) or 'none, for nothing was found'
+            there = '; '.join(f'{i}: {drawn.words}' for i, drawn in enumerate(shown)) or 'none, for nothing was found'
             raise ConfigError(f'number: {number}: no such drawing; there are {there}')
         return figure_of(shown[number])
 
@@ -136,7 +136,7 @@ class StudyResult(abc.ABC):
         return self.table().to_pandas()
 
     def json(self) -> str:
-        """The tree as text; null for numbers that JSON does not have."""
+        """Return the tree as text; null for numbers that JSON does not have."""
         return json_text(self.tree(), indent=1) + '\n'
 
     def files(self) -> dict[str, str]:
@@ -191,7 +191,7 @@ def opened(
     span: Span = WHOLE,
     tell: Tell = warn_caller,
 ) -> Opened:
-    """The recording and the rig that describes it: ``rig``, its parameter file, or that of the recording's end.
+    """Return the recording and the rig that describes it: ``rig``, its parameter file, or that of the recording's end.
 
     ``span``: the part of the recording that is meant. ``tell`` gets a warning if nobody names a rig.
     Raises RecordingError and ConfigError.
@@ -209,7 +209,7 @@ def opened(
 
 
 def named(recording: str, digest: str, digits: int = 16) -> str:
-    """A recording by its name and the start of its SHA-256, if it has files."""
+    """Return a recording by its name and the start of its SHA-256, if it has files."""
     return f'{recording} (sha256 {digest[:digits]})' if digest else recording
 
 
@@ -232,7 +232,7 @@ def edited_rig_file(
     edit: Callable[[str, Path], str],
     tell: Tell = warn_caller,
 ) -> str:
-    """The text of the file ``name``: ``edit`` of the user's file and its path, comments kept.
+    """Return the text of the file ``name``: ``edit`` of the user's file and its path, comments kept.
 
     Without a file of the user, or if it cannot be edited, which ``tell`` gets, ``edit`` of what ``rig_text`` gives.
     """

@@ -97,7 +97,7 @@ def test_a_hidden_effect_is_named(key: str) -> None:
 
 
 @pytest.mark.statistics
-def test_times_that_leave_the_noise_are_kept_beside_an_effect_that_is_far_from_linear() -> None:
+def test_times_at_the_noise_stay_beside_a_nonlinear_effect() -> None:
     """Friction: a further step of the free times led away."""
     key = 'hand-slow-64146-clamp_friction'
     case = next(c for c in cases_by_hand(64000, 200) if c.key == key)
@@ -166,7 +166,7 @@ def test_a_mistake_is_named_and_no_effect_beside_it() -> None:
 
 
 @pytest.mark.statistics
-def test_a_torque_that_was_never_noted_gets_its_time_beside_another_torsional_stiffness() -> None:
+def test_an_unnoted_torque_beside_a_soft_link_has_its_time() -> None:
     key = 'hand-forgotten-65019-torsional_stiffness'
     case = Case(key, 'hand', 'hand-forgotten-65019', (), mistake=('hand', 0.0))
     truth = {'name': 'torsional_stiffness', 'moves_frequency': 1, 'scale': 0.006287795979194355}
@@ -181,7 +181,7 @@ def test_a_torque_that_was_never_noted_gets_its_time_beside_another_torsional_st
 
 
 @pytest.mark.statistics
-def test_loads_that_are_right_as_noted_are_not_called_wrong_beside_a_clamp_that_sticks() -> None:
+def test_right_loads_beside_a_sticking_clamp_stay() -> None:
     case = Case('spread-81014-tip_mass-mount_tilt-clamp_friction', 'spread', 'two', ())
     found, _ = run.answer(
         case,
@@ -198,21 +198,21 @@ def test_loads_that_are_right_as_noted_are_not_called_wrong_beside_a_clamp_that_
 def test_what_is_left_unsaid_fails_the_suite() -> None:
     gap = {'before': 4.0, 'after': 2.0, 'floor': 1.0, 'heldout_after': 1.0}
     answer = {'verdict': 'effects_found', 'effects': [], 'unknown': [], 'setup': [], 'gap': gap}
-    for floors, null_log in ((1.4, 0), (1.6, 1)):
+    for floors, failures in ((1.4, 0), (1.6, 1)):
         whole = {**answer, 'remaining': {'floors': floors}, 'provenance': {'forward_simulations': 1}}
         text, _ = score.summary([score.Row('spread', 'spread', 3.0, True, [{'name': 'creep'}], whole)])
-        assert f'answers that leave more than 1.5 floors unsaid: {null_log}' in text
+        assert f'answers that leave more than 1.5 floors unsaid: {failures}' in text
         assert 'all of a pair or triple of 1:10:100 floors: 0.0 % (0/1' in text
 
 
-def test_an_effect_that_is_none_fails_the_suite_unless_it_cannot_be_told_from_the_true_one() -> None:
+def test_a_false_effect_fails_the_suite_unless_equivalent() -> None:
     for names, false in (((), 0), (('creep',), 0), (('creep', 'damping'), 1)):
         effects = [{'name': n} for n in names]
         row = score.Row(
-            'pair', 'pair', 3.0, True, [{'name': 'creep'}, {'name': 'x'}], score.whole({'effects': effects})
+            'pair', 'pair', 3.0, True, [{'name': 'creep'}, {'name': 'x'}], score.complete({'effects': effects})
         )
         assert f'an effect named that is none: {100 * false:.1f} % ({false}/1;' in score.summary([row])[0]
-    alike = score.whole({'effects': [{'name': 'tip_force', 'equivalent': ['mount_tilt']}]})
+    alike = score.complete({'effects': [{'name': 'tip_force', 'equivalent': ['mount_tilt']}]})
     row = score.Row('single', 'single', 3.0, True, [{'name': 'mount_tilt'}], alike)
     assert 'an effect named that is none: 0.0 % (0/1;' in score.summary([row])[0]
 
@@ -225,7 +225,7 @@ def test_a_peer_answers_the_same_cases(peer: str) -> None:
     for name in ('single-creep-3-s', 'null-s0', 'single-quantisation-3-s'):
         case = next(c for c in short_cases() if c.key == name)
         found = suite_peers.answer(peer, run.observe(case, run.truth_of(case)), load_rig(), ())
-        row = score.Row(case.key, case.kind, 3.0, True, run.truth_of(case), score.whole(found))
+        row = score.Row(case.key, case.kind, 3.0, True, run.truth_of(case), score.complete(found))
         assert row.named == [n for n, _ in case.wanted], name
         assert row.answer['remaining']['floors'] < 1.1
 

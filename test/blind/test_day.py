@@ -28,6 +28,7 @@ def test_our_decoder_reads_its_frames() -> None:
 
 def test_a_ping_is_answered_with_its_cookie_and_a_question_with_who_it_is() -> None:
     asked = day.frame(0x12, struct.pack('<Q', 99))[:-1]
+    # What the simulated device answers; else only a serial line in real time shows it.
     assert day.Device._answer(asked, 1.5) == day.frame(0x13, struct.pack('<QQ', 99, 1_500_000))
     assert day.Device._answer(day.frame(0x11, b'')[:-1], 0.0) == day.hello()
     assert day.Device._answer(b'\x05\x01', 0.0) == b''

@@ -5,19 +5,16 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from zipfile import ZipFile
 
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
-from scipy.io import savemat
 
-from blind import balls, duels, foreign, silverbox
+from blind import balls, silverbox
 from blind.boom import Boom
-from blind.duel_peers import Answers, best_subset
-from blind.emps import Emps
+from blind.duel_peers import best_subset
 from blind.measured import DATA
 from blind.silverbox import RATE, Silverbox, rmse
 from psd_deflection.records import FloatArray
@@ -68,63 +65,6 @@ def test_the_cubic_spring_of_a_made_silverbox_is_found_with_its_size(tmp_path: P
     assert 0.9e-4 < found.gap_after < 2e-4
 
 
-def test_a_silverbox_that_is_not_there_or_too_short_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match=silverbox.FILE):
-        Silverbox(tmp_path)
-    (tmp_path / silverbox.FILE).write_text('"V1","V2",\n0.1,0.2,\n')
-    with pytest.raises(ValueError, match='has 1 samples: too few'):
-        Silverbox(tmp_path)
-
-
-def test_the_measure_counts_after_the_first_samples() -> None:
-    """By hand: errors 3 and 4 in three samples that count, of which the mean is 2 and the variance 2/3."""
-    y, model = np.array([9.0, 1.0, 2.0, 3.0]), np.array([0.0, 4.0, 6.0, 3.0])
-    left, share = rmse(y, model, start=1)
-    assert left == pytest.approx(math.sqrt(25.0 / 3.0))
-    assert share == pytest.approx(math.sqrt(25.0 / 3.0) / math.sqrt(2.0 / 3.0))
-
-
-def test_the_official_parts_do_not_overlap() -> None:
-    """100 to 40575 and its first 32,000 samples; 40650 to 127400, of which the first three quarters train."""
-    (begin, end), tests = silverbox.TRAIN, silverbox.TESTS
-    assert (begin, end - begin) == (40650, int(0.75 * (127400 - 40650)))
-    assert tests['multisine'] == (end, 127400)
-    assert tests['arrow'] == (100, 40575)
-    assert tests['arrow, no extrapolation'] == (100, 100 + 32000)
-
-
-def test_what_is_not_there_has_a_row_each(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert duels.main(['--data', str(tmp_path)]) == 3
-    out = capsys.readouterr().out
-    for name, duel in duels.DUELS.items():
-        assert f'| {name} | not run: {duel.file} is not there |' in out
-
-
-def test_a_file_of_others_that_is_not_there_is_told_by_its_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr('sys.argv', ['foreign', 'auxtel', '--data', str(tmp_path)])
-    assert foreign.main() == 3
-    assert capsys.readouterr().err == f'{tmp_path / "auxtel.txt"}: No such file or directory\n'
-
-
-def test_a_file_without_a_model_and_another_file_are_told(tmp_path: Path) -> None:
-    path = tmp_path / duels.DUELS['kuka'].file
-    path.parent.mkdir()
-    path.write_text('other')
-    first, (second,) = duels.rows('kuka', replace(duels.DUELS['kuka'], sha256='0'), tmp_path, lambda _: None)
-    assert 'NOT the one that is known' in first
-    assert 'not run: there is no model of it here' in second
-
-
-@pytest.mark.parametrize(
-    ('theirs', 'ours', 'better'),
-    [(7.38, 7.43, 'the peer'), (7.38, 7.0, 'ours'), (0.4401, 0.4402, 'even'), ('not installed', 1.0, '')],
-)
-def test_the_smaller_printed_figure_wins(theirs: float | str, ours: float, better: str) -> None:
-    assert duels.Figure('', '', theirs, ours).better() == better
-
-
 def made_drops(path: Path, drag: float) -> None:
     """Two drops of each ball from 47 m, falling as v = -u tanh(g t / u), in the file's form; u by mass and radius."""
     sheet = '<worksheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/2006/main"><sheetData>'
@@ -153,31 +93,6 @@ def test_the_drag_of_made_drops_is_found_with_its_size(tmp_path: Path) -> None:
     assert drag.active.values['coefficient'] == pytest.approx(0.45, rel=0.05)
 
 
-def test_drops_that_are_no_table_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match=balls.FILE):
-        balls.Balls(tmp_path)
-    (tmp_path / balls.FILE).write_text('no table')
-    with pytest.raises(ValueError, match='is no table of drops'):
-        balls.Balls(tmp_path)
-
-
-def test_a_peer_that_is_not_installed_is_told(tmp_path: Path) -> None:
-    def absent(_: Silverbox) -> tuple[str, Answers]:
-        raise ImportError('No module named x', name='x')
-
-    oscillator(tmp_path)
-    assert duels._asked(Silverbox(tmp_path, train=(0, COUNT), shape=(4, 6)), absent) == 'not installed (x)'
-
-
-def test_the_drive_is_read_from_the_file_of_the_benchmark_too(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    t, position, voltage = np.arange(4000) * 1e-3, rng.standard_normal(4000), rng.standard_normal(4000)
-    savemat(tmp_path / 'made.mat', {'t': t[:, None], 'qm': position[:, None], 'vir': voltage[:, None]})
-    plant = Emps((), tmp_path, record='made.mat', segment=4.0)
-    np.testing.assert_array_equal(plant.measured()[0][0], position[::10])
-    np.testing.assert_array_equal(plant.inputs()['voltage'][0], voltage[::10])
-
-
 @pytest.mark.skipif(not (DATA / 'boom').is_dir(), reason='the readings of the boom are not here')
 def test_of_the_boom_every_subset_of_three_is_asked() -> None:
     subset = best_subset(Boom())
@@ -187,7 +102,7 @@ def test_of_the_boom_every_subset_of_three_is_asked() -> None:
 
 
 @pytest.mark.skipif(not (DATA / 'silverbox').is_dir(), reason='the data of the Silverbox are not here')
-def test_with_the_sizes_that_were_found_the_silverbox_is_simulated_to_half_a_percent() -> None:
+def test_the_fitted_silverbox_is_simulated_to_half_a_percent() -> None:
     """The search itself takes minutes: python -m blind.duels --only silverbox."""
     plant = Silverbox(DATA / 'silverbox')
     model = {

@@ -34,7 +34,7 @@ def test_the_boom_lacks_gravity_and_its_root_gives_way() -> None:
     weight, root = found.effects
     assert weight.active.effect.name == 'self_weight'
     assert {root.active.effect.name, *root.equivalent} == {'clamp_compliance', 'root_length'}
-    assert {r.active.effect.name for r in root.rivals} == set(root.equivalent)
+    assert {r.active.effect.name for r in root.fitted_alternatives} == set(root.equivalent)
     assert found.gap_before == pytest.approx(17.65e-3, rel=0.01)
     assert found.gap_after < 2e-3
     assert found.gap_heldout_after < 3e-3

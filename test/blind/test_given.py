@@ -59,11 +59,13 @@ def test_the_score_takes_an_answer_of_any_tool(folder: Path, capsys: pytest.Capt
 
 
 def test_what_an_answer_leaves_out_counts_as_nothing() -> None:
-    assert score.whole({})['verdict'] == 'nothing_missing'
-    assert score.whole({'effects': [{'name': 'a'}]})['effects'] == [{'name': 'a', 'equivalent': [], 'parameters': {}}]
-    assert score.whole({'effects': [{'name': 'a'}]})['verdict'] == 'effects_found'
-    assert score.whole({'effects': [{'name': 'a'}], 'unknown': [{}]})['unknown'] == [{'law': None}]
-    assert score.whole({'effects': [{'name': 'a'}], 'unknown': [{}]})['verdict'] == 'unknown_effect'
+    assert score.complete({})['verdict'] == 'nothing_missing'
+    assert score.complete({'effects': [{'name': 'a'}]})['effects'] == [
+        {'name': 'a', 'equivalent': [], 'parameters': {}}
+    ]
+    assert score.complete({'effects': [{'name': 'a'}]})['verdict'] == 'effects_found'
+    assert score.complete({'effects': [{'name': 'a'}], 'unknown': [{}]})['unknown'] == [{'law': None}]
+    assert score.complete({'effects': [{'name': 'a'}], 'unknown': [{}]})['verdict'] == 'unknown_effect'
     whole = {'verdict': 'unknown_effect', 'gap': {'floor': 1.0}, 'effects': [], 'unknown': []}
-    assert score.whole(whole)['gap'] == {'floor': 1.0}
-    assert score.whole(whole)['verdict'] == 'unknown_effect'
+    assert score.complete(whole)['gap'] == {'floor': 1.0}
+    assert score.complete(whole)['verdict'] == 'unknown_effect'

@@ -11,17 +11,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from blind.redone import SHORT, Hung, main, motion
+from blind.redone import SHORT, HeldLoad, main, motion
 
 
 def test_the_weight_on_the_sidebar_turns_the_link_as_far_as_the_beam_says() -> None:
     """50 N, 0.585 m from the link: -2.23 mm and 0.94 degrees, 0.12 mm sideways because the rig leans."""
-    pose = motion(SHORT, Hung(50.0, 1))
+    pose = motion(SHORT, HeldLoad(50.0, 1))
     assert np.abs(pose[: round(1000 * SHORT.rest)]).max() < 1e-9
     assert pose[-1, :2] == pytest.approx([0.12e-3, -2.22e-3], rel=0.02)
     assert np.degrees(pose[-1, 2]) == pytest.approx(-0.94, rel=0.02)
-    assert motion(SHORT, Hung(50.0, -1))[-1, 2] == pytest.approx(-pose[-1, 2])
-    assert motion(SHORT, Hung(50.0, 0))[-1, 2] == 0.0
+    assert motion(SHORT, HeldLoad(50.0, -1))[-1, 2] == pytest.approx(-pose[-1, 2])
+    assert motion(SHORT, HeldLoad(50.0, 0))[-1, 2] == 0.0
 
 
 @pytest.mark.statistics

@@ -104,7 +104,7 @@ def test_the_lens_is_found_again() -> None:
     images = [(f'{i}.png', shot(scene, BOARD, Pose(phi=a, omega=b), rng)) for i, (a, b) in enumerate(tilts)]
     found = calibrated(BOARD, [*images, ('broken.png', None)])
     assert found.used == len(tilts)
-    assert found.left_out == [('broken.png', 'unreadable image')]
+    assert found.excluded == [('broken.png', 'unreadable image')]
     assert found.matrix[0, 0] == pytest.approx(scene.focal, rel=0.01)
     lens, true = (
         Lens(found.matrix, found.distortion),
@@ -164,7 +164,7 @@ def test_a_printed_board_is_read_again(settings: CameraSettings) -> None:
         ('4.5.4', {'CharucoBoard_create': None}),  # Its boards have other axes.
     ],
 )
-def test_an_opencv_without_boards_is_refused_with_a_way_that_ubuntus_pip_takes(
+def test_an_opencv_without_boards_is_rejected_with_the_fix(
     kind: str, version: str, there: dict[str, None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     old = SimpleNamespace(__version__=version, aruco=SimpleNamespace(DICT_4X4_50=0, **there))

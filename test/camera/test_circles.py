@@ -93,7 +93,7 @@ def test_without_a_lens_what_is_said_of_the_error_is_its_size(tilt: tuple[float,
     assert np.all(np.median(sd, axis=0) < [1.5e-6, 1.5e-6, math.radians(0.01)]), sd
 
 
-def test_without_a_lens_a_plate_that_came_nearer_is_not_known_to_a_micrometre() -> None:
+def test_without_a_lens_the_distance_is_not_known_to_1_um() -> None:
     """Its picture away from the middle of the image moves as that of a displacement does."""
     scene, near = Scene(aim=(0.01, 0.0)), Pose(z=0.04)
     settings = CameraSettings(spacing=0.025, radius=0.008, rest_frames=2)

@@ -16,7 +16,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.camera.answer import NoPoseError, Status, TargetPose
 from psd_deflection.camera.boards import Board
 from psd_deflection.camera.discs.find_discs import find_discs
-from psd_deflection.camera.discs.rim_judge import _sectors
+from psd_deflection.camera.discs.rim_judge import sectors_of
 from psd_deflection.camera.discs.rim_model import Shape, moved, turned
 from psd_deflection.camera.footage import of_ros_image
 from psd_deflection.camera.image_size import declared_size
@@ -100,10 +100,10 @@ def test_a_rim_has_sixteen_parts_of_equal_angle() -> None:
     angle = (np.arange(1600) + 0.5) * 2.0 * math.pi / 1600
     side = (np.cos(angle).astype(np.float32), np.sin(angle).astype(np.float32))
     rims = cast(Any, SimpleNamespace(begin=np.array([0, 1600])))
-    _, counts = np.unique(_sectors(side, rims), return_counts=True)
+    _, counts = np.unique(sectors_of(side, rims), return_counts=True)
     assert counts.tolist() == [100] * 16
     # Each part is of one piece.
-    changes = np.count_nonzero(np.diff(_sectors(side, rims)))
+    changes = np.count_nonzero(np.diff(sectors_of(side, rims)))
     assert changes == 15
 
 
@@ -158,7 +158,7 @@ def test_exact_corners_give_the_pose_of_a_board_at_once(view: str) -> None:
     true = facing @ turned(np.array([0.2, -0.3, 0.4]))
     at = np.array([0.01, -0.02, 0.5])
     seen = np.column_stack([plane, np.zeros(len(plane))]) @ true.T + at
-    rotation, place = board._guess(plane, seen[:, :2] / seen[:, 2:])
+    rotation, place = board.first_pose(plane, seen[:, :2] / seen[:, 2:])
     assert rotation == pytest.approx(true, abs=1e-9)
     assert place == pytest.approx(at, abs=1e-9)
 

@@ -26,6 +26,7 @@ def target(turn: FloatArray, place: FloatArray, keystone: FloatArray, seed: int)
 def shifted(pose: TargetPose, by: FloatArray) -> TargetPose:
     """The pose after a small turn about its own axes, a shift, and a change of its keystone."""
     rotation = pose.rotation @ Rotation.from_rotvec(by[:3]).as_matrix()
+    # _replace is public: the one of named tuples.
     return pose._replace(rotation=rotation, place=pose.place + by[3:6], keystone=pose.keystone + by[6:])
 
 

@@ -38,7 +38,7 @@ def test_discs_that_seem_to_move_together_move_in_the_plane_of_the_target() -> N
     lens = cast(Any, SimpleNamespace(focal=1000.0))
     judge = Judge(lens, 640, np.array([[0.0, 0.1], [0.0, -0.1]]))
     shape = cast(Any, SimpleNamespace(rotation=rotation, place=np.array([0.0, 0.0, 0.5])))
-    found = judge._moved_centres(shape, 0.2)
+    found = judge.moved_centres(shape, 0.2)
     sd = 0.2 * 0.5 / 1000.0
     own = rotation.T @ found[3:, 3:] @ rotation
     assert own == pytest.approx(np.diag([sd**2, sd**2, 0.0]), abs=1e-20)

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from blind.render import Pose, Scene, photograph, seen_at
+from blind.render import Pose, Scene, photograph, pixel_of
 from psd_deflection.cli.main import main
 from psd_deflection.recordings.read.readers import open_recording
 
@@ -63,7 +63,7 @@ def test_the_preview_shows_where_the_discs_were_found(filmed: Path, tmp_path: Pa
         shown = cv2.imread(str(tmp_path / 'now.png'))
         assert shown is not None
         green = (shown[..., 1].astype(int) - shown[..., 2]) > 100
-        seen = [seen_at(Scene(turn=0.1), POSES[-1], 0.0, 0.025 * i) for i in (1, 0, -1)]
+        seen = [pixel_of(Scene(turn=0.1), POSES[-1], 0.0, 0.025 * i) for i in (1, 0, -1)]
         assert [bool(green[round(v), round(u)]) for u, v in seen] == [crosses] * 3
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from blind.watch import SIZES, WITHIN_S, one, quiet, table
+from blind.watch import SIZES, WITHIN_S, quiet, table, watch_run
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.measure.watch import Watch, _Channel, _Window
 from psd_deflection.model.solvers.registry import solver_from_rig
@@ -323,7 +323,7 @@ def test_drift_ringing_and_gaps_are_no_alarm() -> None:
 @pytest.mark.statistics
 @pytest.mark.parametrize('kind', SIZES)
 def test_events_of_the_second_generator_are_seen(kind: str) -> None:
-    run = one((kind, 1000))
+    run = watch_run((kind, 1000))
     assert run.after < WITHIN_S
     assert not run.early
     text, met = table([run], 0.0, 0, (), 0.0)

@@ -26,7 +26,7 @@ from psd_deflection.studies.budget.certificate_page import Certified
 from psd_deflection.studies.budget.from_calibration import read_calibration
 from psd_deflection.studies.budget.inputs import INPUTS, REFERENCE_INPUTS, read_inputs
 from psd_deflection.studies.discover.isolable import isolable
-from psd_deflection.studies.discover.loop import Settled
+from psd_deflection.studies.discover.loop import LoopResult
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.study import StudyResult
 from psd_deflection.studies.watch.from_recordings import watch
@@ -85,9 +85,9 @@ RESULTS: Mapping[str, tuple[Maker, Callable[[Any], int]]] = {
     'Checkup': (lambda _: psd_deflection.check(run()), lambda r: len(r.findings)),
     'Discovery': (lambda _: discovery(), lambda _: 3),
     'Identified': (lambda _: psd_deflection.identify(run()), lambda r: sum(len(axis.modes) for axis in r.axes)),
-    'Isolability': (lambda _: isolable(psd_deflection.load_rig(), run().loads_applied), lambda r: len(r.found)),
+    'Isolability': (lambda _: isolable(psd_deflection.load_rig(), run().loads_applied), lambda r: len(r.effects)),
     'PlantDiscovery': (lambda _: psd_deflection.discover_in(Spring(0.3)), lambda _: 1),
-    'Settled': (lambda _: Settled(discovery(), (), None, None), lambda _: 3),
+    'LoopResult': (lambda _: LoopResult(discovery(), (), None, None), lambda _: 3),
     'Validated': (lambda folder: psd_deflection.validate(run(), tracker(folder)), lambda r: r.tree()['references']),
     'WatchedRun': (watched, lambda _: 2),
 }
@@ -134,7 +134,7 @@ def test_only_an_axis_of_time_has_its_words() -> None:
     assert said == ['charts.py'], 'a chart over time takes a TimeAxis, which has the marks'
 
 
-@pytest.mark.parametrize('kind', ['Calibrated', 'Discovery', 'Identified', 'Settled', 'Validated'])
+@pytest.mark.parametrize('kind', ['Calibrated', 'Discovery', 'Identified', 'LoopResult', 'Validated'])
 @pytest.mark.filterwarnings('ignore:.*lacks its parameters')
 def test_every_chart_over_time_shows_the_marks(kind: str, tmp_path: Path) -> None:
     make, _ = RESULTS[kind]

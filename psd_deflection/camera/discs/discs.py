@@ -77,10 +77,10 @@ class Discs(Target):
             raise NoPoseError(Status.HALF_TURN)
         if upright < 0.0:
             regions = regions[::-1]
-        found = self._fit(image, regions, lens, full_scale)
-        seen = found.points[0] - found.points[2]
-        self._up, self._answered = seen / math.hypot(*seen.tolist()), True
-        return found
+        pose = self._fit(image, regions, lens, full_scale)
+        axis = pose.points[0] - pose.points[2]
+        self._up, self._answered = axis / math.hypot(*axis.tolist()), True
+        return pose
 
     def drawing(self) -> Drawing:
         """Three discs in a line along Y, with as much black around them as the finder needs."""
@@ -121,11 +121,11 @@ class Discs(Target):
                 reason = error
         if not fits:
             raise reason
-        best, *others = sorted(fits, key=lambda f: f.cost)
+        best, *alternatives = sorted(fits, key=lambda f: f.cost)
         if not lens.known:
             # Mirrored tilts have the same dX, dY and theta. Of two of them the mean has not: stay with the one.
-            self._plate, others = best.rotation if self._plate is None else self._plate, []
-        for other in others:
+            self._plate, alternatives = best.rotation if self._plate is None else self._plate, []
+        for other in alternatives:
             if (other.cost - best.cost) * best.residuals < ALIKE:
                 turn = best.rotation.T @ other.rotation
                 off = np.concatenate([(turn - turn.T)[(2, 0, 1), (1, 2, 0)] / 2, other.place - best.place])
@@ -133,7 +133,7 @@ class Discs(Target):
         return best
 
     def _frontal(self, rays: FloatArray) -> FloatArray:
-        """The rotation of a plate that faces the camera, by the line of discs."""
+        """Return the rotation of a plate that faces the camera, by the line of discs."""
         x, y = (rays[0] - rays[2]).tolist()
         long, to = math.hypot(x, y), self._towards
         return np.array([[to * y / long, x / long, 0.0], [-to * x / long, y / long, 0.0], [0.0, 0.0, to]])

@@ -62,31 +62,33 @@ class Region(NamedTuple):
         """Distance of the centres, px."""
         return math.dist(self.centre, other.centre)
 
-    def enlarged(self, by: int) -> Region:
-        """The same in an image whose pixels were taken together ``by`` x ``by``."""
-        x, y = (by * c + (by - 1) / 2 for c in self.centre)
-        xx, xy, yy = (by * by * s for s in self.shape)
-        return self._replace(centre=(x, y), shape=(xx, xy, yy), axes=(by * self.axes[0], by * self.axes[1]))
+    def enlarged(self, factor: int) -> Region:
+        """Return the same in an image whose pixels were taken together ``factor`` x ``factor``."""
+        x, y = (factor * c + (factor - 1) / 2 for c in self.centre)
+        xx, xy, yy = (factor * factor * s for s in self.shape)
+        return self._replace(centre=(x, y), shape=(xx, xy, yy), axes=(factor * self.axes[0], factor * self.axes[1]))
 
 
 def find_discs(grey: Any, ratio: float) -> list[Region]:
-    """The three discs in an 8-bit image, from one end of the line to the other; ``ratio``: spacing / radius.
+    """Return the three discs in an 8-bit image, from one end of the line to the other; ``ratio``: spacing / radius.
 
     Large discs show in an image made small, which takes less time; what is not found there is sought in all pixels.
     Raises RefusedError with the reason if there is no target, or more than one.
     """
-    by = min(grey.shape) // _COARSE_HEIGHT
-    if by > 1:
-        rows, columns = (n // by for n in grey.shape)
-        small = opencv().resize(grey[: rows * by, : columns * by], (columns, rows), interpolation=opencv().INTER_AREA)
+    factor = min(grey.shape) // _COARSE_HEIGHT
+    if factor > 1:
+        rows, columns = (n // factor for n in grey.shape)
+        small = opencv().resize(
+            grey[: rows * factor, : columns * factor], (columns, rows), interpolation=opencv().INTER_AREA
+        )
         try:
-            found = _found([next(_binaries(small, smooth=False))], ratio, CLEAR / by)
+            regions = _found([next(_binaries(small, smooth=False))], ratio, CLEAR / factor)
         except NoPoseError as error:
             if error.status is Status.DOUBLED:
                 raise
         else:
-            if min(r.axes[0] for r in found) > _COARSE_RADIUS:
-                return [r.enlarged(by) for r in found]
+            if min(r.axes[0] for r in regions) > _COARSE_RADIUS:
+                return [r.enlarged(factor) for r in regions]
     return _found(_binaries(grey), ratio, CLEAR)
 
 
@@ -135,7 +137,7 @@ def _regions(binary: Any) -> list[Region]:
     # As a list: to find out which hole is in which outline takes the square of their number.
     outlines, _ = cv2.findContours(binary, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
     rows, columns = binary.shape
-    found = []
+    regions = []
     for outline in outlines:
         # A hole goes around the other way.
         if len(outline) < 12 or cv2.contourArea(outline, True) > 0.0:
@@ -157,13 +159,13 @@ def _regions(binary: Any) -> list[Region]:
         wider = (least + 0.5) / least
         xx, xy, yy = (s * wider * wider for s in (xx, xy, yy))
         centre = (m['m10'] / area, m['m01'] / area)
-        found.append(Region(centre, (xx, xy, yy), (least * wider, most * wider), is_round, at_border))
-    found.sort(key=lambda r: -r.axes[0] * r.axes[1])
-    return found[:_MAX_REGIONS]
+        regions.append(Region(centre, (xx, xy, yy), (least * wider, most * wider), is_round, at_border))
+    regions.sort(key=lambda r: -r.axes[0] * r.axes[1])
+    return regions[:_MAX_REGIONS]
 
 
 def _lines(regions: list[Region], ratio: float) -> list[list[Region]]:
-    """Every three of ``regions`` that may be the target."""
+    """Return every three of ``regions`` that may be the target."""
     lines = []
     large = [r for r in regions if r.axes[0] >= 2.0][:60]
     for i, first in enumerate(large):
@@ -190,7 +192,7 @@ def _lines(regions: list[Region], ratio: float) -> list[list[Region]]:
 
 
 def _crowded(line: list[Region], regions: list[Region], clear: float) -> bool:
-    """Whether something as bright and not much smaller is so near to a disc that it lights its rim."""
+    """Return whether something as bright and not much smaller is so near to a disc that it lights its rim."""
     for disc in line:
         size = disc.axes[1]
         for other in regions:
@@ -204,13 +206,13 @@ def _crowded(line: list[Region], regions: list[Region], clear: float) -> bool:
 def _why(regions: list[Region], ratio: float) -> tuple[int, Status]:
     """Why ``regions`` hold no target, the more telling reason with the higher number."""
     fair = [r for r in regions if r.axes[0] >= MIN_RADIUS]
-    whole = [r for r in fair if r.round and not r.at_border]
-    if len(whole) in (1, 2):
-        reach = 2.4 * ratio * max(r.axes[1] for r in whole)
-        if any(r.at_border and r.away(w) < reach and r.axes[1] < 1.5 * w.axes[1] for r in fair for w in whole):
+    complete = [r for r in fair if r.round and not r.at_border]
+    if len(complete) in (1, 2):
+        reach = 2.4 * ratio * max(r.axes[1] for r in complete)
+        if any(r.at_border and r.away(w) < reach and r.axes[1] < 1.5 * w.axes[1] for r in fair for w in complete):
             return 4, Status.OUTSIDE
         return 3, Status.HIDDEN
-    if len(whole) >= 3:
+    if len(complete) >= 3:
         return 2, Status.HIDDEN
     if len(_lines([r for r in regions if not r.at_border], ratio)) == 1:
         return 1, Status.OBLIQUE

@@ -64,7 +64,7 @@ class Fitter:
     def fit(
         self, image: Any, rotation: FloatArray, place: FloatArray, prior: PosePrior, full_scale: float
     ) -> TargetPose:
-        """The pose, from a first guess that is good to a pixel or two, and from the blur of the last answer.
+        """Return the pose, from a first guess that is good to a pixel or two, and from the blur of the last answer.
 
         ``image`` (rows, columns): grey levels; ``full_scale``: where the camera saturates. Raises RefusedError.
         """
@@ -97,7 +97,7 @@ class Fitter:
         return found
 
     def _gather(self, image: Any, shape: Shape, half: float) -> tuple[Rims, FloatArray]:
-        """The pixels nearer than ``half`` to a rim, and first lights by the means well in and out of it."""
+        """Return the pixels nearer than ``half`` to a rim, and first lights by the means well in and out of it."""
         plane = shape.plane
         middles = self._lens.project(self._points @ plane.T)
         bends = self._bends(middles)
@@ -163,7 +163,7 @@ class Fitter:
         return np.asarray((forward * far[:, None, None]) @ bends)
 
     def _converge(self, rims: Rims, shape: Shape, prior: PosePrior) -> tuple[Shape, tuple[float, float] | None]:
-        """The shape by some of the pixels, and the noise outside and inside."""
+        """Return the shape by some of the pixels, and the noise outside and inside."""
         for _ in range(_STEPS):
             normal = self._linearise(rims, shape, None)
             shape, step, deviation = self._stepped(normal, shape, prior, len(rims.level))
@@ -175,7 +175,7 @@ class Fitter:
     def _stepped(
         self, normal: Normal, shape: Shape, prior: PosePrior, count: int
     ) -> tuple[Shape, FloatArray, FloatArray]:
-        """The shape after a Gauss-Newton step, the step and the standard deviations."""
+        """Return the shape after a Gauss-Newton step, the step and the standard deviations."""
         variance = max(normal.squares / max(count - 30, 1), 1e-9)
         stiff, pull = beforehand(shape, prior)
         inverse = covariance_of(normal, variance, stiff)

@@ -22,8 +22,8 @@ from psd_deflection.camera.discs.rim_model import (
     after,
     beforehand,
     covariance_of,
+    eigenvalues,
     motion_of,
-    spread,
 )
 from psd_deflection.camera.lens import Lens
 from psd_deflection.records import FloatArray, IntArray
@@ -88,7 +88,7 @@ class Judge:
         if contrast.min() <= 0.0 or contrast.min() < 0.3 * contrast.max():
             raise NoPoseError(Status.HIDDEN)
         motion = motion_of(shape.blur)
-        sharp = math.sqrt(spread(shape.blur)[0])
+        sharp = math.sqrt(eigenvalues(shape.blur)[0])
         if math.sqrt(12.0) * motion > MOST_BLUR * pixel_radius:
             raise NoPoseError(Status.BLURRED)
         if sharp > MOST_DEFOCUS * pixel_radius:
@@ -101,7 +101,7 @@ class Judge:
         pose = [*range(6), *range(10 + shape.skew.size, len(inverse))]
         *pulls, residual = after(normal, rims, step, inverse[pose])
         raw = residual if normal.root is None else residual / normal.root
-        sector = _sectors(normal.side, rims)
+        sector = sectors_of(normal.side, rims)
         relative = raw / float(contrast.mean())
         if motion > _DOUBLED_FROM * max(sharp, 0.5) and _doubled(normal, relative, shape.blur):
             raise NoPoseError(Status.GHOST)
@@ -135,7 +135,7 @@ class Judge:
         covariance = inverse * np.outer(wider, wider)
         covariance += bent[pose] @ bent[pose].T
         # What the first three moments of the motion do not say of its mean.
-        covariance[:6, :6] += self._moved_centres(shape, MEAN_OF_BLUR * max(motion - 0.15, 0.0))
+        covariance[:6, :6] += self.moved_centres(shape, MEAN_OF_BLUR * max(motion - 0.15, 0.0))
         noise = math.sqrt(float(raw @ raw) / count)
         return TargetPose(
             shape.rotation,
@@ -152,7 +152,7 @@ class Judge:
             keystone=shape.keystone,
         )
 
-    def _moved_centres(self, shape: Shape, pixels: float) -> FloatArray:
+    def moved_centres(self, shape: Shape, pixels: float) -> FloatArray:
         """Covariance (6, 6) of an error of ``pixels`` that the discs share, or that turns them about the normal."""
         variance = (pixels * float(shape.place[2]) / self._lens.focal) ** 2
         out = np.zeros((6, 6))
@@ -193,7 +193,7 @@ def _misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: Rims, full_scale: fl
 
 
 def _doubled(normal: Normal, raw: Pixels, blur: FloatArray) -> bool:
-    """Whether the plate was seen in two places, not in motion: the places between were not exposed.
+    """Return whether the plate was seen in two places, not in motion: the places between were not exposed.
 
     The rims that lie across the blur show how long it was where, as the steepness of the grey level there.
     """
@@ -252,8 +252,8 @@ def _of_bent_rims(normal: Normal, rims: Rims) -> FloatArray:
     return np.hstack([*by_shape[:, :, :2], *by_shape[:, :, 2:]])
 
 
-def _sectors(side: tuple[Pixels, Pixels], rims: Rims) -> IntArray:
-    """The part of a rim to which each pixel belongs, counted through all discs: 16 parts of equal angle."""
+def sectors_of(side: tuple[Pixels, Pixels], rims: Rims) -> IntArray:
+    """Return the part of a rim to which each pixel belongs, counted through all discs: 16 parts of equal angle."""
     x, y = np.abs(side[0]), np.abs(side[1])
     part = (np.minimum(x, y) > _HALF_OCTANT * np.maximum(x, y)).astype(np.uint8)
     for bit in (y > x, side[1] > 0, side[0] > 0):

@@ -73,7 +73,7 @@ class Rims(NamedTuple):
     pixel: IntArray
 
     def thinned(self) -> Rims:
-        """Each fourth pixel, for the first steps."""
+        """Return each fourth pixel, for the first steps."""
         chosen = np.s_[::THINNED]
         begin = -(-self.begin // THINNED)
         rays, flat = np.ascontiguousarray(self.rays[:, chosen]), np.ascontiguousarray(self.flat[:, chosen])
@@ -162,7 +162,7 @@ def below(z: Pixels, bell: Pixels) -> Pixels:
 
 
 def expected(prior: PosePrior, rotation: FloatArray) -> FloatArray:
-    """The keystone that ``prior`` expects, in the axes of ``rotation``."""
+    """Return the keystone that ``prior`` expects, in the axes of ``rotation``."""
     return np.asarray((rotation.T @ prior.rotation)[:2, :2] @ prior.keystone)
 
 
@@ -189,7 +189,7 @@ def moved(shape: Shape, step: FloatArray, light: FloatArray) -> Shape:
     """``shape`` after ``step`` of the parameters, within their bounds, with these lights."""
     by_xx, by_xy, by_yy = step[7:10].tolist()
     blur = np.add(shape.blur, [[by_xx, by_xy], [by_xy, by_yy]])
-    small, large = spread(blur)
+    small, large = eigenvalues(blur)
     if small < _SHARPEST**2 or large > 900.0:
         values, vectors = np.linalg.eigh(blur)
         blur = (vectors * np.clip(values, _SHARPEST**2, 900.0)) @ vectors.T
@@ -206,7 +206,7 @@ def moved(shape: Shape, step: FloatArray, light: FloatArray) -> Shape:
 
 
 def turned(v: FloatArray) -> FloatArray:
-    """The rotation (3, 3) about ``v`` by its length, rad (Rodrigues)."""
+    """Return the rotation (3, 3) about ``v`` by its length, rad (Rodrigues)."""
     x, y, z = v.tolist()
     angle = math.sqrt(x * x + y * y + z * z)
     sine, versed = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / angle**2) if angle > 1e-9 else (1.0, 0.5)
@@ -222,17 +222,17 @@ def turned(v: FloatArray) -> FloatArray:
 
 def motion_of(blur: FloatArray) -> float:
     """Standard deviation of the motion within the exposure, px: what the blur has more along one axis."""
-    small, large = spread(blur)
+    small, large = eigenvalues(blur)
     return math.sqrt(large - small)
 
 
 def width(blur: FloatArray) -> float:
     """How far from a rim its pixels are used, px: up to where a rise of this blur has ended."""
-    return max(3.2 * math.sqrt(spread(blur)[1]) + 1.7, 3.5)
+    return max(3.2 * math.sqrt(eigenvalues(blur)[1]) + 1.7, 3.5)
 
 
-def spread(blur: FloatArray) -> tuple[float, float]:
-    """The eigenvalues of a variance (2, 2), the smaller first."""
+def eigenvalues(blur: FloatArray) -> tuple[float, float]:
+    """Return the eigenvalues of a variance (2, 2), the smaller first."""
     (xx, xy), (_, yy) = blur.tolist()
     half, apart = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
     return half - apart, half + apart

@@ -133,7 +133,7 @@ def _intrinsics(args: argparse.Namespace, settings: CameraSettings) -> int:
         return 0
     show(f'{out}: {found.used} of {len(paths)} images used, rms {found.rms:.3f} px')
     show(*found.lines())
-    for path, reason in found.left_out:
+    for path, reason in found.excluded:
         warn(f'{path}: not used: {reason}')
     return 0
 

@@ -69,7 +69,7 @@ from psd_deflection.studies.discover.conclusion import adopting_folder
 from psd_deflection.studies.discover.experiment import Limits
 from psd_deflection.studies.discover.from_recordings import DiscoverOptions
 from psd_deflection.studies.discover.isolable import isolable
-from psd_deflection.studies.discover.loop import Settled, planned, settle
+from psd_deflection.studies.discover.loop import LoopResult, planned, run_loop
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.study import StudyResult
@@ -225,11 +225,11 @@ def _searched(
     observations: Sequence[Observation],
     limits: Limits,
     progress: Callable[[str], None],
-) -> Discovery | Settled:
+) -> Discovery | LoopResult:
     search = partial(asked.discovered, progress=progress, tell=warn)
     if args.make_it:
         record = _next.simulated(args, asked.rig() or observations[0].rig, Path(args.out))
-        return settle(observations, search, record, limits=limits, most=args.at_most, progress=progress)
+        return run_loop(observations, search, record, limits=limits, most=args.at_most, progress=progress)
     found = search(observations)
     progress('planning')
     return planned(found, limits) if args.next else found
@@ -242,9 +242,9 @@ def _answered(args: argparse.Namespace, found: StudyResult, files: Mapping[str, 
     return 0
 
 
-def _hints(args: argparse.Namespace, answer: Discovery | Settled) -> list[str]:
+def _hints(args: argparse.Namespace, answer: Discovery | LoopResult) -> list[str]:
     """What to type next."""
-    out, found = Path(args.out), answer.found if isinstance(answer, Settled) else answer
+    out, found = Path(args.out), answer.discovery if isinstance(answer, LoopResult) else answer
     hints = []
     if args.adopt is not None and found.model_of_law is None:
         hints.append(f'--adopt {args.adopt}: there is no law to adopt')
@@ -252,7 +252,7 @@ def _hints(args: argparse.Namespace, answer: Discovery | Settled) -> list[str]:
         hints.append(f'{args.adopt} is an effect now: {effect_folders()[0] / args.adopt}.yaml')
     elif found.model_of_law is not None:
         hints.append(f'law: {out / "law.yaml"}; --adopt NAME makes it an effect')
-    if isinstance(answer, Settled):
+    if isinstance(answer, LoopResult):
         if answer.outcome is None and answer.open is not None and answer.open.useful:
             hints += _next.how(answer.open, out)
     elif found.unsettled:

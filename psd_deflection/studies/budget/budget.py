@@ -43,10 +43,10 @@ def budget(problem: BudgetProblem, drawn: Callable[[int], object] = lambda size:
     rig = problem.rig
     check_two_psds(rig, 'a budget')
     load = default_load(rig) if problem.load is None else problem.load
-    found = evaluate(Situation.at_load(rig, problem.inputs, load, problem.method or method_of(rig)))
+    budget_at_load = evaluate(Situation.at_load(rig, problem.inputs, load, problem.method or method_of(rig)))
     sampled: Contribution | None = None
     interval: Interval | None = None
     if problem.draws:
-        sampled = monte_carlo(found.at, problem.draws, problem.seed, drawn=drawn)
-        interval = interval_of(draws(found.at, problem.draws, problem.seed, drawn=drawn, shaped=True))
-    return Budgeted(found, load, sampled, interval, problem.draws, problem.seed, problem.rig_file)
+        sampled = monte_carlo(budget_at_load.at, problem.draws, problem.seed, drawn=drawn)
+        interval = interval_of(draws(budget_at_load.at, problem.draws, problem.seed, drawn=drawn, shaped=True))
+    return Budgeted(budget_at_load, load, sampled, interval, problem.draws, problem.seed, problem.rig_file)

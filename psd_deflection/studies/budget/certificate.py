@@ -88,7 +88,7 @@ class Certificate:
 
 
 def certify(problem: CertificateProblem) -> Certificate:
-    """Every input and the expanded uncertainty at each pose.
+    """Return every input and the expanded uncertainty at each pose.
 
     Raises ConfigError if the rig is not calibrated, if its calibration has no reference, for a solver that has no
     budget, or for a pose that no detector sees.
@@ -105,10 +105,10 @@ def certify(problem: CertificateProblem) -> Certificate:
     sights = [_situation(problem, pose) for pose in poses]
     gains = np.stack([at.estimator.response(at.pose, at.chain.zeros)[0] for at in sights])
     rows, correlations = _of_calibration(problem, poses, gains)
-    found = _as_found(problem, rows)
+    as_found = _as_found(problem, rows)
     every = (*rows, *_of_reference(problem, poses), *_since_zero(problem.inputs, sights))
     stated = tuple(_expanded(every, correlations, n) for n in range(len(poses)))
-    return Certificate(poses, every, correlations, found, stated)
+    return Certificate(poses, every, correlations, as_found, stated)
 
 
 def default_poses(tree: Mapping[str, Any]) -> list[tuple[float, float, float]]:
@@ -155,7 +155,7 @@ def _frames(tree: Mapping[str, Any]) -> float:
 
 
 def _as_found(problem: CertificateProblem, rows: Sequence[InputQuantity]) -> FloatArray:
-    """The error by the values that were in use before."""
+    """Return the error by the values that were in use before."""
     given = problem.calibration['parameters']
     moved = {name: one['used'] - one['value'] for name, one in given.items()}
     return np.asarray(np.sum([moved.get(row.parameter, 0.0) * row.coefficients for row in rows], axis=0))
@@ -176,7 +176,7 @@ def _of_reference(problem: CertificateProblem, poses: FloatArray) -> list[InputQ
 
 
 def _since_zero(inputs: Mapping[str, float], sights: Sequence[Situation]) -> list[InputQuantity]:
-    """The causes that no calibration measures."""
+    """Return the causes that no calibration measures."""
     out = []
     for cause in CAUSES:
         if cause.calibrated or cause.kind is Kind.KNOWN:
@@ -213,12 +213,12 @@ class Conformity(NamedTuple):
 CONFORMS, FAILS, OPEN = 'conforms', 'does not conform', 'not decided'
 
 
-def verdict_of(found: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> Conformity:
+def verdict_of(as_found: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> Conformity:
     """Guarded acceptance with a guard band of U (JCGM 106:2012, 8.3.2): |error| + U within the limit on every axis.
 
     It does not conform if |error| - U is beyond the limit on any axis.
     """
-    return Conformity(*(_judged(np.abs(error), uncertainty, limits) for error in (found, np.zeros(3))))
+    return Conformity(*(_judged(np.abs(error), uncertainty, limits) for error in (as_found, np.zeros(3))))
 
 
 def _judged(error: FloatArray, uncertainty: FloatArray, limits: FloatArray) -> str:

@@ -29,7 +29,7 @@ from psd_deflection.base.pages import table
 from psd_deflection.base.tables import Column, Table, columns, columns_of
 from psd_deflection.studies.budget.certificate import Certificate, CertificateProblem, Conformity, verdict_of
 from psd_deflection.studies.budget.expanded import PROBABILITY
-from psd_deflection.studies.budget.result import SHOWN, UNITS, freedom_words, in_words, shown
+from psd_deflection.studies.budget.result import SHOWN, UNITS, display_values, freedom_words, in_words
 from psd_deflection.studies.study import PageSection, StudyResult
 
 OBJECT = {
@@ -85,8 +85,8 @@ class Certified(StudyResult):
         runs = self.problem.calibration['provenance']['recordings']
         devices = dict.fromkeys(str(r['device']) for r in runs if r.get('device'))
         warm = [v for r in runs for v in r.get('temperature') or ()]
-        seen = {'device': ', '.join(devices), 'temperature': f'{min(warm):.1f} to {max(warm):.1f}' if warm else ''}
-        return {name: self.problem.fields.get(name) or seen.get(name, '') for name in FIELDS}
+        entries = {'device': ', '.join(devices), 'temperature': f'{min(warm):.1f} to {max(warm):.1f}' if warm else ''}
+        return {name: self.problem.fields.get(name) or entries.get(name, '') for name in FIELDS}
 
     @property
     def verdicts(self) -> list[Conformity]:
@@ -95,11 +95,11 @@ class Certified(StudyResult):
             return []
         limits = np.array(self.problem.limits)
         pairs = zip(self.found.found, self.found.stated, strict=True)
-        return [verdict_of(error, said.uncertainty, limits) for error, said in pairs]
+        return [verdict_of(error, uncertainty.uncertainty, limits) for error, uncertainty in pairs]
 
     def sentences(self) -> list[str]:
-        """The largest U, the largest error as found, the verdict."""
-        largest = np.max([said.uncertainty for said in self.found.stated], axis=0)
+        """Return the largest U, the largest error as found, the verdict."""
+        largest = np.max([uncertainty.uncertainty for uncertainty in self.found.stated], axis=0)
         out = [f'Expanded uncertainty for 95 %, the largest of {len(self.found.poses)} poses: {in_words(largest)}.']
         out.append(f'As found the pose was wrong by up to {in_words(np.abs(self.found.found).max(axis=0))}.')
         if verdicts := self.verdicts:
@@ -108,8 +108,8 @@ class Certified(StudyResult):
         return out
 
     def lines(self) -> list[str]:
-        """The sentences and the table of poses."""
-        return [*self.sentences(), '', *columns(self._results(), left=4).splitlines()]
+        """Return the sentences and the table of poses."""
+        return [*self.sentences(), '', *columns(self.result_rows(), left=4).splitlines()]
 
     def tree(self) -> dict[str, Any]:
         """SI; (ΔX, ΔY, θ) in this order."""
@@ -123,10 +123,10 @@ class Certified(StudyResult):
                 {
                     'pose': pose.tolist(),
                     'as_found': error.tolist(),
-                    **{name: value.tolist() for name, value in said._asdict().items()},
+                    **{name: value.tolist() for name, value in uncertainty._asdict().items()},
                     'conformity': None if verdict is None else verdict._asdict(),
                 }
-                for pose, error, said, verdict in rows
+                for pose, error, uncertainty, verdict in rows
             ],
             'limits': None if self.problem.limits is None else list(self.problem.limits),
             'range': self.problem.calibration['range'],
@@ -136,13 +136,13 @@ class Certified(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row a pose: what it was, how far the estimate was off as found, u_c and U; m, m, rad."""
+        """Return one row a pose: what it was, how far the estimate was off as found, u_c and U; m, m, rad."""
         stated = self.found.stated
         parts = (
             ('', self.found.poses, 'pose'),
             ('as_found_', self.found.found, 'error as found'),
-            ('standard_', np.array([said.standard for said in stated]), 'standard uncertainty'),
-            ('expanded_', np.array([said.uncertainty for said in stated]), 'expanded uncertainty, 95 %'),
+            ('standard_', np.array([uncertainty.standard for uncertainty in stated]), 'standard uncertainty'),
+            ('expanded_', np.array([uncertainty.uncertainty for uncertainty in stated]), 'expanded uncertainty, 95 %'),
         )
         out = []
         for before, values, words in parts:
@@ -150,7 +150,7 @@ class Certified(StudyResult):
         return Table(Column('number', np.arange(1, len(stated) + 1), '', 'of the pose'), out)
 
     def files(self) -> dict[str, str]:
-        """The page, the JSON, and the tables with all their digits."""
+        """Return the page, the JSON, and the tables with all their digits."""
         return {
             'certificate.html': self.report(),
             self.json_name: self.json(),
@@ -164,7 +164,7 @@ class Certified(StudyResult):
         return [
             PageSection('Object and surroundings', (self._filled(OBJECT),)),
             PageSection('Reference', (self._filled(TRACEABLE),)),
-            PageSection('Results', (_table(self._results()), self._chart(), self._range())),
+            PageSection('Results', (_table(self.result_rows()), self.chart(), self._range())),
             PageSection('Decision rule', (f'<p>{html.escape(self._rule())}</p>',)),
             PageSection('How U was computed', (_HOW, _table(self._inputs(_six)))),
             PageSection('Correlations of the calibration', (_table(self._correlations(_six)),)),
@@ -175,44 +175,51 @@ class Certified(StudyResult):
         given = self.fields
         return table(('', ''), [(words, given[name] or _OPEN) for name, words in names.items()])
 
-    def _results(self) -> list[list[str]]:
-        """The head first."""
+    def result_rows(self) -> list[list[str]]:
+        """Return the head first."""
         judged = self.verdicts
         head = ['pose', *UNITS, *(f'as found {u}' for u in UNITS), *(f'u_c {u}' for u in UNITS)]
         head += [f'ν_eff {a}' for a in SYMBOLS] + [f'k {a}' for a in SYMBOLS] + [f'U {u}' for u in UNITS]
         rows = [head + (['as found', 'as left'] if judged else [])]
-        for n, (pose, error, said) in enumerate(
+        for n, (pose, error, uncertainty) in enumerate(
             zip(self.found.poses, self.found.found, self.found.stated, strict=True)
         ):
-            row = [str(n + 1), *shown(pose), *shown(error), *shown(said.standard)]
-            row += map(freedom_words, said.freedom.tolist())
-            row += [f'{k:.3f}' for k in said.factor.tolist()] + shown(said.uncertainty)
+            row = [str(n + 1), *display_values(pose), *display_values(error), *display_values(uncertainty.standard)]
+            row += map(freedom_words, uncertainty.freedom.tolist())
+            row += [f'{k:.3f}' for k in uncertainty.factor.tolist()] + display_values(uncertainty.uncertainty)
             rows.append(row + (list(judged[n]) if judged else []))
         return rows
 
-    def _chart(self) -> Chart:
-        """The error of each pose as found with its expanded uncertainty, and the limits."""
+    def chart(self) -> Chart:
+        """Return the error of each pose as found with its expanded uncertainty, and the limits."""
         number = np.arange(1.0, len(self.found.poses) + 1.0)
         limits = self.problem.limits
         panels = []
         for i, (axis, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
             errors = SHOWN[i] * np.array([error[i] for error in self.found.found])
-            spread = SHOWN[i] * np.array([said.uncertainty[i] for said in self.found.stated])
-            curve = Series('as found ± U', number, errors, 'blue', 'points', spread=spread)
+            expanded = SHOWN[i] * np.array([uncertainty.uncertainty[i] for uncertainty in self.found.stated])
+            curve = Series('as found ± U', number, errors, 'blue', 'points', spread=expanded)
             ends = () if limits is None else (-SHOWN[i] * limits[i], SHOWN[i] * limits[i])
             rules = [Rule(float(at), 'limit', across=True, colour='red') for at in ends]
             panels.append(Panel((curve,), 'pose', f'{axis} / {unit}', rules=rules, height=SMALL))
         return Chart('error of each pose as found, with its expanded uncertainty', panels, beside=3)
 
     def _numbers(self) -> list[list[str]]:
-        """As ``_results``, in SI units with all digits."""
+        """As ``result_rows``, in SI units with all digits."""
         names = ('dx', 'dy', 'theta')
         kinds = ('', 'as_found_', 'u_c_', 'nu_eff_', 'k_', 'U_')
         rows = [['pose', *(f'{kind}{name}' for kind in kinds for name in names)]]
-        for n, (pose, error, said) in enumerate(
+        for n, (pose, error, uncertainty) in enumerate(
             zip(self.found.poses, self.found.found, self.found.stated, strict=True), start=1
         ):
-            values = (pose, error, said.standard, said.freedom, said.factor, said.uncertainty)
+            values = (
+                pose,
+                error,
+                uncertainty.standard,
+                uncertainty.freedom,
+                uncertainty.factor,
+                uncertainty.uncertainty,
+            )
             rows.append([str(n), *(repr(v) for part in values for v in part.tolist())])
         return rows
 
@@ -222,19 +229,22 @@ class Certified(StudyResult):
         rows = [head]
         for row in self.found.inputs:
             kind = 'A' if row.observed else 'B'
-            own = [row.cause, row.parameter, kind, row.distribution, words(row.u), row.unit, words(row.freedom)]
-            rows.append(own + [words(c) for c in row.coefficients.ravel().tolist()])
+            row_words = [row.cause, row.parameter, kind, row.distribution, words(row.u), row.unit, words(row.freedom)]
+            rows.append(row_words + [words(c) for c in row.coefficients.ravel().tolist()])
         return rows
 
     def _correlations(self, words: Any) -> list[list[str]]:
         names = [row.parameter for row in self.found.inputs[: len(self.found.correlations)]]
         rows = [['', *names]]
-        rows += [[name, *map(words, own)] for name, own in zip(names, self.found.correlations.tolist(), strict=True)]
+        rows += [
+            [name, *map(words, coefficients)]
+            for name, coefficients in zip(names, self.found.correlations.tolist(), strict=True)
+        ]
         return rows
 
     def _range(self) -> str:
-        seen, rig = self.problem.calibration['range'], self.problem.rig
-        low, high = (shown(np.array(seen[key])) for key in ('low', 'high'))
+        calibrated_range, rig = self.problem.calibration['range'], self.problem.rig
+        low, high = (display_values(np.array(calibrated_range[key])) for key in ('low', 'high'))
         ends = (f'{unit} {a} to {b}' for unit, a, b in zip(UNITS, low, high, strict=True))
         rate, size = rig.converter.sample_rate_hz, rig.estimator.block_size
         words = (

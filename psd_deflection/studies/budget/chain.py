@@ -74,7 +74,7 @@ class MeasuringChain:
 
     @classmethod
     def of(cls, rig: Rig) -> MeasuringChain:
-        """The nominal rig."""
+        """Return the nominal rig."""
         half_area = np.array([p.active_area for p in rig.psds]) / 2.0
         slope_ratio = np.array([rig.link.slope_ratio])
         return cls(rig.centers, rig.heights, rig.zeros, half_area, rig.link.length, slope_ratio)

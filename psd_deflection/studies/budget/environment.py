@@ -53,7 +53,7 @@ REFRACTION = Term(
 
 
 def averaging_gain(block_size: int, frequency: float, sample_rate_hz: float) -> float:
-    """The fraction of a sinusoid that remains in the mean of a block: |sin(pi N f/fs) / (N sin(pi f/fs))|.
+    """Return the fraction of a sinusoid that remains in the mean of a block: |sin(pi N f/fs) / (N sin(pi f/fs))|.
 
     20 samples at 1 kHz null 50 Hz and leave 0.16 of 60 Hz.
     """

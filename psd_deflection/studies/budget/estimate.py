@@ -108,7 +108,7 @@ METHODS = ('exact', 'beam', 'wls', 'thesis_iteration')
 
 
 def method_of(rig: Rig) -> str:
-    """The method by which the rig's own solver is budgeted, as that solver's class declares it.
+    """Return the method by which the rig's own solver is budgeted, as that solver's class declares it.
 
     Raises ConfigError for an unknown solver and for a solver without a budget method.
     """
@@ -122,7 +122,7 @@ def method_of(rig: Rig) -> str:
 
 
 def estimator_of(rig: Rig, method: str) -> Estimator:
-    """The estimator of one of ``METHODS``.
+    """Return the estimator of one of ``METHODS``.
 
     ``thesis_iteration`` gives the exact angle minus the error of its stop rule (``studies.budget.computation``),
     so it responds to errors as ``exact`` does. Raises ConfigError for another name, or if the two centres

@@ -44,7 +44,7 @@ class Budget:
         return tuple(cause.sensitivities(self.at) for cause, _ in self.lines)
 
     def expanded(self) -> Expanded:
-        """The expanded uncertainty of an estimate, every cause as it is declared."""
+        """Return the expanded uncertainty of an estimate, every cause as it is declared."""
         variances = np.array([np.diag(line.covariance) for _, line in self.lines])
         return expanded(variances, [cause.freedom(self.at) for cause, _ in self.lines], self.total().bias)
 
@@ -53,12 +53,12 @@ class Budget:
 
         They add to 1 except for products of biases, which belong to no single line.
         """
-        whole = self.total().rms ** 2
-        return np.asarray(np.divide(line.rms**2, whole, out=np.zeros(3), where=whole > 0.0))
+        total_variance = self.total().rms ** 2
+        return np.asarray(np.divide(line.rms**2, total_variance, out=np.zeros(3), where=total_variance > 0.0))
 
 
 def evaluate(at: Situation) -> Budget:
-    """Every cause, to first order."""
+    """Return every cause, to first order."""
     return Budget(at, tuple((cause, cause.contribution(at)) for cause in CAUSES))
 
 

@@ -57,9 +57,9 @@ def coverage_factor(freedom: float) -> float:
 
 def expanded(variances: FloatArray, freedom: Sequence[float], bias: FloatArray) -> Expanded:
     """``variances`` (n, 3) of n independent causes, their degrees of ``freedom`` (n,), the sum of known biases (3,)."""
-    own: FloatArray = np.asarray(variances, dtype=np.float64).reshape(-1, 3)
-    standard = np.sqrt(own.sum(axis=0))
-    effective = np.array([effective_freedom(column.tolist(), freedom) for column in own.T])
+    variance_rows: FloatArray = np.asarray(variances, dtype=np.float64).reshape(-1, 3)
+    standard = np.sqrt(variance_rows.sum(axis=0))
+    effective = np.array([effective_freedom(column.tolist(), freedom) for column in variance_rows.T])
     factor = np.array([coverage_factor(v) for v in effective.tolist()])
     return Expanded(standard, effective, factor, bias, factor * standard + np.abs(bias))
 
@@ -72,13 +72,13 @@ class Interval(NamedTuple):
 
 
 def interval_of(errors: FloatArray) -> Interval:
-    """The probabilistically symmetric interval (JCGM 101:2008, 7.7) of drawn ``errors`` (n, 3)."""
+    """Return the probabilistically symmetric interval (JCGM 101:2008, 7.7) of drawn ``errors`` (n, 3)."""
     tail = 0.5 - 0.5 * PROBABILITY
     low, high = np.quantile(errors, [tail, 1.0 - tail], axis=0)
     return Interval(0.5 * (high - low), 0.5 * (high + low))
 
 
-def difference(said: Expanded, drawn: Interval) -> FloatArray:
+def difference(expanded: Expanded, drawn: Interval) -> FloatArray:
     """(3,): by how much of the drawn half width k u_c is larger than that; 0 if nothing was drawn."""
-    stated = said.factor * said.standard
+    stated = expanded.factor * expanded.standard
     return np.asarray(np.divide(stated - drawn.half, drawn.half, out=np.zeros(3), where=drawn.half > 0.0))

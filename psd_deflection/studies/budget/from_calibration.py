@@ -24,7 +24,7 @@ LONGEST_WORDS = 200
 
 
 def read_calibration(folder: Path) -> tuple[Rig, dict[str, Any]]:
-    """The calibrated rig and the tree of calibration.json in ``folder``.
+    """Return the calibrated rig and the tree of calibration.json in ``folder``.
 
     Raises ConfigError if a file or a key is missing, if a value is none that calibrate writes, or if the calibration
     was refused.
@@ -64,9 +64,9 @@ def _check(tree: Any, path: Path) -> None:
     _check_provenance(_map(tree, 'provenance', path), path)
 
 
-def _check_range(seen: Mapping[str, Any], path: Path) -> None:
+def _check_range(calibrated_range: Mapping[str, Any], path: Path) -> None:
     for key in ('low', 'high'):
-        ends = seen.get(key)
+        ends = calibrated_range.get(key)
         if not isinstance(ends, list) or len(ends) != 3 or not all(map(_is_number, ends)):
             raise ConfigError(f'{path}: range.{key}: must be three numbers; calibrate again')
 
@@ -87,10 +87,10 @@ def _words(value: object) -> str:
 
 
 def _map(tree: Mapping[str, Any], key: str, path: Path) -> dict[str, Any]:
-    found = tree.get(key)
-    if not isinstance(found, dict):
+    value = tree.get(key)
+    if not isinstance(value, dict):
         raise ConfigError(f'{path}: {key}: not there; calibrate again with this version')
-    return found
+    return value
 
 
 def _is_number(value: object) -> bool:
@@ -98,7 +98,7 @@ def _is_number(value: object) -> bool:
 
 
 def read_fields(path: str | None) -> dict[str, str]:
-    """The fields of the page of a YAML file, printable; none without a file.
+    """Return the fields of the page of a YAML file, printable; none without a file.
 
     Raises ConfigError naming the file and the field.
     """

@@ -162,9 +162,9 @@ INPUT_BY_NAME: Mapping[str, Input] = MappingProxyType({i.parameter.name: i for i
 
 
 def is_assumed(name: str, value: float) -> bool:
-    """Whether ``value`` of an input is a guess: the default, whose source is an assumption."""
-    found = INPUT_BY_NAME[name]
-    return found.source.startswith('assumption') and value == found.parameter.default
+    """Return whether ``value`` of an input is a guess: the default, whose source is an assumption."""
+    input_quantity = INPUT_BY_NAME[name]
+    return input_quantity.source.startswith('assumption') and value == input_quantity.parameter.default
 
 
 def read_inputs(
@@ -173,7 +173,7 @@ def read_inputs(
     source: str = 'settings',
     declared: Sequence[Input] = INPUTS,
 ) -> dict[str, float]:
-    """All inputs that are ``declared``.
+    """Return all inputs that are ``declared``.
 
     ``settings`` override the YAML file (``name: value`` lines), which overrides the defaults. ``source``: where
     ``settings`` come from, for messages.
@@ -183,11 +183,11 @@ def read_inputs(
     values = {i.parameter.name: float(i.parameter.default) for i in declared}
     for place, given in ((str(path), _read(Path(path)) if path is not None else {}), (source, settings or {})):
         for name, value in given.items():
-            found = INPUT_BY_NAME.get(str(name))
-            if found is None or found.parameter.name not in values:
+            input_quantity = INPUT_BY_NAME.get(str(name))
+            if input_quantity is None or input_quantity.parameter.name not in values:
                 hint = did_you_mean(str(name), values)
                 raise ConfigError(f'{place}: {name} = {value!r}: no such input{hint}')
-            values[str(name)] = cast(float, check_value(found.parameter, value, place))
+            values[str(name)] = cast(float, check_value(input_quantity.parameter, value, place))
     return values
 
 

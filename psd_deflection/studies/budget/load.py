@@ -20,7 +20,7 @@ SHARE = 0.5
 
 
 def default_load(rig: Rig) -> tuple[float, float, float]:
-    """A weight on a sidebar one link length out on +X: Fx N, Fy N, Tz N m.
+    """Return a weight on a sidebar one link length out on +X: Fx N, Fy N, Tz N m.
 
     For the link and the detectors of the thesis its 50 N. For others as much as moves the first dot ``SHARE`` of the
     way to the edge of its active area, to two figures.

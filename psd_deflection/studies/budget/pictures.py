@@ -30,8 +30,8 @@ class DrawnCause(NamedTuple):
     values: FloatArray
 
 
-def shown(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
-    """Every cause that does something, the largest first, and the total (3,)."""
+def plotted_causes(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
+    """Return every cause that does something, the largest first, and the total (3,)."""
     factors = np.array(SHOWN)
     total = budget.total().rms * factors
     # What does nothing, or only rounds, has no place on a logarithmic axis.
@@ -46,8 +46,8 @@ def shown(budget: Budget) -> tuple[list[DrawnCause], FloatArray]:
 
 
 def bars_of(budget: Budget) -> Bars:
-    """Every cause, the largest first, below the total."""
-    causes, total = shown(budget)
+    """Return every cause, the largest first, below the total."""
+    causes, total = plotted_causes(budget)
     names = ['total', *(one.name for one in causes)]
     colours: list[Colour] = ['text', *(COLOURS[one.kind] for one in causes)]
     columns = [

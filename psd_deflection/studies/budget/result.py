@@ -53,7 +53,7 @@ class Budgeted(StudyResult):
         return {'rig': self.rig_file} if self.rig_file else {}
 
     def sentences(self) -> list[str]:
-        """The total, and the cause that gives most of it."""
+        """Return the total, and the cause that gives most of it."""
         at, total = self.budget.at, self.budget.total()
         out = [f'A single estimate is wrong by {_words(total)} (rms), method {at.method}.']
         name, share = max(
@@ -69,10 +69,10 @@ class Budgeted(StudyResult):
         return out
 
     def lines(self) -> list[str]:
-        """The situation, the table of all causes, the totals."""
-        out = [self._situation(), '', *columns(self._causes(), left=4).splitlines()]
-        out += ['', *columns(self._totals()).splitlines()]
-        out += ['', *columns(self._expanded()).splitlines()]
+        """Return the situation, the table of all causes, the totals."""
+        out = [self._situation(), '', *columns(self.cause_rows(), left=4).splitlines()]
+        out += ['', *columns(self.total_rows()).splitlines()]
+        out += ['', *columns(self.expanded_rows()).splitlines()]
         if self.sampled is not None:
             dx, dy, theta = _figures(self.sampled)
             out += ['', f'Monte Carlo, {self.draws} draws of everything at once (seed {self.seed}):']
@@ -82,15 +82,15 @@ class Budgeted(StudyResult):
         return out
 
     def sections(self) -> Iterable[PageSection]:
-        """The chart, the totals, every cause."""
-        head, *rows = self._causes()
-        totals_head, *totals = self._totals()
+        """Return the chart, the totals, every cause."""
+        head, *rows = self.cause_rows()
+        totals_head, *totals = self.total_rows()
         return [
             PageSection('', (f'<p class=quiet>{self._situation()}</p>',)),
             PageSection('Every cause beside the total', (_BARS, bars_of(self.budget))),
             PageSection('Totals', (table(totals_head, totals),)),
             PageSection('Every cause', (table(head, rows),)),
-            PageSection('Expanded uncertainty (GUM)', (table(*_split(self._expanded())), _RULES)),
+            PageSection('Expanded uncertainty (GUM)', (table(*_split(self.expanded_rows())), _RULES)),
             PageSection('Every error parameter', (table(*_split(parameter_rows(self.budget))),)),
         ]
 
@@ -101,11 +101,11 @@ class Budgeted(StudyResult):
         totals['total'] = _si(budget.total())
         if self.sampled is not None:
             totals['monte_carlo'] = _si(self.sampled)
-        said = self.budget.expanded()
+        expanded = self.budget.expanded()
         stated = {
             'probability': PROBABILITY,
-            **{name: value.tolist() for name, value in said._asdict().items()},
-            'freedom': [_or_none(value) for value in said.freedom.tolist()],
+            **{name: value.tolist() for name, value in expanded._asdict().items()},
+            'freedom': [_or_none(value) for value in expanded.freedom.tolist()],
         }
         if self.interval is not None:
             stated['monte_carlo'] = {'half': self.interval.half.tolist(), 'middle': self.interval.middle.tolist()}
@@ -138,7 +138,7 @@ class Budgeted(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row a cause: its kind, rms and share of the mean square for dX, dY, theta; m, m, rad."""
+        """Return one row a cause: its kind, rms and share of the mean square for dX, dY, theta; m, m, rad."""
         lines = self.budget.lines
         rms = np.array([line.rms for _, line in lines])
         share = np.array([self.budget.shares(line) for _, line in lines])
@@ -162,7 +162,8 @@ class Budgeted(StudyResult):
             f'θ {math.degrees(theta):.4f} deg; method {at.method}; mean of {at.rig.estimator.block_size} samples'
         )
 
-    def _causes(self) -> list[list[str]]:
+    def cause_rows(self) -> list[list[str]]:
+        """Return a row of words for each cause: its name, kind, type, degrees of freedom, size and share."""
         rows = [['term', 'Table 3.1', 'kind', 'type', 'ν', *UNITS, 'ΔX %', 'ΔY %', 'θ %']]
         for cause, line in self.budget.lines:
             shares = [f'{100.0 * v:.1f}' for v in self.budget.shares(line).tolist()]
@@ -171,22 +172,22 @@ class Budgeted(StudyResult):
             rows.append([*head, *_figures(line), *shares])
         return rows
 
-    def _expanded(self) -> list[list[str]]:
+    def expanded_rows(self) -> list[list[str]]:
         """u_c, nu_eff, k, U, and what the draws say."""
-        said = self.budget.expanded()
-        rows = [['', *UNITS], ['standard uncertainty u_c', *shown(said.standard)]]
-        rows.append(['effective degrees of freedom ν_eff', *map(freedom_words, said.freedom.tolist())])
-        rows.append(['coverage factor k, 95 %', *(f'{k:.3f}' for k in said.factor.tolist())])
-        rows.append(['known bias b, not corrected', *shown(said.bias)])
-        rows.append(['expanded uncertainty U = k u_c + |b|', *shown(said.uncertainty)])
+        expanded = self.budget.expanded()
+        rows = [['', *UNITS], ['standard uncertainty u_c', *display_values(expanded.standard)]]
+        rows.append(['effective degrees of freedom ν_eff', *map(freedom_words, expanded.freedom.tolist())])
+        rows.append(['coverage factor k, 95 %', *(f'{k:.3f}' for k in expanded.factor.tolist())])
+        rows.append(['known bias b, not corrected', *display_values(expanded.bias)])
+        rows.append(['expanded uncertainty U = k u_c + |b|', *display_values(expanded.uncertainty)])
         if self.interval is not None:
-            rows.append(['Monte Carlo: half of the 95 % interval', *shown(self.interval.half)])
-            off = difference(said, self.interval).tolist()
+            rows.append(['Monte Carlo: half of the 95 % interval', *display_values(self.interval.half)])
+            off = difference(expanded, self.interval).tolist()
             rows.append(['k u_c beside it, %', *(f'{100.0 * v:+.1f}' for v in off)])
         return rows
 
     def _compared(self, interval: Interval) -> str:
-        """The GUM's interval beside that of the draws."""
+        """Return the GUM's interval beside that of the draws."""
         off = difference(self.budget.expanded(), interval).tolist()
         each = ', '.join(f'{name} {100.0 * v:+.1f} %' for name, v in zip(SYMBOLS, off, strict=True))
         return (
@@ -194,7 +195,8 @@ class Budgeted(StudyResult):
             f'{in_words(interval.half)}; k u_c differs by {each}.'
         )
 
-    def _totals(self) -> list[list[str]]:
+    def total_rows(self) -> list[list[str]]:
+        """Return a row of words for the total of each kind and of all causes."""
         rows = [['', *UNITS]]
         rows += [[f'all {kind.value} terms', *_figures(self.budget.total(kind))] for kind in Kind]
         return [*rows, ['total', *_figures(self.budget.total())]]
@@ -212,7 +214,7 @@ _RULES = (
 
 
 def type_of(cause: Cause) -> str:
-    """A or B."""
+    """Return a or B."""
     return 'A' if cause.observed else 'B'
 
 
@@ -222,7 +224,7 @@ def _or_none(freedom: float) -> float | None:
 
 
 def freedom_words(freedom: float) -> str:
-    """A number, or ∞."""
+    """Return a number, or ∞."""
     return '∞' if math.isinf(freedom) else f'{freedom:.0f}'
 
 
@@ -234,7 +236,7 @@ def parameter_rows(budget: Budget) -> list[list[str]]:
         for s in sensitivities:
             head = [cause.name, s.name, type_of(cause), cause.distribution.value, f'{s.deviation:.6g}', cause.unit]
             slopes = [f'{c:.6g}' for c in s.coefficient.tolist()]
-            rows.append([*head, freedom, *slopes, *shown(np.abs(s.coefficient) * s.deviation)])
+            rows.append([*head, freedom, *slopes, *display_values(np.abs(s.coefficient) * s.deviation)])
     return rows
 
 
@@ -243,7 +245,7 @@ def _split(rows: list[list[str]]) -> tuple[list[str], list[list[str]]]:
     return head, others
 
 
-def shown(values: FloatArray) -> list[str]:
+def display_values(values: FloatArray) -> list[str]:
     """(3,) m, m, rad in µm, µm and mdeg."""
     return [f'{v:.3f}' for v in (values * SHOWN).tolist()]
 
@@ -255,7 +257,7 @@ def in_words(values: FloatArray) -> str:
 
 
 def _figures(line: Contribution) -> list[str]:
-    return shown(line.rms)
+    return display_values(line.rms)
 
 
 def _words(line: Contribution) -> str:

@@ -91,7 +91,7 @@ class Situation:
         return cls(rig, inputs, pose, method, chain, estimator)
 
     def __getitem__(self, name: str) -> float:
-        """One input."""
+        """Return one input."""
         return self.inputs[name]
 
     @property
@@ -283,7 +283,7 @@ def _respond(at: Situation, chain: MeasuringChain) -> FloatArray:
 
 
 def adds_to(name: str) -> Callable[[MeasuringChain, FloatArray, Situation], MeasuringChain]:
-    """An ``apply`` that adds the values to one field of the chain: one for each sensor, or for each axis too."""
+    """Return an ``apply`` that adds the values to one field of the chain: one for each sensor, or for each axis too."""
 
     def apply(chain: MeasuringChain, values: FloatArray, at: Situation) -> MeasuringChain:
         old: FloatArray = getattr(chain, name)

@@ -39,7 +39,7 @@ from psd_deflection.studies.calibrate.fit import (
     refitted,
     residual_at,
     weight_matrices,
-    with_one_zero,
+    with_common_zero,
 )
 from psd_deflection.studies.calibrate.observation import (
     LEAST_HOLD,
@@ -47,8 +47,8 @@ from psd_deflection.studies.calibrate.observation import (
     Rows,
     joined,
     noise_of,
+    rest_means,
     rows_of,
-    settled,
     smoothed,
     usable_dots,
 )
@@ -133,7 +133,7 @@ class Calibration:
         return before_of(self.vector, self.prior)
 
     @property
-    def seen(self) -> FloatArray | None:
+    def reference_range(self) -> FloatArray | None:
         """Least and largest pose (2, 3), m, m, rad, of the reference where it counted; None without a reference."""
         poses = self.rows.pose[self.fit.weights > 0.0]
         return np.stack([poses.min(axis=0), poses.max(axis=0)]) if self.kind == 'reference' and len(poses) else None
@@ -160,8 +160,8 @@ def calibrate(
     vector = vector_of_rig(rig)
     prior = prior_of_rig(rig, vector)
     progress('rows')
-    clock = roughly_late(runs, rig, noise) if kind == 'reference' else 0.0
-    parts = [rows_of(run, rig, noise, late=clock, blocks=kind != 'reference') for run in runs]
+    clock = coarse_delay(runs, rig, noise) if kind == 'reference' else 0.0
+    parts = [rows_of(run, rig, noise, delay=clock, blocks=kind != 'reference') for run in runs]
     rows = joined(parts)
     if kind == 'loads':
         if not rows.rest.any():
@@ -169,19 +169,19 @@ def calibrate(
                 f'{runs[0].name}: no load is held for {LEAST_HOLD} s; hold each for some seconds, '
                 f'or give a recording with a reference'
             )
-        rows = settled(rows, rig, noise)
+        rows = rest_means(rows, rig, noise)
     progress('fitting')
     free = fitted_parameters(kind)
-    rows, first = with_one_zero(rows, rig, prior, kind, free)
-    first, prior, widened = _believed(first, rows, rig, prior, kind, free)
+    rows, first = with_common_zero(rows, rig, prior, kind, free)
+    first, prior, widened = believed_fit(first, rows, rig, prior, kind, free)
     free = _determined(first, prior, free)
-    whole = fit(rows, rig, prior, kind, free=free, start=first)
+    full_fit = fit(rows, rig, prior, kind, free=free, start=first)
     progress('held-out motion')
-    whole, believed, dropped = _without_refused_terms(whole, rows, rig, prior, kind)
+    full_fit, believed, dropped = _without_refused_terms(full_fit, rows, rig, prior, kind)
     before = before_of(vector, prior)
-    gap, worse = _heldout(whole, rows, rig, believed, kind, before)
+    gap, worse = _heldout(full_fit, rows, rig, believed, kind, before)
     if kind == 'reference':
-        whole = _with_clamp(whole, rows, rig, prior)
+        full_fit = with_clamp(full_fit, rows, rig, prior)
     refused = ''
     if worse:
         refused = (
@@ -194,12 +194,12 @@ def calibrate(
         kind,
         vector,
         prior,
-        whole,
+        full_fit,
         rows,
         runs,
         noise,
         gap,
-        undetermined(whole, prior),
+        undetermined(full_fit, prior),
         clock,
         refused,
         widened,
@@ -237,7 +237,7 @@ def before_of(vector: RigVector, prior: Prior) -> FloatArray:
     return out
 
 
-def roughly_late(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) -> float:
+def coarse_delay(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) -> float:
     """Seconds to add to the reference's times so that it fits the dots best, in steps; 0 if nothing moves."""
     costs = np.zeros(2 * round(CLOCK_RANGE / CLOCK_STEP) + 1)
     lates = (np.arange(len(costs)) - len(costs) // 2) * CLOCK_STEP
@@ -249,8 +249,8 @@ def roughly_late(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) ->
         period = float(np.median(np.diff(run.t)))
         linear = linearised(moving, prior_of_rig(rig).mean, rig, 'reference')
         # What does not depend on the clock is taken off as a mean: the fit has not begun.
-        for i, late in enumerate(lates):
-            places = np.interp(moving.t + late, run.t, np.arange(len(run.t)))
+        for i, delay in enumerate(lates):
+            places = np.interp(moving.t + delay, run.t, np.arange(len(run.t)))
             s = smoothed(dots, period, places)
             off = linear.residual + s.dots - moving.dots
             off = off[s.good]
@@ -262,7 +262,7 @@ def roughly_late(runs: Sequence[CalibrationRun], rig: Rig, noise: FloatArray) ->
     return float(lates[best]) if costs[best] < 0.9 * costs[middle] else 0.0
 
 
-def _believed(
+def believed_fit(
     first: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask
 ) -> tuple[CalibrationFit, Prior, list[str]]:
     """Widen what the rows contradict, the worst at a time, each once; the third are the names of these."""
@@ -305,98 +305,99 @@ def _pieces(rows: Rows) -> IntArray:
     """Which of two halves each row belongs to: every second of ``FOLDS`` pieces of its recording."""
     out = np.zeros(len(rows), dtype=np.int64)
     for run in np.unique(rows.run):
-        own = np.flatnonzero(rows.run == run)
-        out[own] = (np.arange(len(own)) * FOLDS // len(own)) % 2
+        rows_of_run = np.flatnonzero(rows.run == run)
+        out[rows_of_run] = (np.arange(len(rows_of_run)) * FOLDS // len(rows_of_run)) % 2
     return out
 
 
 def _misfit(
-    residual: FloatArray, whole: CalibrationFit, inverse: FloatArray, rows: Rows, kind: Kind
+    residual: FloatArray, full_fit: CalibrationFit, inverse: FloatArray, rows: Rows, kind: Kind
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted and plain squares (n,) of ``residual`` (n, 4)."""
-    weighted = np.einsum('ni,nij,nj->n', residual, inverse, residual) * whole.weights
+    weighted = np.einsum('ni,nij,nj->n', residual, inverse, residual) * full_fit.weights
     if kind == 'self':
-        across = np.linalg.svd(whole.linear.by_pose)[0][:, :, 3]
-        return weighted, np.einsum('ni,ni->n', across, residual) ** 2 * whole.weights
-    return weighted, np.mean(residual**2, axis=1) * whole.weights
+        across = np.linalg.svd(full_fit.linear.pose_slopes)[0][:, :, 3]
+        return weighted, np.einsum('ni,ni->n', across, residual) ** 2 * full_fit.weights
+    return weighted, np.mean(residual**2, axis=1) * full_fit.weights
 
 
-def _held_out(whole: CalibrationFit, rows: Rows, prior: Prior, free: Mask) -> FloatArray:
+def _held_out(full_fit: CalibrationFit, rows: Rows, prior: Prior, free: Mask) -> FloatArray:
     """Residuals (n, 4) of each half of the rows by the parameters that the other half gives."""
     half = _pieces(rows)
-    out = np.empty_like(whole.linear.residual)
+    out = np.empty_like(full_fit.linear.residual)
     for number in (0, 1):
-        z = refitted(whole, rows, prior, (half != number).astype(np.float64), free)
-        out[half == number] = residual_at(whole, z)[half == number]
+        z = refitted(full_fit, rows, prior, (half != number).astype(np.float64), free)
+        out[half == number] = residual_at(full_fit, z)[half == number]
     return out
 
 
 def _heldout(
-    whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before: FloatArray
+    full_fit: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind, before: FloatArray
 ) -> tuple[Gap, bool]:
-    """The gaps, and whether unseen motion is predicted worse than with the rig file."""
-    inverse = weight_matrices(whole.linear, rows, whole.noise)
-    old, old_plain = _misfit(linearised(rows, before, rig, kind).residual, whole, inverse, rows, kind)
-    _, new_plain = _misfit(whole.linear.residual, whole, inverse, rows, kind)
-    new, held_plain = _misfit(_held_out(whole, rows, prior, whole.free), whole, inverse, rows, kind)
+    """Return the gaps, and whether unseen motion is predicted worse than with the rig file."""
+    inverse = weight_matrices(full_fit.linear, rows, full_fit.noise)
+    old, old_plain = _misfit(linearised(rows, before, rig, kind).residual, full_fit, inverse, rows, kind)
+    _, new_plain = _misfit(full_fit.linear.residual, full_fit, inverse, rows, kind)
+    new, held_plain = _misfit(_held_out(full_fit, rows, prior, full_fit.free), full_fit, inverse, rows, kind)
 
     def rms(plain: FloatArray) -> float:
-        return float(np.sqrt(plain.sum() / max(whole.weights.sum(), 1.0)))
+        return float(np.sqrt(plain.sum() / max(full_fit.weights.sum(), 1.0)))
 
     gap = Gap(rms(old_plain), rms(new_plain), rms(old_plain), rms(held_plain))
     return gap, bool(new.sum() > old.sum() or gap.heldout_after > WORSE * gap.heldout_before)
 
 
 def _without_refused_terms(
-    whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind
+    full_fit: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind
 ) -> tuple[CalibrationFit, Prior, list[str]]:
     """Drop a non-linearity that unseen motion contradicts: the file's value stays, within what the rows leave open."""
     dropped: list[str] = []
     for name in ('psd_1.nonlinearity', 'psd_2.nonlinearity'):
         i = INDEX[name]
-        if not whole.free[i]:
+        if not full_fit.free[i]:
             continue
-        without = whole.free.copy()
+        without = full_fit.free.copy()
         without[i] = False
-        inverse = weight_matrices(whole.linear, rows, whole.noise)
+        inverse = weight_matrices(full_fit.linear, rows, full_fit.noise)
         costs = [
-            _misfit(_held_out(whole, rows, prior, f), whole, inverse, rows, kind)[0] for f in (whole.free, without)
+            _misfit(_held_out(full_fit, rows, prior, f), full_fit, inverse, rows, kind)[0]
+            for f in (full_fit.free, without)
         ]
         more = costs[0] - costs[1]
         if more.sum() > 2.0 * float(np.sqrt(np.sum(more**2))):
             dropped.append(name)
             # The rows bound it all the same: by what they gave it and left open.
-            away = whole.covariance[i, i] + (whole.values[i] - prior.mean[i]) ** 2
+            away = full_fit.covariance[i, i] + (full_fit.values[i] - prior.mean[i]) ** 2
             covariance = prior.covariance.copy()
             shrunk = min(1.0, float(away / covariance[i, i]) ** 0.5)
             covariance[i] *= shrunk
             covariance[:, i] *= shrunk
             prior = Prior(prior.mean, covariance)
-            whole = fit(rows, rig, prior, kind, free=without, start=whole)
-    return whole, prior, dropped
+            full_fit = fit(rows, rig, prior, kind, free=without, start=full_fit)
+    return full_fit, prior, dropped
 
 
-def _with_clamp(whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior) -> CalibrationFit:
-    """The clamp's compliances from the reference's poses at rest under known loads, if there are any.
+def with_clamp(full_fit: CalibrationFit, rows: Rows, rig: Rig, prior: Prior) -> CalibrationFit:
+    """Return the clamp's compliances from the reference's poses at rest under known loads, if there are any.
 
     The link's own stiffness is taken as the rig file has it: at one length a clamp that gives way is a softer link.
     """
-    rest = rows.rest & (whole.weights > 0.0)
-    values, covariance, free = whole.values.copy(), whole.covariance.copy(), whole.free.copy()
+    rest = rows.rest & (full_fit.weights > 0.0)
+    values, covariance, free = full_fit.values.copy(), full_fit.covariance.copy(), full_fit.free.copy()
     length = rig.link.length
-    own = compliances(rig, np.zeros(SIZE))
-    sds = whole.noise.reference
+    compliance = compliances(rig, np.zeros(SIZE))
+    sds = full_fit.noise.reference
     for i, (axes, lever) in enumerate((((0, 1), length**2), ((2,), 1.0))):
         information = right = 0.0
         for axis in axes:
             load = rows.loads[rest, axis]
             if len(load) < 4 or not np.ptp(load) > 0.0:
                 continue
-            y = rows.pose[rest, axis] - load * own[axis]
+            y = rows.pose[rest, axis] - load * compliance[axis]
             x = lever * (load - load.mean())
-            spread = max(float(np.std(y - np.polyval(np.polyfit(load, y, 1), load))), float(sds[axis]))
-            information += float(x @ x) / (spread**2 * whole.noise.fewer)
-            right += float(x @ (y - y.mean())) / (spread**2 * whole.noise.fewer)
+            scatter = max(float(np.std(y - np.polyval(np.polyfit(load, y, 1), load))), float(sds[axis]))
+            information += float(x @ x) / (scatter**2 * full_fit.noise.fewer)
+            right += float(x @ (y - y.mean())) / (scatter**2 * full_fit.noise.fewer)
         at = CLAMP_AT + i
         before = prior.covariance[at, at]
         after = 1.0 / (information + 1.0 / before)
@@ -405,7 +406,9 @@ def _with_clamp(whole: CalibrationFit, rows: Rows, rig: Rig, prior: Prior) -> Ca
             values[at], covariance[at, at], free[at] = prior.mean[at], before, False
         else:
             values[at], covariance[at, at], free[at] = after * (right + prior.mean[at] / before), after, True
-    return CalibrationFit(values, covariance, whole.information, whole.linear, whole.weights, whole.noise, free)
+    return CalibrationFit(
+        values, covariance, full_fit.information, full_fit.linear, full_fit.weights, full_fit.noise, free
+    )
 
 
 _NEEDS = {
@@ -437,22 +440,22 @@ def needs_of(names: Sequence[str]) -> str:
     return '; '.join(dict.fromkeys(_NEEDS[k] for k in short))
 
 
-def undetermined(whole: CalibrationFit, prior: Prior) -> list[Direction]:
+def undetermined(full_fit: CalibrationFit, prior: Prior) -> list[Direction]:
     """Directions whose spread stays above ``OPEN`` of the tolerances: single parameters, then combinations."""
     # The zero is measured at every start, and the clock is no parameter of the rig.
     reported = np.array([not ZERO <= i < COUNT and i != CLOCK for i in range(SIZE)])
-    open_still = np.sqrt(np.diag(whole.covariance)) > OPEN * prior.sd
-    held = np.flatnonzero(~whole.free & reported & open_still)
+    open_still = np.sqrt(np.diag(full_fit.covariance)) > OPEN * prior.sd
+    held = np.flatnonzero(~full_fit.free & reported & open_still)
     out = [Direction({NAMES[i]: 1.0}, needs_of([NAMES[i]])) for i in held]
     # The clamp's were determined one by one.
-    alone = np.isin(np.arange(SIZE), (CLAMP_AT, CLAMP_AT + 1)) & (np.diag(whole.information) == 0.0)
-    at = np.flatnonzero(whole.free & reported & ~alone)
+    alone = np.isin(np.arange(SIZE), (CLAMP_AT, CLAMP_AT + 1)) & (np.diag(full_fit.information) == 0.0)
+    at = np.flatnonzero(full_fit.free & reported & ~alone)
     if not len(at):
         return out
-    own = np.ix_(at, at)
+    block = np.ix_(at, at)
     sd = prior.sd[at]
     # Against the prior of these alone, which may be correlated (an earlier calibration).
-    size, vectors = np.linalg.eigh(posterior(whole.information, prior, whole.free)[own] / np.outer(sd, sd))
+    size, vectors = np.linalg.eigh(posterior(full_fit.information, prior, full_fit.free)[block] / np.outer(sd, sd))
     open_ones = vectors[:, size > OPEN**2]
     for parts in _sparse(open_ones):
         named = {NAMES[at[i]]: float(round(parts[i], 4)) for i in np.argsort(-np.abs(parts)) if abs(parts[i]) > 0.15}

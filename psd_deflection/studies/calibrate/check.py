@@ -25,7 +25,7 @@ from psd_deflection.model.misalignment.model import COUNT, PARAMETERS, TOLERANCE
 from psd_deflection.model.misalignment.rig import vector_of_rig
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.calibrate.calibrate import fitted_parameters, kind_of, roughly_late
+from psd_deflection.studies.calibrate.calibrate import coarse_delay, fitted_parameters, kind_of
 from psd_deflection.studies.calibrate.fit import (
     NAMES,
     CalibrationFit,
@@ -35,9 +35,9 @@ from psd_deflection.studies.calibrate.fit import (
     explained,
     prior_of_rig,
     score_at,
-    with_one_zero,
+    with_common_zero,
 )
-from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows, joined, noise_of, rows_of, settled
+from psd_deflection.studies.calibrate.observation import CalibrationRun, Rows, joined, noise_of, rest_means, rows_of
 
 LEVEL = 0.05
 """Share of rigs that did not move and are said to have moved."""
@@ -67,11 +67,11 @@ class MovedGroup(NamedTuple):
 
 
 class CalibrationCheck(NamedTuple):
-    """``holds``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the
+    """``unchanged``: nothing moved. ``p``: over all groups. ``groups``: the likeliest first. ``like``: groups that the
     first cannot be told from. ``zero``: the unloaded readings less the file's, (4,) m, and their deviations.
     """
 
-    holds: bool
+    unchanged: bool
     p: float
     groups: list[MovedGroup]
     like: list[str]
@@ -90,46 +90,46 @@ def check(
     kind = kind_of(runs, alone)
     progress('rows')
     noise = np.median([noise_of(run, rig) for run in runs], axis=0)
-    clock = roughly_late(runs, rig, noise) if kind == 'reference' else 0.0
-    rows = joined([rows_of(run, rig, noise, late=clock, blocks=kind != 'reference') for run in runs])
+    clock = coarse_delay(runs, rig, noise) if kind == 'reference' else 0.0
+    rows = joined([rows_of(run, rig, noise, delay=clock, blocks=kind != 'reference') for run in runs])
     if kind == 'loads':
-        rows = settled(rows, rig, noise)
+        rows = rest_means(rows, rig, noise)
     progress('fitting')
     vector = vector_of_rig(rig)
-    told = prior_of_rig(rig, vector)
-    told.covariance[:COUNT, :COUNT] += np.diag((BELIEVED * TOLERANCES) ** 2)
+    prior = prior_of_rig(rig, vector)
+    prior.covariance[:COUNT, :COUNT] += np.diag((BELIEVED * TOLERANCES) ** 2)
     # The noise is that about the best fit of a rig that may have moved.
-    wide = told.covariance.copy()
+    wide = prior.covariance.copy()
     wide[:COUNT, :COUNT] += np.diag((3.0 * TOLERANCES) ** 2)
     free = fitted_parameters(kind)
-    rows, best = with_one_zero(rows, rig, Prior(told.mean, wide), kind, free)
+    rows, best = with_common_zero(rows, rig, Prior(prior.mean, wide), kind, free)
     # Gradient and information at the file's values: from a rig that far off k and the heights would not be linear.
-    z = told.mean.copy()
+    z = prior.mean.copy()
     z[ZERO:] = best.values[ZERO:]
-    gradient, whole = score_at(rows, z, rig, kind, best)
+    gradient, information_of_all = score_at(rows, z, rig, kind, best)
     at = np.flatnonzero(free)
-    scale = np.concatenate((TOLERANCES, told.sd[COUNT:]))[at]
-    information = whole[np.ix_(at, at)] * np.outer(scale, scale)
-    right = scale * gradient[at] + information @ ((z - told.mean)[at] / scale)
-    p = told.covariance[np.ix_(at, at)] / np.outer(scale, scale)
+    scale = np.concatenate((TOLERANCES, prior.sd[COUNT:]))[at]
+    information = information_of_all[np.ix_(at, at)] * np.outer(scale, scale)
+    right = scale * gradient[at] + information @ ((z - prior.mean)[at] / scale)
+    p = prior.covariance[np.ix_(at, at)] / np.outer(scale, scale)
     q = np.linalg.solve(np.eye(len(at)) + p @ information, p)
-    left = right - information @ (q @ right)
+    score = right - information @ (q @ right)
     m = information - information @ q @ information
-    groups = [_moved(name, at, left, m, scale) for name in dict.fromkeys(d.group for d in PARAMETERS)]
-    seen = [g for g in groups if g.freedom]
-    seen.sort(key=lambda g: -g.evidence)
-    overall = overall_p([g.p for g in seen])
+    groups = [moved_group(name, at, score, m, scale) for name in dict.fromkeys(d.group for d in PARAMETERS)]
+    testable = [g for g in groups if g.freedom]
+    testable.sort(key=lambda g: -g.evidence)
+    overall = overall_p([g.p for g in testable])
     if overall < LEVEL:
         # A shift of several tolerances is beyond the linear: the likely ones are fitted in full.
-        null = explained(rows, rig, told, kind, free, best)[0]
-        fitted = [_fitted(g, rows, rig, told, kind, free, best, null) for g in seen[:FITTED]]
-        seen = [*sorted(fitted, key=lambda g: -g.evidence), *seen[FITTED:]]
-    like = [g.group for g in seen[1:] if seen[0].evidence - g.evidence < LIKE] if overall < LEVEL else []
+        null = explained(rows, rig, prior, kind, free, best)[0]
+        fitted = [fitted_group(g, rows, rig, prior, kind, free, best, null) for g in testable[:FITTED]]
+        testable = [*sorted(fitted, key=lambda g: -g.evidence), *testable[FITTED:]]
+    like = [g.group for g in testable[1:] if testable[0].evidence - g.evidence < LIKE] if overall < LEVEL else []
     zeros = slice(ZERO, COUNT)
     return CalibrationCheck(
         overall >= LEVEL,
         overall,
-        seen,
+        testable,
         like,
         best.values[zeros] - vector.values[zeros],
         np.sqrt(np.diag(best.covariance)[zeros]),
@@ -141,9 +141,10 @@ def overall_p(each: Sequence[float]) -> float:
     return min([1.0, *(len(each) * p for p in each)])
 
 
-def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> MovedGroup:
-    own = [i for i, index in enumerate(at) if index < ZERO and PARAMETERS[int(index)].group == name]
-    block, score = m[np.ix_(own, own)], left[own]
+def moved_group(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: FloatArray) -> MovedGroup:
+    """Return the shift of a group of parameters, with its evidence against nothing moved."""
+    members = [i for i, index in enumerate(at) if index < ZERO and PARAMETERS[int(index)].group == name]
+    block, score = m[np.ix_(members, members)], left[members]
     size, vectors = np.linalg.eigh(0.5 * (block + block.T))
     shown = size > _SEEN
     along = vectors.T @ score
@@ -155,32 +156,32 @@ def _moved(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale: Floa
     shift = covariance @ score
     named = {
         NAMES[int(at[i])]: (float(scale[i] * shift[j]), float(scale[i] * covariance[j, j] ** 0.5))
-        for j, i in enumerate(own)
+        for j, i in enumerate(members)
     }
     return MovedGroup(name, float(chi2.sf(statistic, freedom)) if freedom else 1.0, evidence, freedom, named)
 
 
-def _fitted(
-    group: MovedGroup, rows: Rows, rig: Rig, told: Prior, kind: Kind, free: Mask, best: CalibrationFit, null: float
+def fitted_group(
+    group: MovedGroup, rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask, best: CalibrationFit, null: float
 ) -> MovedGroup:
     """The group with the evidence and the shifts of a full fit; ``null``: what :func:`explained` says if none moved."""
-    covariance = told.covariance.copy()
+    covariance = prior.covariance.copy()
     for name in group.shifts:
         i = NAMES.index(name)
         covariance[i, i] += (SHIFT * TOLERANCES[i]) ** 2
-    evidence, z = explained(rows, rig, Prior(told.mean, covariance), kind, free, best)
-    moved = {name: (float((z - told.mean)[NAMES.index(name)]), sd) for name, (_, sd) in group.shifts.items()}
+    evidence, z = explained(rows, rig, Prior(prior.mean, covariance), kind, free, best)
+    moved = {name: (float((z - prior.mean)[NAMES.index(name)]), sd) for name, (_, sd) in group.shifts.items()}
     return group._replace(evidence=evidence - null, shifts=moved)
 
 
-def result(found: CalibrationCheck) -> dict[str, Any]:
+def result(outcome: CalibrationCheck) -> dict[str, Any]:
     """As JSON."""
     return {
-        'verdict': 'holds' if found.holds else 'moved',
+        'verdict': 'holds' if outcome.unchanged else 'moved',
         'level': LEVEL,
-        'p': found.p,
-        'moved': None if found.holds else found.groups[0].group,
-        'or': found.like,
+        'p': outcome.p,
+        'moved': None if outcome.unchanged else outcome.groups[0].group,
+        'or': outcome.like,
         'groups': [
             {
                 'name': g.group,
@@ -188,20 +189,20 @@ def result(found: CalibrationCheck) -> dict[str, Any]:
                 'evidence': g.evidence,
                 'shifts': {name: {'value': v, 'sd': sd} for name, (v, sd) in g.shifts.items()},
             }
-            for g in found.groups
+            for g in outcome.groups
         ],
         'zero': {
             NAMES[ZERO + i]: {'value': float(v), 'sd': float(sd)}
-            for i, (v, sd) in enumerate(zip(found.zero, found.zero_sd, strict=True))
+            for i, (v, sd) in enumerate(zip(outcome.zero, outcome.zero_sd, strict=True))
         },
     }
 
 
-def sentence(found: CalibrationCheck) -> str:
-    """The answer in one sentence."""
-    if found.holds:
-        return f'The calibration holds: nothing moved (p {found.p:.2g}; false alarms at most {LEVEL:.0%}).'
-    first = found.groups[0]
+def sentence(outcome: CalibrationCheck) -> str:
+    """Return the answer in one sentence."""
+    if outcome.unchanged:
+        return f'The calibration holds: nothing moved (p {outcome.p:.2g}; false alarms at most {LEVEL:.0%}).'
+    first = outcome.groups[0]
     shifts = ', '.join(f'{name} by {v:+.3g} ± {sd:.1g}' for name, (v, sd) in first.shifts.items())
-    other = f' (or {", ".join(found.like)}: this recording cannot tell)' if found.like else ''
-    return f'{first.group} moved{other}: {shifts} (p {found.p:.2g}). Calibrate again.'
+    alternatives = f' (or {", ".join(outcome.like)}: this recording cannot tell)' if outcome.like else ''
+    return f'{first.group} moved{alternatives}: {shifts} (p {outcome.p:.2g}). Calibrate again.'

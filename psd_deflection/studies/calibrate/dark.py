@@ -48,7 +48,7 @@ CHANNEL_WORDS = ('x', 'y', 'sum')
 class DarkLevel(NamedTuple):
     """One PSD with its laser off. ``psd``: its number, from 1. ``volts``, ``sd`` (3,): x, y, sum, V.
 
-    ``before`` (3,): what the rig file said, V. ``whole``: the sum with its laser on, V. ``place`` (2,): where the other
+    ``before`` (3,): as in the rig file, V. ``lit_sum``: the sum with its laser on, V. ``place`` (2,): where the other
     light pulls to, m. ``half``: half the length of the active area, m. ``seconds``, ``recording``, ``digest``: of what
     it was measured from.
     """
@@ -57,7 +57,7 @@ class DarkLevel(NamedTuple):
     volts: FloatArray
     sd: FloatArray
     before: tuple[float, float, float]
-    whole: float
+    lit_sum: float
     place: FloatArray
     half: float
     seconds: float
@@ -67,21 +67,21 @@ class DarkLevel(NamedTuple):
     @property
     def share(self) -> float:
         """Part of the light that is not the laser's, by which dots move less."""
-        return max(float(self.volts[2]), 0.0) / self.whole
+        return max(float(self.volts[2]), 0.0) / self.lit_sum
 
     @property
     def share_sd(self) -> float:
         """Its standard deviation."""
-        return float(self.sd[2]) / self.whole
+        return float(self.sd[2]) / self.lit_sum
 
     @property
-    def left(self) -> float:
+    def residual(self) -> float:
         """What its uncertainty does to a dot at the edge of the active area, m."""
         return self.share_sd * self.half
 
 
 def dark_levels(runs: Sequence[CalibrationRun], rig: Rig, lit: Sequence[CalibrationRun] = ()) -> list[DarkLevel]:
-    """The dark level of each PSD, from the longest time in ``runs`` in which its laser is off.
+    """Return the dark level of each PSD, from the longest time in ``runs`` in which its laser is off.
 
     ``lit``: recordings with the lasers on, for the share; without them it is that of amplifier.sum_nominal. Raises
     RecordingError if a laser is never off for ``LEAST``, if x or y is saturated or a level drifts so that it matters;
@@ -93,40 +93,40 @@ def dark_levels(runs: Sequence[CalibrationRun], rig: Rig, lit: Sequence[Calibrat
 
 def values_of_levels(levels: Sequence[DarkLevel]) -> dict[str, object]:
     """Flat values of a rig file."""
-    return {f'psd_{one.psd}.dark': [float(f'{v:.6g}') for v in one.volts] for one in levels}
+    return {f'psd_{level.psd}.dark': [float(f'{v:.6g}') for v in level.volts] for level in levels}
 
 
 def result_of_levels(levels: Sequence[DarkLevel]) -> dict[str, Any]:
     """As JSON, by PSD."""
     return {
-        f'psd_{one.psd}': {
+        f'psd_{level.psd}': {
             **{
                 name: {'value': float(v), 'sd': float(sd), 'unit': 'V', 'file': before}
-                for name, v, sd, before in zip(CHANNEL_WORDS, one.volts, one.sd, one.before, strict=True)
+                for name, v, sd, before in zip(CHANNEL_WORDS, level.volts, level.sd, level.before, strict=True)
             },
-            'share': {'value': one.share, 'sd': one.share_sd, 'unit': ''},
-            'place': {'value': one.place.tolist(), 'unit': 'm'},
-            'seconds': one.seconds,
-            'recording': {'name': one.recording, 'sha256': one.digest},
+            'share': {'value': level.share, 'sd': level.share_sd, 'unit': ''},
+            'place': {'value': level.place.tolist(), 'unit': 'm'},
+            'seconds': level.seconds,
+            'recording': {'name': level.recording, 'sha256': level.digest},
         }
-        for one in levels
+        for level in levels
     }
 
 
 def source_of_levels(levels: Sequence[DarkLevel]) -> str:
-    """The recordings, in words."""
-    return ', '.join(dict.fromkeys(named(one.recording, one.digest) for one in levels))
+    """Return the recordings, in words."""
+    return ', '.join(dict.fromkeys(named(level.recording, level.digest) for level in levels))
 
 
-def words_of_level(one: DarkLevel) -> str:
-    """One PSD in a sentence."""
-    sums = f'psd_{one.psd} with its laser off: sum {one.volts[2]:.5f} ± {one.sd[2]:.1g} V'
-    if one.volts[2] <= 0.0:
+def words_of_level(level: DarkLevel) -> str:
+    """Return one PSD in a sentence."""
+    sums = f'psd_{level.psd} with its laser off: sum {level.volts[2]:.5f} ± {level.sd[2]:.1g} V'
+    if level.volts[2] <= 0.0:
         return f'{sums}: no other light'
-    x, y = one.place * 1e3
+    x, y = level.place * 1e3
     return (
-        f'{sums} (file {one.before[2]:g} V): {one.share:.3%} of the light pulls to ({x:+.2f}, {y:+.2f}) mm; '
-        f'what is left of it moves a dot at the edge by {one.left * 1e6:.2g} µm'
+        f'{sums} (file {level.before[2]:g} V): {level.share:.3%} of the light pulls to ({x:+.2f}, {y:+.2f}) mm; '
+        f'what is left of it moves a dot at the edge by {level.residual * 1e6:.2g} µm'
     )
 
 
@@ -155,19 +155,19 @@ def _check(rig: Rig) -> None:
 
 
 def _limit(rig: Rig) -> float:
-    """The sum, V, below which the daemon takes a laser for lost."""
+    """Return the sum, V, below which the daemon takes a laser for lost."""
     return rig.estimator.sum_min * (0.5 if rig.estimator.splitter else 1.0)
 
 
 def _lit(lit: Sequence[CalibrationRun], rig: Rig, psd: int) -> float | None:
-    """The sum with the laser on, V; None if nothing tells."""
+    """Return the sum with the laser on, V; None if nothing tells."""
     sums = np.concatenate([np.empty(0), *(run.volts[:, 3 * psd + 2] for run in lit)])
     on = sums[sums >= _limit(rig)]
     return float(np.median(on)) if len(on) else None
 
 
 def longest(off: Mask) -> slice:
-    """The longest run of True."""
+    """Return the longest run of True."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], off, [False])).astype(np.int8)))
     starts, ends = edges[::2], edges[1::2]
     if not len(starts):
@@ -177,7 +177,7 @@ def longest(off: Mask) -> slice:
 
 
 def _dark_part(run: CalibrationRun, rig: Rig, psd: int) -> slice:
-    """The longest time without this laser; a lost sample does not end it."""
+    """Return the longest time without this laser; a lost sample does not end it."""
     with np.errstate(invalid='ignore'):
         lit = run.volts[:, 3 * psd + 2] >= _limit(rig)
     part = longest(~lit)
@@ -201,13 +201,13 @@ def _level(runs: Sequence[CalibrationRun], rig: Rig, psd: int, lit: float | None
             f'a dark level needs {LEAST:g} s with sum{psd + 1} below {_limit(rig):g} V (sum_min), '
             f'and its median is {float(np.nanmedian(sums)):.3f} V'
         )
-    mean, sd, drift, drift_sd = _mean_and_drift(part, rig.converter.volts_per_count)
+    mean, sd, drift, drift_sd = mean_and_drift(part, rig.converter.volts_per_count)
     half = 0.5 * max(rig.psds[psd].active_area)
     level = max(float(mean[2]), 0.0)
-    whole = rig.amplifier.sum_nominal + level if lit is None else lit
-    share = level / whole
+    lit_sum = rig.amplifier.sum_nominal + level if lit is None else lit
+    share = level / lit_sum
     # What a volt of x, of y and of the sum does to a dot: at the edge, where a sum does most.
-    moves = np.array([*(share * rig.sensitivities[psd]), half / whole])
+    moves = np.array([*(share * rig.sensitivities[psd]), half / lit_sum])
     names = [f'{name}{psd + 1}' for name in CHANNEL_WORDS]
     full = rig.converter.full_scale
     for name, values, move in zip(names, part.T, moves, strict=True):
@@ -217,19 +217,19 @@ def _level(runs: Sequence[CalibrationRun], rig: Rig, psd: int, lit: float | None
                 f'{run.name}: {name} is saturated with the laser off: {highest:.3f} V, converter.full_scale is '
                 f'{full:g} V; where the other light falls is not known'
             )
-    for name, change, own, move in zip(names, drift, drift_sd, moves, strict=True):
-        if abs(change) > DRIFTS * own and abs(change) * move > MATTERS:
+    for name, change, drift_limit, move in zip(names, drift, drift_sd, moves, strict=True):
+        if abs(change) > DRIFTS * drift_limit and abs(change) * move > MATTERS:
             raise RecordingError(
                 f'{run.name}: {name} drifts with the laser off: by {change * 1e3:+.2f} mV in {seconds:.1f} s, noise '
-                f'explains {own * 1e3:.2f} mV; wait until lamps and daylight are steady'
+                f'explains {drift_limit * 1e3:.2f} mV; wait until lamps and daylight are steady'
             )
     zero = np.zeros((1, 3 * len(rig.psds)), dtype=np.float32)
     zero[0, columns] = mean
     place = replace(VoltsToDots.from_rig(rig), dark=()).dots(zero)[0, 2 * psd : 2 * psd + 2]
-    return DarkLevel(psd + 1, mean, sd, rig.psds[psd].dark, whole, place, half, seconds, run.name, run.digest)
+    return DarkLevel(psd + 1, mean, sd, rig.psds[psd].dark, lit_sum, place, half, seconds, run.name, run.digest)
 
 
-def _mean_and_drift(part: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def mean_and_drift(part: FloatArray, step: float) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Mean (3,) of ``part`` (n, 3), its standard error, the drift over all of it, and that of noise alone.
 
     From means of ``PIECES`` pieces, which colour shorter than they are does not correlate, and fewer of them if they
@@ -247,8 +247,10 @@ def _mean_and_drift(part: FloatArray, step: float) -> tuple[FloatArray, FloatArr
     few = float(student.ppf(0.975, n - 1) / norm.ppf(0.975))
     for i in range(3):
         away = means[:, i] - means[:, i].mean()
-        left = away - slope[i] * at
+        residual = away - slope[i] * at
         rounding = undithered(float(np.nanvar(part[:, i])), step)
         sd[i] = (few**2 * float(away @ away) / (n - 1) / n * fewer(away[:, None], same) + rounding) ** 0.5
-        drift_sd[i] = (float(left @ left) / (n - 2) / float(at @ at) * fewer(left[:, None], same) + rounding) ** 0.5
+        drift_sd[i] = (
+            float(residual @ residual) / (n - 2) / float(at @ at) * fewer(residual[:, None], same) + rounding
+        ) ** 0.5
     return mean, sd, slope, drift_sd

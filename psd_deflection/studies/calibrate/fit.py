@@ -76,9 +76,9 @@ def prior_of_rig(rig: Rig, vector: RigVector | None = None) -> Prior:
     covariance[ZERO:COUNT] = covariance[:, ZERO:COUNT] = 0.0
     covariance[ZERO:COUNT, ZERO:COUNT] = np.diag(TOLERANCES[ZERO:] ** 2)
     stated = stated_sd(rig)
-    own = (rig.link.length / rig.link.bending_stiffness, rig.link.length / rig.link.torsional_stiffness)
+    compliance = (rig.link.length / rig.link.bending_stiffness, rig.link.length / rig.link.torsional_stiffness)
     # A tip force F gives L^3 F/3EI; a clamp that turns by c F L moves the tip by c F L^2.
-    shares = (CLAMP_SHARE * own[0] / 3.0, CLAMP_SHARE * own[1])
+    shares = (CLAMP_SHARE * compliance[0] / 3.0, CLAMP_SHARE * compliance[1])
     for i, (name, share) in enumerate(zip(CLAMP, shares, strict=True)):
         covariance[CLAMP_AT + i, CLAMP_AT + i] = (stated.get(name) or share) ** 2
     covariance[CLOCK, CLOCK] = CLOCK_SD**2
@@ -100,11 +100,11 @@ class Noise:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Linear:
-    """Rows about one set of parameters: ``residual`` (n, 4) m, ``slopes`` (n, 4, SIZE), ``by_pose`` (n, 4, 3)."""
+    """Rows about one set of parameters: ``residual`` (n, 4) m, ``slopes`` (n, 4, SIZE), ``pose_slopes`` (n, 4, 3)."""
 
     residual: FloatArray
     slopes: FloatArray
-    by_pose: FloatArray
+    pose_slopes: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,8 +162,8 @@ def pose_of_readings(dots: FloatArray, variances: FloatArray, p: FloatArray, len
     root = 1.0 / np.sqrt(variances)
 
     def step(slopes: FloatArray, pose: FloatArray) -> FloatArray:
-        left = root * (dots - readings(p, pose.T, length).T)
-        return np.asarray(np.einsum('nij,nj->ni', np.linalg.pinv(root[:, :, None] * slopes), left))
+        residual = root * (dots - readings(p, pose.T, length).T)
+        return np.asarray(np.einsum('nij,nj->ni', np.linalg.pinv(root[:, :, None] * slopes), residual))
 
     pose = np.zeros((len(dots), 3))
     pose = pose + step(by_pose(p, pose[:1].T, length).transpose(2, 0, 1), pose)
@@ -176,8 +176,8 @@ def pose_of_readings(dots: FloatArray, variances: FloatArray, p: FloatArray, len
 
 def weight_matrices(linear: Linear, rows: Rows, noise: Noise) -> FloatArray:
     """C^-1 (n, 4, 4), 1/m^2."""
-    spread = linear.by_pose * (noise.reference * rows.sd)[:, None, :]
-    covariance = np.einsum('nij,nkj->nik', spread, spread)
+    pose_scatter = linear.pose_slopes * (noise.reference * rows.sd)[:, None, :]
+    covariance = np.einsum('nij,nkj->nik', pose_scatter, pose_scatter)
     covariance[:, range(4), range(4)] += noise.dots**2 * rows.variances
     return np.asarray(np.linalg.inv(covariance)) / noise.fewer
 
@@ -210,7 +210,7 @@ def fit(
             linear = linearised(rows, z, rig, kind)
             if np.all(np.abs(step) <= 1e-2 * np.sqrt(np.diag(posterior(information, prior, free)))):
                 break
-        noise = _components(linear, rows, robust, kind, number, information, prior)
+        noise = variance_components(linear, rows, robust, kind, number, information, prior)
     inverse = weight_matrices(linear, rows, noise)
     robust = _robust(linear, inverse, noise, kind, PASSES)
     _, information = _step(linear, inverse, robust, z, prior, free, rows)
@@ -253,23 +253,23 @@ def explained(
     scale = prior.sd[at]
     p = prior.covariance[np.ix_(at, at)] / np.outer(scale, scale)
     away = (z - prior.mean)[at] / scale
-    told = information[np.ix_(at, at)] * np.outer(scale, scale)
-    spread = float(np.linalg.slogdet(np.eye(len(at)) + p @ told)[1])
-    return -0.5 * (misfit + float(away @ np.linalg.solve(p, away)) + spread), z
+    scaled_information = information[np.ix_(at, at)] * np.outer(scale, scale)
+    log_determinant = float(np.linalg.slogdet(np.eye(len(at)) + p @ scaled_information)[1])
+    return -0.5 * (misfit + float(away @ np.linalg.solve(p, away)) + log_determinant), z
 
 
-def refitted(whole: CalibrationFit, rows: Rows, prior: Prior, kept: FloatArray, free: Mask) -> FloatArray:
-    """Parameters (SIZE,) from some of the rows, ``kept`` (n,) 1 or 0, by one step from the fit of all of them."""
-    inverse = weight_matrices(whole.linear, rows, whole.noise)
-    z = whole.values.copy()
+def refitted(full_fit: CalibrationFit, rows: Rows, prior: Prior, row_weights: FloatArray, free: Mask) -> FloatArray:
+    """Return the parameters (SIZE,) of the rows with ``row_weights`` (n,) 1, not 0, by one step from the full fit."""
+    inverse = weight_matrices(full_fit.linear, rows, full_fit.noise)
+    z = full_fit.values.copy()
     z[~free] = prior.mean[~free]
-    shifted = Linear(residual_at(whole, z), whole.linear.slopes, whole.linear.by_pose)
-    return z + _step(shifted, inverse, whole.weights * kept, z, prior, free, rows)[0]
+    shifted = Linear(residual_at(full_fit, z), full_fit.linear.slopes, full_fit.linear.pose_slopes)
+    return z + _step(shifted, inverse, full_fit.weights * row_weights, z, prior, free, rows)[0]
 
 
-def residual_at(whole: CalibrationFit, z: FloatArray) -> FloatArray:
+def residual_at(full_fit: CalibrationFit, z: FloatArray) -> FloatArray:
     """Residuals (n, 4), m, for parameters near those of the fit, to first order."""
-    return whole.linear.residual - whole.linear.slopes @ (z - whole.values)
+    return full_fit.linear.residual - full_fit.linear.slopes @ (z - full_fit.values)
 
 
 def _step(
@@ -284,10 +284,10 @@ def _step(
     """Gauss-Newton's step (SIZE,) and the information (SIZE, SIZE) of the rows."""
     right, information = _normal(linear, inverse * robust[:, None, None], rows)
     at = np.flatnonzero(free)
-    own = np.ix_(at, at)
+    block = np.ix_(at, at)
     scale = prior.sd[at]
-    precision = np.linalg.inv(prior.covariance[own] / np.outer(scale, scale))
-    normal = precision + information[own] * np.outer(scale, scale)
+    precision = np.linalg.inv(prior.covariance[block] / np.outer(scale, scale))
+    normal = precision + information[block] * np.outer(scale, scale)
     gradient = scale * right[at] - precision @ ((z - prior.mean)[at] / scale)
     step = np.zeros(SIZE)
     step[at] = scale * np.linalg.solve(normal, gradient)
@@ -304,23 +304,23 @@ def _normal(linear: Linear, inverse: FloatArray, rows: Rows) -> tuple[FloatArray
     information = linear.slopes.reshape(-1, SIZE).T @ weighted.reshape(-1, SIZE)
     right = weighted.reshape(-1, SIZE).T @ linear.residual.ravel()
     for run in range(1, int(rows.run.max()) + 1):
-        whole, shared, pull = _of_zero(linear, weighted, rows.run == run)
-        right -= shared.T @ np.linalg.solve(whole, pull)
-        information -= shared.T @ np.linalg.solve(whole, shared)
+        zero_information, shared, pull = _of_zero(linear, weighted, rows.run == run)
+        right -= shared.T @ np.linalg.solve(zero_information, pull)
+        information -= shared.T @ np.linalg.solve(zero_information, shared)
     return right, 0.5 * (information + information.T)
 
 
-def _of_zero(linear: Linear, weighted: FloatArray, own: Mask) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _of_zero(linear: Linear, weighted: FloatArray, rows_of_run: Mask) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The normal equations of one recording's own zero: (4, 4), with the parameters (4, SIZE), right side (4,)."""
     zero = slice(ZERO, COUNT)
-    by_zero = linear.slopes[own][:, :, zero].reshape(-1, COUNT - ZERO).T
-    shared = by_zero @ weighted[own].reshape(-1, SIZE)
-    pull = weighted[own][:, :, zero].reshape(-1, COUNT - ZERO).T @ linear.residual[own].ravel()
+    by_zero = linear.slopes[rows_of_run][:, :, zero].reshape(-1, COUNT - ZERO).T
+    shared = by_zero @ weighted[rows_of_run].reshape(-1, SIZE)
+    pull = weighted[rows_of_run][:, :, zero].reshape(-1, COUNT - ZERO).T @ linear.residual[rows_of_run].ravel()
     return shared[:, zero] + np.diag(TOLERANCES[zero] ** -2), shared, pull
 
 
-def with_one_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Rows, CalibrationFit]:
-    """The rows as if all recordings had the zero of the first one, and their fit.
+def with_common_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) -> tuple[Rows, CalibrationFit]:
+    """Return the rows as if all recordings had the zero of the first one, and their fit.
 
     The beams may have been aimed anew between two recordings, and a camera takes its rest anew. The offset is a
     change of the unloaded readings; what it does to the others follows from the model.
@@ -339,8 +339,8 @@ def with_one_zero(rows: Rows, rig: Rig, prior: Prior, kind: Kind, free: Mask) ->
         weighted = np.einsum('nij,njk->nik', inverse, best.linear.slopes)
         before = offsets.copy()
         for run in range(1, count):
-            whole, _, pull = _of_zero(best.linear, weighted, rows.run == run)
-            offsets[run] += np.linalg.solve(whole, pull)
+            zero_information, _, pull = _of_zero(best.linear, weighted, rows.run == run)
+            offsets[run] += np.linalg.solve(zero_information, pull)
         if np.abs(offsets - before).max() < SAME_ZERO:
             break
         rows = _moved(given, rig, best.values, offsets)
@@ -354,11 +354,11 @@ def _moved(rows: Rows, rig: Rig, z: FloatArray, offsets: FloatArray) -> Rows:
     for run, offset in enumerate(offsets):
         if not offset.any():
             continue
-        own = rows.run == run
+        rows_of_run = rows.run == run
         moved = z[:COUNT].copy()
         moved[ZERO:] += offset
-        pose = pose_of_readings(rows.dots[own], rows.variances[own], moved, length).T
-        dots[own] -= (readings(moved, pose, length) - readings(z[:COUNT], pose, length)).T
+        pose = pose_of_readings(rows.dots[rows_of_run], rows.variances[rows_of_run], moved, length).T
+        dots[rows_of_run] -= (readings(moved, pose, length) - readings(z[:COUNT], pose, length)).T
     return replace(rows, dots=dots)
 
 
@@ -373,18 +373,18 @@ def posterior(information: FloatArray, prior: Prior, free: Mask) -> FloatArray:
     out = np.zeros((SIZE, SIZE))
     out[np.ix_(d, d)] = p_d
     if len(u):
-        kept = p_d @ np.linalg.inv(p0[np.ix_(d, d)])
+        prior_gain = p_d @ np.linalg.inv(p0[np.ix_(d, d)])
         by_u = -p_d @ info[np.ix_(d, u)]
         p_u, p_du = p0[np.ix_(u, u)], p0[np.ix_(d, u)]
-        cross = kept @ p_du @ by_u.T
+        cross = prior_gain @ p_du @ by_u.T
         out[np.ix_(d, d)] += by_u @ p_u @ by_u.T + cross + cross.T
-        out[np.ix_(d, u)] = kept @ p_du + by_u @ p_u
+        out[np.ix_(d, u)] = prior_gain @ p_du + by_u @ p_u
         out[np.ix_(u, d)] = out[np.ix_(d, u)].T
         out[np.ix_(u, u)] = p_u
     return np.asarray(out * np.outer(scale, scale))
 
 
-def _components(
+def variance_components(
     linear: Linear,
     rows: Rows,
     robust: FloatArray,
@@ -393,12 +393,12 @@ def _components(
     information: FloatArray,
     prior: Prior,
 ) -> Noise:
-    """The variance components from the residuals."""
+    """Return the variance components from the residuals."""
     good = robust > 0.0 if number else np.ones(len(rows), dtype=bool)
-    inverse = np.linalg.pinv(linear.by_pose)
+    inverse = np.linalg.pinv(linear.pose_slopes)
     errors = (np.einsum('nij,nj->ni', inverse, linear.residual) / rows.sd)[good]
     # Two PSDs leave one direction that no pose reaches.
-    across = np.linalg.svd(linear.by_pose)[0][:, :, 3]
+    across = np.linalg.svd(linear.pose_slopes)[0][:, :, 3]
     redundant = np.einsum('ni,ni->n', across, linear.residual)[good]
     expected = np.sqrt(np.einsum('ni,ni->n', across**2, rows.variances))[good]
     scale = prior.sd
@@ -409,16 +409,17 @@ def _components(
     # Each of the four equations of a row pays its part of the parameters that were fitted.
     share = max(1.0 - used / (4.0 * len(errors)), 0.2)
     robustly = number == 0 and kind != 'loads'
-    dots = _deviation(redundant / expected, robustly) / share**0.5
+    dots = deviation_of(redundant / expected, robustly) / share**0.5
     if kind == 'self':
         return Noise(np.full(3, _FREE), max(dots, 0.3), 1.0)
-    own = (np.einsum('nij,nj->ni', inverse**2, rows.variances) / rows.sd**2)[good].mean(axis=0) * dots**2
-    seen = np.array([_deviation(e, robustly) ** 2 for e in errors.T]) / share
-    reference = np.sqrt(np.maximum(seen - own, 0.01 * own))
+    stated_variance = (np.einsum('nij,nj->ni', inverse**2, rows.variances) / rows.sd**2)[good].mean(axis=0) * dots**2
+    observed_variance = np.array([deviation_of(e, robustly) ** 2 for e in errors.T]) / share
+    reference = np.sqrt(np.maximum(observed_variance - stated_variance, 0.01 * stated_variance))
     return Noise(reference, max(dots, 0.3), fewer(errors, rows.run[good]))
 
 
-def _deviation(values: FloatArray, robustly: bool) -> float:
+def deviation_of(values: FloatArray, robustly: bool) -> float:
+    """Return the standard deviation of values, by the median if ``robustly``."""
     if robustly:
         return float(1.4826 * np.median(np.abs(values - np.median(values))))
     return float(np.sqrt(np.mean(values**2)))

@@ -26,7 +26,7 @@ from psd_deflection.studies.calibrate.dark import DarkLevel, dark_levels, values
 from psd_deflection.studies.calibrate.observation import CalibrationRun, usable_dots
 from psd_deflection.studies.calibrate.result import Calibrated
 from psd_deflection.studies.loads.acted import loads_that_acted
-from psd_deflection.studies.loads.noted_times import mend_loads
+from psd_deflection.studies.loads.noted_times import correct_loads
 from psd_deflection.studies.study import Tell, opened
 
 
@@ -39,7 +39,7 @@ def read_run(
     namespace: str | None = None,
     span: Span = WHOLE,
 ) -> CalibrationRun:
-    """One recording: the recording or its path. Raises RecordingError if it cannot be read.
+    """Return one recording: the recording or its path. Raises RecordingError if it cannot be read.
 
     ``reference``: a table of it, or another recording; None: in the recording. ``exposure``: time over which each
     reference is a mean, s. ``span``: the part of the recording that is meant.
@@ -98,7 +98,7 @@ def read_runs(
     namespace: str | None = None,
     span: Span = WHOLE,
 ) -> list[CalibrationRun]:
-    """All of ``sources``; ``references``: none, or the reference of each."""
+    """Return all of ``sources``; ``references``: none, or the reference of each."""
     tables: Sequence[str | Path | None] = references or [None] * len(sources)
     return [
         read_run(source, rig, reference=table, exposure=exposure, namespace=namespace, span=span)
@@ -112,18 +112,18 @@ def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
     """
     if run.loads is None:
         return run
-    mended = mend_loads(rig, usable_dots(run, rig), run.loads)
-    loads, late = (run.loads, ()) if mended is None else (mended.loads, mended.notes)
+    corrected = correct_loads(rig, usable_dots(run, rig), run.loads)
+    loads, notes = (run.loads, ()) if corrected is None else (corrected.loads, corrected.notes)
     acted = loads_that_acted(rig, run.volts, loads)
-    for note in (*late, *acted.notes):
+    for note in (*notes, *acted.notes):
         tell(note.words(run.name))
-    if mended is None and not acted.notes:
+    if corrected is None and not acted.notes:
         return run
     return replace(run, volts=acted.volts, loads=acted.loads)
 
 
 def today() -> str:
-    """The date of a calibration, UTC."""
+    """Return the date of a calibration, UTC."""
     return datetime.now(UTC).date().isoformat()
 
 
@@ -147,13 +147,13 @@ class CalibrationOptions:
     span: Span = WHOLE
 
     def rig(self, recordings: Sequence[Recording | str | Path], tell: Tell) -> Rig:
-        """The known rig; ``tell`` gets a warning if neither a file nor the recording names one."""
+        """Return the known rig; ``tell`` gets a warning if neither a file nor the recording names one."""
         if self.params_file is not None:
             return load_rig(self.params_file)
         return opened(recordings[0], namespace=self.namespace, span=self.span, tell=tell).rig
 
     def runs(self, recordings: Sequence[Recording | str | Path], rig: Rig) -> list[CalibrationRun]:
-        """The recordings with their references."""
+        """Return the recordings with their references."""
         return read_runs(
             recordings,
             rig,
@@ -164,7 +164,7 @@ class CalibrationOptions:
         )
 
     def levels(self, rig: Rig, runs: Sequence[CalibrationRun]) -> list[DarkLevel]:
-        """The light in the recordings of ``dark``; ``runs``: with the lasers on."""
+        """Return the light in the recordings of ``dark``; ``runs``: with the lasers on."""
         if not self.dark:
             return []
         return dark_levels([read_run(source, rig, namespace=self.namespace) for source in self.dark], rig, runs)
@@ -177,8 +177,8 @@ class CalibrationOptions:
         progress: Callable[[str], None],
         tell: Tell,
     ) -> Calibrated:
-        """The answer; ``tell`` gets a warning if a load was noted late, or if the rig file cannot be edited."""
+        """Return the answer; ``tell`` gets a warning if a load was noted late, or if the rig file cannot be edited."""
         runs = [as_acted(run, rig, tell) for run in runs]
         lit = replace_values(rig, values_of_levels(levels))
-        found = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
-        return Calibrated(found, lit, self.params_file, self.date, tell)
+        calibration = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
+        return Calibrated(calibration, lit, self.params_file, self.date, tell)

@@ -86,7 +86,7 @@ class Rows:
 
     def at(self, which: np.ndarray[tuple[int], np.dtype[np.bool_]] | IntArray) -> Rows:
         """Some of the rows."""
-        return Rows(*(getattr(self, one.name)[which] for one in fields(self)))
+        return Rows(*(getattr(self, column.name)[which] for column in fields(self)))
 
 
 @dataclass(slots=True)
@@ -114,7 +114,7 @@ def usable_dots(run: CalibrationRun, rig: Rig) -> FloatArray:
 
 
 def smoothed(dots: FloatArray, period: float, places: FloatArray, exposure: float = 0.0) -> Smoothed:
-    """The polynomial through the samples about each of ``places`` (m,), in samples from the first.
+    """Return the polynomial through the samples about each of ``places`` (m,), in samples from the first.
 
     ``exposure``, s: the dots are the mean over so long about each place.
     """
@@ -181,10 +181,10 @@ def at_rest(loads: FloatArray | None, t: FloatArray) -> np.ndarray[tuple[int], n
     return out
 
 
-def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, late: float = 0.0, blocks: bool = False) -> Rows:
-    """The rows of one recording: one for each reference, or one a block if the reference is as fast as that.
+def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, delay: float = 0.0, blocks: bool = False) -> Rows:
+    """Return the rows of one recording: one for each reference, or one a block if the reference is as fast as that.
 
-    ``noise`` (4,) V. ``late``: seconds to add to the reference's times. ``blocks``: one a block, without reference.
+    ``noise`` (4,) V. ``delay``: seconds to add to the reference's times. ``blocks``: one a block, without reference.
     Raises RecordingError if there are too few.
     """
     period = float(np.median(np.diff(run.t)))
@@ -193,7 +193,7 @@ def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, late: float = 0
     if blocks or not len(run.reference_t):
         times, poses = run.t[size // 2 :: size], None
     else:
-        times, poses = run.reference_t + late, run.reference
+        times, poses = run.reference_t + delay, run.reference
     places = np.interp(times, run.t, np.arange(len(run.t)), left=-np.inf, right=np.inf)
     inside = np.isfinite(places)
     places, times = places[inside], times[inside]
@@ -217,17 +217,17 @@ def rows_of(run: CalibrationRun, rig: Rig, noise: FloatArray, *, late: float = 0
         sd,
     ).at(s.good)
     if len(rows) > 1 and float(np.median(np.diff(rows.t))) < (size - 0.5) * period:
-        rows = _by_block(rows, rig, size * period, sample / size)
+        rows = _block_means(rows, rig, size * period, sample / size)
     if len(rows) < LEAST_ROWS:
         what = 'blocks' if blocks else 'reference measurements with good samples about them'
         raise RecordingError(f'{run.name}: {len(rows)} {what}; a calibration needs at least {LEAST_ROWS}')
     return rows
 
 
-def settled(rows: Rows, rig: Rig, noise: FloatArray) -> Rows:
+def rest_means(rows: Rows, rig: Rig, noise: FloatArray) -> Rows:
     """Means over ``CALM`` of a link at rest under a known load, in which what still rings is small."""
     sample = rig.sensitivities.ravel() ** 2 * noise**2
-    return _by_block(rows.at(rows.rest), rig, CALM, sample * CALM_LEAST)
+    return _block_means(rows.at(rows.rest), rig, CALM, sample * CALM_LEAST)
 
 
 def _pose_of_dots(rig: Rig) -> FloatArray:
@@ -239,7 +239,7 @@ def _pose_of_dots(rig: Rig) -> FloatArray:
     return np.asarray(np.linalg.pinv(design))
 
 
-def _by_block(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) -> Rows:
+def _block_means(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) -> Rows:
     """Means over blocks of ``seconds``. What the mean of a curved function differs by is taken off the dots."""
     block = np.floor((rows.t - rows.t[0]) / seconds).astype(np.int64)
     # Never over a change of the load.
@@ -270,8 +270,8 @@ def _by_block(rows: Rows, rig: Rig, seconds: float, variances: FloatArray) -> Ro
 
 
 def joined(parts: Sequence[Rows]) -> Rows:
-    """All rows, each with the number of its recording."""
-    every = {one.name: np.concatenate([getattr(p, one.name) for p in parts]) for one in fields(Rows)}
+    """Return all rows, each with the number of its recording."""
+    every = {column.name: np.concatenate([getattr(p, column.name) for p in parts]) for column in fields(Rows)}
     every['run'] = np.concatenate([np.full(len(p), i) for i, p in enumerate(parts)])
     sd = every['sd']
     # Only their proportions are believed: the fit finds their size. Recordings that do not state them have no part.

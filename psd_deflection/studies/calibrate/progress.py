@@ -22,7 +22,7 @@ _READ = {'rad': (1e3, 'mrad'), 'm': (1e3, 'mm'), 's': (1e3, 'ms'), '': (1.0, '')
 
 
 def in_words(i: int, value: float, sd: float | None = None) -> str:
-    """The value of parameter ``i`` of ``NAMES`` in the unit that people use, with its ± if ``sd`` is given."""
+    """Return the value of parameter ``i`` of ``NAMES`` in the unit that people use, with its ± if ``sd`` is given."""
     factor, unit = _READ.get(UNITS[i], (1.0, UNITS[i]))
     number = f'{factor * value:.5g}' if sd is None else f'{factor * value:.5g} ± {factor * sd:.2g}'
     return f'{number} {unit}'.strip()
@@ -79,30 +79,30 @@ class CalibrationProgress(NamedTuple):
         return {**self._asdict(), 'determined': self.determined, 'parameters': rows, 'needs': needs}
 
 
-def progress_of(found: Calibration) -> CalibrationProgress:
-    """How far ``found`` is."""
-    left = found.sd / found.prior.sd
-    known = {NAMES[i] for i in REPORTED if found.fit.free[i] and left[i] <= OPEN}
+def progress_of(calibration: Calibration) -> CalibrationProgress:
+    """How far ``calibration`` is."""
+    share_of_prior = calibration.sd / calibration.prior.sd
+    known = {NAMES[i] for i in REPORTED if calibration.fit.free[i] and share_of_prior[i] <= OPEN}
     motions: dict[str, list[str]] = {}
-    for direction in found.undetermined:
+    for direction in calibration.undetermined:
         if direction.needs != TURNED:
             # Of a combination those that are not known one by one, else the largest.
             for name in [part for part in direction.parts if part not in known] or [*direction.parts][:1]:
                 motions.setdefault(needs_of([name]), []).append(name)
     needs = [Need(motion, tuple(dict.fromkeys(names))) for motion, names in motions.items()]
     return CalibrationProgress(
-        kind=found.kind,
-        seconds=float(sum(run.t[-1] - run.t[0] for run in found.runs)),
+        kind=calibration.kind,
+        seconds=float(sum(run.t[-1] - run.t[0] for run in calibration.runs)),
         parameters=tuple(
             ParameterProgress(
                 name=NAMES[i],
                 words=WORDS[NAMES[i]],
-                value=in_words(i, float(found.values[i]), float(found.sd[i])),
-                left=float(left[i]),
+                value=in_words(i, float(calibration.values[i]), float(calibration.sd[i])),
+                left=float(share_of_prior[i]),
                 determined=NAMES[i] in known,
             )
             for i in REPORTED
         ),
         needs=tuple(sorted(needs, key=lambda need: MOTIONS.index(need.motion))),
-        refused=found.refused,
+        refused=calibration.refused,
     )

@@ -50,13 +50,15 @@ class Calibrated(StudyResult):
         return {'version': __version__, 'date': self.date, **runs}
 
     def sentences(self) -> list[str]:
-        """The answer in one sentence, the dark levels, and what is left open."""
-        found = self.found
-        said = [sentence(found), *map(words_of_level, found.dark)]
-        said += [f'undetermined: {", ".join(n.names)}; needed: {n.motion}' for n in progress_of(found).needs]
-        if any(d.needs == TURNED for d in found.undetermined):
-            said.append(TURNED.partition(': ')[2])
-        return said
+        """Return the answer in one sentence, the dark levels, and what is left open."""
+        calibration = self.found
+        statements = [sentence(calibration), *map(words_of_level, calibration.dark)]
+        statements += [
+            f'undetermined: {", ".join(n.names)}; needed: {n.motion}' for n in progress_of(calibration).needs
+        ]
+        if any(d.needs == TURNED for d in calibration.undetermined):
+            statements.append(TURNED.partition(': ')[2])
+        return statements
 
     def tree(self) -> dict[str, Any]:
         """Parameters with covariance, what is left open, noise, gap, provenance."""
@@ -64,17 +66,17 @@ class Calibrated(StudyResult):
 
     def table(self) -> Table:
         """One row a parameter: ``value``, ``sd``, what the ``file`` had, what the new one has (``used``), ``unit``."""
-        found, at = self.found, list(REPORTED)
+        calibration, at = self.found, list(REPORTED)
         return Table(
             text_column('parameter', [NAMES[i] for i in at], 'of the rig'),
             [
-                Column('value', found.values[at], '', 'calibrated, in the unit of the row'),
-                Column('sd', found.sd[at], '', 'its standard deviation'),
-                Column('file', found.prior.mean[at], '', 'of the rig file before'),
-                Column('used', found.used[at], '', 'of the rig file after'),
+                Column('value', calibration.values[at], '', 'calibrated, in the unit of the row'),
+                Column('sd', calibration.sd[at], '', 'its standard deviation'),
+                Column('file', calibration.prior.mean[at], '', 'of the rig file before'),
+                Column('used', calibration.used[at], '', 'of the rig file after'),
                 text_column('unit', [UNITS[i] for i in at], 'of the row'),
             ],
-            {'kind': found.kind, 'gap_before_m': found.gap.before, 'gap_after_m': found.gap.after},
+            {'kind': calibration.kind, 'gap_before_m': calibration.gap.before, 'gap_after_m': calibration.gap.after},
         )
 
     def sections(self) -> Iterable[PageSection]:
@@ -84,86 +86,92 @@ class Calibrated(StudyResult):
         return sections(self.found)
 
     def rig_yaml(self) -> str:
-        """The user's parameter file with the calibration, comments kept; without one what describes the rig."""
-        found = self.found
-        values, effects = values_of(found, self.date)
+        """Return the user's parameter file with the calibration, comments kept; without one what describes the rig."""
+        calibration = self.found
+        values, effects = values_of(calibration, self.date)
 
         def edit(text: str, path: Path) -> str:
             # Without a calibration the effects are those of the file.
-            plain = text if found.refused else with_effects_section(text, effects_to_values(effects), path)
-            return with_values(plain, values, f'Calibrated by {source_of(found, self.date)}', path)
+            plain = text if calibration.refused else with_effects_section(text, effects_to_values(effects), path)
+            return with_values(plain, values, f'Calibrated by {source_of(calibration, self.date)}', path)
 
-        kept = effects_of_rig(self.rig) if found.refused else effects
-        return edited_rig_file(self.params_file, 'rig.yaml', lambda: described(self.rig, kept), edit, self.tell)
+        kept_effects = effects_of_rig(self.rig) if calibration.refused else effects
+        return edited_rig_file(self.params_file, 'rig.yaml', lambda: described(self.rig, kept_effects), edit, self.tell)
 
     def files(self) -> dict[str, str]:
-        """The rig file, the page and the JSON."""
+        """Return the rig file, the page and the JSON."""
         return {'rig.yaml': self.rig_yaml(), **super().files()}
 
 
-def result(found: Calibration, date: str) -> dict[str, Any]:
-    """The tree of calibration.json. ``date``: of the calibration, for the provenance."""
-    sd = found.sd
+def result(calibration: Calibration, date: str) -> dict[str, Any]:
+    """Return the tree of calibration.json. ``date``: of the calibration, for the provenance."""
+    sd = calibration.sd
 
     def one(i: int) -> dict[str, Any]:
-        file = float(found.prior.mean[i])
-        value, used = float(found.values[i]), float(found.used[i])
+        file = float(calibration.prior.mean[i])
+        value, used = float(calibration.values[i]), float(calibration.used[i])
         return {'value': value, 'sd': float(sd[i]), 'unit': UNITS[i], 'file': file, 'used': used}
 
     at = list(REPORTED)
-    seen = found.seen
-    reference = found.fit.noise.reference
+    reference_range = calibration.reference_range
+    reference = calibration.fit.noise.reference
     return {
         'parameters': {NAMES[i]: one(i) for i in at},
-        'covariance': {'names': [NAMES[i] for i in at], 'matrix': found.covariance[np.ix_(at, at)].tolist()},
-        'undetermined': [{'direction': d.parts, 'needs': d.needs} for d in found.undetermined],
-        'noise': dict(zip(CHANNEL_NAMES, found.noise.tolist(), strict=True)),
-        'gap': {'unit': 'm', **found.gap._asdict()},
-        'kind': found.kind,
+        'covariance': {'names': [NAMES[i] for i in at], 'matrix': calibration.covariance[np.ix_(at, at)].tolist()},
+        'undetermined': [{'direction': d.parts, 'needs': d.needs} for d in calibration.undetermined],
+        'noise': dict(zip(CHANNEL_NAMES, calibration.noise.tolist(), strict=True)),
+        'gap': {'unit': 'm', **calibration.gap._asdict()},
+        'kind': calibration.kind,
         'zero': {NAMES[i]: one(i) for i in range(ZERO, COUNT)},
         'reference': {
             'noise': dict(zip(('dx', 'dy', 'theta'), reference.tolist(), strict=True)),
-            'clock_offset': {'value': found.clock + float(found.values[CLOCK]), 'sd': float(sd[CLOCK]), 'unit': 's'},
-            'rows': len(found.rows),
-            'outliers': int(np.sum(found.fit.weights == 0.0)),
+            'clock_offset': {
+                'value': calibration.clock + float(calibration.values[CLOCK]),
+                'sd': float(sd[CLOCK]),
+                'unit': 's',
+            },
+            'rows': len(calibration.rows),
+            'outliers': int(np.sum(calibration.fit.weights == 0.0)),
         }
-        if found.kind == 'reference'
+        if calibration.kind == 'reference'
         else None,
-        'range': None if seen is None else {'low': seen[0].tolist(), 'high': seen[1].tolist()},
-        'dark': result_of_levels(found.dark) or None,
-        'refused': found.refused or None,
-        'widened': found.widened,
-        'dropped': found.dropped,
+        'range': None
+        if reference_range is None
+        else {'low': reference_range[0].tolist(), 'high': reference_range[1].tolist()},
+        'dark': result_of_levels(calibration.dark) or None,
+        'refused': calibration.refused or None,
+        'widened': calibration.widened,
+        'dropped': calibration.dropped,
         'provenance': {
             'version': __version__,
             'date': date,
             'recordings': [
                 {'name': run.name, 'sha256': run.digest, 'device': run.device, 'temperature': run.temperature}
-                for run in found.runs
+                for run in calibration.runs
             ],
         },
     }
 
 
-def source_of(found: Calibration, date: str) -> str:
+def source_of(calibration: Calibration, date: str) -> str:
     """Where a calibrated rig file comes from, in one line."""
-    recordings = ', '.join(named(run.name, run.digest) for run in found.runs)
-    dark = f'; dark levels from {source_of_levels(found.dark)}' if found.dark else ''
+    recordings = ', '.join(named(run.name, run.digest) for run in calibration.runs)
+    dark = f'; dark levels from {source_of_levels(calibration.dark)}' if calibration.dark else ''
     return f'psd-deflection {__version__}, {date}, from {recordings}{dark}'
 
 
-def values_of(found: Calibration, date: str) -> tuple[dict[str, object], list[ActiveEffect]]:
+def values_of(calibration: Calibration, date: str) -> tuple[dict[str, object], list[ActiveEffect]]:
     """Flat values that a rig file gets, and its effects; noise and dark levels alone if the calibration was refused."""
-    noise = {f'psd_{n}.noise': [float(f'{v:.4g}') for v in found.noise[2 * n - 2 : 2 * n]] for n in (1, 2)}
-    measured = {**noise, **values_of_levels(found.dark)}
-    if found.refused:
+    noise = {f'psd_{n}.noise': [float(f'{v:.4g}') for v in calibration.noise[2 * n - 2 : 2 * n]] for n in (1, 2)}
+    measured = {**noise, **values_of_levels(calibration.dark)}
+    if calibration.refused:
         return measured, []
-    clamp = {name: float(found.values[CLAMP_AT + i]) for i, name in enumerate(CLAMP)}
-    values, effects = rig_values(found.vector, found.values[:COUNT], clamp)
-    at = np.array([*range(COUNT), *(CLAMP_AT + i for i in range(2) if found.fit.free[CLAMP_AT + i])])
-    sd = found.sd[at]
+    clamp = {name: float(calibration.values[CLAMP_AT + i]) for i, name in enumerate(CLAMP)}
+    values, effects = rig_values(calibration.vector, calibration.values[:COUNT], clamp)
+    at = np.array([*range(COUNT), *(CLAMP_AT + i for i in range(2) if calibration.fit.free[CLAMP_AT + i])])
+    sd = calibration.sd[at]
     scale = np.where(sd > 0.0, sd, 1.0)
-    correlation = found.covariance[np.ix_(at, at)] / np.outer(scale, scale)
+    correlation = calibration.covariance[np.ix_(at, at)] / np.outer(scale, scale)
     return {
         **values,
         **measured,
@@ -172,18 +180,22 @@ def values_of(found: Calibration, date: str) -> tuple[dict[str, object], list[Ac
         'calibration.correlations': [
             float(f'{np.clip(correlation[i, j], -1.0, 1.0):.12f}') for i in range(1, len(at)) for j in range(i)
         ],
-        'calibration.source': source_of(found, date),
-        **({} if found.seen is None else {'calibration.range': [float(f'{v:.6g}') for v in found.seen.ravel()]}),
+        'calibration.source': source_of(calibration, date),
+        **(
+            {}
+            if calibration.reference_range is None
+            else {'calibration.range': [float(f'{v:.6g}') for v in calibration.reference_range.ravel()]}
+        ),
     }, effects
 
 
-def sentence(found: Calibration) -> str:
-    """The answer in one sentence."""
-    if found.refused:
-        return f'Refused: {found.refused}.'
-    g = found.gap
-    known = int(sum(found.fit.free[i] for i in REPORTED))
-    what = {'reference': 'the reference', 'loads': 'the known loads', 'self': 'the redundant reading'}[found.kind]
+def sentence(calibration: Calibration) -> str:
+    """Return the answer in one sentence."""
+    if calibration.refused:
+        return f'Refused: {calibration.refused}.'
+    g = calibration.gap
+    known = int(sum(calibration.fit.free[i] for i in REPORTED))
+    what = {'reference': 'the reference', 'loads': 'the known loads', 'self': 'the redundant reading'}[calibration.kind]
     return (
         f'{known} of {len(REPORTED)} parameters are determined by {what}; on motion that was not fitted the readings '
         f'are predicted to {g.heldout_after * 1e6:.2f} µm rms, before {g.heldout_before * 1e6:.2f} µm.'

@@ -34,7 +34,7 @@ from psd_deflection.studies.check.wirings import (
     misfit,
 )
 from psd_deflection.studies.loads.acted import LoadNote, loads_that_acted
-from psd_deflection.studies.loads.noted_times import MendedNote, mend_loads
+from psd_deflection.studies.loads.noted_times import CorrectedNote, correct_loads
 
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
@@ -64,49 +64,49 @@ class CheckProblem:
 
 
 def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '') -> CheckProblem:
-    """The problem of a recording: ``volts`` (n, 6) of the device's channels, ``loads`` (n, 3), N, N, N m, held.
+    """Return the problem of a recording: ``volts`` (n, 6) of the device's channels, ``loads`` (n, 3), N, N, N m, held.
 
     Raises ConfigError for a rig of more than two PSDs.
     """
     check_two_psds(rig, 'check')
-    mended = mend_loads(rig, volts[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
-    late: Sequence[MendedNote] = ()
+    corrected = correct_loads(rig, volts[:, list(DOT_CHANNELS)] * rig.amplifier.sensitivity, loads)
+    late: Sequence[CorrectedNote] = ()
     moved = volts
-    if mended is not None:
-        loads, late = mended.loads, mended.notes
-        moved = np.where(mended.unused[:, None], np.nan, volts)
+    if corrected is not None:
+        loads, late = corrected.loads, corrected.notes
+        moved = np.where(corrected.unused[:, None], np.nan, volts)
     wiring = Wiring.from_rig(rig)
     acted = loads_that_acted(rig, wiring.to_psds(moved), loads)
     moved = np.where(np.isfinite(acted.volts).any(axis=1, keepdims=True), moved, np.nan)
     answered = responses(rig, moved, acted.loads)
-    told = (*late, *acted.notes)
-    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, told)
+    notes = (*late, *acted.notes)
+    return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, notes)
 
 
 def check(problem: CheckProblem) -> Checkup:
     """Hold the pushes, the noise and the light against the rig file."""
     rig, pushes, measured = problem.rig, problem.pushes, problem.levels
     file = Wiring.from_rig(rig)
-    seen = tuple(p for p in pushes if p.seen)
-    dead = [*measured.stuck, *(c for c in _dead(seen) if c not in measured.stuck)]
-    found = fitting_wirings(seen) if seen else []
+    observed = tuple(p for p in pushes if p.observed)
+    dead = [*measured.stuck, *(c for c in _dead(observed) if c not in measured.stuck)]
+    wirings = fitting_wirings(observed) if observed else []
     findings = [note_finding(n, problem.source) for n in problem.notes]
     lines: dict[str, object] = {}
     for channel in dead:
         findings.append(Finding('stuck_channel', channel, None, f'{channel} does not answer: look at its cable'))
-    best = min(found, key=lambda c: len(differences(c.wiring, file)), default=WiringFit(file, 0.0))
-    if not dead and found:
-        findings += _wiring_findings(file, seen, found, best, lines)
-        findings += _load_findings(seen, best)
+    best = min(wirings, key=lambda c: len(differences(c.wiring, file)), default=WiringFit(file, 0.0))
+    if not dead and wirings:
+        findings += _wiring_findings(file, observed, wirings, best, lines)
+        findings += _load_findings(observed, best)
     findings += _level_findings(rig, measured, best.wiring, lines)
     light = _light(rig, measured, best.wiring)
-    told = not dead and len(found) == 1
-    if not told and not dead:
-        findings += _coverage(pushes, seen, found)
+    determined = not dead and len(wirings) == 1
+    if not determined and not dead:
+        findings += _coverage(pushes, observed, wirings)
     # Pushes that are not there yet are no mistake.
     wrong = light or problem.notes or any(f.name != 'load_coverage' for f in findings)
-    verdict = WRONG if wrong else RIGHT if told else CANNOT_TELL
-    sizes = tuple(p.misfit(best.wiring)[1] if p.seen else math.nan for p in pushes)
+    verdict = WRONG if wrong else RIGHT if determined else CANNOT_TELL
+    sizes = tuple(p.misfit(best.wiring)[1] if p.observed else math.nan for p in pushes)
     return Checkup(
         rig=rig,
         verdict=verdict,
@@ -114,7 +114,7 @@ def check(problem: CheckProblem) -> Checkup:
         values=lines,
         pushes=tuple(pushes),
         sizes=sizes,
-        found=tuple(found),
+        wirings=tuple(wirings),
         levels=measured,
         drift=problem.drift,
         drift_sd=problem.drift_sd,
@@ -124,52 +124,56 @@ def check(problem: CheckProblem) -> Checkup:
     )
 
 
-def _dead(seen: Sequence[PushResponse]) -> list[str]:
+def _dead(observed: Sequence[PushResponse]) -> list[str]:
     """Channels that answer to no push although pushes along X and along Y moved others."""
-    if not {('fx',), ('fy',)} <= {p.loads for p in seen}:
+    if not {('fx',), ('fy',)} <= {p.loads for p in observed}:
         return []
-    share = np.max([np.abs(p.channels) / np.linalg.norm(p.channels) for p in seen if not p.only_twist], axis=0)
+    share = np.max([np.abs(p.channels) / np.linalg.norm(p.channels) for p in observed if not p.only_twist], axis=0)
     return [name for name, most in zip(DOTS, share.tolist(), strict=True) if most < DEAD]
 
 
 def _wiring_findings(
-    file: Wiring, seen: Sequence[PushResponse], found: Sequence[WiringFit], best: WiringFit, lines: dict[str, object]
+    file: Wiring,
+    observed: Sequence[PushResponse],
+    wirings: Sequence[WiringFit],
+    best: WiringFit,
+    lines: dict[str, object],
 ) -> list[Finding]:
     """How ``best`` differs from the rig file's wiring; nothing if that explains the pushes too."""
-    if any(c.wiring == file for c in found):
+    if any(c.wiring == file for c in wirings):
         return []
-    gained = misfit(file, seen, best.reversed_loads)[0] - best.misfit
-    also = _same_to_first_order(file, seen, best)
-    if (others := len(found) - 1) > 0:
-        also += (f'{others} other wiring{"s" if others > 1 else ""}, which these pushes cannot tell apart',)
+    gained = misfit(file, observed, best.reversed_loads)[0] - best.misfit
+    also = _same_to_first_order(file, observed, best)
+    if (alternatives := len(wirings) - 1) > 0:
+        also += (f'{alternatives} other wiring{"s" if alternatives > 1 else ""}, which these pushes cannot tell apart',)
     findings, right = wiring_findings(best.wiring, file, gained, also)
-    if len(found) == 1:
+    if len(wirings) == 1:
         lines.update(right)
     return findings
 
 
-def _same_to_first_order(file: Wiring, seen: Sequence[PushResponse], best: WiringFit) -> tuple[str, ...]:
-    """Whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
-    turned = tuple(load for p in seen if p.misfit(file)[1] < 0.0 for load in p.loads)
-    total, worst = misfit(file, seen, turned)
+def _same_to_first_order(file: Wiring, observed: Sequence[PushResponse], best: WiringFit) -> tuple[str, ...]:
+    """Return whether the rig file's wiring explains the pushes as well if some went the other way than was said."""
+    turned = tuple(load for p in observed if p.misfit(file)[1] < 0.0 for load in p.loads)
+    total, worst = misfit(file, observed, turned)
     same = worst <= LIMIT and total <= best.misfit + MARGIN
     return (f'load_sign of {" ".join(turned)}',) if same else ()
 
 
-def _load_findings(seen: Sequence[PushResponse], found: WiringFit) -> list[Finding]:
+def _load_findings(observed: Sequence[PushResponse], wiring: WiringFit) -> list[Finding]:
     out = [
         Finding('load_sign', load, -1.0, f'load_{load} in the recording has the wrong sign')
-        for load in found.reversed_loads
+        for load in wiring.reversed_loads
     ]
     sizes = np.full(3, math.nan)
-    for p in seen:
+    for p in observed:
         if p.sized:
-            sizes[[_LOADS.index(load) for load in p.loads]] = p.misfit(found.wiring)[1]
+            sizes[[_LOADS.index(load) for load in p.loads]] = p.misfit(wiring.wiring)[1]
     return out + unit_findings(sizes)[0]
 
 
 def _level_findings(rig: Rig, measured: Levels, wiring: Wiring, lines: dict[str, object]) -> list[Finding]:
-    """The noise of each PSD's x and y, and the converter's steps, against the rig file."""
+    """Return the noise of each PSD's x and y, and the converter's steps, against the rig file."""
     columns = [wiring.columns[c] for c in DOT_CHANNELS]
     # Steps hide a noise that is smaller than they are.
     hidden = [CHANNELS[c] in measured.stuck or measured.noise[c] < measured.steps[c] for c in columns]
@@ -203,11 +207,11 @@ def _light(rig: Rig, measured: Levels, wiring: Wiring) -> dict[str, str]:
 
 
 def _coverage(
-    pushes: Sequence[PushResponse], seen: Sequence[PushResponse], found: Sequence[WiringFit]
+    pushes: Sequence[PushResponse], observed: Sequence[PushResponse], wirings: Sequence[WiringFit]
 ) -> list[Finding]:
-    missing = [load for load in ALONE if (load,) not in {p.loads for p in seen}]
-    weak = [p.name for p in pushes if not p.seen]
-    if seen and not found:
+    missing = [load for load in ALONE if (load,) not in {p.loads for p in observed}]
+    weak = [p.name for p in pushes if not p.observed]
+    if observed and not wirings:
         text = 'no wiring explains these pushes: push one way at a time, along +X, along +Y, then turn about +θ'
     elif weak:
         verb = 'does' if len(weak) == 1 else 'do'

@@ -121,14 +121,14 @@ class Guide:
         quiet = STILL * self._noise * np.sqrt(len(here) / max(sum(count for _, count in self._means), 1))
         match self.phase:
             case Phase.REST:
-                said = self._resting(here, filled, max(quiet, LEAST_PUSH / STAND_OUT))
+                answer = self._resting(here, filled, max(quiet, LEAST_PUSH / STAND_OUT))
             case Phase.PUSH:
-                said = self._pushed(here, filled)
+                answer = self._pushed(here, filled)
             case Phase.RELEASE:
-                said = self._released(here, filled)
+                answer = self._released(here, filled)
             case _:
-                said = ''
-        return said
+                answer = ''
+        return answer
 
     def _next(self, phase: Phase) -> None:
         self.phase, self.progress, self._since = phase, 0.0, self._t
@@ -199,7 +199,7 @@ class Guide:
         return ''
 
     def rest(self) -> FloatArray:
-        """The samples (n, 6) of the first rest, V, of the device's channels."""
+        """Return the samples (n, 6) of the first rest, V, of the device's channels."""
         return np.concatenate(self._rest_volts)
 
     def drift(self) -> tuple[FloatArray, FloatArray]:

@@ -56,8 +56,8 @@ def noise_findings(
         return [], {}
     level = float(f'{factor * rig.amplifier.noise:.2g}')
     fix = line('amplifier.noise', level)
-    found = Finding('noise_level', ' '.join(dot_names(len(rig.psds))), round(factor, 3), fix, abs(math.log(factor)))
-    return [found], {'amplifier.noise': level}
+    finding = Finding('noise_level', ' '.join(dot_names(len(rig.psds))), round(factor, 3), fix, abs(math.log(factor)))
+    return [finding], {'amplifier.noise': level}
 
 
 def step_findings(rig: Rig, steps: FloatArray, *, finer: bool = False) -> tuple[list[Finding], dict[str, object]]:
@@ -68,35 +68,35 @@ def step_findings(rig: Rig, steps: FloatArray, *, finer: bool = False) -> tuple[
     """
     if not steps.any():
         return [], {}
-    own = rig.converter.volts_per_count
-    bits = rig.converter.bits - round(math.log2(float(steps.max()) / own))
+    step_of_file = rig.converter.volts_per_count
+    bits = rig.converter.bits - round(math.log2(float(steps.max()) / step_of_file))
     # There is one number of bits for all channels.
-    told = not finer and LEAST_BITS <= bits < rig.converter.bits
-    right: dict[str, object] = {'converter.bits': bits} if told else {}
+    coarse_enough = not finer and LEAST_BITS <= bits < rig.converter.bits
+    right: dict[str, object] = {'converter.bits': bits} if coarse_enough else {}
     findings = []
     for name, step in zip(channel_names(len(steps) // 3), steps.tolist(), strict=True):
         if step:
-            words = f'{name} steps by {step * 1e3:.3g} mV, the rig file says {own * 1e3:.3g} mV'
+            words = f'{name} steps by {step * 1e3:.3g} mV, the rig file says {step_of_file * 1e3:.3g} mV'
             fix = f'{line("converter.bits", bits)} ({words})' if right else words
-            findings.append(Finding('converter_step', name, step, fix, math.log(step / own)))
+            findings.append(Finding('converter_step', name, step, fix, math.log(step / step_of_file)))
     return findings, right
 
 
 def _of_each_channel(noise: FloatArray, stated: FloatArray) -> tuple[list[Finding], dict[str, object]]:
     findings, lines = [], dict[str, object]()
     for psd in range(1, len(noise) + 1):
-        own = noise[psd - 1]
-        factors = own / stated[psd - 1]
-        if not np.isfinite(own).all() or not any(map(_far, factors.tolist())):
+        noise_of_psd = noise[psd - 1]
+        factors = noise_of_psd / stated[psd - 1]
+        if not np.isfinite(noise_of_psd).all() or not any(map(_far, factors.tolist())):
             continue
         worst = int(np.argmax(np.abs(np.log(factors))))
-        name, level = f'psd_{psd}.noise', [float(f'{v:.2g}') for v in own.tolist()]
+        name, level = f'psd_{psd}.noise', [float(f'{v:.2g}') for v in noise_of_psd.tolist()]
         lines[name] = level
         factor = float(factors[worst])
-        found = Finding(
+        finding = Finding(
             'noise_level', f'{"xy"[worst]}{psd}', round(factor, 3), line(name, level), abs(math.log(factor))
         )
-        findings.append(found)
+        findings.append(finding)
     return findings, lines
 
 
@@ -133,11 +133,11 @@ def _units(sizes: FloatArray) -> dict[int, tuple[float, str]]:
     out: dict[int, tuple[float, str]] = {}
     force = [float(s) for s in sizes[:2] if math.isfinite(s)]
     torque = float(sizes[2])
-    if force and not _power_of_ten(force, torque) and (found := _nearest(force, FORCE_UNITS, 'N')):
-        out.update({k: found for k in range(2) if math.isfinite(sizes[k])})
+    if force and not _power_of_ten(force, torque) and (unit := _nearest(force, FORCE_UNITS, 'N')):
+        out.update({k: unit for k in range(2) if math.isfinite(sizes[k])})
     beside = next((factor for factor, _ in out.values()), 0.0)
-    if math.isfinite(torque) and (found := _of_torque(torque, beside)):
-        out[2] = found
+    if math.isfinite(torque) and (unit := _of_torque(torque, beside)):
+        out[2] = unit
     return out
 
 
@@ -146,7 +146,7 @@ def _of_torque(size: float, force: float) -> tuple[float, str] | None:
     if not force:
         return _nearest([size], TORQUE_UNITS, 'N m')
     pounds = OF_POUNDS if _is('lbf', force) else {}
-    alike = {f: unit for f, unit in TORQUE_UNITS.items() if _whole_decades(f / force) or _whole_decades(f * force)}
+    alike = {f: unit for f, unit in TORQUE_UNITS.items() if _full_decades(f / force) or _full_decades(f * force)}
     return _nearest([size], {**alike, **pounds}, 'N m') or _nearest([size], TORQUE_UNITS, 'N m')
 
 
@@ -154,27 +154,27 @@ def _is(unit: str, factor: float) -> bool:
     return any(name == unit and factor in (f, 1.0 / f) for f, name in FORCE_UNITS.items())
 
 
-def _whole_decades(ratio: float) -> bool:
+def _full_decades(ratio: float) -> bool:
     return abs(math.log10(ratio) - round(math.log10(ratio))) < 1e-3
 
 
-def _nearest(sizes: Sequence[float], units: Mapping[float, str], own: str) -> tuple[float, str] | None:
+def _nearest(sizes: Sequence[float], units: Mapping[float, str], stated_unit: str) -> tuple[float, str] | None:
     """The factor and unit within ``UNIT_TOLERANCE`` of all ``sizes`` that is nearest: kg mm and N cm are 2 % apart."""
-    fitting = [u for u in both_ways(units, own) if all(abs(s / u[0] - 1.0) < UNIT_TOLERANCE for s in sizes)]
+    fitting = [u for u in both_ways(units, stated_unit) if all(abs(s / u[0] - 1.0) < UNIT_TOLERANCE for s in sizes)]
     return min(fitting, key=lambda u: sum(abs(math.log(s / u[0])) for s in sizes), default=None)
 
 
-def both_ways(units: Mapping[float, str], own: str) -> list[tuple[float, str]]:
-    """Each unit instead of ``own``, and ``own`` converted once more; with the factor that puts it right."""
-    return [(f, f'{unit} instead of {own}') for f, unit in units.items()] + [
-        (1.0 / f, f'{own}, and then converted from {unit} once more')
+def both_ways(units: Mapping[float, str], stated_unit: str) -> list[tuple[float, str]]:
+    """Return each unit in place of ``stated_unit``, and this converted once more, with the factor that corrects it."""
+    return [(f, f'{unit} instead of {stated_unit}') for f, unit in units.items()] + [
+        (1.0 / f, f'{stated_unit}, and then converted from {unit} once more')
         for f, unit in units.items()
         if f not in (1e3, 1e-3)
     ]
 
 
 def _power_of_ten(force: Sequence[float], torque: float) -> bool:
-    """Whether only the forces are off, and by ten: a digit of Young's modulus, not a unit."""
+    """Return whether only the forces are off, and by ten: a digit of Young's modulus, not a unit."""
     return abs(torque - 1.0) < 0.1 and all(min(abs(10.0 * s - 1.0), abs(0.1 * s - 1.0)) < 0.01 for s in force)
 
 

@@ -69,18 +69,18 @@ def levels(rig: Rig, volts: FloatArray) -> Levels:
     rough = rough[np.isfinite(rough).all(axis=1)]
     if not len(rough):
         rough = np.zeros((1, volts.shape[1]))
-    whole = volts[np.isfinite(volts).all(axis=1)]
-    steps = _steps(rig, whole)
+    complete = volts[np.isfinite(volts).all(axis=1)]
+    steps = _steps(rig, complete)
     # Steps of a load and glitches are cut off. The median alone would be as coarse as the converter.
     cut = _FAR * np.maximum(_TO_SD * np.median(np.abs(rough), axis=0), np.maximum(steps, step))
     noise = np.sqrt((np.clip(rough, -cut, cut) ** 2).mean(axis=0)) / _THIRD
     # Steps that are coarser than the noise can hide it: no channel that stands still is dead then.
     moves = rig.amplifier.noise > max(step, float(steps.max()))
-    still = (whole == whole[0]).all(axis=0)
+    still = (complete == complete[0]).all(axis=0)
     stuck = tuple(name for name, same in zip(CHANNELS, still.tolist(), strict=True) if same and moves)
     rate = rig.converter.sample_rate_hz
-    hum_hz, hum = _hum(_longest_run(volts)[: round(HUM_S * rate)], rate, noise)
-    return Levels(noise, stated, hum, hum_hz, whole[:, 2::3].mean(axis=0), stuck, steps)
+    hum_hz, hum = mains_hum(longest_run(volts)[: round(HUM_S * rate)], rate, noise)
+    return Levels(noise, stated, hum, hum_hz, complete[:, 2::3].mean(axis=0), stuck, steps)
 
 
 def _steps(rig: Rig, volts: FloatArray) -> FloatArray:
@@ -90,8 +90,8 @@ def _steps(rig: Rig, volts: FloatArray) -> FloatArray:
     return converter.steps
 
 
-def _longest_run(volts: FloatArray) -> FloatArray:
-    """The longest stretch without a lost sample."""
+def longest_run(volts: FloatArray) -> FloatArray:
+    """Return the longest stretch without a lost sample."""
     there = np.concatenate(([False], np.isfinite(volts).all(axis=1), [False]))
     edges: npt.NDArray[np.int64] = np.flatnonzero(np.diff(there.astype(np.int8)))
     starts, ends = edges[0::2], edges[1::2]
@@ -99,7 +99,7 @@ def _longest_run(volts: FloatArray) -> FloatArray:
     return volts[starts[best] : ends[best]]
 
 
-def _hum(volts: FloatArray, rate: float, noise: FloatArray) -> tuple[float, FloatArray]:
+def mains_hum(volts: FloatArray, rate: float, noise: FloatArray) -> tuple[float, FloatArray]:
     """(Hz, amplitude (6,) V) of the mains frequency that stands out more; its neighbours say what does not.
 
     A Hann window keeps the link's ringing, tens of hertz away, out of it.

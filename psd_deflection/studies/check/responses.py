@@ -48,7 +48,7 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
     """
     size, period = rig.estimator.block_size, 1.0 / rig.converter.sample_rate_hz
     n = len(volts) // size
-    dots = _block_means(volts[: n * size, DOT_CHANNELS], n) * rig.amplifier.sensitivity
+    dots = block_means(volts[: n * size, DOT_CHANNELS], n) * rig.amplifier.sensitivity
     present = np.isfinite(dots).all(axis=1)
     if int(present.sum()) < FEWEST_BLOCKS:
         raise RecordingError(f'{int(present.sum())} blocks of samples: at least {FEWEST_BLOCKS} are needed')
@@ -58,9 +58,9 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
     shown = _simulated(rig, loads)[: n * size].reshape(n, size, 4).mean(axis=1)
     t = np.arange(n) * size * period
     design = np.column_stack((shown - shown[present].mean(axis=0), np.ones(n), t - t.mean()))[present]
-    slopes, spread, variance = _regression(design, dots[present])
+    slopes, covariance, variance = least_squares_fit(design, dots[present])
     pushes = []
-    for group in _groups(held[present], means[present], pattern(rig)):
+    for group in load_groups(held[present], means[present], pattern(rig)):
         most = int(np.argmax(np.abs(held[present][:, group[0]])))
         alone = np.zeros((2, 3))
         alone[1, group] = loads[: n * size].reshape(n, size, 3).mean(axis=1)[present][most, group]
@@ -69,9 +69,9 @@ def responses(rig: Rig, volts: FloatArray, loads: FloatArray) -> Responses:
         expected = np.sign(alone[1, group[0]]) * (after - before)
         moved = np.append(expected, (0.0, 0.0))
         names = tuple(LOADS[k] for k in group)
-        sd = np.sqrt(moved @ spread @ moved * variance)
+        sd = np.sqrt(moved @ covariance @ moved * variance)
         pushes.append(PushResponse(names, moved @ slopes, sd, expected, scales=scales_of(rig)))
-    return Responses(tuple(pushes), slopes[-1], np.sqrt(spread[-1, -1] * variance))
+    return Responses(tuple(pushes), slopes[-1], np.sqrt(covariance[-1, -1] * variance))
 
 
 def _simulated(rig: Rig, loads: FloatArray, *, settled: bool = False) -> FloatArray:
@@ -87,7 +87,7 @@ def _moved(rig: Rig, static: FloatArray, period: float) -> FloatArray:
     return np.column_stack([Filter(c)(static[:, i]) for i, c in enumerate((bending, bending, torsion))])
 
 
-def _block_means(samples: FloatArray, n: int) -> FloatArray:
+def block_means(samples: FloatArray, n: int) -> FloatArray:
     """Means (n, c) over the samples that are there; NaN for a block without any."""
     parts = samples.reshape(n, -1, samples.shape[1])
     there = np.isfinite(parts)
@@ -96,7 +96,7 @@ def _block_means(samples: FloatArray, n: int) -> FloatArray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
-def _groups(poses: FloatArray, moved: FloatArray, per_pose: FloatArray) -> list[list[int]]:
+def load_groups(poses: FloatArray, moved: FloatArray, per_pose: FloatArray) -> list[list[int]]:
     """The applied loads, those together that always came together. ``poses`` (n, 3): held; ``moved`` (n, 3): rung."""
     size = np.minimum(np.ptp(poses, axis=0), np.ptp(moved, axis=0)) * np.linalg.norm(per_pose, axis=0)
     applied = [int(i) for i in np.argsort(-size) if size[i] > 0.0]
@@ -111,7 +111,7 @@ def _groups(poses: FloatArray, moved: FloatArray, per_pose: FloatArray) -> list[
     return sorted((sorted(group) for group in out), key=lambda group: group[0])
 
 
-def _regression(design: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def least_squares_fit(design: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Slopes (k, c) of ``values`` (n, c) on ``design`` (n, k), their spread (k, k) per variance, the variances (c,).
 
     The variances count the correlation of one block's rest with the next one's, so that hum, ringing and drift widen

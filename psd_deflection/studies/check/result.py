@@ -76,7 +76,7 @@ class Finding:
 
 
 def finding_tree(finding: Finding) -> dict[str, Any]:
-    """A finding as JSON has it."""
+    """Return a finding as JSON has it."""
     return {
         'name': finding.name,
         'where': finding.where,
@@ -90,7 +90,7 @@ def finding_tree(finding: Finding) -> dict[str, Any]:
 @dataclass(frozen=True, eq=False, repr=False)
 class Checkup(StudyResult):
     """``findings``: what is wrong. ``values``: parameters for the rig file. ``sizes``: movement of
-    each push over the expected one, NaN if it was not seen. ``found``: the wirings that explain the
+    each push over the expected one, NaN if it was not seen. ``wirings``: the wirings that explain the
     pushes. ``drift``, ``drift_sd`` (4,): m/s, of the device's channels x1 y1 x2 y2. ``light``: of a PSD,
     in words, that it has too little or too much of it. ``notes``: what else is worth a look. ``source``: the recording.
     """
@@ -104,7 +104,7 @@ class Checkup(StudyResult):
     values: Mapping[str, object]
     pushes: tuple[PushResponse, ...]
     sizes: tuple[float, ...]
-    found: tuple[WiringFit, ...]
+    wirings: tuple[WiringFit, ...]
     levels: Levels
     drift: FloatArray
     drift_sd: FloatArray
@@ -118,43 +118,43 @@ class Checkup(StudyResult):
         return {'recording': self.source} if self.source else {}
 
     def sentences(self) -> list[str]:
-        """The verdict, then what is wrong, one line each, then what to look at."""
+        """Return the verdict, then what is wrong, one line each, then what to look at."""
         wrong = [f'{what}: {fix}' for what, fix in _findings(self)]
-        return [_verdict(self), *wrong, *_other_causes(self), *(f'note: {note}' for note in self.notes)]
+        return [_verdict(self), *wrong, *other_causes(self), *(f'note: {note}' for note in self.notes)]
 
     def lines(self) -> list[str]:
         """Pushes, verdict, lines for the rig file, levels."""
-        out = ['', *columns(_pushes(self)).splitlines(), '', _verdict(self)]
+        out = ['', *columns(push_rows(self)).splitlines(), '', _verdict(self)]
         findings = _findings(self)
         width = max((len(what) for what, _ in findings), default=0)
         out += [f'  {what:<{width}}   {fix}' for what, fix in findings]
-        out += [f'  {text}' for text in _other_causes(self)]
+        out += [f'  {text}' for text in other_causes(self)]
         if self.values:
             out += ['', 'Lines for the rig file, below ros__parameters:', '']
             out += [f'    {line(name, value)}' for name, value in self.values.items()]
         notes = [('note', note) for note in self.notes]
-        return [*out, '', *(f'{name:<9}{text}' for name, text in (*_levels(self), *notes))]
+        return [*out, '', *(f'{name:<9}{text}' for name, text in (*level_rows(self), *notes))]
 
     def sections(self) -> Iterable[PageSection]:
         """Pushes, lines for the rig file, levels."""
-        head, *rows = _pushes(self)
-        answers = (table(head, rows), _answers(self)) if self.pushes else (table(head, rows),)
+        head, *rows = push_rows(self)
+        answers = (table(head, rows), answers_chart(self)) if self.pushes else (table(head, rows),)
         out = [PageSection('How each channel answered', answers)]
         if self.values:
             lines = [(line(name, value),) for name, value in self.values.items()]
             out.append(PageSection('Lines for the rig file', (table(('below ros__parameters',), lines),)))
-        return [*out, PageSection('Noise, light and drift', (table(('', ''), _levels(self)),))]
+        return [*out, PageSection('Noise, light and drift', (table(('', ''), level_rows(self)),))]
 
     def table(self) -> Table:
-        """One row a finding: ``where``, ``value`` (a number, numbers, or None), ``fix``, ``evidence``."""
-        found = self.findings
+        """Return one row a finding: ``where``, ``value`` (a number, numbers, or None), ``fix``, ``evidence``."""
+        findings = self.findings
         return Table(
-            text_column('finding', [f.name for f in found], 'what is wrong'),
+            text_column('finding', [f.name for f in findings], 'what is wrong'),
             [
-                text_column('where', [f.where for f in found], 'channel, PSD, load, or when'),
-                text_column('value', [f.value for f in found], 'as it is'),
-                text_column('fix', [f.fix for f in found], 'what puts it right'),
-                Column('evidence', np.array([f.evidence for f in found], dtype=np.float64), '', 'for it'),
+                text_column('where', [f.where for f in findings], 'channel, PSD, load, or when'),
+                text_column('value', [f.value for f in findings], 'as it is'),
+                text_column('fix', [f.fix for f in findings], 'what puts it right'),
+                Column('evidence', np.array([f.evidence for f in findings], dtype=np.float64), '', 'for it'),
             ],
             {'verdict': self.verdict},
         )
@@ -166,11 +166,11 @@ class Checkup(StudyResult):
             'verdict': self.verdict,
             'setup': [finding_tree(f) for f in self.findings],
             'lines': dict(self.values),
-            'wirings_that_fit': [_wiring_json(c.wiring) for c in self.found],
+            'wirings_that_fit': [_wiring_json(c.wiring) for c in self.wirings],
             'pushes': [
                 {
                     'loads': list(p.loads),
-                    'seen': p.seen,
+                    'seen': p.observed,
                     'channels': _by(DOTS, p.channels.tolist()),
                     'sd': _by(DOTS, p.sd.tolist()),
                     'size': size if p.sized else None,
@@ -187,13 +187,13 @@ class Checkup(StudyResult):
         }
 
 
-def _pushes(found: Checkup) -> list[list[str]]:
+def push_rows(checkup: Checkup) -> list[list[str]]:
     """How each channel answered, beside what the rig file expects of it."""
     rows = [['push', *(f'{c} µm' for c in DOTS), '', *DOTS, 'size']]
-    for push, size in zip(found.pushes, found.sizes, strict=True):
-        expected = on_channels(Wiring.from_rig(found.rig), push.expected)
+    for push, size in zip(checkup.pushes, checkup.sizes, strict=True):
+        expected = on_channels(Wiring.from_rig(checkup.rig), push.expected)
         told_size = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
-        words = [_arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
+        words = [arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
         rows.append(
             [push.name, *(f'{v * 1e6:+z.1f}' for v in push.channels.tolist()), '  rig file:', *words, told_size]
         )
@@ -202,59 +202,59 @@ def _pushes(found: Checkup) -> list[list[str]]:
     return rows
 
 
-def _answers(found: Checkup) -> Chart:
+def answers_chart(checkup: Checkup) -> Chart:
     """How each channel moved at each push, and how it would by the rig file."""
-    wiring = Wiring.from_rig(found.rig)
-    at = np.arange(1.0, len(found.pushes) + 1.0)
-    expected = np.array([on_channels(wiring, push.expected) for push in found.pushes]) * 1e6
-    moved = np.array([push.channels for push in found.pushes]) * 1e6
-    spread = np.array([push.sd for push in found.pushes]) * 1e6
+    wiring = Wiring.from_rig(checkup.rig)
+    at = np.arange(1.0, len(checkup.pushes) + 1.0)
+    expected = np.array([on_channels(wiring, push.expected) for push in checkup.pushes]) * 1e6
+    moved = np.array([push.channels for push in checkup.pushes]) * 1e6
+    deviations = np.array([push.sd for push in checkup.pushes]) * 1e6
     panels = []
     for i, name in enumerate(DOTS):
         curves = (
             Series('by the rig file', at, expected[:, i], 'red', 'rings'),
-            Series('measured', at, moved[:, i], 'blue', 'points', spread[:, i]),
+            Series('measured', at, moved[:, i], 'blue', 'points', deviations[:, i]),
         )
         panels.append(Panel(curves, 'push', f'{name} / µm', height=SMALL))
     return Chart('how each channel moved at each push', panels, beside=2)
 
 
-def _arrow(value: float, size: float) -> str:
-    """A direction: + or -, or 0 for next to nothing."""
+def arrow(value: float, size: float) -> str:
+    """Return a direction: + or -, or 0 for next to nothing."""
     return '0' if abs(value) < 0.1 * size else '+' if value > 0.0 else '-'
 
 
-def _verdict(found: Checkup) -> str:
-    fit = len(found.found)
-    if found.verdict == RIGHT:
+def _verdict(checkup: Checkup) -> str:
+    fit = len(checkup.wirings)
+    if checkup.verdict == RIGHT:
         return f'RIGHT: of {len(WIRINGS)} wirings only that of the rig file fits.'
-    if found.verdict == CANNOT_TELL:
+    if checkup.verdict == CANNOT_TELL:
         if not fit:
             return 'CANNOT TELL: these pushes fit no wiring.'
         verb = 'does' if fit == 2 else 'do'
         return f"CANNOT TELL: the rig file's wiring fits, and so {verb} {fit - 1} of the other {len(WIRINGS) - 1}."
-    if not any(f.name in WIRED for f in found.findings):
+    if not any(f.name in WIRED for f in checkup.findings):
         return 'WRONG, but not in the wiring: that of the rig file fits.' if fit == 1 else 'WRONG, as follows:'
     fits = f'one wiring of {len(WIRINGS)} fits' if fit == 1 else f'{fit} wirings of {len(WIRINGS)} fit'
     return f'WRONG: {fits}, and that of the rig file does not.'
 
 
-def _findings(found: Checkup) -> list[tuple[str, str]]:
+def _findings(checkup: Checkup) -> list[tuple[str, str]]:
     """What is wrong, and what to do about it."""
     rows = []
-    for f in found.findings:
+    for f in checkup.findings:
         where, name = f.where, NAMES[f.name]
         if f.name == 'psd_swap':
             where = where.replace(' ', ' and ')
         elif f.name == 'load_coverage' and f.value is None:
             where, name = 'pushes', 'not enough to tell'
         rows.append((f'{where}: {name}', f.fix))
-    return [*rows, *((f'{psd}: light', text) for psd, text in found.light.items())]
+    return [*rows, *((f'{psd}: light', text) for psd, text in checkup.light.items())]
 
 
-def _other_causes(found: Checkup) -> list[str]:
+def other_causes(checkup: Checkup) -> list[str]:
     """What else would look the same."""
-    return [f'or else: {_other(text)}' for text in dict.fromkeys(t for f in found.findings for t in f.equivalent)]
+    return [f'or else: {_other(text)}' for text in dict.fromkeys(t for f in checkup.findings for t in f.equivalent)]
 
 
 def _other(text: str) -> str:
@@ -266,15 +266,16 @@ def _other(text: str) -> str:
     return f'the rig file is right, and {pushes} went the other way (sign of the load); this would look the same'
 
 
-def _levels(found: Checkup) -> list[tuple[str, str]]:
-    measured = found.levels
+def level_rows(checkup: Checkup) -> list[tuple[str, str]]:
+    """Return noise, hum, light and drift as pairs of a title and words."""
+    measured = checkup.levels
     noise = '  '.join(f'{c} {v * 1e3:.2f}' for c, v in zip(CHANNELS, measured.noise.tolist(), strict=True))
     drift = '  '.join(
         f'{c} {v * 60e6:+z.1f} ± {sd * 60e6:.1f}'
-        for c, v, sd in zip(DOTS, found.drift.tolist(), found.drift_sd.tolist(), strict=True)
+        for c, v, sd in zip(DOTS, checkup.drift.tolist(), checkup.drift_sd.tolist(), strict=True)
     )
     drift += '  µm a minute'
-    if found.drift_sd.max() > TELLING_DRIFT:
+    if checkup.drift_sd.max() > TELLING_DRIFT:
         drift = 'cannot be told: the recording is too short'
     hum = 'none at 50 or 60 Hz'
     if measured.hum.max() > 0.0:
@@ -284,7 +285,7 @@ def _levels(found: Checkup) -> list[tuple[str, str]]:
     return [
         ('noise', f'{noise}  mV rms a sample (rig file {measured.stated * 1e3:.2f})'),
         ('hum', hum),
-        ('light', f'{sums}  V (rig file {found.rig.amplifier.sum_nominal:g})'),
+        ('light', f'{sums}  V (rig file {checkup.rig.amplifier.sum_nominal:g})'),
         ('drift', drift),
     ]
 

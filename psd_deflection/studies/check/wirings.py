@@ -34,7 +34,7 @@ WIRINGS = tuple(
 
 
 def wirings_of(file: Wiring) -> Sequence[Wiring]:
-    """The wirings that are tried of a rig whose file says ``file``: of two PSDs all.
+    """Return the wirings that are tried of a rig whose file says ``file``: of two PSDs all.
 
     Of more, those in which at most two PSDs are wired otherwise than ``file`` says, and those in which all are wired
     alike; each with any two PSDs exchanged, and with none.
@@ -106,7 +106,7 @@ class PushResponse:
         return ' with '.join(_BY_PUSH[load] for load in self.loads)
 
     @property
-    def seen(self) -> bool:
+    def observed(self) -> bool:
         """Whether it stands out of the noise. What a turn moves both dots alike does not count."""
         moved = _pattern(self.channels, self.only_twist)
         variance = float(np.mean(self.sd**2)) * (2.0 if self.only_twist else 1.0)
@@ -117,11 +117,11 @@ class PushResponse:
 
         The size is negative if the push went the other way.
         """
-        seen = _pattern(_dots(wiring, self.channels) * np.array(self.scales), self.only_twist)
+        pattern = _pattern(_dots(wiring, self.channels) * np.array(self.scales), self.only_twist)
         expected = _pattern(self.expected, self.only_twist)
-        size = float(seen @ expected / (expected @ expected))
-        left = seen - size * expected
-        return float(left @ left / (seen @ seen)), size
+        size = float(pattern @ expected / (expected @ expected))
+        residual = pattern - size * expected
+        return float(residual @ residual / (pattern @ pattern)), size
 
 
 def on_channels(wiring: Wiring, dots: FloatArray) -> FloatArray:
@@ -169,22 +169,22 @@ def misfit(
 
 
 def fitting_wirings(responses: Sequence[PushResponse]) -> list[WiringFit]:
-    """The wirings that explain the pushes about as well as the best one does, best first; [] if none does.
+    """Return the wirings that explain the pushes about as well as the best one does, best first; [] if none does.
 
     First with the loads as they are said to be. Only if no wiring explains these, with the sign of loads turned.
     """
-    told = [response.loads for response in responses]
-    for turned in range(len(told) + 1):
-        found: list[WiringFit] = []
-        for some in itertools.combinations(told, turned):
+    loads_of_responses = [response.loads for response in responses]
+    for turned in range(len(loads_of_responses) + 1):
+        fits: list[WiringFit] = []
+        for some in itertools.combinations(loads_of_responses, turned):
             loads = tuple(itertools.chain.from_iterable(some))
             for wiring in WIRINGS:
                 total, worst = misfit(wiring, responses, loads)
                 if worst <= LIMIT:
-                    found.append(WiringFit(wiring, total, loads))
-        if found:
-            found.sort(key=lambda c: c.misfit)
-            return [c for c in found if c.misfit <= found[0].misfit + MARGIN]
+                    fits.append(WiringFit(wiring, total, loads))
+        if fits:
+            fits.sort(key=lambda c: c.misfit)
+            return [c for c in fits if c.misfit <= fits[0].misfit + MARGIN]
     return []
 
 
@@ -227,7 +227,7 @@ def _of_channels(wiring: Wiring) -> dict[str, tuple[int, str, bool]]:
 
 
 def parameters(wiring: Wiring, file: Wiring) -> dict[str, object]:
-    """The parameters of ``wiring`` that are others in the rig file."""
+    """Return the parameters of ``wiring`` that are others in the rig file."""
     out: dict[str, object] = {}
     if wiring.exchanged != file.exchanged:
         out['psds_exchanged'] = wiring.exchanged
@@ -238,7 +238,7 @@ def parameters(wiring: Wiring, file: Wiring) -> dict[str, object]:
 
 
 def fix_of(difference: Difference, wiring: Wiring, right: Mapping[str, object]) -> str:
-    """The line of the rig file that puts one difference right, or what else does."""
+    """Return the line of the rig file that puts one difference right, or what else does."""
     if difference.name == 'psd_swap' and difference.where != SWAP:
         both = difference.where.replace(' ', ' and ')
         return f'exchange the cables of {both} at the device, or what the rig file says of {both}'

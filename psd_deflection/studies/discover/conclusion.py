@@ -69,7 +69,7 @@ class Conclusion(StudyResult):
     effects: tuple[NamedEffect, ...]
     unknown: tuple[Unknown, ...]
     where: Localisation
-    left: Localisation
+    residual: Localisation
     gap_before: float
     gap_after: float
     gap_floor: float
@@ -100,8 +100,10 @@ class Conclusion(StudyResult):
     @property
     def sources(self) -> Mapping[str, str]:
         """Version and recordings, with their digests."""
-        seen = self.workspace.provenance()
-        of = {f'recording {n}': named(str(r['name']), str(r.get('sha256', '')), 64) for n, r in enumerate(seen, 1)}
+        provenance = self.workspace.provenance()
+        of = {
+            f'recording {n}': named(str(r['name']), str(r.get('sha256', '')), 64) for n, r in enumerate(provenance, 1)
+        }
         return {'version': __version__, 'seed': str(self.seed), **of}
 
     @property
@@ -114,22 +116,22 @@ class Conclusion(StudyResult):
         return [_missing(self), *(t.sentence for t in ties(self.effects)), *self.beyond]
 
     @property
-    def remains(self) -> bool:
+    def unexplained(self) -> bool:
         """Whether more terms would lower the error on unseen cases than the named effects do."""
-        return self.prediction is not None and self.prediction.remains
+        return self.prediction is not None and self.prediction.unexplained
 
     @property
     def beyond(self) -> list[str]:
         """What small terms beyond the named effects do together, in a sentence; nothing if they do nothing."""
-        return [self.prediction.sentence(self.workspace)] if self.prediction is not None and self.remains else []
+        return [self.prediction.sentence(self.workspace)] if self.prediction is not None and self.unexplained else []
 
     @property
     def predicting(self) -> tuple[ActiveEffect, ...]:
         """The effects of the model that predicts best: at least the nuisance and the named ones."""
-        return self.fit.whole if self.prediction is None else self.prediction.effects
+        return self.fit.coefficients_with_nuisance if self.prediction is None else self.prediction.effects
 
     def lines(self) -> list[str]:
-        """The sentences in one line, then what is unknown."""
+        """Return the sentences in one line, then what is unknown."""
         unknown = [f'unknown: {u.signature}' for u in self.unknown]
         limits = [f'limit: {x.limit}; {x.beyond}' for x in self.search.limits]
         return [self.sentence, *unknown, *limits, f'{self.simulations} forward simulations']
@@ -156,7 +158,7 @@ class Conclusion(StudyResult):
             'remainder': None if self.remainder is None else self.remainder.tree(),
             'setup': [],
             'moves': None,
-            'remains': self.remains,
+            'remains': self.unexplained,
             'predictive': None if self.prediction is None else self.prediction.tree(),
             'remaining': {'rms': self.gap_after, 'floors': self.floors},
             'gap': self._gap(),
@@ -171,15 +173,17 @@ class Conclusion(StudyResult):
 
     def table(self) -> Table:
         """One row a parameter of each effect that was named: ``value``, ``sd``, ``unit``, and what speaks for it."""
-        rows = [(e, name, told) for e in self.effects for name, told in parameters_of(e).items()]
-        told = [t if isinstance(t, dict) else {'value': t, 'sd': 0.0, 'unit': ''} for *_, t in rows]
+        rows = [(e, name, entries) for e in self.effects for name, entries in parameters_of(e).items()]
+        entries = [t if isinstance(t, dict) else {'value': t, 'sd': 0.0, 'unit': ''} for *_, t in rows]
         return Table(
             text_column('effect', [e.active.label for e, *_ in rows], 'that was missing'),
             [
                 text_column('parameter', [name for _, name, _ in rows], 'of the effect'),
-                Column('value', np.array([t['value'] for t in told], dtype=np.float64), '', 'in the unit of the row'),
-                Column('sd', np.array([t['sd'] for t in told], dtype=np.float64), '', 'its standard deviation'),
-                text_column('unit', [t['unit'] for t in told], 'of the row'),
+                Column(
+                    'value', np.array([t['value'] for t in entries], dtype=np.float64), '', 'in the unit of the row'
+                ),
+                Column('sd', np.array([t['sd'] for t in entries], dtype=np.float64), '', 'its standard deviation'),
+                text_column('unit', [t['unit'] for t in entries], 'of the row'),
                 Column('delta_bic', np.array([e.delta_bic for e, *_ in rows], dtype=np.float64), '', 'BIC better by'),
                 Column('p', np.array([e.p for e, *_ in rows], dtype=np.float64), '', 'over the whole library'),
             ],
@@ -233,8 +237,8 @@ class RigConclusion(Conclusion):
 
     ``setup``: mistakes of the set-up and the recording, with ``values`` that put the rig file right; ``known``: the
     effects that the rig file has already. ``law``: describes what is unknown; it is in no gap and no effect here.
-    ``rivals``: the whole models that these recordings do not exclude beside ``fit``, also those of mistakes of the
-    set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
+    ``alternative_fits``: complete models that these recordings do not exclude beside ``fit``, also those of mistakes of
+    the set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
     ``moves``: by how much at most an estimate is wrong that is not corrected for the effects: dX m, dY m, theta rad.
     ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
     became, '' if it is none. ``tell``: takes warnings.
@@ -245,7 +249,7 @@ class RigConclusion(Conclusion):
     values: Mapping[str, object]
     known: tuple[ActiveEffect, ...]
     law: FoundLaw | None
-    rivals: tuple[Fit, ...]
+    alternative_fits: tuple[Fit, ...]
     unsettled: tuple[str, ...]
     moves: tuple[float, float, float]
     rig: Rig
@@ -284,18 +288,18 @@ class RigConclusion(Conclusion):
         """What is wrong with the set-up, what is missing besides, what that does to an estimate, the law."""
         missing = _missing(self, ' besides' if self.setup else '')
         tied = [t.sentence for t in ties(self.effects)]
-        return [s for s in (_setup(self), missing, *tied, _moved(self), _law(self), *self.beyond) if s]
+        return [s for s in (_setup(self), missing, *tied, _moved(self), law_sentence(self), *self.beyond) if s]
 
     def lines(self) -> list[str]:
-        """The sentences in one line, what puts the set-up right, what would decide, what is unknown."""
-        first, *others = super().lines()
+        """Return the sentences in one line, what puts the set-up right, what would decide, what is unknown."""
+        first, *remaining_lines = super().lines()
         out = [first, *(f'set-up: {f.name} {f.where}: {f.fix}' for f in self.setup)]
         numbers = [RIG_NUMBERS[e.name] for e in self.effects if e.name in RIG_NUMBERS]
         out += [f'rig file: {line(key, self.values[key])}' for key in numbers]
         for e in self.effects:
             if e.suggestion is not None:
                 out.append(f'to tell {e.active.effect.name} from {", ".join(e.equivalent)}: {e.suggestion.text}')
-        return out + others
+        return out + remaining_lines
 
     def tree(self) -> dict[str, Any]:
         """As for any machine, with set-up, moves and law."""
@@ -307,7 +311,7 @@ class RigConclusion(Conclusion):
         return out
 
     def adopt(self, name: str) -> Self:
-        """The answer with its law as the effect ``name``, written to the folder of the user's effects.
+        """Return the answer with its law as the effect ``name``, written to the folder of the user's effects.
 
         Without a law nothing happens. Raises ConfigError for a name that cannot be, RecordingError if the disk refuses.
         """
@@ -324,7 +328,7 @@ class RigConclusion(Conclusion):
         return out
 
     def model_yaml(self) -> str:
-        """The user's parameter file with the effects, comments kept; without one what describes the rig."""
+        """Return the user's parameter file with the effects, comments kept; without one what describes the rig."""
         # Other numbers of the rig file are lines of it.
         effects = [a for a in self.active_effects if a.effect.name not in RIG_NUMBERS]
         if self.adopted and self.law is not None:
@@ -335,14 +339,14 @@ class RigConclusion(Conclusion):
         return model_yaml(self.params_file, self.rig, effects, self.values, self.tell)
 
     def files(self) -> dict[str, str]:
-        """The rig file with the effects, the page, the JSON, and the law as an effect that can be adopted."""
+        """Return the rig file with the effects, the page, the JSON, and the law as an effect that can be adopted."""
         law = self.model_of_law
         laws = {} if law is None else {'law.yaml': _law_file(law)}
         return {'model.yaml': self.model_yaml(), **super().files(), **laws}
 
 
 def adopting_folder(name: str) -> Path:
-    """The folder of the user's effects, for an effect ``name``. Raises ConfigError if there cannot be one."""
+    """Return the folder of the user's effects, for an effect ``name``. Raises ConfigError if there cannot be one."""
     if not name.isidentifier() or name.startswith('_'):
         raise ConfigError(f'{name}: must be a name of letters, digits and underscores, such as base_yields')
     if name in effect_names():
@@ -370,7 +374,7 @@ def model_yaml(
     values: Mapping[str, object],
     tell: Tell = warn_caller,
 ) -> str:
-    """The user's parameter file with ``effects``, comments kept; without one what describes ``rig``.
+    """Return the user's parameter file with ``effects``, comments kept; without one what describes ``rig``.
 
     ``values``: what was wrong in the rig file, put right. ``tell`` gets a warning if the file cannot be edited.
     """
@@ -385,7 +389,7 @@ def model_yaml(
     return edited_rig_file(params_file, 'model.yaml', lambda: described(rig, given), edit, tell)
 
 
-def _left(discovery: Conclusion) -> str:
+def _residual_words(discovery: Conclusion) -> str:
     """What remains, and how many floors it is."""
     after, floor = (
         discovery.workspace.worded(v, discovery.workspace.digits) for v in (discovery.gap_after, discovery.gap_floor)
@@ -408,8 +412,8 @@ def _seconds(finding: Finding) -> str:
     """How late a load was noted, or how long it took."""
     if not isinstance(finding.value, float) or finding.name not in ('load_time', 'load_ramp'):
         return ''
-    late = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
-    return f', {abs(finding.value):.3g} s{late}'
+    direction = '' if finding.name == 'load_ramp' else ' late' if finding.value > 0.0 else ' early'
+    return f', {abs(finding.value):.3g} s{direction}'
 
 
 def _moved(discovery: RigConclusion) -> str:
@@ -417,8 +421,8 @@ def _moved(discovery: RigConclusion) -> str:
     if not discovery.effects:
         return ''
     dx, dy, theta = (1e6 * v for v in discovery.moves)
-    found = [e.active.effect for e in discovery.effects]
-    stays = dict.fromkeys(effect.name for effect in found if effect.stage in STAGES and not effect.corrected)
+    effects = [e.active.effect for e in discovery.effects]
+    stays = dict.fromkeys(effect.name for effect in effects if effect.stage in STAGES and not effect.corrected)
     uncorrected = f'An estimate is not corrected for {", ".join(stays)}.' if stays else ''
     if max(dx, dy, theta) < SHOWN and uncorrected:
         return uncorrected
@@ -430,31 +434,31 @@ def _moved(discovery: RigConclusion) -> str:
     return ' '.join(filter(None, (f'Without {them} an estimate is wrong by up to {words}.', uncorrected)))
 
 
-def _law(discovery: RigConclusion) -> str:
-    """The law for what is unknown, in a sentence, or nothing."""
+def law_sentence(discovery: RigConclusion) -> str:
+    """Return the law for what is unknown, in a sentence, or nothing."""
     if discovery.law is None:
         return ''
-    found = discovery.law
-    expressions = '; '.join(e.expression for e in found.laws)
-    words = f'What remains follows a law ({found.law.stage}, {found.law.kind}): {expressions}'
-    beside = [a.effect.name for a in found.beside]
+    law = discovery.law
+    expressions = '; '.join(e.expression for e in law.laws)
+    words = f'What remains follows a law ({law.law.stage}, {law.law.kind}): {expressions}'
+    beside = [a.effect.name for a in law.beside]
     named = {e.active.effect.name for e in discovery.effects}
-    with_law = f'; on unseen load cases it leaves {1e6 * found.heldout_gap:.3f} µm'
+    with_law = f'; on unseen load cases it leaves {1e6 * law.heldout_gap:.3f} µm'
     also = f', beside {", ".join(beside)}' if beside and set(beside) != named else ''
     return f'{words}{also}{with_law}.'
 
 
 def _missing(discovery: Conclusion, besides: str = '') -> str:
-    ws, left = discovery.workspace, _left(discovery)
-    before = f'{ws.scale_shown[0] * discovery.gap_before:{ws.digits}}'
+    ws, residual = discovery.workspace, _residual_words(discovery)
+    before = f'{ws.display_scale[0] * discovery.gap_before:{ws.digits}}'
     if discovery.verdict == 'nothing_missing':
         if not math.isfinite(discovery.gap_floor):
             # Without a stated noise nobody knows how large what remains should be.
             return (
-                f'Nothing is missing{besides} as far as these readings show: {left} remains and follows nothing, '
+                f'Nothing is missing{besides} as far as these readings show: {residual} remains and follows nothing, '
                 'as noise does. How exact the readings are is not stated.'
             )
-        return f'Nothing is missing{besides}: the gap is {left}.'
+        return f'Nothing is missing{besides}: the gap is {residual}.'
     parts = []
     for e in discovery.effects:
         text = e.active.label
@@ -466,16 +470,19 @@ def _missing(discovery: Conclusion, besides: str = '') -> str:
     named = ' and '.join(parts)
     if discovery.verdict == 'effects_found':
         is_are, them = ('is', 'it') if len(parts) == 1 else ('are', 'them')
-        return f'{named} {is_are} missing from the model; adding {them} closes the gap from {before} to {left}.{fitted}'
-    if not any(u.remains for u in discovery.unknown):
         return (
-            f'{named} close the gap from {before} to {left}, but their sizes '
+            f'{named} {is_are} missing from the model; adding {them} closes the gap '
+            f'from {before} to {residual}.{fitted}'
+        )
+    if not any(u.unexplained for u in discovery.unknown):
+        return (
+            f'{named} close the gap from {before} to {residual}, but their sizes '
             f'are tied: one effect that is not in the catalogue is likelier.'
         )
     if named:
         explains = 'explains' if len(parts) == 1 else 'explain'
         return (
             f'{named} {explains} part, but an unknown effect remains: the gap goes from {before} '
-            f'{ws.scale_shown[1]} to {left}.{fitted}'
+            f'{ws.display_scale[1]} to {residual}.{fitted}'
         )
-    return f'An effect that is not in the catalogue: the gap is {left}.'
+    return f'An effect that is not in the catalogue: the gap is {residual}.'

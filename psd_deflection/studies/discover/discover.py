@@ -32,9 +32,9 @@ from psd_deflection.studies.discover.search.signatures import SignatureBank
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS, SETUP
-from psd_deflection.studies.discover.setup.hung import told
-from psd_deflection.studies.discover.setup.setup import noise_of, said
-from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, solve, where, without_one
+from psd_deflection.studies.discover.setup.hung import wrong_load_findings
+from psd_deflection.studies.discover.setup.setup import finding_of_effect, noise_of
+from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, solve, where, without_effect
 from psd_deflection.studies.loads.plate_motion import dots_of
 
 
@@ -63,7 +63,7 @@ def discover(
         values=problem.values,
         known=machine.recorded.stated,
         law=problem.law if problem.unknown else None,
-        rivals=problem.rivals,
+        alternative_fits=problem.alternative_fits,
         unsettled=problem.unsettled,
         moves=pose_change(workspace_of(problem.bare), problem.fit) if problem.named else (0.0, 0.0, 0.0),
         rig=known,
@@ -71,41 +71,43 @@ def discover(
 
 
 def law(problem: Problem) -> Problem:
-    """A law for what remains, and the fit without the effects that only stood in for it."""
+    """Return a law for what remains, and the fit without the effects that only stood in for it."""
     ws, fit = workspace_of(problem.comparison), problem.fit
     # Coarse steps cause noise that varies with the signal, which is no law.
     if rig_of(problem).recorded.lattice is not None:
         return problem
     much = ws.gap(fit.difference) > UNSAID * ws.floor()
-    if not (unknown_of(problem.left, 1.0) or much or coincidences(fit, ws.physics)):
+    if not (unknown_of(problem.residual, 1.0) or much or coincidences(fit, ws.physics)):
         return problem
-    found = find_law(ws, problem.null, fit, problem.search.penalty, problem.left.excess, problem.rng, problem.progress)
-    if found is None:
+    found_law = find_law(
+        ws, problem.null, fit, problem.search.penalty, problem.residual.excess, problem.rng, problem.progress
+    )
+    if found_law is None:
         return problem
-    problem = _beside(replace(problem, law=found), found)
-    return replace(problem, left=problem.machine.look(ws, problem.fit, problem.result.null, problem.rng))
+    problem = _beside(replace(problem, law=found_law), found_law)
+    return replace(problem, residual=problem.machine.look(ws, problem.fit, problem.result.null, problem.rng))
 
 
-def _beside(problem: Problem, found: FoundLaw) -> Problem:
-    kept = {(a.effect.name, a.choices) for a in found.beside}
+def _beside(problem: Problem, found_law: FoundLaw) -> Problem:
+    known = {(a.effect.name, a.choices) for a in found_law.beside}
     for i in reversed(range(len(problem.fit.effects))):
         active = problem.fit.effects[i]
-        if (active.effect.name, active.choices) not in kept:
-            problem = without_one(problem, i, 'only stood in for the law')
+        if (active.effect.name, active.choices) not in known:
+            problem = without_effect(problem, i, 'only stood in for the law')
     return problem
 
 
 def set_up(problem: Problem) -> Problem:
     """What is wrong with the set-up, beside the named effects that are physics; and the coarse steps."""
     machine, ws = rig_of(problem), workspace_of(problem.comparison)
-    setup = [*machine.recorded.late_loads(ws), *machine.recorded.findings]
+    setup = [*machine.recorded.delayed_loads(ws), *machine.recorded.findings]
     values = dict(machine.recorded.values)
     for i, effect in enumerate(problem.named):
         if effect.active.effect.name in SETUP:
-            more, lines = said(ws, problem.fit, i, effect.delta_bic)
+            more, lines = finding_of_effect(ws, problem.fit, i, effect.delta_bic)
             setup += [dataclasses.replace(f, equivalent=effect.equivalent) for f in more]
             values |= lines
-    setup += told(ws, machine.recorded.wrong)
+    setup += wrong_load_findings(ws, machine.recorded.wrong)
     named = [n for n in problem.named if n.name not in SETUP or n.name in RIG_NUMBERS]
     if machine.recorded.lattice is not None and not machine.recorded.lattice_stated:
         lattice = machine.recorded.lattice
@@ -127,7 +129,7 @@ def set_up(problem: Problem) -> Problem:
 
 
 def noise_level(problem: Problem) -> Problem:
-    """Whether the noise is the rig file's. What is unknown may move faster than noise can be told from it."""
+    """Return whether the noise is the rig file's. What is unknown may move faster than noise can be told from it."""
     if problem.unknown or rig_of(problem).recorded.lattice is not None:
         return problem
     ws = workspace_of(problem.comparison)
@@ -159,7 +161,7 @@ def pose_change(ws: Workspace, fit: Fit) -> tuple[float, float, float]:
 
 
 def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
-    """The named effect of coarse steps, which the readings themselves show."""
+    """Return the named effect of coarse steps, which the readings themselves show."""
     gain = lattice_gain(workspace, lattice)
     sd = min(s.sd for o in workspace.observations if (s := propose.coarse_step(o)) is not None)
     return NamedEffect(
@@ -169,7 +171,7 @@ def _named_lattice(workspace: Workspace, lattice: ActiveEffect) -> NamedEffect:
         delta_bic=2.0 * gain,
         heldout=HeldOut(gain, float(np.sqrt(2.0 * gain))),
         equivalent=(),
-        rivals=(),
+        fitted_alternatives=(),
         alternatives=(),
         suggestion=None,
     )

@@ -110,10 +110,10 @@ def settings(rig: Rig, limits: Limits) -> list[Setting]:
     out = [Setting()]
     if limits.swing > 0.0:
         out.append(Setting(f'while the temperature swings by +-{limits.swing:g} K', swing=limits.swing, effort=0.03))
-    own = rig.link.length
-    lengths = (round(0.7 * own, 3),) if limits.lengths is None else limits.lengths
+    arm_length = rig.link.length
+    lengths = (round(0.7 * arm_length, 3),) if limits.lengths is None else limits.lengths
     for length in lengths:
-        if not math.isclose(length, own):
+        if not math.isclose(length, arm_length):
             out.append(Setting(f'on a link of {length:.2f} m', {'link.length': length}, effort=0.05))
     for rate in limits.rates:
         if not math.isclose(rate, rig.converter.sample_rate_hz):
@@ -185,7 +185,7 @@ def pieces(rig: Rig, limits: Limits) -> list[Piece]:
 
 
 def proposals(rig: Rig, limits: Limits) -> list[Proposal]:
-    """Every piece in every setting, those that fit into the longest recording."""
+    """Return every piece in every setting, those that fit into the longest recording."""
     out = []
     for setting in settings(rig, limits):
         changed = replace_values(rig, setting.changes) if setting.changes else rig
@@ -227,18 +227,18 @@ class ModelSums:
             times * self.seconds,
         )
 
-    def separation(self, true: int, other: int, known: FloatArray) -> float:
-        """Chi-square between the models ``true`` and ``other``, whose parameters adapt; ``known`` (p, p): the curvature
+    def separation(self, true: int, assumed: int, known: FloatArray) -> float:
+        """Return chi-square of models ``true`` and ``assumed``, whose parameters adapt; ``known`` (p, p): the curvature
         of the old data about it.
         """
-        pull = self.pull[true][other]
+        pull = self.pull[true][assumed]
         if not len(pull):
-            return float(self.apart[true, other])
-        f = self.fisher[other] + known
+            return float(self.apart[true, assumed])
+        f = self.fisher[assumed] + known
         lengths = np.sqrt(np.maximum(np.diag(f), 1e-300))
         g = pull / lengths
         step = np.linalg.lstsq(f / np.outer(lengths, lengths), g, rcond=1e-10)[0]
-        return max(float(self.apart[true, other] - g @ step), 0.0)
+        return max(float(self.apart[true, assumed] - g @ step), 0.0)
 
 
 def nothing_of(models: Sequence[Fit]) -> ModelSums:
@@ -252,7 +252,7 @@ def nothing_of(models: Sequence[Fit]) -> ModelSums:
     )
 
 
-def shown(
+def expected_sums(
     workspace: Workspace, models: Sequence[Fit], setting: Setting, loads: FloatArray, rig: Rig | None = None
 ) -> ModelSums:
     """What a recording with ``loads`` (n, 3) in ``setting`` would show of ``models``.
@@ -297,7 +297,7 @@ def shown(
 
 
 def limits_to_tree(limits: Limits) -> dict[str, Any]:
-    """The limits as result.json has them."""
+    """Return the limits as result.json has them."""
     return {
         'force_n': limits.force,
         'torque_nm': limits.torque,

@@ -42,7 +42,7 @@ FOLLOWS = 0.1
 """Known effects of a few per cent are linear to this share of the gap: if they leave more, it follows none of them."""
 
 
-def hung(problem: Problem) -> Problem:
+def effective_loads(problem: Problem) -> Problem:
     """With the free loads as the chosen model says."""
     ws, fit = workspace_of(problem.comparison), problem.fit
     if not ws.free_loads:
@@ -50,39 +50,39 @@ def hung(problem: Problem) -> Problem:
     ws, fit = _in_turns(ws, fit)
     null = refit(ws, ())
     fit = fit if fit.effects else null
-    found = problem.search.at(ws)
-    found.dropped = {}
-    p, delta_bic, delta_chi2 = found.weigh(null, fit)
-    others = [found.alternatives(null, fit, i, delta_chi2[i]) for i in range(len(fit.effects))]
+    search = problem.search.at(ws)
+    search.dropped = {}
+    p, delta_bic, delta_chi2 = search.weigh(null, fit)
+    alternatives = [search.alternatives(null, fit, i, delta_chi2[i]) for i in range(len(fit.effects))]
     result = replace(
-        problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others
+        problem.result, null=null, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=alternatives
     )
-    return replace(problem, search=found, result=result, fit=fit, null=null)
+    return replace(problem, search=search, result=result, fit=fit, null=null)
 
 
 def _in_turns(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
-    """The free loads as ``fit`` asks for, and the sizes of its effects beside them, in turns."""
+    """Return the free loads as ``fit`` asks for, and the sizes of its effects beside them, in turns."""
     gap = ws.gap(fit.difference)
     for _ in range(MOST_SETTLED):
         # Loads and times are found to first order: at the sizes as they are, then the sizes beside them.
-        turned, better = _settled(ws, fit)
+        turned, better = _refitted(ws, fit)
         if fit.effects:
-            turned, better = _settled(turned, refit(turned, fit.effects, 6))
-        left, gap = gap, turned.gap(better.difference)
-        if gap > left:
+            turned, better = _refitted(turned, refit(turned, fit.effects, 6))
+        previous_gap, gap = gap, turned.gap(better.difference)
+        if gap > previous_gap:
             break
         ws, fit = turned, better
-        if gap > SETTLED * left or gap < AT_FLOOR * ws.floor():
+        if gap > SETTLED * previous_gap or gap < AT_FLOOR * ws.floor():
             break
     return ws, fit
 
 
-def _settled(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
-    """The free loads as ``fit`` asks for, and what it leaves then: never more than before."""
+def _refitted(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
+    """Return the free loads as ``fit`` asks for, and what it leaves then: never more than before."""
     for _ in range(TURNS):
-        turned = ws.settled_beside(fit.difference, fit.whole)
-        turned = ws.settled(fit.difference) if turned is ws else turned
-        residual, difference = turned.residual([*turned.base, *fit.whole])
+        turned = ws.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
+        turned = ws.refitted(fit.difference) if turned is ws else turned
+        residual, difference = turned.residual([*turned.base, *fit.coefficients_with_nuisance])
         if turned.gap(difference) > ws.gap(fit.difference):
             # Beside an effect that is far from linear a step may lead away.
             break
@@ -90,17 +90,17 @@ def _settled(ws: Workspace, fit: Fit) -> tuple[Workspace, Fit]:
     return ws, fit
 
 
-def settled(problem: Problem) -> Problem:
+def refitted(problem: Problem) -> Problem:
     """With the free loads as the effects ask for that hold, if not all that were searched do."""
     ws = workspace_of(problem.comparison)
     if not ws.free_loads or problem.fit is problem.result.fit:
         return problem
-    ws, fit = _settled(ws, problem.fit)
+    ws, fit = _refitted(ws, problem.fit)
     null = refit(ws, ())
     return replace(problem, search=problem.search.at(ws), fit=fit if fit.effects else null, null=null)
 
 
-SEARCH = (search, hung, weigh, settled)
+SEARCH = (search, effective_loads, weigh, refitted)
 """The search with its verdict, of the loads as they are."""
 
 
@@ -117,39 +117,39 @@ def searched(problem: Problem) -> Problem:
         return problem
     problem.progress('how the link rang on after what is left out')
     # What rings on is all that is seen of loads that were hung in what is left out.
-    seen = [d for d in ws.directions if not unseen(ws, d)]
-    free = ws.freed((*seen, *ringing), effects)
+    observable = [d for d in ws.directions if not unseen(ws, d)]
+    free = ws.with_free((*observable, *ringing), effects)
     begun = refit(free, effects, 12)
     # Else the noise beside it would be that of a link that does not ring as it did.
     free, begun = _in_turns(free, begun)
-    other = replace(problem, search=problem.search.at(free), fit=begun, null=refit(free, ()))
+    alternative = replace(problem, search=problem.search.at(free), fit=begun, null=refit(free, ()))
     for step in (partial(search, begun=begun), *SEARCH[1:]):
-        other = step(other)
-    return other if other.comparison.gap(other.fit.difference) < UNSAID * ws.floor() else problem
+        alternative = step(alternative)
+    return alternative if alternative.comparison.gap(alternative.fit.difference) < UNSAID * ws.floor() else problem
 
 
 def _searched(problem: Problem) -> Problem:
     machine = rig_of(problem)
     if machine.recorded.fourth is not None and machine.recorded.fourth.acquits and _follows_nothing(problem):
         # No detector is at fault, and nothing that is known: the loads are asked before the search spends on stand-ins.
-        freed = _freed(problem)
+        freed = _with_all_loads_free(problem)
         if freed is not None and freed.comparison.gap(freed.fit.difference) < UNSAID * freed.comparison.floor():
-            return _as_noted(problem, freed)
-    asked = _freed(problem, maybe_rounded=True) if _rounded_beside_one(problem) else None
+            return _as_annotated(problem, freed)
+    asked = _with_all_loads_free(problem, maybe_rounded=True) if _rounded_beside_effect(problem) else None
     if asked is not None and _rounded(asked):
-        return _as_noted(problem, asked)
+        return _as_annotated(problem, asked)
     for step in SEARCH:
         problem = step(problem)
-    freed = _freed(problem, had=asked)
+    freed = _with_all_loads_free(problem, had=asked)
     before = problem.comparison.gap(problem.fit.difference)
     if freed is not None and freed.comparison.gap(freed.fit.difference) < CLOSED * before:
-        return _as_noted(problem, freed)
+        return _as_annotated(problem, freed)
     # A detector at fault may move the dots by more than rounded loads move the plate.
-    freed = _freed(problem, maybe_rounded=True) if freed is None and asked is None else None
-    return _as_noted(problem, freed) if freed is not None and _rounded(freed) else problem
+    freed = _with_all_loads_free(problem, maybe_rounded=True) if freed is None and asked is None else None
+    return _as_annotated(problem, freed) if freed is not None and _rounded(freed) else problem
 
 
-def _as_noted(problem: Problem, freed: Problem) -> Problem:
+def _as_annotated(problem: Problem, freed: Problem) -> Problem:
     """``freed``; or the search as noted, from the effects that were found beside free loads, if these leave no more."""
     ws, effects = problem.comparison, freed.fit.effects
     begun = refit(ws, effects, 12) if effects else problem.null
@@ -163,7 +163,7 @@ def _as_noted(problem: Problem, freed: Problem) -> Problem:
 
 
 def _follows_nothing(problem: Problem) -> bool:
-    """Whether some effects leave a good part of the gap, to first order: no simulation is made."""
+    """Return whether some effects leave a good part of the gap, to first order: no simulation is made."""
     ws, fit = problem.comparison, problem.fit
     gap = ws.gap(fit.difference)
     if gap < FREED_FROM * ws.floor():
@@ -175,36 +175,36 @@ def _follows_nothing(problem: Problem) -> bool:
         if best is None:
             break
         columns += problem.search.screen.columns_of(best.candidate)
-    return not columns or _left(ws, fit, columns) > max(FOLLOWS * gap, FREED_FROM * ws.floor())
+    return not columns or _residual_gap(ws, fit, columns) > max(FOLLOWS * gap, FREED_FROM * ws.floor())
 
 
-def _left(ws: Comparison, fit: Fit, columns: Sequence[FloatArray]) -> float:
-    """The gap that ``columns`` (D,), whitened, leave of ``fit``, to first order."""
+def _residual_gap(ws: Comparison, fit: Fit, columns: Sequence[FloatArray]) -> float:
+    """Return the gap that ``columns`` (D,), whitened, leave of ``fit``, to first order."""
     moved = np.column_stack(columns)
-    left = fit.residual - moved @ np.linalg.lstsq(moved, fit.residual, rcond=1e-9)[0]
-    return ws.gap([d + c for d, c in zip(fit.difference, ws.unwhitened(left - fit.residual), strict=True)])
+    residual = fit.residual - moved @ np.linalg.lstsq(moved, fit.residual, rcond=1e-9)[0]
+    return ws.gap([d + c for d, c in zip(fit.difference, ws.unwhitened(residual - fit.residual), strict=True)])
 
 
-def _rounded_beside_one(problem: Problem) -> bool:
+def _rounded_beside_effect(problem: Problem) -> bool:
     """Whether one effect leaves little of the gap beside loads that may be rounded, and much alone, to first order."""
     ws, fit = workspace_of(problem.comparison), problem.fit
     gap = ws.gap(fit.difference)
     if gap < FREED_FROM * ws.floor():
         return False
-    hung = []
+    implied = []
     for i, (o, difference) in enumerate(zip(ws.observations, fit.difference, strict=True)):
         asked = levels(ws, i, difference, times(o, i))
         if not may_be_rounded(asked):
             return False
-        hung += [p for p in asked.plateaus if np.any(p.noted != 0.0)]
-    free = ws.freed((*ws.directions, *directions(ws, hung))).free
+        implied += [p for p in asked.plateaus if np.any(p.annotated != 0.0)]
+    free = ws.with_free((*ws.directions, *directions(ws, implied))).free
     loads = [] if free is None else [*free.rows]
-    alone, beside = (_left(ws, fit, [*known, *_best_beside(problem, known)]) for known in ([], loads))
+    alone, beside = (_residual_gap(ws, fit, [*known, *_best_beside(problem, known)]) for known in ([], loads))
     return beside < FOLLOWS * gap and beside < CLOSED * alone
 
 
 def _best_beside(problem: Problem, columns: Sequence[FloatArray]) -> list[FloatArray]:
-    """The signatures of the effect that explains most beside ``columns`` (D,), whitened."""
+    """Return the signatures of the effect that explains most beside ``columns`` (D,), whitened."""
     screen, known = problem.search.screen, np.column_stack(columns) if columns else None
     return screen.columns_of(max(screen.score(problem.fit.residual, known), key=lambda s: s.gain).candidate)
 
@@ -217,14 +217,18 @@ def _rounded(problem: Problem) -> bool:
     if ws.gap(problem.fit.difference) >= UNSAID * ws.floor():
         return False
     observations = ws.observations
-    own = [[p for p in free if p.recording == i] for i in range(len(observations))]
+    free_of_recording = [[p for p in free if p.recording == i] for i in range(len(observations))]
     return all(
-        rounded(*(np.array(of).reshape(-1, 3) for of in ([p.noted for p in listed], [p.of(o.loads) for p in listed])))
-        for o, listed in zip(observations, own, strict=True)
+        rounded(
+            *(np.array(of).reshape(-1, 3) for of in ([p.annotated for p in listed], [p.of(o.loads) for p in listed]))
+        )
+        for o, listed in zip(observations, free_of_recording, strict=True)
     )
 
 
-def _freed(problem: Problem, *, maybe_rounded: bool = False, had: Problem | None = None) -> Problem | None:
+def _with_all_loads_free(
+    problem: Problem, *, maybe_rounded: bool = False, had: Problem | None = None
+) -> Problem | None:
     """If much remains: the search beside free loads, what hung with every load that was noted free.
 
     None if little remains, or if no loads, constant between changes, would leave next to nothing. ``maybe_rounded``:
@@ -235,24 +239,28 @@ def _freed(problem: Problem, *, maybe_rounded: bool = False, had: Problem | None
         return None
     wrong, observations = [], []
     for i, (o, difference) in enumerate(zip(ws.observations, problem.fit.difference, strict=True)):
-        noted = {p.first: p.noted for p in machine.recorded.wrong if p.recording == i}
-        listed = [replace(p, noted=noted.get(p.first, p.noted)) for p in times(o, i)]
+        annotated = {p.first: p.annotated for p in machine.recorded.wrong if p.recording == i}
+        listed = [replace(p, annotated=annotated.get(p.first, p.annotated)) for p in times(o, i)]
         asked = levels(ws, i, difference, listed)
         if not (may_be_rounded(asked) if maybe_rounded else all_free(asked, o.loads)):
             return None
         # A person knows when nothing hangs.
-        own = [(p, more) for p, more in zip(asked.plateaus, asked.more, strict=True) if np.any(p.noted != 0.0)]
+        implied_of_loads = [
+            (p, more) for p, more in zip(asked.plateaus, asked.more, strict=True) if np.any(p.annotated != 0.0)
+        ]
         loads = o.loads.copy()
-        for p, more in own:
+        for p, more in implied_of_loads:
             loads[p.first : p.last] += more
-        wrong += [p for p, _ in own]
+        wrong += [p for p, _ in implied_of_loads]
         observations.append(dataclasses.replace(o, loads=loads, digest=o.digest or o.hashed()))
     if had is not None:
         return had
     problem.progress('what hung instead of what was noted')
     recorded = replace(machine.recorded, observations=tuple(observations), wrong=tuple(wrong))
     recorded = replace(recorded, stated_gap=recorded.stated_gap or problem.gap_before)
-    freed = recordings_ready.freed(recorded, recordings_ready.beside(ws, observations, recorded.known))
+    freed = recordings_ready.with_free(recorded, recordings_ready.beside(ws, observations, recorded.known))
     recorded = replace(recorded, fourth=fourth_reading(freed, freed.residual(freed.base)[0]))
-    other = replace(machine, recorded=recorded, workspace=freed, bank=SignatureBank(), proposals=proposals_of(freed))
-    return solve(other, SEARCH, problem.seed, problem.progress, problem.rng)
+    with_free_loads = replace(
+        machine, recorded=recorded, workspace=freed, bank=SignatureBank(), proposals=proposals_of(freed)
+    )
+    return solve(with_free_loads, SEARCH, problem.seed, problem.progress, problem.rng)

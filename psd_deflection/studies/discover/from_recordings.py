@@ -51,7 +51,7 @@ def read_observation(
     warn: Callable[[str], None] | None = None,
     any_rate: bool = False,
 ) -> Observation:
-    """One recording with its rig (by default from its own parameters), changed by ``overrides``.
+    """Return one recording with its rig (by default from its own parameters), changed by ``overrides``.
 
     ``source``: the recording or its path. ``where``: where the overrides are from, for a message.
     ``namespace``, ``span``: as in :func:`open_recording`. ``warn``: told if the recording names no rig.
@@ -103,7 +103,7 @@ def read_observation(
 
 
 def _at_its_rate(recording: Recording, rig: Rig, where: str, any_rate: bool) -> tuple[Rig, float]:
-    """The rig with the sample rate that the recording's times say, and the one that the rig file states, else 0.
+    """Return the rig with the sample rate that the recording's times say, and the one that the rig file states, else 0.
 
     Raises RecordingError if they differ and not ``any_rate`` will do.
     """
@@ -226,7 +226,7 @@ def read_readings(
     where: str = 'overrides',
     warn: Callable[[str], None] | None = None,
 ) -> Readings:
-    """One table with its rig (by default the nominal one), changed by ``overrides``, which are from ``where``.
+    """Return one table with its rig (by default the nominal one), changed by ``overrides``, which are from ``where``.
 
     ``warn`` is told what is not read. Raises RecordingError naming file, line, column and value, ConfigError for a bad
     override.
@@ -291,7 +291,7 @@ def read_tables(
     warn: Tell = lambda _: None,
     namespace: str | None = None,
 ) -> list[Readings]:
-    """The tables among ``sources``, which may be ``.yaml`` lists; none if all are recordings of samples.
+    """Return the tables among ``sources``, which may be ``.yaml`` lists; none if all are recordings of samples.
 
     A recording that has references and no samples counts as a table. ``namespace``: as in :func:`open_recording`.
     Raises RecordingError if some are tables and some are not.
@@ -302,8 +302,8 @@ def read_tables(
     if not any(kinds):
         return []
     if not all(kinds):
-        other = next(s for (s, _, _), table in zip(listed, kinds, strict=True) if not table)
-        name = other.path if isinstance(other, Recording) else other
+        source_of_kind = next(s for (s, _, _), table in zip(listed, kinds, strict=True) if not table)
+        name = source_of_kind.path if isinstance(source_of_kind, Recording) else source_of_kind
         raise RecordingError(f'{name}: is no table of readings, but others are: search them one by one')
     if rig is None and None in alone:
         warn('a table of readings says nothing of its rig: the nominal rig is taken; give --params-file')
@@ -335,17 +335,17 @@ class DiscoverOptions:
         return None if isinstance(self.known, Rig) else self.known
 
     def rig(self) -> Rig | None:
-        """The rig as it is known, if it is. Raises ConfigError."""
+        """Return the rig as it is known, if it is. Raises ConfigError."""
         return self.known if self.known is None or isinstance(self.known, Rig) else load_rig(self.known)
 
     def read(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Observation]:
-        """The recordings; ``tell`` gets what is odd."""
+        """Return the recordings; ``tell`` gets what is odd."""
         return read_observations(
             sources, self.rig(), namespace=self.namespace, span=self.span, warn=tell, any_rate=True
         )
 
     def tables(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Readings]:
-        """The tables of readings; none if ``sources`` are recordings."""
+        """Return the tables of readings; none if ``sources`` are recordings."""
         return read_tables(sources, self.rig(), tell, self.namespace)
 
     def discovered(
@@ -354,13 +354,13 @@ class DiscoverOptions:
         progress: Callable[[str], None] = lambda _: None,
         tell: Tell = warn_caller,
     ) -> Discovery:
-        """The answer; ``tell`` gets a warning if the rig file cannot be edited."""
-        found = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
+        """Return the answer; ``tell`` gets a warning if the rig file cannot be edited."""
+        discovery = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
         source = GIVEN_RIG if self.known else 'the parameters in each recording, the nominal rig if it has none'
-        return replace(found, params_file=self.params_file, tell=tell, rig_source=source)
+        return replace(discovery, params_file=self.params_file, tell=tell, rig_source=source)
 
     def discovered_in_tables(self, tables: Sequence[Readings], tell: Tell = warn_caller) -> PlantDiscovery:
-        """The answer of tables of readings; ``tell`` gets a warning if the rig file cannot be edited.
+        """Return the answer of tables of readings; ``tell`` gets a warning if the rig file cannot be edited.
 
         Raises RecordingError if a part of a table is asked for.
         """

@@ -32,7 +32,7 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.planning import TELLS_APART
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
-from psd_deflection.studies.discover.search.screen import Screen, solve_seen
+from psd_deflection.studies.discover.search.screen import Screen, solve_observable
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.trials import BIC_ACCEPT
@@ -77,7 +77,7 @@ HEAD = ('effect', 'size', 'seen from', 'named from', 'most like')
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Isolability(StudyResult):
-    """``found``: each effect that shows under ``loads``, in words. ``hidden``: the others, and what each needs.
+    """``effects``: each effect that shows under ``loads``, in words. ``hidden``: the others, and what each needs.
 
     ``matrix`` (n, n): how much of the signature of each the other imitates, 0 to 1.
     """
@@ -87,7 +87,7 @@ class Isolability(StudyResult):
 
     loads: str
     seconds: float
-    found: tuple[Isolable, ...]
+    effects: tuple[Isolable, ...]
     hidden: Mapping[str, str]
     matrix: FloatArray
     params_file: str
@@ -99,13 +99,13 @@ class Isolability(StudyResult):
 
     def sentences(self) -> list[str]:
         """How many can be named, which imitate each other, which do not show."""
-        named = [f for f in self.found if f.named is not None]
-        count = len(self.found) + len(self.hidden)
+        named = [f for f in self.effects if f.named is not None]
+        count = len(self.effects) + len(self.hidden)
         out = [
             f'Under {self.loads}, {self.seconds:.0f} s, {len(named)} of {count} effects can be named, '
             f'each from its own size on.'
         ]
-        lost = [f for f in self.found if f.named is None]
+        lost = [f for f in self.effects if f.named is None]
         if lost:
             out.append('Seen, but not told apart: ' + '; '.join(f'{f.label} from {f.alike}' for f in lost) + '.')
         if self.hidden:
@@ -113,39 +113,39 @@ class Isolability(StudyResult):
         return out
 
     def lines(self) -> list[str]:
-        """The table, then the sentences."""
-        return [*columns([HEAD, *(f.row for f in self.found)], left=5).split('\n'), '', *self.sentences()]
+        """Return the table, then the sentences."""
+        return [*columns([HEAD, *(f.row for f in self.effects)], left=5).split('\n'), '', *self.sentences()]
 
     def tree(self) -> dict[str, Any]:
-        """The answer for programs; sizes in SI units."""
+        """Return the answer for programs; sizes in SI units."""
         return {
             'loads': self.loads,
             'seconds': self.seconds,
-            'effects': [f.tree() for f in self.found],
+            'effects': [f.tree() for f in self.effects],
             'hidden': dict(self.hidden),
         }
 
     def table(self) -> Table:
         """One row an effect: the least sizes at which it is ``seen`` and ``named``, NaN: never, and its ``unit``."""
-        found = self.found
-        sizes = np.array([(f.seen, f.named) for f in found], dtype=np.float64)
+        effects = self.effects
+        sizes = np.array([(f.seen, f.named) for f in effects], dtype=np.float64)
         sizes = sizes.reshape(-1, 2)
         return Table(
-            text_column('effect', [f.label for f in found], 'that may be there'),
+            text_column('effect', [f.label for f in effects], 'that may be there'),
             [
                 Column('seen', sizes[:, 0], '', 'from this size on'),
                 Column('named', sizes[:, 1], '', 'from this size on'),
-                text_column('unit', [f.unit for f in found], 'of the sizes'),
-                text_column('alike', [f.alike for f in found], 'what it is mistaken for'),
+                text_column('unit', [f.unit for f in effects], 'of the sizes'),
+                text_column('alike', [f.alike for f in effects], 'what it is mistaken for'),
             ],
             {'loads': self.loads, 'seconds': self.seconds},
         )
 
     def sections(self) -> Iterable[PageSection]:
-        """The table, and the picture of all pairs."""
-        rows = table(HEAD, [f.row for f in self.found])
+        """Return the table, and the picture of all pairs."""
+        rows = table(HEAD, [f.row for f in self.effects])
         yield PageSection('From which size', (wide(rows, 'the least sizes'),))
-        labels = [f.label for f in self.found]
+        labels = [f.label for f in self.effects]
         words = 'how much of the signature of each effect another one imitates'
         shown = Matrix(words, self.matrix, labels, labels, most=1.0)
         note = '<p class=quiet>Each row an effect; dark: the effect of the column imitates it.</p>'
@@ -175,12 +175,12 @@ def isolable(
     variants: dict[str, list[Candidate]] = {}
     for candidate in screen.candidates:
         variants.setdefault(_label(candidate), []).append(candidate)
-    found, matrix = [], []
+    effects, matrix = [], []
     for label, shapes in variants.items():
-        one, shares = min((_one(screen, label, c, variants, accepts) for c in shapes), key=_easiest)
+        isolable_effect, shares = min((_isolable(screen, label, c, variants, accepts) for c in shapes), key=_easiest)
         if shapes[0].effect.finite:
-            one = _of_probes(screen, one, shapes, accepts(1))
-        found.append(one)
+            isolable_effect = _of_probes(screen, isolable_effect, shapes, accepts(1))
+        effects.append(isolable_effect)
         matrix.append(shares)
     hidden = {}
     for effect in effects_for(len(rig.psds)):
@@ -193,9 +193,9 @@ def isolable(
     return Isolability(
         loads=words,
         seconds=len(loads) / rig.converter.sample_rate_hz,
-        found=tuple(found),
+        effects=tuple(effects),
         hidden=hidden,
-        matrix=np.array(matrix).reshape(len(found), -1),
+        matrix=np.array(matrix).reshape(len(effects), -1),
         params_file=params_file,
     )
 
@@ -210,27 +210,29 @@ def _label(candidate: Candidate) -> str:
     return ActiveEffect(candidate.effect, candidate.start).label
 
 
-def _easiest(one: tuple[Isolable, list[float]]) -> float:
-    return math.inf if one[0].named is None else one[0].named
+def _easiest(candidate: tuple[Isolable, list[float]]) -> float:
+    return math.inf if candidate[0].named is None else candidate[0].named
 
 
-def _one(
+def _isolable(
     screen: Screen,
     label: str,
     candidate: Candidate,
     variants: Mapping[str, Sequence[Candidate]],
     accepts: Callable[[int], float],
 ) -> tuple[Isolable, list[float]]:
-    """One candidate, and the share of its signature that each of ``variants`` imitates at best."""
-    own = screen.slice_of(candidate).start
-    length = float(screen.fisher[own, own])
-    shares = [max(_imitated(screen, own, screen.slice_of(c)) for c in others) for others in variants.values()]
-    rivals = [
-        (share, name)
-        for (name, others), share in zip(variants.items(), shares, strict=True)
-        if others[0].effect is not candidate.effect and len(others[0].free) <= len(candidate.free)
+    """Return one candidate, and the share of its signature that each of ``variants`` imitates at best."""
+    column = screen.slice_of(candidate).start
+    length = float(screen.fisher[column, column])
+    shares = [
+        max(_imitated(screen, column, screen.slice_of(c)) for c in other_choices) for other_choices in variants.values()
     ]
-    share, alike = max(rivals, default=(0.0, ''))
+    alternatives = [
+        (share, name)
+        for (name, other_choices), share in zip(variants.items(), shares, strict=True)
+        if other_choices[0].effect is not candidate.effect and len(other_choices[0].free) <= len(candidate.free)
+    ]
+    share, alike = max(alternatives, default=(0.0, ''))
     apart = 1.0 - share if 1.0 - share > ALIKE else 0.0
     accepted = accepts(len(candidate.free))
     p = candidate.effect.parameter(candidate.free[0])
@@ -246,14 +248,16 @@ def _one(
     return out, shares
 
 
-def _imitated(screen: Screen, own: int, other: slice) -> float:
-    """The share, 0 to 1, of the squared length of a column that those of another candidate make up."""
-    gain = solve_seen(screen.fisher[other, other], screen.fisher[other, own], screen.lengths[other])[0]
-    return min(gain / float(screen.fisher[own, own]), 1.0)
+def _imitated(screen: Screen, column: int, imitating: slice) -> float:
+    """Return the share, 0 to 1, of the squared length of a column that those of another candidate make up."""
+    gain = solve_observable(
+        screen.fisher[imitating, imitating], screen.fisher[imitating, column], screen.lengths[imitating]
+    )[0]
+    return min(gain / float(screen.fisher[column, column]), 1.0)
 
 
 def _size(candidate: Candidate, length: float, wanted: float) -> float | None:
-    """The size with a chi-square of ``wanted``, if its probe has ``length``; None if it may not be so large."""
+    """Return the size with a chi-square of ``wanted``, if its probe has ``length``; None if it may not be so large."""
     p, off, times = candidate.effect.parameter(candidate.free[0]), candidate.off, math.sqrt(wanted / length)
     if not candidate.effect.finite:
         size, room = p.scale * times, max(p.maximum - off[p.name], off[p.name] - p.minimum)
@@ -264,16 +268,16 @@ def _size(candidate: Candidate, length: float, wanted: float) -> float | None:
     return candidate.start[p.name] if times <= 1.0 else None
 
 
-def _of_probes(screen: Screen, one: Isolable, probes: Sequence[Candidate], accepted: float) -> Isolable:
-    """``one`` with the weakest of several probes that still shows, if the effect does not grow in proportion."""
+def _of_probes(screen: Screen, effect: Isolable, probes: Sequence[Candidate], accepted: float) -> Isolable:
+    """``effect`` with the weakest of several probes that still shows, if the effect does not grow in proportion."""
     p = probes[0].effect.parameter(probes[0].free[0])
     if p.power:
-        return one
+        return effect
     lengths = {c: float(screen.lengths[screen.slice_of(c).start]) for c in probes}
 
     def weakest(wanted: float) -> float | None:
         enough = [c for c in probes if lengths[c] >= wanted]
         return min(enough, key=lambda c: lengths[c]).start[p.name] if enough else None
 
-    named = None if one.apart == 0.0 else weakest(max(accepted, TELLS_APART / one.apart))
-    return replace(one, seen=weakest(accepted), named=named)
+    named = None if effect.apart == 0.0 else weakest(max(accepted, TELLS_APART / effect.apart))
+    return replace(effect, seen=weakest(accepted), named=named)

@@ -23,8 +23,8 @@ SCRIPT, LISTED = 'next_loads.csv', 'next.yaml'
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Settled(StudyResult):
-    """``found``: the last answer. ``plans``: those that were carried out. ``open``: the one that was not, if rivals
+class LoopResult(StudyResult):
+    """``discovery``: the last answer. ``plans``: those that were carried out. ``open``: the one that was not, if rivals
     are left. ``outcome``: one explanation is left; no recording within the limits tells the rest apart; or no more
     recordings were allowed. None: it was only planned.
     """
@@ -32,7 +32,7 @@ class Settled(StudyResult):
     study, json_name = 'discover', 'result.json'
     title = Discovery.title
 
-    found: Discovery
+    discovery: Discovery
     plans: tuple[Plan, ...]
     open: Plan | None
     outcome: Outcome | None
@@ -40,7 +40,7 @@ class Settled(StudyResult):
     @property
     def sources(self) -> Mapping[str, str]:
         """Those of the answer."""
-        return self.found.sources
+        return self.discovery.sources
 
     @property
     def sentence(self) -> str:
@@ -61,19 +61,19 @@ class Settled(StudyResult):
 
     def sentences(self) -> list[str]:
         """Those of the answer, then the outcome."""
-        return [*self.found.sentences(), self.sentence]
+        return [*self.discovery.sentences(), self.sentence]
 
     def lines(self) -> list[str]:
         """Those of the answer, what was recorded, the outcome or the plan with its table."""
         made = [f'{recorded_name(i)}: {p.words}' for i, p in enumerate(self.plans, start=1)]
-        out = [*self.found.lines(), *made]
+        out = [*self.discovery.lines(), *made]
         if self.outcome is None and self.open is not None:
             return [*out, '', self.sentence, '', *self.open.table.split('\n')]
         return [*out, self.sentence]
 
     def tree(self) -> dict[str, Any]:
         """That of the answer, with the plan and what was recorded."""
-        out = {**self.found.tree(), 'next': None if self.open is None else self.open.tree()}
+        out = {**self.discovery.tree(), 'next': None if self.open is None else self.open.tree()}
         if self.outcome is not None:
             made = [{'file': recorded_name(i), **p.tree()} for i, p in enumerate(self.plans, start=1)]
             out['run'] = {'outcome': self.outcome, 'sentence': self.sentence, 'recordings': made}
@@ -81,19 +81,19 @@ class Settled(StudyResult):
 
     def table(self) -> Table:
         """That of the answer."""
-        return self.found.table()
+        return self.discovery.table()
 
     def sections(self) -> Iterable[PageSection]:
         """Those of the answer."""
-        return self.found.sections()
+        return self.discovery.sections()
 
-    def adopt(self, name: str) -> Settled:
+    def adopt(self, name: str) -> LoopResult:
         """See :meth:`Discovery.adopt`."""
-        return replace(self, found=self.found.adopt(name))
+        return replace(self, discovery=self.discovery.adopt(name))
 
     def files(self) -> dict[str, str]:
         """Those of the answer; the list for the next search, and the loads that are planned."""
-        out = {**self.found.files(), self.json_name: self.json()}
+        out = {**self.discovery.files(), self.json_name: self.json()}
         if self.outcome is not None:
             return {**out, LISTED: _listed([(recorded_name(i), p) for i, p in enumerate(self.plans, start=1)])}
         if self.open is not None and self.open.useful:
@@ -102,27 +102,27 @@ class Settled(StudyResult):
 
 
 def recorded_name(number: int) -> str:
-    """The file of a recording that was planned and made; ``number`` counts from 1."""
+    """Return the file of a recording that was planned and made; ``number`` counts from 1."""
     return f'next_{number}.csv'
 
 
 def _listed(made: Sequence[tuple[str, Plan]]) -> str:
-    """The list of recordings that were made or are to be made, with the parameters that differ in each."""
+    """Return the list of recordings that were made or are to be made, with the parameters that differ in each."""
     tree = [{'recording': name, 'overrides': dict(plan.setting.changes)} for name, plan in made]
     return yaml.safe_dump(tree, sort_keys=False)
 
 
-def next_of(found: Discovery, limits: Limits | None = None) -> Plan | None:
-    """The next recording after a search; None if it left no rivals."""
-    return plan_next(found.workspace, found.fit, found.rivals, limits)
+def next_of(discovery: Discovery, limits: Limits | None = None) -> Plan | None:
+    """Return the next recording after a search; None if it left no rivals."""
+    return plan_next(discovery.workspace, discovery.fit, discovery.alternative_fits, limits)
 
 
-def planned(found: Discovery, limits: Limits | None = None) -> Settled:
-    """The answer with the plan of the next recording, which nobody makes here."""
-    return Settled(found, (), next_of(found, limits), None)
+def planned(discovery: Discovery, limits: Limits | None = None) -> LoopResult:
+    """Return the answer with the plan of the next recording, which nobody makes here."""
+    return LoopResult(discovery, (), next_of(discovery, limits), None)
 
 
-def settle(
+def run_loop(
     recordings: Sequence[Observation],
     search: Callable[[Sequence[Observation]], Discovery],
     record: Callable[[Plan, int], Observation],
@@ -130,25 +130,25 @@ def settle(
     limits: Limits | None = None,
     most: int = 3,
     progress: Callable[[str], None] = lambda _: None,
-) -> Settled:
+) -> LoopResult:
     """``search`` ``recordings``, and ``record`` what is planned (its number counts from 1) until the answer is unique.
 
     ``most``: how many further recordings are made.
     """
     known, plans = list(recordings), list[Plan]()
     while True:
-        found = search(known)
+        discovery = search(known)
         progress('planning')
-        plan = next_of(found, limits)
+        plan = next_of(discovery, limits)
         # A rival with more parameters that came out as the named effect would be has nothing left that could be tested:
         # nothing within the limits needs its further ones.
-        needed = any(rival.parameters <= found.fit.parameters for rival in found.rivals)
-        if plan is None or not (plan.useful or (found.unsettled and needed)):
-            return Settled(found, tuple(plans), None, 'unique')
+        needed = any(rival.parameters <= discovery.fit.parameters for rival in discovery.alternative_fits)
+        if plan is None or not (plan.useful or (discovery.unsettled and needed)):
+            return LoopResult(discovery, tuple(plans), None, 'unique')
         if not plan.useful:
-            return Settled(found, tuple(plans), plan, 'limits')
+            return LoopResult(discovery, tuple(plans), plan, 'limits')
         if len(plans) == most:
-            return Settled(found, tuple(plans), plan, 'recordings')
+            return LoopResult(discovery, tuple(plans), plan, 'recordings')
         plans.append(plan)
         progress(f'recording {len(plans)}')
         known.append(record(plan, len(plans)))

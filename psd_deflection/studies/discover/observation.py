@@ -96,7 +96,7 @@ def check_same_psds(observations: Sequence[Observation], rig: Rig) -> None:
 
 
 def load_cases(loads: FloatArray, period: float) -> IntArray:
-    """The load case of each sample, int (n,), counted from 0.
+    """Return the load case of each sample, int (n,), counted from 0.
 
     A case begins if the load changes after at least ``QUIET`` seconds of rest. Each step with its
     ringing is one case; a sweep or ramp is one case. If there is only one case, it is cut into four

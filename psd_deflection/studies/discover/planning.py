@@ -25,10 +25,10 @@ from psd_deflection.studies.discover.experiment import (
     ModelSums,
     Piece,
     Setting,
+    expected_sums,
     limits_to_tree,
     nothing_of,
     proposals,
-    shown,
 )
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
@@ -64,13 +64,13 @@ class Suggestion:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Told:
-    """How a rival fares: ``rival`` in place of ``named``, labels of effects. ``separation``: chi-square by which it
+class Discrimination:
+    """One alternative model: ``alternative`` for ``named``, labels of effects. ``separation``: chi-square by which it
     would lose in the planned recording if the named effect is true; ``reverse``: by which the named one would lose if
-    the rival is true; ``possible``: the greatest of both in any recording within the limits.
+    the alternative is true; ``possible``: the greatest of both in any recording within the limits.
     """
 
-    rival: str
+    alternative: str
     named: str
     separation: float
     reverse: float
@@ -84,11 +84,14 @@ class Told:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """The next recording: ``pieces`` one after the other in ``setting``, at ``rate`` Hz. ``told``: one per rival."""
+    """The next recording: ``pieces`` one after the other in ``setting``, at ``rate`` Hz.
+
+    ``discriminations``: one per alternative model.
+    """
 
     setting: Setting
     pieces: tuple[Piece, ...]
-    told: tuple[Told, ...]
+    discriminations: tuple[Discrimination, ...]
     limits: Limits
     rate: float
 
@@ -110,7 +113,7 @@ class Plan:
     @property
     def useful(self) -> bool:
         """Whether any recording within the limits tells a rival from the named model."""
-        return any(t.separable for t in self.told)
+        return any(t.separable for t in self.discriminations)
 
     @property
     def words(self) -> str:
@@ -122,17 +125,17 @@ class Plan:
     @property
     def sentence(self) -> str:
         """The plan in one sentence."""
-        rivals = ', '.join(dict.fromkeys(t.rival for t in self.told))
+        alternatives = ', '.join(dict.fromkeys(t.alternative for t in self.discriminations))
         if not self.useful:
-            return f'No recording within the limits would tell {self.told[0].named} from {rivals}.'
-        apart = [t for t in self.told if t.separable]
+            return f'No recording within the limits would tell {self.discriminations[0].named} from {alternatives}.'
+        apart = [t for t in self.discriminations if t.separable]
         least = min(max(t.separation, t.reverse) for t in apart)
-        others = ', '.join(dict.fromkeys(t.rival for t in apart))
+        others = ', '.join(dict.fromkeys(t.alternative for t in apart))
         out = (
             f'Record next, {self.seconds:.0f} s: {self.words}. It tells {apart[0].named} from {others} '
             f'(chi-square {least:.0f} at least, {TELLS_APART:g} needed)'
         )
-        lasting = [t.rival for t in self.told if not t.separable]
+        lasting = [t.alternative for t in self.discriminations if not t.separable]
         return f'{out}; nothing within the limits tells {", ".join(lasting)} apart.' if lasting else f'{out}.'
 
     @property
@@ -143,12 +146,13 @@ class Plan:
             kind, loads, *rest = script.split(':')
             words = 'hold' if kind != 'chirp' else f'sweep {rest[0].replace(",", " to ")} Hz, up to'
             rows += [(words, *load.split(','), rest[-1]) for load in loads.split(';')]
-        rivals = [('instead of', 'rival', 'expected chi-square', 'if the rival is true', 'at most')]
-        rivals += [
-            (t.named, t.rival, f'{t.separation:.0f}', f'{t.reverse:.0f}', f'{t.possible:.0f}') for t in self.told
+        rows_of_alternatives = [('instead of', 'rival', 'expected chi-square', 'if the rival is true', 'at most')]
+        rows_of_alternatives += [
+            (t.named, t.alternative, f'{t.separation:.0f}', f'{t.reverse:.0f}', f'{t.possible:.0f}')
+            for t in self.discriminations
         ]
         held = f'{columns(rows)}\n\n' if self.useful else ''
-        return held + columns(rivals, left=2)
+        return held + columns(rows_of_alternatives, left=2)
 
     @property
     def loads_csv(self) -> str:
@@ -160,7 +164,7 @@ class Plan:
         return '\n'.join(lines) + '\n'
 
     def tree(self) -> dict[str, Any]:
-        """The plan as result.json has it."""
+        """Return the plan as result.json has it."""
         return {
             'sentence': self.sentence,
             'useful': self.useful,
@@ -171,25 +175,27 @@ class Plan:
             'overrides': dict(self.setting.changes),
             'rivals': [
                 {
-                    'name': t.rival,
+                    'name': t.alternative,
                     'instead_of': t.named,
                     'separation': t.separation,
                     'reverse': t.reverse,
                     'possible': t.possible,
                     'separable': t.separable,
                 }
-                for t in self.told
+                for t in self.discriminations
             ],
             'limits': limits_to_tree(self.limits),
         }
 
 
-def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: Limits | None = None) -> Plan | None:
-    """The recording within ``limits`` that best tells ``named`` from ``rivals``; None without rivals."""
-    if not rivals:
+def plan_next(
+    workspace: Workspace, named: Fit, alternatives: Sequence[Fit], limits: Limits | None = None
+) -> Plan | None:
+    """Return the recording within ``limits`` that best tells ``named`` from ``alternatives``; None without rivals."""
+    if not alternatives:
         return None
     limits = limits or Limits()
-    models = [named, *rivals]
+    models = [named, *alternatives]
     known = [m.jacobian.T @ m.jacobian for m in models]
     # One of the rivals may be true: then it is to be told from the other rivals too.
     pairs = list(itertools.permutations(range(len(models)), 2))
@@ -203,41 +209,55 @@ def plan_next(workspace: Workspace, named: Fit, rivals: Sequence[Fit], limits: L
     for _, group in itertools.groupby(proposals(rig, limits), key=lambda p: id(p.setting)):
         offered = list(group)
         setting = offered[0].setting
-        seen = [(p.piece, shown(workspace, models, setting, p.piece.loads(rate_of(rig, setting)))) for p in offered]
-        for _, s in seen:
+        expected = [
+            (p.piece, expected_sums(workspace, models, setting, p.piece.loads(rate_of(rig, setting)))) for p in offered
+        ]
+        for _, s in expected:
             # The same for as long as a recording may be.
             possible = np.maximum(possible, separations(s * max(limits.seconds // s.seconds, 1.0)))
-        value, chosen = _together(seen, nothing_of(models), separations, limits.seconds)
+        value, chosen = best_combination(expected, nothing_of(models), separations, limits.seconds)
         if chosen and value - setting.effort > best[0]:
             best = (value - setting.effort, setting, chosen)
     _, setting, chosen = best
     plan = Plan(setting, tuple(chosen), (), limits, rate_of(rig, setting))
-    final = separations(shown(workspace, models, setting, plan.loads))
+    final = separations(expected_sums(workspace, models, setting, plan.loads))
     possible = np.maximum(possible, final)
-    told = []
-    for k, rival in enumerate(rivals, start=1):
+    discriminations = []
+    for k, alternative in enumerate(alternatives, start=1):
         there, back = pairs.index((0, k)), pairs.index((k, 0))
         most = float(max(possible[there], possible[back]))
-        told.append(
-            Told(rival.effects[-1].label, _replaced(named, rival), float(final[there]), float(final[back]), most)
+        discriminations.append(
+            Discrimination(
+                alternative.effects[-1].label,
+                _replaced(named, alternative),
+                float(final[there]),
+                float(final[back]),
+                most,
+            )
         )
-    return dataclasses.replace(plan, told=tuple(told))
+    return dataclasses.replace(plan, discriminations=tuple(discriminations))
 
 
-def suggest(workspace: Workspace, named: Fit, others: Sequence[Fit], limits: Limits | None = None) -> Suggestion | None:
-    """The experiment that best separates ``named`` from the worst of ``others``, added to the existing recordings."""
-    plan = plan_next(workspace, named, others, limits)
-    return None if plan is None else Suggestion(plan.words, min(max(t.separation, t.reverse) for t in plan.told))
+def suggest(
+    workspace: Workspace, named: Fit, alternatives: Sequence[Fit], limits: Limits | None = None
+) -> Suggestion | None:
+    """Return the next experiment that best separates ``named`` from the closest of ``alternatives``."""
+    plan = plan_next(workspace, named, alternatives, limits)
+    return (
+        None
+        if plan is None
+        else Suggestion(plan.words, min(max(t.separation, t.reverse) for t in plan.discriminations))
+    )
 
 
 def rate_of(rig: Rig, setting: Setting) -> float:
-    """The sample rate in ``setting``, Hz."""
+    """Return the sample rate in ``setting``, Hz."""
     changed = replace_values(rig, setting.changes) if setting.changes else rig
     return changed.converter.sample_rate_hz
 
 
-def _together(
-    seen: Sequence[tuple[Piece, ModelSums]],
+def best_combination(
+    expected: Sequence[tuple[Piece, ModelSums]],
     total: ModelSums,
     separations: Callable[[ModelSums], FloatArray],
     seconds: float,
@@ -247,7 +267,7 @@ def _together(
     value = 0.0
     while True:
         trials: list[tuple[float, int, Piece, ModelSums]] = []
-        for piece, s in seen:
+        for piece, s in expected:
             more = total + s
             if more.seconds <= seconds + 1e-6:
                 worth = float(np.mean(np.minimum(separations(more) / SURE, 1.0)))
@@ -262,7 +282,7 @@ def _together(
         chosen.append(piece)
 
 
-def _replaced(named: Fit, rival: Fit) -> str:
-    """The label of the effect of ``named`` that ``rival`` does without."""
-    kept = {(a.effect.name, a.choices) for a in rival.effects[:-1]}
-    return ', '.join(a.label for a in named.effects if (a.effect.name, a.choices) not in kept)
+def _replaced(named: Fit, alternative: Fit) -> str:
+    """Return the label of the effect of ``named`` that ``alternative`` does without."""
+    common = {(a.effect.name, a.choices) for a in alternative.effects[:-1]}
+    return ', '.join(a.label for a in named.effects if (a.effect.name, a.choices) not in common)

@@ -24,7 +24,7 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.studies.discover.conclusion import Conclusion
-from psd_deflection.studies.discover.plants import Model, Plant, check_plant, measured_by, table_of
+from psd_deflection.studies.discover.plants import Model, Plant, check_plant, measured_tables, table_of
 from psd_deflection.studies.discover.problem import Machine, Progress
 from psd_deflection.studies.discover.report import sections
 from psd_deflection.studies.discover.search.comparison import Comparison, SimulationCount
@@ -79,7 +79,7 @@ class PlantComparison(Comparison):
         self.tally = SimulationCount()
         self.base = ()
         self.nuisance = tuple(ActiveEffect(e, e.off_values(plant.physics, next(e.variants()))) for e in plant.nuisance)
-        self.measured = measured_by(plant)
+        self.measured = measured_tables(plant)
         check_plant(plant)
         exact = _exact(plant, self.measured, self.nuisance)
         # Readings that are the simulation's to the last digit are no measurement: nothing can be held against them.
@@ -145,7 +145,7 @@ class PlantComparison(Comparison):
         return out
 
     def whiten(self, tables: Sequence[FloatArray]) -> FloatArray:
-        """One vector; the squares of a residual add up to the number of independent values."""
+        """Return one vector; the squares of a residual add up to the number of independent values."""
         scale = self.scale[:, None]
         parts = [np.where(t, x / scale, 0.0).ravel() for x, t in zip(tables, self.there, strict=True)]
         return np.concatenate(parts)
@@ -173,7 +173,7 @@ class PlantComparison(Comparison):
         return self.replaced(level=level, independent=independent, correlated=self._alike(independent))
 
     def _alike(self, independent: FloatArray) -> bool:
-        """Whether what remains is alike from one value to the next, and no noise is stated."""
+        """Return whether what remains is alike from one value to the next, and no noise is stated."""
         return not self.plant.noise and float(independent.sum()) < ALIKE * float(self.total.sum())
 
     def _independent(self, difference: Sequence[FloatArray], channel: int) -> float:
@@ -182,16 +182,16 @@ class PlantComparison(Comparison):
             return max(float(self.total[channel]), 1.0)
         count = 0.0
         for d, there in zip(difference, self.there, strict=True):
-            seen = there[channel]
-            if not seen.any():
+            valid = there[channel]
+            if not valid.any():
                 continue
-            x = np.where(seen, d[channel] - d[channel][seen].mean(), 0.0)
+            x = np.where(valid, d[channel] - d[channel][valid].mean(), 0.0)
             n = len(x)
-            found = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2, 2 * n)[:n]
-            correlation = found / max(float(found[0]), 1e-300)
+            autocorrelation = np.fft.irfft(np.abs(np.fft.rfft(x, 2 * n)) ** 2, 2 * n)[:n]
+            correlation = autocorrelation / max(float(autocorrelation[0]), 1e-300)
             negative = np.flatnonzero(correlation < 0.0)
             stop = int(negative[0]) if len(negative) else n
-            count += float(seen.sum()) / (1.0 + 2.0 * float(correlation[1:stop].sum()))
+            count += float(valid.sum()) / (1.0 + 2.0 * float(correlation[1:stop].sum()))
         return max(count, 2.0)
 
     def sd(self, jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -200,16 +200,16 @@ class PlantComparison(Comparison):
         The degrees of freedom of a parameter that several channels tell of are those of Welch (1947).
         """
         rows = np.concatenate([np.repeat(np.arange(len(m)), m.shape[1]) for m in self.measured])
-        told = jacobian @ covariance
-        fitted = np.bincount(rows, (told * jacobian).sum(axis=1), len(self.channels))
-        left = np.maximum(self.independent - fitted, 1.0)
+        propagated = jacobian @ covariance
+        fitted = np.bincount(rows, (propagated * jacobian).sum(axis=1), len(self.channels))
+        freedom = np.maximum(self.independent - fitted, 1.0)
         by_channel = np.zeros((len(self.channels), len(covariance)))
-        np.add.at(by_channel, rows, told**2)
+        np.add.at(by_channel, rows, propagated**2)
         open_level = self.level > self.known
-        by_channel *= np.where(open_level, self.independent / left, 1.0)[:, None]
+        by_channel *= np.where(open_level, self.independent / freedom, 1.0)[:, None]
         variance = by_channel.sum(axis=0)
         share = by_channel / np.maximum(variance, 1e-300)
-        unsure = (share**2 * np.where(open_level, 1.0 / left, 0.0)[:, None]).sum(axis=0)
+        unsure = (share**2 * np.where(open_level, 1.0 / freedom, 0.0)[:, None]).sum(axis=0)
         return np.asarray(np.sqrt(variance) * stdtrit(1.0 / np.maximum(unsure, 1e-9), 0.975) / ndtri(0.975))
 
     def effective_size(self) -> float:
@@ -244,7 +244,7 @@ class PlantComparison(Comparison):
         return np.asarray((gained * count * (self.independent / np.maximum(self.total, 1))[:, None]).sum(axis=0))
 
     def unwhitened(self, white: FloatArray) -> list[FloatArray]:
-        """A vector in the units of the channels."""
+        """Return a vector in the units of the channels."""
         return [part * self.scale[:, None] for part in self.split(white)]
 
     def folds(self) -> IntArray:
@@ -268,7 +268,7 @@ class PlantComparison(Comparison):
         return self._joined(self.gap_per_channel(residual))
 
     def floor(self) -> float:
-        """The gap from the plant's noise; NaN if that is not known."""
+        """Return the gap from the plant's noise; NaN if that is not known."""
         return self._joined(self.known) if self.plant.noise else float('nan')
 
     @property
@@ -277,16 +277,16 @@ class PlantComparison(Comparison):
         return 'share of the gap before' if self.shares else self.plant.units[0]
 
     @property
-    def scale_shown(self) -> tuple[float, str]:
+    def display_scale(self) -> tuple[float, str]:
         """The unit of the channels if they have one, else shares."""
         return (100.0, '% of the gap before') if self.shares else (1.0, self.plant.units[0])
 
     @property
-    def units_shown(self) -> tuple[str, ...]:
+    def display_units(self) -> tuple[str, ...]:
         """Those of the channels."""
         return self.plant.units
 
-    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+    def displayed(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
         """As they are."""
         return [np.where(t, x, np.nan) for x, t in zip(tables, self.there, strict=True)]
 
@@ -298,7 +298,7 @@ class PlantComparison(Comparison):
         return TimeAxis('(cases one after another)', ()) if period > 0.0 else 'number of the reading', along
 
     def against(self) -> dict[str, list[FloatArray]]:
-        """The inputs, and what was measured."""
+        """Return the inputs, and what was measured."""
         out = {name: [np.asarray(v) for v in values] for name, values in self.plant.inputs().items()}
         for c, (channel, unit) in enumerate(zip(self.channels, self.plant.units, strict=True)):
             out[f'{channel} / {unit}' if unit else channel] = [m[c] for m in self.measured]
@@ -313,8 +313,8 @@ class PlantComparison(Comparison):
 
     def begun(self, null: Fit) -> Self:
         """With what the fit without any effect leaves as the gap before."""
-        whole = np.maximum(self.gap_per_channel(null.difference), 1e-300)
-        return self.replaced(whole=whole).renoised([*self.base, *null.whole])
+        gap_before = np.maximum(self.gap_per_channel(null.difference), 1e-300)
+        return self.replaced(whole=gap_before).renoised([*self.base, *null.coefficients_with_nuisance])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -326,11 +326,11 @@ class PlantDiscovery(Conclusion):
     workspace: PlantComparison
 
     def sections(self) -> Iterable[PageSection]:
-        """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
+        """Return the gap step by step, what is missing, what is unknown, before and after, how it was found."""
         return sections(self)
 
     def files(self) -> dict[str, str]:
-        """The page, the JSON, and what the plant itself writes of the effects."""
+        """Return the page, the JSON, and what the plant itself writes of the effects."""
         return {**self.workspace.plant.files([e.active for e in self.effects]), **super().files()}
 
     @property
@@ -360,16 +360,16 @@ def regressors(ws: PlantComparison, fit: Fit) -> Table:
         shared.update(_powers(name, [np.asarray(v, dtype=np.float64) for v in values]))
     out = []
     for c, channel in enumerate(ws.channels):
-        own = [np.nan_to_num(s[c]) for s in simulated]
-        named = {**shared, **_powers(channel, own), f'|{channel}|': [np.abs(x) for x in own]}
-        if ws.plant.period > 0.0 and min(len(x) for x in own) > 1:
-            rate = [np.gradient(x) for x in own]
+        simulated_values = [np.nan_to_num(s[c]) for s in simulated]
+        named = {**shared, **_powers(channel, simulated_values), f'|{channel}|': [np.abs(x) for x in simulated_values]}
+        if ws.plant.period > 0.0 and min(len(x) for x in simulated_values) > 1:
+            rate = [np.gradient(x) for x in simulated_values]
             named.update({f'rate of {channel}': rate, f'sign of rate of {channel}': [np.sign(r) for r in rate]})
         out.append((channel, named))
     return out
 
 
-def _where(ws: PlantComparison, fit: Fit, known: FloatArray | None) -> Localisation:
+def localise_cases(ws: PlantComparison, fit: Fit, known: FloatArray | None) -> Localisation:
     """What ``fit`` leaves by case and channel, and what it follows. Only what it follows makes it an unknown effect: a
     case may be worse than others because it moves more.
     """
@@ -419,14 +419,14 @@ class SimulatedPlant(Machine):
         return self.start
 
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
-        """The plant's library, always beside what the model has already: a rough machine is far from linear."""
+        """Return the plant's library, always beside what the model has already: a rough machine is far from linear."""
         beside = refit(comparison, (), nuisance=self.nuisance) if fit is None else fit
         listed = candidates(self.plant.library, self.plant.physics, {})
         return Screen(comparison, signatures_beside(comparison, listed, beside))
 
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
         """By case and channel, and what it follows."""
-        return _where(_of_plant(comparison), fit, fit.jacobian if fit.free else None)
+        return localise_cases(_of_plant(comparison), fit, fit.jacobian if fit.free else None)
 
     def regressors(self, comparison: Comparison, fit: Fit) -> Table:
         """Time, the plant's inputs, and the channel's own reading and rate."""

@@ -29,7 +29,7 @@ def plant_effect(
     source: str = '',
     finite: bool = False,
 ) -> Effect:
-    """An effect of a plant, which its ``simulate`` finds in the model under ``name``.
+    """Return an effect of a plant, which its ``simulate`` finds in the model under ``name``.
 
     Each parameter's ``nominal`` is the value at which the effect is off, ``scale`` roughly its prior standard
     deviation. ``finite``: a small change at the nominal value shows nothing (a limit that is not reached), so exactly
@@ -38,10 +38,12 @@ def plant_effect(
     for p in parameters:
         if p.of_rig or p.within is not None or p.propose:
             raise ConfigError(f'{name}: {p.name}: of_rig, within and propose are for effects of the PSD rig; leave out')
-    return Effect(name, 'link', summary, equation, source, '', tuple(parameters), 'configure', _by_plant, finite=finite)
+    return Effect(
+        name, 'link', summary, equation, source, '', tuple(parameters), 'configure', _per_plant, finite=finite
+    )
 
 
-def _by_plant(physics: Physics, values: Values) -> None:
+def _per_plant(physics: Physics, values: Values) -> None:
     raise TypeError('an effect of a plant is simulated by its plant')
 
 
@@ -72,7 +74,7 @@ class Plant(ABC):
 
     @abstractmethod
     def simulate(self, model: Model) -> Sequence[FloatArray]:
-        """The same with the effects of ``model`` on, without noise."""
+        """Return the same with the effects of ``model`` on, without noise."""
 
     def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
         """What was done to the machine, by name: of each case (n,). What remains is held against it."""
@@ -110,8 +112,8 @@ def table_of(rows: object, source: str) -> FloatArray:
     return table
 
 
-def measured_by(plant: Plant) -> list[FloatArray]:
-    """The tables of ``plant``. Raises ConfigError if they do not fit its channels and cases."""
+def measured_tables(plant: Plant) -> list[FloatArray]:
+    """Return the tables of ``plant``. Raises ConfigError if they do not fit its channels and cases."""
     tables = plant.measured()
     if len(tables) != len(plant.cases):
         raise ConfigError(f'measured: {len(tables)} tables for {len(plant.cases)} cases')

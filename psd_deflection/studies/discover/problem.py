@@ -41,7 +41,7 @@ class Machine(ABC):
 
     @abstractmethod
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
-        """The signatures of all that may be missing, beside ``fit``."""
+        """Return the signatures of all that may be missing, beside ``fit``."""
 
     @abstractmethod
     def look(self, comparison: Comparison, fit: Fit, null: Fit | None, rng: np.random.Generator) -> Localisation:
@@ -59,12 +59,12 @@ class Machine(ABC):
         """``comparison`` without what the readings show by themselves, before any search."""
         return comparison
 
-    def seen(self, comparison: Comparison) -> float:
+    def chi_square_explained(self, comparison: Comparison) -> float:
         """Chi-square that this explains."""
         return 0.0
 
     def suggest(self, comparison: Comparison, fit: Fit, equal: Sequence[Fit]) -> Suggestion | None:
-        """The experiment that tells ``fit`` from others that are as good."""
+        """Return the experiment that tells ``fit`` from others that are as good."""
         return None
 
 
@@ -72,12 +72,12 @@ class Machine(ABC):
 class Problem:
     """``search``: what is compared, and the signatures. ``result``: the model that the search chose. ``fit``: the model
     so far; ``heldout``: the gain of each of its effects on unseen load cases. ``null``: the model as described, against
-    which gaps count. ``before``, ``left``: where ``null`` and ``fit`` leave structure. ``named``: the effects of
+    which gaps count. ``before``, ``residual``: where ``null`` and ``fit`` leave structure. ``named``: the effects of
     ``fit`` that are told. ``remainder``: what is unknown as a function of named variables.
     ``predictive``: the model that predicts best, None if none was looked for.
     ``setup``: what is wrong with the set-up, with ``values`` that put the rig file right.
-    ``rivals``: whole models in place of ``fit``; ``unsettled``: names of what explains as much. ``law``: for what is
-    unknown. ``stated_gap``: before the wiring was put right, 0 if that was right. ``rng``: draws of the steps.
+    ``alternative_fits``: complete models in place of ``fit``; ``unsettled``: names of what fits as well. ``law``: of
+    what is unknown. ``stated_gap``: before the wiring was put right, 0 if that was right. ``rng``: draws of the steps.
     """
 
     machine: Machine
@@ -90,14 +90,14 @@ class Problem:
     progress: Progress
     heldout: tuple[HeldOut, ...] = ()
     before: Localisation = NOWHERE
-    left: Localisation = NOWHERE
+    residual: Localisation = NOWHERE
     named: tuple[NamedEffect, ...] = ()
     unknown: tuple[Unknown, ...] = ()
     remainder: Remainder | None = None
     predictive: Predictive | None = None
     setup: tuple[Finding, ...] = ()
     values: Mapping[str, object] = field(default_factory=dict)
-    rivals: tuple[Fit, ...] = ()
+    alternative_fits: tuple[Fit, ...] = ()
     unsettled: tuple[str, ...] = ()
     law: FoundLaw | None = None
     stated_gap: float = 0.0

@@ -96,10 +96,11 @@ class ReadingsPlant(Plant):
         if len(kinds) > 1:
             words = ' and '.join(','.join(CHANNELS[k]) for k in sorted(kinds))
             raise RecordingError(f'{", ".join(t.name for t in tables)}: one has {words}: search them one by one')
-        other = next((t for t in tables if t.psds != tables[0].psds), None)
-        if other is not None:
+        different = next((t for t in tables if t.psds != tables[0].psds), None)
+        if different is not None:
             raise RecordingError(
-                f'{other.name}: is of {other.psds} PSDs, {tables[0].name} of {tables[0].psds}: search them one by one'
+                f'{different.name}: is of {different.psds} PSDs, {tables[0].name} of {tables[0].psds}: '
+                'search them one by one'
             )
         self.tables = tuple(tables)
         self._params_file, self._tell = params_file, tell
@@ -116,15 +117,15 @@ class ReadingsPlant(Plant):
         self.library = tuple(
             e
             for effect in effects_for(tables[0].psds)
-            if effect.name not in without and not effect.lattice and (e := self._shown(effect)) is not None
+            if effect.name not in without and not effect.lattice and (e := self._observable(effect)) is not None
         )
 
     def measured(self) -> Sequence[FloatArray]:
-        """The readings, µm and µrad."""
+        """Return the readings, µm and µrad."""
         return [MICRO * t.values.T for t in self.tables]
 
     def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
-        """The loads, and the temperature where every table has it."""
+        """Return the loads, and the temperature where every table has it."""
         names = ('load_fx / N', 'load_fy / N', 'load_tz / N m')
         out = {name: [t.loads[:, i] for t in self.tables] for i, name in enumerate(names)}
         warm = [t.temperature for t in self.tables if t.temperature is not None]
@@ -150,12 +151,12 @@ class ReadingsPlant(Plant):
         return out
 
     def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
-        """The rig file with the effects."""
+        """Return the rig file with the effects."""
         rig = self.tables[0].rig
         return {'model.yaml': model_yaml(self._params_file, rig, [*self.known, *effects], {}, self._tell)}
 
     def _rows(self, table: Readings, effects: Sequence[ActiveEffect], order: IntArray) -> FloatArray:
-        """The readings (channels, n) of the rows, which are simulated in ``order``."""
+        """Return the readings (channels, n) of the rows, which are simulated in ``order``."""
         rig, warm = table.rig, table.temperature
         model = ForwardModel(rig, sort_effects([*self.known, *effects]), settled=True)
         samples = model.expect(table.loads[order], None if warm is None else warm[order])
@@ -168,7 +169,7 @@ class ReadingsPlant(Plant):
         pose = solver_from_rig(rig.estimator.solver, rig).solve_many(dots.T, dot_noise_variances(rig)).pose
         return np.asarray(MICRO * pose.T[:, back])
 
-    def _shown(self, effect: Effect) -> Effect | None:
+    def _observable(self, effect: Effect) -> Effect | None:
         """``effect`` without the choices that make no difference here; None if a table cannot show it."""
         table = self.tables[0]
         forward = np.arange(len(table.loads))
@@ -177,18 +178,18 @@ class ReadingsPlant(Plant):
         by_choice: dict[tuple[float, ...], list[FloatArray]] = {}
         choices = [p for p in effect.parameters if p.kind == 'choice' and not p.each]
         for choice in effect.variants(table.psds):
-            active = ActiveEffect(effect, _dosed(effect, effect.off_values(self.physics, choice)))
+            active = ActiveEffect(effect, with_first_dose(effect, effect.off_values(self.physics, choice)))
             rows = self._rows(table, [active], forward)
             if not np.allclose(rows, self._rows(table, [active], backward), rtol=1e-9, atol=1e-6):
                 return None
             by_choice.setdefault(tuple(choice[p.name] for p in choices), []).append(rows)
-        first, *others = by_choice.values()
-        if choices and all(np.array_equal(a, b) for other in others for a, b in zip(first, other, strict=True)):
-            return dataclasses.replace(effect, parameters=tuple(map(_settled_choice, effect.parameters)))
+        first, *other_choices = by_choice.values()
+        if choices and all(np.array_equal(a, b) for other in other_choices for a, b in zip(first, other, strict=True)):
+            return dataclasses.replace(effect, parameters=tuple(map(fixed_choice, effect.parameters)))
         return effect
 
 
-def _dosed(effect: Effect, off: Mapping[str, float]) -> dict[str, float]:
+def with_first_dose(effect: Effect, off: Mapping[str, float]) -> dict[str, float]:
     """``effect`` with a small size and the first shape that its declaration names."""
     out = dict(off)
     for p in effect.parameters:
@@ -200,7 +201,8 @@ def _dosed(effect: Effect, off: Mapping[str, float]) -> dict[str, float]:
     return out
 
 
-def _settled_choice(p: EffectParameter) -> EffectParameter:
+def fixed_choice(p: EffectParameter) -> EffectParameter:
+    """Return a choice with one value, for one that makes no difference at rest; anything else as it is."""
     if p.kind != 'choice' or p.each:
         return p
     return dataclasses.replace(p, choices=(int(p.nominal) if p.nominal in p.choices else p.choices[0],))

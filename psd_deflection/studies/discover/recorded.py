@@ -32,9 +32,9 @@ from psd_deflection.studies.discover.setup.hidden import beginning
 from psd_deflection.studies.discover.setup.hung import directions, in_time, levels, of_plateau, swayed, times
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
-from psd_deflection.studies.loads.noted_times import MendedLoads
-from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_hung, noted_wrong
-from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swung
+from psd_deflection.studies.loads.noted_times import CorrectedLoads
+from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_applied, wrong_notes_against
+from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swung
 from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
 
 MUCH = 10.0
@@ -51,7 +51,7 @@ class Recorded:
     for. ``findings``: what was wrong, with ``values`` that put the rig file right. ``stated_gap``: m, before loads and
     wiring were put right, 0 if they were right. ``lattice``: the effect of coarse steps that the readings show;
     ``lattice_stated``: the rig file has it.
-    ``delays``: by how much the loads may be noted late, s. ``mended``: of each recording, its loads as they were put
+    ``delays``: by how much the loads may be noted late, s. ``corrected``: of each recording, its loads as they were put
     right, if they were. ``wrong``: where another load hung than noted; it is free.
     ``fourth``: what the readings say of themselves.
     """
@@ -66,7 +66,7 @@ class Recorded:
     lattice: ActiveEffect | None = None
     lattice_stated: bool = False
     delays: tuple[float, ...] = ()
-    mended: tuple[MendedLoads | None, ...] = ()
+    corrected: tuple[CorrectedLoads | None, ...] = ()
     wrong: tuple[Plateau, ...] = ()
     fourth: FourthReading | None = None
 
@@ -83,26 +83,26 @@ class Recorded:
     @property
     def mistaken(self) -> bool:
         """Whether anything was noted or wired otherwise than it was."""
-        return bool(self.findings) or any(m is not None and m.notes for m in self.mended)
+        return bool(self.findings) or any(m is not None and m.notes for m in self.corrected)
 
-    def late_loads(self, workspace: Workspace) -> list[Finding]:
+    def delayed_loads(self, workspace: Workspace) -> list[Finding]:
         """Loads that acted at another time than noted; ``workspace``: where their times were fitted."""
         sizes = {id(d.of): d.sizes for d in workspace.directions if isinstance(d, LoadDirection) and d.exact}
         out = []
-        for o, mended in zip(workspace.observations, self.mended, strict=True):
-            for note in mended.notes if mended is not None else ():
+        for o, corrected in zip(workspace.observations, self.corrected, strict=True):
+            for note in corrected.notes if corrected is not None else ():
                 out.append(note_finding(note.moved(sizes.get(id(note), ()), o.period), o.name))
         return out
 
 
 def cleaned(recorded: Recorded) -> Recorded:
     """Without outliers, stuck channels and times without a known load."""
-    found = [clean(o, recorded.known) for o in recorded.observations]
+    results = [clean(o, recorded.known) for o in recorded.observations]
     rates = {o.rig.converter.sample_rate_hz for o in recorded.observations if o.stated_rate_hz}
     return replace(
         recorded,
-        observations=tuple(o for o, _ in found),
-        findings=tuple(f for _, own in found for f in own),
+        observations=tuple(o for o, _ in results),
+        findings=tuple(f for _, findings in results for f in findings),
         values={'converter.sample_rate_hz': rates.pop()} if len(rates) == 1 else {},
     )
 
@@ -112,7 +112,7 @@ def put_right(recorded: Recorded) -> Recorded:
     timed = [time_loads(o) for o in recorded.observations]
     observations, wrong, lines = wire([o for o, _ in timed], recorded.known)
     gap = 0.0
-    if wrong or any(mended is not None and mended.notes for _, mended in timed):
+    if wrong or any(corrected is not None and corrected.notes for _, corrected in timed):
         stated = Workspace(recorded.observations, recorded.known)
         gap = stated.gap(stated.residual(recorded.known)[1])
     values = {**recorded.values, **lines}
@@ -123,7 +123,7 @@ def put_right(recorded: Recorded) -> Recorded:
         findings=(*recorded.findings, *wrong),
         values=values,
         stated_gap=gap,
-        mended=tuple(mended for _, mended in timed),
+        corrected=tuple(corrected for _, corrected in timed),
     )
 
 
@@ -167,7 +167,7 @@ STEPS: Sequence[Callable[[Recorded], Recorded]] = (cleaned, put_right, snapped)
 
 
 def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
-    """The recordings against the simulation of the rig as it is described, from how each of them began.
+    """Return the recordings against the simulation of the rig as it is described, from how each of them began.
 
     Where loads may be noted late, without the last moments, whose loads are noted after the end.
     """
@@ -178,7 +178,7 @@ def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
         recorded = replace(recorded, observations=cut)
         workspace = Workspace(cut, recorded.known)
     recorded = replace(recorded, delays=tuple(delays))
-    recorded, workspace = _as_hung(recorded, workspace)
+    recorded, workspace = _corrected(recorded, workspace)
     residual, difference = workspace.residual(workspace.base)
     if workspace.gap(difference) > MUCH * workspace.floor():
         # Poses that are far off bend what no movement makes.
@@ -187,21 +187,34 @@ def compared(recorded: Recorded) -> tuple[Recorded, Workspace]:
     return recorded, workspace.replaced(nuisance=_beginnings(workspace))
 
 
-def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Workspace]:
+def _corrected(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Workspace]:
     """Without the time in which a weight swayed, or in which many loads were not noted; the few loads that were noted
     wrong, and fitted times, are free.
     """
     _, difference = workspace.residual(workspace.base)
     gap = workspace.gap(difference)
     if gap <= MUCH * min(workspace.floor(), _stated_floor(workspace)):
-        return recorded, freed(recorded, workspace)
-    noted = [_not_as_noted(workspace, i, part) for i, part in enumerate(difference)]
-    if not any(noted):
-        return recorded, freed(recorded, workspace)
-    observations = [_mended(o, own) for o, own in zip(workspace.observations, noted, strict=True)]
-    both = zip(noted, workspace.observations, strict=True)
-    free = [n.plateau for own in noted for n in own if isinstance(n, WrongNote) and not n.exact]
-    findings = [note_finding(n, o.name) for own, o in both for n in own if not isinstance(n, WrongNote) or n.exact]
+        return recorded, with_free(recorded, workspace)
+    notes = [_wrong_notes(workspace, i, part) for i, part in enumerate(difference)]
+    if not any(notes):
+        return recorded, with_free(recorded, workspace)
+    observations = [
+        _with_effective_loads(o, notes_of_recording)
+        for o, notes_of_recording in zip(workspace.observations, notes, strict=True)
+    ]
+    both = zip(notes, workspace.observations, strict=True)
+    free = [
+        n.plateau
+        for notes_of_recording in notes
+        for n in notes_of_recording
+        if isinstance(n, WrongNote) and not n.exact
+    ]
+    findings = [
+        note_finding(n, o.name)
+        for notes_of_recording, o in both
+        for n in notes_of_recording
+        if not isinstance(n, WrongNote) or n.exact
+    ]
     recorded = replace(
         recorded,
         observations=tuple(observations),
@@ -210,13 +223,13 @@ def _as_hung(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Worksp
         stated_gap=recorded.stated_gap or gap,
     )
     workspace = beside(workspace, observations, recorded.known)
-    if any(isinstance(n, UnnotedTime) for own in noted for n in own):
-        return _as_hung(recorded, workspace)
-    return recorded, freed(recorded, workspace)
+    if any(isinstance(n, UnnotedTime) for notes_of_recording in notes for n in notes_of_recording):
+        return _corrected(recorded, workspace)
+    return recorded, with_free(recorded, workspace)
 
 
 def _stated_floor(workspace: Workspace) -> float:
-    """The gap that the noise of the rig file alone leaves, m: motion spoils any other estimate of it."""
+    """Return the gap that the noise of the rig file alone leaves, m: motion spoils any other estimate of it."""
     dots = [
         o.rig.noises[:, :2] * o.rig.sensitivities / math.sqrt(o.rig.estimator.block_size)
         for o in workspace.observations
@@ -224,63 +237,63 @@ def _stated_floor(workspace: Workspace) -> float:
     return float(np.sqrt(np.mean(np.square(dots))))
 
 
-def _not_as_noted(workspace: Workspace, i: int, difference: FloatArray) -> list[WrongNote | SwayingLoad | UnnotedTime]:
+def _wrong_notes(workspace: Workspace, i: int, difference: FloatArray) -> list[WrongNote | SwayingLoad | UnnotedTime]:
     """What of recording ``i`` was noted otherwise than it hung; ``difference`` (3P, m), V: measured minus simulated."""
     o = workspace.observations[i]
-    found = levels(workspace, i, difference, times(o, i))
-    wrong = noted_wrong(o.loads, o.period, partial(_asked, workspace, i, found), MOST_AN_EFFECT_DOES)
-    if not wrong and (unnoted := unnoted_times(found, len(o.loads), o.period)):
+    implied = levels(workspace, i, difference, times(o, i))
+    wrong = wrong_notes_against(o.loads, o.period, partial(_implied_loads, workspace, i, implied), MOST_AN_EFFECT_DOES)
+    if not wrong and (unnoted := unnoted_times(implied, len(o.loads), o.period)):
         return [*unnoted]
-    return [*swayed(workspace, i, difference, found), *wrong]
+    return [*swayed(workspace, i, difference, implied), *wrong]
 
 
-def _asked(workspace: Workspace, i: int, found: PlateauLoads, acting: FloatArray) -> PlateauLoads:
-    """The loads that recording ``i`` asks for under ``acting`` ones; ``found``: under those that it has."""
+def _implied_loads(workspace: Workspace, i: int, implied: PlateauLoads, acting: FloatArray) -> PlateauLoads:
+    """Return the loads that recording ``i`` asks for under ``acting`` ones; ``implied``: under those that it has."""
     o = workspace.observations[i]
     if acting is o.loads:
-        return found
+        return implied
     moved = workspace.loaded(i, acting)
-    return levels(workspace, i, moved.residual(moved.base)[1][i], found.plateaus)
+    return levels(workspace, i, moved.residual(moved.base)[1][i], implied.plateaus)
 
 
-def _mended(o: Observation, notes: Sequence[WrongNote | SwayingLoad | UnnotedTime]) -> Observation:
+def _with_effective_loads(o: Observation, notes: Sequence[WrongNote | SwayingLoad | UnnotedTime]) -> Observation:
     """With the loads that hung, without the times in which nobody knows them."""
     if not notes:
         return o
     swayed = [n for n in notes if isinstance(n, SwayingLoad)]
-    volts = left_out(o.rig, o.volts, swayed)
+    volts = excluded(o.rig, o.volts, swayed)
     volts = without_times(volts, [n for n in notes if isinstance(n, UnnotedTime)])
-    loads = as_hung(o.loads, [n for n in notes if isinstance(n, WrongNote)])
+    loads = as_applied(o.loads, [n for n in notes if isinstance(n, WrongNote)])
     return dataclasses.replace(_with_volts(o, volts), loads=loads, swing=swung(len(loads), swayed))
 
 
 def beside(workspace: Workspace, observations: Sequence[Observation], known: Sequence[ActiveEffect]) -> Workspace:
-    """The ``observations`` in place of those of ``workspace``, with its simulations counted on."""
+    """Return the ``observations`` in place of those of ``workspace``, with its simulations counted on."""
     out = Workspace(observations, known)
     workspace.tally.count += out.tally.count
     return out.replaced(tally=workspace.tally)
 
 
-def freed(recorded: Recorded, workspace: Workspace) -> Workspace:
+def with_free(recorded: Recorded, workspace: Workspace) -> Workspace:
     """``workspace`` with what is not known free: loads that were noted wrong, times that were fitted, zeros."""
     free: list[Direction] = [*directions(workspace, recorded.wrong)]
     for i, o in enumerate(workspace.observations):
         sds = np.sqrt(o.zero_variances).tolist()
         free += [ZeroDirection(i, axis, sd) for axis, sd in enumerate(sds) if sd > 0.0]
-    for i, mended in enumerate(recorded.mended):
-        if mended is None:
+    for i, corrected in enumerate(recorded.corrected):
+        if corrected is None:
             continue
         o = workspace.observations[i]
-        for note in mended.timed:
+        for note in corrected.timed:
             free += in_time(o, i, note)
         # In whatever unit they were measured.
-        unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(mended.loads).max(axis=0), 1e-30)
-        if len(mended.measured) <= MOST_MEASURED:
-            free += [d for m in mended.measured for d in of_plateau(o, i, m, m.sd * unit)]
-    workspace = workspace.freed(free)
+        unit = np.abs(o.loads).max(axis=0) / np.maximum(np.abs(corrected.loads).max(axis=0), 1e-30)
+        if len(corrected.measured) <= MOST_MEASURED:
+            free += [d for m in corrected.measured for d in of_plateau(o, i, m, m.sd * unit)]
+    workspace = workspace.with_free(free)
     # What a large load bends is no change in proportion.
     for _ in range(2 if recorded.wrong else 0):
-        workspace = workspace.settled(workspace.residual(workspace.base)[1])
+        workspace = workspace.refitted(workspace.residual(workspace.base)[1])
     return workspace
 
 

@@ -58,7 +58,7 @@ class RecordedRig(Machine):
         bank: SignatureBank | None,
         progress: Progress,
     ) -> RecordedRig:
-        """The recordings made ready. ``bank``: see :func:`discover`."""
+        """Return the recordings made ready. ``bank``: see :func:`discover`."""
         check_same_psds(recordings, rig)
         progress('checking the recording')
         recorded = Recorded(tuple(recordings), rig, tuple(effects_of_rig(rig)), tuple(without))
@@ -68,15 +68,15 @@ class RecordedRig(Machine):
         recorded, workspace = recordings_ready.compared(recorded)
         # Signatures that are kept are those of recordings as they were, from rest.
         changed = recorded.mistaken or bool(workspace.nuisance) or any(d > 0.0 for d in recorded.delays)
-        kept = SignatureBank() if bank is None or changed else bank
-        kept.nominal(workspace)
-        found = proposals_of(workspace)
+        bank_of_rig = SignatureBank() if bank is None or changed else bank
+        bank_of_rig.nominal(workspace)
+        proposals = proposals_of(workspace)
         if recorded.lattice is not None:
             workspace = workspace.replaced(base=(*workspace.base, recorded.lattice))
-        return cls(recorded=recorded, workspace=workspace, proposals=found, bank=kept)
+        return cls(recorded=recorded, workspace=workspace, proposals=proposals, bank=bank_of_rig)
 
     def compared(self) -> Workspace:
-        """The recordings against the simulation."""
+        """Return the recordings against the simulation."""
         return self.workspace
 
     def bare(self, comparison: Comparison) -> Comparison:
@@ -85,13 +85,13 @@ class RecordedRig(Machine):
             return comparison
         return comparison.replaced(base=tuple(a for a in comparison.base if a is not self.recorded.lattice))
 
-    def seen(self, comparison: Comparison) -> float:
+    def chi_square_explained(self, comparison: Comparison) -> float:
         """Chi-square that the coarse steps explain."""
         lattice = self.recorded.lattice
         return 0.0 if lattice is None else 2.0 * lattice_gain(workspace_of(comparison), lattice)
 
     def screen(self, comparison: Comparison, fit: Fit | None) -> Screen:
-        """The catalogue's effects and the mistakes of the set-up, beside ``fit`` if that leaves much."""
+        """Return the catalogue's effects and the mistakes of the set-up, beside ``fit`` if that leaves much."""
         ws = workspace_of(comparison)
         residual = ws.residual([*ws.base, *ws.nuisance])[0] if fit is None else fit.residual
         more = mistakes(len(ws.observations), self.recorded.delays, likely_jumps(ws, residual), ws.psds)
@@ -104,25 +104,25 @@ class RecordedRig(Machine):
             values = {name: [*seen, *(v for v in beside[name] if v not in seen)] for name, seen in values.items()}
         listed = candidates([*library, *more], self.recorded.physics, values)
         if fit is None or not far(fit):
-            found = [(c, self.bank.get(c, ws)) for c in listed]
+            signatures = [(c, self.bank.get(c, ws)) for c in listed]
         else:
             # A large effect changes the signatures of the others.
-            found = signatures_beside(ws, listed, fit)
-        return Screen(ws, self._not_acquitted(ws, found, residual, fit))
+            signatures = signatures_beside(ws, listed, fit)
+        return Screen(ws, self._not_acquitted(ws, signatures, residual, fit))
 
     def _not_acquitted(
-        self, ws: Workspace, found: list[tuple[Candidate, Columns]], residual: FloatArray, fit: Fit | None
+        self, ws: Workspace, signatures: list[tuple[Candidate, Columns]], residual: FloatArray, fit: Fit | None
     ) -> list[tuple[Candidate, Columns]]:
         """Without detectors and beams that would show in the fourth reading if they made much of ``residual`` (D,)."""
         reading = self.recorded.fourth if fit is None else fourth_reading(ws, residual)
         beyond, throughout = excess(ws, residual)
         if reading is None or not reading.acquits or throughout < FAR - 1.0:
-            return found
+            return signatures
         least = 2.0 * reading.allowed / (PART * beyond)
         # Mistakes of the set-up touch every channel; those of a detector are steps that the readings themselves show.
         return [
             (c, columns)
-            for c, columns in found
+            for c, columns in signatures
             if c.effect.stage not in STAGES or c.effect.name in SETUP or visible(ws, columns) < least
         ]
 
@@ -138,7 +138,7 @@ class RecordedRig(Machine):
         return regressors(workspace_of(comparison))
 
     def suggest(self, comparison: Comparison, fit: Fit, equal: Sequence[Fit]) -> Suggestion | None:
-        """The recording that tells them apart."""
+        """Return the recording that tells them apart."""
         return suggest(workspace_of(comparison), fit, equal[: 3 if comparison.simulations < comparison.budget else 1])
 
 
@@ -150,7 +150,7 @@ def workspace_of(comparison: Comparison) -> Workspace:
 
 
 def rig_of(problem: Problem) -> RecordedRig:
-    """The machine of ``problem``, which is the rig."""
+    """Return the machine of ``problem``, which is the rig."""
     if not isinstance(problem.machine, RecordedRig):
         raise TypeError(f'{type(problem.machine).__name__}: not the rig with its recordings')
     return problem.machine

@@ -41,21 +41,27 @@ class Resting:
 
 def resting_in(recording: Recording, rig: Rig) -> Resting:
     """The references of a recording without samples. Raises RecordingError if it has no loads or too few of them."""
-    found = references_in(recording)
+    references = references_in(recording)
     applied = sorted(recording.loads(), key=lambda load: load.t_ns)
-    if found is None or not applied:
+    if references is None or not applied:
         raise RecordingError(
             f'{recording.path}: holds references, but neither samples nor loads; loads (topic /link_tip/load) are '
             f'needed to compare it with a simulation'
         )
-    start = int(found.t_ns[0])
-    t = np.asarray((found.t_ns - start) * 1e-9, dtype=np.float64)
-    noted = np.array([(a.t_ns - start) * 1e-9 for a in applied], dtype=np.float64)
+    start = int(references.t_ns[0])
+    t = np.asarray((references.t_ns - start) * 1e-9, dtype=np.float64)
+    times = np.array([(a.t_ns - start) * 1e-9 for a in applied], dtype=np.float64)
     warm = recording.temperatures()
     at = np.array([(w.t_ns - start) * 1e-9 for w in warm])
     celsius = np.asarray(np.interp(t, at, [w.celsius for w in warm]), dtype=np.float64) if warm else None
     return _rows(
-        str(recording.path), rig, noted, np.array([a[1:] for a in applied], dtype=np.float64), t, found.poses, celsius
+        str(recording.path),
+        rig,
+        times,
+        np.array([a[1:] for a in applied], dtype=np.float64),
+        t,
+        references.poses,
+        celsius,
     )
 
 
@@ -72,7 +78,7 @@ def resting_rows(
 def _rows(
     name: str,
     rig: Rig,
-    noted: FloatArray,
+    annotated: FloatArray,
     loads: FloatArray,
     t: FloatArray,
     poses: FloatArray,
@@ -83,26 +89,28 @@ def _rows(
     A load is often noted late. If more than half of the time is under it, what is far from the median is not.
     """
     new = np.append(True, np.any(np.diff(loads, axis=0) != 0.0, axis=1))
-    starts, changed = noted[new], loads[new]
+    starts, changed = annotated[new], loads[new]
     stops = np.append(starts[1:], math.inf)
     there = np.isfinite(poses).all(axis=1)
     of, means, celsius = list[FloatArray](), list[FloatArray](), list[float]()
     for load, start, stop in zip(changed, starts, stops, strict=True):
         end = min(stop, float(t[-1]))
-        hung = there & (t >= start) & (t < stop)
-        if np.count_nonzero(hung) < FEWEST:
+        applied = there & (t >= start) & (t < stop)
+        if np.count_nonzero(applied) < FEWEST:
             continue
-        own = hung & _near(poses, hung) & (t >= start + min(settling(rig), MOST_OF_IT * max(end - start, 0.0)))
-        if np.count_nonzero(own) >= FEWEST:
+        settled_samples = (
+            applied & _near(poses, applied) & (t >= start + min(settling(rig), MOST_OF_IT * max(end - start, 0.0)))
+        )
+        if np.count_nonzero(settled_samples) >= FEWEST:
             of.append(load)
-            means.append(np.median(poses[own], axis=0))
-            celsius.append(math.nan if warm is None else float(warm[own].mean()))
+            means.append(np.median(poses[settled_samples], axis=0))
+            celsius.append(math.nan if warm is None else float(warm[settled_samples].mean()))
     if not of:
         raise RecordingError(f'{name}: no load hung for as long as {FEWEST} references')
     return Resting(np.array(of), np.array(means), None if warm is None else np.array(celsius))
 
 
-def _near(poses: FloatArray, hung: BoolArray) -> BoolArray:
-    """(n,): whether ``poses`` (n, 3) are about as near to the median of those that ``hung`` as most of them."""
-    off = np.abs(poses - np.median(poses[hung], axis=0))
-    return np.asarray((off <= FAR * 1.4826 * np.median(off[hung], axis=0)).all(axis=1))
+def _near(poses: FloatArray, applied: BoolArray) -> BoolArray:
+    """(n,): whether ``poses`` (n, 3) are about as near to the median of those that ``applied`` as most of them."""
+    off = np.abs(poses - np.median(poses[applied], axis=0))
+    return np.asarray((off <= FAR * 1.4826 * np.median(off[applied], axis=0)).all(axis=1))

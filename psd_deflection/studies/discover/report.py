@@ -38,7 +38,7 @@ AFTER: Final = 'blue'
 
 def _residual_chart(discovery: Conclusion) -> Chart:
     ws = discovery.workspace
-    before, after = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
+    before, after = ws.displayed(discovery.search.null.difference), ws.displayed(discovery.fit.difference)
     along, times = ws.along()
     # A gap between recordings.
     t = np.concatenate([np.append(part, part[-1]) for part in times])
@@ -53,19 +53,19 @@ def _residual_chart(discovery: Conclusion) -> Chart:
 
 
 def _joined(parts: Iterable[FloatArray]) -> FloatArray:
-    """One after the other, with no value after each."""
+    """Return one after the other, with no value after each."""
     return np.concatenate([np.append(part, np.nan) for part in parts])
 
 
 def _labels(ws: Comparison) -> list[str]:
-    pairs = zip(ws.channels, ws.units_shown, strict=True)
+    pairs = zip(ws.channels, ws.display_units, strict=True)
     return [f'{name} / {unit}' if unit else name for name, unit in pairs]
 
 
 def _against_chart(discovery: Conclusion) -> Chart | None:
     """What was missing against each input and position, in the channel where the effects changed most."""
     ws = discovery.workspace
-    tables = ws.shown(discovery.search.null.difference), ws.shown(discovery.fit.difference)
+    tables = ws.displayed(discovery.search.null.difference), ws.displayed(discovery.fit.difference)
     gaps = list(discovery.per_channel.values())
     row = max(range(len(gaps)), key=lambda c: (gaps[c][0] ** 2 - gaps[c][1] ** 2) / max(gaps[c][0] ** 2, 1e-300))
     before, after = (np.concatenate([t[row] for t in table]) for table in tables)
@@ -88,10 +88,10 @@ def _function_chart(discovery: Conclusion, function: Smooth) -> Chart:
     against: list[tuple[str | TimeAxis, list[FloatArray]]] = list(ws.against().items())
     # The last ones are the readings.
     inputs = against[: len(against) - len(ws.channels)] or [ws.along()]
-    value, left = ws.shown(function.tables), ws.shown(discovery.fit.difference)
+    value, residual = ws.displayed(function.tables), ws.displayed(discovery.fit.difference)
     panels = []
     for row, label in enumerate(_labels(ws)):
-        remains, smooth = (np.concatenate([t[row] for t in table]) for table in (left, value))
+        remains, smooth = (np.concatenate([t[row] for t in table]) for table in (residual, value))
         for along, at in inputs:
             x = np.concatenate(at)
             curves = (
@@ -134,7 +134,7 @@ def _spectrum_chart(discovery: RigConclusion) -> Chart:
 
 
 def _waterfall(discovery: Conclusion) -> Bars:
-    scale, unit = discovery.workspace.scale_shown
+    scale, unit = discovery.workspace.display_scale
     steps: list[tuple[str, float, Colour]] = [(n, scale * v, AFTER) for n, v in discovery.waterfall]
     steps[0] = (*steps[0][:2], BEFORE)
     steps[-1] = (*steps[-1][:2], 'quiet')
@@ -158,10 +158,10 @@ def _where_matrix(discovery: Conclusion) -> tuple[str, Matrix]:
     labels = ['' if of_rig and label in names else label for label in labels]
     parts = [np.pad(shown[:, c, :], ((0, 0), (0, 1)), constant_values=np.nan) for c in range(len(names))]
     spans = discovery.where.spans
-    told = [f'{a:.1f}-{b:.1f} s' if of_rig else ws.names[i] for i, a, b in spans]
+    spans_in_words = [f'{a:.1f}-{b:.1f} s' if of_rig else ws.names[i] for i, a, b in spans]
     height = max(4, min(CELL, 400 // len(spans)))
     every = -(-CELL // height)
-    rows = [name if i % every == 0 else '' for i, name in enumerate(told)]
+    rows = [name if i % every == 0 else '' for i, name in enumerate(spans_in_words)]
     across = ' and band in Hz' if of_rig else ''
     words = f'where: load case (down) by channel{across} (across), before; darkest: {most:.0f} σ above noise and more'
     drawn = Matrix(words, np.hstack(parts)[:, :-1], rows, labels, most, height)
@@ -186,8 +186,8 @@ def _effect_section(effect: NamedEffect) -> str:
         else:
             rows.append((name, v, '', ''))
     out.append(table(('parameter', 'value', '± sd', 'unit'), rows))
-    if effect.rivals:
-        fitted = [(r.active.label, size_of(r), f'{r.delta_bic:+.1f}') for r in effect.rivals]
+    if effect.fitted_alternatives:
+        fitted = [(r.active.label, size_of(r), f'{r.delta_bic:+.1f}') for r in effect.fitted_alternatives]
         out.append('<p>What explains these recordings nearly as well in its place:</p>')
         out.append(table(('rival', 'fitted', 'BIC worse by'), fitted))
     if effect.suggestion is not None:
@@ -198,25 +198,25 @@ def _effect_section(effect: NamedEffect) -> str:
         f'load cases {effect.heldout.gain:+.1f} ± {effect.heldout.error:.1f}.</p>'
     )
     if effect.alternatives:
-        told = {True: 'cannot be told apart', False: 'worse'}
-        others = [
-            (n, f'{loss:.1f}', f'{bic:.1f}', told[n in effect.equivalent]) for n, loss, bic in effect.alternatives
+        verdicts = {True: 'cannot be told apart', False: 'worse'}
+        alternatives = [
+            (n, f'{loss:.1f}', f'{bic:.1f}', verdicts[n in effect.equivalent]) for n, loss, bic in effect.alternatives
         ]
-        out.append(table(('in its place', 'chi-square lost', 'BIC worse by', 'verdict'), others))
+        out.append(table(('in its place', 'chi-square lost', 'BIC worse by', 'verdict'), alternatives))
     out.append('</details>')
     return ''.join(out)
 
 
-def _law_chart(discovery: RigConclusion, found: FoundLaw) -> Chart:
+def _law_chart(discovery: RigConclusion, found_law: FoundLaw) -> Chart:
     """What is missing and what the law leaves against its first variable, in the channel where it shows most."""
-    ws, name = discovery.workspace, found.law.variables[0]
-    _, alone = ws.residual([*ws.base, *found.fit.nuisance, *found.beside])
-    missing, left = ws.block_dots(alone), ws.block_dots(found.fit.difference)
-    moved = np.concatenate([a - b for a, b in zip(missing, left, strict=True)], axis=1)
+    ws, name = discovery.workspace, found_law.law.variables[0]
+    _, alone = ws.residual([*ws.base, *found_law.fit.nuisance, *found_law.beside])
+    missing, residual = ws.block_dots(alone), ws.block_dots(found_law.fit.difference)
+    moved = np.concatenate([a - b for a, b in zip(missing, residual, strict=True)], axis=1)
     row = int(np.argmax(np.nansum(moved**2, axis=1)))
     scale, unit = (1e3, f'm{VARIABLES[name]}') if VARIABLES[name] in ('m', 'rad') else (1.0, VARIABLES[name])
-    at = np.concatenate(known_values(ws, found.beside, name)) * scale
-    before, after = (np.concatenate([b[row] for b in blocks]) * 1e6 for blocks in (missing, left))
+    at = np.concatenate(known_values(ws, found_law.beside, name)) * scale
+    before, after = (np.concatenate([b[row] for b in blocks]) * 1e6 for blocks in (missing, residual))
     law = (
         Series('missing', at, before, BEFORE, 'points'),
         Series('law', at, moved[row] * 1e6, 'text', 'points'),
@@ -229,22 +229,22 @@ def _law_chart(discovery: RigConclusion, found: FoundLaw) -> Chart:
     return Chart(f'measured minus simulated {ws.channels[row]} against {name}, block means', panels, beside=2)
 
 
-def _law_section(discovery: RigConclusion, found: FoundLaw) -> list[str | Drawing]:
-    law = found.law
-    expressions = '<br>'.join(html.escape(e.expression) for e in found.laws)
+def _law_section(discovery: RigConclusion, found_law: FoundLaw) -> list[str | Drawing]:
+    law = found_law.law
+    expressions = '<br>'.join(html.escape(e.expression) for e in found_law.laws)
     out: list[str | Drawing] = [f'<h3>A law for it</h3><p>{expressions}</p>']
-    beside = ', '.join(a.label for a in found.beside)
+    beside = ', '.join(a.label for a in found_law.beside)
     out.append(
-        f'<p>Stage {law.stage}, {law.kind}; it shows on {", ".join(found.channels)}'
+        f'<p>Stage {law.stage}, {law.kind}; it shows on {", ".join(found_law.channels)}'
         f'{f"; fitted beside {html.escape(beside)}" if beside else ""}. On unseen load cases '
-        f'{1e6 * found.heldout_gap:.3f} µm remain. BIC better by {found.delta_bic:.1f}; p over all terms that '
-        f'were tried {found.p:.2g}; log-likelihood on unseen load cases {found.heldout.gain:+.1f} ± '
-        f'{found.heldout.error:.1f}. It is an empirical law and not in model.yaml unless it is adopted.</p>'
+        f'{1e6 * found_law.heldout_gap:.3f} µm remain. BIC better by {found_law.delta_bic:.1f}; p over all terms that '
+        f'were tried {found_law.p:.2g}; log-likelihood on unseen load cases {found_law.heldout.gain:+.1f} ± '
+        f'{found_law.heldout.error:.1f}. It is an empirical law and not in model.yaml unless it is adopted.</p>'
     )
     if law.kind != 'variance':
-        out.append(_law_chart(discovery, found))
-    if found.equivalent:
-        rows = [(e.stage, ', '.join(e.variables), e.expression) for e in found.equivalent]
+        out.append(_law_chart(discovery, found_law))
+    if found_law.equivalent:
+        rows = [(e.stage, ', '.join(e.variables), e.expression) for e in found_law.equivalent]
         out.append('<p>This recording cannot tell it from:</p>')
         out.append(table(('stage', 'depends on', 'law'), rows))
     return out
@@ -275,7 +275,7 @@ def _value(finding: Finding) -> str:
 
 
 def sections(discovery: Conclusion) -> list[PageSection]:
-    """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
+    """Return the gap step by step, what is missing, what is unknown, before and after, how it was found."""
     of_rig = discovery if isinstance(discovery, RigConclusion) else None
     out = [PageSection('', (_waterfall(discovery),))]
     if of_rig is not None and of_rig.setup:
@@ -284,7 +284,7 @@ def sections(discovery: Conclusion) -> list[PageSection]:
     effects = [_effect_section(e) for e in discovery.effects] or ['<p>No effect is named.</p>']
     out.append(PageSection('What', (*effects, *_nuisance(discovery))))
     law = [] if of_rig is None or of_rig.law is None else _law_section(of_rig, of_rig.law)
-    if discovery.remains and discovery.prediction is not None:
+    if discovery.unexplained and discovery.prediction is not None:
         out.append(PageSection('What predicts', tuple(_predicts(discovery, discovery.prediction))))
     if discovery.unknown or law:
         function = None if discovery.remainder is None else discovery.remainder.function
@@ -315,7 +315,7 @@ def _nuisance(discovery: Conclusion) -> list[str]:
 
 
 def _unknown(u: Unknown) -> str:
-    where = 'is not in the model' if u.remains else 'the effects stand in for it in the model'
+    where = 'is not in the model' if u.unexplained else 'the effects stand in for it in the model'
     share = f'{100 * u.explains:.0f} % of what was to be explained'
     return f'<p>{html.escape(u.signature)}. It is {share}; {where}.</p>'
 
@@ -328,10 +328,10 @@ def _before_and_after(discovery: Conclusion) -> list[str | Drawing]:
     factor = 1.0
     if isinstance(discovery, RigConclusion):
         out.append(_spectrum_chart(discovery))
-        factor = discovery.workspace.scale_shown[0]
+        factor = discovery.workspace.display_scale[0]
     channels = [
         (n, *(f'{factor * v:.4g}' for v in (*gaps, discovery.heldout_per_channel[n])), unit)
-        for (n, gaps), unit in zip(discovery.per_channel.items(), discovery.workspace.units_shown, strict=True)
+        for (n, gaps), unit in zip(discovery.per_channel.items(), discovery.workspace.display_units, strict=True)
     ]
     return [*out, table(('gap, rms', 'before', 'after', 'on unseen load cases', 'unit'), channels)]
 

@@ -17,5 +17,5 @@ class Discovery(RigConclusion):
     """See :class:`~psd_deflection.studies.discover.conclusion.RigConclusion`."""
 
     def sections(self) -> Iterable[PageSection]:
-        """The gap step by step, what is missing, what is unknown, before and after, how it was found."""
+        """Return the gap step by step, what is missing, what is unknown, before and after, how it was found."""
         return sections(self)

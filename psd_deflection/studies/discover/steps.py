@@ -23,22 +23,22 @@ from psd_deflection.studies.discover.search.hold_out import heldout_gain, heldou
 from psd_deflection.studies.discover.search.predictive import predictive_of
 from psd_deflection.studies.discover.search.remainder import Remainder, remainder_of
 from psd_deflection.studies.discover.search.search import Search
-from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, by_its_size, unphysical
+from psd_deflection.studies.discover.search.trials import BIC_ACCEPT, unphysical, wald_chi_square
 from psd_deflection.studies.discover.search.weighing import (
     EQUIVALENT,
     EQUIVALENT_BIC,
     RIVAL_BIC,
     UNSAID,
+    Alternative,
     NamedEffect,
-    Rival,
     Unknown,
     heldout_per_channel_of,
     no_noise,
-    null_log,
     per_channel_of,
     sd_of,
     tied,
     unknown_of,
+    unnamed_gap,
     waterfall_of,
 )
 
@@ -51,7 +51,7 @@ LITTLE = 0.1
 def solve(
     machine: Machine, steps: Sequence[Step], seed: int, progress: Progress, rng: np.random.Generator | None = None
 ) -> Problem:
-    """The problem of ``machine`` after ``steps``. The same ``seed`` gives the same answer."""
+    """Return the problem of ``machine`` after ``steps``. The same ``seed`` gives the same answer."""
     problem = Problem.of(machine, seed, progress, np.random.default_rng(seed) if rng is None else rng)
     for step in steps:
         problem = step(problem)
@@ -59,35 +59,42 @@ def solve(
 
 
 def search(problem: Problem, begun: Fit | None = None) -> Problem:
-    """The model that the search chooses, beside its alternatives; from the effects of ``begun`` on, if given."""
+    """Return the model that the search chooses, beside its alternatives; from the effects of ``begun`` on, if given."""
     start = problem.comparison
-    found, result = problem.search.run(problem.null, begun)
+    search_used, result = problem.search.run(problem.null, begun)
     names = {a.effect.name for a in result.fit.effects}
     if names & start.first and names - start.setup:
         # A mistake that needs an effect beside it must be much better than effects alone.
-        plain = found.workspace.replaced(first=frozenset())
-        other = Search(plain, problem.machine.screen, problem.progress)
-        other, others = other.run(refit(plain, ()))
-        cost = others.fit.chi2 + other.penalty * others.fit.parameters
-        if cost < result.fit.chi2 + found.penalty * result.fit.parameters + BIC_ACCEPT:
-            found, result = other, others
+        plain = search_used.workspace.replaced(first=frozenset())
+        plain_search = Search(plain, problem.machine.screen, problem.progress)
+        plain_search, plain_result = plain_search.run(refit(plain, ()))
+        cost = plain_result.fit.chi2 + plain_search.penalty * plain_result.fit.parameters
+        if cost < result.fit.chi2 + search_used.penalty * result.fit.parameters + BIC_ACCEPT:
+            search_used, result = plain_search, plain_result
     if not start.open_level:
-        found = found.at(found.workspace.replaced(nuisance=result.fit.nuisance))
-    return replace(problem, search=found, result=result, fit=result.fit, null=result.null)
+        search_used = search_used.at(search_used.workspace.replaced(nuisance=result.fit.nuisance))
+    return replace(problem, search=search_used, result=result, fit=result.fit, null=result.null)
 
 
 def weigh(problem: Problem) -> Problem:
-    """The effects that hold, with where what they leave has structure."""
+    """Return the effects that hold, with where what they leave has structure."""
     problem.progress('weighing')
     problem = accepted(problem)
     for _ in range(2 if problem.comparison.open_level else 0):
         if problem.fit is problem.result.fit or not problem.fit.effects:
             break
         # Without what did not hold, another effect may be the better one.
-        null, found = problem.result.null, problem.search
-        fit, others = found.swap(null, problem.fit)
-        p, delta_bic, delta_chi2 = found.weigh(null, fit)
-        result = replace(problem.result, fit=fit, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2, alternatives=others)
+        null, search_used = problem.result.null, problem.search
+        fit, alternatives_of_effects = search_used.swap(null, problem.fit)
+        p, delta_bic, delta_chi2 = search_used.weigh(null, fit)
+        result = replace(
+            problem.result,
+            fit=fit,
+            p=p,
+            delta_bic=delta_bic,
+            delta_chi2=delta_chi2,
+            alternatives=alternatives_of_effects,
+        )
         problem = accepted(replace(problem, result=result, fit=fit))
     problem = credible(problem)
     bare = problem.bare
@@ -95,20 +102,20 @@ def weigh(problem: Problem) -> Problem:
 
 
 def accepted(problem: Problem) -> Problem:
-    """The joint rule: without the effects that fail it, the weakest first, the rest fitted anew."""
+    """Return the joint rule: without the effects that fail it, the weakest first, the rest fitted anew."""
     while True:
         heldout, fails = [], []
-        ws, found, fit = problem.comparison, problem.search, problem.fit
-        for i, without in enumerate(found.without_each(fit, problem.result.null)):
+        ws, search_used, fit = problem.comparison, problem.search, problem.fit
+        for i, without in enumerate(search_used.without_each(fit, problem.result.null)):
             gain = heldout_gain(ws, without, fit, problem.rng)
             heldout.append(gain)
             columns = fit.columns_of(i)
             chi2 = without.chi2 - fit.chi2
-            bic = chi2 - found.penalty * len(columns)
+            bic = chi2 - search_used.penalty * len(columns)
             if (
-                not gain.holds
+                not gain.significant
                 or unphysical(ws, fit, i)
-                or found.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
+                or search_used.library_p(_gain(ws, fit, i, chi2), len(columns)) > ws.p_accept
                 or bic <= BIC_ACCEPT
                 or _in_sds(ws, fit, i) < LEAST_SDS
             ):
@@ -116,11 +123,11 @@ def accepted(problem: Problem) -> Problem:
         problem = replace(problem, heldout=tuple(heldout))
         if not fails:
             return problem
-        problem = without_one(problem, min(fails)[1], 'fails the joint rule')
+        problem = without_effect(problem, min(fails)[1], 'fails the joint rule')
 
 
 def _in_sds(ws: Comparison, fit: Fit, index: int) -> float:
-    """The largest size of effect ``index``, in its own standard deviations; infinite if none is no number."""
+    """Return the largest size of effect ``index``, in its own standard deviations; infinite if none is no number."""
     effect, sds = fit.effects[index], sd_of(ws, fit, index)
     sizes = [p for p in effect.effect.parameters if p.kind == 'amplitude' and p.name in sds]
     apart = [(abs(effect.values[p.name] - p.off(ws.physics)), sds[p.name]) for p in sizes]
@@ -129,52 +136,52 @@ def _in_sds(ws: Comparison, fit: Fit, index: int) -> float:
 
 def _gain(ws: Comparison, fit: Fit, index: int, chi2: float) -> float:
     """What effect ``index`` explains: the ``chi2`` that is lost without it, or less if its size says less."""
-    return chi2 if ws.open_level else min(chi2, by_its_size(ws, fit, index))
+    return chi2 if ws.open_level else min(chi2, wald_chi_square(ws, fit, index))
 
 
 def credible(problem: Problem) -> Problem:
     """Without effects that explain less than the unknown remainder: they probably stand in for it."""
     while True:
-        left = problem.machine.look(problem.comparison, problem.fit, problem.result.null, problem.rng)
-        problem = replace(problem, left=left)
-        steps = problem.machine.seen(problem.comparison)
-        if not problem.fit.effects or not unknown_of(left, 0.0, steps=steps):
+        residual = problem.machine.look(problem.comparison, problem.fit, problem.result.null, problem.rng)
+        problem = replace(problem, residual=residual)
+        steps = problem.machine.chi_square_explained(problem.comparison)
+        if not problem.fit.effects or not unknown_of(residual, 0.0, steps=steps):
             return problem
         closer = _of_another_shape(problem)
         if closer is not problem:
             problem = closer
             continue
         weakest = int(np.argmin(problem.result.delta_chi2))
-        if problem.result.delta_chi2[weakest] >= left.excess:
+        if problem.result.delta_chi2[weakest] >= residual.excess:
             return problem
-        problem = without_one(problem, weakest, 'explains less than what remains unknown')
+        problem = without_effect(problem, weakest, 'explains less than what remains unknown')
 
 
 def _of_another_shape(problem: Problem) -> Problem:
     """``problem`` with a better fit of its effects, if another shape explains the little that this one leaves."""
-    ws, found, fit, result = problem.comparison, problem.search, problem.fit, problem.result
+    ws, search_used, fit, result = problem.comparison, problem.search, problem.fit, problem.result
     little = max(UNSAID * ws.floor(), LITTLE * problem.gap_before)
     if ws.open_level or ws.gap(fit.difference) > little:
         return problem
-    better = found.of_another_shape(fit)
+    better = search_used.of_another_shape(fit)
     if better is fit:
         return problem
-    found.say('another shape: ' + ', '.join(a.label for a in better.effects))
-    p, delta_bic, delta_chi2 = found.weigh(result.null, better)
+    search_used.log('another shape: ' + ', '.join(a.label for a in better.effects))
+    p, delta_bic, delta_chi2 = search_used.weigh(result.null, better)
     result = replace(result, fit=better, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2)
     return accepted(replace(problem, fit=better, result=result))
 
 
-def without_one(problem: Problem, index: int, why: str) -> Problem:
+def without_effect(problem: Problem, index: int, why: str) -> Problem:
     """``problem`` without one effect of its fit, the rest fitted and weighed anew; ``why`` goes into the trace."""
-    found, null, fit = problem.search, problem.result.null, problem.fit
-    found.trace.append(f'{fit.effects[index].label} {why}')
+    search_used, null, fit = problem.search, problem.result.null, problem.fit
+    search_used.trace.append(f'{fit.effects[index].label} {why}')
     rest = [a for j, a in enumerate(fit.effects) if j != index]
-    left = refit(problem.comparison, rest, iterations=6) if rest else null
-    p, delta_bic, delta_chi2 = found.weigh(null, left)
+    remaining = refit(problem.comparison, rest, iterations=6) if rest else null
+    p, delta_bic, delta_chi2 = search_used.weigh(null, remaining)
     result = replace(problem.result, p=p, delta_bic=delta_bic, delta_chi2=delta_chi2)
     heldout = tuple(h for j, h in enumerate(problem.heldout) if j != index)
-    return replace(problem, result=result, fit=left, heldout=heldout)
+    return replace(problem, result=result, fit=remaining, heldout=heldout)
 
 
 def alternatives(problem: Problem) -> Problem:
@@ -194,14 +201,14 @@ def alternatives(problem: Problem) -> Problem:
     return replace(
         problem,
         named=tuple(named),
-        rivals=tuple(r.fit for e in named for r in e.rivals),
+        alternative_fits=tuple(r.fit for e in named for r in e.fitted_alternatives),
         unsettled=tuple(dict.fromkeys(name for e in named for name in e.equivalent)),
     )
 
 
 def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
     ws, result, fit = problem.comparison, problem.result, problem.fit
-    rows, equal, rivals = [], [], []
+    rows, equal, fitted_alternatives = [], [], []
     for f in fits:
         loss = f.chi2 - fit.chi2
         bic = loss + problem.search.penalty * (f.parameters - fit.parameters)
@@ -209,7 +216,7 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
         if loss < EQUIVALENT and (f.parameters <= fit.parameters or bic < EQUIVALENT_BIC):
             equal.append(f)
         if (bic < RIVAL_BIC or f in equal) and not unphysical(ws, f, len(f.effects) - 1):
-            rivals.append(Rival(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
+            fitted_alternatives.append(Alternative(f.effects[-1], sd_of(ws, f, len(f.effects) - 1), bic, f))
     return NamedEffect(
         active=fit.effects[index],
         sd=sd_of(ws, fit, index),
@@ -217,7 +224,7 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
         delta_bic=result.delta_bic[index],
         heldout=problem.heldout[index],
         equivalent=tuple(dict.fromkeys(f.effects[-1].effect.name for f in equal)),
-        rivals=tuple(sorted(rivals, key=lambda r: r.delta_bic)),
+        fitted_alternatives=tuple(sorted(fitted_alternatives, key=lambda r: r.delta_bic)),
         alternatives=tuple(rows),
         suggestion=problem.machine.suggest(ws, fit, equal) if equal else None,
     )
@@ -226,19 +233,19 @@ def _named(problem: Problem, index: int, fits: Sequence[Fit]) -> NamedEffect:
 def where(problem: Problem) -> Problem:
     """Where the described model and the fit leave structure, and what of it remains unknown."""
     problem.progress('where')
-    ws, null, fit, left = problem.bare, problem.null, problem.fit, problem.left
-    before = left if fit is null else problem.machine.look(ws, null, None, problem.rng)
+    ws, null, fit, residual = problem.bare, problem.null, problem.fit, problem.residual
+    before = residual if fit is null else problem.machine.look(ws, null, None, problem.rng)
     # Coarse steps cause noise that varies with the signal; compare what they explain with it.
-    steps = problem.machine.seen(ws)
+    steps = problem.machine.chi_square_explained(ws)
     explained = max(null.chi2 - fit.chi2, 0.0) + steps
     gap_after = ws.gap(fit.difference)
     unknown = (
-        unknown_of(left, explained, gap_after, ws.floor(), ws.most_by_noise(), steps, ws.worded)
-        or null_log(ws, problem.gap_before, gap_after)
-        or (() if fit.effects else no_noise(ws, left, problem.gap_before, gap_after))
+        unknown_of(residual, explained, gap_after, ws.floor(), ws.noise_limit(), steps, ws.worded)
+        or unnamed_gap(ws, problem.gap_before, gap_after)
+        or (() if fit.effects else no_noise(ws, residual, problem.gap_before, gap_after))
         or tied(coincidences(fit, ws.physics), fit, problem.result, before)
     )
-    remainder = remainder_of(ws, fit, left, problem.machine.regressors(ws, fit)) if unknown else None
+    remainder = remainder_of(ws, fit, residual, problem.machine.regressors(ws, fit)) if unknown else None
     smooth = problem.machine.smooth(ws, fit)
     if smooth is not None and (remainder is None or smooth.heldout < remainder.heldout):
         remainder = Remainder.of(smooth)
@@ -248,15 +255,15 @@ def where(problem: Problem) -> Problem:
 
 
 def predict(problem: Problem) -> Problem:
-    """The model that predicts best beside the named effects; what it explains beyond them is unknown."""
-    ws, fit, found = problem.comparison, problem.fit, problem.search
+    """Return the model that predicts best beside the named effects; what it explains beyond them is unknown."""
+    ws, fit, search_used = problem.comparison, problem.fit, problem.search
     little = not ws.open_level and ws.gap(fit.difference) <= UNSAID * ws.floor()
     if little and not problem.unknown and not problem.result.limits:
         return problem
     problem.progress('predicting')
-    predictive = predictive_of(ws, fit, found.screen, problem.rng)
+    predictive = predictive_of(ws, fit, search_used.screen, problem.rng)
     problem = replace(problem, predictive=predictive)
-    if predictive is None or not predictive.remains or problem.unknown:
+    if predictive is None or not predictive.unexplained or problem.unknown:
         return problem
     before = max(problem.gap_before, 1e-300)
     rms = float(np.sqrt(max(predictive.unseen_named**2 - predictive.unseen**2, 0.0)))
@@ -273,7 +280,7 @@ def fields_of(problem: Problem) -> dict[str, Any]:
         'effects': problem.named,
         'unknown': problem.unknown,
         'where': problem.before,
-        'left': problem.left,
+        'residual': problem.residual,
         'gap_before': problem.gap_before,
         'gap_after': after,
         'gap_floor': ws.floor(),

@@ -11,7 +11,7 @@ from typing import Any
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.studies.discover.laws.laws import FoundLaw
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, covariance_of
+from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect, covariance_of
 
 
 def number(value: float) -> float:
@@ -21,13 +21,13 @@ def number(value: float) -> float:
     return float(min(max(value, -1e300), 1e300))
 
 
-def parameters_of(effect: NamedEffect | Rival) -> dict[str, Any]:
+def parameters_of(effect: NamedEffect | Alternative) -> dict[str, Any]:
     """Choices as numbers, the rest with standard deviation and unit."""
     return fitted(effect.active, effect.sd)
 
 
 def fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
-    """The tree of an effect's parameters; ``sds``: their standard deviations."""
+    """Return the tree of an effect's parameters; ``sds``: their standard deviations."""
     out: dict[str, Any] = {}
     for p in active.effect.parameters:
         value = active.values[p.name]
@@ -39,13 +39,13 @@ def fitted(active: ActiveEffect, sds: Mapping[str, float]) -> dict[str, Any]:
 
 
 def covariance_tree(fit: Fit, effects: Iterable[NamedEffect]) -> dict[str, Any]:
-    """The covariance of all amplitudes that were fitted together."""
+    """Return the covariance of all amplitudes that were fitted together."""
     names, matrix = covariance_of(fit, tuple(effects))
     return {'names': list(names), 'matrix': [[number(v) for v in row] for row in matrix.tolist()]}
 
 
 def effect_tree(e: NamedEffect) -> dict[str, Any]:
-    """An effect of ``effects``."""
+    """Return an effect of ``effects``."""
     return {
         'name': e.active.effect.name,
         'stage': e.active.effect.stage,
@@ -64,39 +64,39 @@ def effect_tree(e: NamedEffect) -> dict[str, Any]:
                 'parameters': parameters_of(r),
                 'delta_bic': number(r.delta_bic),
             }
-            for r in e.rivals
+            for r in e.fitted_alternatives
         ],
     }
 
 
-def law_tree(found: FoundLaw) -> dict[str, Any]:
-    """The tree of ``law``."""
-    law = found.law
+def law_tree(found_law: FoundLaw) -> dict[str, Any]:
+    """Return the tree of ``law``."""
+    law = found_law.law
     return {
         'stage': law.stage,
         'acts_on': law.acts_on,
-        'channels': list(found.channels),
+        'channels': list(found_law.channels),
         'variables': list(law.variables),
         'kind': law.kind,
         'expression': law.expression,
-        'further': [e.expression for e in found.further],
-        'heldout_after': found.heldout_gap,
-        'beside': [a.label for a in found.beside],
+        'further': [e.expression for e in found_law.further],
+        'heldout_after': found_law.heldout_gap,
+        'beside': [a.label for a in found_law.beside],
         'equivalent': [
             {'stage': e.stage, 'acts_on': e.acts_on, 'variables': list(e.variables), 'expression': e.expression}
-            for e in found.equivalent
+            for e in found_law.equivalent
         ],
         'evidence': {
-            'delta_bic': number(found.delta_bic),
-            'p': number(found.p),
-            'heldout_gain': number(found.heldout.gain),
-            'heldout_gain_error': number(found.heldout.error),
+            'delta_bic': number(found_law.delta_bic),
+            'p': number(found_law.p),
+            'heldout_gain': number(found_law.heldout.gain),
+            'heldout_gain_error': number(found_law.heldout.error),
         },
     }
 
 
-def size_of(effect: NamedEffect | Rival) -> str:
-    """The fitted amplitudes with their standard deviations, for a person: ``angle 0.00399 ± 2e-05 rad``."""
+def size_of(effect: NamedEffect | Alternative) -> str:
+    """Return the fitted amplitudes with their standard deviations, for a person: ``angle 0.00399 ± 2e-05 rad``."""
     out = []
     for p in effect.active.effect.parameters:
         value, sd = effect.active.values[p.name], effect.sd.get(p.name, 0.0)

@@ -37,11 +37,11 @@ class IdentifyProblem:
 def read_identify(opened: Opened, counted: Counted = iter) -> IdentifyProblem:
     """Solve every trusted sample. Raises RecordingError if there are none."""
     recording, rig = opened.recording, opened.rig
-    seen = read_run(recording, Pipeline(rig), counted(recording.blocks()))
+    run = read_run(recording, Pipeline(rig), counted(recording.blocks()))
     rate = rig.converter.sample_rate_hz
-    solved = solver_from_rig(rig.estimator.solver, rig).solve_many(seen.dots, dot_noise_variances(rig))
-    place = np.rint((seen.t_ns - seen.t_ns[0]) * 1e-9 * rate).astype(np.int64)
+    solved = solver_from_rig(rig.estimator.solver, rig).solve_many(run.dots, dot_noise_variances(rig))
+    place = np.rint((run.t_ns - run.t_ns[0]) * 1e-9 * rate).astype(np.int64)
     poses = np.full((int(place[-1]) + 1, 3), np.nan)
     good = solved.status == 0
     poses[place[good]] = solved.pose[good]
-    return IdentifyProblem(opened, poses, rate, moments(recording.marks(), int(seen.t_ns[0])))
+    return IdentifyProblem(opened, poses, rate, moments(recording.marks(), int(run.t_ns[0])))

@@ -10,6 +10,6 @@ from psd_deflection.studies.identify.result import Identified
 
 
 def identify(problem: IdentifyProblem) -> Identified:
-    """The modes of each axis; see :mod:`psd_deflection.studies.identify.modes` for the methods."""
+    """Return the modes of each axis; see :mod:`psd_deflection.studies.identify.modes` for the methods."""
     x, y, twist = (modes_of(problem.poses[:, i], problem.rate) for i in range(3))
     return Identified(problem, (x, y, twist))

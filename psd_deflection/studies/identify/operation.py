@@ -29,7 +29,7 @@ ODDS = 1e-3
 
 
 def mode_in_operation(samples: FloatArray, rate: float, frequency: float) -> Mode | None:
-    """The mode from the spectrum of a link that is driven all the time."""
+    """Return the mode from the spectrum of a link that is driven all the time."""
     from scipy.signal import detrend, periodogram
 
     f, p = periodogram(detrend(samples), rate, detrend=False, window='hann')
@@ -61,12 +61,12 @@ def mode_in_operation(samples: FloatArray, rate: float, frequency: float) -> Mod
         )
         if best is None or tried.fun < best.fun:
             best = tried
-    if best is None or not _scatters_as_it_should(p / density(best.x)):
+    if best is None or not scatters_as_exponential(p / density(best.x)):
         return None
     a, f0, zeta, _ = (float(v) for v in np.exp(best.x[:4]))
     if not 0.7 * frequency < f0 < 1.4 * frequency or not 10.0 * LEAST_DAMPING < zeta < 0.5:
         return None
-    information = _information(density, best.x)
+    information = information_of(density, best.x)
     information[4, 4] += SLOPE_SD**-2
     covariance = np.linalg.pinv(information)
     # The area under the mode's density.
@@ -74,7 +74,7 @@ def mode_in_operation(samples: FloatArray, rate: float, frequency: float) -> Mod
     return Mode(f0, f0 * math.sqrt(covariance[1, 1]), zeta, zeta * math.sqrt(covariance[2, 2]), rms)
 
 
-def _scatters_as_it_should(ratios: FloatArray) -> bool:
+def scatters_as_exponential(ratios: FloatArray) -> bool:
     """Whether ``ratios`` (n,) of a periodogram to a density are as the right one leaves them: exponential, mean 1."""
     from scipy.stats import gamma
 
@@ -88,7 +88,7 @@ def _scatters_as_it_should(ratios: FloatArray) -> bool:
     return min(chances) > 0.5 * ODDS
 
 
-def _information(density: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
+def information_of(density: Callable[[FloatArray], FloatArray], x: FloatArray) -> FloatArray:
     """Fisher's information of Whittle's likelihood: the products of the derivatives of log S, summed."""
     step = 1e-5
     columns = []

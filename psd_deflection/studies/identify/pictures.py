@@ -36,43 +36,45 @@ class DrawnModes:
     shapers: Sequence[Shaper | None]
 
 
-def sections(found: DrawnModes) -> list[PageSection]:
-    """The page below the sentences."""
-    out = [PageSection('Spectra', (_spectra(found),))]
-    if any(a.stretches for a in found.axes):
-        out.append(PageSection('Ring-downs', (_ring_downs(found),)))
-    if any(a.modes for a in found.axes):
+def sections(drawn: DrawnModes) -> list[PageSection]:
+    """Return the page below the sentences."""
+    out = [PageSection('Spectra', (_spectra(drawn),))]
+    if any(a.stretches for a in drawn.axes):
+        out.append(PageSection('Ring-downs', (_ring_downs(drawn),)))
+    if any(a.modes for a in drawn.axes):
         words = (
             '<p class=quiet>Share of the vibration that is left if the frequency is another. '
             'The recommended one is the shortest that leaves at most 5 % about the mode.</p>'
         )
-        rows = table(('axis', 'shaper', 'longer by, ms', 'impulses'), _shaper_rows(found))
-        out.append(PageSection('Input shapers', (words, _shapers(found), rows)))
+        rows = table(('axis', 'shaper', 'longer by, ms', 'impulses'), _shaper_rows(drawn))
+        out.append(PageSection('Input shapers', (words, _shapers(drawn), rows)))
     return out
 
 
-def _shaper_rows(found: DrawnModes) -> list[tuple[str, str, str, str]]:
+def _shaper_rows(drawn: DrawnModes) -> list[tuple[str, str, str, str]]:
     rows = []
-    for i, axis in enumerate(found.axes):
+    for i, axis in enumerate(drawn.axes):
         if not axis.modes:
             continue
-        best = found.shapers[i]
+        best = drawn.shapers[i]
         for kind in KINDS:
-            one = shaper(kind, axis.modes[0].frequency, axis.modes[0].damping)
+            impulses = shaper(kind, axis.modes[0].frequency, axis.modes[0].damping)
             name = kind.upper() + (' (recommended)' if best is not None and best.name == kind else '')
-            pairs = ', '.join(f'{s:.4f} at {1e3 * t:.2f} ms' for t, s in zip(one.times, one.sizes, strict=True))
-            rows.append((SYMBOLS[i], name, f'{1e3 * one.duration:.1f}', pairs))
+            pairs = ', '.join(
+                f'{s:.4f} at {1e3 * t:.2f} ms' for t, s in zip(impulses.times, impulses.sizes, strict=True)
+            )
+            rows.append((SYMBOLS[i], name, f'{1e3 * impulses.duration:.1f}', pairs))
     return rows
 
 
-def _spectra(found: DrawnModes) -> Chart:
+def _spectra(drawn: DrawnModes) -> Chart:
     panels = []
-    for i, axis in enumerate(found.axes):
-        samples = found.poses[:, i]
+    for i, axis in enumerate(drawn.axes):
+        samples = drawn.poses[:, i]
         there = np.flatnonzero(np.isfinite(samples))
         filled = np.interp(np.arange(len(samples)), there, samples[there])
-        f, p = welch(filled, found.rate, nperseg=min(len(filled), int(8 * found.rate)))
-        shown = (f > 0.3) & (f < 0.25 * found.rate)
+        f, p = welch(filled, drawn.rate, nperseg=min(len(filled), int(8 * drawn.rate)))
+        shown = (f > 0.3) & (f < 0.25 * drawn.rate)
         curve = Series('', f[shown], SHOWN[i] * np.sqrt(p[shown]), MEASURED)
         rules = [Rule(mode.frequency, f'{mode.frequency:.3f} Hz', colour=FITTED) for mode in axis.modes]
         label = f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}/√Hz'
@@ -80,36 +82,36 @@ def _spectra(found: DrawnModes) -> Chart:
     return Chart('spectrum of each axis with its modes', panels)
 
 
-def _ring_downs(found: DrawnModes) -> Chart:
+def _ring_downs(drawn: DrawnModes) -> Chart:
     panels = []
-    for i, modes in enumerate(found.axes):
+    for i, modes in enumerate(drawn.axes):
         if not modes.stretches:
             continue
         first, last = max(
             modes.stretches, key=lambda s: np.nanmax(np.abs(modes.fitted[s[0] : s[1]] - modes.fitted[s[1] - 1]))
         )
-        t = np.arange(first, last) / found.rate
+        t = np.arange(first, last) / drawn.rate
         curves = (
-            Series('samples', t, SHOWN[i] * found.poses[first:last, i], MEASURED, 'points'),
+            Series('samples', t, SHOWN[i] * drawn.poses[first:last, i], MEASURED, 'points'),
             Series('fit', t, SHOWN[i] * modes.fitted[first:last], FITTED),
         )
-        along = TimeAxis(FROM_FIRST, found.marks, SYMBOLS[i])
+        along = TimeAxis(FROM_FIRST, drawn.marks, SYMBOLS[i])
         panels.append(Panel(curves, along, f'{SYMBOLS[i]} / {SHOWN_UNITS[i]}', height=180))
     return Chart('the largest ring-down of each axis and its fit', panels)
 
 
-def _shapers(found: DrawnModes) -> Chart:
+def _shapers(drawn: DrawnModes) -> Chart:
     panels = []
-    for i, axis in enumerate(found.axes):
+    for i, axis in enumerate(drawn.axes):
         if not axis.modes:
             continue
-        mode, best = axis.modes[0], found.shapers[i]
+        mode, best = axis.modes[0], drawn.shapers[i]
         f = np.linspace(0.6 * mode.frequency, 1.4 * mode.frequency, 300)
         curves = []
         for kind, tone in zip(KINDS, TONES, strict=True):
-            left = shaper(kind, mode.frequency, mode.damping).residual(f, mode.damping)
+            residual = shaper(kind, mode.frequency, mode.damping).residual(f, mode.damping)
             bold = best is not None and best.name == kind
-            curves.append(Series(kind.upper(), f, 100.0 * left, tone, bold=bold))
+            curves.append(Series(kind.upper(), f, 100.0 * residual, tone, bold=bold))
         rules = (Rule(mode.frequency),)
         panels.append(Panel(curves, f'{SYMBOLS[i]}: frequency / Hz', 'vibration left / %', rules=rules, height=SMALL))
     return Chart('what is left of the vibration over the frequency, for each shaper', panels, beside=3)

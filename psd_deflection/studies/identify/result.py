@@ -66,18 +66,18 @@ class Identified(StudyResult):
         out: dict[str, float] = {}
         for name, axes in KINDS.items():
             modes = [self.axes[i].modes[0] for i in axes if self.axes[i].modes]
-            if modes and self._withheld(name) is None:
+            if modes and self.withheld_reason(name) is None:
                 best = min(modes, key=lambda m: m.frequency_sd / m.frequency)
                 out[f'dynamics.{name}_frequency'] = float(f'{best.frequency:.8g}')
                 out[f'dynamics.{name}_damping_ratio'] = float(f'{best.damping:.6g}')
         return out
 
-    def _withheld(self, name: str) -> str | None:
+    def withheld_reason(self, name: str) -> str | None:
         """Why the rig file does not get the mode of this kind; None if it does, or if none was found."""
         found = [self.axes[i].modes for i in KINDS[name] if self.axes[i].modes]
         if not found:
             return None
-        if any(len(_close(modes)) > 1 for modes in found):
+        if any(len(close_modes(modes)) > 1 for modes in found):
             return 'two modes close to each other, and the rig file describes one'
         first = [modes[0] for modes in found]
         apart = abs(first[0].frequency - first[-1].frequency)
@@ -93,7 +93,7 @@ class Identified(StudyResult):
 
         Of modes close to each other it works for all.
         """
-        modes = _close(self.axes[axis].modes)
+        modes = close_modes(self.axes[axis].modes)
         if not modes or min(m.damping / m.damping_sd if m.damping_sd else 0.0 for m in modes) < 1.0 / KNOWN[1]:
             return None
         low, high = min(m.frequency for m in modes), max(m.frequency for m in modes)
@@ -106,62 +106,62 @@ class Identified(StudyResult):
         return self.problem.opened.sources
 
     def sentences(self) -> list[str]:
-        """One line for each mode, and the shaper."""
+        """Return one line for each mode, and the shaper."""
         out = []
         for i, axis in enumerate(self.axes):
             if not axis.modes:
                 out.append(f'{SYMBOLS[i]}: no mode stands out of the noise. Knock on the link, or release a load.')
             for mode in axis.modes:
-                frequency, damping, size, how = self._mode_words(i, mode)
+                frequency, damping, size, how = self.mode_words(i, mode)
                 out.append(f'{SYMBOLS[i]}: {frequency} Hz, damping ratio {damping} (95 %), {size}, from {how}')
-            if best := self._shaper_words(i):
+            if best := self.shaper_words(i):
                 out.append(f'{SYMBOLS[i]}: input shaper {best}')
-        return [*out, *self._nothing()]
+        return [*out, *self.withheld_sentences()]
 
     def page_sentences(self) -> list[str]:
         """How many modes there are; what they are stands in a table."""
-        found = [f'{len(axis.modes)} along {SYMBOLS[i]}' for i, axis in enumerate(self.axes) if axis.modes]
-        first = f'Modes: {", ".join(found)}.' if found else 'No mode stands out of the noise.'
-        return [first, *self._nothing()]
+        counts = [f'{len(axis.modes)} along {SYMBOLS[i]}' for i, axis in enumerate(self.axes) if axis.modes]
+        first = f'Modes: {", ".join(counts)}.' if counts else 'No mode stands out of the noise.'
+        return [first, *self.withheld_sentences()]
 
     def rows(self) -> list[list[str]]:
-        """The modes as a table: axis, frequency, damping ratio, amplitude, what from, and the shaper."""
+        """Return the modes as a table: axis, frequency, damping ratio, amplitude, what from, and the shaper."""
         out = []
         for i, axis in enumerate(self.axes):
             if not axis.modes:
                 out.append([SYMBOLS[i], 'none: knock on the link, or release a load', '', '', '', ''])
             for number, mode in enumerate(axis.modes):
-                shaper = self._shaper_words(i).partition(':')[0] if number == 0 else ''
-                out.append([SYMBOLS[i], *self._mode_words(i, mode), shaper])
+                shaper = self.shaper_words(i).partition(':')[0] if number == 0 else ''
+                out.append([SYMBOLS[i], *self.mode_words(i, mode), shaper])
         return out
 
-    def _mode_words(self, i: int, mode: Mode) -> tuple[str, str, str, str]:
+    def mode_words(self, i: int, mode: Mode) -> tuple[str, str, str, str]:
         """Frequency, damping ratio, amplitude of a mode of axis ``i``, and what it was found from."""
         axis = self.axes[i]
         count = len(axis.stretches)
         rings = f'{count} ring-down{"" if count == 1 else "s"}'
         return (
-            _pm(mode.frequency, mode.frequency_sd),
-            _pm(mode.damping, mode.damping_sd),
+            interval_words(mode.frequency, mode.frequency_sd),
+            interval_words(mode.damping, mode.damping_sd),
             f'{SHOWN[i] * mode.amplitude:.1f} {SHOWN_UNITS[i]}',
             rings if axis.how == 'ring-down' else 'the spectrum in operation',
         )
 
-    def _shaper_words(self, i: int) -> str:
-        """The recommended shaper of axis ``i``; '' if there is none."""
+    def shaper_words(self, i: int) -> str:
+        """Return the recommended shaper of axis ``i``; '' if there is none."""
         best = self.shaper_of(i)
         if best is None:
             return ''
         pairs = ', '.join(f'{s:.4f} at {1e3 * t:.1f} ms' for t, s in zip(best.times, best.sizes, strict=True))
         return f'{best.name.upper()}: {pairs}'
 
-    def _nothing(self) -> list[str]:
+    def withheld_sentences(self) -> list[str]:
         """What the rig file does not get, and why."""
-        whys = [(name, self._withheld(name)) for name in KINDS]
+        whys = [(name, self.withheld_reason(name)) for name in KINDS]
         return [f'Nothing for dynamics.{name}_*: {why}.' for name, why in whys if why is not None]
 
     def lines(self) -> list[str]:
-        """The sentences, and the lines for the rig file."""
+        """Return the sentences, and the lines for the rig file."""
         if not self.values:
             return self.sentences()
         values = [f'    {name}: {value:g}' for name, value in self.values.items()]
@@ -195,7 +195,7 @@ class Identified(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row a mode: Hz and damping ratio with their standard deviations, amplitude in m or rad."""
+        """Return one row a mode: Hz and damping ratio with their standard deviations, amplitude in m or rad."""
         modes = [(AXES[i], mode, UNITS[i], axis.how) for i, axis in enumerate(self.axes) for mode in axis.modes]
 
         def column(name: str, values: list[float], unit: str, words: str) -> Column:
@@ -215,7 +215,7 @@ class Identified(StudyResult):
         )
 
     def sections(self) -> Iterable[PageSection]:
-        """The table of modes, spectra, ring-downs, shapers."""
+        """Return the table of modes, spectra, ring-downs, shapers."""
         from psd_deflection.studies.identify.pictures import DrawnModes, sections
 
         shapers = [self.shaper_of(i) for i in range(len(self.axes))]
@@ -224,7 +224,7 @@ class Identified(StudyResult):
         return [modes, *sections(DrawnModes(self.poses, self.rate, self.problem.marks, self.axes, shapers))]
 
     def rig_yaml(self) -> str:
-        """The user's parameter file with the modes, comments kept; without one what describes the rig."""
+        """Return the user's parameter file with the modes, comments kept; without one what describes the rig."""
         recording, rig, params_file, tell, _ = self.problem.opened
         date = datetime.now(UTC).date().isoformat()
         recorded = named(recording.name, recording.digest)
@@ -236,16 +236,16 @@ class Identified(StudyResult):
         return edited_rig_file(params_file, 'rig.yaml', lambda: described(rig, effects_of_rig(rig)), edit, tell)
 
     def files(self) -> dict[str, str]:
-        """The page, the JSON, and ``rig.yaml`` with the modes in it."""
+        """Return the page, the JSON, and ``rig.yaml`` with the modes in it."""
         return {**super().files(), 'rig.yaml': self.rig_yaml()}
 
 
-def _close(modes: Sequence[Mode]) -> list[Mode]:
-    """The loudest mode and those that are close to it; empty if there is none."""
+def close_modes(modes: Sequence[Mode]) -> list[Mode]:
+    """Return the loudest mode and those that are close to it; empty if there is none."""
     return [m for m in modes if abs(m.frequency - modes[0].frequency) < CLOSE * modes[0].frequency]
 
 
-def _pm(value: float, sd: float) -> str:
+def interval_words(value: float, sd: float) -> str:
     """Value and 95 % interval, with two digits of the latter."""
     half = 1.96 * sd
     digits = min(max(1 - math.floor(math.log10(half)), 0), 9) if 0.0 < half < math.inf else 6

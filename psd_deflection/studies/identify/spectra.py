@@ -84,7 +84,7 @@ class ColouredNoise:
 
 
 def coloured_noise(filled: FloatArray, rate: float, peaks: Sequence[float]) -> ColouredNoise:
-    """The noise, from the spectrum of the quieter times above the modes that have their ``peaks`` there, Hz.
+    """Return the noise, from the spectrum of the quieter times above the modes that have their ``peaks`` there, Hz.
 
     A mode falls off faster above its frequency than noise that remembers.
     """
@@ -108,13 +108,13 @@ def coloured_noise(filled: FloatArray, rate: float, peaks: Sequence[float]) -> C
     shapes += [1.0 / ((k * k - f * f) ** 2 + 1e-2 * k**4) for k in peaks]
     matrix = np.array([[shape[at].mean() / power for shape in shapes] for at, power in bands])
     sizes = np.linalg.norm(matrix, axis=0)
-    found, _ = nnls(matrix / sizes, np.ones(len(bands)))
-    white, walk = (found / sizes)[:2]
+    weights, _ = nnls(matrix / sizes, np.ones(len(bands)))
+    white, walk = (weights / sizes)[:2]
     return ColouredNoise(float(white), float(walk))
 
 
-def stands_above(filled: FloatArray, rate: float, frequency: float, noise: ColouredNoise) -> bool:
-    """Whether the motion at ``frequency``, Hz, exceeds the ``noise`` there."""
+def exceeds_noise(filled: FloatArray, rate: float, frequency: float, noise: ColouredNoise) -> bool:
+    """Return whether the motion at ``frequency``, Hz, exceeds the ``noise`` there."""
     f, p = _spectrum(filled, rate)
     floor = noise.density(f[1:], rate) * rate**2 * (2.0 - 2.0 * np.cos(2.0 * np.pi * f[1:] / rate))
     return bool(np.interp(frequency, f, p) > PEAK * np.interp(frequency, f[1:], floor))

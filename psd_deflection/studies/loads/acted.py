@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.noted_times import MendedNote
-from psd_deflection.studies.loads.plateaus import WrongNote, as_hung, asked_beside_rig, plateaus, wrong_notes
-from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
+from psd_deflection.studies.loads.noted_times import CorrectedNote
+from psd_deflection.studies.loads.plateaus import WrongNote, as_applied, implied_beside_rig, plateaus, wrong_notes
+from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swaying_loads
 from psd_deflection.studies.loads.unnoted import MANY, UnnotedTime, unnoted_times, without_times
 
-LoadNote = MendedNote | WrongNote | SwayingLoad | UnnotedTime
+LoadNote = CorrectedNote | WrongNote | SwayingLoad | UnnotedTime
 """What was noted of a load otherwise than it was."""
 
 
@@ -34,13 +34,13 @@ def loads_that_acted(rig: Rig, volts: FloatArray, loads: FloatArray) -> ActedLoa
     """
     period = 1.0 / rig.converter.sample_rate_hz
     swayed = swaying_loads(rig, volts, loads)
-    steady = left_out(rig, volts, swayed)
+    steady = excluded(rig, volts, swayed)
     wrong = wrong_notes(rig, steady, loads)
     listed = plateaus(rig, volts, loads)
     if not wrong and sum(p.unnoted for p in listed) >= MANY:
-        found = asked_beside_rig(rig, volts, loads)(listed)
-        if unnoted := unnoted_times(found, len(loads), period):
+        implied = implied_beside_rig(rig, volts, loads)(listed)
+        if unnoted := unnoted_times(implied, len(loads), period):
             # What seemed to sway there was hung and taken off.
             rest = loads_that_acted(rig, without_times(volts, unnoted), loads)
             return ActedLoads(rest.loads, rest.volts, (*unnoted, *rest.notes))
-    return ActedLoads(as_hung(loads, wrong), steady, (*swayed, *wrong))
+    return ActedLoads(as_applied(loads, wrong), steady, (*swayed, *wrong))

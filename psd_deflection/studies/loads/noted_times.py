@@ -58,28 +58,30 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)
-class MendedNote:
-    """One noted load: ``number`` from 1; ``load`` fx N, fy N, tz N m; ``noted``, ``hung``: s from the first sample.
+class CorrectedNote:
+    """One noted load: ``number`` from 1; ``load`` fx N, fy N, tz N m.
 
-    ``took``: time that it was applied over, s, 0 for a step. ``settled_only``: the motion is left out.
+    ``annotated``, ``applied``: s from the first sample.
+
+    ``took``: time that it was applied over, s, 0 for a step. ``rest_only``: the motion is left out.
     """
 
     number: int
     load: tuple[float, float, float]
-    noted: float
-    hung: float
+    annotated: float
+    applied: float
     took: float
-    settled_only: bool = False
+    rest_only: bool = False
 
     @property
-    def late(self) -> float:
+    def delay(self) -> float:
         """s; below 0 if it was noted early."""
-        return self.noted - self.hung
+        return self.annotated - self.applied
 
     @property
     def name(self) -> str:
         """Of the finding: ``load_time``, or ``load_ramp`` if it was noted in time and applied slowly."""
-        return 'load_time' if self._is_late else 'load_ramp'
+        return 'load_time' if self._is_delayed else 'load_ramp'
 
     @property
     def where(self) -> str:
@@ -89,62 +91,62 @@ class MendedNote:
     @property
     def value(self) -> float:
         """s by which it was noted late, or in which it was applied."""
-        return self.late if self._is_late else self.took
+        return self.delay if self._is_delayed else self.took
 
     @property
     def size(self) -> float:
         """s by which it was noted late or early."""
-        return abs(self.late)
+        return abs(self.delay)
 
     @property
     def wrong(self) -> bool:
         """Whether it was noted otherwise than it was hung."""
-        return abs(self.late) > ALIKE_S or self.took > 0.0
+        return abs(self.delay) > ALIKE_S or self.took > 0.0
 
-    def moved(self, moments: Sequence[float], period: float) -> MendedNote:
+    def moved(self, moments: Sequence[float], period: float) -> CorrectedNote:
         """It acted so many moments later and, the second number, took so many longer. A moment is a quarter of a
         sample, of which one comes every ``period``, s.
         """
         later, slower = (*moments, 0.0, 0.0)[:2]
         moment = 0.25 * period
-        return replace(self, hung=self.hung + later * moment, took=max(self.took + slower * moment, 0.0))
+        return replace(self, applied=self.applied + later * moment, took=max(self.took + slower * moment, 0.0))
 
     @property
-    def _is_late(self) -> bool:
-        return abs(self.late) > ALIKE_S and abs(self.late) > self.took
+    def _is_delayed(self) -> bool:
+        return abs(self.delay) > ALIKE_S and abs(self.delay) > self.took
 
     def words(self, name: str) -> str:
         """What was wrong, and what to do; ``name``: of the recording."""
         fx, fy, tz = self.load
         how = ' and '.join(self._how())
-        until = f', as a ramp until {self.hung + self.took:.3f} s' if self.took > 0.0 else ''
-        left = '; here only the link at rest under it is used' if self.settled_only else ''
+        until = f', as a ramp until {self.applied + self.took:.3f} s' if self.took > 0.0 else ''
+        remark = '; here only the link at rest under it is used' if self.rest_only else ''
         return (
             f'the {ordinal(self.number)} load of {name} ({fx:g} N, {fy:g} N, {tz:g} N m) was noted {how}: note it '
-            f'{self.hung:.3f} s after the first sample{until}, not {self.noted:.3f} s{left}'
+            f'{self.applied:.3f} s after the first sample{until}, not {self.annotated:.3f} s{remark}'
         ).replace('was noted applied', 'was applied')
 
     def _how(self) -> list[str]:
         out = []
-        if self._is_late:
-            out.append(f'{abs(self.late):.3f} s {"late" if self.late > 0.0 else "early"}')
+        if self._is_delayed:
+            out.append(f'{abs(self.delay):.3f} s {"late" if self.delay > 0.0 else "early"}')
         if self.took > 0.0:
             out.append(f'applied over {self.took:.2g} s')
         return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MendedLoads:
+class CorrectedLoads:
     """``loads`` (n, 3) N, N, N m as they acted; ``notes``: those that were wrong; ``unused`` (n,): samples in motion
     that the mended loads do not describe; ``measured``: those that were measured; ``timed``: all whose time is fitted,
     also those that were right as noted: a fitted time is known no better than what else the dots do then.
     """
 
     loads: FloatArray
-    notes: tuple[MendedNote, ...]
+    notes: tuple[CorrectedNote, ...]
     unused: BoolArray
     measured: tuple[MeasuredLoad, ...] = ()
-    timed: tuple[MendedNote, ...] = ()
+    timed: tuple[CorrectedNote, ...] = ()
 
 
 def ordinal(number: int) -> str:
@@ -153,17 +155,17 @@ def ordinal(number: int) -> str:
     return f'{number}{ending}'
 
 
-def mend_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
+def correct_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> CorrectedLoads | None:
     """The loads with the times at which they acted and without the noise of a load cell; None if they are right as
     noted or the motion does not tell.
 
     ``dots`` (n, 2P) m of any wiring, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m as noted, held.
     """
     calm, measured = without_cell_noise(loads)
-    mended = _mended_times(rig, dots, calm)
-    if mended is None:
-        return MendedLoads(calm, (), np.zeros(len(loads), dtype=bool), measured) if measured else None
-    return replace(mended, measured=measured)
+    corrected = _corrected_times(rig, dots, calm)
+    if corrected is None:
+        return CorrectedLoads(calm, (), np.zeros(len(loads), dtype=bool), measured) if measured else None
+    return replace(corrected, measured=measured)
 
 
 def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
@@ -187,127 +189,132 @@ def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
     return out
 
 
-def _mended_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> MendedLoads | None:
+def _corrected_times(rig: Rig, dots: FloatArray, loads: FloatArray) -> CorrectedLoads | None:
     period = 1.0 / rig.converter.sample_rate_hz
     changes = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
     if len(changes) == 0 or np.any(np.diff(changes) * period < APART_S):
         return None
     width = max(2, round(PERIODS / rig.dynamics.bending_frequency / period))
     steps = lasting_steps(dots, width)
-    sizes = _expected(rig, loads[changes] - loads[changes - 1])
-    matched = _matched(changes, sizes, steps, period)
+    sizes = expected_movements(rig, loads[changes] - loads[changes - 1])
+    matched = matched_notes(changes, sizes, steps, period)
     if not matched:
         return None
-    late = np.array([(changes[i] - steps[j].at) * period for i, j in matched])
+    delays = np.array([(changes[i] - steps[j].at) * period for i, j in matched])
     long = np.array([steps[j].last - steps[j].first > 2.0 * width + GRADUAL_S / period for _, j in matched])
-    if _alike(late, ALIKE_S) and not long.any():
+    if are_alike(delays, ALIKE_S) and not long.any():
         return None
     edges = [0.0, *(s.at for s in steps), float(len(dots))]
     fitted = {i: time_of_step(rig, dots, steps[j], (edges[j], edges[j + 2]), period) for i, j in matched}
-    late = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
+    delays = np.array([changes[i] * period - start for i, (start, _) in fitted.items()])
     # One delay is left to a search, unless it would have to find it from what was lost.
-    unseen = abs(float(np.median(late))) > ALIKE_S and any(steps[j].lost for _, j in matched)
-    if not unseen and _alike(late, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
+    unseen = abs(float(np.median(delays))) > ALIKE_S and any(steps[j].lost for _, j in matched)
+    if not unseen and are_alike(delays, ALIKE_S) and max(took for _, took in fitted.values()) <= GRADUAL_S:
         return None
-    mended, timed = _as_acted(loads, changes, fitted, period)
-    left, rest = _left(rig, dots, mended)
-    if BETTER * left > _left(rig, dots, loads)[0]:
+    corrected, timed = loads_with_times(loads, changes, fitted, period)
+    residual, rest = residual_of_dots(rig, dots, corrected)
+    if BETTER * residual > residual_of_dots(rig, dots, loads)[0]:
         return None
-    return replace(_without_rough_motion(rig, mended, [n for n in timed if n.wrong], rest), timed=tuple(timed))
+    return replace(without_rough_motion(rig, corrected, [n for n in timed if n.wrong], rest), timed=tuple(timed))
 
 
-def _as_acted(
+def loads_with_times(
     loads: FloatArray, changes: IntArray, fitted: Mapping[int, tuple[float, float]], period: float
-) -> tuple[FloatArray, list[MendedNote]]:
+) -> tuple[FloatArray, list[CorrectedNote]]:
     """The loads with change ``i`` from the time ``fitted[i]`` says, in the time that it took; the notes of these."""
-    mended = np.tile(loads[0], (len(loads), 1))
+    corrected = np.tile(loads[0], (len(loads), 1))
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
     notes = []
     for i, at in enumerate(changes.tolist()):
-        noted = at * period
-        start, took = fitted.get(i, (noted, 0.0))
-        mended += applied(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
+        annotated = at * period
+        start, took = fitted.get(i, (annotated, 0.0))
+        corrected += applied(t, start, took, period)[:, None] * (loads[at] - loads[at - 1])
         if i in fitted:
             fx, fy, tz = loads[at].tolist()
-            notes.append(MendedNote(i + 1, (fx, fy, tz), noted, start, took if took > GRADUAL_S else 0.0))
-    return mended, notes
+            notes.append(CorrectedNote(i + 1, (fx, fy, tz), annotated, start, took if took > GRADUAL_S else 0.0))
+    return corrected, notes
 
 
-def _without_rough_motion(rig: Rig, mended: FloatArray, notes: Sequence[MendedNote], rest: FloatArray) -> MendedLoads:
-    """The mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
-    t: FloatArray = np.arange(len(mended), dtype=np.float64) / rig.converter.sample_rate_hz
-    unused = np.zeros(len(mended), dtype=bool)
-    told = []
+def without_rough_motion(
+    rig: Rig, corrected: FloatArray, notes: Sequence[CorrectedNote], rest: FloatArray
+) -> CorrectedLoads:
+    """Return the mended loads; the motion under one applied slowly is left out if ``rest`` (n, 2P), m, is another."""
+    t: FloatArray = np.arange(len(corrected), dtype=np.float64) / rig.converter.sample_rate_hz
+    unused = np.zeros(len(corrected), dtype=bool)
+    notes_used = []
     for note in notes:
-        moving = _moving(rig, note, t)
-        told.append(note)
+        moving = in_motion(rig, note, t)
+        notes_used.append(note)
         # A step is the simplest motion: if the link rings otherwise, that is the rig's.
-        if note.took > 0.0 and _rough(rest, moving & (t > note.hung + note.took), rig.estimator.block_size):
+        if note.took > 0.0 and is_rough(rest, moving & (t > note.applied + note.took), rig.estimator.block_size):
             unused |= moving
-            told[-1] = MendedNote(note.number, note.load, note.noted, note.hung, note.took, settled_only=True)
-    return MendedLoads(mended, tuple(told), unused)
+            notes_used[-1] = CorrectedNote(
+                note.number, note.load, note.annotated, note.applied, note.took, rest_only=True
+            )
+    return CorrectedLoads(corrected, tuple(notes_used), unused)
 
 
-def shifted(note: MendedNote, loads: FloatArray, period: float) -> Callable[[Sequence[float]], FloatArray]:
+def shifted(note: CorrectedNote, loads: FloatArray, period: float) -> Callable[[Sequence[float]], FloatArray]:
     """What so many moments more do to ``loads`` (n, 3): of the time at which the load of ``note`` began to act and, the
     second number if it was applied slowly, of how long that took.
     """
     t: FloatArray = np.arange(len(loads), dtype=np.float64) * period
-    before, after = np.searchsorted(t, (note.hung - period, note.hung + note.took + 2.0 * period))
+    before, after = np.searchsorted(t, (note.applied - period, note.applied + note.took + 2.0 * period))
     step = loads[min(int(after), len(loads) - 1)] - loads[max(int(before) - 1, 0)]
-    now = applied(t, note.hung, note.took, period)
+    now = applied(t, note.applied, note.took, period)
 
     def more(moments: Sequence[float]) -> FloatArray:
         then = note.moved(moments, period)
-        return np.asarray((applied(t, then.hung, then.took, period) - now)[:, None] * step)
+        return np.asarray((applied(t, then.applied, then.took, period) - now)[:, None] * step)
 
     return more
 
 
-def _alike(late: FloatArray, within: float) -> bool:
-    middle = float(np.median(late))
-    return abs(middle) <= ONE_DELAY_S and bool(np.all(np.abs(late - middle) <= within))
+def are_alike(delays: FloatArray, within: float) -> bool:
+    """Return whether all delays, s, are ``within`` s of the middle one, and that is one delay of all."""
+    middle = float(np.median(delays))
+    return abs(middle) <= ONE_DELAY_S and bool(np.all(np.abs(delays - middle) <= within))
 
 
-def _expected(rig: Rig, changes: FloatArray) -> FloatArray:
+def expected_movements(rig: Rig, changes: FloatArray) -> FloatArray:
     """How far (k,) the dots move, m, by changes (k, 3) of the load."""
     poses = changes @ LinkStatics.from_rig(rig).compliance
     return np.asarray(np.linalg.norm(poses @ design_matrix(rig.centers + rig.zeros).T, axis=1))
 
 
-def _matched(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period: float) -> list[tuple[int, int]]:
+def matched_notes(changes: IntArray, sizes: FloatArray, steps: list[DotStep], period: float) -> list[tuple[int, int]]:
     """Pairs of a noted change and a step, both in their order, at least cost; changes that move nothing have none."""
     if not steps or float(sizes.sum()) <= 0.0:
         return []
-    seen = [i for i in range(len(changes)) if sizes[i] > LEAST_SHARE * float(sizes.max())]
-    factor = sum(s.size for s in steps) / float(sizes[seen].sum())
-    apart = np.abs(np.array([step.at for step in steps]) - changes[seen, None]) * period
+    significant = [i for i in range(len(changes)) if sizes[i] > LEAST_SHARE * float(sizes.max())]
+    factor = sum(s.size for s in steps) / float(sizes[significant].sum())
+    apart = np.abs(np.array([step.at for step in steps]) - changes[significant, None]) * period
     on_time = apart <= _ON_TIME_S
-    own = _ON_TIME if 2 * np.count_nonzero(on_time.any(axis=1)) >= len(seen) else 0.0
-    cost = np.zeros((len(seen) + 1, len(steps) + 1))
+    least_share = _ON_TIME if 2 * np.count_nonzero(on_time.any(axis=1)) >= len(significant) else 0.0
+    cost = np.zeros((len(significant) + 1, len(steps) + 1))
     way = np.zeros(cost.shape, dtype=np.int64)
-    cost[:, 0], cost[0] = _SKIP_NOTE * np.arange(len(seen) + 1), _SKIP_STEP * np.arange(len(steps) + 1)
+    cost[:, 0], cost[0] = _SKIP_NOTE * np.arange(len(significant) + 1), _SKIP_STEP * np.arange(len(steps) + 1)
     way[1:, 0], way[0, 1:] = 1, 2
-    for a, i in enumerate(seen, start=1):
+    for a, i in enumerate(significant, start=1):
         for b, step in enumerate(steps, start=1):
             away = float(apart[a - 1, b - 1])
             unlike = math.log(max(step.size, 1e-12) / (factor * float(sizes[i]))) / 0.5
             pair = math.inf if away > FARTHEST_S else _PER_SECOND * away + min(unlike**2, 8.0)
-            pair -= own * float(on_time[a - 1, b - 1])
+            pair -= least_share * float(on_time[a - 1, b - 1])
             ways = (cost[a - 1, b - 1] + pair, cost[a - 1, b] + _SKIP_NOTE, cost[a, b - 1] + _SKIP_STEP)
             way[a, b] = int(np.argmin(ways))
             cost[a, b] = ways[way[a, b]]
     out = []
-    a, b = len(seen), len(steps)
+    a, b = len(significant), len(steps)
     while a > 0 or b > 0:
         chosen = way[a, b]
         if chosen == 0:
-            out.append((seen[a - 1], b - 1))
+            out.append((significant[a - 1], b - 1))
         a, b = a - (chosen != 2), b - (chosen != 1)
     return out[::-1]
 
 
-def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:
+def residual_of_dots(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatArray]:
     """What a regression of the dots on the motion under ``loads`` leaves, m^2; block means of it (n, 2P), m."""
     period = 1.0 / rig.converter.sample_rate_hz
     static = loads @ LinkStatics.from_rig(rig).compliance
@@ -328,18 +335,18 @@ def _left(rig: Rig, dots: FloatArray, loads: FloatArray) -> tuple[float, FloatAr
     return float((rest**2).sum()), np.repeat(blocks, size, axis=0)[: len(dots)]
 
 
-def _moving(rig: Rig, note: MendedNote, t: FloatArray) -> BoolArray:
+def in_motion(rig: Rig, note: CorrectedNote, t: FloatArray) -> BoolArray:
     """Samples (n,) in which the link moves by the load of ``note``."""
     slowest = max(1.0 / (2.0 * math.pi * f * max(ratio, 1e-3)) for f, ratio in link_modes(rig))
-    ends = note.hung + note.took + SETTLED_S * slowest
-    return np.asarray((t >= note.hung - 0.02) & (t < ends))
+    ends = note.applied + note.took + SETTLED_S * slowest
+    return np.asarray((t >= note.applied - 0.02) & (t < ends))
 
 
-def _rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
+def is_rough(rest: FloatArray, ringing: BoolArray, size: int) -> bool:
     """Whether the link rings otherwise than the mended load makes it; ``rest`` (n, 2P): means of blocks of ``size``."""
     blocks, rings = rest[::size], ringing[::size]
     noise = 0.5 * np.nanmedian((np.diff(blocks, axis=0) ** 2).sum(axis=1))
-    seen = blocks[rings & np.all(np.isfinite(blocks), axis=1)]
-    if len(seen) < 4:
+    valid = blocks[rings & np.all(np.isfinite(blocks), axis=1)]
+    if len(valid) < 4:
         return False
-    return bool(((seen - seen.mean(axis=0)) ** 2).sum(axis=1).mean() > ROUGH**2 * noise)
+    return bool(((valid - valid.mean(axis=0)) ** 2).sum(axis=1).mean() > ROUGH**2 * noise)

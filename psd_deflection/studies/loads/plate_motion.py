@@ -22,12 +22,12 @@ def dot_rows(psds: int) -> list[int]:
 
 
 def dots_of(rig: Rig, volts: FloatArray) -> FloatArray:
-    """The dots x1 y1 x2 ... (2P, m), m, of readings (3P, m), V."""
+    """Return the dots x1 y1 x2 ... (2P, m), m, of readings (3P, m), V."""
     return np.asarray(volts[dot_rows(len(rig.psds))] * rig.sensitivities.reshape(-1, 1))
 
 
 def moved_plate(rig: Rig, volts: FloatArray, there: FloatArray) -> FloatArray:
-    """The plate's movement (3, m), m, m, rad, of readings (3P, m), V; NaN where one is missing (``there`` 0)."""
+    """Return the plate's movement (3, m), m, m, rad, of readings (3P, m), V; NaN where one is missing (``there`` 0)."""
     dots = dots_of(rig, volts)
     out = np.linalg.pinv(design_matrix(rig.centers + rig.zeros)) @ dots
     out[:, (there[dot_rows(len(rig.psds))] <= 0.0).any(axis=0)] = np.nan

@@ -68,7 +68,7 @@ class Plateau:
     """One time between two changes of the load: samples ``first`` to ``last`` of recording ``recording``.
 
     ``number``: of the noted change that began it, from 1; 0 before the first. ``unnoted``: nothing was noted when it
-    began; ``left``: nor when it ended. ``noted`` (3,): N, N, N m.
+    began; ``end_unnoted``: nor when it ended. ``annotated`` (3,): N, N, N m.
     """
 
     recording: int
@@ -76,8 +76,8 @@ class Plateau:
     last: int
     number: int
     unnoted: bool
-    noted: FloatArray
-    left: bool = False
+    annotated: FloatArray
+    end_unnoted: bool = False
 
     def of(self, loads: FloatArray) -> FloatArray:
         """(3,): the load in its middle, of ``loads`` (n, 3)."""
@@ -85,19 +85,19 @@ class Plateau:
 
 
 def plateaus(
-    rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0, *, noted: bool = False
+    rig: Rig, volts: FloatArray, loads: FloatArray, recording: int = 0, *, annotated_only: bool = False
 ) -> list[Plateau]:
-    """The times between changes of ``loads`` (n, 3), also between those that only the motion shows.
+    """Return the times between changes of ``loads`` (n, 3), also between those that only the motion shows.
 
-    ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost. ``recording``: which one it is. ``noted``: only between
-    changes that were noted.
+    ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost. ``recording``: its index. ``annotated_only``: only between
+    annotated changes.
     """
     period = 1.0 / rig.converter.sample_rate_hz
     changed = np.flatnonzero(np.any(np.diff(loads, axis=0) != 0.0, axis=1)) + 1
     # A load that was applied slowly changes from sample to sample: what counts is its end.
     ends = changed[np.append(np.diff(changed) > 1, True)].tolist() if len(changed) else []
     dots = volts[:, dot_rows(len(rig.psds))] * rig.sensitivities.ravel()
-    unnoted = [] if noted else [round(t / period) for t in unnoted_steps(rig, dots, loads)]
+    unnoted = [] if annotated_only else [round(t / period) for t in unnoted_steps(rig, dots, loads)]
     starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unnoted)])
     stops = np.append(np.union1d(changed, unnoted), len(loads))
     out, number = [], 0
@@ -131,9 +131,9 @@ class PlateauLoads:
     size: int
 
     @property
-    def noted(self) -> FloatArray:
+    def annotated(self) -> FloatArray:
         """(k, 3) N, N, N m."""
-        return np.array([p.noted for p in self.plateaus]).reshape(-1, 3)
+        return np.array([p.annotated for p in self.plateaus]).reshape(-1, 3)
 
     @property
     def sizes(self) -> FloatArray:
@@ -141,10 +141,10 @@ class PlateauLoads:
         return np.asarray(np.linalg.norm(self.more * self.compliance * AXES, axis=1))
 
 
-def asked_for(
+def implied_loads(
     rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: Sequence[Plateau]
 ) -> PlateauLoads:
-    """The loads that readings ask for: ``difference`` (3P, m), V, measured minus simulated.
+    """Return the loads that readings ask for: ``difference`` (3P, m), V, measured minus simulated.
 
     Of a recording of so many ``samples``, in means of ``size``, of which the share ``count`` (3P, m) is there.
     """
@@ -156,9 +156,9 @@ def asked_for(
         columns = np.array(
             [np.ones(moved.shape[1]), *(fine_means(r[None, :], size)[0] for r in _pulses(rig, samples, listed, axis))]
         )
-        found = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
-        more[:, axis] = found[1:] / compliance[axis]
-        rest[axis, there] = moved[axis, there] - found @ columns[:, there]
+        solution = np.linalg.lstsq(columns[:, there].T, moved[axis, there], rcond=1e-9)[0]
+        more[:, axis] = solution[1:] / compliance[axis]
+        rest[axis, there] = moved[axis, there] - solution @ columns[:, there]
     beside = np.where(there, across_plate(rig, difference), np.nan)
     across = np.array([[_mean(row[p.first // size : p.last // size]) for p in listed] for row in beside])
     across = across - across[:, :1]
@@ -168,14 +168,14 @@ def asked_for(
     return PlateauLoads(tuple(listed), more, rest, moved, beside, far, compliance, size)
 
 
-def asked_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Plateau]], PlateauLoads]:
-    """The same, of ``volts`` (n, 3P) held against the rig as its file says under ``acting`` loads (n, 3)."""
+def implied_beside_rig(rig: Rig, volts: FloatArray, acting: FloatArray) -> Callable[[Sequence[Plateau]], PlateauLoads]:
+    """Return the same, of ``volts`` (n, 3P) held against the rig as its file says under ``acting`` loads (n, 3)."""
     size = max(1, round(FINE_SECONDS * rig.converter.sample_rate_hz))
     difference = (volts - ForwardModel(rig).expect(acting).volts.T).T
     there = np.isfinite(difference).astype(np.float64)
     means = fine_means(np.where(there > 0.0, difference, 0.0), size, there)
     count = fine_means(there, size)
-    return lambda listed: asked_for(rig, means, count, len(acting), size, listed)
+    return lambda listed: implied_loads(rig, means, count, len(acting), size, listed)
 
 
 def _mean(values: FloatArray) -> float:
@@ -213,152 +213,153 @@ class StandingOut:
     softer: float = 0.0
 
 
-def stand_out(found: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
-    """The few plateaus with another load than noted; none if it is none or are many.
+def outliers(implied: PlateauLoads, bent: float = 0.0, largest: float = ANY) -> StandingOut:
+    """Return the few plateaus with another load than noted; none if it is none or are many.
 
     ``bent``: share of what is wrong by which the others may seem to be, too. ``largest``: share by which an effect, a
     sign or another unit may change a load that no other is like.
     """
-    count = len(found.plateaus)
-    if np.abs(found.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not _closes(found, CLOSES + bent):
+    count = len(implied.plateaus)
+    if np.abs(implied.more).max(initial=0.0) < EXACT * STANDS_OUT * TOLERANCE or not closes(implied, CLOSES + bent):
         return StandingOut()
     # A detector at fault moves its dots as no plate does.
-    as_plate = np.abs(found.across) <= PLATE * found.sizes + PLATE_M
-    off = _apart(found, (), 0.0)
+    as_plate = np.abs(implied.across) <= PLATE * implied.sizes + PLATE_M
+    off = deviation_in_tolerances(implied, (), 0.0)
     order = np.argsort(-off, kind='stable')
     for share, right, most in ((EXACT, FEWEST_EXACT, count - FEWEST_EXACT), (1.0, FEWEST_RIGHT, 2)):
         for wrong in range(1, min(most, count - right) + 1):
             gone = order[:wrong]
-            stands = _stands(off[gone] / share, off[order[wrong:]] / share, bent)
-            if stands and (share == 1.0 or as_plate[gone].all()) and _known(found, gone, largest):
+            stands = are_outliers(off[gone] / share, off[order[wrong:]] / share, bent)
+            if stands and (share == 1.0 or as_plate[gone].all()) and is_known(implied, gone, largest):
                 return StandingOut(tuple(sorted(gone.tolist())))
     # Two wrong ones of seven leave too few to tell what effects do.
     fitting, tried = 0, []
     for k in range(1, count if count > FEWEST_RIGHT else 0):
-        slopes, offset = _proportion(found, (k,), SOFTER)
+        slopes, offset = proportional_part(implied, (k,), SOFTER)
         if np.abs(slopes).max() > MOST * SOFTER or np.abs(offset).max() > MOST * OFFSET:
             continue
-        apart = _apart(found, (k,), SOFTER)
-        others = np.delete(apart, k)
-        fitting += bool(others.max() <= 1.0 + bent * apart[k])
-        if _stands(apart[k : k + 1], others, bent) and _known(found, np.array([k]), largest):
+        apart = deviation_in_tolerances(implied, (k,), SOFTER)
+        remaining = np.delete(apart, k)
+        fitting += bool(remaining.max() <= 1.0 + bent * apart[k])
+        if are_outliers(apart[k : k + 1], remaining, bent) and is_known(implied, np.array([k]), largest):
             tried.append(k)
     # If the others are in proportion whichever is left out, nobody knows which one is wrong.
     return StandingOut(tuple(tried), SOFTER) if len(tried) == fitting == 1 else StandingOut()
 
 
-def _known(found: PlateauLoads, gone: IntArray, largest: float) -> bool:
+def is_known(implied: PlateauLoads, gone: IntArray, largest: float) -> bool:
     """Whether the other loads say what effects in proportion do to those of ``gone``, or no effect does so much, or a
     change was noted twice.
     """
-    twice = np.array([_noted_twice(found, int(k)) is not None for k in gone])
-    far = np.linalg.norm(found.more[gone], axis=1) > largest * np.linalg.norm(found.noted[gone], axis=1)
-    return bool(np.all(_alike(found, gone) | far | twice))
+    twice = np.array([_annotated_twice(implied, int(k)) is not None for k in gone])
+    far = np.linalg.norm(implied.more[gone], axis=1) > largest * np.linalg.norm(implied.annotated[gone], axis=1)
+    return bool(np.all(_alike(implied, gone) | far | twice))
 
 
-def _alike(found: PlateauLoads, gone: IntArray) -> BoolArray:
+def _alike(implied: PlateauLoads, gone: IntArray) -> BoolArray:
     """Of each of ``gone`` whether it is a sum of the other loads, nearly."""
-    noted = found.noted
-    right = np.delete(noted, gone, axis=0)
-    own = noted[gone]
-    rest = own - own @ np.linalg.pinv(right, rcond=ALONE) @ right
-    return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(own, axis=1))
+    annotated = implied.annotated
+    right = np.delete(annotated, gone, axis=0)
+    outlying = annotated[gone]
+    rest = outlying - outlying @ np.linalg.pinv(right, rcond=ALONE) @ right
+    return np.asarray(np.linalg.norm(rest, axis=1) <= ALONE * np.linalg.norm(outlying, axis=1))
 
 
-def _noted_twice(found: PlateauLoads, k: int) -> FloatArray | None:
+def _annotated_twice(implied: PlateauLoads, k: int) -> FloatArray | None:
     """(3,): what hung in plateau ``k`` if the change that began it was noted twice; None if something else did.
 
     Of the first load that is ambiguous: half of it may be another unit, or another stiffness.
     """
-    noted, before = found.noted[k], found.noted[k - 1]
-    if k == 0 or found.plateaus[k].unnoted or not np.any(before != 0.0):
+    annotated, before = implied.annotated[k], implied.annotated[k - 1]
+    if k == 0 or implied.plateaus[k].unnoted or not np.any(before != 0.0):
         return None
-    hung = 0.5 * (before + noted)
-    off = np.abs(found.more[k] - (hung - noted))
-    allowed = TOLERANCE + SHARE * np.abs(noted).max() + SOFTER * np.abs(hung)
-    return hung if np.all(off <= allowed) and np.any(np.abs(hung - noted) > STANDS_OUT * allowed) else None
+    applied = 0.5 * (before + annotated)
+    off = np.abs(implied.more[k] - (applied - annotated))
+    allowed = TOLERANCE + SHARE * np.abs(annotated).max() + SOFTER * np.abs(applied)
+    return applied if np.all(off <= allowed) and np.any(np.abs(applied - annotated) > STANDS_OUT * allowed) else None
 
 
-def _stands(wrong: FloatArray, others: FloatArray, bent: float) -> bool:
-    rest, least = float(others.max()), float(wrong.min())
+def are_outliers(wrong: FloatArray, remaining: FloatArray, bent: float) -> bool:
+    """Return whether the ``wrong`` are far off and the others are not, in tolerances."""
+    rest, least = float(remaining.max()), float(wrong.min())
     return rest <= 1.0 + bent * least and least > max(STANDS_OUT, 5.0 * rest)
 
 
-def _proportion(found: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
+def proportional_part(implied: PlateauLoads, gone: Sequence[int], softer: float) -> tuple[FloatArray, FloatArray]:
     """What effects do to all loads but ``gone``: (3, 3) and (3,), the likeliest if it is a share of ``softer``."""
     if softer == 0.0:
         return np.zeros((3, 3)), np.zeros(3)
-    keep = np.setdiff1d(np.arange(len(found.plateaus)), gone)
-    x = np.column_stack((found.noted[keep], np.ones(len(keep))))
+    keep = np.setdiff1d(np.arange(len(implied.plateaus)), gone)
+    x = np.column_stack((implied.annotated[keep], np.ones(len(keep))))
     prior = np.diag([(0.1 * TOLERANCE / softer) ** 2] * 3 + [(0.1 * TOLERANCE / OFFSET) ** 2])
-    both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ found.more[keep]), dtype=np.float64)
+    both = np.asarray(np.linalg.solve(x.T @ x + prior, x.T @ implied.more[keep]), dtype=np.float64)
     return both[:3], both[3]
 
 
-def _apart(found: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
+def deviation_in_tolerances(implied: PlateauLoads, gone: Sequence[int], softer: float) -> FloatArray:
     """(k,): how far each load is from what effects do to the others, in units of what is allowed."""
-    slopes, offset = _proportion(found, gone, softer)
-    off = np.abs(found.more - found.noted @ slopes - offset)
-    allowed = TOLERANCE + SHARE * np.abs(found.noted).max(axis=1, keepdims=True)
+    slopes, offset = proportional_part(implied, gone, softer)
+    off = np.abs(implied.more - implied.annotated @ slopes - offset)
+    allowed = TOLERANCE + SHARE * np.abs(implied.annotated).max(axis=1, keepdims=True)
     return np.asarray((off / allowed).max(axis=1))
 
 
-def all_free(found: PlateauLoads, loads: FloatArray) -> bool:
-    """Whether other loads than noted, at most of the times, leave next to nothing of the movement.
+def all_free(implied: PlateauLoads, loads: FloatArray) -> bool:
+    """Return whether other loads than noted, at most of the times, leave next to nothing of the movement.
 
-    ``loads`` (n, 3): as the movement of ``found`` counts them; those that were already put right differ from the noted.
+    ``loads`` (n, 3): as the movement of ``implied`` counts them; corrected ones differ from the annotated.
     """
-    if len(found.plateaus) < FEWEST or not _closes(found):
+    if len(implied.plateaus) < FEWEST or not closes(implied):
         return False
-    return int(np.count_nonzero(_apart(found, (), SOFTER) > 1.0)) >= 2 or _rounded(found, loads)
+    return int(np.count_nonzero(deviation_in_tolerances(implied, (), SOFTER) > 1.0)) >= 2 or are_rounded(implied, loads)
 
 
-def may_be_rounded(found: PlateauLoads) -> bool:
-    """Whether the noted forces are multiples of a whole step, and ``found`` asks for others by less than a step."""
-    held = found.noted[np.any(found.noted != 0.0, axis=1)]
+def may_be_rounded(implied: PlateauLoads) -> bool:
+    """Whether the noted forces are multiples of a whole step, and ``implied`` asks for others by less than a step."""
+    held = implied.annotated[np.any(implied.annotated != 0.0, axis=1)]
     if len(held) < FEWEST:
         return False
     forces = float(steps_of(held)[0])
-    return 0.0 < forces < np.inf and bool(np.all(np.abs(found.more[:, :2]) < forces))
+    return 0.0 < forces < np.inf and bool(np.all(np.abs(implied.more[:, :2]) < forces))
 
 
-def _rounded(found: PlateauLoads, loads: FloatArray) -> bool:
-    """Whether the loads that ``found`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
-    return rounded(found.noted, np.array([p.of(loads) for p in found.plateaus]).reshape(-1, 3) + found.more)
+def are_rounded(implied: PlateauLoads, loads: FloatArray) -> bool:
+    """Whether the loads that ``implied`` asks for are the noted ones before these were rounded; see :func:`rounded`."""
+    return rounded(implied.annotated, np.array([p.of(loads) for p in implied.plateaus]).reshape(-1, 3) + implied.more)
 
 
-def rounded(noted: FloatArray, hung: FloatArray) -> bool:
-    """Whether the ``noted`` loads (k, 3) are what ``hung`` (k, 3), N, N, N m, rounded to a whole step.
+def rounded(annotated: FloatArray, applied: FloatArray) -> bool:
+    """Whether the ``annotated`` loads (k, 3) are what ``applied`` (k, 3), N, N, N m, rounded to a whole step.
 
     They are off by up to half of it, and by no less.
 
     An effect of the catalogue changes loads by little against such a step, or in proportion to them.
     """
-    held = np.any(noted != 0.0, axis=1)
+    held = np.any(annotated != 0.0, axis=1)
     if np.count_nonzero(held) < FEWEST:
         return False
-    off, noted = (hung - noted)[held], noted[held]
-    steps = steps_of(noted)
+    off, annotated = (applied - annotated)[held], annotated[held]
+    steps = steps_of(annotated)
     if np.any(np.abs(off) > (0.5 + SHARE) * steps):
         return False
     return float(np.sqrt(np.mean(np.max(off[:, :2] ** 2, axis=1)))) > LEAST_STEP * float(steps[0])
 
 
-def steps_of(noted: FloatArray) -> FloatArray:
-    """(3,): to which steps the ``noted`` loads (k, 3) are rounded, N, N, N m; 0 for none, infinity if all are 0."""
-    return np.array([_step(noted[:, :2]), _step(noted[:, :2]), _step(noted[:, 2:])])
+def steps_of(annotated: FloatArray) -> FloatArray:
+    """(3,): to which steps the ``annotated`` loads (k, 3) are rounded, N, N, N m; 0 for none, infinity if all are 0."""
+    return np.array([largest_step(annotated[:, :2]), largest_step(annotated[:, :2]), largest_step(annotated[:, 2:])])
 
 
-def _step(noted: FloatArray) -> float:
-    """The largest step of which all ``noted`` numbers are multiples; infinity if all are 0, 0 if there is none."""
-    if not np.any(noted):
+def largest_step(annotated: FloatArray) -> float:
+    """The largest step of which all ``annotated`` numbers are multiples; infinity if all are 0, 0 if there is none."""
+    if not np.any(annotated):
         return np.inf
-    return max((s for s in STEPS if np.allclose(noted, s * np.round(noted / s), atol=1e-6)), default=0.0)
+    return max((s for s in STEPS if np.allclose(annotated, s * np.round(annotated / s), atol=1e-6)), default=0.0)
 
 
-def _closes(found: PlateauLoads, share: float = CLOSES) -> bool:
-    """Whether other loads, constant between changes, leave next to nothing of the movement."""
-    return _rms(found.rest) < share * _rms(found.moved)
+def closes(implied: PlateauLoads, share: float = CLOSES) -> bool:
+    """Return whether other loads, constant between changes, leave next to nothing of the movement."""
+    return _rms(implied.rest) < share * _rms(implied.moved)
 
 
 def _rms(part: FloatArray) -> float:
@@ -369,12 +370,12 @@ def _rms(part: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrongNote:
-    """A load that was noted wrong, or not at all: ``hung`` (3,) N, N, N m in ``plateau``. ``period``: s from one sample
-    to the next. ``exact``: by what was noted, not by what the readings say.
+    """A load that was noted wrong, or not at all: ``applied`` (3,) N, N, N m in ``plateau``. ``period``: s between
+    samples. ``exact``: from the other notes, not from the readings.
     """
 
     plateau: Plateau
-    hung: FloatArray
+    applied: FloatArray
     period: float
     exact: bool = False
 
@@ -392,12 +393,12 @@ class WrongNote:
     @property
     def value(self) -> tuple[float, ...]:
         """What hung: N, N, N m."""
-        return tuple(self.hung.tolist())
+        return tuple(self.applied.tolist())
 
     @property
     def off(self) -> FloatArray:
         """(3,): by what it differs from the noted load, N, N, N m."""
-        return np.asarray(np.abs(self.hung - self.plateau.noted))
+        return np.asarray(np.abs(self.applied - self.plateau.annotated))
 
     @property
     def size(self) -> float:
@@ -409,12 +410,12 @@ class WrongNote:
         p = self.plateau
         return (
             f'{_begun(p, name)}: from {p.first * self.period:.3f} s to {p.last * self.period:.3f} s '
-            f'({_worded(self.hung)}) hung, not ({_worded(p.noted)}): note that'
+            f'({_worded(self.applied)}) hung, not ({_worded(p.annotated)}): note that'
         )
 
 
 def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNote]:
-    """The few loads of a recording that are not what hung, of a rig that is nearly as its file says.
+    """Return the few loads of a recording that are not what hung, of a rig that is nearly as its file says.
 
     ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, at the times at which
     they acted. Effects of the catalogue are no reason: they change all loads in proportion, more or less.
@@ -422,15 +423,15 @@ def wrong_notes(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[WrongNot
     listed = plateaus(rig, volts, loads)
 
     def asked(acting: FloatArray) -> PlateauLoads:
-        return asked_beside_rig(rig, volts, acting)(listed)
+        return implied_beside_rig(rig, volts, acting)(listed)
 
-    return noted_wrong(loads, 1.0 / rig.converter.sample_rate_hz, asked)
+    return wrong_notes_against(loads, 1.0 / rig.converter.sample_rate_hz, asked)
 
 
-def noted_wrong(
+def wrong_notes_against(
     loads: FloatArray, period: float, asked: Callable[[FloatArray], PlateauLoads], largest: float = ANY
 ) -> list[WrongNote]:
-    """The same of any simulation: ``asked`` holds the recording against that under other loads (n, 3).
+    """Return the same of any simulation: ``asked`` holds the recording against that under other loads (n, 3).
 
     ``largest``: share by which effects may change a load; signs and units are right then.
     """
@@ -439,39 +440,39 @@ def noted_wrong(
         return []
     # A load that is far off moves the dots to where neither plate nor detectors are linear, or off the detectors: what
     # the readings themselves say hung is simulated, then judged.
-    noted = first.noted
-    said = asked(np.zeros_like(loads)).more
-    far = np.abs(said - noted).max(axis=1) > FAR + FAR_SHARE * np.abs(said).max(axis=1)
-    hung = np.where(far[:, None], said, noted)
+    annotated = first.annotated
+    readings_ask = asked(np.zeros_like(loads)).more
+    far = np.abs(readings_ask - annotated).max(axis=1) > FAR + FAR_SHARE * np.abs(readings_ask).max(axis=1)
+    applied = np.where(far[:, None], readings_ask, annotated)
 
     def against() -> PlateauLoads:
-        off = np.flatnonzero((hung != noted).any(axis=1)).tolist()
-        found = asked(as_hung(loads, [WrongNote(first.plateaus[k], hung[k], period) for k in off]))
-        return replace(found, more=found.more + hung - noted, moved=first.moved)
+        off = np.flatnonzero((applied != annotated).any(axis=1)).tolist()
+        implied = asked(as_applied(loads, [WrongNote(first.plateaus[k], applied[k], period) for k in off]))
+        return replace(implied, more=implied.more + applied - annotated, moved=first.moved)
 
-    found = against()
-    which = stand_out(found, BENT, largest)
+    implied = against()
+    which = outliers(implied, BENT, largest)
     for bent in (0.2 * BENT, 0.0, 0.0, 0.0):
         if not which.gone:
             return []
-        slopes, offset = _proportion(found, which.gone, which.softer)
+        slopes, offset = proportional_part(implied, which.gone, which.softer)
         for k in which.gone:
-            hung[k] = np.linalg.solve((np.eye(3) + slopes).T, noted[k] + found.more[k] - offset)
-        found = against()
-        which = stand_out(found, bent, largest)
+            applied[k] = np.linalg.solve((np.eye(3) + slopes).T, annotated[k] + implied.more[k] - offset)
+        implied = against()
+        which = outliers(implied, bent, largest)
     out = []
     for k in which.gone:
         # What effects do to a load that no other is like, the readings alone do not tell from the load.
-        twice = None if _alike(found, np.array([k]))[0] else _noted_twice(found, k)
-        out.append(WrongNote(first.plateaus[k], hung[k] if twice is None else twice, period, twice is not None))
+        twice = None if _alike(implied, np.array([k]))[0] else _annotated_twice(implied, k)
+        out.append(WrongNote(first.plateaus[k], applied[k] if twice is None else twice, period, twice is not None))
     return out
 
 
-def as_hung(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:
+def as_applied(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:
     """``loads`` (n, 3) with what hung in place of what was noted."""
     out = loads.copy()
     for note in wrong:
-        out[note.plateau.first : note.plateau.last] = note.hung
+        out[note.plateau.first : note.plateau.last] = note.applied
     return out
 
 

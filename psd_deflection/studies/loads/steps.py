@@ -68,18 +68,19 @@ def lasting_steps(dots: FloatArray, width: int) -> list[DotStep]:
     for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if b - a > width // 4:
             keep[a:b] = False
-    kept = np.flatnonzero(keep)
+    lasting = np.flatnonzero(keep)
     out = []
-    for step in _steps_of_kept(dots[kept], width):
-        first, last = kept[[step.first, step.last]].tolist()
+    for step in steps_among_samples(dots[lasting], width):
+        first, last = lasting[[step.first, step.last]].tolist()
         # Between the last sample before it and the first after it.
-        before, after = np.interp((step.at - 1.0, step.at), np.arange(len(kept)), kept).tolist()
+        before, after = np.interp((step.at - 1.0, step.at), np.arange(len(lasting)), lasting).tolist()
         lost = last - first - (step.last - step.first)
         out.append(DotStep(0.5 * (before + 1.0 + after), step.size, first, last, lost))
     return out
 
 
-def _steps_of_kept(dots: FloatArray, width: int) -> list[DotStep]:
+def steps_among_samples(dots: FloatArray, width: int) -> list[DotStep]:
+    """Return the lasting steps of dots (n, 4), m, without regard to lost samples."""
     n = len(dots)
     if n < 4 * width:
         return []
@@ -169,35 +170,35 @@ def time_of_step(
 
     middle = step.at * period
     around = min(0.15 + step.lost * period, MOST_AROUND_S)
-    sudden = _least(left, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
-    slow = _least(left, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
+    sudden = best_time(left, [(middle + d, 0.0) for d in np.arange(-around, around + 1e-4, 0.006)], period)
+    slow = best_time(left, [(middle - 0.5 * d, d) for d in (0.15, 0.3, 0.6, 1.0, 1.5, 2.5)], 0.05)
     start, took = slow[1] if slow[0] < 0.5 * sudden[0] else (sudden[1][0], 0.0)
     return start, abs(took)
 
 
-def _least(
-    left: Callable[[FloatArray], float], starts: list[tuple[float, float]], reach: float
+def best_time(
+    chi_square: Callable[[FloatArray], float], starts: list[tuple[float, float]], reach: float
 ) -> tuple[float, tuple[float, float]]:
-    """The least of ``left`` and where, from the best of ``starts``; starts without duration, in their order, keep none.
+    """Return the least ``chi_square`` and where, from the best of ``starts``; those without duration keep none.
 
     Each period of the ringing has a narrow valley: of starts without duration those about every deep one are followed.
     """
-    sizes = np.array([left(np.array(x)) for x in starts])
+    sizes = np.array([chi_square(np.array(x)) for x in starts])
     best = np.array(starts[int(np.argmin(sizes))])
     if best[1] > 0.0:
         corners = best + reach * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-        found = minimize(left, best, method='Nelder-Mead', options={'maxfev': 120, 'initial_simplex': corners})
-        return float(found.fun), (float(found.x[0]), float(found.x[1]))
+        simplex = minimize(chi_square, best, method='Nelder-Mead', options={'maxfev': 120, 'initial_simplex': corners})
+        return float(simplex.fun), (float(simplex.x[0]), float(simplex.x[1]))
     around = np.concatenate(([np.inf], sizes, [np.inf]))
     valleys = np.flatnonzero((sizes <= around[:-2]) & (sizes <= around[2:]) & (sizes <= DEEP * sizes.min()))
     ends = []
     for k in valleys.tolist():
         at = starts[k][0]
-        one = minimize_scalar(
-            lambda x: left(np.array([x, 0.0])),
+        scalar = minimize_scalar(
+            lambda x: chi_square(np.array([x, 0.0])),
             bounds=(at - 6.0 * reach, at + 6.0 * reach),
             method='bounded',
             options={'xatol': 1e-3 * reach},
         )
-        ends.append((float(one.fun), (float(one.x), 0.0)))
+        ends.append((float(scalar.fun), (float(scalar.x), 0.0)))
     return min(ends)

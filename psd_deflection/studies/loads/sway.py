@@ -16,7 +16,7 @@ import numpy as np
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.loads.noted_times import SETTLED_S
-from psd_deflection.studies.loads.plateaus import FEWEST, Plateau, PlateauLoads, asked_beside_rig, plateaus
+from psd_deflection.studies.loads.plateaus import FEWEST, Plateau, PlateauLoads, implied_beside_rig, plateaus
 
 SWAYS, SLOWEST_HZ, FASTEST_HZ = 8.0, 0.3, 6.0
 """A weight that sways makes so much more slow movement than any other, in this band."""
@@ -74,26 +74,26 @@ class SwayingLoad:
 
 
 def swaying(
-    found: PlateauLoads,
-    noted: Sequence[Plateau],
+    implied: PlateauLoads,
+    annotated: Sequence[Plateau],
     again: Callable[[Sequence[Plateau]], PlateauLoads],
     period: float,
 ) -> list[SwayingLoad]:
-    """The plateaus of ``found`` in which the link swings. ``noted``: those between noted changes alone; ``again``: the
+    """Return the holds of ``implied`` in which the link swings. ``annotated``: between noted changes; ``again``: the
     loads that other plateaus ask for; ``period``: s from one sample to the next.
     """
-    found = _not_cut(found, noted, again)
-    size, fine = found.size, period * found.size
+    implied = _not_cut(implied, annotated, again)
+    size, fine = implied.size, period * implied.size
     rows = []
-    for p in found.plateaus:
+    for p in implied.plateaus:
         a, b = p.first // size + round(RINGS_S / fine), p.last // size
-        part = found.rest[:2, a:b]
+        part = implied.rest[:2, a:b]
         there = np.isfinite(part).all(axis=0)
         # How the link moved before the first sample is nobody's mistake.
         if p.first == 0 or there.sum() < round(0.5 / fine):
             rows.append((0.0, 0.0, 0.0))
             continue
-        part = np.vstack((part, found.beside[..., a:b]))
+        part = np.vstack((part, implied.beside[..., a:b]))
         part = np.where(there, part - part[:, there].mean(axis=1, keepdims=True), 0.0)
         power = np.abs(np.fft.rfft(part * np.hanning(b - a), axis=1)) ** 2 / (0.375 * (b - a) ** 2) * 2.0
         f: FloatArray = np.fft.rfftfreq(b - a, fine).astype(np.float64)
@@ -101,26 +101,28 @@ def swaying(
         moves, across = np.split(power[:, band].sum(axis=1), [2])
         each = moves if sum(moves) > PLATE * sum(across) else np.zeros(2)
         axis = int(np.argmax(each))
-        peak = _strongest(f[band], power[axis, band])
+        peak = peak_frequency(f[band], power[axis, band])
         # A step that nobody noted has no tone.
         tone = float(power[axis, band & (np.abs(f - peak) <= TONE * peak)].sum())
         if peak * (b - a) * fine < 2.0 or tone < 0.5 * float(power[axis, band].sum()):
             each = np.zeros(2)
-        rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / found.compliance[axis]), peak))
+        rows.append((float(np.sqrt(each.sum())), float(np.sqrt(2.0 * each[axis]) / implied.compliance[axis]), peak))
     sizes = np.array([r[0] for r in rows])
     limit = max(SWAYS * float(np.median(sizes)), SWAYS_M) if len(sizes) >= FEWEST else np.inf
     out: dict[int, SwayingLoad] = {}
-    for p, (moved, force, frequency) in sorted(zip(found.plateaus, rows, strict=True), key=lambda both: both[1][0]):
+    for p, (moved, force, frequency) in sorted(zip(implied.plateaus, rows, strict=True), key=lambda both: both[1][0]):
         if moved > limit:
             # A strong sway seems to step: all of the time of that load, from its largest part.
-            whole = next((w for w in noted if w.first <= p.first < w.last), p)
-            out[whole.first] = SwayingLoad(whole, force, frequency, period, _swung(found, whole, frequency, period))
+            annotated_hold = next((w for w in annotated if w.first <= p.first < w.last), p)
+            out[annotated_hold.first] = SwayingLoad(
+                annotated_hold, force, frequency, period, _swung(implied, annotated_hold, frequency, period)
+            )
     return [out[first] for first in sorted(out)]
 
 
-def _swung(found: PlateauLoads, p: Plateau, frequency: float, period: float) -> FloatArray:
+def _swung(implied: PlateauLoads, p: Plateau, frequency: float, period: float) -> FloatArray:
     """(k, 3): the load in each sample of ``p`` that the link swings with: a tone whose amplitude changes slowly."""
-    size, count = found.size, p.last - p.first
+    size, count = implied.size, p.last - p.first
     a, b = p.first // size + round(RINGS_S / (period * size)), p.last // size
 
     def tone(at: FloatArray) -> FloatArray:
@@ -128,14 +130,14 @@ def _swung(found: PlateauLoads, p: Plateau, frequency: float, period: float) -> 
         swing = np.array([np.sin(turn), np.cos(turn)])
         return np.array([*swing, *along * swing, *along**2 * swing, np.ones_like(at)])
 
-    part = found.rest[:2, a:b]
+    part = implied.rest[:2, a:b]
     there = np.flatnonzero(np.isfinite(part).all(axis=0))
     middles = np.asarray((a + there + 0.5) * size - 0.5 - p.first, dtype=np.float64)
     sizes = np.asarray(np.linalg.lstsq(tone(middles).T, part[:, there].T, rcond=1e-9)[0])
     every: FloatArray = np.arange(count, dtype=np.float64)
     out = np.zeros((count, 3))
     # What does not swing is no sway.
-    out[:, :2] = tone(every)[:-1].T @ sizes[:-1] / found.compliance[:2]
+    out[:, :2] = tone(every)[:-1].T @ sizes[:-1] / implied.compliance[:2]
     return out
 
 
@@ -156,14 +158,14 @@ def swaying_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> list[Swayin
     ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held, as they acted.
     """
     period = 1.0 / rig.converter.sample_rate_hz
-    asked = asked_beside_rig(rig, volts, loads)
+    asked = implied_beside_rig(rig, volts, loads)
     listed = plateaus(rig, volts, loads)
     if len(listed) < FEWEST:
         return []
-    return swaying(asked(listed), plateaus(rig, volts, loads, noted=True), asked, period)
+    return swaying(asked(listed), plateaus(rig, volts, loads, annotated_only=True), asked, period)
 
 
-def left_out(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> FloatArray:
+def excluded(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> FloatArray:
     """``volts`` (n, 3P) without the times in which a weight swayed, and until the link has come to rest after it."""
     out = volts.copy()
     d = rig.dynamics
@@ -173,7 +175,7 @@ def left_out(rig: Rig, volts: FloatArray, swayed: Sequence[SwayingLoad]) -> Floa
     return out
 
 
-def _strongest(f: FloatArray, power: FloatArray) -> float:
+def peak_frequency(f: FloatArray, power: FloatArray) -> float:
     """Frequency at which ``power`` is largest, between those of ``f``: the top of a parabola through its logarithm."""
     if not len(f) or not power.any():
         return 0.0
@@ -187,12 +189,12 @@ def _strongest(f: FloatArray, power: FloatArray) -> float:
 
 
 def _not_cut(
-    found: PlateauLoads, noted: Sequence[Plateau], again: Callable[[Sequence[Plateau]], PlateauLoads]
+    implied: PlateauLoads, annotated: Sequence[Plateau], again: Callable[[Sequence[Plateau]], PlateauLoads]
 ) -> PlateauLoads:
     """What swings seems to step, too: the time of a noted load is whole if steps cut it into too short pieces."""
     listed = list[Plateau]()
-    for whole in noted:
-        pieces = [p for p in found.plateaus if p.number == whole.number]
-        all_there = sum(p.last - p.first for p in pieces) >= whole.last - whole.first
-        listed += pieces if all_there else [whole]
-    return found if listed == [*found.plateaus] else again(listed)
+    for annotated_hold in annotated:
+        pieces = [p for p in implied.plateaus if p.number == annotated_hold.number]
+        all_there = sum(p.last - p.first for p in pieces) >= annotated_hold.last - annotated_hold.first
+        listed += pieces if all_there else [annotated_hold]
+    return implied if listed == [*implied.plateaus] else again(listed)

@@ -62,26 +62,28 @@ class UnnotedTime:
         )
 
 
-def unnoted_times(found: PlateauLoads, samples: int, period: float) -> list[UnnotedTime]:
+def unnoted_times(implied: PlateauLoads, samples: int, period: float) -> list[UnnotedTime]:
     """Those of a recording of so many ``samples``; none if no noted load would be left. ``period``: s from one sample
     to the next.
 
     A change counts if the plate moves with it by what no effect does to the noted load.
     """
-    allowed = STANDS_OUT * (TOLERANCE + SHARE * np.abs(found.noted).max(initial=0.0))
+    allowed = STANDS_OUT * (TOLERANCE + SHARE * np.abs(implied.annotated).max(initial=0.0))
     out = []
-    numbered = groupby(range(len(found.plateaus)), key=lambda k: found.plateaus[k].number)
+    numbered = groupby(range(len(implied.plateaus)), key=lambda k: implied.plateaus[k].number)
     for _, group in numbered:
-        own = list(group)
-        more = found.more[own]
+        in_group = list(group)
+        more = implied.more[in_group]
         steps = np.abs(np.diff(more, axis=0)).max(axis=1) > allowed
-        alone = [k for k, stepped in zip(own[1:], steps, strict=True) if stepped and found.plateaus[k].unnoted]
-        as_plate = np.abs(found.across[own]).max() <= PLATE * float(found.sizes[own].max()) + PLATE_M
+        alone = [k for k, stepped in zip(in_group[1:], steps, strict=True) if stepped and implied.plateaus[k].unnoted]
+        as_plate = np.abs(implied.across[in_group]).max() <= PLATE * float(implied.sizes[in_group].max()) + PLATE_M
         if len(alone) >= MANY and as_plate:
-            first, last = found.plateaus[alone[0]].first, found.plateaus[own[-1]].last
+            first, last = implied.plateaus[alone[0]].first, implied.plateaus[in_group[-1]].last
             out.append(UnnotedTime(first, last, samples, len(alone), period))
-    left = [p for p in found.plateaus if not any(u.first <= p.first < u.last for u in out) and np.any(p.noted != 0.0)]
-    return out if left else []
+    remaining = [
+        p for p in implied.plateaus if not any(u.first <= p.first < u.last for u in out) and np.any(p.annotated != 0.0)
+    ]
+    return out if remaining else []
 
 
 def without_times(volts: FloatArray, times: Sequence[UnnotedTime]) -> FloatArray:

@@ -47,7 +47,7 @@ def appendix_d_iterative(
     init_mm: tuple[float, ...],
     centers_mm: tuple[float, ...] = (0.0, 70.0, -100.0, 0.0),
 ) -> AppendixDResult:
-    """The code of Appendix D: dots x1, y1, x2, y2 and their pre-load values, mm.
+    """Return the code of Appendix D: dots x1, y1, x2, y2 and their pre-load values, mm.
 
     ``centers_mm``: its constants +70 (PSD 1, vertical) and -100 (PSD 2, horizontal), the others 0.
     """
@@ -105,7 +105,7 @@ class AppendixDSolver(Solver):
         self._init_mm = tuple((np.asarray(geometry.zeros) * _MM).ravel().tolist())
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
-        """One block, pure floats. See :class:`Solver`."""
+        """Return one block, pure floats. See :class:`Solver`."""
         got = appendix_d_iterative(tuple([m * _MM for m in dots]), self._init_mm, self._centers_mm)
         dx = got.horz_disp / _MM
         dy = got.vert_disp / _MM

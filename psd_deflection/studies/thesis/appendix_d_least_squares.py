@@ -23,7 +23,7 @@ from psd_deflection.records import FloatArray
 
 
 def printed_design_matrix(geometry: Geometry) -> FloatArray:
-    """A (4, 3) of 4.12 as the code fills it in, in m; its angle is positive clockwise.
+    """Return a (4, 3) of 4.12 as the code fills it in, in m; its angle is positive clockwise.
 
     R_1 and R_2 are the centres' distances from the tip's origin; -90 and -180 degrees are constants of
     the code, whatever the rig.

@@ -84,16 +84,16 @@ def thesis_geometry() -> Geometry:
 
 
 def methods() -> tuple[Method, ...]:
-    """The rows of the table: ``VARIANTS``, then every other method that solves the thesis's rig."""
-    return (*VARIANTS, *(Method(name, name, {}) for name, why in _others().items() if not why))
+    """Return the rows of the table: ``VARIANTS``, then every other method that solves the thesis's rig."""
+    return (*VARIANTS, *(Method(name, name, {}) for name, why in _other_methods().items() if not why))
 
 
 def refused() -> dict[str, str]:
-    """The methods that cannot solve the thesis's rig, and why."""
-    return {name: why for name, why in _others().items() if why}
+    """Return the methods that cannot solve the thesis's rig, and why."""
+    return {name: why for name, why in _other_methods().items() if why}
 
 
-def _others() -> dict[str, str]:
+def _other_methods() -> dict[str, str]:
     """Methods that ``VARIANTS`` does not name: name to the reason of a refusal, '' if there is none."""
     reasons = {}
     for name in registry.SOLVERS:
@@ -131,14 +131,14 @@ def dots_of(geometry: Geometry, poses: FloatArray) -> FloatArray:
 
 
 def solve(method: Method, geometry: Geometry, dots: FloatArray) -> Solutions:
-    """The answers of ``method`` for ``dots`` (n, 4)."""
+    """Return the answers of ``method`` for ``dots`` (n, 4)."""
     solutions = make_solver(method.name, geometry, **method.options).solve_many(dots, VARIANCES)
     solutions.pose[:, 2] *= method.sign
     return solutions
 
 
 def errors(method: Method, condition: str) -> Errors:
-    """One cell of the table; ``method`` is one of :func:`methods`."""
+    """Return one cell of the table; ``method`` is one of :func:`methods`."""
     return _cell(method.label, condition)
 
 
@@ -148,9 +148,9 @@ def _cell(label: str, condition: str) -> Errors:
     (method,) = (m for m in methods() if m.label == label)
     geometry = thesis_geometry()
     poses = grid(condition, geometry)
-    found = solve(method, geometry, dots_of(geometry, poses))
-    spoke = found.status == SolverStatus.OK
-    off = (found.pose - poses[:, :3])[spoke]
+    solution = solve(method, geometry, dots_of(geometry, poses))
+    spoke = solution.status == SolverStatus.OK
+    off = (solution.pose - poses[:, :3])[spoke]
     return Errors(np.sqrt(np.mean(off**2, axis=0)), np.abs(off).max(axis=0), 1.0 - float(spoke.mean()))
 
 
@@ -229,17 +229,17 @@ def table_5_1(cause: Explanation) -> tuple[FloatArray, FloatArray]:
     linear = make_solver(name, nominal, **options).solve_many(dots[None, :], VARIANCES).pose[0]
     c = np.cos(cause.camera_roll)
     s = np.sin(cause.camera_roll)
-    seen = np.array([theta, c * dx + s * dy, c * dy - s * dx])
-    return np.roll(iterative, 1) / seen - 1.0, np.roll(linear, 1) / seen - 1.0
+    observed = np.array([theta, c * dx + s * dy, c * dy - s * dx])
+    return np.roll(iterative, 1) / observed - 1.0, np.roll(linear, 1) / observed - 1.0
 
 
 def _project(geometry: Geometry, pose: FloatArray, cause: Explanation, offsets: FloatArray) -> FloatArray:
     """Readings (4,) of a rig with that cause: the crossing of each beam's line with the plate's plane."""
     plate = rotation(*pose[2:])
-    own = rotation(cause.rotation, 0.0, 0.0)
+    rotated = rotation(cause.rotation, 0.0, 0.0)
     places = geometry.centers + np.asarray(cause.center)
-    aimed = places + offsets @ own[:2, :2].T / cause.gain
+    aimed = places + offsets @ rotated[:2, :2].T / cause.gain
     slopes = np.array([cause.beam_1, (0.0, 0.0)])
     origins = lifted(places, cause.height) @ plate.T + [pose[0], pose[1], 0.0]
-    dots = hit(lifted(aimed, cause.height), lifted(slopes, 1.0), origins, np.stack([plate @ own] * 2))
+    dots = hit(lifted(aimed, cause.height), lifted(slopes, 1.0), origins, np.stack([plate @ rotated] * 2))
     return cause.gain * dots.ravel()

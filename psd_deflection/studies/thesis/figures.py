@@ -59,7 +59,7 @@ def drawn() -> Iterator[tuple[str, Figure]]:
 
 
 def comparison() -> Figure:
-    """The table of ``thesis compare-methods`` as a picture."""
+    """Return the table of ``thesis compare-methods`` as a picture."""
     figure, axes = plt.subplots(1, 2, figsize=(9.6, 5.0), sharey=True, layout='constrained')
     shown = methods()[::-1]
     rows = np.arange(len(shown))
@@ -82,7 +82,7 @@ def comparison() -> Figure:
 
 
 def iterative() -> Figure:
-    """The PSDs' disagreement against the trial angle, and where each criterion stops."""
+    """Return the PSDs' disagreement against the trial angle, and where each criterion stops."""
     geometry = thesis_geometry()
     pose = np.array([0.5e-3, -1.2e-3, np.radians(0.55), 0.0, 0.0])
     dots = dots_of(geometry, pose[None])[0]
@@ -98,10 +98,10 @@ def iterative() -> Figure:
     ax.axhspan(-0.1, 0.1, color=_GREY, alpha=0.2, label='tolerance 0.1 mm')
     trial = tuple(dots.tolist()), tuple(VARIANCES.tolist())
     for criterion, name, color, height in (('absolute', 'first hit', _RED, -0.7), ('argmin', 'least', _GREEN, 0.62)):
-        found = make_solver('iterative_printed', geometry, criterion=criterion).solve(*trial)
-        at = np.degrees(found.theta)
+        solution = make_solver('iterative_printed', geometry, criterion=criterion).solve(*trial)
+        at = np.degrees(solution.theta)
         ax.axvline(at, color=color, lw=1.2)
-        label = f'{name}: {at:.2f} deg, ΔX off {1e6 * (found.dx - pose[0]):.0f} µm'
+        label = f'{name}: {at:.2f} deg, ΔX off {1e6 * (solution.dx - pose[0]):.0f} µm'
         ax.annotate(label, (at, height), (at - 0.02, height), ha='right', color=color, fontsize=8)
     ax.set(xlabel='trial angle, deg', ylabel='disagreement, mm', xlim=(0, 1))
     ax.legend(loc='upper right', fontsize=8)
@@ -109,7 +109,7 @@ def iterative() -> Figure:
 
 
 def linear() -> Figure:
-    """The error of linearising, and which channels the weights use."""
+    """Return the error of linearising, and which channels the weights use."""
     geometry = thesis_geometry()
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.4), layout='constrained')
     theta = np.radians(np.linspace(-3, 3, 121))
@@ -121,8 +121,8 @@ def linear() -> Figure:
         ('wls, thesis weights', 'wls', {'weights': 'thesis'}, _ORANGE, '-'),
         ('wls_exact (either weights)', 'wls_exact', {'weights': 'thesis'}, _GREEN, '-'),
     ):
-        found = make_solver(name, geometry, **options).solve_many(dots, VARIANCES).pose
-        left.plot(np.degrees(theta), 1e6 * (found[:, 0] - 2e-3), color=color, ls=dash, label=label)
+        solution = make_solver(name, geometry, **options).solve_many(dots, VARIANCES).pose
+        left.plot(np.degrees(theta), 1e6 * (solution[:, 0] - 2e-3), color=color, ls=dash, label=label)
     left.set(xlabel='twist, deg', ylabel='error of ΔX, µm', title='tip at (2, -2) mm, no noise')
     left.legend(fontsize=8)
     design = design_matrix(geometry.beams)
@@ -148,9 +148,9 @@ def exact() -> Figure:
     pose = np.array([[1.5e-3, -2.5e-3, np.radians(-1.2), 0.0, 0.0]])
     rng = np.random.default_rng(1)
     dots = dots_of(geometry, pose) + 2e-6 * rng.standard_normal((3000, 4))
-    found = make_solver('exact', geometry).solve_many(dots, VARIANCES)
-    off = (found.pose - pose[0, :3]) * (1e6, 1e6, MDEG)
-    claimed = found.covariance[0] * np.outer((1e6, 1e6, MDEG), (1e6, 1e6, MDEG))
+    solution = make_solver('exact', geometry).solve_many(dots, VARIANCES)
+    off = (solution.pose - pose[0, :3]) * (1e6, 1e6, MDEG)
+    claimed = solution.covariance[0] * np.outer((1e6, 1e6, MDEG), (1e6, 1e6, MDEG))
     figure, axes = plt.subplots(1, 2, figsize=(8.0, 3.6), layout='constrained')
     labels = ('error of ΔX, µm', 'error of ΔY, µm', 'error of θ, mdeg')
     for ax, (i, j) in zip(axes, ((0, 2), (1, 2)), strict=True):
@@ -173,9 +173,9 @@ def appendix_d() -> Figure:
     theta = theta + np.radians(0.03) * np.random.default_rng(4).uniform(-1.0, 1.0, theta.shape)
     poses = np.zeros((dy.size, 5))
     poses[:, 0], poses[:, 1], poses[:, 2] = 1e-4, dy.ravel(), theta.ravel()
-    found = make_solver('appendix_d', geometry).solve_many(dots_of(geometry, poses), VARIANCES)
-    off = np.abs(found.pose[:, 2] - poses[:, 2]) * MDEG
-    off[found.status != 0] = np.nan
+    solution = make_solver('appendix_d', geometry).solve_many(dots_of(geometry, poses), VARIANCES)
+    off = np.abs(solution.pose[:, 2] - poses[:, 2]) * MDEG
+    off[solution.status != 0] = np.nan
     figure, ax = plt.subplots(figsize=(6.4, 3.8), layout='constrained')
     ax.grid(visible=False)
     extent = (-4.0, 4.0, -2.0, 2.0)
@@ -232,7 +232,7 @@ def minimum_tilt() -> Figure:
 
 
 def beam() -> Figure:
-    """The error of a flat method due to the cantilever's tilt, by load and height of the sensors."""
+    """Return the error of a flat method due to the cantilever's tilt, by load and height of the sensors."""
     figure, axes = plt.subplots(1, 2, figsize=(8.6, 3.4), sharey=True, layout='constrained')
     force = np.linspace(2.0, 50.0, 25)
     for ax, height in zip(axes, (0.0, 0.020), strict=True):
@@ -275,8 +275,8 @@ def pose() -> Figure:
     at = np.array([0.1e-3, -2e-3, -0.015, 0.0, 0.0])
     deviations = []
     for step in steps:
-        spread = pose_spread(at, centers, np.array([step, -step / 2, -step / 2]), 2e-6)
-        deviations.append(MDEG * spread[[3, 4, 2]])
+        deviation = pose_spread(at, centers, np.array([step, -step / 2, -step / 2]), 2e-6)
+        deviations.append(MDEG * deviation[[3, 4, 2]])
     figure, ax = plt.subplots(figsize=(5.8, 3.6), layout='constrained')
     for values, label, color in zip(
         np.transpose(deviations), ('phi', 'omega', 'theta'), (_BLUE, _ORANGE, _GREEN), strict=True
@@ -289,7 +289,7 @@ def pose() -> Figure:
 
 
 def base_pair() -> Figure:
-    """The error of section 5.3's method under twist, and its correction by tying the tilts to the deflection."""
+    """Return the error of section 5.3's method under twist, and its correction by tying the tilts to the deflection."""
     nominal = thesis_geometry()
     geometry = Geometry(nominal.centers, nominal.zeros, np.array([-0.585, -0.485]), nominal.link_length, 1.5)
     theta = np.radians(np.linspace(-1, 1, 81))
@@ -306,8 +306,8 @@ def base_pair() -> Figure:
     dots = (places - geometry.centers).reshape(len(poses), -1)
     figure, (left, right) = plt.subplots(1, 2, figsize=(8.6, 3.4), layout='constrained')
     for assume, color in (('no_twist', _RED), ('beam', _GREEN)):
-        found = make_solver('base_pair', geometry, assume=assume).solve_many(dots, VARIANCES).pose
-        left.plot(np.degrees(theta), 1e3 * (found[:, 1] + 2e-3), color=color, label=f'assume {assume}')
+        solution = make_solver('base_pair', geometry, assume=assume).solve_many(dots, VARIANCES).pose
+        left.plot(np.degrees(theta), 1e3 * (solution[:, 1] + 2e-3), color=color, label=f'assume {assume}')
     left.set(xlabel='true twist, deg', ylabel='error of ΔY, mm', title='tip at (1, -2) mm, exact readings')
     left.set_xticks([-1.0, -0.5, 0.0, 0.5, 1.0])
     left.legend(fontsize=8)

@@ -66,7 +66,7 @@ class IterativePrintedSolver(Solver):
         self._l = tuple(np.asarray(geometry.beams).ravel().tolist())
 
     def solve(self, dots: tuple[float, ...], variances: tuple[float, ...]) -> Solution:
-        """One block, all trials at once. See :class:`Solver`."""
+        """Return one block, all trials at once. See :class:`Solver`."""
         q1x, q1y, q2x, q2y = (c + m for c, m in zip(self._c, dots, strict=True))
         l1x, l1y, l2x, l2y = self._l
         # The translation that each PSD gives at each trial.
@@ -74,17 +74,17 @@ class IterativePrintedSolver(Solver):
         dy = l1y - (_S * q1x + _C * q1y)
         gap_x = dx - (l2x - (_C * q2x - _S * q2y))
         gap_y = dy - (l2y - (_S * q2x + _C * q2y))
-        at, found = 0, False
+        at, converged = 0, False
         if self._criterion == 'argmin':
             square = gap_x * gap_x + gap_y * gap_y
             dx, dy = dx - 0.5 * gap_x, dy - 0.5 * gap_y
-            at, found = int(np.argmin(square)), bool(np.isfinite(square).all())
+            at, converged = int(np.argmin(square)), bool(np.isfinite(square).all())
         else:
             if self._criterion == 'absolute':
                 gap_x, gap_y = np.abs(gap_x), np.abs(gap_y)
             hits = (gap_x < TOLERANCE) & (gap_y < TOLERANCE)
-            at, found = int(np.argmax(hits)), bool(hits.any())
-        if not found:
+            at, converged = int(np.argmax(hits)), bool(hits.any())
+        if not converged:
             nan = float('nan')
             return Solution(nan, nan, nan, 0.0, 0.0, NO_COVARIANCE, (nan,) * 4, SolverStatus.NO_HIT, LAST_TRIAL + 1)
         x, y, c, s = float(dx[at]), float(dy[at]), float(_C[at]), float(_S[at])

@@ -46,7 +46,7 @@ class SpotRun(NamedTuple):
 
 @functools.cache
 def spot_run(force: float, diameter: float) -> SpotRun:
-    """The weight ``force``, N, hung on the sidebar, seen by dots of ``diameter``, m."""
+    """Return the weight ``force``, N, hung on the sidebar, seen by dots of ``diameter``, m."""
     rig = load_rig()
     rest, held = (round(s * rig.converter.sample_rate_hz) for s in (REST_S, HELD_S))
     loads = np.repeat([[0.0, 0.0, 0.0], [LEAN * force, -force, -ARM * force]], [rest, held], axis=0)
@@ -60,11 +60,11 @@ def spot_run(force: float, diameter: float) -> SpotRun:
     truth = made.pose[:, :3].reshape(-1, BLOCK, 3).mean(axis=1)
     t = np.asarray((np.arange(len(dots)) + 0.5) * BLOCK / rig.converter.sample_rate_hz, np.float64)
     geometry = thesis_geometry()
-    found = {
+    results = {
         label: make_solver(name, geometry, **options).solve_many(dots, VARIANCES).pose[:, :3]
         for label, (name, options) in METHODS.items()
     }
-    return SpotRun(force, diameter, t, truth, found)
+    return SpotRun(force, diameter, t, truth, results)
 
 
 class SpotChange(NamedTuple):

@@ -92,7 +92,7 @@ class Case(NamedTuple):
 
 
 def table_b1_cases(youngs_modulus: float = YOUNGS_MODULUS) -> tuple[Case, ...]:
-    """The six theoretical cases; ``youngs_modulus`` Pa."""
+    """Return the six theoretical cases; ``youngs_modulus`` Pa."""
     length, section = 2.0 * BASE_LENGTH, BASE_SECTION
     wall = section.wall
     double_outer = TubeSection(2.0 * section.outer_radius, 2.0 * section.outer_radius - wall)
@@ -161,7 +161,7 @@ def round_as(value: float, printed: str) -> Decimal:
 
 
 def table_b1(youngs_modulus: float = YOUNGS_MODULUS) -> list[TableCell]:
-    """Every cell of Table B1's theoretical rows, in the thesis's own units."""
+    """Return every cell of Table B1's theoretical rows, in the thesis's own units."""
     cells = []
     for number, _, link in table_b1_cases(youngs_modulus):
         section = link.section
@@ -203,7 +203,7 @@ ERRATA_B2 = {'E-glass/epoxy +-45': '1.5 x 12/11 is 1.636, so 1.64'}
 
 
 def table_b2() -> list[TableCell]:
-    """Every ratio of Table B2."""
+    """Return every ratio of Table B2."""
     return [
         TableCell(
             m.name,

@@ -47,7 +47,7 @@ def hats(geometry: Geometry, dots: tuple[float, ...], theta: float) -> FloatArra
 
 
 def tilt_branches(geometry: Geometry, dots: tuple[float, ...], theta: float) -> tuple[TiltBranch, ...]:
-    """All (dX, dY, phi, omega) that give exactly these dots at twist ``theta``: none, or four.
+    """Return all (dX, dY, phi, omega) that give exactly these dots at twist ``theta``: none, or four.
 
     (2.33) to (2.43), corrected:
 
@@ -74,7 +74,7 @@ def tilt_branches(geometry: Geometry, dots: tuple[float, ...], theta: float) -> 
     cos_phi = min(1.0, cos_phi)
     phi = acos(cos_phi)
     dy = l2y - y2 * cos_phi
-    found = []
+    branches = []
     for signed in (phi, -phi):
         p1 = y1 * sin(signed)
         p2 = y2 * sin(signed)
@@ -85,8 +85,8 @@ def tilt_branches(geometry: Geometry, dots: tuple[float, ...], theta: float) -> 
         middle = atan2(p1 - p2, x1 - x2)
         for sum_ in (middle + apart, middle - apart):
             omega = remainder(sum_, 2.0 * np.pi)
-            found.append(TiltBranch(l1x - x1 * cos(omega) - p1 * sin(omega), dy, signed, omega))
-    return tuple(found)
+            branches.append(TiltBranch(l1x - x1 * cos(omega) - p1 * sin(omega), dy, signed, omega))
+    return tuple(branches)
 
 
 def compared(geometry: Geometry, pose: FloatArray) -> list[Compared]:

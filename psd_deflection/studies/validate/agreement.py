@@ -50,16 +50,16 @@ def agreement(estimate: FloatArray, reference: FloatArray) -> Agreement:
     k = len(estimate)
     difference = estimate - reference
     bias = float(difference.mean())
-    spread = difference - bias
-    sd = float(np.sqrt((spread * spread).sum() / (k - 1)))
+    scatter = difference - bias
+    sd = float(np.sqrt((scatter * scatter).sum() / (k - 1)))
     centred = estimate - estimate.mean()
     power = float(centred @ centred)
     slope, slope_sd, noise, mirrored = math.nan, math.nan, sd, False
     if power > 0.0:
         slope = float(centred @ reference) / power
-        left = reference - reference.mean() - slope * centred
-        noise = float(np.sqrt((left * left).sum() / (k - 2)))
-        slope_sd = math.sqrt(max(variance_of_sum(centred * left), noise**2 * power)) / power
+        residual = reference - reference.mean() - slope * centred
+        noise = float(np.sqrt((residual * residual).sum() / (k - 2)))
+        slope_sd = math.sqrt(max(variance_of_sum(centred * residual), noise**2 * power)) / power
         mirrored = slope < -MOVES and slope_sd < CERTAIN
         if not (slope > MOVES and slope_sd < CERTAIN):
             slope, slope_sd = math.nan, math.nan
@@ -68,7 +68,7 @@ def agreement(estimate: FloatArray, reference: FloatArray) -> Agreement:
     deflection = float(np.abs(reference).max())
     return Agreement(
         bias=bias,
-        bias_sd=math.sqrt(max(variance_of_sum(spread), sd * sd * k)) / k,
+        bias_sd=math.sqrt(max(variance_of_sum(scatter), sd * sd * k)) / k,
         limits=(bias - 1.96 * sd, bias + 1.96 * sd),
         scale=1.0 / slope - 1.0,
         scale_sd=slope_sd / slope**2,

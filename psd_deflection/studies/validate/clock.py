@@ -61,7 +61,7 @@ class Offset:
     used: int
 
     @property
-    def told(self) -> bool:
+    def determined(self) -> bool:
         """Whether the motion tells the offset."""
         return self.explained and self.sd < VAGUE and not self.rivals
 
@@ -73,12 +73,12 @@ class Offset:
     @property
     def sentence(self) -> str:
         """Which clock is ahead, and what to add to what."""
-        if not self.told:
+        if not self.determined:
             if self.explained and self.rivals:
-                others = ', '.join(f'{1e3 * r:+.1f}' for r in self.rivals)
+                alternatives = ', '.join(f'{1e3 * r:+.1f}' for r in self.rivals)
                 return (
                     'The offset between the clocks is not told: the motion repeats itself, so that '
-                    f'{1e3 * self.value:+.1f} and {others} ms fit alike. '
+                    f'{1e3 * self.value:+.1f} and {alternatives} ms fit alike. '
                     'Record an event that comes once, such as a push or a step of the load.'
                 )
             return (
@@ -103,22 +103,22 @@ class Offset:
 
 
 @dataclass
-class _Fit:
-    """``left``: what the fit leaves (k, 3), m, m, rad; ``sizes`` (3,): its scatter."""
+class OffsetFit:
+    """``residual``: what the fit leaves (k, 3), m, m, rad; ``sizes`` (3,): its scatter."""
 
     value: float
     sd: float
     drift: float
     drift_sd: float
-    left: FloatArray
+    residual: FloatArray
     sizes: FloatArray
 
     def chi_square(self, sizes: FloatArray) -> float:
         """Mean over the references of what the fit leaves, in ``sizes``; an outlier counts like any other."""
-        return _robust(self.left / sizes)
+        return biweight_sum(self.residual / sizes)
 
 
-def _robust(u: FloatArray) -> float:
+def biweight_sum(u: FloatArray) -> float:
     """Tukey's biweight in place of u^2, summed over the axes, mean over the references."""
     inside = np.clip(1.0 - (u / BIWEIGHT) ** 2, 0.0, None)
     return float((BIWEIGHT**2 / 3.0 * (1.0 - inside**3)).sum(axis=1).mean())
@@ -127,7 +127,7 @@ def _robust(u: FloatArray) -> float:
 def clock_offset(
     motion: Motion, t: FloatArray, poses: FloatArray, *, largest: float = 1.0, exposure: float = 0.0
 ) -> Offset:
-    """The offset of a reference with stamps ``t`` (k,), s, and ``poses`` (k, 3), m, m, rad.
+    """Return the offset of a reference with stamps ``t`` (k,), s, and ``poses`` (k, 3), m, m, rad.
 
     ``largest``: offset that is looked for, s. If the stamps lie outside the motion by more, the clocks count from
     different days, and every offset is looked for at which half of the references lie within the motion.
@@ -138,35 +138,36 @@ def clock_offset(
     if t[0] - largest > motion.t[-1] or t[-1] + largest < motion.t[0]:
         base = float(motion.t[0] - t[0])
         largest = float(max(t[-1] - t[0], motion.t[-1] - motion.t[0]))
-    found = _offset(motion, t + base, poses, largest, exposure)
-    return replace(found, value=found.value + base, rivals=tuple(r + base for r in found.rivals))
+    fitted = offset_near(motion, t + base, poses, largest, exposure)
+    return replace(fitted, value=fitted.value + base, rivals=tuple(r + base for r in fitted.rivals))
 
 
-def _offset(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
-    fits: list[_Fit] = []
-    best: _Fit | None = None
-    for start in _coarse(motion, t, poses, largest):
-        found = _refined(motion, t, poses, start, exposure, best)
-        if found is not None and abs(found.value) <= largest + APART * motion.period:
-            fits.append(found)
-            if best is None or found.chi_square(best.sizes) < best.chi_square(best.sizes):
-                best = found
+def offset_near(motion: Motion, t: FloatArray, poses: FloatArray, largest: float, exposure: float) -> Offset:
+    """Return the offset up to ``largest`` s either way that fits best, and its rivals."""
+    fits: list[OffsetFit] = []
+    best: OffsetFit | None = None
+    for start in coarse_offsets(motion, t, poses, largest):
+        fitted = refined_offset(motion, t, poses, start, exposure, best)
+        if fitted is not None and abs(fitted.value) <= largest + APART * motion.period:
+            fits.append(fitted)
+            if best is None or fitted.chi_square(best.sizes) < best.chi_square(best.sizes):
+                best = fitted
     if best is None:
         raise RecordingError(
             f'the reference and the samples do not overlap enough: fewer than {FEWEST} of the references lie within '
             f'the recording at any offset up to {largest:g} s'
         )
-    used = len(best.left)
+    used = len(best.residual)
     least = best.chi_square(best.sizes)
     near = APART * motion.period
-    rivals = tuple(
+    alternatives = tuple(
         f.value for f in fits if abs(f.value - best.value) > near and used * (f.chi_square(best.sizes) - least) < RIVAL
     )
-    explained = used * (_robust((poses - np.median(poses, axis=0)) / best.sizes) - least)
-    return Offset(best.value, best.sd, best.drift, best.drift_sd, explained > MOVES, rivals, used)
+    explained = used * (biweight_sum((poses - np.median(poses, axis=0)) / best.sizes) - least)
+    return Offset(best.value, best.sd, best.drift, best.drift_sd, explained > MOVES, alternatives, used)
 
 
-def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) -> list[float]:
+def coarse_offsets(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) -> list[float]:
     """Offsets, s, at which the motion explains the reference best, the best first."""
     single, there = motion.grid()
     n, period = len(single), motion.period
@@ -215,27 +216,27 @@ def _coarse(motion: Motion, t: FloatArray, poses: FloatArray, largest: float) ->
     return [float(lag) * period for lag in lags[best]]
 
 
-def _refined(
-    motion: Motion, t: FloatArray, poses: FloatArray, start: float, exposure: float, best: _Fit | None
-) -> _Fit | None:
-    """The offset near ``start``, s; None if fewer than 20 references have samples about them.
+def refined_offset(
+    motion: Motion, t: FloatArray, poses: FloatArray, start: float, exposure: float, best: OffsetFit | None
+) -> OffsetFit | None:
+    """Return the offset near ``start``, s; None if fewer than 20 references have samples about them.
 
     ``best``: another fit. One that stays far above its chi-square is not finished.
     """
     value = start
     weights = np.ones((len(t), 3))
-    fit: _Fit | None = None
+    fit: OffsetFit | None = None
     for passed in range(PASSES):
-        seen, rates = motion.poses_at(t + value, exposure)
-        good = np.isfinite(seen).all(axis=1)
+        poses_of_motion, rates = motion.poses_at(t + value, exposure)
+        good = np.isfinite(poses_of_motion).all(axis=1)
         if good.sum() < FEWEST:
             return None
-        used = _Used(t[good], poses[good], seen[good], rates[good])
+        used = UsedReferences(t[good], poses[good], poses_of_motion[good], rates[good])
         step, fit, weights[good] = used.solved(weights[good])
         value += step
         fit.value = value
         if passed > 0 and best is not None:
-            worse = len(fit.left) * (fit.chi_square(best.sizes) - best.chi_square(best.sizes))
+            worse = len(fit.residual) * (fit.chi_square(best.sizes) - best.chi_square(best.sizes))
             if worse > 10.0 * RIVAL:
                 break
         if passed > 1 and abs(step) < SETTLED:
@@ -244,52 +245,54 @@ def _refined(
 
 
 @dataclass(frozen=True)
-class _Used:
+class UsedReferences:
     """The references in the fit: times (k,), references, motion and its rates (k, 3)."""
 
     t: FloatArray
     poses: FloatArray
-    seen: FloatArray
+    motion: FloatArray
     rates: FloatArray
 
-    def solved(self, weights: FloatArray) -> tuple[float, _Fit, FloatArray]:
-        """The step of the offset, s, the fit there, and the weights of the next pass (k, 3)."""
+    def solved(self, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
+        """Return the step of the offset, s, the fit there, and the weights of the next pass (k, 3)."""
         k = len(self.t)
         # Of an axis that does not move, the readings are noise and explain nothing.
-        moving = [i for i in range(3) if np.ptp(self.seen[:, i]) > 0.0]
-        causes = np.column_stack([np.ones(k), *(self.seen[:, i] - self.seen[:, i].mean() for i in moving)])
+        moving = [i for i in range(3) if np.ptp(self.motion[:, i]) > 0.0]
+        causes = np.column_stack([np.ones(k), *(self.motion[:, i] - self.motion[:, i].mean() for i in moving)])
         scale = np.sqrt((causes * causes).mean(axis=0))
         causes = causes / scale
-        left = np.empty((k, 3))
+        residual = np.empty((k, 3))
         own = np.empty((k, 3))
         ramp = np.empty((k, 3))
         sizes = np.empty(3)
         for axis in range(3):
             root = np.sqrt(weights[:, axis])[:, None]
             terms = np.linalg.lstsq(causes * root, self.poses[:, axis, None] * root, rcond=1e-10)[0][:, 0]
-            left[:, axis] = self.poses[:, axis] - causes @ terms
-            sizes[axis] = max(1.4826 * float(np.median(np.abs(left[:, axis] - np.median(left[:, axis])))), 1e-12)
+            residual[:, axis] = self.poses[:, axis] - causes @ terms
+            sizes[axis] = max(
+                1.4826 * float(np.median(np.abs(residual[:, axis] - np.median(residual[:, axis])))), 1e-12
+            )
             # What the offset does to this axis, without what bias and scales could do as well.
             does = sum((terms[1 + c] / scale[1 + c] * self.rates[:, i] for c, i in enumerate(moving)), np.zeros(k))
             # Beside it what an offset that grows with time does.
             both = np.column_stack([does, does * self.t])
             both -= causes @ np.linalg.lstsq(causes * root, both * root, rcond=1e-10)[0]
             own[:, axis], ramp[:, axis] = both.T
-        next_weights = np.clip(1.0 - (left / (BIWEIGHT * sizes)) ** 2, 0.0, None) ** 2
+        next_weights = np.clip(1.0 - (residual / (BIWEIGHT * sizes)) ** 2, 0.0, None) ** 2
         w = next_weights / sizes**2
         information = float((w * own * own).sum())
         if information <= 0.0:
-            return 0.0, _Fit(0.0, math.inf, 0.0, math.inf, left, sizes), next_weights
-        step = float((w * own * left).sum()) / information
-        scores = (w * own * left).sum(axis=1)
-        spread = max(variance_of_sum(scores) / information**2, 1.0 / information)
+            return 0.0, OffsetFit(0.0, math.inf, 0.0, math.inf, residual, sizes), next_weights
+        step = float((w * own * residual).sum()) / information
+        scores = (w * own * residual).sum(axis=1)
+        variance = max(variance_of_sum(scores) / information**2, 1.0 / information)
         # The offset's growth with time, by what is left.
         ramp = ramp - own * (float((w * own * ramp).sum()) / information)
         grows = float((w * ramp * ramp).sum())
-        drift = float((w * ramp * left).sum()) / grows if grows > 0.0 else 0.0
-        drift_spread = variance_of_sum((w * ramp * left).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf
+        drift = float((w * ramp * residual).sum()) / grows if grows > 0.0 else 0.0
+        drift_spread = variance_of_sum((w * ramp * residual).sum(axis=1)) / grows**2 if grows > 0.0 else math.inf
         drift_sd = math.sqrt(max(drift_spread, 1.0 / grows)) if grows > 0.0 else math.inf
-        return step, _Fit(0.0, math.sqrt(spread), drift, drift_sd, left, sizes), next_weights
+        return step, OffsetFit(0.0, math.sqrt(variance), drift, drift_sd, residual, sizes), next_weights
 
 
 def variance_of_sum(scores: FloatArray) -> float:
@@ -299,10 +302,10 @@ def variance_of_sum(scores: FloatArray) -> float:
     alone give half of the deviation of scores that remember nine tenths.
     """
     power = float(scores @ scores)
-    kept = min(max(float(scores[1:] @ scores[:-1]) / power, 0.0), LONGEST_MEMORY) if power > 0.0 else 0.0
-    new = scores[1:] - kept * scores[:-1] if kept > 0.0 else scores
+    correlation = min(max(float(scores[1:] @ scores[:-1]) / power, 0.0), LONGEST_MEMORY) if power > 0.0 else 0.0
+    new = scores[1:] - correlation * scores[:-1] if correlation > 0.0 else scores
     lags = math.floor(4.0 * (len(scores) / 100.0) ** (2.0 / 9.0))
     total = float(new @ new)
     for lag in range(1, lags + 1):
         total += 2.0 * (1.0 - lag / (lags + 1.0)) * float(new[lag:] @ new[:-lag])
-    return max(total, 0.0) * len(scores) / max(len(new), 1) / (1.0 - kept) ** 2
+    return max(total, 0.0) * len(scores) / max(len(new), 1) / (1.0 - correlation) ** 2

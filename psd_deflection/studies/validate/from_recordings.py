@@ -71,19 +71,19 @@ def read_validate(
     """
     recording, rig = opened.recording, opened.rig
     references = references_of(recording) if reference is None else read_references(reference)
-    seen = read_run(recording, Pipeline(rig), counted(recording.blocks()))
+    run = read_run(recording, Pipeline(rig), counted(recording.blocks()))
     compared = _solvers(rig, solvers)
-    start = int(seen.t_ns[0])
+    start = int(run.t_ns[0])
     return ValidateProblem(
         motion=Motion(
-            _seconds(seen.t_ns, start), seen.dots, 1.0 / rig.converter.sample_rate_hz, compared[rig.estimator.solver]
+            _seconds(run.t_ns, start), run.dots, 1.0 / rig.converter.sample_rate_hz, compared[rig.estimator.solver]
         ),
         solvers=compared,
         t=_seconds(references.t_ns, start),
         reference=references.poses,
         sd=references.sd,
         refused=references.refused,
-        estimate_sd=seen.estimate_sd,
+        estimate_sd=run.estimate_sd,
         align=align,
         largest=largest,
         exposure=exposure,
@@ -98,7 +98,7 @@ def _seconds(t_ns: IntArray, start_ns: int) -> FloatArray:
 
 
 def _solvers(rig: Rig, beside: Sequence[str]) -> dict[str, Solve]:
-    """The rig's, then those ``beside`` it."""
+    """Return the rig's, then those ``beside`` it."""
     variances = dot_noise_variances(rig) / rig.estimator.block_size
     named = [rig.estimator.solver, *(name for name in beside if name != ALL)]
     out: dict[str, Solve] = {}
@@ -116,9 +116,9 @@ def _solve(name: str, rig: Rig, variances: FloatArray) -> Solve:
     solver = solver_from_rig(name, rig)
 
     def solve(dots: FloatArray) -> FloatArray:
-        found = solver.solve_many(dots, variances)
-        poses = found.pose.copy()
-        poses[found.status != 0] = float('nan')
+        solution = solver.solve_many(dots, variances)
+        poses = solution.pose.copy()
+        poses[solution.status != 0] = float('nan')
         return poses
 
     return solve

@@ -79,8 +79,8 @@ class Motion:
         rate = np.where(powers % 2 == 1, span ** np.maximum(powers - 1.0, 0.0), 0.0) / reach
         values = np.einsum('p,kpc->kc', mean, terms)
         rates = np.einsum('p,kpc->kc', rate, terms)
-        left = np.where(there[:, :, None], self.dots[index] - design @ terms, 0.0)
-        scatter = (left * left).sum(axis=1) / np.maximum(used - ORDER - 1, 1)[:, None]
+        residual = np.where(there[:, :, None], self.dots[index] - design @ terms, 0.0)
+        scatter = (residual * residual).sum(axis=1) / np.maximum(used - ORDER - 1, 1)[:, None]
         shrink = np.einsum('p,kpq,q->k', mean, inverse, mean)
         out = (values, rates, scatter * shrink[:, None])
         for array in out:

@@ -32,8 +32,8 @@ class DrawnAgreement:
     marks: Sequence[Moment]
 
 
-def sections(found: DrawnAgreement, rows: Sequence[Sequence[str]]) -> list[PageSection]:
-    """The page below the sentences; ``rows``: the table of solvers, its head first."""
+def sections(drawn: DrawnAgreement, rows: Sequence[Sequence[str]]) -> list[PageSection]:
+    """Return the page below the sentences; ``rows``: the table of solvers, its head first."""
     head, *cells = rows
     shares = (
         '<p class=quiet>Estimate minus reference. The last column is the rms in percent of the largest deflection.</p>'
@@ -44,33 +44,33 @@ def sections(found: DrawnAgreement, rows: Sequence[Sequence[str]]) -> list[PageS
     )
     return [
         PageSection('Agreement by solver', (shares, table(head, cells))),
-        PageSection('Over time', (_over_time(found),)),
-        PageSection('Agreement', (altman, _bland_altman(found))),
-        PageSection('One against the other', (_scatter(found),)),
+        PageSection('Over time', (_over_time(drawn),)),
+        PageSection('Agreement', (altman, _bland_altman(drawn))),
+        PageSection('One against the other', (_scatter(drawn),)),
     ]
 
 
-def _over_time(found: DrawnAgreement) -> Chart:
+def _over_time(drawn: DrawnAgreement) -> Chart:
     panels = []
-    along = TimeAxis('by the clock of the samples', found.marks)
+    along = TimeAxis('by the clock of the samples', drawn.marks)
     for i, (symbol, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
-        estimate, reference = SHOWN[i] * found.estimate[:, i], SHOWN[i] * found.reference[:, i]
+        estimate, reference = SHOWN[i] * drawn.estimate[:, i], SHOWN[i] * drawn.reference[:, i]
         both = (
-            Series('reference', found.t, reference, 'red', 'rings'),
-            Series(f'estimate ({found.solver})', found.t, estimate, 'blue'),
+            Series('reference', drawn.t, reference, 'red', 'rings'),
+            Series(f'estimate ({drawn.solver})', drawn.t, estimate, 'blue'),
         )
-        difference = (Series('', found.t, estimate - reference, 'text', 'points'),)
+        difference = (Series('', drawn.t, estimate - reference, 'text', 'points'),)
         panels.append(Panel(both, along, f'{symbol} / {unit}'))
         panels.append(Panel(difference, along, f'{symbol}: difference / {unit}', height=90))
     return Chart('estimate and reference over time, and differences', panels)
 
 
-def _bland_altman(found: DrawnAgreement) -> Chart:
+def _bland_altman(drawn: DrawnAgreement) -> Chart:
     panels = []
     for i, (symbol, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
-        agreement = found.agreements[i]
-        mean = SHOWN[i] * 0.5 * (found.estimate + found.reference)[:, i]
-        difference = Series('', mean, SHOWN[i] * (found.estimate - found.reference)[:, i], 'blue', 'points')
+        agreement = drawn.agreements[i]
+        mean = SHOWN[i] * 0.5 * (drawn.estimate + drawn.reference)[:, i]
+        difference = Series('', mean, SHOWN[i] * (drawn.estimate - drawn.reference)[:, i], 'blue', 'points')
         rules = [Rule(SHOWN[i] * agreement.bias, 'bias', across=True, colour='text')]
         rules += [Rule(SHOWN[i] * limit, across=True) for limit in agreement.limits]
         label = f'{symbol}: difference / {unit}'
@@ -78,10 +78,10 @@ def _bland_altman(found: DrawnAgreement) -> Chart:
     return Chart('differences over means', panels, beside=3)
 
 
-def _scatter(found: DrawnAgreement) -> Chart:
+def _scatter(drawn: DrawnAgreement) -> Chart:
     panels = []
     for i, (symbol, unit) in enumerate(zip(SYMBOLS, SHOWN_UNITS, strict=True)):
-        estimate, reference = SHOWN[i] * found.estimate[:, i], SHOWN[i] * found.reference[:, i]
+        estimate, reference = SHOWN[i] * drawn.estimate[:, i], SHOWN[i] * drawn.reference[:, i]
         both = np.concatenate([reference, estimate])
         ends = np.array([np.nanmin(both), np.nanmax(both)])
         curves = (

@@ -26,7 +26,7 @@ class Validated(StudyResult):
     ``estimates``: of each solver at these times (k, 3), NaN if it has no answer. ``agreements``: of each solver, for
     dX, dY, theta. ``offset``: between the clocks; ``applied``: whether it was removed. ``covered``: share of
     differences within 1.96 standard deviations of estimate and reference together, for each axis; NaN if the
-    reference does not state its own. ``left_out``: references without samples about them.
+    reference does not state its own. ``excluded``: references without samples about them.
     """
 
     study, json_name = 'validate', 'validate.json'
@@ -40,7 +40,7 @@ class Validated(StudyResult):
     offset: Offset
     applied: bool
     covered: tuple[float, float, float]
-    left_out: int
+    excluded: int
 
     @property
     def solver(self) -> str:
@@ -57,7 +57,7 @@ class Validated(StudyResult):
         out = [self.offset.sentence]
         if self.applied:
             out.append('The offset is removed in what follows.')
-        elif self.offset.told and abs(self.offset.value) > 1.96 * self.offset.sd:
+        elif self.offset.determined and abs(self.offset.value) > 1.96 * self.offset.sd:
             out.append('It is not removed in what follows; --align removes it.')
         for i, name in enumerate(SYMBOLS):
             a = self.agreements[self.solver][i]
@@ -76,16 +76,16 @@ class Validated(StudyResult):
         if math.isfinite(self.covered[0]):
             cover = ', '.join(f'{n} {100.0 * c:.1f} %' for n, c in zip(SYMBOLS, self.covered, strict=True))
             out.append(f'Differences within 1.96 standard deviations of both instruments (95 % expected): {cover}.')
-        if self.left_out:
-            total = len(self.t) + self.left_out
-            out.append(f'{self.left_out} of {total} references have no samples about them and are left out.')
+        if self.excluded:
+            total = len(self.t) + self.excluded
+            out.append(f'{self.excluded} of {total} references have no samples about them and are left out.')
         if refused := self.problem.refused:
             reasons = ', '.join(f'{reason} {count}' for reason, count in sorted(refused.items()))
             out.append(f'The reference gave no answer {sum(refused.values())} times: {reasons}.')
         return out
 
     def lines(self) -> list[str]:
-        """The sentences and the table of solvers."""
+        """Return the sentences and the table of solvers."""
         return [*self.sentences(), '', *columns(self.rows(), left=3).splitlines()]
 
     def rows(self) -> list[list[str]]:
@@ -110,11 +110,11 @@ class Validated(StudyResult):
 
     def tree(self) -> dict[str, Any]:
         """In SI units."""
-        offset = {**asdict(self.offset), 'interval': self.offset.interval, 'told': self.offset.told}
+        offset = {**asdict(self.offset), 'interval': self.offset.interval, 'told': self.offset.determined}
         return {
             'solver': self.solver,
             'references': len(self.t),
-            'left_out': self.left_out,
+            'left_out': self.excluded,
             'refused': dict(self.problem.refused),
             'offset': {**offset, 'applied': self.applied, 'unit': 's', 'sentence': self.offset.sentence},
             'solvers': {
@@ -125,13 +125,13 @@ class Validated(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row a reference over ``t`` (s): the ``reference_`` pose, and that of each solver (m, m, rad)."""
+        """Return one row a reference over ``t`` (s): the ``reference_`` pose, and that of each solver (m, m, rad)."""
         parts = [('reference', self.reference), *self.estimates.items()]
         out = [c for name, pose in parts for c in columns_of(pose, [f'{name}_{a}' for a in AXES], UNITS, [name] * 3)]
         return Table(Column('t', self.t, 's', 'by the clock of the samples'), out, {'solver': self.solver})
 
     def sections(self) -> Iterable[PageSection]:
-        """The solvers, over time, agreement."""
+        """Return the solvers, over time, agreement."""
         from psd_deflection.studies.validate.pictures import DrawnAgreement, sections
 
         of = self.solver

@@ -23,7 +23,7 @@ def validate(problem: ValidateProblem) -> Validated:
     """
     motion, t = problem.motion, problem.t
     offset = clock_offset(motion, t, problem.reference, largest=problem.largest, exposure=problem.exposure)
-    applied = problem.align and offset.told
+    applied = problem.align and offset.determined
     at = t + offset.value if applied else t
     dots, _, _ = motion.dots_at(at, problem.exposure)
     there = np.isfinite(dots).all(axis=1)
@@ -32,12 +32,12 @@ def validate(problem: ValidateProblem) -> Validated:
             f'{int(there.sum())} references lie within the recording by their stamps; at least {FEWEST} are needed '
             f'(with the offset between the clocks removed there may be more: --align)'
         )
-    kept, dots = problem.reference[there], dots[there]
+    reference, dots = problem.reference[there], dots[there]
     estimates = {name: solve(dots) for name, solve in problem.solvers.items()}
-    agreements = {name: of for name, poses in estimates.items() if (of := _on_each_axis(poses, kept)) is not None}
+    agreements = {name: of for name, poses in estimates.items() if (of := _on_each_axis(poses, reference)) is not None}
     covered = (math.nan, math.nan, math.nan)
     if problem.sd is not None and problem.solver in agreements:
-        error = np.abs(estimates[problem.solver] - kept)
+        error = np.abs(estimates[problem.solver] - reference)
         both = np.sqrt(problem.sd[there] ** 2 + problem.estimate_sd**2)
         good = np.isfinite(error).all(axis=1)
         x, y, twist = (float(v) for v in (error[good] <= 1.96 * both[good]).mean(axis=0))
@@ -45,13 +45,13 @@ def validate(problem: ValidateProblem) -> Validated:
     return Validated(
         problem=problem,
         t=at[there],
-        reference=kept,
+        reference=reference,
         estimates=estimates,
         agreements=agreements,
         offset=offset,
         applied=applied,
         covered=covered,
-        left_out=int((~there).sum()),
+        excluded=int((~there).sum()),
     )
 
 

@@ -43,12 +43,12 @@ class WatchedRun(StudyResult):
         return (alarm.since_ns - self.start_ns) / 1e9
 
     def sentences(self) -> list[str]:
-        """Each alarm with its time; or that there was none, and what was watched."""
+        """Return each alarm with its time; or that there was none, and what was watched."""
         lines = [f'since {self.since_s(a):.1f} s: {a.words}' for a in self.alarms]
         return lines or [f'the rig is its model; watched: {self.watched}']
 
     def tree(self) -> dict[str, Any]:
-        """The alarms: times in s from the first sample, shifts in m (of theta in rad)."""
+        """Return the alarms: times in s from the first sample, shifts in m (of theta in rad)."""
         return {
             'same': not self.alarms,
             'watched': self.watched,
@@ -66,7 +66,7 @@ class WatchedRun(StudyResult):
         }
 
     def sections(self) -> Iterable[PageSection]:
-        """The alarms as a table."""
+        """Return the alarms as a table."""
         rows = [
             (f'{self.since_s(a):.1f}', a.channel, f'{a.shift * 1e6:z.2f} ± {a.sd * 1e6:.2f}', ', '.join(a.also))
             for a in self.alarms
@@ -79,12 +79,12 @@ class WatchedRun(StudyResult):
         along = TimeAxis(FROM_FIRST, self.marks)
         panels = []
         for channel in dict.fromkeys(a.channel for a in self.alarms):
-            own = [a for a in self.alarms if a.channel == channel]
-            t, shift, sd = np.array([(self.since_s(a), 1e6 * a.shift, 1e6 * a.sd) for a in own]).T
-            one = Series('', t, shift, 'red', 'points', 1.96 * sd)
+            alarms_of_channel = [a for a in self.alarms if a.channel == channel]
+            t, shift, sd = np.array([(self.since_s(a), 1e6 * a.shift, 1e6 * a.sd) for a in alarms_of_channel]).T
+            series = Series('', t, shift, 'red', 'points', 1.96 * sd)
             label = f'{channel} / {"µrad" if channel == "theta" else "µm"}'
             model = Series('', np.array([0.0, max(self.seconds, *t)]), np.zeros(2), 'quiet')
-            panels.append(Panel((model, one), along, label))
+            panels.append(Panel((model, series), along, label))
         return Chart('what shifted, since when and by how much (95 %)', panels)
 
     @property
@@ -97,14 +97,14 @@ class WatchedRun(StudyResult):
 
         Shifts are in m, of ``theta`` in rad.
         """
-        found = self.alarms
+        alarms = self.alarms
         return Table(
-            Column('since', np.array([self.since_s(a) for a in found], dtype=np.float64), 's', 'when it began'),
+            Column('since', np.array([self.since_s(a) for a in alarms], dtype=np.float64), 's', 'when it began'),
             [
-                Column('seen', np.array([(a.seen_ns - self.start_ns) / 1e9 for a in found]), 's', 'when it was sure'),
-                text_column('channel', [a.channel for a in found], 'what shifted'),
-                Column('shift', np.array([a.shift for a in found], dtype=np.float64), 'm, rad', 'by how much'),
-                Column('sd', np.array([a.sd for a in found], dtype=np.float64), 'm, rad', 'its standard deviation'),
+                Column('seen', np.array([(a.seen_ns - self.start_ns) / 1e9 for a in alarms]), 's', 'when it was sure'),
+                text_column('channel', [a.channel for a in alarms], 'what shifted'),
+                Column('shift', np.array([a.shift for a in alarms], dtype=np.float64), 'm, rad', 'by how much'),
+                Column('sd', np.array([a.sd for a in alarms], dtype=np.float64), 'm, rad', 'its standard deviation'),
             ],
             {'watched': self.watched},
         )

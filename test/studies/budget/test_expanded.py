@@ -11,10 +11,10 @@ import pytest
 
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.budget.budget import BudgetProblem, budget
-from psd_deflection.studies.budget.evaluate import CAUSES, draws, evaluate
+from psd_deflection.studies.budget.evaluate import CAUSES, draws
 from psd_deflection.studies.budget.expanded import coverage_factor, difference, effective_freedom, expanded, interval_of
 from psd_deflection.studies.budget.inputs import read_inputs
-from psd_deflection.studies.budget.term import Distribution, Kind, Situation
+from psd_deflection.studies.budget.term import Distribution, Situation
 
 RIG = load_rig()
 SIDEBAR = (0.0, -50.0, -29.25)
@@ -49,38 +49,6 @@ def test_a_bias_that_is_not_corrected_is_added_with_its_size() -> None:
     # 25^2/(16^2/8) = 19.5.
     assert said.freedom.tolist() == [19.0, math.inf, math.inf]
     assert said.uncertainty == pytest.approx([2.093 * 5.0, 2.0 + 1.96 * 2.0, 3.0 + 1.96], abs=2e-3)
-
-
-def test_types_and_degrees_of_freedom() -> None:
-    at = _at()
-    freedom = {cause.name: cause.freedom(at) for cause in CAUSES}
-    assert {c.name for c in CAUSES if c.observed} == {'amplifier_noise', 'zeroing'}
-    assert freedom['amplifier_noise'] == 999.0
-    # An assumption known to a quarter; a data sheet's bound.
-    assert freedom['pointing_drift'] == 8.0
-    assert freedom['dark_current'] == math.inf
-    # What somebody measured is no assumption, and a doubt may be stated.
-    assert _by_name(_at(pointing_drift=3e-6))['pointing_drift'] == math.inf
-    assert _by_name(_at(assumption_doubt=0.5))['pointing_drift'] == 2.0
-    assert _by_name(_at(assumption_doubt=0.0))['pointing_drift'] == math.inf
-    assert _by_name(_at(noise_freedom=50.0))['zeroing'] == 50.0
-
-
-def _by_name(at: Situation) -> dict[str, float]:
-    return {cause.name: cause.freedom(at) for cause in CAUSES}
-
-
-def test_sensitivities_add_up_to_the_causes() -> None:
-    """Of what acts to first order the squares of c u are the variance of the line."""
-    at = _at()
-    for cause, line in evaluate(at).lines:
-        own = cause.sensitivities(at)
-        if cause.kind is Kind.KNOWN:
-            assert own == []
-            continue
-        linear = sum((s.deviation * s.coefficient) ** 2 for s in own)
-        # A tilted sensor's own foreshortening is of second order.
-        assert linear == pytest.approx(np.diag(line.covariance), rel=0.02 if cause.name != 'sensor_tilt' else 0.3)
 
 
 def test_the_sensitivity_to_a_shift_of_one_reading() -> None:

@@ -12,32 +12,12 @@ from psd_deflection.base.errors import ConfigError
 from psd_deflection.studies.budget.environment import averaging_gain
 from psd_deflection.studies.budget.optics import (
     air_index,
-    beam_diameter,
     boundary_shift,
     gradient_shift,
     index_per_kelvin,
     refracted_angle,
     saturation_pressure,
 )
-
-
-@pytest.mark.parametrize(
-    ('diameter', 'distance', 'expected', 'printed'),
-    [
-        (1.0e-3, 0.585, 1.111035814e-3, 1.007298385e-3),
-        (2.0e-3, 0.585, 2.014596770e-3, 2.000915418e-3),
-        (0.5e-3, 0.585, 1.089771683e-3, 0.555517907e-3),
-        (1.0e-3, 10.0, 8.3363e-3, 2.2980e-3),
-    ],
-)
-def test_beam_diameter(diameter: float, distance: float, expected: float, printed: float) -> None:
-    got = beam_diameter(diameter, 650e-9, distance)
-    assert got == pytest.approx(expected, rel=1e-5 if distance > 1.0 else 1e-9)
-    # 3.1 as printed puts diameters into the law of the radii.
-    as_printed = diameter * math.sqrt(1.0 + (650e-9 * distance / (math.pi * diameter**2)) ** 2)
-    assert as_printed == pytest.approx(printed, rel=1e-4 if distance > 1.0 else 1e-9)
-    # Far from the waist the full divergence is 4 lambda/(pi D0).
-    assert beam_diameter(diameter, 650e-9, 1e6) / 1e6 == pytest.approx(4.0 * 650e-9 / (math.pi * diameter), rel=1e-6)
 
 
 def air_index_short(temperature: float, humidity: float, co2: float) -> float:
@@ -65,47 +45,11 @@ def test_standard_air_agrees_with_another_authors_formula() -> None:
     assert air_index(101_325.0, 288.15, 0.0) == pytest.approx(1.00027653, abs=5e-9)
 
 
-@pytest.mark.parametrize(('degrees', 'micrometres'), [(5.0, 0.46), (45.0, 10.488010), (80.0, 987.0)])
-def test_shift_behind_a_boundary(degrees: float, micrometres: float) -> None:
-    cold, warm = (air_index_short(t, 50.0, 400.0) for t in (293.15, 303.15))
-    got = 1e6 * boundary_shift(math.radians(degrees), cold, warm, 0.585)
-    assert got == pytest.approx(micrometres, abs={5.0: 5e-3, 45.0: 5e-7, 80.0: 0.5}[degrees])
-
-
-def test_a_boundary_met_at_right_angles_shifts_nothing() -> None:
-    assert boundary_shift(0.0, 1.0003, 1.0002, 0.585) == 0.0
-
-
-def test_snells_law_and_its_limit() -> None:
-    angle = refracted_angle(0.5, 1.0, 1.5)
-    assert 1.5 * math.sin(angle) == pytest.approx(math.sin(0.5), rel=1e-15)
-    with pytest.raises(ConfigError, match='reflected totally'):
-        refracted_angle(1.2, 1.5, 1.0)
-
-
-def test_a_gradient_bends_the_beam() -> None:
-    per_kelvin = index_per_kelvin(293.15)
-    assert 1e6 * gradient_shift(abs(per_kelvin), 0.585) == pytest.approx(0.159, abs=5e-4)
-    # Slices of a layered medium, refracted one after the other, give the same.
-    gradient, length, slices = 1e-4, 0.585, 2000
-    slope, place, step = 0.0, 0.0, 0.585 / 2000
-    for _ in range(slices):
-        slope += gradient * step / 2.0
-        place += slope * step
-        slope += gradient * step / 2.0
-    assert place == pytest.approx(gradient_shift(gradient, length), rel=1e-9)
-
-
 def test_what_averaging_leaves_of_hum() -> None:
     assert averaging_gain(20, 50.0, 1000.0) == pytest.approx(0.0, abs=1e-12)
     assert averaging_gain(20, 60.0, 1000.0) == pytest.approx(0.157, abs=1e-3)
     # An alias of a constant is not averaged at all.
     assert averaging_gain(20, 1000.0, 1000.0) == 1.0
-
-
-@pytest.mark.parametrize(('celsius', 'hectopascal'), [(0.0, 6.11), (10.0, 12.28), (20.0, 23.39), (30.0, 42.47)])
-def test_saturated_vapour_is_that_of_the_tables(celsius: float, hectopascal: float) -> None:
-    assert saturation_pressure(273.15 + celsius) == pytest.approx(100.0 * hectopascal, rel=4e-3)
 
 
 def _magnus(celsius: float) -> float:

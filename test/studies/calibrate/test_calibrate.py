@@ -215,10 +215,10 @@ def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
     rng = np.random.default_rng(9)
     truth = misaligned.draw(rng)
     rig, _ = campaign.calibrated_rig(nominal, campaign.run_of(misaligned.record(truth, pose, rng)))
-    assert check([campaign.run_of(misaligned.record(truth, pose, rng))], rig).holds
+    assert check([campaign.run_of(misaligned.record(truth, pose, rng))], rig).unchanged
     moved = truth | {'psd_1.rotation': truth['psd_1.rotation'] + 0.03}
     found = check([campaign.run_of(misaligned.record(moved, pose, rng))], rig)
-    assert not found.holds
+    assert not found.unchanged
     assert found.groups[0].group == 'psd_1.rotation'
     value, sd = found.groups[0].shifts['psd_1.rotation']
     assert abs(value - 0.03) < 4.0 * sd
@@ -247,7 +247,7 @@ def test_what_the_rows_contradict_is_widened_once_each_the_worst_first(
     # A fit that stays where it is.
     monkeypatch.setattr(module, 'fit', lambda *_, start, **__: start)
     free = np.ones(len(NAMES), dtype=bool)
-    _, wider, widened = module._believed(first, cast(Rows, None), nominal, prior, 'loads', free)
+    _, wider, widened = module.believed_fit(first, cast(Rows, None), nominal, prior, 'loads', free)
     assert widened == ['clamp.bending_compliance', 'psd_1.rotation']
     sd = prior.sd.copy()
     sd[[worst, next_one]] *= module.WIDER

@@ -16,8 +16,8 @@ from psd_deflection.model.misalignment.model import INDEX, PARAMETERS, ZERO
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
 from psd_deflection.studies.calibrate import check as checking
-from psd_deflection.studies.calibrate.calibrate import _with_clamp, undetermined
-from psd_deflection.studies.calibrate.check import LEVEL, MovedGroup, _fitted, _moved, overall_p
+from psd_deflection.studies.calibrate.calibrate import undetermined, with_clamp
+from psd_deflection.studies.calibrate.check import LEVEL, MovedGroup, fitted_group, moved_group, overall_p
 from psd_deflection.studies.calibrate.fit import (
     CLAMP_AT,
     CalibrationFit,
@@ -39,7 +39,7 @@ def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(ZERO, ZERO))
     m, score, scale = root @ root.T, rng.normal(size=ZERO), rng.uniform(0.5, 2.0, ZERO)
-    found = _moved(group, at, score, m, scale)
+    found = moved_group(group, at, score, m, scale)
     # In units of the prior, whose information is 1.
     covariance = np.linalg.inv(m[np.ix_(own, own)] + np.eye(len(own)))
     shift = scale[own] * (covariance @ score[own])
@@ -60,7 +60,7 @@ def test_a_group_is_fitted_as_if_it_may_have_moved_by_three_tolerances(monkeypat
     monkeypatch.setattr(checking, 'explained', explained)
     group = MovedGroup('psd_1.gain', 0.01, 1.0, 2, dict.fromkeys(names, (0.0, 0.1)))
     nothing = cast(Any, None)
-    found = _fitted(group, nothing, nothing, told, 'reference', nothing, nothing, 3.0)
+    found = fitted_group(group, nothing, nothing, told, 'reference', nothing, nothing, 3.0)
     wider = np.zeros(len(told.mean))
     for p in PARAMETERS:
         if p.name in names:
@@ -128,5 +128,5 @@ def test_a_clamp_that_gives_way_is_found_beside_a_pose_that_is_an_outlier() -> N
     free = np.zeros(size, dtype=bool)
     noise = Noise(np.array([1e-7, 1e-7, 1e-7]))
     whole = CalibrationFit(np.zeros(size), np.zeros((size, size)), np.zeros((size, size)), linear, weights, noise, free)
-    found = _with_clamp(whole, rows, rig, prior)
+    found = with_clamp(whole, rows, rig, prior)
     assert found.values[CLAMP_AT : CLAMP_AT + 2] == pytest.approx([bends, twists], rel=1e-3)

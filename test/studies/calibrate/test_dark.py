@@ -21,8 +21,8 @@ from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import (
     PIECES,
     DarkLevel,
-    _mean_and_drift,
     dark_levels,
+    mean_and_drift,
     result_of_levels,
     values_of_levels,
     words_of_level,
@@ -82,19 +82,19 @@ def test_steps_that_noise_does_not_dither_are_an_uncertainty(nominal: Rig) -> No
 def test_what_is_said_of_one_psd(nominal: Rig) -> None:
     lit = run_of(white((0.0, 0.0, 5.12, 0.0, 0.0, 5.06), 500, 0.0))
     (one, two) = dark_levels([run_of(darkness())], nominal, [lit])
-    assert one.whole == 5.12
+    assert one.lit_sum == 5.12
     assert one.share == pytest.approx(0.12 / 5.12, rel=4e-3)
     assert two.share == pytest.approx(0.06 / 5.06, rel=8e-3)
     # 0.5 mm a volt, in metres; what is left is the error of the share times half of 10 mm.
     assert one.place == pytest.approx([1.5e-3, -1.0e-3], abs=1e-6)
-    assert one.left == pytest.approx(5e-3 * one.sd[2] / 5.12)
+    assert one.residual == pytest.approx(5e-3 * one.sd[2] / 5.12)
     tree = result_of_levels([one])['psd_1']
     assert tree['sum']['value'] == one.volts[2]
     assert (tree['sum']['file'], tree['sum']['unit']) == (0.0, 'V')
     assert tree['recording'] == {'name': 'off.csv', 'sha256': 'ab' * 32}
     assert words_of_level(one).startswith('psd_1 with its laser off: sum 0.119')
     (alone, _) = dark_levels([run_of(darkness())], nominal)
-    assert alone.whole == pytest.approx(5.0 + alone.volts[2])
+    assert alone.lit_sum == pytest.approx(5.0 + alone.volts[2])
 
 
 def test_lasers_may_be_off_one_after_the_other_and_for_a_part(nominal: Rig) -> None:
@@ -240,7 +240,7 @@ def test_a_level_is_a_record(nominal: Rig) -> None:
 
 def test_few_pieces_widen_the_interval_to_that_of_student() -> None:
     part = np.random.default_rng(6).normal(0.0, 2e-3, (4000, 3))
-    mean, sd, _, _ = _mean_and_drift(part, 1e-9)
+    mean, sd, _, _ = mean_and_drift(part, 1e-9)
     pieces = np.array([piece.mean(axis=0) for piece in np.array_split(part, PIECES)])
     plain = pieces.std(axis=0, ddof=1) / PIECES**0.5
     worth = [fewer((pieces[:, [i]] - pieces[:, i].mean()), np.zeros(PIECES, dtype=np.int64)) ** 0.5 for i in range(3)]

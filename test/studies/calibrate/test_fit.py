@@ -22,9 +22,9 @@ from psd_deflection.studies.calibrate.fit import (
     Kind,
     Linear,
     Noise,
-    _components,
     pose_of_readings,
     prior_of_rig,
+    variance_components,
     weight_matrices,
 )
 
@@ -68,7 +68,7 @@ def test_rows_that_are_worth_fewer_weigh_less() -> None:
     linear = Linear(np.zeros((5, 4)), np.zeros((5, 4, 2)), rng.normal(size=(5, 4, 3)))
     noise = Noise(np.array([1e-6, 2e-6, 3e-6]), 1.5)
     each = weight_matrices(linear, rows, noise)
-    spread = linear.by_pose[2] @ np.diag(noise.reference**2) @ linear.by_pose[2].T
+    spread = linear.pose_slopes[2] @ np.diag(noise.reference**2) @ linear.pose_slopes[2].T
     np.testing.assert_allclose(each[2], np.linalg.inv(spread + np.diag(1.5**2 * rows.variances[2])), rtol=1e-9)
     np.testing.assert_allclose(weight_matrices(linear, rows, replace(noise, fewer=4.0)), each / 4.0, rtol=1e-12)
 
@@ -91,5 +91,5 @@ def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: 
     )
     linear = Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
     prior = prior_of_rig(rig_from_values({}))
-    found = _components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
+    found = variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
     assert found.dots == pytest.approx(told)

@@ -9,7 +9,7 @@ import pytest
 
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import rig_from_values
-from psd_deflection.studies.calibrate.fit import _deviation
+from psd_deflection.studies.calibrate.fit import deviation_of
 from psd_deflection.studies.calibrate.observation import (
     CALM_LEAST,
     CalibrationRun,
@@ -17,8 +17,8 @@ from psd_deflection.studies.calibrate.observation import (
     at_rest,
     joined,
     noise_of,
+    rest_means,
     rows_of,
-    settled,
     smoothed,
 )
 
@@ -96,7 +96,7 @@ def test_the_noise_of_each_channel_is_found() -> None:
     assert noise_of(run_of(lit(20_000, noise)), RIG) == pytest.approx(noise, rel=0.05)
 
 
-def test_a_load_is_at_rest_in_the_second_half_of_its_time_if_that_is_long_enough() -> None:
+def test_a_load_is_at_rest_in_the_second_half_of_its_hold() -> None:
     t = seconds(3000)
     loads = np.zeros((3000, 3))
     loads[1000:1500, 0] = 5.0
@@ -142,7 +142,7 @@ def test_settled_rows_are_means_no_better_than_the_calmest() -> None:
     noise = np.array([1e-3, 2e-3, 4e-3, 8e-3])
     for variances in (small, large):
         rows = Rows(t, run, zeros, dots, variances, zeros, loads, t >= 0.5, np.ones((100, 3)))
-        found = settled(rows, RIG, noise)
+        found = rest_means(rows, RIG, noise)
         assert len(found) >= 6
         assert {tuple(row) for row in found.loads.tolist()} == {(0.0, 0.0, 0.0), (0.0, -10.0, 0.0)}
         if variances is small:
@@ -171,10 +171,10 @@ def test_references_count_by_their_proportions_if_all_state_them() -> None:
 
 def test_half_of_the_deviations_tell_that_of_all() -> None:
     values = np.random.default_rng(3).normal(0.0, 2.0, 20_000)
-    assert _deviation(values, False) == pytest.approx(2.0, rel=0.02)
-    assert _deviation(values, True) == pytest.approx(2.0, rel=0.03)
+    assert deviation_of(values, False) == pytest.approx(2.0, rel=0.02)
+    assert deviation_of(values, True) == pytest.approx(2.0, rel=0.03)
     values[::10] += 1000.0
-    assert _deviation(values, True) == pytest.approx(2.0, rel=0.2)
+    assert deviation_of(values, True) == pytest.approx(2.0, rel=0.2)
 
 
 def test_the_steps_of_the_converter_are_no_noise() -> None:

@@ -22,14 +22,14 @@ def noisy(n: int, sd: float = 2e-3, seed: int = 1) -> FloatArray:
     return np.array([1.0, 2.0, 5.0, -1.0, 0.5, 4.0]) + np.random.default_rng(seed).normal(0.0, sd, (n, 6))
 
 
-def test_the_noise_that_the_file_says_is_that_of_four_channels_and_of_the_converter() -> None:
+def test_stated_noise_has_four_channels_and_the_converter() -> None:
     assert levels(RIG, noisy(100)).stated == pytest.approx(math.hypot(2e-3, STEP / math.sqrt(12.0)))
     each = load_rig(overrides={'psd_1.noise': [1e-3, 2e-3], 'psd_2.noise': [4e-3, 3e-3]})
     mean = math.sqrt((1.0 + 4.0 + 16.0 + 9.0) / 4.0) * 1e-3
     assert levels(each, noisy(100)).stated == pytest.approx(math.hypot(mean, STEP / math.sqrt(12.0)))
 
 
-def test_noise_is_what_third_differences_have_without_steps_glitches_and_lost_samples() -> None:
+def test_noise_is_that_of_third_differences() -> None:
     volts = noisy(800)
     volts[400:] += 0.3
     volts[::90] -= 0.5
@@ -56,13 +56,6 @@ def test_noise_is_what_third_differences_have_without_steps_glitches_and_lost_sa
     assert levels(RIG, still).noise == pytest.approx(math.sqrt((1 + 4 + 1) * 16 / 897 / 20) * STEP, rel=0.5)
 
 
-def test_only_the_begin_of_a_long_recording_is_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    volts = noisy(900)
-    volts[500:] = 3.0
-    monkeypatch.setattr(module, 'LONGEST', 500)
-    assert levels(RIG, volts).sums == pytest.approx(volts[:500, [2, 5]].mean(axis=0))
-
-
 def test_a_channel_on_which_no_bit_moves_is_stuck_if_noise_would_move_one() -> None:
     volts = noisy(200)
     volts[:, [1, 5]] = 0.25
@@ -79,21 +72,14 @@ def test_one_sample_has_no_noise() -> None:
     assert found.sums == pytest.approx(noisy(1)[0, [2, 5]])
 
 
-def test_steps_are_seen_wherever_they_are() -> None:
-    volts = np.zeros((2500, 6))
-    volts[2000:] = 0.05 * np.random.default_rng(2).integers(-3, 4, (500, 6))
-    assert levels(RIG, volts).steps == pytest.approx([0.05] * 6, rel=1e-3)
-    assert not levels(RIG, noisy(2500)).steps.any()
-
-
 def test_the_longest_run_is_the_first_of_those_without_a_lost_sample() -> None:
     volts = np.arange(120.0).reshape(20, 6)
-    assert module._longest_run(volts) == pytest.approx(volts)
+    assert module.longest_run(volts) == pytest.approx(volts)
     volts[[0, 7, 8, 15], [0, 5, 2, 3]] = np.nan
     # 1 to 6, 9 to 14 and 16 to 19.
-    assert module._longest_run(volts) == pytest.approx(volts[1:7])
+    assert module.longest_run(volts) == pytest.approx(volts[1:7])
     volts[6, 1] = np.nan
-    assert module._longest_run(volts) == pytest.approx(volts[9:15])
+    assert module.longest_run(volts) == pytest.approx(volts[9:15])
 
 
 def waves(n: int, rate: float, amplitudes: dict[float, float]) -> FloatArray:
@@ -107,14 +93,14 @@ def waves(n: int, rate: float, amplitudes: dict[float, float]) -> FloatArray:
 
 def test_hum_is_the_amplitude_of_the_mains_that_stands_out_more() -> None:
     noise = np.full(6, 1e-3)
-    hz, hum = module._hum(waves(4000, 1000.0, {50.0: 2e-3, 60.0: 5e-3}), 1000.0, noise)
+    hz, hum = module.mains_hum(waves(4000, 1000.0, {50.0: 2e-3, 60.0: 5e-3}), 1000.0, noise)
     assert hz == 60.0
     assert hum[1] == pytest.approx(5e-3, rel=0.03)
     assert hum[[0, 2, 3, 4, 5]].tolist() == [0.0] * 5
-    hz, hum = module._hum(waves(4000, 1000.0, {50.0: 5e-3, 60.0: 2e-3}), 1000.0, noise)
+    hz, hum = module.mains_hum(waves(4000, 1000.0, {50.0: 5e-3, 60.0: 2e-3}), 1000.0, noise)
     assert (hz, hum[1]) == (50.0, pytest.approx(5e-3, rel=0.03))
     # Without any it is that of the first.
-    hz, hum = module._hum(waves(4000, 1000.0, {}), 1000.0, noise)
+    hz, hum = module.mains_hum(waves(4000, 1000.0, {}), 1000.0, noise)
     assert (hz, hum.tolist()) == (50.0, [0.0] * 6)
 
 
@@ -151,34 +137,20 @@ def test_hum_stands_out_of_its_neighbours_five_times() -> None:
                 high = middle
             if high - low < 1e-9:
                 break
-        assert bool(module._hum(less, 500.0, np.zeros(6))[1][1] > 0.0) is seen
+        assert bool(module.mains_hum(less, 500.0, np.zeros(6))[1][1] > 0.0) is seen
 
 
 @pytest.mark.parametrize(('noise', 'seen'), [(0.0195, True), (0.0205, False)])
 def test_hum_below_a_quarter_of_the_noise_is_none(noise: float, seen: bool) -> None:
     volts = waves(4000, 1000.0, {50.0: 5e-3})
-    assert bool(module._hum(volts, 1000.0, np.full(6, noise))[1].any()) is seen
+    assert bool(module.mains_hum(volts, 1000.0, np.full(6, noise))[1].any()) is seen
 
 
 @pytest.mark.parametrize(
     ('n', 'rate', 'seen'), [(1000, 1000.0, True), (999, 1000.0, False), (600, 150.0, True), (600, 149.0, False)]
 )
-def test_hum_is_looked_for_in_a_second_and_at_two_and_a_half_samples_a_period(n: int, rate: float, seen: bool) -> None:
-    hz, hum = module._hum(waves(n, rate, {50.0: 0.1}), rate, np.full(6, 1e-3))
+def test_hum_needs_a_second_and_2_5_samples_a_period(n: int, rate: float, seen: bool) -> None:
+    hz, hum = module.mains_hum(waves(n, rate, {50.0: 0.1}), rate, np.full(6, 1e-3))
     assert hz == 50.0
     assert bool(hum[1] > 0.0) is seen
     assert len(hum) == 6
-
-
-def test_hum_is_looked_for_in_the_first_minute(monkeypatch: pytest.MonkeyPatch) -> None:
-    looked: list[int] = []
-
-    def hum(volts: FloatArray, rate: float, noise: FloatArray) -> tuple[float, FloatArray]:
-        looked.append(len(volts))
-        return rate, noise
-
-    monkeypatch.setattr(module, '_hum', hum)
-    rig = load_rig(overrides={'converter.sample_rate_hz': 200.0})
-    assert levels(rig, noisy(13_000)).hum_hz == 200.0
-    levels(rig, noisy(11_999))
-    assert looked == [12_000, 11_999]

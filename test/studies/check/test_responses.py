@@ -24,7 +24,7 @@ def test_means_are_of_the_samples_that_are_there() -> None:
     samples[1, 0] = samples[1:4, 1] = samples[4:8, 1] = np.nan
     wanted = np.array([[(0 + 4 + 6) / 3, 1.0], [11.0, np.nan]])
     with np.errstate(invalid='raise', divide='raise'):
-        assert module._block_means(samples, 2) == pytest.approx(wanted, nan_ok=True)
+        assert module.block_means(samples, 2) == pytest.approx(wanted, nan_ok=True)
 
 
 def test_loads_that_always_came_together_are_one() -> None:
@@ -34,7 +34,7 @@ def test_loads_that_always_came_together_are_one() -> None:
 
     def groups(*columns: FloatArray, per: FloatArray = one) -> list[list[int]]:
         poses = np.column_stack(columns)
-        return module._groups(poses, poses, per)
+        return module.load_groups(poses, poses, per)
 
     none = np.zeros(70)
     assert groups(steps, other, none) == [[0], [1]]
@@ -43,7 +43,7 @@ def test_loads_that_always_came_together_are_one() -> None:
     assert groups(steps, other, 3.0 * steps) == [[0, 2], [1]]
     assert groups(steps, 2.0 * steps, 3.0 * steps) == [[0, 1, 2]]
     # What has moved nothing yet counts for nothing.
-    assert module._groups(np.column_stack((steps, other, none)), np.column_stack((steps, none, none)), one) == [[0]]
+    assert module.load_groups(np.column_stack((steps, other, none)), np.column_stack((steps, none, none)), one) == [[0]]
     # A correlation of 0.95 parts them.
     about = steps - steps.mean()
     beside = other - other.mean()
@@ -58,14 +58,14 @@ def test_loads_that_always_came_together_are_one() -> None:
     assert groups(third, about, fourth, per=np.array([[9.0, 1.0, 1.0]])) == [[0, 1], [2]]
 
 
-def test_slopes_and_their_spread_are_those_of_least_squares_and_memory_widens_them() -> None:
+def test_slopes_are_least_squares_and_memory_widens_them() -> None:
     chance = np.random.default_rng(1)
     design = np.column_stack((chance.normal(size=(200, 4)) * 1e-4, np.ones(200), np.arange(200.0) - 99.5))
     # Noise that remembers half of itself, and one that turns around.
     white = chance.normal(size=(201, 3))
     rest = np.column_stack((white[1:, 0], white[1:, 1] + 0.8 * white[:-1, 1], white[1:, 2] - 0.8 * white[:-1, 2]))
     values = design @ chance.normal(size=(6, 3)) + 1e-5 * rest
-    slopes, spread, variance = module._regression(design, values)
+    slopes, spread, variance = module.least_squares_fit(design, values)
     wanted, squares, _, _ = np.linalg.lstsq(design, values, rcond=None)
     assert slopes == pytest.approx(wanted, rel=1e-6)
     assert spread == pytest.approx(np.linalg.inv(design.T @ design), rel=1e-6)
@@ -77,7 +77,7 @@ def test_slopes_and_their_spread_are_those_of_least_squares_and_memory_widens_th
     wave = np.sin(np.arange(2000.0) / 300.0)[:, None]
     about = wave[:, 0] - wave.mean()
     assert (about[1:] @ about[:-1]) / (about @ about) > 0.99
-    _, _, slow = module._regression(np.column_stack((np.zeros((2000, 4)), np.ones(2000))), wave)
+    _, _, slow = module.least_squares_fit(np.column_stack((np.zeros((2000, 4)), np.ones(2000))), wave)
     assert slow == pytest.approx(about @ about / 1995 * 1.98 / 0.02, rel=1e-6)
     # One value more than numbers, and as many of which some count for nothing.
     for rows in (7, 4):
@@ -86,14 +86,14 @@ def test_slopes_and_their_spread_are_those_of_least_squares_and_memory_widens_th
         own = chance.normal(size=(rows, 1))
         r = own[:, 0] - some @ np.linalg.lstsq(some, own[:, 0], rcond=None)[0]
         colour = min(max(float(r[1:] @ r[:-1] / (r @ r)), 0.0), 0.98)
-        assert module._regression(some, own)[2] == pytest.approx(
+        assert module.least_squares_fit(some, own)[2] == pytest.approx(
             r @ r * (1 + colour) / (1 - colour), rel=1e-5, abs=1e-20
         )
     # What explains all leaves nothing, and no more numbers than values have a variance still.
-    _, _, exact = module._regression(np.eye(3)[:, :2], np.array([[1.0], [2.0], [0.0]]))
+    _, _, exact = module.least_squares_fit(np.eye(3)[:, :2], np.array([[1.0], [2.0], [0.0]]))
     assert exact == pytest.approx([0.0], abs=1e-25)
     few = np.column_stack((np.eye(2), np.zeros((2, 3))))
-    assert module._regression(few, np.ones((2, 1)))[2] == pytest.approx([0.0], abs=1e-25)
+    assert module.least_squares_fit(few, np.ones((2, 1)))[2] == pytest.approx([0.0], abs=1e-25)
 
 
 @pytest.mark.parametrize('other', [1, 2, 3])
@@ -107,7 +107,7 @@ def test_combinations_that_hardly_move_say_nothing_in_whatever_unit(
     design = np.column_stack((np.zeros((100, 4)), np.ones(100), np.arange(100.0)))
     design[:, 0] = unit * along
     design[:, other] = unit * (along + beside)
-    slopes, _, _ = module._regression(design, unit * (3.0 * along + beside + 7.0)[:, None])
+    slopes, _, _ = module.least_squares_fit(design, unit * (3.0 * along + beside + 7.0)[:, None])
     # Of the difference alone that is 1; if it says nothing both have the same share.
     assert bool(abs(slopes[other, 0] - slopes[0, 0]) > 0.5) is told
     assert slopes[4, 0] == pytest.approx(7.0 * unit, rel=1e-3)
@@ -115,7 +115,7 @@ def test_combinations_that_hardly_move_say_nothing_in_whatever_unit(
     for small, large in ((0, other), (other, 0)):
         design[:, :4] = 0.0
         design[:, small], design[:, large] = 1e-3 * unit * share * along, unit * np.cos(np.arange(100.0))
-        slopes, _, _ = module._regression(design, design[:, [small]] + 7.0 * unit)
+        slopes, _, _ = module.least_squares_fit(design, design[:, [small]] + 7.0 * unit)
         assert slopes[small, 0] == pytest.approx(0.0, abs=1e-3)
         assert slopes[4, 0] == pytest.approx(7.0 * unit, rel=1e-3)
 

@@ -21,12 +21,12 @@ from psd_deflection.studies.check.result import (
     WRONG,
     Checkup,
     Finding,
-    _answers,
-    _arrow,
-    _levels,
-    _other_causes,
-    _pushes,
+    answers_chart,
+    arrow,
     finding_tree,
+    level_rows,
+    other_causes,
+    push_rows,
 )
 from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFit
 
@@ -59,7 +59,7 @@ CHECKUP = Checkup(
     values={},
     pushes=PUSHES,
     sizes=(1.5, -0.5),
-    found=(WiringFit(Wiring(), 0.1),),
+    wirings=(WiringFit(Wiring(), 0.1),),
     levels=LEVELS,
     drift=np.array([1.0, -2.0, 0.0, -1e-4]) * 1e-6 / 60.0,
     drift_sd=np.array([0.1, 0.2, 0.3, 0.44]) * 1e-6 / 60.0,
@@ -90,7 +90,7 @@ def fits(count: int) -> tuple[WiringFit, ...]:
 )
 def test_the_verdict_is_a_sentence(verdict: str, names: tuple[str, ...], count: int, words: str) -> None:
     some = tuple(finding(name, 'x1') for name in names)
-    found = replace(CHECKUP, verdict=verdict, findings=some, found=fits(count))
+    found = replace(CHECKUP, verdict=verdict, findings=some, wirings=fits(count))
     assert found.sentences()[0] == words
     assert words in found.lines()
 
@@ -122,7 +122,7 @@ def test_what_is_wrong_is_said_with_where_and_what_to_do() -> None:
         *causes,
         'note: hum',
     ]
-    assert _other_causes(found) == causes
+    assert other_causes(found) == causes
     lines = found.lines()
     at = lines.index(found.sentences()[0])
     assert lines[at + 1 : at + 14] == [
@@ -151,18 +151,18 @@ def test_what_is_wrong_is_said_with_where_and_what_to_do() -> None:
 
 
 def test_each_push_has_a_row_with_what_the_file_expects_on_each_channel() -> None:
-    head, along, beside = _pushes(CHECKUP)
+    head, along, beside = push_rows(CHECKUP)
     assert head == ['push', 'x1 µm', 'y1 µm', 'x2 µm', 'y2 µm', '', 'x1', 'y1', 'x2', 'y2', 'size']
     # The file has x1 turned; a hundredth of the whole is next to nothing. By hand there is no size.
     assert along == ['+X', '+1.0', '-2.0', '+0.0', '+4.0', '  rig file:', '+', '0', '+', '0', '']
     assert beside == ['+Y with +θ', '+0.0', '+0.0', '+0.0', '+1000.0', '  rig file:', '0', '+', '0', '-', '0.50']
     # Rounded to a tenth of a micrometre.
     near = replace(PUSHES[0], channels=np.array([1.0499995e-6, 1.0500005e-6, 0.0, 0.0]))
-    assert _pushes(replace(CHECKUP, pushes=(near,), sizes=(1.0,)))[1][1:3] == ['+1.0', '+1.1']
+    assert push_rows(replace(CHECKUP, pushes=(near,), sizes=(1.0,)))[1][1:3] == ['+1.0', '+1.1']
     # One push that has a size is enough for a column.
-    assert [row[-1] for row in _pushes(replace(CHECKUP, pushes=PUSHES[::-1]))] == ['size', '1.50', '']
+    assert [row[-1] for row in push_rows(replace(CHECKUP, pushes=PUSHES[::-1]))] == ['size', '1.50', '']
     # A push that was not seen has none either, and then there is no column.
-    assert [len(row) for row in _pushes(replace(CHECKUP, sizes=(1.5, math.nan)))] == [10, 10, 10]
+    assert [len(row) for row in push_rows(replace(CHECKUP, sizes=(1.5, math.nan)))] == [10, 10, 10]
     assert CHECKUP.lines()[0] == ''
     assert CHECKUP.lines()[1].split() == [
         'push',
@@ -183,12 +183,12 @@ def test_each_push_has_a_row_with_what_the_file_expects_on_each_channel() -> Non
 
 
 def test_an_arrow_is_nothing_below_a_tenth() -> None:
-    assert [_arrow(v, 2.0) for v in (0.0, 0.19, -0.19, 0.25, -0.25, 5.0)] == ['0', '0', '0', '+', '-', '+']
-    assert _arrow(0.5, 5.0) == '+'
+    assert [arrow(v, 2.0) for v in (0.0, 0.19, -0.19, 0.25, -0.25, 5.0)] == ['0', '0', '0', '+', '-', '+']
+    assert arrow(0.5, 5.0) == '+'
 
 
 def test_the_chart_has_a_panel_a_channel_two_beside_each_other_in_micrometres() -> None:
-    chart = _answers(CHECKUP)
+    chart = answers_chart(CHECKUP)
     assert isinstance(chart, Chart)
     # x and y of one PSD beside each other.
     assert chart.beside == 2
@@ -208,14 +208,14 @@ def test_the_chart_has_a_panel_a_channel_two_beside_each_other_in_micrometres() 
 
 
 def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:
-    assert _levels(CHECKUP) == [
+    assert level_rows(CHECKUP) == [
         ('noise', 'x1 1.00  y1 2.00  sum1 3.00  x2 4.00  y2 5.00  sum2 6.50  mV rms a sample (rig file 2.20)'),
         ('hum', 'none at 50 or 60 Hz'),
         ('light', 'sum1 4.50  sum2 5.25  V (rig file 5)'),
         ('drift', 'x1 +1.0 ± 0.1  y1 -2.0 ± 0.2  x2 +0.0 ± 0.3  y2 +0.0 ± 0.4  µm a minute'),
     ]
     hum = replace(LEVELS, hum=np.array([0.0, 1e-3, 0.0, 2.5e-3, 0.0, 0.0]), hum_hz=60.0)
-    assert _levels(replace(CHECKUP, levels=hum))[1] == (
+    assert level_rows(replace(CHECKUP, levels=hum))[1] == (
         'hum',
         'x1 0.0  y1 1.0  sum1 0.0  x2 2.5  y2 0.0  sum2 0.0  mV at 60 Hz',
     )
@@ -226,14 +226,14 @@ def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:
         drift_sd=minute * np.array([2.24999998, 2.25000002, 0.0, 0.0]),
         levels=replace(LEVELS, hum=np.array([1.0495e-3, 1.0505e-3, 0.0, 0.0, 0.0, 0.0]), stated=2.2245e-3),
     )
-    told = dict(_levels(near))
+    told = dict(level_rows(near))
     assert told['drift'].startswith('x1 +1.0 ± 2.2  y1 +1.1 ± 2.3  ')
     assert told['hum'].startswith('x1 1.0  y1 1.1  ')
     assert told['noise'].endswith('(rig file 2.22)')
-    assert _levels(replace(CHECKUP, levels=replace(LEVELS, stated=2.2255e-3)))[0][1].endswith('(rig file 2.23)')
+    assert level_rows(replace(CHECKUP, levels=replace(LEVELS, stated=2.2255e-3)))[0][1].endswith('(rig file 2.23)')
     for sd, known in ((TELLING_DRIFT, True), (1.001 * TELLING_DRIFT, False)):
         short = replace(CHECKUP, drift_sd=np.array([0.0, 0.0, sd, 0.0]))
-        assert (_levels(short)[3][1] != 'cannot be told: the recording is too short') is known
+        assert (level_rows(short)[3][1] != 'cannot be told: the recording is too short') is known
 
 
 def test_the_tree_and_the_table_have_all_numbers() -> None:

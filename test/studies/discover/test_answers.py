@@ -26,23 +26,22 @@ from psd_deflection.studies.discover import planning, trees
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Setting
 from psd_deflection.studies.discover.laws.laws import FoundLaw
-from psd_deflection.studies.discover.planning import Plan, Suggestion, Told
+from psd_deflection.studies.discover.planning import Discrimination, Plan, Suggestion
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search import proposals, weighing
-from psd_deflection.studies.discover.search.fit import Fit, refit
+from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.localise import Cell, Dependence, Localisation
 from psd_deflection.studies.discover.search.screen import promising
 from psd_deflection.studies.discover.search.signatures import Candidate, candidates, signature_columns
 from psd_deflection.studies.discover.search.trials import far, slot, unbound, unphysical
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival, Unknown, unknown_of
+from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect, Unknown, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes, only_in
 from psd_deflection.studies.discover.setup.setup import (
-    _blocks,
+    finding_of_effect,
     likely_delays,
     likely_jumps,
-    said,
 )
 
 from .test_formulas import RIG, observed
@@ -172,15 +171,10 @@ def test_an_effect_of_one_recording_acts_in_that_alone() -> None:
     assert only_in([everywhere, first, second], 1) == [everywhere, second]
 
 
-def fit_of(workspace: Workspace, *effects: ActiveEffect, **given: Any) -> Fit:
-    fit = refit(workspace, effects, 0)
-    return dataclasses.replace(fit, **given) if given else fit
-
-
 def test_a_mistake_is_said_with_its_line(workspace: Workspace) -> None:
     def words(name: str, **values: float) -> tuple[Any, dict[str, object]]:
         fit = cast(Fit, SimpleNamespace(effects=(None, ActiveEffect(of_setup(name), values))))
-        (finding,), lines = said(workspace, fit, 1, 33.0)
+        (finding,), lines = finding_of_effect(workspace, fit, 1, 33.0)
         assert (finding.name, finding.evidence) == (name, 33.0)
         return finding, lines
 
@@ -202,14 +196,6 @@ def test_a_mistake_is_said_with_its_line(workspace: Workspace) -> None:
     finding, lines = words('zero', recording=2.0, x1=1e-4, y1=-2e-4, x2=0.0, y2=5e-5)
     assert (finding.where, finding.value, lines) == ('second', 2e-4, {})
     assert finding.fix == 'overrides of second: psd_1.zero: [0.0001, -0.0002], psd_2.zero: [0.0, 5e-05]'
-
-
-def test_a_block_counts_from_half_of_its_samples_on() -> None:
-    rows = np.arange(12.0).reshape(1, 12)
-    rows[0, [0, 1]] = np.nan
-    rows[0, [4, 5, 6]] = np.nan
-    np.testing.assert_array_equal(_blocks(rows, 4), [[2.5, np.nan, 9.5]])
-    assert _blocks(rows, 5).shape == (1, 2)
 
 
 def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
@@ -337,16 +323,6 @@ def test_a_signature_is_the_change_by_one_probe() -> None:
 # Proposals.
 
 
-def test_a_limit_is_looked_for_at_the_highest_voltage_and_a_little_below() -> None:
-    o = observed()
-    volts = np.zeros_like(o.volts)
-    volts[3, 2], volts[7, 4], volts[9, 0] = -4.0, 3.0, np.nan
-    o = dataclasses.replace(o, volts=volts)
-    assert proposals.highest_voltages([o], True, 0.01) == pytest.approx([3.98, 3.96, 3.88, 3.92])
-    assert proposals.highest_voltages([o], False, 0.01) == pytest.approx([2.98, 2.96, 2.88, 2.94])
-    assert proposals.highest_voltages([o], False, 0.3) == pytest.approx([2.4, 1.8, 2.94])
-
-
 def test_lines_come_strongest_first_each_once() -> None:
     rng = np.random.default_rng(1)
     t = np.arange(4096) * 1e-3
@@ -445,8 +421,8 @@ def test_the_best_of_each_variant_is_tried() -> None:
 # Plans.
 
 
-def told_of(rival: str, separation: float, reverse: float, possible: float) -> Told:
-    return Told(rival, 'creep', separation, reverse, possible)
+def told_of(rival: str, separation: float, reverse: float, possible: float) -> Discrimination:
+    return Discrimination(rival, 'creep', separation, reverse, possible)
 
 
 def test_a_plan_says_what_it_tells_apart() -> None:
@@ -464,10 +440,12 @@ def test_a_plan_says_what_it_tells_apart() -> None:
         'Record next, 9 s: push, 2 times; then wait, while it is warm. It tells creep from damping, tip_mass '
         '(chi-square 40 at least, 21.6 needed); nothing within the limits tells x apart.'
     )
-    assert dataclasses.replace(plan, told=tells[:1]).sentence.endswith(
+    assert dataclasses.replace(plan, discriminations=tells[:1]).sentence.endswith(
         'from damping (chi-square 40 at least, 21.6 needed).'
     )
-    idle = dataclasses.replace(plan, setting=Setting(), told=(tells[2], dataclasses.replace(tells[2], rival='y')))
+    idle = dataclasses.replace(
+        plan, setting=Setting(), discriminations=(tells[2], dataclasses.replace(tells[2], alternative='y'))
+    )
     assert not idle.useful
     assert idle.words == 'push, 2 times; then wait'
     assert idle.sentence == 'No recording within the limits would tell creep from x, y.'
@@ -499,7 +477,7 @@ def test_pieces_are_put_together_as_long_as_each_is_worth_it() -> None:
     seen = [(Piece(n, ()), shows(g, s)) for n, g, s in (('a', 30.0, 10.0), ('b', 25.0, 1.0), ('c', 1.0, 1.0))]
 
     def together(seconds: float) -> Any:
-        value, chosen = planning._together(seen, shows(0.0, 0.0), lambda s: s.apart[0], seconds)
+        value, chosen = planning.best_combination(seen, shows(0.0, 0.0), lambda s: s.apart[0], seconds)
         return value, ''.join(p.words for p in chosen)
 
     # 30/60 - 0.005 against 25/60 - 0.0005; then the same again; then nothing is left to gain.
@@ -510,20 +488,7 @@ def test_pieces_are_put_together_as_long_as_each_is_worth_it() -> None:
     assert together(0.5) == (0.0, '')
     # One piece is there in any case, even if it is worth nothing.
     poor = [(Piece('c', ()), shows(0.0, 1.0))]
-    assert len(planning._together(poor, shows(0.0, 0.0), lambda s: s.apart[0], 9.0)[1]) == 1
-
-
-def test_the_effect_that_a_rival_does_without_is_named() -> None:
-    a, b, c = (
-        make_active('creep', {'amplitude': 0.1}, 't'),
-        make_active('sensor_gain', {'psd': 1, 'x': 0.1}, 't'),
-        make_active('sensor_gain', {'psd': 2, 'x': 0.1}, 't'),
-    )
-    named, rival = (
-        cast(Fit, SimpleNamespace(effects=e))
-        for e in ((a, b, c), (a, c, make_active('load_direction', {'angle': 0.1}, 't')))
-    )
-    assert planning._replaced(named, rival) == 'sensor_gain (psd 1)'
+    assert len(planning.best_combination(poor, shows(0.0, 0.0), lambda s: s.apart[0], 9.0)[1]) == 1
 
 
 # What is said.
@@ -578,33 +543,14 @@ def test_what_remains_is_told_in_words() -> None:
     assert unknown_of(left_with(excess=101.0), 0.0, steps=5000.0) != ()
 
 
-@pytest.mark.parametrize(
-    ('regressor', 'even'),
-    [
-        ('dot_x^2', True),
-        ('|rate of dot_x|', True),
-        ('constant', True),
-        ('dot_x dot_y', True),
-        ('dot_x r^2', True),
-        ('dot_x', False),
-        ('load_fx', False),
-        ('time', False),
-    ],
-)
-def test_a_regressor_is_even_or_odd(regressor: str, even: bool) -> None:
-    assert weighing._even(regressor) == even
-
-
 def test_a_gap_that_remains_is_never_left_unsaid() -> None:
     noise = cast(Workspace, SimpleNamespace(floor=lambda: 1e-6, worded=micrometres))
-    assert weighing.null_log(noise, 9e-6, 1.5e-6) == ()
-    (u,) = weighing.null_log(noise, 3e-6, 1.6e-6)
+    assert weighing.unnamed_gap(noise, 9e-6, 1.5e-6) == ()
+    (u,) = weighing.unnamed_gap(noise, 3e-6, 1.6e-6)
     assert u.signature == '1.25 µm remain, 1.6 times the noise, in no single place or band'
     assert u.rms == pytest.approx(math.sqrt(1.56) * 1e-6)
     assert u.explains == pytest.approx((1.6 / 3) ** 2)
-    assert u.remains
-    assert weighing._beyond(5.0, 3.0) == 4.0
-    assert weighing._beyond(3.0, 5.0) == 0.0
+    assert u.unexplained
 
 
 def test_a_waterfall_falls_effect_by_effect() -> None:
@@ -630,7 +576,14 @@ def test_a_waterfall_falls_effect_by_effect() -> None:
 
 
 def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
-    whole = {'sd': {}, 'p': 1e-9, 'delta_bic': 50.0, 'heldout': HeldOut(20.0, 2.0), 'equivalent': (), 'rivals': ()}
+    whole = {
+        'sd': {},
+        'p': 1e-9,
+        'delta_bic': 50.0,
+        'heldout': HeldOut(20.0, 2.0),
+        'equivalent': (),
+        'fitted_alternatives': (),
+    }
     return NamedEffect(active, **{**whole, 'alternatives': (), 'suggestion': None, **given})
 
 
@@ -705,7 +658,7 @@ def test_every_number_of_the_answer_is_that_of_its_model(found: Discovery) -> No
         ('noise alone', found.gap_floor),
     )
     assert (found.verdict, found.unknown, found.setup, found.law, found.values) == ('effects_found', (), (), None, {})
-    assert (found.seed, found.known, found.rivals, found.unsettled) == (0, (), (), ())
+    assert (found.seed, found.known, found.alternative_fits, found.unsettled) == (0, (), (), ())
     assert found.active_effects == [named.active]
     # One picture, whose length is the deviation: of the turn about the centre of the PSD.
     h = 1e-4
@@ -879,7 +832,7 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
         f'model; adding them closes the gap from {before} to {left}.'
     )
     assert said_of_two.count('Fitted') == 1
-    assert sentence(effects=two, verdict='unknown_effect', unknown=(Unknown('', (), 1.0, remains=False),)).endswith(
+    assert sentence(effects=two, verdict='unknown_effect', unknown=(Unknown('', (), 1.0, unexplained=False),)).endswith(
         f' close the gap from {before} to {left}, but their sizes are tied: '
         'one effect that is not in the catalogue is likelier.'
     )
@@ -893,8 +846,10 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     assert tree['setup'] == [
         {'name': 'channel_sign', 'where': 'y1', 'value': -1.0, 'fix': 'x', 'evidence': 0.0, 'equivalent': []}
     ]
-    rival = Rival(named.active, {'angle': 1e-3}, 4.0, found.fit)
-    listed_rivals = dataclasses.replace(found, effects=(dataclasses.replace(named, rivals=(rival,)),)).tree()
+    rival = Alternative(named.active, {'angle': 1e-3}, 4.0, found.fit)
+    listed_rivals = dataclasses.replace(
+        found, effects=(dataclasses.replace(named, fitted_alternatives=(rival,)),)
+    ).tree()
     assert listed_rivals['effects'][0]['rivals'] == [
         {
             'name': 'sensor_rotation',

@@ -23,7 +23,7 @@ from psd_deflection.studies.discover import experiment
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, nothing_of, pieces, settings
 from psd_deflection.studies.discover.observation import Observation, load_cases
 from psd_deflection.studies.discover.search.fit import Fit
-from psd_deflection.studies.discover.search.localise import _plain, regressors
+from psd_deflection.studies.discover.search.localise import plain_word, regressors
 from psd_deflection.studies.discover.search.trust import energies, gain_beyond
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, outliers, stuck
@@ -283,23 +283,6 @@ def test_regressors_are_the_words_they_have(workspace: Workspace) -> None:
                 np.testing.assert_allclose(table[psd][name][r], values, rtol=1e-9, atol=1e-12, err_msg=name)
 
 
-@pytest.mark.parametrize(
-    ('regressor', 'word'),
-    [
-        ('load_fx^2', 'load_fx'),
-        ('history of load_fy', 'load_fy'),
-        ('load_tz', 'load_tz'),
-        ('|rate of dot_x|', 'rate'),
-        ('dot_x dot_y', 'dot_position'),
-        ('temperature^2', 'temperature'),
-        ('time', 'time'),
-        ('constant', 'constant'),
-    ],
-)
-def test_a_regressor_has_a_plain_word(regressor: str, word: str) -> None:
-    assert _plain(regressor) == word
-
-
 def test_energies_are_those_of_band_passed_rows(workspace: Workspace) -> None:
     """By masks on the full spectrum (Parseval); the gain in a band counts if it is beyond what may be wrong there."""
     rng = np.random.default_rng(2)
@@ -503,3 +486,20 @@ def test_what_is_known_of_a_recording_is_told() -> None:
     assert findings == []
     assert np.isnan(quiet.volts).all(axis=1).sum() == 60
     assert clean(o, ())[0] is o
+
+
+@pytest.mark.parametrize(
+    ('regressor', 'word'),
+    [
+        ('load_fx^2', 'load_fx'),
+        ('history of load_fy', 'load_fy'),
+        ('load_tz', 'load_tz'),
+        ('|rate of dot_x|', 'rate'),
+        ('dot_x dot_y', 'dot_position'),
+        ('temperature^2', 'temperature'),
+        ('time', 'time'),
+        ('constant', 'constant'),
+    ],
+)
+def test_a_regressor_has_a_plain_word(regressor: str, word: str) -> None:
+    assert plain_word(regressor) == word

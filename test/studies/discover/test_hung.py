@@ -13,12 +13,11 @@ import numpy as np
 import pytest
 
 from psd_deflection.model.simulation.catalogue import make_active
-from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import load_rig, replace_values
+from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.parameter_files import flat_parameters
 from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.free_loads import settled
+from psd_deflection.studies.discover.free_loads import refitted
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.problem import Problem
 from psd_deflection.studies.discover.recorded import STEPS, Recorded, compared
@@ -30,22 +29,11 @@ from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hung import ringing_on, unseen
 from psd_deflection.studies.discover.setup.redundant import excess
-from psd_deflection.studies.loads.noted_times import MendedNote
+from psd_deflection.studies.loads.noted_times import CorrectedNote
 from psd_deflection.studies.loads.steps import applied
+from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, noted_as, read
 
-RIG = load_rig()
-LEVELS = np.array(
-    [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (0, 0, 0)], float
-)
-DWELL = 4000
-HUNG = np.repeat(LEVELS, DWELL, axis=0)
-NUMBER = np.arange(len(HUNG))
-
-
-def read(acting: FloatArray, **true: object) -> FloatArray:
-    """What the device reads (n, 6), V, under ``acting`` loads, of a rig that differs by ``true``."""
-    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
-    return np.asarray(RigSimulator(rig, 3).step(acting).counts * RIG.converter.volts_per_count, dtype=np.float64)
+NUMBER = np.arange(len(HELD))
 
 
 TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.004}
@@ -55,16 +43,9 @@ def searched(volts: FloatArray, noted: FloatArray) -> Discovery:
     return discover([Observation('x', RIG, volts, noted)])
 
 
-def noted_as(number: int, load: tuple[float, float, float]) -> FloatArray:
-    """The loads with another one in plateau ``number``."""
-    out = HUNG.copy()
-    out[number * DWELL : (number + 1) * DWELL] = load
-    return out
-
-
 @pytest.mark.statistics
 def test_a_weight_that_was_hung_and_never_noted_is_told_with_what_hung() -> None:
-    found = searched(read(HUNG, **TURNED), noted_as(2, (0, -20, 0)))
+    found = searched(read(HELD, **TURNED), noted_as(2, (0, -20, 0)))
     assert [(f.name, f.where) for f in found.setup] == [('missing_load', '8.000 s')]
     assert found.setup[0].value == pytest.approx((0.0, -50.0, 0.0), abs=0.2)
     assert 'not noted: from 8.000 s to 12.000 s (0 N, -50 N, 0 N m) hung, not (0 N, -20 N, 0 N m)' in found.setup[0].fix
@@ -76,7 +57,7 @@ def test_a_weight_that_was_hung_and_never_noted_is_told_with_what_hung() -> None
 
 @pytest.mark.statistics
 def test_a_load_that_was_noted_twice_is_told() -> None:
-    found = searched(read(HUNG), noted_as(5, (80, -80, 40)))
+    found = searched(read(HELD), noted_as(5, (80, -80, 40)))
     assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 5')]
     assert 'the 5th load of x was noted wrong' in found.setup[0].fix
     assert '(40 N, -40 N, 20 N m) hung, not (80 N, -80 N, 40 N m)' in found.setup[0].fix
@@ -88,7 +69,7 @@ def test_rounded_loads_are_told_one_by_one_and_the_effect_beside_them() -> None:
     odd = LEVELS + np.array(
         [(0, 0, 0), (0, 1.3, 0), (0, -2.1, 0), (0, 1.7, 0.9), (2.2, 0, 0), (-1.1, 2.4, 0), (0, 1.9, 0), (0, 0, 0)]
     )
-    found = searched(read(np.repeat(odd, DWELL, axis=0), **TURNED), HUNG)
+    found = searched(read(np.repeat(odd, DWELL, axis=0), **TURNED), HELD)
     assert [f.where for f in found.setup] == [f'load {i}' for i in range(1, 7)]
     assert {f.name for f in found.setup} == {'load_value'}
     assert '(38.9 N, -37.6 N, 20 N m) hung' in found.setup[4].fix
@@ -98,7 +79,7 @@ def test_rounded_loads_are_told_one_by_one_and_the_effect_beside_them() -> None:
 
 
 @pytest.mark.statistics
-def test_rounded_loads_are_told_beside_a_beam_that_drifts_by_more_than_they_move_the_plate() -> None:
+def test_rounded_loads_beside_beam_drift_are_reported() -> None:
     drift = {'effects__e__name': 'laser_pointing_drift', 'effects__e__psd': 2}
     rates = {'effects__e__rate_x': 5e-6, 'effects__e__rate_y': -5e-6}
     found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0), **drift, **rates), np.repeat(ROUNDED, DWELL, axis=0))
@@ -113,10 +94,10 @@ def test_rounded_loads_are_told_beside_a_beam_that_drifts_by_more_than_they_move
 @pytest.mark.statistics
 def test_a_lag_of_the_amplifiers_is_found_beside_fitted_times_which_follow_it() -> None:
     """All times a little later leave of a lag only what bends; and they are settled again beside it."""
-    noted = np.tile(LEVELS[0], (len(HUNG), 1))
+    noted = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
         noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
-    found = searched(read(HUNG, effects__e__name='amplifier_lag', effects__e__time_constant=4e-4), noted)
+    found = searched(read(HELD, effects__e__name='amplifier_lag', effects__e__time_constant=4e-4), noted)
     assert [e.active.effect.name for e in found.effects] == ['amplifier_lag']
     assert found.effects[0].active.values['time_constant'] == pytest.approx(4e-4, rel=0.1)
     assert found.verdict == 'effects_found'
@@ -144,10 +125,10 @@ def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search
 @pytest.mark.parametrize(('force', 'frequency'), [(1.0, 1.3), (2.0, 1.6)])
 def test_a_weight_that_sways_is_told_and_its_time_left_out(force: float, frequency: float) -> None:
     """So much that its swings are taken for steps of a load that nobody noted, too."""
-    acting = HUNG.copy()
+    acting = HELD.copy()
     at = (NUMBER - 3 * DWELL) / 1000.0
     acting[:, 0] += np.where((at > 0.0) & (at < 4.0), force * np.sin(2.0 * np.pi * frequency * at), 0.0)
-    found = searched(read(acting), HUNG)
+    found = searched(read(acting), HELD)
     assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 3')]
     assert f'from 12.000 s to 16.000 s swayed at {frequency}' in found.setup[0].fix
     assert found.setup[0].value is None
@@ -159,10 +140,10 @@ def test_a_weight_that_sways_is_told_and_its_time_left_out(force: float, frequen
 def test_a_clamp_that_sticks_is_found_beside_loads_that_were_noted_late() -> None:
     """It keeps where the load was, so that a mended load must not turn back by a thousandth behind its step."""
     sticks = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
-    noted = np.tile(LEVELS[0], (len(HUNG), 1))
+    noted = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
         noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
-    found = searched(read(HUNG, **sticks), noted)
+    found = searched(read(HELD, **sticks), noted)
     assert [f.name for f in found.setup] == ['load_time'] * 7
     assert [(e.active.effect.name, e.active.values['axis']) for e in found.effects] == [('clamp_friction', 3)]
     assert found.effects[0].active.values['width'] == pytest.approx(1.4e-5, rel=5e-3)
@@ -172,8 +153,8 @@ def test_a_clamp_that_sticks_is_found_beside_loads_that_were_noted_late() -> Non
 
 @pytest.mark.statistics
 def test_the_noise_of_a_load_cell_is_no_effect() -> None:
-    noise = np.random.default_rng(1).normal(size=HUNG.shape) * (0.05, 0.05, 0.01)
-    found = searched(read(HUNG), HUNG + noise)
+    noise = np.random.default_rng(1).normal(size=HELD.shape) * (0.05, 0.05, 0.01)
+    found = searched(read(HELD), HELD + noise)
     assert found.verdict == 'nothing_missing'
     assert not found.setup
     assert found.floors < 1.05
@@ -186,21 +167,21 @@ def prepared(volts: FloatArray, noted: FloatArray) -> Recorded:
     return compared(recorded)[0]
 
 
-def test_the_fourth_reading_acquits_detectors_whatever_hangs_and_convicts_one_that_is_turned() -> None:
-    soft = read(HUNG, link__youngs_modulus=0.9 * RIG.link.youngs_modulus)
-    for volts, noted in ((read(HUNG), HUNG), (read(HUNG), 1.3 * HUNG), (soft, HUNG)):
+def test_the_fourth_reading_names_only_a_rotated_detector() -> None:
+    soft = read(HELD, link__youngs_modulus=0.9 * RIG.link.youngs_modulus)
+    for volts, noted in ((read(HELD), HELD), (read(HELD), 1.3 * HELD), (soft, HELD)):
         fourth = prepared(volts, noted).fourth
         assert fourth is not None
         assert fourth.acquits
         assert 0.8 * fourth.values < fourth.chi_square < 1.05 * fourth.values
-    turned = prepared(read(HUNG, **TURNED), HUNG).fourth
+    turned = prepared(read(HELD, **TURNED), HELD).fourth
     assert turned is not None
     assert not turned.acquits
 
 
 @pytest.mark.statistics
 def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wrong() -> None:
-    found = searched(read(HUNG, effects__e__name='bending_stiffness', effects__e__scale=-0.06), HUNG)
+    found = searched(read(HELD, effects__e__name='bending_stiffness', effects__e__scale=-0.06), HELD)
     (effect,) = found.effects
     assert effect.active.effect.stage == 'link'
     assert not any('sensor' in name or 'gain' in name for name in effect.equivalent)
@@ -213,7 +194,7 @@ def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wron
 @pytest.mark.parametrize(('bending', 'torsion'), [(1.05, 1.03), (1.02, 1.0), (1.0, 0.97), (0.96, 1.05)])
 def test_other_natural_frequencies_than_the_rig_file_says_are_lines_for_it(bending: float, torsion: float) -> None:
     true = {'dynamics__bending_frequency': 14.0 * bending, 'dynamics__torsion_frequency': 21.0 * torsion}
-    found = searched(read(HUNG, **true), HUNG)
+    found = searched(read(HELD, **true), HELD)
     wrong = {key: f for key, f in (('bending', bending), ('torsion', torsion)) if f != 1.0}
     assert [e.name for e in found.effects] == [f'{key}_frequency' for key in wrong]
     assert [e.values['error'] for e in found.effects] == pytest.approx([f - 1.0 for f in wrong.values()], abs=1e-5)
@@ -232,7 +213,7 @@ def test_other_natural_frequencies_than_the_rig_file_says_are_lines_for_it(bendi
 
 @pytest.mark.statistics
 def test_a_lower_frequency_of_the_bending_alone_may_be_a_mass_at_the_tip() -> None:
-    found = searched(read(HUNG, dynamics__bending_frequency=14.0 * 0.97), HUNG)
+    found = searched(read(HELD, dynamics__bending_frequency=14.0 * 0.97), HELD)
     assert [(e.name, e.equivalent) for e in found.effects] == [('tip_mass', ('bending_frequency',))]
     assert found.setup == ()
 
@@ -240,7 +221,7 @@ def test_a_lower_frequency_of_the_bending_alone_may_be_a_mass_at_the_tip() -> No
 @pytest.mark.statistics
 def test_other_frequencies_are_told_beside_an_effect() -> None:
     true = {'dynamics__bending_frequency': 14.0 * 1.05, 'dynamics__torsion_frequency': 21.0 * 0.97}
-    found = searched(read(HUNG, **true, **TURNED), HUNG)
+    found = searched(read(HELD, **true, **TURNED), HELD)
     sizes = {e.name: e.values for e in found.effects}
     assert set(sizes) == {'bending_frequency', 'torsion_frequency', 'sensor_rotation'}
     assert sizes['sensor_rotation']['angle'] == pytest.approx(0.004, abs=2e-5)
@@ -250,10 +231,10 @@ def test_other_frequencies_are_told_beside_an_effect() -> None:
 @pytest.mark.statistics
 @pytest.mark.parametrize('step', [0.01, 0.07])
 def test_positions_that_step_alone_accuse_no_cable(step: float) -> None:
-    volts = read(HUNG)
+    volts = read(HELD)
     dots = [0, 1, 3, 4]
     volts[:, dots] = np.rint(volts[:, dots] / step) * step
-    found = searched(volts, HUNG)
+    found = searched(volts, HELD)
     assert [(e.name, e.values['sums']) for e in found.effects] == [('quantisation', 0.0)]
     assert found.effects[0].values['step'] == pytest.approx(step, rel=1e-5)
     assert [(f.name, f.where) for f in found.setup] == [('converter_step', c) for c in ('x1', 'y1', 'x2', 'y2')]
@@ -263,14 +244,14 @@ def test_positions_that_step_alone_accuse_no_cable(step: float) -> None:
     assert found.law is None
     # With the model that has them, nothing is missing: no noise, no steps.
     own = replace_values(RIG, {f'effects.q.{name}': v for name, v in found.effects[0].values.items()})
-    again = discover([Observation('x', replace_values(own, {'effects.q.name': 'quantisation'}), volts, HUNG)])
+    again = discover([Observation('x', replace_values(own, {'effects.q.name': 'quantisation'}), volts, HELD)])
     assert (again.verdict, again.setup, again.effects) == ('nothing_missing', (), ())
     assert [a.effect.name for a in again.known] == ['quantisation']
     assert again.floors < 1.1
 
 
 @pytest.mark.statistics
-def test_a_few_milliseconds_late_are_found_beside_a_clamp_that_twists_under_the_only_torque() -> None:
+def test_small_delays_beside_a_twisting_clamp_are_found() -> None:
     """What is found first is a stiffness; beside the delay, which is better, the clamp is looked for again."""
     levels = np.array([(0, 0, 0), (0, -50, 0), (0, -20, 0), (0, -40, 0), (20, -30, 17.55), (-25, -15, 0), (0, -40, 0)])
     acting = np.repeat(np.vstack((levels, np.zeros(3))), DWELL, axis=0).astype(np.float64)
@@ -286,10 +267,10 @@ def test_a_few_milliseconds_late_are_found_beside_a_clamp_that_twists_under_the_
 
 @pytest.mark.statistics
 @pytest.mark.parametrize(('late', 'angle'), [(1, 0.02), (2, 0.02), (5, 0.02), (2, 0.06)])
-def test_a_few_milliseconds_late_are_found_beside_a_detector_that_is_turned_far(late: int, angle: float) -> None:
+def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: float) -> None:
     """Neither leaves next to nothing without the other, and stiffnesses would stand in for the delay."""
-    noted = np.vstack((np.zeros((late, 3)), HUNG[:-late]))
-    found = searched(read(HUNG, **{**TURNED, 'effects__e__angle': angle}), noted)
+    noted = np.vstack((np.zeros((late, 3)), HELD[:-late]))
+    found = searched(read(HELD, **{**TURNED, 'effects__e__angle': angle}), noted)
     assert [f.name for f in found.setup] == ['load_delay']
     assert found.setup[0].value == pytest.approx(1e-3 * late, abs=1e-5)
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
@@ -299,10 +280,10 @@ def test_a_few_milliseconds_late_are_found_beside_a_detector_that_is_turned_far(
 
 
 @pytest.mark.statistics
-def test_a_few_milliseconds_late_are_found_beside_a_second_mode_whose_line_they_hide() -> None:
+def test_small_delays_beside_a_second_mode_are_found() -> None:
     mode = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
     found = searched(
-        read(HUNG, **{f'effects__e__{k}': v for k, v in mode.items()}), np.vstack((np.zeros((2, 3)), HUNG[:-2]))
+        read(HELD, **{f'effects__e__{k}': v for k, v in mode.items()}), np.vstack((np.zeros((2, 3)), HELD[:-2]))
     )
     assert [f.name for f in found.setup] == ['load_delay']
     assert found.setup[0].value == pytest.approx(0.002, abs=1e-5)
@@ -328,15 +309,15 @@ def test_the_first_load_noted_twice_is_told_if_no_other_pulls_that_way() -> None
 @pytest.mark.statistics
 def test_no_noise_is_told_of_what_rings_and_is_unknown() -> None:
     ringing = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
-    volts = read(HUNG, **{f'effects__e__{k}': v for k, v in ringing.items()})
-    found = discover([Observation('x', RIG, volts, HUNG)], without=('second_bending_mode',))
+    volts = read(HELD, **{f'effects__e__{k}': v for k, v in ringing.items()})
+    found = discover([Observation('x', RIG, volts, HELD)], without=('second_bending_mode',))
     assert found.verdict == 'unknown_effect'
     assert 'noise_level' not in [f.name for f in found.setup]
 
 
 @pytest.mark.statistics
 def test_loads_that_are_one_sample_late_are_told() -> None:
-    found = searched(read(HUNG), np.vstack((np.zeros((1, 3)), HUNG[:-1])))
+    found = searched(read(HELD), np.vstack((np.zeros((1, 3)), HELD[:-1])))
     assert [f.name for f in found.setup] == ['load_delay']
     assert found.setup[0].value == pytest.approx(0.001, abs=1e-5)
     assert (found.verdict, found.effects) == ('nothing_missing', ())
@@ -346,12 +327,12 @@ def test_loads_that_are_one_sample_late_are_told() -> None:
 def test_a_spot_that_is_clipped_at_the_ends_of_the_swing_alone_is_found() -> None:
     """For moments a dot is far off: the fourth reading, in which an outlier counts little, acquits nothing then."""
     clipped = {'effects__e__name': 'spot_clipping', 'effects__e__psd': 1, 'effects__e__radius': 2e-3}
-    found = searched(read(HUNG, **clipped), HUNG)
+    found = searched(read(HELD, **clipped), HELD)
     assert [(e.active.effect.name, e.active.values['psd']) for e in found.effects] == [('spot_clipping', 1)]
     assert found.effects[0].active.values['radius'] == pytest.approx(2e-3, rel=0.02)
 
 
-def test_a_dot_that_is_far_off_for_moments_is_nothing_that_the_fourth_reading_could_see() -> None:
+def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
     """Five values of 1000 sd among 4000 of dots: 5 (36 - 1) / 4000 of what an outlier counts; sums do not count."""
     table = np.zeros((6, 1000))
     comparison = cast(Workspace, SimpleNamespace(count=[np.ones((6, 1000))], split=lambda _: [table]))
@@ -385,38 +366,38 @@ def test_the_only_torque_noted_twice_is_told_with_the_clamp_that_twists() -> Non
     assert found.law is None
 
 
-def test_free_times_are_settled_again_if_an_effect_beside_which_they_were_does_not_hold() -> None:
-    noted = np.tile(LEVELS[0], (len(HUNG), 1))
+def test_free_times_are_settled_again_if_an_effect_fails() -> None:
+    noted = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
         noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
-    machine = RecordedRig.of([Observation('x', RIG, read(HUNG), noted)], RIG, (), None, lambda _: None)
+    machine = RecordedRig.of([Observation('x', RIG, read(HELD), noted)], RIG, (), None, lambda _: None)
     problem = Problem.of(machine, 0, lambda _: None, np.random.default_rng(0))
     ws = machine.workspace
     assert ws.free is not None
     # As beside a lag of 0.25 ms.
     more = [(d, 1.0) for d in ws.free.directions]
-    off = ws._loaded(more).replaced(free=replace(ws.free, directions=moved(more)))
+    off = ws.with_loads(more).replaced(free=replace(ws.free, directions=moved(more)))
     fit = refit(off, ())
     assert off.gap(fit.difference) > 3.0 * off.floor()
     dropped = replace(problem, search=problem.search.at(off), fit=fit)
-    again = settled(dropped)
+    again = refitted(dropped)
     assert again.comparison.gap(again.fit.difference) < 1.05 * off.floor()
     assert again.fit is again.null
     # If all effects hold, they were settled beside these.
     same = replace(dropped, result=SearchResult(fit, fit))
-    assert settled(same) is same
+    assert refitted(same) is same
 
 
 @pytest.mark.statistics
 def test_a_link_that_rings_on_through_loads_applied_slowly_has_its_damping() -> None:
     """What rings outlasts what is left out, and a search begins far from it."""
-    t = np.arange(len(HUNG)) / 1000.0
-    acting = np.tile(LEVELS[0], (len(HUNG), 1))
+    t = np.arange(len(HELD)) / 1000.0
+    acting = np.tile(LEVELS[0], (len(HELD), 1))
     for number, took in enumerate((0.67, 1.17, 0.36, 1.08, 0.62, 0.9, 1.23), start=1):
         share = applied(t, number * DWELL / 1000.0, took, 1e-3)
         acting += share[:, None] * (LEVELS[number] - LEVELS[number - 1])
     dynamics = {'dynamics__bending_damping_ratio': 0.028, 'dynamics__torsion_damping_ratio': 4e-4}
-    found = searched(read(acting, **dynamics), HUNG)
+    found = searched(read(acting, **dynamics), HELD)
     assert [f.name for f in found.setup] == ['load_ramp'] * 7
     assert [e.active.effect.name for e in found.effects] == ['damping']
     assert found.effects[0].active.values['torsion_ratio'] == pytest.approx(4e-4, abs=2e-5)
@@ -424,7 +405,7 @@ def test_a_link_that_rings_on_through_loads_applied_slowly_has_its_damping() -> 
     assert found.floors < 1.1
 
 
-def test_what_rings_on_is_free_after_what_is_left_out_in_the_modes_that_decay_more_slowly() -> None:
+def test_what_rings_on_is_free_after_excluded_samples() -> None:
     volts = np.zeros((2000, 6))
     volts[500:900] = np.nan
     volts[1990:] = np.nan
@@ -445,23 +426,23 @@ def test_what_rings_on_is_free_after_what_is_left_out_in_the_modes_that_decay_mo
 
 
 def test_a_motion_that_nobody_noted_changes_no_load_that_was() -> None:
-    ws = Workspace([Observation('x', RIG, read(HUNG), HUNG)])
-    change = np.zeros_like(HUNG)
+    ws = Workspace([Observation('x', RIG, read(HELD), HELD)])
+    change = np.zeros_like(HELD)
     change[7000, 0] = 1.0
     swings = LoadDirection(0, change, 1.0, 'x', 0, swings=True)
-    (o,) = ws._loaded([(swings, 2.0), (swings, 1.0)]).observations
-    np.testing.assert_array_equal(o.loads, HUNG)
+    (o,) = ws.with_loads([(swings, 2.0), (swings, 1.0)]).observations
+    np.testing.assert_array_equal(o.loads, HELD)
     np.testing.assert_array_equal(o.acting - o.loads, 3.0 * change)
-    assert ws._loaded([(replace(swings, swings=False), 2.0)]).observations[0].loads[7000, 0] == HUNG[7000, 0] + 2.0
+    assert ws.with_loads([(replace(swings, swings=False), 2.0)]).observations[0].loads[7000, 0] == HELD[7000, 0] + 2.0
 
 
 def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> None:
-    volts = read(HUNG)
+    volts = read(HELD)
     volts[7900:9000] = np.nan
     volts[3900:4100, 0] = np.nan
-    ws = Workspace([Observation('x', RIG, volts, HUNG)])
-    nothing = np.zeros_like(HUNG)
-    notes = [MendedNote(i, (0.0, 0.0, 0.0), t, t, 0.0) for i, t in enumerate((4.0, 8.0, 12.0, 40.0), start=1)]
+    ws = Workspace([Observation('x', RIG, volts, HELD)])
+    nothing = np.zeros_like(HELD)
+    notes = [CorrectedNote(i, (0.0, 0.0, 0.0), t, t, 0.0) for i, t in enumerate((4.0, 8.0, 12.0, 40.0), start=1)]
     assert [unseen(ws, LoadDirection(0, nothing, 1.0, n, 0)) for n in notes] == [False, True, False, False]
     assert not unseen(ws, LoadDirection(0, nothing, 1.0, 'x', 0))
     assert not unseen(ws, ZeroDirection(0, 0, 1e-6))
@@ -471,6 +452,6 @@ def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> No
 def test_two_effects_under_loads_in_whole_steps_are_no_rounded_loads() -> None:
     """One of them moves the plate as a load does. Whether loads were rounded is asked first, at no search's expense."""
     two = {**TURNED, 'effects__f__name': 'load_direction', 'effects__f__angle': 0.02}
-    found = searched(read(HUNG, **two), HUNG)
+    found = searched(read(HELD, **two), HELD)
     assert {e.active.effect.name for e in found.effects} == {'sensor_rotation', 'load_direction'}
     assert (found.verdict, found.setup) == ('effects_found', ())

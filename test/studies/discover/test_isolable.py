@@ -30,7 +30,7 @@ def answer() -> Isolability:
 
 
 def of(label: str) -> Isolable:
-    return next(one for one in answer().found if one.label == label)
+    return next(one for one in answer().effects if one.label == label)
 
 
 def searched(name: str, **values: float) -> Discovery:
@@ -66,7 +66,7 @@ def test_what_does_not_show_is_listed_with_what_it_needs() -> None:
     still = isolable(RIG, np.zeros((2000, 3)), 'no load')
     assert 'bending_stiffness (moves_frequency 1)' in still.hidden
     # Where a PSD is shows without any load.
-    assert any(one.label == 'sensor_position (psd 1, aimed 0)' for one in still.found)
+    assert any(one.label == 'sensor_position (psd 1, aimed 0)' for one in still.effects)
     assert 'axis_crosstalk (psd 1)' not in isolable(RIG, LOADS, without=['axis_crosstalk']).hidden
 
 
@@ -80,14 +80,14 @@ def test_every_effect_imitates_itself() -> None:
 def test_the_answer_for_people_and_programs() -> None:
     found = answer()
     first, *others = found.sentences()
-    named = sum(one.named is not None for one in found.found)
+    named = sum(one.named is not None for one in found.effects)
     assert first == (
-        f'Under thesis:1, 9 s, {named} of {len(found.found) + len(found.hidden)} effects can be named, '
+        f'Under thesis:1, 9 s, {named} of {len(found.effects) + len(found.hidden)} effects can be named, '
         f'each from its own size on.'
     )
     assert any('mount_tilt from tip_force' in text for text in others)
     tree = found.tree()
-    assert tree['effects'][0]['label'] == found.found[0].label
+    assert tree['effects'][0]['label'] == found.effects[0].label
     assert 'bending_stiffness (moves_frequency 0)' in found.report()
     assert found.files().keys() == {'report.html', 'isolable.json'}
 

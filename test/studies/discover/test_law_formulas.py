@@ -16,15 +16,14 @@ import pytest
 from psd_deflection.model.simulation.catalogue import make_active
 from psd_deflection.model.simulation.declaration import ActiveEffect
 from psd_deflection.model.simulation.laws import TARGETS, Law, LawTerm, effect_of, values_of, variables_of
-from psd_deflection.model.simulation.simulator import ForwardModel
-from psd_deflection.records import CHANNELS, FloatArray
+from psd_deflection.records import CHANNELS
 from psd_deflection.studies.discover.laws import law_features, laws, variance
 from psd_deflection.studies.discover.laws.law_features import responses, score, switchings, terms
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_gap
 from psd_deflection.studies.discover.search.workspace import Workspace
 
-from .test_formulas import HISTORY, RIG, observed
+from .test_formulas import RIG, observed
 
 
 @pytest.fixture(scope='module')
@@ -162,42 +161,6 @@ def test_what_a_target_lacks_is_estimated_with_its_weight(seen: tuple[Workspace,
     )
 
 
-def test_what_whitening_does_to_noise_with_a_memory_is_undone_by_its_transpose() -> None:
-    rng = np.random.default_rng(1)
-    ar, n = np.array([0.5, -0.3]), 12
-    matrix = np.eye(n) - 0.5 * np.eye(n, k=-1) + 0.3 * np.eye(n, k=-2)
-    rows = rng.standard_normal((3, n))
-    np.testing.assert_allclose(law_features._unwhiten(rows, ar), rows @ matrix, rtol=1e-12)
-
-
-def test_the_optics_answer_to_the_pose_as_their_difference_says() -> None:
-    model = ForwardModel(RIG, [])
-    samples = model.run(HISTORY[:40])
-    pose, beams = samples.pose + 1e-3, samples.beams
-    got = law_features._jacobian(pose, beams, model)
-    p, theta = model.physics, pose[2]
-    # Of parallel planes: m = R(-theta)(l - d) - c.
-    c, s = np.cos(theta), np.sin(theta)
-    for i in range(2):
-        x, y = beams[2 * i] - pose[0], beams[2 * i + 1] - pose[1]
-        want = [(-c, s), (-s, -c), (-s * x + c * y, -c * x - s * y)]
-        for k, rows in enumerate(want):
-            np.testing.assert_allclose(got[k, 2 * i : 2 * i + 2], rows, rtol=1e-6, atol=1e-9)
-    assert p.slope_ratio == 0.0
-
-
-@pytest.mark.parametrize('blocks', [1, 2, 5])
-def test_an_average_is_over_so_many_neighbours(blocks: int) -> None:
-    values = np.random.default_rng(0).standard_normal(20)
-    got = law_features._averaged(values, blocks)
-    for k in range(5, 15):
-        left = k - blocks // 2
-        assert got[k] == pytest.approx(values[left : left + blocks].mean()) or got[k] == pytest.approx(
-            values[left + 1 - blocks % 2 : left + 1 - blocks % 2 + blocks].mean()
-        )
-    assert (got == values).all() == (blocks == 1)
-
-
 @pytest.mark.parametrize('seed', range(6))
 def test_the_likeliest_states_are_those_of_all_that_gain_most(seed: int) -> None:
     """Of 2^10 sequences; each change costs 24, and the state before the first is 0."""
@@ -208,7 +171,7 @@ def test_the_likeliest_states_are_those_of_all_that_gain_most(seed: int) -> None
             sum(g for g, on in zip(gain, s, strict=True) if on) - 24.0 * int(np.abs(np.diff(s, prepend=0)).sum())
         ),
     )
-    assert law_features._likeliest(gain).tolist() == list(best)
+    assert law_features.likeliest_states(gain).tolist() == list(best)
 
 
 def test_two_levels_are_told_apart_from_a_stated_gain_on() -> None:
@@ -220,21 +183,21 @@ def test_two_levels_are_told_apart_from_a_stated_gain_on() -> None:
     own[150:170] = 2.0
     v = rng.uniform(0.5, 2.0, n) * rng.choice((-1.0, 1.0), n)
     v[5] = 0.0
-    assert law_features._two_levels(own * v, np.full(n, 3.0), v) == [60, 110, 150, 170]
+    assert law_features.two_levels(own * v, np.full(n, 3.0), v) == [60, 110, 150, 170]
     ones = np.ones(n)
     box = np.zeros(n)
     box[60:110] = 1.0
-    assert law_features._two_levels(box, ones * 1.2 * 48.0 / 50.0, ones) == [60, 110]
-    assert law_features._two_levels(box, ones * 0.8 * 48.0 / 50.0, ones) == []
-    assert law_features._two_levels(box, ones * 0.4 * 48.0 / 50.0, ones) == []
-    assert law_features._two_levels(np.zeros(n), ones, ones) == []
+    assert law_features.two_levels(box, ones * 1.2 * 48.0 / 50.0, ones) == [60, 110]
+    assert law_features.two_levels(box, ones * 0.8 * 48.0 / 50.0, ones) == []
+    assert law_features.two_levels(box, ones * 0.4 * 48.0 / 50.0, ones) == []
+    assert law_features.two_levels(np.zeros(n), ones, ones) == []
     # However little each block weighs: 50 of 0.01, of a level of 7, gain 24.5.
-    assert law_features._two_levels(np.full(50, 7.0), np.full(50, 0.01), np.ones(50)) == [0]
-    assert law_features._two_levels(np.full(50, 6.9), np.full(50, 0.01), np.ones(50)) == []
+    assert law_features.two_levels(np.full(50, 7.0), np.full(50, 0.01), np.ones(50)) == [0]
+    assert law_features.two_levels(np.full(50, 6.9), np.full(50, 0.01), np.ones(50)) == []
     # To the end of the recording one change is enough.
     late = np.zeros(n)
     late[150:] = -1.0
-    assert law_features._two_levels(late, ones, ones) == [150]
+    assert law_features.two_levels(late, ones, ones) == [150]
 
 
 def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]) -> None:
@@ -292,19 +255,13 @@ def test_between_two_loads_any_level_is_as_good(seen: tuple[Workspace, Fit]) -> 
     assert better.gain == pytest.approx(start.gain)
     assert better.term.shapes['threshold'] == pytest.approx(0.5 * (low + high))
     assert better.term.sd['threshold'] == pytest.approx((high - low) / math.sqrt(12.0))
-    seeker = laws._Seeker(workspace, fit, 3.0)
-    (law,) = seeker.trial([laws._on('x2', better.term)], fit.effects, 2).laws
+    seeker = laws.LawSearch(workspace, fit, 3.0)
+    (law,) = seeker.trial([laws.law_on('x2', better.term)], fit.effects, 2).laws
     assert law.terms[0].sd['threshold'] == better.term.sd['threshold']
     assert f'> ({0.5 * (low + high):.4g} ± ' in law.expression
 
 
 # Laws and their fits.
-
-
-def fit_of(jacobian: FloatArray, *effects: ActiveEffect, **given: Any) -> Fit:
-    free = tuple((i, name) for i, a in enumerate(effects) for name in a.values)
-    empty = np.zeros(len(jacobian))
-    return dataclasses.replace(Fit(effects, 100.0, empty, [], jacobian, free[: jacobian.shape[1]], ()), **given)
 
 
 def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
@@ -324,9 +281,9 @@ def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
         (),
     )
     covariance = np.linalg.inv(jacobian.T @ jacobian)
-    np.testing.assert_allclose(laws._covariance(fit), covariance, rtol=1e-6)
+    np.testing.assert_allclose(laws.term_covariance(fit), covariance, rtol=1e-6)
     sd = np.sqrt(np.diag(covariance))
-    got = laws._fitted(law, fit, laws._covariance(fit), 1)
+    got = laws.fitted_law(law, fit, laws.term_covariance(fit), 1)
     first, second = got.terms
     assert (first.coefficient, first.shapes, second.coefficient) == (2.0, {'threshold': 5.0}, -3.0)
     assert first.sd == pytest.approx({'coefficient': sd[2], 'threshold': sd[3]})
@@ -336,45 +293,45 @@ def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
     for factor, told in ((99.0, True), (101.0, False)):
         wide = np.array(covariance, dtype=np.float64)
         wide[4, 4] = (factor * 3.0) ** 2
-        assert ('coefficient' in laws._fitted(law, fit, wide, 1).terms[1].sd) == told
+        assert ('coefficient' in laws.fitted_law(law, fit, wide, 1).terms[1].sd) == told
     # Two pictures that are one: what cannot be told apart has a large deviation, and stays finite.
     same = dataclasses.replace(fit, jacobian=np.column_stack((jacobian[:, :4], jacobian[:, 3])))
-    assert laws._covariance(same)[3, 3] > 1e6 * covariance[3, 3]
+    assert laws.term_covariance(same)[3, 3] > 1e6 * covariance[3, 3]
 
 
 def test_terms_are_added_to_the_law_on_their_quantity_and_left_out_one_by_one() -> None:
     a, b, c = (LawTerm('product', (v,)) for v in ('load_fx', 'load_fy', 'load_tz'))
     first = Law('law_y2', 'psd', 'y2', (a,))
-    (both,) = laws._with([first], law_features.Scored('y2', b, 1.0))
+    (both,) = laws.with_term([first], law_features.Scored('y2', b, 1.0))
     assert both == Law('law_y2', 'psd', 'y2', (a, b))
-    two = laws._with([both], law_features.Scored('static_dx', c, 1.0))
+    two = laws.with_term([both], law_features.Scored('static_dx', c, 1.0))
     assert two == (both, Law('law_static_dx', 'link', 'static_dx', (c,)))
     x1 = Law('law_static_dx', 'link', 'static_dx', (c,))
-    assert laws._fewer(two) == [
+    assert laws.subsets_without_a_term(two) == [
         (dataclasses.replace(both, terms=(b,)), x1),
         (dataclasses.replace(both, terms=(a,)), x1),
         (both,),
     ]
 
 
-def trial(law: Law, cost: float, chi2: float, *beside: ActiveEffect) -> laws._Trial:
+def trial(law: Law, cost: float, chi2: float, *beside: ActiveEffect) -> laws.LawTrial:
     fit = SimpleNamespace(chi2=chi2, effects=(*beside, ActiveEffect(effect_of(law), values_of(law))))
-    return laws._Trial((law,), cast(Fit, fit), cost)
+    return laws.LawTrial((law,), cast(Fit, fit), cost)
 
 
 def test_of_laws_that_cannot_be_told_apart_the_simplest_is_taken() -> None:
     two = trial(Law('a', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fy')),)), 10.0, 5.0)
     one = Law('b', 'psd', 'y2', (LawTerm('product', ('x2',)),))
-    assert laws._simplest(two, [trial(one, 19.9, 26.5)]).laws == (one,)
-    assert laws._simplest(two, [trial(one, 20.1, 6.0)]) is two
-    assert laws._simplest(two, [trial(one, 11.0, 26.7)]) is two
+    assert laws.simplest(two, [trial(one, 19.9, 26.5)]).laws == (one,)
+    assert laws.simplest(two, [trial(one, 20.1, 6.0)]) is two
+    assert laws.simplest(two, [trial(one, 11.0, 26.7)]) is two
     # Beside other effects it is another answer; a dot goes before the pose; of equals the cheaper.
-    assert laws._simplest(two, [trial(one, 11.0, 6.0, make_active('creep', {'amplitude': 0.1}, 'test'))]) is two
+    assert laws.simplest(two, [trial(one, 11.0, 6.0, make_active('creep', {'amplitude': 0.1}, 'test'))]) is two
     of_pose = trial(Law('c', 'psd', 'y2', (LawTerm('product', ('dx',)),)), 5.0, 5.0)
-    assert laws._simplest(of_pose, [trial(one, 6.0, 5.0)]).laws == (one,)
+    assert laws.simplest(of_pose, [trial(one, 6.0, 5.0)]).laws == (one,)
     on_link = trial(Law('c', 'link', 'theta', (LawTerm('product', ('dx',)),)), 5.0, 5.0)
-    assert laws._simplest(on_link, [trial(one, 6.0, 5.0)]) is on_link
-    assert laws._simplest(trial(one, 6.0, 5.0), [on_link]) == on_link
+    assert laws.simplest(on_link, [trial(one, 6.0, 5.0)]) is on_link
+    assert laws.simplest(trial(one, 6.0, 5.0), [on_link]) == on_link
 
 
 def test_laws_that_the_recording_cannot_exclude_are_listed_once() -> None:
@@ -389,7 +346,7 @@ def test_laws_that_the_recording_cannot_exclude_are_listed_once() -> None:
         trial(dear, 31.7, 5.0),
         trial(best, 10.0, 5.0),
     ]
-    assert laws._tied(trial(best, 10.0, 5.0), others) == (beam, link)
+    assert laws.tied_laws(trial(best, 10.0, 5.0), others) == (beam, link)
 
 
 def test_variances_are_the_likeliest() -> None:
@@ -469,13 +426,13 @@ def test_a_law_shows_where_a_twentieth_of_its_energy_is(seen: tuple[Workspace, F
         small = Law('small', 'psd', 'x1', (LawTerm('product', ('load_fy',), 1e-5 * ratio),))
         effects = tuple(ActiveEffect(effect_of(law), values_of(law)) for law in (big, small))
         fit = refit(workspace, effects, 0)
-        assert laws._channels(workspace, laws._Trial((big, small), fit, 0.0)) == shown
+        assert laws.dominant_channels(workspace, laws.LawTrial((big, small), fit, 0.0)) == shown
 
 
 # The search for a law, with costs that are given.
 
 
-class Given(laws._Seeker):
+class Given(laws.LawSearch):
     """A search whose trials cost what ``costs`` says of (terms' variables, effects beside them); 1000 else."""
 
     def __init__(self, costs: dict[tuple[str, str], float], chi2: float = 1e9) -> None:
@@ -484,12 +441,12 @@ class Given(laws._Seeker):
         self.start = cast(Fit, SimpleNamespace(effects=()))
         self.penalty, self.last, self.found, self.listed = 3.0, 600, [], []
 
-    def trial(self, found: Any, beside: Any, iterations: int) -> laws._Trial:
+    def trial(self, found: Any, beside: Any, iterations: int) -> laws.LawTrial:
         key = ' '.join(v for law in found for t in law.terms for v in t.of), ' '.join(a.effect.name for a in beside)
         self.asked.append((*key, iterations))
         effects = (*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in found))
         fit = cast(Fit, SimpleNamespace(chi2=self.chi2, effects=effects, parameters=1))
-        return laws._Trial(tuple(found), fit, self.costs.get(key, 1000.0))
+        return laws.LawTrial(tuple(found), fit, self.costs.get(key, 1000.0))
 
 
 def law_of(*variables: str, on: str = 'y2') -> Law:
@@ -594,7 +551,7 @@ def test_a_law_shows_alike_at_other_stages() -> None:
 def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit]) -> None:
     workspace, fit = seen
     before = workspace.simulations
-    seeker = laws._Seeker(workspace, fit, 3.0)
+    seeker = laws.LawSearch(workspace, fit, 3.0)
     assert seeker.tried == len(seeker.listed) * len(law_features.SOUGHT)
     assert seeker.last == before + 600
     got = seeker.trial([law_of('load_fy')], fit.effects, 2)
@@ -613,7 +570,7 @@ def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit])
 @pytest.mark.parametrize('form', ['over', 'under'])
 def test_a_threshold_that_no_refit_moves_is_not_at_its_bound(seen: tuple[Workspace, Fit], form: str) -> None:
     workspace, fit = seen
-    seeker = laws._Seeker(workspace, fit, 3.0)
+    seeker = laws.LawSearch(workspace, fit, 3.0)
     level = Law('b', 'psd', 'y2', (LawTerm(form, ('x1',), shapes={'threshold': 1e-4}),))
     got = seeker.trial([law_of('load_fy'), level], fit.effects, 2)
     assert math.isfinite(got.cost)
@@ -628,50 +585,6 @@ def test_events_are_looked_for_in_one_recording_only(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(laws, 'terms', lambda _: iter([term]))
     monkeypatch.setattr(laws, 'switchings', lambda _: [event])
     ws = cast(Workspace, SimpleNamespace(observations=[None] * recordings, simulations=7, psds=2))
-    seeker = laws._Seeker(ws, cast(Fit, None), 3.0)
+    seeker = laws.LawSearch(ws, cast(Fit, None), 3.0)
     assert seeker.listed == [term, event][: 3 - recordings]
     assert (seeker.last, seeker.tried) == (607, len(seeker.listed) * 12)
-
-
-class StopError(Exception):
-    """Ends a search in the middle."""
-
-
-@pytest.mark.parametrize(
-    ('done', 'grown'), [('second', ['first']), ('first', []), ('none', ['first', 'second', 'third'])]
-)
-def test_where_one_law_leaves_only_noise_no_other_gets_further_terms(
-    monkeypatch: pytest.MonkeyPatch, seen: tuple[Workspace, Fit], done: str, grown: list[str]
-) -> None:
-    """The three cheapest are followed, up to the first that is done; the cheapest of them goes on."""
-    names = ('first', 'second', 'third', 'fourth')
-    trials = [dataclasses.replace(trial(law_of('dx'), cost, 5.0), cost=cost) for cost in (1.0, 2.0, 3.0, 4.0)]
-    asked: list[str] = []
-
-    def name_of(t: laws._Trial) -> str:
-        return names[next(i for i, other in enumerate(trials) if other is t)]
-
-    class Follower:
-        def __init__(self, *_: object) -> None:
-            pass
-
-        def first(self) -> list[laws._Trial]:
-            return [trials[3], trials[1], trials[0], trials[2], dataclasses.replace(trials[0], cost=math.inf)]
-
-        def done(self, t: laws._Trial) -> bool:
-            return name_of(t) == done
-
-        def grown(self, t: laws._Trial) -> laws._Trial:
-            asked.append(name_of(t))
-            return t
-
-        def lean(self, t: laws._Trial) -> laws._Trial:
-            assert name_of(t) == 'first'
-            raise StopError
-
-    monkeypatch.setattr(laws, '_Seeker', Follower)
-    workspace, _ = seen
-    null = refit(workspace, ())
-    with pytest.raises(StopError):
-        laws._law_of_the_mean(workspace, null, null, 3.0, 0.0, np.random.default_rng(0))
-    assert asked == grown

@@ -13,29 +13,27 @@ import numpy as np
 import pytest
 
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
-from psd_deflection.model.simulation.laws import Law, LawTerm
+from psd_deflection.model.simulation.laws import LawTerm
 from psd_deflection.model.simulation.physics import Physics
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.wirings import WIRINGS, differences
-from psd_deflection.studies.discover import conclusion, experiment, planning, readings
+from psd_deflection.studies.discover import conclusion, experiment, readings
 from psd_deflection.studies.discover.experiment import ModelSums
 from psd_deflection.studies.discover.laws import law_features, laws, variance
-from psd_deflection.studies.discover.laws.law_features import SOUGHT, Response
+from psd_deflection.studies.discover.laws.law_features import Response
 from psd_deflection.studies.discover.search import coincidence, localise, proposals, weighing
 from psd_deflection.studies.discover.search import hold_out as validate
-from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.localise import dependences
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup import cleaning, hidden, setup
+from psd_deflection.studies.discover.setup import cleaning, setup
 
 from .test_formulas import RIG, observed
-from .test_law_formulas import Given
 from .test_rules import FINE, SIGMA, A, N, Plant, active, candidate, noise, pictures
 
 # Wiring and units.
@@ -54,17 +52,6 @@ def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch
 # Starting values.
 
 
-def test_a_short_recording_does_not_end_the_search_for_lines() -> None:
-    rng = np.random.default_rng(0)
-    t = np.arange(2000) * 1e-3
-    long = 0.1 * rng.standard_normal((2000, 6)) + np.sin(2.0 * np.pi * 50.0 * t)[:, None]
-    sigma = np.full(6, 0.1)
-    for n, seen in ((255, []), (256, [50.0])):
-        assert proposals.spectral_peaks([long[:n]], [sigma], [1e-3]) == pytest.approx(seen, abs=0.5)
-    (f,) = proposals.spectral_peaks([long[:100], long], [sigma] * 2, [1e-3] * 2)
-    assert f == pytest.approx(50.0, abs=0.01)
-
-
 @pytest.mark.parametrize(('of_simulation', 'taken'), [(2, 2), (3, 1)])
 def test_a_simulation_is_rougher_if_it_has_more_than_twice_the_outliers(
     monkeypatch: pytest.MonkeyPatch, of_simulation: int, taken: int
@@ -78,16 +65,6 @@ def test_a_simulation_is_rougher_if_it_has_more_than_twice_the_outliers(
 
     monkeypatch.setattr(cleaning, 'outliers', outliers)
     assert np.isnan(cleaning.clean(o, ())[0].volts).sum() == taken
-
-
-def test_a_slow_line_does_not_hide_another() -> None:
-    """Of 5 Hz in a second: nothing is left of it once it is found, down to the first of the spectrum."""
-    rng = np.random.default_rng(0)
-    t = np.arange(1000) * 1e-3
-    both = np.sin(2.0 * np.pi * 5.0 * t) + 0.5 * np.sin(2.0 * np.pi * 50.0 * t)
-    seen = 0.05 * rng.standard_normal((1000, 6)) + both[:, None]
-    found = proposals.spectral_peaks([seen], [np.full(6, 0.05)], [1e-3], limit=2)
-    assert found == pytest.approx([5.0, 50.0], abs=0.05)
 
 
 # Candidates.
@@ -141,14 +118,6 @@ def test_two_models_are_told_apart_by_what_no_sizes_of_one_explain() -> None:
 # Laws.
 
 
-def response(weight: np.ndarray, length: np.ndarray, values: np.ndarray, columns: int = 0) -> Response:
-    """A recording of fine blocks of one sample, of which every target is shown alike."""
-    n, rows = len(values), len(SOUGHT)
-    known = {'time': np.arange(n) * 1e-3, 'load_fx': values, 'load_fy': values, 'load_tz': values}
-    flat = np.zeros((rows, n))
-    return Response(known, 1e-3, 1, weight, length, flat, flat, (), (1, 1))
-
-
 def test_noise_of_a_sum_is_no_gap() -> None:
     """What grows with a load in the light of a PSD: the gap of the dots is as it was."""
     rng = np.random.default_rng(5)
@@ -170,16 +139,6 @@ def test_noise_of_a_sum_is_no_gap() -> None:
     assert term.coefficient == pytest.approx(math.sqrt(b / (known**2).max()) * scale, rel=1e-9)
 
 
-def test_a_law_has_the_covariance_of_least_squares_in_any_unit() -> None:
-    rng = np.random.default_rng(0)
-    unit = rng.standard_normal((50, 3))
-    for size in (1e-9, 1.0, 1e9):
-        jacobian = unit * [size, 1.0, 1.0 / size]
-        got = laws._covariance(cast(Fit, SimpleNamespace(jacobian=jacobian)))
-        want = np.linalg.inv(unit.T @ unit) / np.outer([size, 1.0, 1.0 / size], [size, 1.0, 1.0 / size])
-        np.testing.assert_allclose(got, want, rtol=1e-9)
-
-
 def test_where_a_block_is_lost_a_law_is_not_looked_for() -> None:
     o = observed(warm=None)
     volts = o.volts.copy()
@@ -191,21 +150,6 @@ def test_where_a_block_is_lost_a_law_is_not_looked_for() -> None:
     assert (r.error[:, lost] == 0.0).all()
     assert (r.power[:, lost] == 0.0).all()
     assert np.isfinite(r.error).all()
-
-
-def test_two_levels_are_fitted_in_turn_four_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    error = np.zeros(60)
-    error[20:40] = 3.0
-    real, asked = law_features._likeliest, list[float]()
-
-    def likeliest(gain: FloatArray) -> Any:
-        asked.append(float(gain.max()))
-        return real(gain)
-
-    monkeypatch.setattr(law_features, '_likeliest', likeliest)
-    assert law_features._two_levels(error, np.ones(60), np.ones(60)) == [20, 40]
-    # Each block of the box is worth A (2 A - A).
-    assert asked == pytest.approx([9.0] * 4)
 
 
 def test_loads_keep_the_dots_within_what_the_converter_can_read() -> None:
@@ -258,7 +202,7 @@ def test_a_step_that_makes_it_worse_is_damped_twenty_times_more() -> None:
 # The screen.
 
 
-def test_a_candidate_counts_from_a_thousandth_of_sigma_on_and_on_its_own_side_only() -> None:
+def test_a_candidate_counts_from_a_thousandth_of_sigma() -> None:
     shown = pictures(A)
     unit = shown[A] / np.linalg.norm(shown[A]) * SIGMA
     plant = Plant(shown, 5.0 * unit)
@@ -278,7 +222,7 @@ def test_other_wirings_that_are_as_good_are_told(monkeypatch: pytest.MonkeyPatch
     o = observed(warm=None)
     file = Wiring.from_rig(o.rig)
     good = [w for w in WIRINGS if len(differences(w, file)) == 1][:4]
-    monkeypatch.setattr(setup, '_sizes', lambda m, w: (0.0 if w in good else m.squared, np.ones(3)))
+    monkeypatch.setattr(setup, 'load_sizes', lambda m, w: (0.0 if w in good else m.squared, np.ones(3)))
     _, (finding,), _ = setup.wire([o], ())
     assert len(finding.equivalent) == 2
 
@@ -297,23 +241,6 @@ def test_a_jump_is_a_step_that_gains_fifty(n: int, height: float, seen: bool) ->
         assert [t for *_, t in found] == pytest.approx([n // 2 * 4e-3] * seen)
 
 
-def test_below_25_hz_a_cell_says_what_its_channel_follows(monkeypatch: pytest.MonkeyPatch) -> None:
-    workspace = Workspace([observed(warm=None)])
-    found = [
-        localise.Dependence('x1', 'load_fx', 99.0, 0.00999),
-        localise.Dependence('y1', 'load_fy', 98.0, 0.01),
-        *(localise.Dependence('x2', f'load_f{a}{b}', 90.0, 1e-9) for a, b in (('x', ''), ('x', '^2'), ('y', ''))),
-    ]
-    monkeypatch.setattr(localise, 'dependences', lambda *_: found)
-    where = localise.localise(workspace, workspace.residual([])[0], None, np.random.default_rng(0), limit=999)
-    names = {(c.channel, c.band[0]): c.depends_on for c in where.cells}
-    for low in (2.0, 9.0, 17.0, 25.0, 60.0):
-        assert names['x1', low] == (('load_fx',) if low < 25.0 else ())
-        assert names['y1', low] == ()
-        assert names['x2', low] == (('load_fx', 'load_fy') if low < 25.0 else ())
-    assert all(c.band[1] <= 125.0 for c in where.cells)
-
-
 # The words of the answer.
 
 
@@ -321,33 +248,12 @@ def test_what_a_law_leaves_is_told_in_micrometres() -> None:
     law = SimpleNamespace(expression='y2 += 1', stage='psd', kind='straight')
     found = SimpleNamespace(law=law, laws=[law], beside=[], heldout_gap=1.0)
     answer = SimpleNamespace(law=found, effects=())
-    assert conclusion._law(cast(Any, answer)).endswith('on unseen load cases it leaves 1000000.000 µm.')
+    assert conclusion.law_sentence(cast(Any, answer)).endswith('on unseen load cases it leaves 1000000.000 µm.')
     creep = SimpleNamespace(effect=SimpleNamespace(name='creep'))
     found.beside = [creep]
     for named, words in (([], ', beside creep; on'), ([SimpleNamespace(active=creep)], 'y2 += 1; on')):
         answer.effects = named
-        assert words in conclusion._law(cast(Any, answer))
-
-
-def test_the_error_of_an_unseen_gain_is_that_of_four_hundred_draws(monkeypatch: pytest.MonkeyPatch) -> None:
-    pieces = np.random.default_rng(1).normal(40.0, 1.0, 12)
-    monkeypatch.setattr(validate, 'heldout_residual', lambda *_: np.zeros(1))
-    ws = SimpleNamespace(pieces=lambda a, b: pieces)
-    fit = cast(Fit, None)
-    got = validate.heldout_gain(cast(Comparison, ws), fit, fit, np.random.default_rng(7))
-    draws = np.random.default_rng(7).integers(0, 12, size=(400, 12))
-    assert got.gain == pytest.approx(pieces.sum())
-    assert got.error == pytest.approx(np.std([pieces[d].sum() for d in draws]))
-
-
-def test_pieces_of_long_blocks_are_a_block_each() -> None:
-    plant = Plant(pictures(A), noise())
-    a, b = np.random.default_rng(0).standard_normal((2, N))
-    for size, count in ((4, 4), (400, FINE), (4000, FINE)):
-        plant.fine = [size]
-        pieces = plant.pieces(a, b)
-        assert len(pieces) == count
-        assert pieces.sum() == pytest.approx(0.5 * (a @ a - b @ b))
+        assert words in conclusion.law_sentence(cast(Any, answer))
 
 
 def test_a_table_is_tried_with_a_small_size_and_the_first_shape() -> None:
@@ -361,7 +267,7 @@ def test_a_table_is_tried_with_a_small_size_and_the_first_shape() -> None:
         EffectParameter('with_it', '', -9.0, 9.0, 1.0, '', kind='coupled'),
     )
     effect = Effect('made_up', 'psd', '', '', '', '', parameters, 'dots', apply=lambda *_: None)
-    got = readings._dosed(effect, {p.name: p.nominal for p in parameters})
+    got = readings.with_first_dose(effect, {p.name: p.nominal for p in parameters})
     want = {'plain': 0.6, 'near': 0.55, 'listed': 0.4, 'far': 1.0, 'shape': 2.0, 'alone': 5.0, 'with_it': 1.0}
     assert got == pytest.approx(want)
 
@@ -377,37 +283,6 @@ def test_where_something_is_left_does_not_depend_on_the_units_of_what_is_fitted(
     assert [d.gain for d in one.dependences] == pytest.approx([d.gain for d in other.dependences])
     # A column that is all of what noise draws leaves less of it.
     assert [c.p for c in one.cells] == pytest.approx([c.p for c in other.cells])
-
-
-def law_with(*listed: LawTerm) -> Law:
-    return Law('law_static_dx', 'link', 'static_dx', listed)
-
-
-SWITCHED, STRAIGHT = LawTerm('switched', (), 1e-6, times=(1.0, 2.0)), LawTerm('product', ('dx',), 1e-6)
-
-
-@pytest.mark.parametrize(
-    ('found', 'again'),
-    [
-        ([law_with(SWITCHED, STRAIGHT)], True),
-        ([law_with(STRAIGHT, SWITCHED)], False),
-        ([law_with(SWITCHED), law_with(STRAIGHT)], False),
-    ],
-)
-def test_further_times_are_looked_for_if_the_only_law_begins_with_some(
-    monkeypatch: pytest.MonkeyPatch, found: list[Law], again: bool
-) -> None:
-    monkeypatch.setattr(laws, 'responses', lambda *_: [])
-    monkeypatch.setattr(laws, 'score', lambda *_: [])
-    seeker, asked = Given({}), list[object]()
-
-    def switched_again(trial: laws._Trial, more: object) -> laws._Trial:
-        asked.append(more)
-        return trial
-
-    monkeypatch.setattr(seeker, '_switched_again', switched_again)
-    seeker.grown(seeker.trial(found, (), 1))
-    assert bool(asked) == again
 
 
 @pytest.mark.parametrize('sign', [1.0, -1.0])
@@ -451,7 +326,7 @@ def test_tied_effects_explain_none_to_all_of_the_gap(gains: tuple[float, float],
         [tie], cast(Fit, fit), cast(SearchResult, found), cast(Any, SimpleNamespace(dependences=()))
     )
     assert unknown.explains == pytest.approx(share)
-    assert not unknown.remains
+    assert not unknown.unexplained
 
 
 @pytest.mark.parametrize('channel', range(6))
@@ -481,29 +356,6 @@ def test_two_sizes_agree_as_their_ratio_is_known(together: float) -> None:
     want = 2.0 * math.log(10.0) * math.exp(-0.5 * z * z) / (sd * math.sqrt(2.0 * math.pi))
     assert tie.odds == pytest.approx(want, rel=1e-6)
     assert (tie.members, tie.sizes, tie.unit) == (free, sizes, 'V')
-
-
-def test_a_zero_may_be_of_the_beam_or_of_the_reading() -> None:
-    zero = next(e for e in hidden.mistakes(2, [], []) if e.name == 'zero')
-    way = zero.parameter('of_reading')
-    assert (way.minimum, way.maximum, way.choices, way.nominal) == (0, 1, (0, 1), 0)
-    assert len(list(zero.variants())) == 4
-
-
-def test_the_next_recording_is_one_of_the_first_ones_rig(monkeypatch: pytest.MonkeyPatch) -> None:
-    other = replace_values(RIG, {'link.length': 0.4})
-    asked: list[object] = []
-
-    def offered(rig: object, limits: object) -> list[experiment.Proposal]:
-        asked.append(rig)
-        raise RuntimeError('enough')
-
-    monkeypatch.setattr(planning, 'proposals', offered)
-    ws = SimpleNamespace(observations=[SimpleNamespace(rig=RIG), SimpleNamespace(rig=other)])
-    fit = cast(Fit, SimpleNamespace(jacobian=np.zeros((3, 1))))
-    with pytest.raises(RuntimeError, match='enough'):
-        planning.plan_next(cast(Workspace, ws), fit, [fit])
-    assert asked == [RIG]
 
 
 @pytest.mark.parametrize(('rest', 'listed'), [(1e-8, False), (1e-5, True)])
@@ -536,11 +388,11 @@ def test_a_variable_is_known_as_means_of_the_blocks_of_an_estimate() -> None:
 @pytest.mark.parametrize(('nominal', 'choices', 'kept'), [(1.0, (0, 1), 1), (0.0, (0, 1), 0), (5.0, (2, 3), 2)])
 def test_a_choice_that_makes_no_difference_stays_as_it_is(nominal: float, choices: tuple[int, ...], kept: int) -> None:
     way = EffectParameter('way', '', 0, 9, 1, '', nominal=nominal, kind='choice', choices=choices)
-    assert readings._settled_choice(way).choices == (kept,)
+    assert readings.fixed_choice(way).choices == (kept,)
     psd = dataclasses.replace(way, each=True)
     size = EffectParameter('size', 'V', -1.0, 1.0, 0.1, '')
-    assert readings._settled_choice(psd) is psd
-    assert readings._settled_choice(size) is size
+    assert readings.fixed_choice(psd) is psd
+    assert readings.fixed_choice(size) is size
 
 
 def test_the_nuisance_takes_part_in_no_tie() -> None:

@@ -19,7 +19,6 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import replace_values
 from psd_deflection.studies.discover import experiment, planning
 from psd_deflection.studies.discover.experiment import Limits, ModelSums, Piece, Proposal, Setting
-from psd_deflection.studies.discover.laws import laws, variance
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search import hold_out as validate
 from psd_deflection.studies.discover.search import localise, proposals, weighing
@@ -31,12 +30,10 @@ from psd_deflection.studies.discover.search.localise import Dependence
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.signatures import Candidate, SignatureBank, signatures_beside
-from psd_deflection.studies.discover.search.trust import energies
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import cleaning
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes
-from psd_deflection.studies.discover.setup.noise import _filled, _kept, _level, estimate_noise
-from psd_deflection.studies.discover.setup.setup import likely_delays
+from psd_deflection.studies.discover.setup.noise import estimate_noise
 
 from .test_formulas import HISTORY, RIG, observed
 from .test_rules import CASES, FINE, SIGMA, Plant, active, columns, noise, nowhere, pictures
@@ -46,22 +43,6 @@ DOTS = [0, 1, 3, 4]
 
 
 # What of a recording is no measurement.
-
-
-def test_a_sample_is_held_against_the_cubic_through_its_neighbours() -> None:
-    at = np.arange(20.0)
-    cubic = 0.01 * at**3 - 0.2 * at**2 + at - 3.0
-    np.testing.assert_allclose(cleaning._from_cubic(cubic)[2:-2], 0.0, atol=1e-12)
-    for size in (1.0, -1.0):
-        x = cubic.copy()
-        x[10] += size
-        got = cleaning._from_cubic(x)
-        # Its weight in the cubics of its neighbours is 2/3, in those of theirs 1/6.
-        np.testing.assert_allclose(got[7:14], [0.0, 1 / 6, 2 / 3, 1.0, 2 / 3, 1 / 6, 0.0], atol=1e-12)
-    # At an end: the distance from the median of five, less three of the usual steps between them.
-    for order in (1, -1):
-        ends = np.array([9.0, 2.0, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0])[::order]
-        np.testing.assert_allclose(cleaning._from_cubic(ends)[::order][:2], [7.0 - 3.0 * 1.5, 0.0])
 
 
 @pytest.mark.parametrize(('size', 'found'), [(8.1e-3, True), (7.9e-3, False), (-8.1e-3, True)])
@@ -105,33 +86,6 @@ def test_what_is_stuck_is_told_with_its_place_and_share() -> None:
     step = 64 * RIG.converter.volts_per_count
     coarse = dataclasses.replace(o, volts=np.rint(o.volts / step) * step)
     assert cleaning.clean(coarse, ())[1] == []
-
-
-@pytest.mark.parametrize('factor', [1.0, 30.0])
-def test_what_stands_out_is_left_out_whatever_the_unit_of_the_loads(factor: float) -> None:
-    """Against the simulation, which knows the steps; in a wrong unit its steps are rougher than the readings."""
-    o = observed(warm=None)
-    volts = o.volts.copy()
-    volts[[200, 700], [0, 4]] += 0.5
-    seen = dataclasses.replace(o, volts=volts, loads=factor * o.loads)
-    gone = np.argwhere(np.isnan(cleaning.clean(seen, ())[0].volts)).tolist()
-    assert [200, 0] in gone
-    assert [700, 4] in gone
-    assert len(gone) <= 4
-
-
-@pytest.mark.parametrize(('rate', 'evidence'), [(500.0, math.log(2.0)), (2000.0, math.log(2.0))])
-def test_another_rate_is_told_with_its_distance(rate: float, evidence: float) -> None:
-    _, (finding,) = cleaning.clean(dataclasses.replace(observed(), stated_rate_hz=rate), ())
-    assert finding.evidence == pytest.approx(evidence)
-    assert finding.value == pytest.approx(1000.0 / rate)
-
-
-@pytest.mark.parametrize(('unknown', 'told'), [(60, False), (61, True)])
-def test_more_than_a_twentieth_without_loads_is_told(unknown: int, told: bool) -> None:
-    for span in ((unknown, 0), (0, unknown)):
-        _, findings = cleaning.clean(dataclasses.replace(observed(), unknown_load=span), ())
-        assert [f.name for f in findings] == ['load_coverage'] * told
 
 
 # The workspace.
@@ -235,7 +189,9 @@ def test_a_slow_change_is_unwhitened_by_what_is_left_of_a_constant() -> None:
 def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> None:
     dots = gappy.block_dots(gappy.measured)
     assert [d.shape for d in dots] == [(4, 60), (4, 40)]
-    for (row, shown), o in zip(zip(dots, gappy.shown(gappy.measured), strict=True), gappy.observations, strict=True):
+    for (row, shown), o in zip(
+        zip(dots, gappy.displayed(gappy.measured), strict=True), gappy.observations, strict=True
+    ):
         np.testing.assert_array_equal(shown, 1e6 * row)
         n = row.shape[1]
         blocks = o.volts[: 20 * n, DOTS].reshape(n, 20, 4)
@@ -245,7 +201,7 @@ def test_what_is_shown_of_a_workspace_is_in_micrometres(gappy: Workspace) -> Non
         np.testing.assert_allclose(row, want, rtol=1e-9)
     # Two blocks of the first have none of their samples.
     assert np.isnan(dots[0]).all(axis=0).sum() == 2
-    assert (gappy.unit, gappy.scale_shown, gappy.units_shown) == ('m', (1e6, 'µm'), ('µm',) * 4)
+    assert (gappy.unit, gappy.display_scale, gappy.display_units) == ('m', (1e6, 'µm'), ('µm',) * 4)
     assert gappy.worded(1.2345e-6) == '1.23 µm'
     beside = gappy.against()
     assert list(beside) == [
@@ -288,41 +244,7 @@ def test_a_row_of_a_channel_is_whitened_as_the_readings_are(gappy: Workspace) ->
     np.testing.assert_array_equal(got[1], difference[1])
 
 
-@pytest.mark.parametrize('n', [301, 300])
-def test_energies_add_up_in_rows_of_any_length(n: int) -> None:
-    part = np.random.default_rng(1).standard_normal((6, n))
-    fake = cast(Comparison, SimpleNamespace(split=lambda v: [part, part[:, :20]], periods=[0.004, 0.004]))
-    got = energies(fake, np.zeros(0))
-    assert got[0].sum(axis=1) == pytest.approx((part**2).sum(axis=1))
-    spectrum, f = np.abs(np.fft.fft(part, axis=1)) ** 2 / n, np.abs(np.fft.fftfreq(n, 0.004))
-    assert got[0, :, 0] == pytest.approx(spectrum[:, f < 2.0].sum(axis=1))
-    assert got[0, :, 5] == pytest.approx(spectrum[:, f >= 60.0].sum(axis=1))
-    # A recording so short that a band has no frequency (multiples of 12.5 Hz): 2 to 9 Hz.
-    assert not got[1, :, 1].any()
-    assert got[1].sum(axis=1) == pytest.approx((part[:, :20] ** 2).sum(axis=1))
-
-
 # Noise.
-
-
-def test_what_is_lost_is_bridged_by_straight_lines() -> None:
-    values = np.array([np.nan, 1.0, np.nan, np.nan, 4.0, 6.0, np.nan])
-    np.testing.assert_allclose(_filled(values, np.isfinite(values)), [1.0, 1.0, 2.0, 3.0, 4.0, 6.0, 6.0])
-    assert _filled(values[1:2], np.array([True])) is not None
-    np.testing.assert_array_equal(_filled(values, np.zeros(7, dtype=bool)), np.zeros(7))
-    whole = np.arange(4.0)
-    assert _filled(whole, np.ones(4, dtype=bool)) is whole
-
-
-def test_straight_lines_keep_a_part_of_the_noise() -> None:
-    upper = np.fft.rfftfreq(20_000) > 0.2
-    assert _kept(np.ones(20_000, dtype=bool), upper) == _kept(np.zeros(20_000, dtype=bool), upper) == 1.0
-    there = np.random.default_rng(1).random(20_000) < 0.5
-    # Another noise through the same gaps.
-    white = _filled(np.random.default_rng(9).standard_normal(20_000), there)
-    power = np.abs(np.fft.rfft(white * np.hanning(20_000))) ** 2 / (0.375 * 20_000)
-    assert _kept(there, upper) == pytest.approx(_level(power[upper]), rel=0.03)
-    assert _kept(np.arange(20_000) < 2, upper) == 1e-3
 
 
 def resting(n: int, level: float, memory: float = 0.0, seed: int = 0) -> FloatArray:
@@ -487,15 +409,6 @@ def test_a_line_persists_though_most_of_a_quarter_was_left_out() -> None:
     assert proposals.persistent([50.0], [rows], [np.ones(1)], [1e-3]) == []
 
 
-def test_a_limit_is_that_of_the_highest_reading_of_all_recordings() -> None:
-    o = observed(warm=None)
-    low, high = (dataclasses.replace(o, volts=np.full_like(o.volts, v)) for v in (1.0, -2.0))
-    assert proposals.highest_voltages([low, high], True, 0.01)[0] == pytest.approx(1.98)
-    # A limit below 0.1 V is none.
-    tiny = dataclasses.replace(o, volts=np.full_like(o.volts, 0.11))
-    assert proposals.highest_voltages([tiny], True, 0.004) == pytest.approx([0.102, 0.11 * 0.98])
-
-
 # What the set-up may be wrong by.
 
 
@@ -570,7 +483,7 @@ def test_a_parameter_at_its_bound_stays_there_and_a_blind_fold_moves_nothing() -
     stopped = dataclasses.replace(fit, at_bound=((1, 'x'),))
     fold = np.tile(plant.case[0] % 4, 6)
     matrix = columns(shown, A, B)
-    for (test, step), k in zip(validate._steps(plant, stopped), range(4), strict=True):
+    for (test, step), k in zip(validate.fold_steps(plant, stopped), range(4), strict=True):
         assert test.tolist() == (fold == k).tolist()
         assert step[1] == 0.0
         rest = matrix[fold != k, 0]
@@ -579,7 +492,7 @@ def test_a_parameter_at_its_bound_stays_there_and_a_blind_fold_moves_nothing() -
     # The picture shows in one fold alone: without that fold there is nothing to move it by.
     only = {A: shown[A] * (np.arange(FINE) * CASES // FINE % 4 == 2)}
     plant = Plant(only, 2e-3 * only[A] + noise())
-    steps = [float(s[0]) for _, s in validate._steps(plant, refit(plant, [active('a', x=0.0)]))]
+    steps = [float(s[0]) for _, s in validate.fold_steps(plant, refit(plant, [active('a', x=0.0)]))]
     assert np.abs(steps).max() < 1e-3
     tables = validate.heldout_tables(plant, refit(plant, [active('a', x=0.0)]))
     assert tables[0].shape == (6, FINE)
@@ -625,7 +538,7 @@ def test_what_is_tied_is_told_in_words() -> None:
         'a and c agree in size (x 0.1235, y 0.1235 V) as independent effects hardly would (odds 123 to 1): '
         'one cause that is not in the catalogue'
     )
-    assert (u.depends_on, u.remains, u.rms) == (('u', 'w', 'p', 'q'), False, 0.0)
+    assert (u.depends_on, u.unexplained, u.rms) == (('u', 'w', 'p', 'q'), False, 0.0)
     assert u.explains == pytest.approx(80.0 / 200.0)
     (u,) = weighing.tied(ties[1:], fit, result, nowhere())
     assert 'a and b agree in size (x 0.5, x 0.5) as' in u.signature
@@ -643,37 +556,9 @@ def test_gaps_of_channels_are_before_and_after() -> None:
     before, after = cast(Any, ([3.0], [1.0]))
     assert weighing.per_channel_of(fake, before, after) == {'p': (3.0, 1.0), 'q': (6.0, 2.0)}
     assert weighing.heldout_per_channel_of(fake, after) == {'p': 1.0, 'q': 2.0}
-    assert weighing._beyond(5.0, math.nan) == 5.0
 
 
 # Where.
-
-
-def test_a_load_case_of_eight_blocks_is_looked_at() -> None:
-    plant = Plant({}, noise())
-    plant.case = [np.repeat([0, 1, 2, 3], [7, 8, 185, 200])]
-    layouts = localise._layouts(plant)
-    assert [(x.recording, x.start, x.stop) for x in layouts] == [(0, 7, 15), (0, 15, 200), (0, 200, 400)]
-    for layout in layouts:
-        f = np.fft.rfftfreq(layout.stop - layout.start, 0.004)
-        assert np.concatenate(layout.bins).tolist() == list(range(len(f)))
-        edges = (0.0, 2.0, 9.0, 17.0, 25.0, 60.0, math.inf)
-        for index, low, high in zip(layout.bins, edges[:-1], edges[1:], strict=True):
-            assert ((f[index] >= low) & (f[index] < high)).all()
-    for n in (8, 9):
-        x = np.random.default_rng(n).standard_normal((2, n))
-        assert localise._power(x).sum(axis=1) == pytest.approx((x**2).sum(axis=1))
-    # Bands in which a short case has no frequency are not looked at.
-    z, excess = localise._energies([noise() / SIGMA], layouts)
-    assert (z[0, :, 1] == -9.0).all()
-    assert not excess[0, :, 1].any()
-    # Degrees of freedom: two for a frequency, one for the mean and for the highest of an even number.
-    spectrum = np.abs(np.fft.rfft(noise()[:, 7:15] / SIGMA, axis=1)) ** 2 / 8
-    np.testing.assert_allclose(excess[0, :, 0], spectrum[:, 0] - 1.0)
-    np.testing.assert_allclose(excess[0, :, 5], 2.0 * spectrum[:, 2:4].sum(axis=1) + spectrum[:, 4] - 5.0)
-    for at, dof, energy in ((0, 1.0, spectrum[:, 0]), (4, 2.0, 2.0 * spectrum[:, 1])):
-        spread = 2.0 / (9.0 * dof)
-        np.testing.assert_allclose(z[0, :, at], (np.cbrt(energy / dof) - 1.0 + spread) / math.sqrt(spread))
 
 
 # Plans.
@@ -694,7 +579,7 @@ def test_a_recording_shows_the_distance_of_its_models_in_units_of_the_noise() ->
     setting = Setting('', {'converter.sample_rate_hz': 500.0}, swing=3.0)
     loads = HISTORY[:400]
     before = ws.simulations
-    got = experiment.shown(ws, models, setting, loads)
+    got = experiment.expected_sums(ws, models, setting, loads)
     assert ws.simulations - before == sum(1 + len(m.free) for m in models)
     rig = replace_values(RIG, setting.changes)
     # Two samples are 4 ms here, and were four.
@@ -715,7 +600,7 @@ def test_a_recording_shows_the_distance_of_its_models_in_units_of_the_noise() ->
     # At its greatest value a parameter is moved downward, which gives the same slope.
     top = warm.effect.parameter('angle').maximum
     high = refit(ws, [ActiveEffect(warm.effect, {**warm.values, 'angle': top})], iterations=0)
-    assert np.isfinite(experiment.shown(ws, [high], setting, loads, rig).fisher[0]).all()
+    assert np.isfinite(experiment.expected_sums(ws, [high], setting, loads, rig).fisher[0]).all()
 
 
 @pytest.mark.parametrize('seconds', [3.0, 6.1, 30.0])
@@ -731,7 +616,7 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
         return ModelSums(apart * len(loads) / 3000.0, none, [np.zeros((0, 0))] * 3, len(loads) / 1000.0)
 
     monkeypatch.setattr(planning, 'proposals', lambda *_: offered)
-    monkeypatch.setattr(planning, 'shown', shown)
+    monkeypatch.setattr(planning, 'expected_sums', shown)
     fits = [
         cast(Fit, SimpleNamespace(jacobian=np.zeros((5, 0)), free=(), effects=(active(name, x=0.1),))) for name in 'abc'
     ]
@@ -739,9 +624,13 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
     plan = planning.plan_next(ws, fits[0], fits[1:], Limits(seconds=seconds))
     assert plan is not None
     times = int(seconds // 3.0)
-    first, second = plan.told
-    assert (first.rival, first.separation, first.reverse) == ('b', 4.0 * len(plan.pieces), 3.0 * len(plan.pieces))
-    assert (second.rival, second.separation, second.reverse) == ('c', 1.0 * len(plan.pieces), 0.5 * len(plan.pieces))
+    first, second = plan.discriminations
+    assert (first.alternative, first.separation, first.reverse) == ('b', 4.0 * len(plan.pieces), 3.0 * len(plan.pieces))
+    assert (second.alternative, second.separation, second.reverse) == (
+        'c',
+        1.0 * len(plan.pieces),
+        0.5 * len(plan.pieces),
+    )
     assert [first.possible, second.possible] == pytest.approx([4.0 * times, 1.0 * times])
     assert 1 <= len(plan.pieces) <= times
     found = planning.suggest(ws, fits[0], fits[1:], Limits(seconds=seconds))
@@ -751,20 +640,6 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
 
 
 # Coarse steps.
-
-
-@pytest.mark.parametrize('gap', [10.4, 17.3, 33.7, 128.9])
-def test_a_step_is_that_of_least_squares_through_all_readings(gap: float) -> None:
-    """Each of 513 multiples was rounded to counts."""
-    lsb = RIG.converter.volts_per_count
-    k = np.resize(np.arange(-256.0, 257.0), (2052, 6))
-    counts = np.rint(k * gap)
-    o = dataclasses.replace(observed(warm=None), volts=counts * lsb, loads=np.zeros((2052, 3)))
-    found = proposals.coarse_step(o)
-    assert found is not None
-    values, of = np.rint(np.arange(-256.0, 257.0) * gap), np.arange(-256.0, 257.0)
-    assert found[0] / lsb == pytest.approx(float(of @ values) / float(of @ of), rel=1e-12)
-    assert found[1] / lsb == pytest.approx(1.0 / math.sqrt(12.0 * float(of @ of)), rel=1e-12)
 
 
 @pytest.mark.parametrize(('gap', 'seen'), [(255, False), (300, True)])
@@ -786,41 +661,7 @@ def test_half_a_per_cent_of_readings_may_be_off_the_steps() -> None:
         assert (proposals.coarse_step(o) is not None) == seen
 
 
-def test_at_its_limit_nothing_stands_out() -> None:
-    x = np.zeros((60, 1))
-    x[30] = cleaning.FAR * 1e-3
-    assert not cleaning.outliers(x, 1e-3).any()
-    x[30] = np.nextafter(cleaning.FAR * 1e-3, 1.0)
-    assert cleaning.outliers(x, 1e-3).any()
-
-
 # Noise that grows.
-
-
-@pytest.mark.parametrize('size', [1e-6, 1.0, 1e4])
-def test_what_noise_grows_with_may_have_any_size(monkeypatch: pytest.MonkeyPatch, size: float) -> None:
-    ws = Workspace([observed(warm=None)])
-    rng = np.random.default_rng(2)
-    v = rng.uniform(-1.0, 1.0, 300)
-    known = {'dx': size * v, 'load_fx': 0.2 * size * rng.uniform(-1.0, 1.0, 300)}
-    monkeypatch.setattr(laws, 'heldout_gap', lambda *_: 0.0)
-    monkeypatch.setattr(laws, 'known_fine', lambda _, __, name: [known.get(name, np.zeros(300))])
-    fit = refit(ws, ())
-    residual = rng.standard_normal((6, 300))
-    residual[1] *= np.sqrt(0.2 + 8.0 * v**2)
-    found = laws.find_jitter(ws, dataclasses.replace(fit, residual=residual.ravel()), 3.0)
-    assert found is not None
-    assert (found.law.acts_on, found.law.terms[0].of) == ('y1', ('dx',))
-    squares, v2 = residual[1] ** 2, v**2 / float((v**2).max())
-    a, b = variance.variance(squares, v2)
-    gain = variance.likelihood(squares, a + b * v2) - variance.likelihood(squares, squares.mean())
-    assert found.delta_bic == pytest.approx(gain - 3.0)
-    # Two variables that change, on each of six channels.
-    assert found.p == pytest.approx(12.0 * math.erfc(math.sqrt(gain / 2.0)), rel=1e-6)
-    # What this noise adds is no gap any more, nor less than none.
-    assert found.heldout_gap == 0.0
-    per = ws.noise[0].innovation[1] * 2.0 * float(RIG.sensitivities.ravel()[1])
-    assert found.law.terms[0].coefficient == pytest.approx(math.sqrt(b / float((v**2).max())) / size * per)
 
 
 def test_wild_values_count_as_six_deviations() -> None:
@@ -859,23 +700,3 @@ def test_a_candidate_that_is_in_the_model_already_has_nothing_to_explain() -> No
     second, first = sorted(Screen(plant, found).score(data, columns(shown, A)), key=lambda s: s.candidate.effect.name)
     assert (second.gain, second.dof, second.p) == (0.0, 0, 1.0)
     assert first.dof == 1
-
-
-def test_a_plan_names_the_effect_of_the_first_rival_that_can_be_told() -> None:
-    told = tuple(
-        planning.Told(rival, name, 30.0, 40.0, p)
-        for rival, name, p in (('x', 'a', 1.0), ('y', 'b', 50.0), ('z', 'c', 60.0))
-    )
-    plan = planning.Plan(Setting(), (Piece('push', ('constant:0,-5,0:3',)),), told, Limits(), 1000.0)
-    assert 'It tells b from y, z' in plan.sentence
-    assert 'nothing within the limits tells x apart' in plan.sentence
-    idle = dataclasses.replace(plan, told=tuple(dataclasses.replace(t, possible=1.0) for t in told))
-    assert idle.sentence == 'No recording within the limits would tell a from x, y, z.'
-
-
-@pytest.mark.parametrize('shift', [1000, -1000])
-def test_loads_may_be_a_second_late_or_early(shift: int) -> None:
-    history = np.repeat(np.random.default_rng(3).uniform(-20, 20, (12, 3)), 400, axis=0)
-    o = observed(history=history, warm=None)
-    late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0))])
-    assert likely_delays(late) == pytest.approx(sorted(shift / 1000.0 + s for s in (-0.004, 0.0, 0.004)))

@@ -8,7 +8,6 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
@@ -106,10 +105,10 @@ def test_a_plant_is_measured_by_its_own_level() -> None:
     assert float(vector @ vector) == pytest.approx(50.0)
     for part, rows in zip(ws.unwhitened(vector), seen, strict=True):
         np.testing.assert_allclose(part, np.nan_to_num(rows), rtol=1e-12)
-    for part, rows in zip(ws.shown(seen), seen, strict=True):
+    for part, rows in zip(ws.displayed(seen), seen, strict=True):
         np.testing.assert_array_equal(part, rows)
     # What is simulated where nothing was measured is not shown.
-    assert np.isnan(ws.shown([np.zeros_like(rows) for rows in seen])[1][1]).all()
+    assert np.isnan(ws.displayed([np.zeros_like(rows) for rows in seen])[1][1]).all()
     assert ws.provenance() == [
         {'name': 'a', 'values': 18, 'lost': 2},
         {'name': 'b', 'values': 7, 'lost': 7},
@@ -138,7 +137,7 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     assert ws.gap(left) == pytest.approx(0.5)
     mixed = [rows * [[1.0], [0.5]] for rows in seen]
     assert ws.gap(mixed) == pytest.approx(math.sqrt((1.0 + 0.25) / 2.0))
-    assert (ws.unit, ws.scale_shown, ws.units_shown) == (
+    assert (ws.unit, ws.display_scale, ws.display_units) == (
         'share of the gap before',
         (100.0, '% of the gap before'),
         ('N', 'rad'),
@@ -163,7 +162,7 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     both = np.concatenate((forces, turns))
     assert same.gap(seen) == pytest.approx(rms(both))
     assert same.floor() == pytest.approx(math.sqrt((28 * 0.3**2 + 22 * 0.1**2) / 50))
-    assert (same.unit, same.scale_shown, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
+    assert (same.unit, same.display_scale, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
     # A number without a unit has none behind it.
     assert PlantComparison(Pictures(seen, {}, units=('', ''))).worded(0.5) == '0.5'
 
@@ -448,7 +447,7 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     plant.done = {'u': [np.arange(n) / n for n in LENGTHS]}
     ws = PlantComparison(plant)
     fit = refit(ws, ())
-    found = plant_search._where(ws, fit, None)
+    found = plant_search.localise_cases(ws, fit, None)
     cells = {(c.channel, c.recording): c for c in found.cells}
     assert set(cells) == {('force', 0), ('force', 1), ('force', 2), ('turn', 0), ('turn', 2)}
     for (channel, case), cell in cells.items():
@@ -474,26 +473,6 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     assert [c.statistic for c in found.cells] == sorted((c.statistic for c in found.cells), reverse=True)
     assert found.spans == tuple((i, 0.0, n * period) for i, n in enumerate(LENGTHS))
     assert (found.excess, found.p) == (found.dependences[0].gain, found.dependences[0].p)
-
-
-def test_words_for_a_channel_are_those_of_its_own_strongest_dependences(monkeypatch: pytest.MonkeyPatch) -> None:
-    depends = [
-        SimpleNamespace(channel=channel, regressor=name, gain=gain, p=p)
-        for channel, name, gain, p in (
-            ('force', 'u', 90.0, 1e-9),
-            ('force', 'u^2', 80.0, 0.009),
-            ('turn', 'time', 70.0, 1e-9),
-            ('force', 'u^3', 60.0, 1e-9),
-            ('turn', 'u', 50.0, 0.011),
-        )
-    ]
-    monkeypatch.setattr(plant_search, 'dependences', lambda *_: depends)
-    ws = PlantComparison(Pictures(tables(0), {}))
-    words = {c.channel: c.depends_on for c in plant_search._where(ws, refit(ws, ()), None).cells}
-    assert words == {'force': ('u', 'u^2'), 'turn': ('time',)}
-    monkeypatch.setattr(plant_search, 'dependences', lambda *_: [])
-    found = plant_search._where(ws, refit(ws, ()), None)
-    assert (found.excess, found.p, found.dependences) == (0.0, 1.0, ())
 
 
 # Whole answers.
@@ -555,8 +534,8 @@ def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
         'where',
     ]
     # Where it was before the effect, and where nothing is left after it.
-    assert max(c.statistic for c in found.where.cells) > 8.0 > max(c.statistic for c in found.left.cells)
-    assert found.left.p > 1e-4
+    assert max(c.statistic for c in found.where.cells) > 8.0 > max(c.statistic for c in found.residual.cells)
+    assert found.residual.p > 1e-4
     assert found.sentence.startswith('b is missing from the model; adding it closes the gap from')
     assert repr(found) == (
         f'<PlantDiscovery effects_found: b; gap {found.gap_before:.3g} N → {found.gap_after:.3g} N '
@@ -573,16 +552,3 @@ def test_noise_of_a_plant_is_nothing_missing() -> None:
     assert found.floors == 0.0
     assert '(noise alone: not known)' in repr(found)
     assert 'no effect' in repr(found)
-
-
-def test_what_no_effect_of_a_plant_explains_is_unknown() -> None:
-    plant = steel(0.4)
-    plant.library = (size_of('a'),)
-    plant.done = {'load': [np.mean(rows, axis=0) for rows in plant.shown['b']]}
-    found = discover_in(plant)
-    assert (found.verdict, found.effects) == ('unknown_effect', ())
-    (unknown,) = found.unknown
-    assert unknown.depends_on[0] == 'load'
-    assert unknown.remains
-    assert unknown.rms == pytest.approx(found.gap_after)
-    assert unknown.explains == 1.0

@@ -15,7 +15,6 @@ import psd_deflection
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.discover.plant_search import PlantComparison
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
 STIFFNESS = plant_effect('stiffness', EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'))
@@ -185,12 +184,6 @@ def test_the_answer_is_the_same_again() -> None:
     assert first == second
 
 
-def test_few_cases_are_cut_into_pieces() -> None:
-    plant = Spring(0.3)
-    plant.cases, plant.seen, plant.u = ('a',), plant.seen[:1], plant.u[:1]
-    assert PlantComparison(plant).folds().tolist() == [0, 1, 2, 3]
-
-
 @pytest.mark.parametrize(
     ('change', 'words'),
     [
@@ -214,11 +207,6 @@ def test_a_plant_that_contradicts_itself_is_refused(change: Mapping[str, object]
         plant.seen = []
     with pytest.raises(ConfigError, match=words):
         psd_deflection.discover_in(plant)
-
-
-def test_an_effect_of_a_plant_has_no_bounds_of_a_rig() -> None:
-    with pytest.raises(ConfigError, match='of_rig'):
-        plant_effect('stiff', EffectParameter('ei', '', 0.0, 9.0, 1.0, '', of_rig='bending_stiffness'))
 
 
 def test_what_swings_on_is_no_noise_though_none_is_stated() -> None:

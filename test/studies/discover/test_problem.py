@@ -18,7 +18,7 @@ from psd_deflection.studies.discover.search.localise import NOWHERE, Cell, Local
 from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.hidden import FIRST
-from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_one
+from psd_deflection.studies.discover.steps import alternatives, fields_of, search, solve, weigh, where, without_effect
 
 from .test_rules import A, B, Lone, Plant, active, candidate, noise, nowhere, pictures, without_noise
 
@@ -68,7 +68,7 @@ def test_each_step_adds_what_it_finds_and_changes_nothing_before_it() -> None:
     assert not searched.heldout
     assert len(weighed.heldout) == 2
     assert [n.active.effect.name for n in named.named] == [a.effect.name for a in weighed.fit.effects]
-    assert (last.unknown, last.rivals, last.unsettled) == ((), (), ())
+    assert (last.unknown, last.alternative_fits, last.unsettled) == ((), (), ())
     fields = fields_of(last)
     assert (fields['verdict'], fields['effects'], fields['fit']) == ('effects_found', last.named, last.fit)
     assert fields['gap_after'] < fields['gap_before']
@@ -92,7 +92,7 @@ def test_what_remains_somewhere_is_unknown_and_takes_weak_effects_with_it() -> N
     fast = Cell('x1', 0, (0.0, 1.0), (25.0, 60.0), (), 9.0, 0.0, 900.0)
     left = nowhere(p=0.0, excess=900.0, cells=(fast,))
     last = solve(Library(plant, left), STEPS, 0, lambda _: None)
-    assert (fields_of(last)['verdict'], names(last.fit), last.left) == ('unknown_effect', [], left)
+    assert (fields_of(last)['verdict'], names(last.fit), last.residual) == ('unknown_effect', [], left)
     assert last.search.trace[-1].endswith('explains less than what remains unknown')
     strong = Plant(shown, without_noise((shown[A], 2000.0)) + noise())
     kept = solve(Library(strong, left), STEPS, 0, lambda _: None)
@@ -125,13 +125,13 @@ def test_without_one_effect_the_others_are_fitted_and_weighed_anew() -> None:
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
     both = weigh(search(begun(Library(plant))))
     at = [a.effect.name for a in both.fit.effects].index('a')
-    one = without_one(both, at, 'is not wanted')
+    one = without_effect(both, at, 'is not wanted')
     assert names(one.fit) == ['b']
     assert one.heldout == (both.heldout[1 - at],)
     assert len(one.result.delta_chi2) == 1
     assert one.result.fit is both.fit
     assert one.search.trace[-1] == 'a is not wanted'
-    none = without_one(one, 0, 'neither')
+    none = without_effect(one, 0, 'neither')
     assert none.fit is one.result.null
 
 

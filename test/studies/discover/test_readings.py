@@ -194,9 +194,7 @@ def test_recordings_and_tables_of_two_kinds_are_searched_one_by_one(tmp_path: Pa
     assert not is_table(tmp_path / 'none.csv')
 
 
-def test_options_for_recordings_are_refused_and_other_commands_say_who_takes_a_table(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_options_for_recordings_are_rejected_for_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     table = written(tmp_path / 'hung.csv', 1e3 * read([]).values)
     assert main(['discover', str(table), '--out', str(tmp_path / 'found'), '--next']) == 2
     assert '--next is for recordings of samples, not for readings of a link at rest' in capsys.readouterr().err

@@ -23,7 +23,7 @@ from psd_deflection.studies.discover.from_recordings import read_observation
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.cleaning import clean, outliers, stuck
+from psd_deflection.studies.discover.setup.cleaning import clean, outliers
 from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, wire
 
 RIG = load_rig()
@@ -112,7 +112,7 @@ def test_the_nearest_of_two_units_that_are_alike_is_named(factor: float, unit: s
     assert f'it is noted in {unit} instead' in findings[0].fix
 
 
-def test_units_that_are_alike_are_told_apart_where_the_movement_is_not_in_proportion() -> None:
+def test_alike_units_differ_where_movement_is_nonlinear() -> None:
     """50 N at the end of a bar: what moves in proportion to the load is 1 % off, and the units are 2 % apart."""
     loads = np.repeat([(0, 0, 0), (0, -50, -29.25), (0, 0, 0)], 2000, axis=0).astype(np.float64)
     volts = np.asarray(RigSimulator(RIG, 1).step(loads).counts * RIG.converter.volts_per_count, dtype=np.float64)
@@ -216,19 +216,6 @@ def test_outliers_of_any_rate_and_size_are_left_out_and_movement_is_not(share: f
     # Neither a step of the load nor hum of a hundred times the noise.
     t = np.arange(len(o.volts))[:, None] / 1000.0
     assert not outliers(o.volts + 0.2 * np.sin(2.0 * np.pi * 50.0 * t), 5e-4).any()
-
-
-def test_a_stuck_channel_is_named_and_left_out() -> None:
-    o = recorded()
-    o.volts[2500:2600, 4] = o.volts[2500, 4]
-    cleaned, (finding,) = clean(o, ())
-    assert (finding.name, finding.where, finding.value) == ('stuck_channel', 'y2', 2.5)
-    assert np.isnan(cleaned.volts[2501:2600, 4]).all()
-    assert np.isnan(cleaned.volts).sum() <= 101
-    # At the rail a reading may rest, and without noise anywhere.
-    high = np.minimum(o.volts, np.quantile(o.volts[:, 0], 0.5))
-    assert not stuck(high[:, :1], 1e-3, np.full(1, 2e-3), 3e-4).any()
-    assert not stuck(np.zeros((500, 1)), 1e-3, np.zeros(1), 3e-4).any()
 
 
 def test_what_no_load_is_known_of_does_not_count() -> None:

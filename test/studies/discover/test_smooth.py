@@ -18,7 +18,7 @@ from psd_deflection.studies.discover.plant_search import PlantComparison
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 from psd_deflection.studies.discover.search import smooth as smoothing
 from psd_deflection.studies.discover.search.fit import refit
-from psd_deflection.studies.discover.search.smooth import Smooth, _Remains, _unseen, smooth_of
+from psd_deflection.studies.discover.search.smooth import Remainders, Smooth, smooth_of, unseen_residual
 
 NOISE = 0.1
 SLOPE = plant_effect('slope', EffectParameter('size', 'mm', -9.0, 9.0, 0.1, 'per turn'))
@@ -81,7 +81,7 @@ def test_noise_alone_is_no_function(seed: int) -> None:
     assert smooth(Table(seed, 0.0)) is None
 
 
-def test_what_the_library_explains_is_no_function_and_neither_is_what_the_stated_noise_does() -> None:
+def test_library_effects_and_stated_noise_are_no_remainder() -> None:
     assert psd_deflection.discover_in(Table(1, 0.0)).tree()['remainder'] is None
     quiet = Table(1, 1.0)
     quiet.noise = (1.0,)
@@ -96,8 +96,8 @@ def test_a_reading_is_predicted_without_itself() -> None:
     there = np.ones(24, dtype=bool)
 
     def left(readings: FloatArray) -> FloatArray:
-        remains = _Remains(readings, np.zeros(24, dtype=np.int64), np.ones((24, 1)), np.arange(24), apart)
-        return _unseen(remains, ('x',), np.log([[0.1, 1.0, 0.5]]), there)
+        remains = Remainders(readings, np.zeros(24, dtype=np.int64), np.ones((24, 1)), np.arange(24), apart)
+        return unseen_residual(remains, ('x',), np.log([[0.1, 1.0, 0.5]]), there)
 
     moved = values.copy()
     moved[7] += 0.5
@@ -105,7 +105,7 @@ def test_a_reading_is_predicted_without_itself() -> None:
     assert float(np.std(left(values))) < 0.3
 
 
-def test_with_the_shapes_of_all_cases_a_reading_is_predicted_as_its_closed_form_says() -> None:
+def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
     """Left out one by one, with size, length and noise given: the residual of reading i is (P y)_i / P_ii, where P is
     the inverse covariance without what the free sizes can do (Dubrule 1983).
     """
@@ -115,8 +115,8 @@ def test_with_the_shapes_of_all_cases_a_reading_is_predicted_as_its_closed_form_
     values = np.sin(9.0 * x) + 0.1 * rng.standard_normal(n)
     free = np.column_stack([np.ones(n), x])
     apart = {'x': (x[:, None] - x) ** 2 / np.var(x)}
-    remains = _Remains(values, np.zeros(n, dtype=np.int64), free, np.arange(n), apart)
-    left = _unseen(remains, ('x',), np.log([[noise, size, length]]), np.ones(n, dtype=bool), shaped=True)
+    remains = Remainders(values, np.zeros(n, dtype=np.int64), free, np.arange(n), apart)
+    left = unseen_residual(remains, ('x',), np.log([[noise, size, length]]), np.ones(n, dtype=bool), shaped=True)
     inverse = np.linalg.inv(size**2 * np.exp(-0.5 * apart['x'] / length**2) + noise**2 * np.eye(n))
     p = inverse - inverse @ free @ np.linalg.inv(free.T @ inverse @ free) @ free.T @ inverse
     np.testing.assert_allclose(left, (p @ values) / np.diag(p), rtol=1e-6, atol=1e-9)
@@ -142,8 +142,8 @@ def test_sizes_that_channels_share_are_left_out_of_the_likelihood_once() -> None
     channel = np.repeat([0, 1, 0, 1], [7, 5, 4, 6])
     values, sizes, place = rng.standard_normal(22), rng.standard_normal((22, 3)), rng.uniform(0.0, 3.0, 22)
     apart = {'place': (place[:, None] - place[None, :]) ** 2}
-    remains = _Remains(values, channel, sizes, np.arange(22), apart)
-    basis = smoothing._span(sizes)
+    remains = Remainders(values, channel, sizes, np.arange(22), apart)
+    basis = smoothing.orthonormal_basis(sizes)
     parts = [(remains.part(channel == c), basis[channel == c]) for c in (0, 1)]
     across = null_space(sizes.T)
 
@@ -154,7 +154,9 @@ def test_sizes_that_channels_share_are_left_out_of_the_likelihood_once() -> None
         return -float(multivariate_normal(cov=across.T @ whole @ across).logpdf(across.T @ values))
 
     first, second = np.log([[0.5, 1.0, 0.7], [0.3, 2.0, 1.5]]), np.log([[0.2, 1.5, 0.4], [0.9, 0.7, 0.9]])
-    (one, _), (other, gradient) = (smoothing._surprise(s.ravel(), parts, ('place',)) for s in (first, second))
+    (one, _), (other, gradient) = (
+        smoothing.negative_log_likelihood(s.ravel(), parts, ('place',)) for s in (first, second)
+    )
     assert other - one == pytest.approx(exact(second) - exact(first))
     steps = 1e-5 * np.eye(6).reshape(6, 2, 3)
     numeric = [(exact(second + h) - exact(second - h)) / 2e-5 for h in steps]

@@ -18,7 +18,7 @@ from psd_deflection.records import DOT_CHANNELS, ParameterChange
 from psd_deflection.rig.config import load_rig, replace_values
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.recorded import Recorded, freed
+from psd_deflection.studies.discover.recorded import Recorded, with_free
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.workspace import Workspace
 
@@ -78,7 +78,7 @@ def test_a_constant_is_whitened_by_what_the_zero_allows() -> None:
     """One standard deviation of a well seen constant leaves a residual of about one standard deviation of noise."""
     o = recorded(taken=True)
     ws = Workspace([o])
-    own = freed(Recorded((o,), RIG, ()), ws)
+    own = with_free(Recorded((o,), RIG, ()), ws)
     constant = [np.zeros_like(t) for t in ws.measured]
     axis = 3
     constant[0][DOT_CHANNELS[axis]] = np.sqrt(ZERO[axis]) / RIG.sensitivities.ravel()[axis]
@@ -86,7 +86,7 @@ def test_a_constant_is_whitened_by_what_the_zero_allows() -> None:
     assert seen > 5.0
     assert np.linalg.norm(own.whiten(constant)) == pytest.approx(seen / np.hypot(1.0, seen), rel=1e-9)
     assert not own.free_loads
-    assert own.settled(ws.measured) is own
+    assert own.refitted(ws.measured) is own
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ import pytest
 from psd_deflection.arms.shapers import recommended, shaper
 from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.result import Identified, _close, _pm
+from psd_deflection.studies.identify.result import Identified, interval_words
 
 
 def mode(frequency: float = 14.0, damping: float = 0.02, *, sd: float = 1e-4, damping_sd: float = 1e-4) -> Mode:
@@ -61,12 +61,12 @@ def found(*axes: tuple[Mode, ...], stretches: int = 1) -> Identified:
 )
 def test_why_the_rig_file_does_not_get_a_mode(x: tuple[Mode, ...], y: tuple[Mode, ...], why: str | None) -> None:
     answer = found(x, y, ())
-    said = answer._withheld('bending')
+    said = answer.withheld_reason('bending')
     assert (said is None) is (why is None)
     assert why is None or (said is not None and why in said)
     assert bool(answer.values) is bool((x or y) and why is None)
-    assert answer._nothing() == ([f'Nothing for dynamics.bending_*: {said}.'] if why else [])
-    assert answer._withheld('torsion') is None
+    assert answer.withheld_sentences() == ([f'Nothing for dynamics.bending_*: {said}.'] if why else [])
+    assert answer.withheld_reason('torsion') is None
 
 
 def test_the_surer_axis_is_the_one_that_the_rig_file_gets() -> None:
@@ -80,12 +80,6 @@ def test_the_surer_axis_is_the_one_that_the_rig_file_gets() -> None:
     )
     twist = found((), (), (mode(21.0), mode(3.0))).values
     assert twist == {'dynamics.torsion_frequency': 21.0, 'dynamics.torsion_damping_ratio': 0.02}
-
-
-def test_only_modes_near_the_loudest_are_close() -> None:
-    modes = [mode(10.0), mode(12.99), mode(13.01), mode(7.01), mode(6.99)]
-    assert _close(modes) == [modes[0], modes[1], modes[3]]
-    assert _close([]) == []
 
 
 @pytest.mark.parametrize(('sd', 'name'), [(0.03, 'mzv'), (0.05, 'zvd')])
@@ -107,20 +101,6 @@ def test_the_shaper_suits_all_close_modes_and_their_scatter(sd: float, name: str
 
 
 @pytest.mark.parametrize(
-    ('modes', 'known'),
-    [
-        ((mode(damping_sd=0.0067),), True),
-        ((mode(damping_sd=0.0069),), False),
-        ((mode(damping_sd=0.0),), False),
-        ((mode(damping_sd=0.001), mode(15.0, damping_sd=0.0069)), False),
-        ((mode(damping_sd=0.001), mode(30.0, damping_sd=0.0069)), True),
-    ],
-)
-def test_a_shaper_needs_a_damping_ratio_within_a_third(modes: tuple[Mode, ...], known: bool) -> None:
-    assert (found(modes, (), ()).shaper_of(0) is not None) is known
-
-
-@pytest.mark.parametrize(
     ('value', 'sd', 'words'),
     [
         (14.0, 0.01, '14.000 ± 0.020'),
@@ -135,7 +115,7 @@ def test_a_shaper_needs_a_damping_ratio_within_a_third(modes: tuple[Mode, ...], 
     ],
 )
 def test_an_interval_has_two_digits(value: float, sd: float, words: str) -> None:
-    assert _pm(value, sd) == words
+    assert interval_words(value, sd) == words
 
 
 def test_a_mode_in_words() -> None:
@@ -143,10 +123,10 @@ def test_a_mode_in_words() -> None:
     twist = Mode(21.0, 0.02, 0.03, 0.001, math.radians(0.0125))
     answer = found((x, mode(40.0)), (), (twist,))
     words = ('14.000 ± 0.020', '0.0200 ± 0.0020', '12.3 µm', '1 ring-down')
-    assert answer._mode_words(0, x) == words
-    assert answer._mode_words(2, twist)[2:] == ('12.5 mdeg', '1 ring-down')
-    assert found((x,), (), (), stretches=2)._mode_words(0, x)[3] == '2 ring-downs'
-    assert found((x,), (), (), stretches=0)._mode_words(0, x)[3] == 'the spectrum in operation'
+    assert answer.mode_words(0, x) == words
+    assert answer.mode_words(2, twist)[2:] == ('12.5 mdeg', '1 ring-down')
+    assert found((x,), (), (), stretches=2).mode_words(0, x)[3] == '2 ring-downs'
+    assert found((x,), (), (), stretches=0).mode_words(0, x)[3] == 'the spectrum in operation'
     best = answer.shaper_of(0)
     assert best is not None
     impulses = ', '.join(f'{s:.4f} at {1000.0 * t:.1f} ms' for s, t in zip(best.sizes, best.times, strict=True))
@@ -165,23 +145,9 @@ def test_a_mode_in_words() -> None:
 
 def test_a_shaper_in_words_has_sizes_and_milliseconds() -> None:
     """ZVD of 0.5 Hz without damping: a quarter, a half and a quarter, half a turn apart."""
-    words = found((mode(0.5, 1e-9, sd=1e-9, damping_sd=1e-12),), (), ())._shaper_words(0)
+    words = found((mode(0.5, 1e-9, sd=1e-9, damping_sd=1e-12),), (), ()).shaper_words(0)
     assert words == 'ZVD: 0.2500 at 0.0 ms, 0.5000 at 1000.0 ms, 0.2500 at 2000.0 ms'
-    assert found((), (), ())._shaper_words(0) == ''
-
-
-def test_how_many_modes_there_are() -> None:
-    assert found((mode(), mode(40.0)), (), (mode(),)).page_sentences() == ['Modes: 2 along ΔX, 1 along θ.']
-    assert found((), (), ()).page_sentences() == ['No mode stands out of the noise.']
-    assert len(found((mode(sd=1.0),), (), ()).page_sentences()) == 2
-
-
-def test_lines_for_the_rig_file_follow_the_sentences() -> None:
-    answer = found((mode(14.25),), (), ())
-    tail = ['    dynamics.bending_frequency: 14.25', '    dynamics.bending_damping_ratio: 0.02']
-    assert answer.lines() == [*answer.sentences(), '', 'Lines for the rig file, below ros__parameters:', '', *tail]
-    nothing = found((), (), ())
-    assert nothing.lines() == nothing.sentences()
+    assert found((), (), ()).shaper_words(0) == ''
 
 
 def test_numbers_for_machines_are_in_si_units() -> None:
@@ -203,13 +169,3 @@ def test_numbers_for_machines_are_in_si_units() -> None:
     }
     assert dx['modes'] == [expected]
     assert len(tree['axes']['theta']['modes']) == 2
-
-
-def test_the_table_has_a_row_for_each_mode() -> None:
-    x = Mode(14.0, 0.01, 0.02, 0.001, 12e-6)
-    columns = {c.name: list(c.values) for c in found((x,), (), (mode(21.0), mode(30.0))).table().columns}
-    assert columns['frequency'] == [14.0, 21.0, 30.0]
-    assert columns['frequency_sd'] == [0.01, 1e-4, 1e-4]
-    assert columns['damping_ratio'] == [0.02, 0.02, 0.02]
-    assert columns['damping_ratio_sd'] == [0.001, 1e-4, 1e-4]
-    assert columns['amplitude'] == [12e-6, 1e-3, 1e-3]

@@ -7,12 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from blind.modes import RATE, Link, driven, rung
+from blind.modes import RATE
 from psd_deflection.cli.main import main
-from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify.axis_modes import AxisModes, Mode
 from psd_deflection.studies.identify.from_recordings import IdentifyProblem
-from psd_deflection.studies.identify.identify import identify
 from psd_deflection.studies.identify.result import Identified
 from psd_deflection.studies.study import Opened, opened
 
@@ -67,30 +65,10 @@ def test_doubtful_modes_do_not(source: Opened, x: tuple[Mode, ...], y: tuple[Mod
     assert 'bending_frequency: 14.0' in found(source, (mode(14.0),), (), ()).rig_yaml()
 
 
-def test_the_shaper_of_two_close_modes_works_for_both(source: Opened) -> None:
-    shaper = found(source, (mode(14.0), mode(15.4)), (), ()).shaper_of(0)
-    assert shaper is not None
-    assert float(shaper.residual(np.array([14.0, 14.7, 15.4]), 0.02).max()) <= 0.05
-    # One mode far off is none of its business.
-    alone, beside = (found(source, modes, (), ()).shaper_of(0) for modes in ((mode(14.0),), (mode(14.0), mode(40.0))))
-    assert alone == beside
-
-
 def test_a_damping_ratio_that_may_be_anything_has_no_shaper(source: Opened) -> None:
     answer = found(source, (mode(14.0, 0.02, damping_sd=0.01),), (), ())
     assert answer.shaper_of(0) is None
     assert answer.tree()['axes']['dx']['shaper'] is None
-
-
-def test_turned_bending_planes_leave_the_rig_file_alone(source: Opened) -> None:
-    """Both axes ring with both modes."""
-    link = Link(((14.0, 0.02, 0.5), (14.7, 0.02, 0.5)))
-    x, y = (rung(link, np.random.default_rng(seed), 8.0, 2) for seed in (1, 2))
-    twist = driven(Link(((21.0, 0.02, 1.0),)), np.random.default_rng(3), 8.0)
-    poses: FloatArray = np.column_stack((x, y, twist))
-    answer = identify(IdentifyProblem(source, poses, RATE))
-    assert [len(a.modes) for a in answer.axes[:2]] == [2, 2]
-    assert not any(name.startswith('dynamics.bending') for name in answer.values)
 
 
 def test_a_damping_ratio_of_nothing_is_no_answer(source: Opened) -> None:

@@ -16,27 +16,27 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify import modes as module
 from psd_deflection.studies.identify.modes import (
     Modes,
-    _basis,
-    _ends_well,
-    _fit,
-    _good,
-    _grown,
-    _hints,
-    _of_right_order,
-    _ringing,
-    _rms,
-    _Rung,
-    _rung,
-    _scanned,
-    _seeds,
-    _settled,
-    _sizes,
-    _split,
-    _Stretch,
-    _stretches,
-    _trimmed,
-    _variance_at,
-    _variance_of,
+    RingFit,
+    Stretch,
+    ends_well,
+    find_stretches,
+    fit_modes,
+    fit_ring_downs,
+    fit_trimmed,
+    grow_stretch,
+    hints_at_pair,
+    is_good,
+    mode_columns,
+    mode_sizes,
+    ringing_levels,
+    rms_of,
+    scan_windows,
+    seed_windows,
+    split_mode,
+    trim,
+    variance_at,
+    variance_of,
+    with_right_order,
 )
 
 RATE = 1024.0
@@ -56,8 +56,8 @@ def times(n: int) -> FloatArray:
     return np.arange(n) / RATE
 
 
-def stretch(samples: FloatArray) -> _Stretch:
-    return _Stretch(samples, 0, len(samples), RATE)
+def stretch(samples: FloatArray) -> Stretch:
+    return Stretch(samples, 0, len(samples), RATE)
 
 
 def columns(t: FloatArray, modes: Modes) -> FloatArray:
@@ -72,16 +72,16 @@ def columns(t: FloatArray, modes: Modes) -> FloatArray:
 def test_the_columns_are_a_line_and_damped_turns() -> None:
     t = times(100)[3:]
     modes = [(16.0, 0.02), (40.0, 0.3), (9.0, 1.0)]
-    np.testing.assert_allclose(_basis(t, modes), columns(t, modes), rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(mode_columns(t, modes), columns(t, modes), rtol=1e-12, atol=1e-14)
     # Beyond critical damping it does not turn.
-    assert np.all(_basis(t, [(9.0, 1.4)])[:, 3] == 0.0)
+    assert np.all(mode_columns(t, [(9.0, 1.4)])[:, 3] == 0.0)
 
 
 def test_what_a_stretch_leaves_is_that_of_dense_least_squares() -> None:
     rng = np.random.default_rng(1)
     samples = 1e-4 + 1e-3 * rng.normal(size=400)
     samples[[120, 121, 200]] = math.nan
-    s = _Stretch(samples, 100, 300, RATE)
+    s = Stretch(samples, 100, 300, RATE)
     there = np.array([k for k in range(100, 300) if k not in {120, 121, 200}])
     np.testing.assert_array_equal(s.t, (there - 100) / RATE)
     np.testing.assert_array_equal(s.y, samples[there])
@@ -100,30 +100,9 @@ def test_what_a_stretch_leaves_is_that_of_dense_least_squares() -> None:
 
 
 def test_the_root_of_the_mean_square() -> None:
-    assert _rms(np.array([3.0, -4.0])) == pytest.approx(math.sqrt(12.5))
-    assert _rms(np.zeros(0)) == 0.0
-    assert _Rung([(16.0, 0.02)], np.array([3.0, -4.0]), np.eye(2)).deviation == pytest.approx(math.sqrt(12.5))
-
-
-@pytest.mark.parametrize(('damping', 'bounded'), [(0.96e-5, True), (1.04e-5, False), (0.69, False), (0.695, True)])
-def test_a_damping_ratio_at_its_bound_is_no_answer(damping: float, bounded: bool) -> None:
-    """Below ten times 1e-6, or above 0.99 of 0.7."""
-    assert _Rung([(16.0, 0.02), (40.0, damping)], np.zeros(3), np.eye(4)).bounded is bounded
-
-
-def test_two_modes_are_fitted_to_the_last_digits() -> None:
-    t = times(900)
-    samples = 2e-4 + 1e-4 * t + ring(t, size=1e-6) + ring(t, 40.0, 0.01, 5e-7)
-    for steps in (100, 12):
-        fit = _fit([stretch(samples)], [(16.3, 0.01), (39.5, 0.03)], steps)
-        np.testing.assert_allclose(fit.modes, [(16.0, 0.02), (40.0, 0.01)], rtol=1e-6)
-        assert fit.deviation < 1e-12
-
-
-def test_of_rest_nothing_is_left() -> None:
-    fit = _fit([stretch(np.zeros(100))], [(16.0, 0.02)])
-    assert fit.deviation == 0.0
-    assert np.all(np.isfinite(fit.modes))
+    assert rms_of(np.array([3.0, -4.0])) == pytest.approx(math.sqrt(12.5))
+    assert rms_of(np.zeros(0)) == 0.0
+    assert RingFit([(16.0, 0.02)], np.array([3.0, -4.0]), np.eye(2)).deviation == pytest.approx(math.sqrt(12.5))
 
 
 def test_the_scatter_of_a_fit_is_that_of_its_slopes() -> None:
@@ -131,7 +110,7 @@ def test_the_scatter_of_a_fit_is_that_of_its_slopes() -> None:
     rng = np.random.default_rng(2)
     t = times(700)
     both = [ring(t) + 1e-5 * rng.normal(size=700), ring(t[:500], size=5e-4) + 1e-5 * rng.normal(size=500)]
-    fit = _fit([stretch(y) for y in both], [(16.0, 0.01)])
+    fit = fit_modes([stretch(y) for y in both], [(16.0, 0.01)])
     (frequency, damping) = fit.modes[0]
     assert frequency == pytest.approx(16.0, rel=1e-3)
     assert damping == pytest.approx(0.02, rel=0.03)
@@ -152,23 +131,23 @@ def test_the_scatter_of_a_fit_is_that_of_its_slopes() -> None:
     expected = np.linalg.inv(jacobian.T @ jacobian)[:2, :2]
     np.testing.assert_allclose(fit.covariance.diagonal(), expected.diagonal(), rtol=0.02)
     left = np.concatenate([s.solved(fit.modes)[0] for s in (stretch(y) for y in both)])
-    np.testing.assert_allclose(fit.left, left)
+    np.testing.assert_allclose(fit.residual, left)
     # Least squares: along its slopes nothing is left to gain.
     along = jacobian[:, :2] / np.linalg.norm(jacobian[:, :2], axis=0)
-    assert np.max(np.abs(along.T @ fit.left)) < 1e-3 * np.linalg.norm(fit.left)
+    assert np.max(np.abs(along.T @ fit.residual)) < 1e-3 * np.linalg.norm(fit.residual)
 
 
 @pytest.mark.parametrize(('start', 'end'), [(11.2, 15.68), (23.5, 16.45), (11.5, 16.0), (22.8, 16.0)])
 def test_a_fit_stays_within_thirty_percent_below_and_forty_above(start: float, end: float) -> None:
     t = times(100)
-    fit = _fit([stretch(ring(t, damping=0.1))], [(start, 0.05)])
+    fit = fit_modes([stretch(ring(t, damping=0.1))], [(start, 0.05)])
     assert fit.modes[0][0] == pytest.approx(min(max(16.0, 0.7 * start), 1.4 * start), rel=1e-4)
     assert min(max(16.0, 0.7 * start), 1.4 * start) == pytest.approx(end, abs=0.05)
 
 
 @pytest.mark.parametrize('damping', [0.0, 1.0])
 def test_a_start_outside_of_the_bounds_is_put_inside(damping: float) -> None:
-    fit = _fit([stretch(ring(times(300)))], [(16.1, damping)])
+    fit = fit_modes([stretch(ring(times(300)))], [(16.1, damping)])
     np.testing.assert_allclose(fit.modes, [(16.0, 0.02)], rtol=1e-5)
 
 
@@ -177,7 +156,7 @@ def test_one_mode_is_split_into_two(apart: float) -> None:
     t = np.arange(300) / 128.0
     pair = [(16.0 * (1.0 - apart / 2.0), 0.01), (16.0 * (1.0 + apart / 2.0), 0.012)]
     samples = ring(t, *pair[0], 1e-3) + ring(t, *pair[1], 7e-4, -1.0) + ring(t, 50.0, 0.01, 1e-4)
-    fit = _split([_Stretch(samples, 0, 300, 128.0)], [(50.0, 0.01), (16.0, 0.02)])
+    fit = split_mode([Stretch(samples, 0, 300, 128.0)], [(50.0, 0.01), (16.0, 0.02)])
     np.testing.assert_allclose(sorted(fit.modes), [*pair, (50.0, 0.01)], rtol=1e-5)
 
 
@@ -191,10 +170,10 @@ def test_a_pair_beside_a_mode_is_hinted_at(apart: float, seen: bool, damping: fl
     both = [stretch(y) for y in samples]
     modes = [(50.0, 0.02), (16.0, damping)]
     left = np.concatenate([s.solved(modes)[0] for s in both])
-    fit = _Rung(modes, left, np.eye(4))
+    fit = RingFit(modes, left, np.eye(4))
     squares = float(np.sum(left**2))
-    assert _hints(both, fit, 0.99999999 * squares) is seen
-    assert not _hints(both, fit, 1.0001 * squares)
+    assert hints_at_pair(both, fit, 0.99999999 * squares) is seen
+    assert not hints_at_pair(both, fit, 1.0001 * squares)
 
 
 def test_how_loud_the_ringing_is_is_told_by_dense_least_squares() -> None:
@@ -208,7 +187,7 @@ def test_how_loud_the_ringing_is_is_told_by_dense_least_squares() -> None:
     shapes = np.hstack([*every, *(t[:, None] * c for c in every)])
     shapes -= line @ np.linalg.lstsq(line, shapes, rcond=None)[0]
     shapes /= np.linalg.norm(shapes, axis=0)
-    found = _ringing(samples, RATE, modes, [0, 250, 500], window)
+    found = ringing_levels(samples, RATE, modes, [0, 250, 500], window)
     for first, (loud, rest) in zip((0, 250, 500), found, strict=True):
         y = samples[first : first + window]
         y = y - line @ np.linalg.lstsq(line, y, rcond=None)[0]
@@ -225,7 +204,7 @@ def test_windows_to_begin_with_ring_do_not_overlap_by_half_and_are_there() -> No
     filled = samples.copy()
     samples[2000::4] = math.nan
     window, hop = 384, 32
-    found = _seeds(samples, filled, RATE, [(16.0, 0.01)], 1e-6, window, hop)
+    found = seed_windows(samples, filled, RATE, [(16.0, 0.01)], 1e-6, window, hop)
     firsts = [s.first for s in found]
     assert found[0].first == 0
     assert all(s.last - s.first == window and s.first % hop == 0 for s in found)
@@ -233,26 +212,16 @@ def test_windows_to_begin_with_ring_do_not_overlap_by_half_and_are_there() -> No
     assert max(firsts) < 2000 - window + 0.8 * window
     samples[2000::4] = filled[2000::4]
     samples[2000::6] = math.nan
-    firsts = [s.first for s in _seeds(samples, filled, RATE, [(16.0, 0.01)], 1e-6, window, hop)]
+    firsts = [s.first for s in seed_windows(samples, filled, RATE, [(16.0, 0.01)], 1e-6, window, hop)]
     assert any(first >= 2000 for first in firsts)
     # Down to 8 um at most: later than ln(1000/8)/(zeta w) = 2.4 s after a blow it is too quiet.
     assert max(firsts) > 2900
 
 
-def test_a_window_to_begin_with_swings_eight_times_the_noise() -> None:
-    t = times(1000)
-    for factor, count in ((7.9, 0), (8.1, 2)):
-        # The amplitude of a steady swing is sqrt(2) times its deviation; whole turns, so that no line takes any.
-        samples = factor * 1e-6 * np.cos(2.0 * math.pi * 16.0 * t)
-        level = 1e-6 * float(_ringing(samples, RATE, [(16.0, 0.01)], [0], 384)[0, 0]) / (factor * 1e-6)
-        found = _seeds(samples, samples, RATE, [(16.0, 0.01)], level, 384, 384)
-        assert len(found) == count
-
-
 def test_at_most_thirty_windows_are_tried() -> None:
     t = times(9000)
     samples = 1e-3 * np.cos(2.0 * math.pi * 16.0 * t)
-    assert len(_seeds(samples, samples, RATE, [(16.0, 0.01)], 1e-6, 100, 50)) == 30
+    assert len(seed_windows(samples, samples, RATE, [(16.0, 0.01)], 1e-6, 100, 50)) == 30
 
 
 @pytest.mark.parametrize('early', [False, True])
@@ -268,37 +237,14 @@ def test_half_a_window_at_the_end_fits_by_itself(early: bool) -> None:
         left = np.zeros(300)
         left[order][-50:] = size
         left[order][:-50] = 1.0
-        assert _ends_well(s, left, 100, 1e-6, early) is fits
-        assert early or _ends_well(s, left, 100, 1e-6) is fits
-        assert not _ends_well(s, left, 100, 1e-6, not early)
+        assert ends_well(s, left, 100, 1e-6, early) is fits
+        assert early or ends_well(s, left, 100, 1e-6) is fits
+        assert not ends_well(s, left, 100, 1e-6, not early)
     left = np.zeros(300)
     left[order][-50] = 2.36e-6 * math.sqrt(50.0)
-    assert _ends_well(s, left, 100, 1e-6, early)
+    assert ends_well(s, left, 100, 1e-6, early)
     left[order][-50] *= 1.02
-    assert not _ends_well(s, left, 100, 1e-6, early)
-
-
-@pytest.mark.parametrize(
-    ('left', 'level', 'damping', 'good'),
-    [
-        # 1.25 of the noise, and three thousandths of a swing of 2 mm.
-        (1.24e-6 + 6e-6, 1e-6, 0.02, True),
-        (1.27e-6 + 6e-6, 1e-6, 0.02, False),
-        (0.0, 1e-6, 0.8, False),
-        # Eight times as loud as the noise.
-        (0.0, 1e-3 / 8.05, 0.02, True),
-        (0.0, 1e-3 / 7.95, 0.02, False),
-    ],
-)
-def test_a_stretch_is_good_if_little_is_left_of_loud_ringing(
-    left: float, level: float, damping: float, good: bool
-) -> None:
-    t = times(640)
-    s = stretch(1e-3 * np.cos(2.0 * math.pi * 16.0 * t))
-    if damping < 0.1:
-        assert s.loud([(16.0, 0.0)]) == pytest.approx(1e-3)
-        damping = 2e-5
-    assert _good(s, _Rung([(16.0, damping)], np.full(640, left), np.eye(2)), level) is good
+    assert not ends_well(s, left, 100, 1e-6, early)
 
 
 def test_a_stretch_grows_by_half_a_window_or_a_third_until_a_blow() -> None:
@@ -308,9 +254,9 @@ def test_a_stretch_grows_by_half_a_window_or_a_third_until_a_blow() -> None:
     samples = ring(times(n) - 400.0 / RATE) + 1e-6 * rng.normal(size=n)
     samples[2300:] += 1e-3
     window = 384
-    seed = _Stretch(samples, 1000, 1000 + window, RATE)
-    start = _fit([seed], [(16.0, 0.01)])
-    grown, fit = _grown(samples, seed, start, window, 1e-6)
+    seed = Stretch(samples, 1000, 1000 + window, RATE)
+    start = fit_modes([seed], [(16.0, 0.01)])
+    grown, fit = grow_stretch(samples, seed, start, window, 1e-6)
     first, last = 1000, 1000 + window
     while last + max(window // 2, (last - first) // 3) <= 2300:
         last += max(window // 2, (last - first) // 3)
@@ -322,17 +268,9 @@ def test_a_stretch_grows_by_half_a_window_or_a_third_until_a_blow() -> None:
     # To the first and the last sample of a recording, not beyond.
     for low, high, expected in ((659, 2024, (659, 2024)), (660, 2024, (1000, 2024)), (659, 2023, (659, 1768))):
         cut = samples[low:high]
-        grown, _ = _grown(cut, _Stretch(cut, 1000 - low, 1384 - low, RATE), start, window, 1e-6)
+        grown, _ = grow_stretch(cut, Stretch(cut, 1000 - low, 1384 - low, RATE), start, window, 1e-6)
         assert grown.first + low == max(expected[0], low) or expected[0] < 1000
         assert grown.last + low == expected[1]
-
-
-def test_a_stretch_ends_where_the_recording_ends() -> None:
-    samples = 1e-3 * np.exp(-0.02 * 100.0 * times(400)) * np.cos(100.0 * times(400))
-    samples += 1e-6 * np.random.default_rng(16).normal(size=400)
-    seed = _Stretch(samples, 8, 392, RATE)
-    grown, _ = _grown(samples, seed, _fit([seed], [(16.0, 0.02)]), 384, 1e-6)
-    assert (grown.first, grown.last) == (8, 392)
 
 
 @pytest.mark.parametrize('split', [True, False])
@@ -341,26 +279,26 @@ def test_a_small_blow_that_is_lost_in_the_mean_ends_a_stretch(split: bool, monke
     n = 3000
     samples = ring(times(n) - 400.0 / RATE) + 1e-6 * np.random.default_rng(5).normal(size=n)
     samples[1832:] += 5e-6 * (-1.0) ** np.arange(n - 1832)
-    seed = _Stretch(samples, 1000, 1384, RATE)
-    longer = _Stretch(samples, 1000, 2024, RATE)
-    bad = _fit([longer], [(16.0, 0.02)])
-    assert _good(longer, bad, 1e-6)
+    seed = Stretch(samples, 1000, 1384, RATE)
+    longer = Stretch(samples, 1000, 2024, RATE)
+    bad = fit_modes([longer], [(16.0, 0.02)])
+    assert is_good(longer, bad, 1e-6)
     asked: list[float] = []
 
-    def hints(stretches: Sequence[_Stretch], fit: _Rung, enough: float) -> bool:
+    def hints(stretches: Sequence[Stretch], fit: RingFit, enough: float) -> bool:
         asked.append(enough)
         return split
 
-    monkeypatch.setattr(module, '_hints', hints)
-    monkeypatch.setattr(module, '_split', lambda stretches, modes: _fit(stretches, modes))
-    grown, _ = _grown(samples, seed, _fit([seed], [(16.0, 0.01)]), 384, 1e-6)
+    monkeypatch.setattr(module, 'hints_at_pair', hints)
+    monkeypatch.setattr(module, 'split_mode', lambda stretches, modes: fit_modes(stretches, modes))
+    grown, _ = grow_stretch(samples, seed, fit_modes([seed], [(16.0, 0.01)]), 384, 1e-6)
     assert grown.last == 1768
     # Two modes are tried if they may take off a quarter of the squares.
-    assert asked[0] == pytest.approx(0.25 * float(np.sum(bad.left**2)), rel=1e-3)
+    assert asked[0] == pytest.approx(0.25 * float(np.sum(bad.residual**2)), rel=1e-3)
     # Not if there are three modes already.
     asked.clear()
-    three = _fit([seed], [(16.0, 0.02), (40.0, 0.02), (90.0, 0.02)])
-    _grown(samples, seed, three, 384, 1e-9)
+    three = fit_modes([seed], [(16.0, 0.02), (40.0, 0.02), (90.0, 0.02)])
+    grow_stretch(samples, seed, three, 384, 1e-9)
     assert asked == []
 
 
@@ -368,9 +306,9 @@ def test_two_modes_come_apart_while_a_stretch_grows() -> None:
     t = times(4000)
     rng = np.random.default_rng(6)
     samples = ring(t, 15.6, 0.01, 5e-4) + ring(t, 16.4, 0.01, 5e-4) + 1e-6 * rng.normal(size=4000)
-    seed = _Stretch(samples, 0, 384, RATE)
-    start = _fit([seed], [(16.0, 0.01)])
-    grown, fit = _grown(samples, seed, start, 384, 5e-6)
+    seed = Stretch(samples, 0, 384, RATE)
+    start = fit_modes([seed], [(16.0, 0.01)])
+    grown, fit = grow_stretch(samples, seed, start, 384, 5e-6)
     assert grown.last > 2500
     np.testing.assert_allclose(sorted(fit.modes), [(15.6, 0.01), (16.4, 0.01)], rtol=0.01)
 
@@ -386,7 +324,7 @@ def blows(n: int, firsts: Sequence[int], noise: float = 1e-6) -> FloatArray:
 def test_stretches_begin_after_a_blow_and_end_before_the_next() -> None:
     """Windows of 384 each 32; then half windows are added, to 384 + 192 k."""
     samples = blows(3500, [650, 2000])
-    found = _scanned(samples, RATE, [(16.0, 0.02)], 1e-6, 384, 32)
+    found = scan_windows(samples, RATE, [(16.0, 0.02)], 1e-6, 384, 32)
     first = 672
     last = first + 384 + 192 * ((2000 - first - 384) // 192)
     assert (found[0].first, found[0].last) == (first, last)
@@ -396,8 +334,8 @@ def test_stretches_begin_after_a_blow_and_end_before_the_next() -> None:
     assert len(found) == 2
     # The end of the recording may be the end of a stretch.
     end = found[1].last
-    assert _scanned(samples[:end], RATE, [(16.0, 0.02)], 1e-6, 384, 32)[1].last == end
-    assert _scanned(samples[: end - 1], RATE, [(16.0, 0.02)], 1e-6, 384, 32)[1].last == end - 192
+    assert scan_windows(samples[:end], RATE, [(16.0, 0.02)], 1e-6, 384, 32)[1].last == end
+    assert scan_windows(samples[: end - 1], RATE, [(16.0, 0.02)], 1e-6, 384, 32)[1].last == end - 192
 
 
 @pytest.mark.parametrize(('share', 'fits'), [(0.98, True), (1.02, False)])
@@ -407,30 +345,30 @@ def test_a_window_may_leave_a_hundredth_of_the_ringing_in_its_middle(share: floa
     samples = ring(t[:385])
     allowed = 1.25 * 1e-6 + 0.01 * 1e-3 * math.exp(-6.0 * math.pi * 0.02)
     samples += share * allowed * (-1.0) ** np.arange(385)
-    found = _scanned(samples, RATE, [(16.0, 0.02)], 1e-6, 384, 32)
+    found = scan_windows(samples, RATE, [(16.0, 0.02)], 1e-6, 384, 32)
     assert [(s.first, s.last) for s in found] == ([(0, 384)] if fits else [])
 
 
 @pytest.mark.parametrize(('level', 'fits'), [(1e-3 / 8.1, True), (1e-3 / 7.9, False)])
 def test_a_window_is_eight_times_as_loud_as_the_noise(level: float, fits: bool) -> None:
-    assert bool(_scanned(ring(times(385)), RATE, [(16.0, 0.02)], level, 384, 32)) is fits
+    assert bool(scan_windows(ring(times(385)), RATE, [(16.0, 0.02)], level, 384, 32)) is fits
 
 
 def test_of_a_window_half_is_there_and_twelve_samples() -> None:
     samples = ring(times(385), damping=0.001)
     samples[1:384:2] = math.nan
-    assert len(_scanned(samples, RATE, [(16.0, 0.001)], 1e-6, 384, 32)) == 1
+    assert len(scan_windows(samples, RATE, [(16.0, 0.001)], 1e-6, 384, 32)) == 1
     samples[0] = math.nan
-    assert _scanned(samples, RATE, [(16.0, 0.001)], 1e-6, 384, 32) == []
+    assert scan_windows(samples, RATE, [(16.0, 0.001)], 1e-6, 384, 32) == []
     for there, seen in ((12, True), (11, False)):
         few = ring(times(17), 200.0, damping=0.001)
         few[[3, 6, 8, 10, 13][: 16 - there]] = math.nan
-        assert bool(_scanned(few, RATE, [(200.0, 0.001)], 1e-6, 16, 2)) is seen
+        assert bool(scan_windows(few, RATE, [(200.0, 0.001)], 1e-6, 16, 2)) is seen
 
 
 def test_the_search_finds_the_ring_downs_and_their_mode() -> None:
     samples = blows(4000, [650, 2000])
-    found, modes = _stretches(samples, samples, RATE, [(15.5, 0.01)], 1e-6)
+    found, modes = find_stretches(samples, samples, RATE, [(15.5, 0.01)], 1e-6)
     # Windows of six periods each half a period, of the frequency that is known at first.
     window, hop = round(6.0 * RATE / 15.5), round(0.5 * RATE / 15.5)
     firsts = [hop * math.ceil(650 / hop)]
@@ -440,7 +378,7 @@ def test_the_search_finds_the_ring_downs_and_their_mode() -> None:
     assert 2000 <= found[1].first < 2000 + hop
     np.testing.assert_allclose(modes, [(16.0, 0.02)], rtol=2e-3)
     noise = 1e-6 * np.random.default_rng(8).normal(size=3000)
-    assert _stretches(noise, noise, RATE, [(15.5, 0.01)], 1e-6) == ([], [(15.5, 0.01)])
+    assert find_stretches(noise, noise, RATE, [(15.5, 0.01)], 1e-6) == ([], [(15.5, 0.01)])
 
 
 @pytest.mark.parametrize(('level', 'told'), [(1e-6, 3e-6), (4e-6, 4e-6)])
@@ -453,20 +391,20 @@ def test_of_three_windows_that_grow_the_longest_tells_the_modes(
     seen: list[Modes] = []
     scanned: list[tuple[Modes, float, int, int]] = []
 
-    def grown(samples: FloatArray, seed: _Stretch, start: _Rung, window: int, level: float) -> tuple[_Stretch, _Rung]:
+    def grown(samples: FloatArray, seed: Stretch, start: RingFit, window: int, level: float) -> tuple[Stretch, RingFit]:
         length, first = lengths[len(seen)], (100, 200, 4000)[len(seen)]
         seen.append(start.modes)
-        return _Stretch(samples, first, first + length, RATE), _Rung(
+        return Stretch(samples, first, first + length, RATE), RingFit(
             [(float(length), 0.02)], np.full(4, 3e-6), np.eye(2)
         )
 
-    def scan(samples: FloatArray, rate: float, modes: Modes, level: float, window: int, hop: int) -> list[_Stretch]:
+    def scan(samples: FloatArray, rate: float, modes: Modes, level: float, window: int, hop: int) -> list[Stretch]:
         scanned.append((modes, level, window, hop))
         return []
 
-    monkeypatch.setattr(module, '_grown', grown)
-    monkeypatch.setattr(module, '_scanned', scan)
-    assert _stretches(samples, samples, RATE, [(16.0, 0.01)], level) == ([], [(900.0, 0.02)])
+    monkeypatch.setattr(module, 'grow_stretch', grown)
+    monkeypatch.setattr(module, 'scan_windows', scan)
+    assert find_stretches(samples, samples, RATE, [(16.0, 0.01)], level) == ([], [(900.0, 0.02)])
     assert len(seen) == 3
     np.testing.assert_allclose(np.reshape(seen, (3, 2)), [(16.0, 0.02)] * 3, rtol=0.02)
     # Six periods, and half a one.
@@ -482,21 +420,21 @@ def test_if_no_window_fits_the_first_ten_are_split(fits: int, splits: int, monke
     samples = blows(6000, [100, 2000, 4000])
     count = 0
 
-    def split(stretches: Sequence[_Stretch], modes: Modes) -> _Rung:
+    def split(stretches: Sequence[Stretch], modes: Modes) -> RingFit:
         nonlocal count
         count += 1
         assert modes == [(16.0, 0.01)]
-        return _Rung([(16.0, 0.02)], np.full(4, 1e-9 if count > fits else 1.0), np.eye(2))
+        return RingFit([(16.0, 0.02)], np.full(4, 1e-9 if count > fits else 1.0), np.eye(2))
 
-    def grown(samples: FloatArray, seed: _Stretch, start: _Rung, window: int, level: float) -> tuple[_Stretch, _Rung]:
+    def grown(samples: FloatArray, seed: Stretch, start: RingFit, window: int, level: float) -> tuple[Stretch, RingFit]:
         return seed, start
 
     monkeypatch.setattr(
-        module, '_fit', lambda stretches, start, steps=100: _Rung([(16.0, 0.02)], np.ones(4), np.eye(2))
+        module, 'fit_modes', lambda stretches, start, steps=100: RingFit([(16.0, 0.02)], np.ones(4), np.eye(2))
     )
-    monkeypatch.setattr(module, '_split', split)
-    monkeypatch.setattr(module, '_grown', grown)
-    found, modes = _stretches(samples, samples, RATE, [(16.0, 0.01)], 1e-6)
+    monkeypatch.setattr(module, 'split_mode', split)
+    monkeypatch.setattr(module, 'grow_stretch', grown)
+    found, modes = find_stretches(samples, samples, RATE, [(16.0, 0.01)], 1e-6)
     assert count == splits
     assert bool(found) is (fits == 2)
     assert modes == ([(16.0, 0.02)] if found else [(16.0, 0.01)])
@@ -507,7 +445,7 @@ def test_the_largest_ringing_of_each_mode() -> None:
     first = ring(t, size=1e-3) + ring(t, 50.0, 0.01, 1e-4)
     second = ring(t, size=6e-4) + ring(t, 50.0, 0.01, 3e-4)
     np.testing.assert_allclose(
-        _sizes([stretch(first), stretch(second)], [(16.0, 0.02), (50.0, 0.01)]), [1e-3, 3e-4], rtol=1e-6
+        mode_sizes([stretch(first), stretch(second)], [(16.0, 0.02), (50.0, 0.01)]), [1e-3, 3e-4], rtol=1e-6
     )
 
 
@@ -515,20 +453,20 @@ def test_a_mode_stays_if_it_saves_30_variances_and_4_each_stretch(monkeypatch: p
     t = times(800)
     rng = np.random.default_rng(9)
     both = [stretch(ring(t, size=s) + ring(t, 50.0, 0.01, 5e-6) + 1e-6 * rng.normal(size=800)) for s in (1e-3, -7e-4)]
-    two = _fit(both, [(50.0, 0.01), (16.0, 0.02)])
-    one = _fit(both, [(16.0, 0.02)])
-    saved = float(np.sum(one.left**2) - np.sum(two.left**2))
+    two = fit_modes(both, [(50.0, 0.01), (16.0, 0.02)])
+    one = fit_modes(both, [(16.0, 0.02)])
+    saved = float(np.sum(one.residual**2) - np.sum(two.residual**2))
     for factor, count in ((37.9, 1), (38.1, 2)):
         asked: list[float] = []
 
         def variance(
-            fit: _Rung, stretches: Sequence[_Stretch], rate: float, frequency: float, value: float = saved / factor
+            fit: RingFit, stretches: Sequence[Stretch], rate: float, frequency: float, value: float = saved / factor
         ) -> float:
             asked.append(frequency)  # noqa: B023
             return value
 
-        monkeypatch.setattr(module, '_variance_at', variance)
-        fit = _of_right_order(both, two, RATE)
+        monkeypatch.setattr(module, 'variance_at', variance)
+        fit = with_right_order(both, two, RATE)
         assert len(fit.modes) == count
         assert fit.modes[-1][0] == pytest.approx(16.0, rel=1e-3)
         # The noise at the frequency of the mode in question.
@@ -539,7 +477,7 @@ def test_modes_that_beat_are_added_until_nothing_is_left() -> None:
     t = times(2500)
     rng = np.random.default_rng(10)
     pair = ring(t, 15.7, 0.01, 1e-3) + ring(t, 16.3, 0.01, 6e-4, 1.0) + 1e-6 * rng.normal(size=2500)
-    fit = _of_right_order([stretch(pair)], _fit([stretch(pair)], [(16.0, 0.01)]), RATE)
+    fit = with_right_order([stretch(pair)], fit_modes([stretch(pair)], [(16.0, 0.01)]), RATE)
     np.testing.assert_allclose(sorted(fit.modes), [(15.7, 0.01), (16.3, 0.01)], rtol=0.01)
 
 
@@ -552,38 +490,25 @@ def test_a_further_mode_has_a_hundredth_of_the_loudest_and_saves_enough(
     """In one stretch 34 variances; three tenths of that are a hint to try it."""
     t = times(600)
     s = stretch(ring(t, size=1e-3) + ring(t, 50.0, 0.01, size) + 1e-9 * np.random.default_rng(11).normal(size=600))
-    one, two = _fit([s], [(16.0, 0.02)]), _fit([s], [(16.0, 0.02), (50.0, 0.01)])
-    variance = float(np.sum(one.left**2) - np.sum(two.left**2)) / saves
+    one, two = fit_modes([s], [(16.0, 0.02)]), fit_modes([s], [(16.0, 0.02), (50.0, 0.01)])
+    variance = float(np.sum(one.residual**2) - np.sum(two.residual**2)) / saves
     asked: list[float] = []
 
-    def hints(stretches: Sequence[_Stretch], fit: _Rung, enough: float) -> bool:
+    def hints(stretches: Sequence[Stretch], fit: RingFit, enough: float) -> bool:
         asked.append(enough)
         return len(fit.modes) == 1
 
-    monkeypatch.setattr(module, '_hints', hints)
-    monkeypatch.setattr(module, '_split', lambda stretches, modes: two)
+    monkeypatch.setattr(module, 'hints_at_pair', hints)
+    monkeypatch.setattr(module, 'split_mode', lambda stretches, modes: two)
 
-    def variance_at(fit: _Rung, stretches: Sequence[_Stretch], rate: float, frequency: float) -> float:
+    def variance_at(fit: RingFit, stretches: Sequence[Stretch], rate: float, frequency: float) -> float:
         assert frequency == pytest.approx(16.0, rel=1e-3)
         return variance
 
-    monkeypatch.setattr(module, '_variance_at', variance_at)
-    assert len(_of_right_order([s], one, RATE).modes) == count
+    monkeypatch.setattr(module, 'variance_at', variance_at)
+    assert len(with_right_order([s], one, RATE).modes) == count
     np.testing.assert_allclose(asked, 0.3 * 34.0 * variance)
     assert len(asked) == count
-
-
-def test_three_modes_are_the_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    t = times(600)
-    s = stretch(ring(t) + ring(t, 50.0, 0.01) + ring(t, 90.0, 0.01) + 1e-6 * np.random.default_rng(15).normal(size=600))
-    more = [_fit([s], [(16.0, 0.02), (50.0, 0.01), (90.0, 0.01)][:k]) for k in (1, 2, 3)]
-    monkeypatch.setattr(module, '_hints', lambda stretches, fit, enough: True)
-    monkeypatch.setattr(module, '_split', lambda stretches, modes: more[len(modes)])
-    assert _of_right_order([s], more[0], RATE) is more[2]
-    # One too much is dropped: the one that makes no difference, not the loudest.
-    noise = _fit([s], [(90.0, 0.01), (16.0, 0.02), (50.0, 0.01), (130.0, 0.01)])
-    monkeypatch.setattr(module, '_hints', lambda stretches, fit, enough: False)
-    assert [round(f) for f, _ in _of_right_order([s], noise, RATE).modes] == [90, 16, 50]
 
 
 def trimmed(
@@ -594,10 +519,10 @@ def trimmed(
 ) -> tuple[int, int] | None:
     """What is kept of pieces of so many samples, a quarter of a period, that leave so much."""
     samples = np.zeros(3000)
-    s = _Stretch(samples, 100, 100 + piece * len(scatter), RATE)
+    s = Stretch(samples, 100, 100 + piece * len(scatter), RATE)
     left = np.repeat(scatter, piece) * np.resize(pattern, piece * len(scatter))
-    monkeypatch.setattr(_Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
-    kept = _trimmed(s, samples, RATE, [(RATE / (4.0 * piece), 0.02), (40.0, 0.02)])
+    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
+    kept = trim(s, samples, RATE, [(RATE / (4.0 * piece), 0.02), (40.0, 0.02)])
     return None if kept is None else (kept.first, kept.last)
 
 
@@ -615,18 +540,6 @@ def test_the_ends_that_fit_worse_are_cut(monkeypatch: pytest.MonkeyPatch) -> Non
     assert trimmed([*usual[:19], 9.0, *usual[20:]], monkeypatch) == (420, 740)
 
 
-def test_errors_that_remember_are_worth_fewer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Four of a sign and four of the other: neighbours correlate by a half, which leaves a third of 16."""
-    alike = (1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0)
-    limit = 1.0 + 4.0 / math.sqrt(2.0 * 16.0 / 3.0)
-    assert trimmed([*[1.0] * 39, limit * 0.98], monkeypatch, alike) == (100, 740)
-    assert trimmed([*[1.0] * 39, limit * 1.03], monkeypatch, alike) == (100, 724)
-    # All of one sign: a correlation of 0.95 is the most that is believed, and one sample is left at least.
-    limit = 1.0 + 4.0 / math.sqrt(2.0)
-    assert trimmed([*[1.0] * 39, limit * 0.98], monkeypatch, (1.0,)) == (100, 740)
-    assert trimmed([*[1.0] * 39, limit * 1.03], monkeypatch, (1.0,)) == (100, 724)
-
-
 def test_however_errors_remember_a_fortieth_of_the_samples_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of a memory of 0.95 there are 0.05/1.95; of 64 samples that is 1.64."""
     limit = 1.0 + 4.0 / math.sqrt(2.0 * 64.0 * 0.05 / 1.95)
@@ -636,40 +549,40 @@ def test_however_errors_remember_a_fortieth_of_the_samples_counts(monkeypatch: p
 
 def test_of_fast_modes_a_piece_has_four_samples(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = np.zeros(200)
-    s = _Stretch(samples, 0, 200, RATE)
+    s = Stretch(samples, 0, 200, RATE)
     left = np.ones(200) * np.resize((1.0, -1.0), 200)
     left[197] = 50.0
-    monkeypatch.setattr(_Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
-    kept = _trimmed(s, samples, RATE, [(128.0, 0.02)])
+    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
+    kept = trim(s, samples, RATE, [(128.0, 0.02)])
     assert kept is not None
     assert (kept.first, kept.last) == (0, 196)
 
 
 def test_a_piece_of_one_sample_counts_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = np.zeros(400)
-    s = _Stretch(samples, 10, 10 + 16 * 20 + 1, RATE)
+    s = Stretch(samples, 10, 10 + 16 * 20 + 1, RATE)
     left = np.resize((1.0, -1.0), 321)
-    monkeypatch.setattr(_Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
+    monkeypatch.setattr(Stretch, 'solved', lambda self, modes: (left, np.zeros(4)))
     for size, last in ((1.65, 331), (1.75, 330)):
         left[-1] = size
-        kept = _trimmed(s, samples, RATE, [(16.0, 0.02)])
+        kept = trim(s, samples, RATE, [(16.0, 0.02)])
         assert kept is not None
         assert (kept.first, kept.last) == (10, last)
 
 
 def test_the_ends_are_cut_three_times_at_most(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = blows(3000, [0])
-    both = [_Stretch(samples, 0, 1000, RATE), _Stretch(samples, 1000, 1500, RATE)]
+    both = [Stretch(samples, 0, 1000, RATE), Stretch(samples, 1000, 1500, RATE)]
 
-    def cut(s: _Stretch, samples: FloatArray, rate: float, modes: Modes) -> _Stretch | None:
-        return _Stretch(samples, s.first + 10, s.last, rate) if s.last == 1000 else None
+    def cut(s: Stretch, samples: FloatArray, rate: float, modes: Modes) -> Stretch | None:
+        return Stretch(samples, s.first + 10, s.last, rate) if s.last == 1000 else None
 
-    monkeypatch.setattr(module, '_trimmed', cut)
-    kept, fit = _settled(samples, RATE, both, [(16.0, 0.02)])
+    monkeypatch.setattr(module, 'trim', cut)
+    kept, fit = fit_trimmed(samples, RATE, both, [(16.0, 0.02)])
     assert [(s.first, s.last) for s in kept] == [(30, 1000)]
-    assert len(fit.left) == 970
+    assert len(fit.residual) == 970
     # If nothing would be left, all is.
-    kept, fit = _settled(samples, RATE, both[1:], [(16.0, 0.02)])
+    kept, fit = fit_trimmed(samples, RATE, both[1:], [(16.0, 0.02)])
     assert [(s.first, s.last) for s in kept] == [(1000, 1500)]
 
 
@@ -681,28 +594,15 @@ def test_four_periods_are_left_at_least(monkeypatch: pytest.MonkeyPatch) -> None
     assert trimmed([*[1.0] * 15, 9.0, *[1.0] * 4], monkeypatch) is None
 
 
-def test_a_piece_without_samples_is_no_bad_one() -> None:
-    """And what is lost does not change the usual."""
-    rng = np.random.default_rng(12)
-    samples = ring(times(900)) + 1e-6 * rng.normal(size=900)
-    samples[200:420] = math.nan
-    samples[-40:] += 1e-4
-    s = _Stretch(samples, 0, 900, RATE)
-    kept = _trimmed(s, samples, RATE, [(16.0, 0.02)])
-    assert kept is not None
-    assert kept.first == 0
-    assert 840 <= kept.last <= 864
-
-
 def test_the_variance_of_what_is_left_is_for_its_freedom() -> None:
     """A mode and a line of each of two stretches are eight, the mode two more."""
     s = stretch(np.zeros(20))
-    one = _Rung([(16.0, 0.02)], np.full(40, 3.0), np.eye(2))
-    assert _variance_of(one, [s, s]) == pytest.approx(9.0 * 40 / 30)
-    two = _Rung([(16.0, 0.02), (40.0, 0.02)], np.full(40, 3.0), np.eye(4))
-    assert _variance_of(two, [s, s]) == pytest.approx(9.0 * 40 / 24)
-    assert _variance_of(two, [s] * 5) == pytest.approx(9.0 * 40 / 6)
-    assert _variance_of(two, [s] * 6) == pytest.approx(9.0 * 40)
+    one = RingFit([(16.0, 0.02)], np.full(40, 3.0), np.eye(2))
+    assert variance_of(one, [s, s]) == pytest.approx(9.0 * 40 / 30)
+    two = RingFit([(16.0, 0.02), (40.0, 0.02)], np.full(40, 3.0), np.eye(4))
+    assert variance_of(two, [s, s]) == pytest.approx(9.0 * 40 / 24)
+    assert variance_of(two, [s] * 5) == pytest.approx(9.0 * 40 / 6)
+    assert variance_of(two, [s] * 6) == pytest.approx(9.0 * 40)
 
 
 @pytest.mark.parametrize(
@@ -716,7 +616,7 @@ def test_the_variance_at_a_mode_is_that_of_white_noise_of_its_density(
     rng = np.random.default_rng(13)
     left = np.cumsum(rng.normal(size=n))
     modes = [(frequency * 1.01, 0.02), *[(frequency * 0.72, 0.02)] * (close - 1), (frequency * 1.31, 0.02)]
-    fit = _Rung(modes, left, np.eye(2 * len(modes)))
+    fit = RingFit(modes, left, np.eye(2 * len(modes)))
     f, p = periodogram(left, rate)
     near = [v for k, v in zip(f, p, strict=True) if abs(k - frequency) < half_width]
     assert len(near) == count
@@ -725,16 +625,16 @@ def test_the_variance_at_a_mode_is_that_of_white_noise_of_its_density(
         free = max(2 * count - 2 * close * (stretches + 1), 2)
         expected = sum(near) * rate / free
         # More than the mean, as this noise remembers.
-        assert _variance_at(fit, [s] * stretches, rate, frequency) == pytest.approx(
-            max(expected, _variance_of(fit, [s] * stretches)), rel=1e-9
+        assert variance_at(fit, [s] * stretches, rate, frequency) == pytest.approx(
+            max(expected, variance_of(fit, [s] * stretches)), rel=1e-9
         )
-    assert _variance_at(fit, [s], rate, 300.0) == pytest.approx(_variance_of(fit, [s]))
+    assert variance_at(fit, [s], rate, 300.0) == pytest.approx(variance_of(fit, [s]))
 
 
 def test_the_fit_goes_through_the_samples_of_each_stretch() -> None:
     samples = blows(3500, [650, 2000])
-    found = _rung(
-        samples, RATE, [(16.1, 0.01)], [_Stretch(samples, *ends, RATE) for ends in ((660, 1900), (2010, 3400))]
+    found = fit_ring_downs(
+        samples, RATE, [(16.1, 0.01)], [Stretch(samples, *ends, RATE) for ends in ((660, 1900), (2010, 3400))]
     )
     assert found.stretches == ((660, 1900), (2010, 3400))
     assert found.how == 'ring-down'
@@ -763,18 +663,18 @@ def test_the_fit_goes_through_the_samples_of_each_stretch() -> None:
 
 def test_each_mode_has_its_own_scatter_and_the_loudest_is_first(monkeypatch: pytest.MonkeyPatch) -> None:
     samples = np.zeros(1000)
-    fit = _Rung([(16.0, 0.02), (50.0, 0.03)], np.full(1000, 2e-6), np.diag([4.0, 9.0, 16.0, 25.0]))
-    s = _Stretch(samples, 0, 1000, RATE)
+    fit = RingFit([(16.0, 0.02), (50.0, 0.03)], np.full(1000, 2e-6), np.diag([4.0, 9.0, 16.0, 25.0]))
+    s = Stretch(samples, 0, 1000, RATE)
     asked: list[float] = []
 
-    def variance(fit: _Rung, stretches: Sequence[_Stretch], rate: float, frequency: float) -> float:
+    def variance(fit: RingFit, stretches: Sequence[Stretch], rate: float, frequency: float) -> float:
         asked.append(frequency)
         return 1e-4 * frequency
 
-    monkeypatch.setattr(module, '_settled', lambda *a: ([s], fit))
-    monkeypatch.setattr(module, '_sizes', lambda *a: np.array([1e-4, 1e-3]))
-    monkeypatch.setattr(module, '_variance_at', variance)
-    found = _rung(samples, RATE, fit.modes, [s])
+    monkeypatch.setattr(module, 'fit_trimmed', lambda *a: ([s], fit))
+    monkeypatch.setattr(module, 'mode_sizes', lambda *a: np.array([1e-4, 1e-3]))
+    monkeypatch.setattr(module, 'variance_at', variance)
+    found = fit_ring_downs(samples, RATE, fit.modes, [s])
     assert asked == [16.0, 50.0]
     assert found.noise == pytest.approx(2e-6)
     loud, quiet = found.modes
@@ -798,37 +698,37 @@ def test_the_stretches_are_sought_again_with_the_mode_that_was_missing(
 ) -> None:
     """Three times at most, as long as there are more samples in them. Windows are of the first mode."""
     samples = np.zeros(3000)
-    fit = _Rung([(16.0, 0.02), (50.0, 0.03)], np.full(1000, 2e-6), np.eye(4))
+    fit = RingFit([(16.0, 0.02), (50.0, 0.03)], np.full(1000, 2e-6), np.eye(4))
     left = list(scans)
     settled: list[int] = []
 
     def settle(
-        samples: FloatArray, rate: float, stretches: list[_Stretch], start: Modes
-    ) -> tuple[list[_Stretch], _Rung]:
+        samples: FloatArray, rate: float, stretches: list[Stretch], start: Modes
+    ) -> tuple[list[Stretch], RingFit]:
         settled.append(stretches[0].last - stretches[0].first)
         return stretches, fit
 
-    def scan(samples: FloatArray, rate: float, modes: Modes, level: float, window: int, hop: int) -> list[_Stretch]:
+    def scan(samples: FloatArray, rate: float, modes: Modes, level: float, window: int, hop: int) -> list[Stretch]:
         assert (modes, window, hop) == (fit.modes, 384, 32)
         assert level == pytest.approx(2e-6)
-        return [_Stretch(samples, 100, 100 + left.pop(0), RATE)]
+        return [Stretch(samples, 100, 100 + left.pop(0), RATE)]
 
-    monkeypatch.setattr(module, '_settled', settle)
-    monkeypatch.setattr(module, '_scanned', scan)
-    monkeypatch.setattr(module, '_sizes', lambda *a: np.array([1e-3, 1e-4]))
-    found = _rung(samples, RATE, fit.modes[:1], [_Stretch(samples, 300, 800, RATE)])
+    monkeypatch.setattr(module, 'fit_trimmed', settle)
+    monkeypatch.setattr(module, 'scan_windows', scan)
+    monkeypatch.setattr(module, 'mode_sizes', lambda *a: np.array([1e-3, 1e-4]))
+    found = fit_ring_downs(samples, RATE, fit.modes[:1], [Stretch(samples, 300, 800, RATE)])
     assert settled == [500, *lengths]
     assert found.stretches == (((100, 100 + lengths[-1]),) if lengths else ((300, 800),))
     # With the modes that were known nothing is sought again.
     left[:] = [999]
-    _rung(samples, RATE, fit.modes, [_Stretch(samples, 300, 800, RATE)])
+    fit_ring_downs(samples, RATE, fit.modes, [Stretch(samples, 300, 800, RATE)])
     assert left == [999]
 
 
 def test_ends_that_reach_into_a_blow_are_cut_before_the_fit() -> None:
     samples = blows(3500, [650, 2000])
-    reaching = [_Stretch(samples, 640, 1900, RATE), _Stretch(samples, 2010, 3400, RATE)]
-    kept, fit = _settled(samples, RATE, reaching, [(16.1, 0.01)])
+    reaching = [Stretch(samples, 640, 1900, RATE), Stretch(samples, 2010, 3400, RATE)]
+    kept, fit = fit_trimmed(samples, RATE, reaching, [(16.1, 0.01)])
     assert 650 <= kept[0].first < 1000
     assert (kept[0].last, kept[1].first, kept[1].last) == (1900, 2010, 3400)
     np.testing.assert_allclose(fit.modes, [(16.0, 0.02)], rtol=2e-3)
@@ -839,14 +739,7 @@ def test_with_the_mode_that_was_missing_the_stretches_are_longer() -> None:
     t = times(3000)
     rng = np.random.default_rng(14)
     samples = ring(t, 15.7, 0.01, 1e-3) + ring(t, 16.3, 0.01, 6e-4, 1.0) + 1e-6 * rng.normal(size=3000)
-    found = _rung(samples, RATE, [(16.0, 0.01)], [_Stretch(samples, 0, 1000, RATE)])
+    found = fit_ring_downs(samples, RATE, [(16.0, 0.01)], [Stretch(samples, 0, 1000, RATE)])
     assert len(found.modes) == 2
     assert found.modes[0].amplitude > found.modes[1].amplitude
     assert sum(last - first for first, last in found.stretches) > 2000
-
-
-def test_a_fit_at_its_bounds_is_no_mode() -> None:
-    samples = 1e-3 * np.cos(2.0 * math.pi * 16.0 * times(1000))
-    found = _rung(samples, RATE, [(16.0, 0.01)], [_Stretch(samples, 0, 1000, RATE)])
-    assert (found.modes, found.how, found.stretches) == ((), 'none', ())
-    assert np.all(np.isnan(found.fitted))

@@ -16,7 +16,7 @@ from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import noted_times
 from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.noted_times import (
-    mend_loads,
+    correct_loads,
     unnoted_steps,
 )
 from psd_deflection.studies.loads.steps import last_step
@@ -89,9 +89,7 @@ def test_one_time_is_fitted_beside_drift_and_the_ringing_of_before(start: float,
         ((4950.0, 5050.0), (4900, 5100)),
     ],
 )
-def test_a_time_is_fitted_to_a_second_before_and_two_after_without_the_neighbours(
-    between: tuple[float, float], window: tuple[int, int]
-) -> None:
+def test_a_time_is_fitted_without_its_neighbours(between: tuple[float, float], window: tuple[int, int]) -> None:
     looked = Looked(moved_by(5.0, 0.0, 9000))
     step = steps_module.DotStep(5000.0, 1e-4, 4900, 5100)
     steps_module.time_of_step(RIG, cast(FloatArray, looked), step, between, 1e-3)
@@ -121,7 +119,7 @@ def test_a_time_late_in_a_long_recording_is_fitted_as_well() -> None:
     assert found == pytest.approx((1003.0, 0.0), abs=3e-4)
 
 
-def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_it_leaves_less_than_half(
+def test_steps_every_6_ms_and_ramps_below_half_are_fitted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[list[tuple[float, float]], float]] = []
@@ -131,7 +129,7 @@ def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_i
         asked.append((starts, reach))
         return (1.0, (3.01, 0.0)) if len(asked) % 2 else (slowly[0], (2.5, -1.1))
 
-    monkeypatch.setattr(steps_module, '_least', least)
+    monkeypatch.setattr(steps_module, 'best_time', least)
     step = steps_module.DotStep(3000.0, 1e-4, 2800, 3200)
     for left, found in ((0.49, (2.5, 1.1)), (0.5, (3.01, 0.0)), (1.2, (3.01, 0.0))):
         slowly[0] = left
@@ -145,31 +143,16 @@ def test_a_step_is_looked_for_every_six_milliseconds_and_a_ramp_is_believed_if_i
     assert (by, seconds) == (1e-3, 0.05)
 
 
-def test_the_search_begins_with_a_reach_to_either_side_and_ends_after_120_looks() -> None:
+def test_the_time_search_ends_after_120_evaluations() -> None:
     looks: list[tuple[float, float]] = []
 
     def down(x: FloatArray) -> float:
         looks.append((float(x[0]), float(x[1])))
         return float(-x[0] - 2.0 * x[1])
 
-    steps_module._least(down, [(1.0, 0.5), (2.0, 1.0)], 0.25)
+    steps_module.best_time(down, [(1.0, 0.5), (2.0, 1.0)], 0.25)
     assert looks[2:5] == [(2.0, 1.0), (2.25, 1.0), (2.0, 1.25)]
     assert len(looks) == 2 + 120
-
-
-def test_the_least_of_a_valley_is_found_from_the_best_start() -> None:
-    def valley(x: FloatArray) -> float:
-        return float((x[0] - 1.23) ** 2 + 4.0 * (x[1] - 0.61) ** 2 + 2.0)
-
-    least, (at, took) = steps_module._least(valley, [(0.0, 0.3), (1.2, 0.6), (5.0, 1.0)], 0.05)
-    assert (least, at, took) == pytest.approx((2.0, 1.23, 0.61), abs=1e-3)
-    # Without a duration it keeps none, and looks six reaches about.
-    least, (at, took) = steps_module._least(valley, [(0.0, 0.0), (1.2, 0.0), (5.0, 0.0)], 0.01)
-    assert at == pytest.approx(1.23, abs=2e-5)
-    assert took == 0.0
-    assert least == pytest.approx(2.0 + 4.0 * 0.61**2)
-    for begun, end in ((1.1, 1.16), (1.4, 1.34)):
-        assert steps_module._least(valley, [(begun, 0.0)], 0.01)[1][0] == pytest.approx(end, abs=5e-5)
 
 
 # ---- what is left
@@ -191,7 +174,7 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
     there = np.asarray(np.isfinite(dots).all(axis=1))
     rest = np.where(there[:, None], dots - design @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0], np.nan)
     with np.errstate(invalid='raise', divide='raise'):
-        left, means = noted_times._left(RIG, dots, loads)
+        left, means = noted_times.residual_of_dots(RIG, dots, loads)
     assert left == pytest.approx(float(np.nansum(rest**2)), rel=1e-6)
     assert means.shape == dots.shape
     for first in range(0, 1010, 20):
@@ -199,12 +182,12 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
         wanted = np.nanmean(part, axis=0) if np.isfinite(part).any() else np.full(4, np.nan)
         assert means[first : first + 20] == pytest.approx(np.tile(wanted, (len(part), 1)), rel=1e-4, nan_ok=True)
     # A millionth of the loads moves the dots alike.
-    assert noted_times._left(RIG, dots, 1e-6 * loads)[0] == pytest.approx(left, rel=1e-6)
+    assert noted_times.residual_of_dots(RIG, dots, 1e-6 * loads)[0] == pytest.approx(left, rel=1e-6)
     # And one axis that is never loaded does nothing.
     loads[:, 1] = 0.0
     design[:, 3] = 0.0
     rest = dots[there] - design[there] @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0]
-    assert noted_times._left(RIG, dots, loads)[0] == pytest.approx(float((rest**2).sum()), rel=1e-6)
+    assert noted_times.residual_of_dots(RIG, dots, loads)[0] == pytest.approx(float((rest**2).sum()), rel=1e-6)
 
 
 def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
@@ -213,13 +196,13 @@ def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
     # 1 / (2 pi f ratio): 0.568 s of 14 Hz at 0.02, 0.318 s of 10 Hz at 0.05.
     wanted = 5.0 / (2.0 * math.pi * 14.0 * 0.02)
     for took in (0.0, 0.7):
-        moving = np.flatnonzero(noted_times._moving(rig, note(3.0, 2.0, took), t))
+        moving = np.flatnonzero(noted_times.in_motion(rig, note(3.0, 2.0, took), t))
         assert moving[0] == 1980
         assert moving[-1] == math.floor(1000.0 * (2.0 + took + wanted))
         assert len(moving) == moving[-1] - moving[0] + 1
     # Without damping of a thousandth or more it would never end.
     free = load_rig(overrides={'dynamics.torsion_frequency': 200.0, 'dynamics.torsion_damping_ratio': 0.0})
-    assert np.flatnonzero(noted_times._moving(free, note(3.0, 2.0), t))[-1] == math.floor(
+    assert np.flatnonzero(noted_times.in_motion(free, note(3.0, 2.0), t))[-1] == math.floor(
         2000.0 + 5e6 / (400.0 * math.pi)
     )
 
@@ -237,32 +220,32 @@ def test_ringing_is_rough_beyond_three_times_the_noise() -> None:
     # Six that are s off their mean, of four dots: 4 s^2, above 9 * 2 if s is above 2.1.
     for size, rough in ((2.1, False), (2.14, True)):
         rest = rest_of([*quiet, *[size, -size] * 3])
-        assert noted_times._rough(rest, rings, 4) is rough
+        assert noted_times.is_rough(rest, rings, 4) is rough
         # About their own mean.
         rest[-24:] += 50.0
-        assert noted_times._rough(rest, rings, 4) is rough
+        assert noted_times.is_rough(rest, rings, 4) is rough
     # Exactly three times is not beyond: 1.5 of two dots, beside quiet ones of which one differs by 1.
     rest = rest_of([*quiet, *[1.5, -1.5] * 3]) * (1.0, 0.0, 0.0, 0.0)
     rest[-24:, 1] = rest[-24:, 0]
-    assert not noted_times._rough(rest, rings, 4)
-    assert noted_times._rough(1.01 * rest - 0.01 * rest * ~rings[:, None], rings, 4)
+    assert not noted_times.is_rough(rest, rings, 4)
+    assert noted_times.is_rough(1.01 * rest - 0.01 * rest * ~rings[:, None], rings, 4)
     # A lost block counts as none, and of three nothing is told.
     rest = rest_of([*quiet, *[5.0, -5.0] * 3])
     rest[-8:] = np.nan
-    assert noted_times._rough(rest, rings, 4)
+    assert noted_times.is_rough(rest, rings, 4)
     rest[-12:, 2] = np.nan
-    assert not noted_times._rough(rest, rings, 4)
+    assert not noted_times.is_rough(rest, rings, 4)
 
 
-def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_rough() -> None:
+def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     loads, count = np.zeros((6000, 3)), 6000
     quiet = np.repeat(np.random.default_rng(1).normal(size=(300, 4)), 20, axis=0)
     rest = quiet.copy()
     rest[2500:4000] += 20.0 * np.sin(np.arange(1500) / 40.0)[:, None]
     slow, sudden = note(2.0, 2.0, 0.5), note(2.5, 2.5)
-    rough = note(2.0, 2.0, 0.5, settled_only=True)
-    assert noted_times._without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
-    found = noted_times._without_rough_motion(RIG, loads, [sudden, slow], rest)
+    rough = note(2.0, 2.0, 0.5, rest_only=True)
+    assert noted_times.without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
+    found = noted_times.without_rough_motion(RIG, loads, [sudden, slow], rest)
     assert found.loads is loads
     assert found.notes == (sudden, rough)
     ends = 2.5 + 5.0 / (2.0 * math.pi * 14.0 * 0.02)
@@ -271,32 +254,11 @@ def test_only_motion_under_a_load_that_was_applied_slowly_is_left_out_if_it_is_r
     rest = quiet.copy()
     rest[1000:2520] += 100.0 * np.sin(np.arange(1520) / 40.0)[:, None]
     rest[2500:2520] = 1000.0
-    found = noted_times._without_rough_motion(RIG, loads, [slow], rest)
+    found = noted_times.without_rough_motion(RIG, loads, [slow], rest)
     assert (found.notes, found.unused.sum(), len(found.unused)) == ((slow,), 0, count)
 
 
 # ---- all of it, with what it is made of told
-
-
-@pytest.mark.parametrize(('rate', 'width'), [(1000.0, 286), (200.0, 57), (10.0, 3), (5.0, 2)])
-def test_means_take_four_periods_of_bending_and_two_samples_at_least(
-    rate: float, width: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    widths: list[int] = []
-
-    def none(dots: FloatArray, width: int) -> list[steps_module.DotStep]:
-        widths.append(width)
-        return []
-
-    monkeypatch.setattr(noted_times, 'lasting_steps', none)
-    monkeypatch.setattr(steps_module, 'lasting_steps', none)
-    rig = load_rig(overrides={'converter.sample_rate_hz': rate, 'dynamics.bending_frequency': 14.0})
-    loads = np.zeros((100, 3))
-    loads[50:] = 1.0
-    assert unnoted_steps(rig, np.zeros((100, 4)), loads) == []
-    assert last_step(rig, np.zeros((100, 4)), 1.0 / rate) is None
-    assert mend_loads(rig, np.zeros((100, 4)), loads) is None
-    assert widths == [width] * 3
 
 
 def with_pieces(
@@ -318,7 +280,9 @@ def with_pieces(
     monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(noted_times, 'time_of_step', fit)
-    monkeypatch.setattr(noted_times, '_left', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4))))
+    monkeypatch.setattr(
+        noted_times, 'residual_of_dots', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4)))
+    )
     return between
 
 
@@ -361,7 +325,7 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     dots = np.zeros((20_000, 4))
     for apart, told in ((249, []), (250, [3.01])):
         assert unnoted_steps(RIG, dots, noted_at(8000, 8000 + apart)) == told
-        assert (mend_loads(RIG, dots, noted_at(3000, 9000, 9000 + apart)) is None) == (not told)
+        assert (correct_loads(RIG, dots, noted_at(3000, 9000, 9000 + apart)) is None) == (not told)
     # A ramp is one change, which ends once; one that comes two samples later is another.
     ramp = noted_at(*range(8000, 8100))
     assert unnoted_steps(RIG, dots, ramp) == [3.01]
@@ -373,7 +337,7 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
 
 def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(monkeypatch: pytest.MonkeyPatch) -> None:
     places = (3000.0, 8000.0, 15000.0)
-    sizes = noted_times._expected(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
+    sizes = noted_times.expected_movements(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
     steps = [
         steps_module.DotStep(at, size, int(at) - 200, int(at) + 200) for at, size in zip(places, sizes, strict=True)
     ]
@@ -381,9 +345,9 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     dots = np.zeros((20_000, 4))
     between = with_pieces(monkeypatch, steps, fitted)
     late = noted_at(3000, 9500, 15000)
-    found = mend_loads(RIG, dots, late)
+    found = correct_loads(RIG, dots, late)
     assert found is not None
-    assert [(n.number, n.noted, n.hung, n.took) for n in found.notes] == [(2, 9.5, 8.0, 0.0)]
+    assert [(n.number, n.annotated, n.applied, n.took) for n in found.notes] == [(2, 9.5, 8.0, 0.0)]
     assert [n.number for n in found.timed] == [1, 2, 3]
     assert found.loads == pytest.approx(noted_at(3000, 8000, 15000))
     assert between == [(0.0, 8000.0), (3000.0, 15000.0), (8000.0, 20000.0)]
@@ -392,7 +356,7 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     # Right as noted, all late alike, or two milliseconds off: nothing is fitted.
     for noted_so in (noted_at(3000, 8000, 15000), noted_at(3500, 8500, 15500), noted_at(3002, 8000, 14998)):
         between.clear()
-        assert mend_loads(RIG, dots, noted_so) is None
+        assert correct_loads(RIG, dots, noted_so) is None
         assert between == []
     # A step that is longer than two widths and a tenth of a second is looked at: 2 * 286 + 100 samples.
     for long, looks in ((672, 0), (673, 3)):
@@ -400,52 +364,57 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
         some = [steps[0], steps_module.DotStep(8000.0, sizes[1], 7700, 7700 + long), steps[2]]
         monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width, some=some: some)
         monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width, some=some: some)
-        assert mend_loads(RIG, dots, noted_at(3000, 8000, 15000)) is None
+        assert correct_loads(RIG, dots, noted_at(3000, 8000, 15000)) is None
         assert len(between) == looks
     # Applied over a tenth of a second is a step.
     for took, told in ((0.1, None), (0.101, [0.101])):
         fitted[8000.0] = (8.0, took)
-        ramp = mend_loads(RIG, dots, noted_at(3000, 8000, 15000))
+        ramp = correct_loads(RIG, dots, noted_at(3000, 8000, 15000))
         assert (None if ramp is None else [n.took for n in ramp.notes]) == told
     fitted[8000.0] = (8.0, 0.0)
     monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
     # Alike by the fitted times, though not by the middles of the steps.
     fitted.update({3000.0: (2.999, 0.0), 8000.0: (9.498, 0.0), 15000.0: (15.0, 0.0)})
-    assert mend_loads(RIG, dots, late) is None
+    assert correct_loads(RIG, dots, late) is None
     fitted.update({3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0)})
     for left, told_late in (((1.0, 3.9), False), ((1.0, 4.0), True), ((1.0, 4.1), True), ((0.1, 0.41), True)):
         with_pieces(monkeypatch, steps, fitted, left)
-        assert (mend_loads(RIG, dots, late) is not None) == told_late
-
-
-def test_the_size_of_a_change_is_what_came_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[FloatArray] = []
-
-    def expected(rig: Rig, changes: FloatArray) -> FloatArray:
-        asked.append(changes)
-        return np.zeros(len(changes))
-
-    monkeypatch.setattr(noted_times, '_expected', expected)
-    with_pieces(monkeypatch, as_steps((3000.0, 1.0)), {})
-    # From the second sample on, and the last with the last.
-    loads = np.zeros((1000, 3))
-    loads[1:], loads[500:], loads[999:] = (1.0, 0.0, 0.0), (1.0, 2.0, 0.0), (0.0, 2.0, -5.0)
-    assert mend_loads(RIG, np.zeros((1000, 4)), loads) is None
-    assert asked[0].tolist() == [[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [-1.0, 0.0, -5.0]]
+        assert (correct_loads(RIG, dots, late) is not None) == told_late
 
 
 def test_loads_of_a_cell_lose_their_noise_whether_times_are_mended_or_not(monkeypatch: pytest.MonkeyPatch) -> None:
     dots, chance = np.zeros((2000, 4)), np.random.default_rng(1)
     noisy = np.where(np.arange(2000)[:, None] < 1500, 0.0, 50.0) + chance.normal(size=(2000, 3))
     with_pieces(monkeypatch, [], {})
-    found = mend_loads(RIG, dots, noisy)
+    found = correct_loads(RIG, dots, noisy)
     assert found is not None
     assert [m.first for m in found.measured] == [0, 1500]
     assert (found.notes, found.timed, found.unused.sum(), found.unused.shape) == ((), (), 0, (2000,))
     assert np.ptp(found.loads[:1500], axis=0).tolist() == [0.0] * 3
     with_pieces(monkeypatch, as_steps((400.0, 1e-4)), {400.0: (0.4, 0.0)})
-    found = mend_loads(RIG, dots, noisy)
+    found = correct_loads(RIG, dots, noisy)
     assert found is not None
     assert [m.first for m in found.measured] == [0, 1500]
-    assert [n.hung for n in found.notes] == [0.4]
+    assert [n.applied for n in found.notes] == [0.4]
+
+
+@pytest.mark.parametrize(('rate', 'width'), [(1000.0, 286), (200.0, 57), (10.0, 3), (5.0, 2)])
+def test_means_take_four_periods_of_bending_and_two_samples_at_least(
+    rate: float, width: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    widths: list[int] = []
+
+    def none(dots: FloatArray, width: int) -> list[steps_module.DotStep]:
+        widths.append(width)
+        return []
+
+    monkeypatch.setattr(noted_times, 'lasting_steps', none)
+    monkeypatch.setattr(steps_module, 'lasting_steps', none)
+    rig = load_rig(overrides={'converter.sample_rate_hz': rate, 'dynamics.bending_frequency': 14.0})
+    loads = np.zeros((100, 3))
+    loads[50:] = 1.0
+    assert unnoted_steps(rig, np.zeros((100, 4)), loads) == []
+    assert last_step(rig, np.zeros((100, 4)), 1.0 / rate) is None
+    assert correct_loads(rig, np.zeros((100, 4)), loads) is None
+    assert widths == [width] * 3

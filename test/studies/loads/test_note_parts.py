@@ -16,15 +16,14 @@ from psd_deflection.studies.loads import noted_times
 from psd_deflection.studies.loads import steps as steps_module
 from psd_deflection.studies.loads.noted_times import (
     ALIKE_S,
-    MendedNote,
+    CorrectedNote,
     ordinal,
     shifted,
 )
-from psd_deflection.studies.loads.steps import LEAST_SHARE
 
 
-def note(noted: float, hung: float, took: float = 0.0, *, settled_only: bool = False, number: int = 3) -> MendedNote:
-    return MendedNote(number, (1.5, -2.0, 0.25), noted, hung, took, settled_only)
+def note(noted: float, hung: float, took: float = 0.0, *, rest_only: bool = False, number: int = 3) -> CorrectedNote:
+    return CorrectedNote(number, (1.5, -2.0, 0.25), noted, hung, took, rest_only)
 
 
 @pytest.mark.parametrize(
@@ -44,12 +43,12 @@ def note(noted: float, hung: float, took: float = 0.0, *, settled_only: bool = F
         (note(0.0021, 0.0), 'load_time', 0.0021, 0.0021, True),
     ],
 )
-def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_took(
-    one: MendedNote, name: str, value: float, size: float, wrong: bool
+def test_a_late_note_is_late_by_2_ms_and_the_ramp_time(
+    one: CorrectedNote, name: str, value: float, size: float, wrong: bool
 ) -> None:
     assert (one.name, one.value, one.size, one.wrong) == (name, value, size, wrong)
     assert one.where == 'load 3'
-    assert MendedNote(3, one.load, one.noted, one.hung, one.took) == one
+    assert CorrectedNote(3, one.load, one.annotated, one.applied, one.took) == one
 
 
 @pytest.mark.parametrize(
@@ -63,13 +62,13 @@ def test_a_note_is_late_by_more_than_two_milliseconds_and_by_more_than_the_load_
         (note(1.125, 1.0), 'was noted 0.125 s late: note it 1.000 s after the first sample, not 1.125 s'),
         (note(1.0, 1.125), 'was noted 0.125 s early: note it 1.125 s after the first sample, not 1.000 s'),
         (
-            note(1.0, 1.0, 0.5, settled_only=True),
+            note(1.0, 1.0, 0.5, rest_only=True),
             'was applied over 0.5 s: note it 1.000 s after the first sample, as a ramp until 1.500 s, not 1.000 s; '
             'here only the link at rest under it is used',
         ),
     ],
 )
-def test_a_wrong_time_is_told_in_words_and_so_is_what_to_do(one: MendedNote, words: str) -> None:
+def test_a_wrong_time_is_told_in_words_and_so_is_what_to_do(one: CorrectedNote, words: str) -> None:
     assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
 
 
@@ -97,10 +96,8 @@ def test_numbers_up_to_a_thousand_have_the_ending_of_their_last_word() -> None:
         ([0.25, 0.25, 0.0, 0.25], False),
     ],
 )
-def test_delays_are_alike_within_so_much_of_the_middle_one_and_up_to_0_9_seconds(
-    late: list[float], alike: bool
-) -> None:
-    assert noted_times._alike(np.array(late), 0.125) is alike
+def test_equal_delays_are_near_the_median_and_below_0_9_s(late: list[float], alike: bool) -> None:
+    assert noted_times.are_alike(np.array(late), 0.125) is alike
 
 
 def test_the_dots_move_by_what_a_cantilever_and_a_shaft_do() -> None:
@@ -116,7 +113,7 @@ def test_the_dots_move_by_what_a_cantilever_and_a_shaft_do() -> None:
         x, y, turn = bend * fx, bend * fy, twist * tz
         moved = [(-x + turn * ly, -y - turn * lx) for lx, ly in beams]
         wanted.append(math.sqrt(sum(a * a + b * b for a, b in moved)))
-    assert noted_times._expected(rig, np.array(loads)) == pytest.approx(wanted, rel=1e-9)
+    assert noted_times.expected_movements(rig, np.array(loads)) == pytest.approx(wanted, rel=1e-9)
 
 
 # ---- steps of the dots
@@ -142,33 +139,26 @@ def sizes_of(dots: FloatArray, width: int) -> dict[int, float]:
 
 def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
     # The difference is a triangle from 90 to 110: above 3 % of it from 91 to 109.
-    (step,) = steps_module._steps_of_kept(stepped(200, {100: 2.0}), 10)
+    (step,) = steps_module.steps_among_samples(stepped(200, {100: 2.0}), 10)
     assert (step.at, step.size) == pytest.approx((100.0, 2.0))
     assert (step.first, step.last) == (91, 110)
     # Of two rows of three the middle is between them.
-    (slow,) = steps_module._steps_of_kept(stepped(200, {100: 1.0, 101: 1.0}), 10)
+    (slow,) = steps_module.steps_among_samples(stepped(200, {100: 1.0, 101: 1.0}), 10)
     assert slow.at == pytest.approx(100.5)
     # So it is wherever the dots are, from the first width of them on.
     early = stepped(200, {14: 1.0})
-    (first,), (shifted,) = steps_module._steps_of_kept(early, 10), steps_module._steps_of_kept(early + 5.0, 10)
+    (first,), (shifted,) = (
+        steps_module.steps_among_samples(early, 10),
+        steps_module.steps_among_samples(early + 5.0, 10),
+    )
     assert (shifted.at, shifted.size) == pytest.approx((first.at, first.size))
     assert (shifted.first, shifted.last) == (first.first, first.last) == (10, 24)
     # Four widths are the least, even if most of them is lost: more than two of ten must be there.
     for n, told in ((40, 1), (39, 0)):
         short = stepped(n, {20: 1.0})
         short[:15] = short[26:] = np.nan
-        assert len(steps_module._steps_of_kept(short, 10)) == told
-    assert steps_module._steps_of_kept(np.zeros((200, 4)), 10) == []
-
-
-@pytest.mark.parametrize(('times', 'seen'), [(13.5, 1), (13.0, 0)])
-def test_a_step_stands_out_ten_times_of_what_is_there_without_one(times: float, seen: int) -> None:
-    # A drift of 0.01 a sample is 1 between two means of 100, everywhere. Half of the stretch, 51 samples, must be above
-    # 10: three quarters of the step, and the drift across it.
-    dots = stepped(2000, {900: times})
-    dots[:, 3] = 0.01 * np.arange(2000.0)
-    assert (0.75 * times) ** 2 + 1.0 != pytest.approx(100.0, abs=2.0)
-    assert len(steps_module._steps_of_kept(dots, 100)) == seen
+        assert len(steps_module.steps_among_samples(short, 10)) == told
+    assert steps_module.steps_among_samples(np.zeros((200, 4)), 10) == []
 
 
 def test_places_without_a_mean_have_no_step() -> None:
@@ -178,29 +168,15 @@ def test_places_without_a_mean_have_no_step() -> None:
     dots[:, 3] = 0.1 * np.arange(120.0)
     dots[62:] = np.nan
     assert list(sizes_of(dots, 10).values()).count(0.0) == 50
-    assert steps_module._steps_of_kept(dots, 10) == []
-    assert len(steps_module._steps_of_kept(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
-
-
-def test_a_step_is_more_than_three_per_cent_of_the_largest() -> None:
-    for size, seen in ((2.9, 1), (4.0, 2)):
-        assert len(steps_module._steps_of_kept(stepped(100, {30: 100.0, 70: size}), 2)) == seen
-
-
-@pytest.mark.parametrize(('share', 'seen'), [(0.0395, 1), (0.0400, 2)])
-def test_a_stretch_above_three_per_cent_of_the_largest_is_half_a_width_long(share: float, seen: int) -> None:
-    # A triangle of 102 to either side: 25 on either side of the middle one are half of it, 51, and 24 are less.
-    assert len(steps_module._steps_of_kept(stepped(2000, {500: 1.0, 1200: share}), 102)) == seen
-    assert len(steps_module._steps_of_kept(stepped(2000, {500: share, 1200: 1.0}), 102)) == seen
+    assert steps_module.steps_among_samples(dots, 10) == []
+    assert len(steps_module.steps_among_samples(dots + 3.0 * stepped(120, {30: 2.0}), 10)) == 1
 
 
 @pytest.mark.parametrize(
     ('width', 'lost', 'unit'), [(16, 0.3, 1.0), (16, 0.6, 1e-4), (16, 0.7, 1e-4), (16, 0.75, 1.0), (3, 0.4, 1e-4)]
 )
 @pytest.mark.parametrize('seed', range(4))
-def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample(
-    width: int, lost: float, unit: float, seed: int
-) -> None:
+def test_a_step_agrees_with_a_sample_by_sample_account(width: int, lost: float, unit: float, seed: int) -> None:
     dots = unit * stepped(600, {100: 1.0, 110: 0.5, 300: -2.0, 470: 0.3}, 0.01, 3)
     dots[np.random.default_rng(seed).random(600) < lost] = np.nan
     dots[296:304] = np.nan
@@ -226,16 +202,9 @@ def test_the_place_and_size_of_a_step_are_those_of_an_account_sample_by_sample(
         middle = sum(at * w for at, w in over.items()) / sum(over.values())
         wanted.append((middle, float(np.linalg.norm(after - before)), first, last))
     with np.errstate(invalid='raise', divide='raise'):
-        found = [(s.at, s.size, s.first, s.last) for s in steps_module._steps_of_kept(dots, width)]
+        found = [(s.at, s.size, s.first, s.last) for s in steps_module.steps_among_samples(dots, width)]
     assert len(found) == len(wanted)
     assert np.array(found) == pytest.approx(np.array(wanted), rel=1e-7)
-
-
-def test_a_difference_is_of_the_means_of_whole_samples_and_nothing_has_the_mean_0() -> None:
-    dots = np.arange(24.0).reshape(6, 4)
-    dots[4, 2] = np.nan
-    assert steps_module._difference(dots, slice(3, 6), slice(0, 2)) == pytest.approx([14.0] * 4)
-    assert steps_module._difference(dots, slice(4, 5), slice(0, 2)) == pytest.approx([-2.0, -3.0, -4.0, -5.0])
 
 
 # ---- which note belongs to which step
@@ -277,34 +246,18 @@ def test_notes_and_steps_are_paired_at_the_least_cost_of_all_ways(seed: int) -> 
     sizes[chance.integers(5)] *= 0.01
     places = np.sort(changes[:4] + chance.normal(size=4) * chance.choice([1.0, 4.0, 20.0, 300.0, 1500.0]))
     steps = as_steps(*zip(places.tolist(), (2e-4 * np.exp(chance.normal(size=4))).tolist(), strict=True))
-    assert noted_times._matched(changes, sizes, steps, 0.01) == cheapest(changes, sizes, steps, 0.01)
+    assert noted_times.matched_notes(changes, sizes, steps, 0.01) == cheapest(changes, sizes, steps, 0.01)
 
 
-def test_a_note_that_half_of_the_others_show_to_be_on_time_keeps_the_step_at_its_time() -> None:
+def test_a_note_on_time_like_half_of_the_others_stays() -> None:
     # A load of 10 hung 12 s before the third note, which says that all came off: only the second step is at a note.
     sizes = np.array([40.0, 30.0, 40.0])
     steps = as_steps((1000.0, 40.0), (3000.0, 30.0), (3800.0, 35.0), (5000.0, 10.0))
     on_time = np.array([1000, 3000, 5000])
-    assert noted_times._matched(on_time, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 3)]
+    assert noted_times.matched_notes(on_time, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 3)]
     # If the others are late, that one is at a step by chance.
     late = np.array([1400, 3600, 5000])
-    assert noted_times._matched(late, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 2)]
-
-
-def test_a_note_without_a_step_near_it_has_none() -> None:
-    changes = np.array([1000, 9000])
-    # Thirty seconds away is the farthest.
-    for away, pairs in ((2999.0, [(0, 0)]), (3000.0, [(0, 0)]), (3001.0, [])):
-        assert noted_times._matched(changes[:1], np.array([1e-4]), as_steps((1000.0 + away, 1e-4)), 0.01) == pairs
-    # What moves the dots by no more than 3 % of the largest does not count.
-    sizes = np.array([1.0, LEAST_SHARE])
-    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.04)), 0.01) == [(0, 0)]
-    sizes[1] = 0.04
-    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.04)), 0.01) == [(0, 0), (1, 1)]
-    assert noted_times._matched(changes, np.zeros(2), as_steps((1000.0, 1.0)), 0.01) == []
-    assert noted_times._matched(changes, sizes, [], 0.01) == []
-    # A step of no size is paired with the one that it is nearest to.
-    assert noted_times._matched(changes, sizes, as_steps((1000.0, 1.0), (9000.0, 0.0)), 0.01) == [(0, 0), (1, 1)]
+    assert noted_times.matched_notes(late, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 2)]
 
 
 # ---- loads between samples
@@ -353,12 +306,12 @@ def test_later_and_slower_shift_what_the_load_changed_by() -> None:
     assert last([4.0, 0.0])[38] == pytest.approx(-(loads[39] - loads[36]) / 2.0, rel=1e-5)
 
 
-def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_are_told() -> None:
+def test_effective_loads_change_at_the_fitted_times() -> None:
     loads = np.zeros((30, 3))
     loads[5:] = (1.0, 0.0, 0.0)
     loads[12:] = (1.0, -2.0, 0.0)
     loads[20:] = (0.0, 0.0, 3.0)
-    acted, notes = noted_times._as_acted(loads, np.array([5, 12, 20]), {0: (0.3, 0.0), 2: (1.8, 0.2)}, 0.1)
+    acted, notes = noted_times.loads_with_times(loads, np.array([5, 12, 20]), {0: (0.3, 0.0), 2: (1.8, 0.2)}, 0.1)
     wanted = np.zeros((30, 3))
     wanted[3:] += (1.0, 0.0, 0.0)
     wanted[12:] += (0.0, -2.0, 0.0)
@@ -366,18 +319,18 @@ def test_loads_as_they_acted_have_each_change_at_its_time_and_only_fitted_ones_a
     wanted[19:] += 0.5 * np.array((-1.0, 2.0, 3.0))
     assert acted == pytest.approx(wanted, abs=1e-5)
     assert [(n.number, n.load) for n in notes] == [(1, (1.0, 0.0, 0.0)), (3, (0.0, 0.0, 3.0))]
-    assert [(n.noted, n.hung, n.took) for n in notes] == [
+    assert [(n.annotated, n.applied, n.took) for n in notes] == [
         pytest.approx((0.5, 0.3, 0.0)),
         pytest.approx((2.0, 1.8, 0.2)),
     ]
     # What took a tenth of a second was no ramp.
-    (one,) = noted_times._as_acted(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
+    (one,) = noted_times.loads_with_times(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
     assert one.took == 0.0
     # From the second sample on, and one right after the other.
     loads = np.zeros((6, 3))
     loads[1:], loads[2:] = (1.0, 0.0, 0.0), (5.0, 2.0, 0.0)
-    assert noted_times._as_acted(loads, np.array([1, 2]), {}, 0.1)[0] == pytest.approx(loads)
+    assert noted_times.loads_with_times(loads, np.array([1, 2]), {}, 0.1)[0] == pytest.approx(loads)
     loads = np.zeros((30, 3))
     loads[5:], loads[12:], loads[20:] = (1.0, 0.0, 0.0), (1.0, -2.0, 0.0), (0.0, 0.0, 3.0)
     begun = np.add(loads, (7.0, 8.0, 9.0))
-    assert noted_times._as_acted(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)
+    assert noted_times.loads_with_times(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)

@@ -31,7 +31,7 @@ def as_volts(dots: FloatArray) -> FloatArray:
     return volts
 
 
-def test_the_movement_of_a_plate_is_told_from_its_readings_and_none_from_readings_that_lack_one() -> None:
+def test_plate_motion_needs_every_reading() -> None:
     poses = np.array([[1e-4, 0.0, 3e-5, 1e-5], [0.0, -2e-4, 1e-5, 2e-5], [0.0, 1e-3, -2e-3, 3e-3]])
     volts, there = as_volts(PLATE @ poses), np.ones((6, 4))
     assert moved_plate(RIG, volts, there) == pytest.approx(poses, abs=1e-12)

@@ -10,19 +10,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from psd_deflection.model.simulation.modes import Filter, mode_coefficients
-from psd_deflection.model.simulation.simulator import ForwardModel, RigSimulator
+from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import Rig, load_rig, replace_values
-from psd_deflection.studies.calibrate.from_recordings import as_acted
-from psd_deflection.studies.calibrate.observation import CalibrationRun
-from psd_deflection.studies.check.checkup import check, of_recording
-from psd_deflection.studies.discover.discover import discover
-from psd_deflection.studies.discover.observation import Observation
+from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import plateaus
-from psd_deflection.studies.loads.fine import fine_means
-from psd_deflection.studies.loads.noted_times import mend_loads, unnoted_steps
-from psd_deflection.studies.loads.plate_motion import across_of
+from psd_deflection.studies.loads.noted_times import correct_loads, unnoted_steps
 from psd_deflection.studies.loads.plateaus import (
     EXACT,
     STANDS_OUT,
@@ -31,32 +23,12 @@ from psd_deflection.studies.loads.plateaus import (
     PlateauLoads,
     WrongNote,
     all_free,
-    as_hung,
+    as_applied,
     wrong_notes,
 )
+from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, answers, noted_as, read
 
-RIG = load_rig()
-DWELL = 4000
-LEVELS = np.array(
-    [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (0, 0, 0)], float
-)
-HUNG = np.repeat(LEVELS, DWELL, axis=0)
-
-
-def read(acting: FloatArray, **true: object) -> FloatArray:
-    """What the device reads (n, 6), V, under ``acting`` loads, of a rig that differs by ``true``."""
-    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
-    return np.asarray(RigSimulator(rig, 3).step(acting).counts * RIG.converter.volts_per_count, dtype=np.float64)
-
-
-def noted_as(number: int, load: tuple[float, float, float]) -> FloatArray:
-    """The loads with another one in plateau ``number``."""
-    out = HUNG.copy()
-    out[number * DWELL : (number + 1) * DWELL] = load
-    return out
-
-
-QUIET = read(HUNG)
+QUIET = read(HELD)
 TWICE = noted_as(5, (80, -80, 40))
 NEVER = noted_as(2, (0, -20, 0))
 WORDS = {
@@ -71,18 +43,14 @@ WORDS = {
     ('noted', 'name', 'where'), [(TWICE, 'load_value', 'load 5'), (NEVER, 'missing_load', '8.000 s')]
 )
 def test_check_calibrate_and_discover_say_what_hung_in_the_same_words(noted: FloatArray, name: str, where: str) -> None:
-    checked = check(of_recording(RIG, QUIET, noted, 'x'))
+    checked, run, log, found = answers(QUIET, noted)
     assert [(f.name, f.where) for f in checked.findings] == [(name, where)]
     assert _rounded(checked.findings[0].fix) == WORDS[name]
     assert checked.verdict == 'wrong'
     assert checked.sizes == pytest.approx([1.0] * 3, abs=0.01)
-    told: list[str] = []
-    t = np.arange(len(HUNG)) / 1000.0
-    run = as_acted(CalibrationRun('x', t, QUIET, np.zeros(0), np.zeros((0, 3)), noted), RIG, told.append)
-    assert [_rounded(words) for words in told] == [WORDS[name]]
+    assert [_rounded(words) for words in log] == [WORDS[name]]
     assert run.loads is not None
-    assert np.abs(run.loads - HUNG).max(axis=0) == pytest.approx([0.0] * 3, abs=0.1)
-    found = discover([Observation('x', RIG, QUIET, noted)])
+    assert np.abs(run.loads - HELD).max(axis=0) == pytest.approx([0.0] * 3, abs=0.1)
     assert [_rounded(f.fix) for f in found.setup] == [WORDS[name]]
 
 
@@ -105,7 +73,7 @@ def _rounded(words: str) -> str:
     ],
 )
 def test_no_note_is_called_wrong_for_what_the_rig_does(true: dict[str, object]) -> None:
-    assert wrong_notes(RIG, read(HUNG, **true), HUNG) == []
+    assert wrong_notes(RIG, read(HELD, **true), HELD) == []
 
 
 def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
@@ -113,8 +81,8 @@ def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
     both[DWELL : 2 * DWELL] = (0, -30, 0)
     found = wrong_notes(RIG, QUIET, both)
     assert [n.where for n in found] == ['load 1', 'load 5']
-    assert as_hung(both, found) == pytest.approx(HUNG, abs=0.1)
-    assert as_hung(both, found) is not both
+    assert as_applied(both, found) == pytest.approx(HELD, abs=0.1)
+    assert as_applied(both, found) is not both
     assert len(wrong_notes(RIG, QUIET[: 7 * DWELL], both[: 7 * DWELL])) == 2
     assert wrong_notes(RIG, QUIET[: 6 * DWELL], both[: 6 * DWELL]) == []
     assert len(wrong_notes(RIG, QUIET[: 6 * DWELL], TWICE[: 6 * DWELL])) == 1
@@ -135,7 +103,7 @@ def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
 def test_a_note_that_is_far_off_is_wrong_however_far(number: int, load: tuple[float, float, float]) -> None:
     (note,) = wrong_notes(RIG, QUIET, noted_as(number, load))
     assert note.where == f'load {number}'
-    assert note.hung == pytest.approx(LEVELS[number], abs=0.1)
+    assert note.applied == pytest.approx(LEVELS[number], abs=0.1)
     assert note.size == pytest.approx(np.abs(LEVELS[number] - load).max(), abs=0.1)
 
 
@@ -157,7 +125,7 @@ def test_of_loads_that_follow_each_other_both_are_found() -> None:
     assert [n.where for n in found] == ['load 4', 'load 5']
 
 
-def test_three_that_are_wrong_and_one_that_is_off_by_a_newton_are_found_if_all_others_are_exact() -> None:
+def test_three_wrong_notes_and_one_off_by_1_n_are_reported() -> None:
     found = wrong_notes(RIG, LONG_QUIET, long_as(p5=(40, -80, 20), p4=(60, 0, 0), p6=(0, 0, 0)))
     assert [n.where for n in found] == ['load 4', 'load 5', 'load 6']
     (note,) = wrong_notes(RIG, QUIET, noted_as(4, (29, 0, 0)))
@@ -177,26 +145,26 @@ def test_a_load_that_no_other_is_like_may_be_a_sign_a_unit_or_an_effect() -> Non
 
 def test_nobody_is_accused_if_another_load_may_be_the_wrong_one() -> None:
     # Without the third load a link that is soft by chance would explain the fourth.
-    soft = read(HUNG, link__youngs_modulus=0.97 * RIG.link.youngs_modulus)
+    soft = read(HELD, link__youngs_modulus=0.97 * RIG.link.youngs_modulus)
     assert wrong_notes(RIG, soft, noted_as(4, (28.5, 0, 0))) == []
     # A fault of one reading under one load is none of the load.
     reading = QUIET.copy()
     reading[4 * DWELL : 5 * DWELL, 0] += 0.1
-    assert wrong_notes(RIG, reading, HUNG) == []
+    assert wrong_notes(RIG, reading, HELD) == []
 
 
 def test_beside_an_effect_what_hung_is_told_as_if_there_were_none() -> None:
     soft = read(np.repeat(LONG, DWELL, axis=0), link__youngs_modulus=0.95 * RIG.link.youngs_modulus)
     (note,) = wrong_notes(RIG, soft, long_as(p5=(40, -80, 20)))
     assert note.where == 'load 5'
-    assert note.hung == pytest.approx((40.0, -40.0, 20.0), abs=0.3)
+    assert note.applied == pytest.approx((40.0, -40.0, 20.0), abs=0.3)
 
 
 def test_lost_samples_are_no_load() -> None:
     lost = QUIET.copy()
     lost[5 * DWELL + 1000 : 5 * DWELL + 1500] = np.nan
     (note,) = wrong_notes(RIG, lost, TWICE)
-    assert note.hung == pytest.approx((40.0, -40.0, 20.0), abs=0.2)
+    assert note.applied == pytest.approx((40.0, -40.0, 20.0), abs=0.2)
     assert note.size == pytest.approx(40.0, abs=0.2)
 
 
@@ -219,7 +187,7 @@ def asked(off: FloatArray, noted: FloatArray = ROUNDED, acting: FloatArray | Non
     return all_free(found, np.repeat(noted, DWELL, axis=0) if acting is None else acting)
 
 
-def test_loads_are_asked_for_if_what_hung_rounds_to_the_notes_and_not_if_it_is_far_nearer_or_farther() -> None:
+def test_rounded_notes_free_the_loads_exact_ones_do_not() -> None:
     assert asked(OFF)
     # What hung would be noted as another number, or the step is too coarse for so small an error.
     assert not asked(ROUNDED * 0.06)
@@ -232,10 +200,10 @@ def test_loads_are_asked_for_if_what_hung_rounds_to_the_notes_and_not_if_it_is_f
 
 
 def test_a_step_without_a_note_has_its_time() -> None:
-    dots = read(HUNG)[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
+    dots = read(HELD)[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
     assert unnoted_steps(RIG, dots, noted_as(2, (0, -20, 0))) == pytest.approx([8.0], abs=2e-3)
-    assert unnoted_steps(RIG, dots, HUNG) == []
-    assert mend_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
+    assert unnoted_steps(RIG, dots, HELD) == []
+    assert correct_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
 
 
 # ---- the pieces, by hand
@@ -245,7 +213,7 @@ def told(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
     return [(p.first, p.last, p.number, p.unnoted) for p in listed]
 
 
-def test_times_of_a_second_or_more_between_changes_are_listed_with_the_number_of_their_note() -> None:
+def test_holds_of_a_second_have_the_number_of_their_note() -> None:
     loads = np.zeros((9000, 3))
     loads[1500:] = (1.0, 0.0, 0.0)
     # A second is enough, a sample less is not, and a ramp ends once.
@@ -255,7 +223,7 @@ def test_times_of_a_second_or_more_between_changes_are_listed_with_the_number_of
     loads[5049:] = (1.0, 2.0, 0.0)
     listed = plateaus.plateaus(RIG, np.zeros((9000, 6)), loads, 7)
     assert told(listed) == [(0, 1500, 0, False), (1500, 2500, 1, False), (3499, 5000, 3, False), (5049, 9000, 4, False)]
-    assert [tuple(p.noted) for p in listed] == [(0, 0, 0), (1, 0, 0), (1, 2, 3), (1, 2, 0)]
+    assert [tuple(p.annotated) for p in listed] == [(0, 0, 0), (1, 0, 0), (1, 2, 3), (1, 2, 0)]
     assert {p.recording for p in listed} == {7}
     # From the second sample on, and two that follow each other in two samples.
     loads[1:] += (5.0, 0.0, 0.0)
@@ -271,7 +239,7 @@ def test_times_of_a_second_or_more_between_changes_are_listed_with_the_number_of
     assert Plateau(0, 10, 21, 1, False, np.zeros(3)).of(np.arange(90.0).reshape(30, 3)).tolist() == [45.0, 46.0, 47.0]
 
 
-def test_a_time_that_only_the_motion_shows_has_the_number_of_the_note_before_it() -> None:
+def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
     acting = np.repeat([(0.0, 0.0, 0.0), (0.0, -20.0, 0.0), (0.0, -50.0, 0.0), (0.0, 0.0, 0.0)], 2000, axis=0)
     noted = acting.copy()
     noted[4000:6000] = (0.0, -20.0, 0.0)
@@ -304,72 +272,6 @@ GIVEN = load_rig(
         'dynamics.torsion_damping_ratio': 0.2,
     }
 )
-PLATE = np.array([[-1.0, 0.0, 0.07], [0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.1]])
-"""Rows x1 y1 x2 y2 of PSDs at (0, 70) and (-100, 0) mm: x_i = -X + ly θ, y_i = -Y - lx θ."""
-ACROSS = np.linalg.svd(PLATE)[0][:, 3]
-
-
-def compliance() -> FloatArray:
-    """m/N, m/N, rad/(N m) of a cantilever and a shaft."""
-    link = RIG.link
-    fourth = link.outer_radius**4 - link.inner_radius**4
-    bend = link.length**3 / (3.0 * link.youngs_modulus * np.pi / 4.0 * fourth)
-    return np.array([bend, bend, link.length / (link.shear_modulus * np.pi / 2.0 * fourth)])
-
-
-def test_loads_are_asked_for_by_how_the_plate_moves_and_what_no_plate_does_is_told_apart() -> None:
-    size, samples = 4, 6002
-    ends = [(0, 1500), (1500, 3000), (3302, 4504), (4504, samples)]
-    listed = [Plateau(0, a, b, k, False, np.zeros(3)) for k, (a, b) in enumerate(ends)]
-    more = np.array([(0.0, 0.0, 0.0), (1.0, -2.0, 3.0), (0.5, 0.0, -1.0), (-4.0, 1.0, 0.5)])
-    poses = np.tile([[1e-5], [-2e-5], [3e-5]], samples)
-    for (a, b), load in zip(ends[1:], more[1:], strict=True):
-        acts = np.zeros(samples)
-        acts[a:b] = 1.0
-        for axis, (frequency, ratio) in enumerate(((14.0, 0.1), (14.0, 0.1), (21.0, 0.2))):
-            moved = Filter(mode_coefficients(frequency, ratio, 1e-3))(acts)
-            poses[axis] += load[axis] * compliance()[axis] * moved
-    beside = np.zeros(samples)
-    for (a, b), far in zip(ends, (2e-6, 5e-6, -1e-6, 2e-6), strict=True):
-        beside[a:b] = far
-    dots = PLATE @ poses + np.outer(ACROSS, beside)
-    # What is in no time of the list counts for nothing.
-    dots[:, 3000:3302] += 1e-3
-    volts = np.zeros((6, samples))
-    volts[[0, 1, 3, 4]] = dots / np.array([[4e-4], [6e-4], [5e-4], [8e-4]])
-    there = np.ones((6, samples))
-    there[3, 2000:2100] = 0.0
-    count = fine_means(there, size)
-    found = plateaus.asked_for(GIVEN, fine_means(volts, size), count, samples, size, listed)
-    assert found.more == pytest.approx(more, abs=1e-6)
-    assert found.plateaus == tuple(listed)
-    assert found.compliance == pytest.approx(compliance())
-    blocks = np.arange(samples // size) * size
-    known = ((blocks < 3000) | (blocks >= 3302)) & ((blocks < 2000) | (blocks >= 2100))
-    assert np.isfinite(found.moved).all(axis=0).tolist() == known.tolist()
-    assert found.moved[:, known] == pytest.approx(fine_means(poses, size)[:, known], abs=1e-12)
-    assert found.rest[:, known] == pytest.approx(0.0, abs=1e-9)
-    assert np.isnan(found.rest[:, ~known]).all()
-    # Against the first time; its sign is that of a direction that may be turned around.
-    way = np.sign(across_of(GIVEN) @ ACROSS)
-    assert way * found.across == pytest.approx([0.0, 3e-6, -3e-6, 0.0], abs=1e-12)
-
-
-def test_the_link_moves_with_its_modes_under_what_is_hung_after_the_first_time() -> None:
-    listed = [Plateau(0, a, b, 0, False, np.zeros(3)) for a, b in ((0, 100), (1, 100), (100, 200))]
-    for axis, (frequency, ratio) in enumerate(((14.0, 0.1), (14.0, 0.1), (21.0, 0.2))):
-        first, second, third = plateaus._pulses(GIVEN, 300, listed, axis)
-        assert not first.any()
-        for pulse, (a, b) in ((second, (1, 100)), (third, (100, 200))):
-            acts = np.zeros(300)
-            acts[a:b] = 1.0
-            assert pulse == pytest.approx(Filter(mode_coefficients(frequency, ratio, 1e-3))(acts))
-
-
-def test_a_mean_of_nothing_is_0() -> None:
-    assert plateaus._mean(np.array([1.0, np.nan, 4.0])) == 2.5
-    assert plateaus._mean(np.array([np.nan])) == 0.0
-    assert plateaus._mean(np.array([])) == 0.0
 
 
 SPREAD = np.array(
@@ -401,7 +303,7 @@ def seen(
 def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> None:
     found = seen({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
     assert found.sizes[:4] == pytest.approx([0.0, 5e-5, 5e-5, 1e-4])
-    assert found.noted.tolist() == SPREAD.tolist()
+    assert found.annotated.tolist() == SPREAD.tolist()
 
 
 @pytest.mark.parametrize(
@@ -423,23 +325,23 @@ def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> 
 def test_loads_that_are_off_beside_exact_ones_are_wrong_if_five_are_right(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
-    found = plateaus.stand_out(seen(more, SPREAD[:count]))
+    found = plateaus.outliers(seen(more, SPREAD[:count]))
     assert (found.gone, found.softer) == (gone, 0.0)
 
 
-def test_a_detector_at_fault_and_a_movement_that_no_load_makes_are_no_wrong_note() -> None:
+def test_a_faulty_detector_is_no_wrong_note() -> None:
     wrong = {6: (0.0, 1.0, 0.0)}
     # A load of 1 N moves the plate by 10 um: a twentieth of that and 0.2 um are 0.7 um.
     for far, gone in ((6.9e-7, (6,)), (-6.9e-7, (6,)), (7.1e-7, ()), (-7.1e-7, ())):
-        assert plateaus.stand_out(seen(wrong, across={6: far})).gone == gone
-    assert plateaus.stand_out(seen(wrong, across={1: 1e-3})).gone == (6,)
+        assert plateaus.outliers(seen(wrong, across={6: far})).gone == gone
+    assert plateaus.outliers(seen(wrong, across={1: 1e-3})).gone == (6,)
     # Far beyond the tolerance no plate is asked for.
-    far_off = plateaus.stand_out(seen({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
+    far_off = plateaus.outliers(seen({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
     assert (far_off.gone, far_off.softer) == ((6,), 0.0)
     # Nothing that moves is nothing to explain.
-    assert not plateaus._closes(seen({}))
+    assert not plateaus.closes(seen({}))
     for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
-        assert plateaus.stand_out(seen(wrong, left=left), bent).gone == gone
+        assert plateaus.outliers(seen(wrong, left=left), bent).gone == gone
 
 
 @pytest.mark.parametrize(
@@ -454,83 +356,40 @@ def test_a_detector_at_fault_and_a_movement_that_no_load_makes_are_no_wrong_note
         (7, {6: (0.0, 2.0, 0.0), 4: (-3.0, 0.0, 0.0)}, ()),
     ],
 )
-def test_beside_loads_that_are_off_by_less_than_the_tolerance_two_may_be_wrong_if_six_are_right(
+def test_two_of_eight_notes_beside_small_errors_are_wrong(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
     twelve = np.vstack((SPREAD, SPREAD[1:5]))
     slightly = np.where(np.arange(count)[:, None] % 2, 0.1, -0.1) * (1.0, 0.0, 0.0)
-    assert plateaus.stand_out(seen(more, twelve[:count], everywhere=slightly)).gone == gone
+    assert plateaus.outliers(seen(more, twelve[:count], everywhere=slightly)).gone == gone
 
 
-def test_one_wrong_load_is_found_beside_what_effects_do_in_proportion() -> None:
-    softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
-    found = plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=softened))
-    assert (found.gone, found.softer) == ((5,), 0.1)
-    assert plateaus.stand_out(seen({}, everywhere=softened)).gone == ()
-    # Of six, and if effects would have to do more than three times what they do, nobody is accused.
-    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, SPREAD[:6], everywhere=softened[:6])).gone == ()
-    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=4.0 * softened)).gone == ()
-    assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=2.6 * softened)).gone == (5,)
-    for more, gone in ((2.0, ()), (1.6, (5,))):
-        offset = np.add(softened, (0.0, more, 0.0))
-        assert plateaus.stand_out(seen({5: (-20.0, 15.0, -8.0)}, everywhere=offset)).gone == gone
-    # The first after a change may be wrong, the time before all of them may not.
-    assert plateaus.stand_out(seen({1: (2.0, 0.0, 0.0)}, everywhere=softened)).gone == (1,)
-    assert plateaus.stand_out(seen({0: (2.0, 0.0, 0.0)}, everywhere=softened)).gone == ()
-
-
-def test_a_load_is_accused_beside_effects_only_if_without_another_one_nothing_fits() -> None:
+def test_a_note_beside_effects_is_wrong_only_if_no_other_fits() -> None:
     softened = 0.1 * SPREAD @ np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]]) + (0.2, -0.3, 0.1)
 
     def left(found: PlateauLoads, without: int) -> float:
-        return float(np.delete(plateaus._apart(found, (without,), 0.1), without).max())
+        return float(np.delete(plateaus.deviation_in_tolerances(found, (without,), 0.1), without).max())
 
     # Without any other one, the worst that is left is one and a half times the tolerance.
     found = seen({2: (0.0, 2.5, 0.0)}, everywhere=softened)
     assert all(1.3 < left(found, k) < 1.8 for k in (1, 3, 4, 5, 6, 7))
-    assert plateaus.stand_out(found).gone == (2,)
+    assert plateaus.outliers(found).gone == (2,)
     # Without the fourth it is 1.13 times, which may come from that one if a tenth of its 3.9 is allowed.
     found = seen({3: (0.0, 6.0, 0.0)}, everywhere=softened)
     assert left(found, 4) == pytest.approx(1.13, abs=0.01)
-    assert plateaus._apart(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
-    assert plateaus.stand_out(found).gone == (3,)
-    assert plateaus.stand_out(found, 0.025).gone == (3,)
-    assert plateaus.stand_out(found, 0.1).gone == ()
+    assert plateaus.deviation_in_tolerances(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
+    assert plateaus.outliers(found).gone == (3,)
+    assert plateaus.outliers(found, 0.025).gone == (3,)
+    assert plateaus.outliers(found, 0.1).gone == ()
 
 
-def test_what_is_off_by_less_than_a_seventh_of_a_newton_is_right_whatever_the_others_suggest() -> None:
-    # Small loads are a tenth too small, so the large one would be off by 5 N.
-    small = np.array(
-        [(0, 0, 0), (1, 0, 0), (0, 1, 0), (-1, 1, 0), (0, -1, 1), (1, -1, 1), (50, 0, 0), (1, 1, -1)], float
-    )
-    share = 0.1 * small
-    share[6] = 0.0
-    assert plateaus._apart(seen({}, small, everywhere=share), (6,), 0.1)[6] > 5.5
-    assert plateaus.stand_out(seen({}, small, everywhere=share)).gone == ()
-
-
-def test_what_stands_out_is_three_times_the_tolerance_and_five_times_the_others() -> None:
-    def stands(wrong: list[float], others: list[float], bent: float = 0.0) -> bool:
-        return plateaus._stands(np.array(wrong), np.array(others), bent)
-
-    assert stands([3.01], [0.5])
-    assert not stands([3.0], [0.5])
-    assert not stands([4.0], [0.8])
-    assert stands([4.01], [0.8])
-    assert stands([5.1, 9.0], [0.2, 1.0])
-    assert not stands([5.1, 3.0], [0.2, 0.5])
-    assert not stands([9.0], [1.01])
-    assert stands([9.0], [1.01], 0.01)
-    assert not stands([9.0], [1.1], 0.01)
-
-
-def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much() -> None:
+def test_a_wrong_load_is_known_if_the_others_span_it() -> None:
     noted = np.array([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 20.0, 0.0), (3.0, 4.0, 0.24), (3.0, 4.0, 0.26)])
 
     def known(k: list[int], more: tuple[float, float, float] = (0.0, 0.0, 1.0), largest: float = 1e9) -> bool:
         rows = [i for i in range(5) if i < 3 or i in k]
         here = [rows.index(i) for i in k]
-        return plateaus._known(seen(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
+        return plateaus.is_known(seen(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
 
     # A torque of 5 % of (3, 4) is as good as none.
     assert known([3])
@@ -542,27 +401,6 @@ def test_a_wrong_load_is_known_if_the_others_span_it_or_no_effect_does_so_much()
     assert known([3, 4], (0.0, 6.1, 8.1), 2.0)
 
 
-def test_what_effects_do_is_the_likeliest_share_and_offset_of_all_other_loads() -> None:
-    chance = np.random.default_rng(1)
-    found = seen({}, everywhere=chance.normal(size=SPREAD.shape))
-    for gone, softer in (((), 0.1), ((2,), 0.1), ((1, 5), 0.2)):
-        keep = [k for k in range(8) if k not in gone]
-        x = np.column_stack((SPREAD, np.ones(8)))[keep]
-        # A tenth of the tolerance, 0.03, is the deviation of a load; those of a share and of an offset are the prior's.
-        pull = np.diag(0.03 / np.array([softer, softer, softer, 0.5]))
-        rows, values = np.vstack((x, pull)), np.vstack((found.more[keep], np.zeros((4, 3))))
-        wanted = np.linalg.lstsq(rows, values, rcond=None)[0]
-        slopes, offset = plateaus._proportion(found, gone, softer)
-        assert slopes == pytest.approx(wanted[:3], abs=1e-9)
-        assert offset == pytest.approx(wanted[3], abs=1e-9)
-        # Off by the largest of the three, in units of 0.3 and a hundredth of the load.
-        off = np.abs(found.more - np.column_stack((SPREAD, np.ones(8))) @ wanted).max(axis=1)
-        allowed = [0.3 + 0.01 * max(abs(v) for v in load) for load in SPREAD.tolist()]
-        assert plateaus._apart(found, gone, softer) == pytest.approx(off / allowed)
-    slopes, offset = plateaus._proportion(found, (), 0.0)
-    assert (slopes.tolist(), offset.tolist()) == (np.zeros((3, 3)).tolist(), [0.0] * 3)
-
-
 def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> None:
     off = {4: (9.0, 0.0, 0.0), 5: (-9.0, 9.0, 4.0), 6: (7.0, -8.0, 0.0)}
     loads = np.repeat(SPREAD, DWELL, axis=0)
@@ -572,24 +410,24 @@ def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> No
     assert not plateaus.all_free(seen({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, SPREAD[:3]), loads)
     # Two that are off by more than the tolerance are enough.
     two = seen({5: (0.0, 0.0, 0.9), 1: (0.0, 0.0, -0.9)})
-    apart = plateaus._apart(two, (), 0.1)
+    apart = plateaus.deviation_in_tolerances(two, (), 0.1)
     assert sorted(apart)[-3] < 1.0 < sorted(apart)[-2]
     assert max(apart) < 2.0
     assert plateaus.all_free(two, loads)
     # One alone is a wrong note, and others are needed to say so.
     found = seen({0: (0.0, 0.0, 0.6)})
-    assert int((plateaus._apart(found, (), 0.1) > 1.0).sum()) == 1
+    assert int((plateaus.deviation_in_tolerances(found, (), 0.1) > 1.0).sum()) == 1
     assert not plateaus.all_free(found, loads)
 
 
-def test_loads_are_rounded_if_each_is_off_by_half_a_step_at_most_and_by_a_tenth_on_average() -> None:
+def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
     noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
     loads = np.repeat(noted, DWELL, axis=0)
 
     def rounded(*off: tuple[float, float, float], count: int = 5) -> bool:
         more = np.zeros((5, 3))
         more[: len(off)] = off
-        return plateaus._rounded(seen({}, noted[:count], everywhere=more[:count]), loads)
+        return plateaus.are_rounded(seen({}, noted[:count], everywhere=more[:count]), loads)
 
     # Forces in steps of 5 N, torques in steps of 2 N m.
     assert rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0, 0.0, 1.0))
@@ -611,12 +449,12 @@ def test_loads_of_which_none_held_were_not_rounded() -> None:
     """As those of a sweep."""
     none = np.zeros((0, 3))
     found = plateaus.PlateauLoads((), none, none.T, none.T, none[:, 0], none[:, 0], np.ones(3), 4)
-    assert found.noted.shape == (0, 3)
+    assert found.annotated.shape == (0, 3)
     assert not plateaus.may_be_rounded(found)
     assert not plateaus.all_free(found, none)
 
 
-def test_loads_may_be_rounded_if_they_are_in_whole_steps_and_off_by_less_than_one() -> None:
+def test_loads_off_by_less_than_a_step_may_be_rounded() -> None:
     noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
 
     def may_be(*off: tuple[float, float, float], loads: FloatArray = noted) -> bool:
@@ -631,29 +469,6 @@ def test_loads_may_be_rounded_if_they_are_in_whole_steps_and_off_by_less_than_on
     assert not may_be((0.0, 0.0, 0.0), loads=noted + 0.3 * np.eye(3)[0])
     assert not may_be((0.0, 0.0, 0.0), loads=noted * [0.0, 0.0, 1.0])
     assert not may_be((0.0, 0.0, 0.0), loads=noted[1:])
-
-
-@pytest.mark.parametrize(
-    ('noted', 'step'),
-    [
-        ([10.0, -30.0], 10.0),
-        ([10.0, -35.0], 5.0),
-        ([4.0, -6.0], 2.0),
-        ([4.0, 7.0], 1.0),
-        ([4.0, 7.5], 0.0),
-        ([4.0, 7.0 + 5e-7], 1.0),
-        ([4.0, 0.0001], 0.0),
-        ([0.0, 0.0], np.inf),
-    ],
-)
-def test_the_step_of_noted_numbers_is_the_largest_of_which_all_are_multiples(noted: list[float], step: float) -> None:
-    assert plateaus._step(np.array(noted)) == step
-
-
-def test_a_movement_counts_about_its_mean_and_an_angle_at_a_tenth_of_a_metre() -> None:
-    part = np.array([[1.0, 3.0, np.nan, 1.0, 3.0], [5.0, 5.0, 9.0, 5.0, 5.0], [20.0, 40.0, 1.0, 40.0, 20.0]])
-    # Squares: 1, 0 and (0.1 * 10)^2 = 1.
-    assert plateaus._rms(part) == pytest.approx((2.0 / 3.0) ** 0.5)
 
 
 # ---- what is said
@@ -715,15 +530,15 @@ def test_what_hung_is_what_readings_say_without_what_effects_do(
         noted[k] = load
     slopes = share * np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
     asked = world(SPREAD, noted, slopes, offset, bend)
-    found = plateaus.noted_wrong(np.repeat(noted, DWELL, axis=0), 1e-3, asked)
+    found = plateaus.wrong_notes_against(np.repeat(noted, DWELL, axis=0), 1e-3, asked)
     assert [n.plateau.number for n in found] == sorted(wrong)
     for one in found:
-        assert one.hung == pytest.approx(SPREAD[one.plateau.number], abs=0.05)
+        assert one.applied == pytest.approx(SPREAD[one.plateau.number], abs=0.05)
         assert one.period == 1e-3
 
 
 @pytest.mark.parametrize(('hung', 'far'), [(46.6, False), (46.8, True), (33.9, True), (34.1, False)])
-def test_a_load_that_is_off_by_two_newtons_and_a_tenth_is_simulated_as_the_readings_say(hung: float, far: bool) -> None:
+def test_a_load_off_by_2_n_is_simulated_as_the_readings_say(hung: float, far: bool) -> None:
     # 46.67 - 40 is 2 + 4.667; 40 - 34 is 2 + 4, as the other force is 40.
     truth = SPREAD.copy()
     truth[5] = (hung, -40.0, 20.0)
@@ -734,13 +549,13 @@ def test_a_load_that_is_off_by_two_newtons_and_a_tenth_is_simulated_as_the_readi
         asked_with.append(acting[5 * DWELL + 5].tolist())
         return inner(acting)
 
-    (note,) = plateaus.noted_wrong(np.repeat(SPREAD, DWELL, axis=0), 1e-3, asked)
-    assert note.hung == pytest.approx(truth[5])
+    (note,) = plateaus.wrong_notes_against(np.repeat(SPREAD, DWELL, axis=0), 1e-3, asked)
+    assert note.applied == pytest.approx(truth[5])
     assert asked_with[:2] == [[40.0, -40.0, 20.0], [0.0, 0.0, 0.0]]
     assert asked_with[2] == pytest.approx(truth[5] if far else [40.0, -40.0, 20.0])
 
 
-def test_readings_are_held_against_the_simulation_in_fine_means_of_what_is_there(
+def test_readings_are_compared_in_fine_means(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     held: list[tuple[FloatArray, FloatArray, int, int]] = []
@@ -751,7 +566,7 @@ def test_readings_are_held_against_the_simulation_in_fine_means_of_what_is_there
         held.append((difference, count, samples, size))
         return seen({}, SPREAD[:0])
 
-    monkeypatch.setattr(plateaus, 'asked_for', asked_for)
+    monkeypatch.setattr(plateaus, 'implied_loads', asked_for)
     loads = np.tile((1.0, -5.0, 2.0), (400, 1))
     for rate, size in ((1000.0, 4), (625.0, 2), (200.0, 1), (100.0, 1)):
         rig = load_rig(overrides={'converter.sample_rate_hz': rate})
@@ -776,24 +591,14 @@ def test_each_round_allows_the_others_less(monkeypatch: pytest.MonkeyPatch) -> N
         allowed.append(bent)
         return plateaus.StandingOut((5,))
 
-    monkeypatch.setattr(plateaus, 'stand_out', stand_out)
+    monkeypatch.setattr(plateaus, 'outliers', stand_out)
     truth = SPREAD + np.where(np.arange(8)[:, None] == 5, 3.0, 0.0)
-    (note,) = plateaus.noted_wrong(np.repeat(SPREAD, DWELL, axis=0), 1e-3, world(truth, SPREAD, np.zeros((3, 3))))
-    assert note.hung == pytest.approx(truth[5])
+    (note,) = plateaus.wrong_notes_against(
+        np.repeat(SPREAD, DWELL, axis=0), 1e-3, world(truth, SPREAD, np.zeros((3, 3)))
+    )
+    assert note.applied == pytest.approx(truth[5])
     # A tenth, a fiftieth, nothing.
     assert allowed == pytest.approx([0.1, 0.02, 0.0, 0.0, 0.0])
-
-
-def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
-    periods: list[float] = []
-
-    def noted(loads: FloatArray, period: float, asked: object) -> list[WrongNote]:
-        periods.append(period)
-        return []
-
-    monkeypatch.setattr(plateaus, 'noted_wrong', noted)
-    wrong_notes(load_rig(overrides={'converter.sample_rate_hz': 200.0}), np.zeros((100, 6)), np.zeros((100, 3)))
-    assert periods == pytest.approx([0.005])
 
 
 def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -> None:
@@ -809,9 +614,9 @@ def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -
     # A seventh of a newton: 0.15 of three times 0.3.
     for size, asks in ((0.134, 1), (EXACT * STANDS_OUT * TOLERANCE, 3), (0.136, 3)):
         asked_with.clear()
-        assert plateaus.noted_wrong(loads, 1e-3, of_size(size)) == []
+        assert plateaus.wrong_notes_against(loads, 1e-3, of_size(size)) == []
         assert len(asked_with) == asks
-    assert plateaus.noted_wrong(loads, 1e-3, lambda acting: seen({}, SPREAD[:0])) == []
+    assert plateaus.wrong_notes_against(loads, 1e-3, lambda acting: seen({}, SPREAD[:0])) == []
 
 
 ONE_TORQUE = np.array(
@@ -825,14 +630,14 @@ def test_the_only_torque_is_accused_if_its_change_was_noted_twice() -> None:
     more = HUNG_ONCE - ONE_TORQUE[4]
     for allowed in ((0.0, 0.0, 0.0), (1.0, -1.5, 1.5)):
         off = tuple((more + allowed).tolist())
-        assert plateaus.stand_out(seen({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
+        assert plateaus.outliers(seen({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
     # Another torque, and half of the torque alone: another unit or stiffness may make that.
-    assert plateaus.stand_out(seen({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
-    assert plateaus.stand_out(seen({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
+    assert plateaus.outliers(seen({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
+    assert plateaus.outliers(seen({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
     # The first load that was hung: half of it may be another unit, too.
     first = ONE_TORQUE.copy()
     first[3] = 0.0
-    assert plateaus.stand_out(seen({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
+    assert plateaus.outliers(seen({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
 
 
 def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> None:
@@ -845,14 +650,26 @@ def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> No
         hung = ONE_TORQUE + listed.more
         return replace(listed, more=hung - held)
 
-    (note,) = plateaus.noted_wrong(noted, 1e-3, asked)
+    (note,) = plateaus.wrong_notes_against(noted, 1e-3, asked)
     assert note.exact
-    assert note.hung.tolist() == HUNG_ONCE.tolist()
+    assert note.applied.tolist() == HUNG_ONCE.tolist()
     assert note.where == 'load 4'
     # One that others are like is what the readings say.
     other = seen({3: (0.0, 5.0, 0.0)}, ONE_TORQUE)
-    (free,) = plateaus.noted_wrong(
+    (free,) = plateaus.wrong_notes_against(
         noted, 1e-3, lambda acting: replace(other, more=ONE_TORQUE + other.more - acting[DWELL // 2 :: DWELL])
     )
     assert not free.exact
-    assert free.hung == pytest.approx((24.0, -35.0, 0.0))
+    assert free.applied == pytest.approx((24.0, -35.0, 0.0))
+
+
+def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    periods: list[float] = []
+
+    def noted(loads: FloatArray, period: float, asked: object) -> list[WrongNote]:
+        periods.append(period)
+        return []
+
+    monkeypatch.setattr(plateaus, 'wrong_notes_against', noted)
+    wrong_notes(load_rig(overrides={'converter.sample_rate_hz': 200.0}), np.zeros((100, 6)), np.zeros((100, 3)))
+    assert periods == pytest.approx([0.005])

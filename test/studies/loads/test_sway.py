@@ -10,36 +10,19 @@ import math
 import numpy as np
 import pytest
 
-from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import load_rig, replace_values
-from psd_deflection.studies.calibrate.from_recordings import as_acted
-from psd_deflection.studies.calibrate.observation import CalibrationRun
-from psd_deflection.studies.check.checkup import check, of_recording
+from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads import sway
-from psd_deflection.studies.loads.plateaus import Plateau, asked_beside_rig, plateaus
-from psd_deflection.studies.loads.sway import SwayingLoad, left_out, swaying_loads
-
-RIG = load_rig()
-LEVELS = np.array(
-    [(0, 0, 0), (0, -20, 0), (0, -50, 0), (0, -50, -29), (30, 0, 0), (40, -40, 20), (0, -30, 0), (0, 0, 0)], float
-)
-DWELL = 4000
-HUNG = np.repeat(LEVELS, DWELL, axis=0)
-T = np.arange(len(HUNG)) / 1000.0
-
-
-def read(acting: FloatArray, **true: object) -> FloatArray:
-    """What the device reads (n, 6), V, under ``acting`` loads, of a rig that differs by ``true``."""
-    rig = replace_values(RIG, {name.replace('__', '.'): value for name, value in true.items()})
-    return np.asarray(RigSimulator(rig, 3).step(acting).counts * RIG.converter.volts_per_count, dtype=np.float64)
+from psd_deflection.studies.loads.plateaus import Plateau, implied_beside_rig, plateaus
+from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swaying_loads
+from test.studies.held_loads import DWELL, HELD, RIG, T, answers, read
 
 
 def swung(force: float, frequency: float, axis: int = 0, number: int = 3) -> FloatArray:
     """The loads with a swing in one plateau."""
-    out = HUNG.copy()
+    out = HELD.copy()
     since = T - number * DWELL / 1000.0
     held = (since > 0.0) & (since < DWELL / 1000.0)
     out[:, axis] += np.where(held, force * np.sin(2.0 * np.pi * frequency * since), 0.0)
@@ -50,42 +33,38 @@ SWUNG = read(swung(1.0, 1.3))
 
 
 def test_check_calibrate_and_discover_say_the_same() -> None:
-    checked = check(of_recording(RIG, SWUNG, HUNG, 'x'))
+    checked, steady, log, found = answers(SWUNG, HELD)
     assert [(f.name, f.where, f.value) for f in checked.findings] == [('load_value', 'load 3', None)]
     words = checked.findings[0].fix
     assert words.startswith('the weight that hung on the link of x from 12.000 s to 16.000 s swayed at 1.3')
     assert checked.verdict == 'wrong'
     assert checked.sizes == pytest.approx([1.0] * 3, abs=0.01)
-    told: list[str] = []
-    run = CalibrationRun('x', T, SWUNG, np.zeros(0), np.zeros((0, 3)), HUNG)
-    steady = as_acted(run, RIG, told.append)
-    assert told == [words]
+    assert log == [words]
     assert np.isnan(steady.volts[12_000:16_000]).all()
     assert np.isfinite(steady.volts[:12_000]).all()
     assert np.isfinite(steady.volts[20_000:]).all()
-    found = discover([Observation('x', RIG, SWUNG, HUNG)])
     assert [f.fix for f in found.setup] == [words]
     assert found.verdict == 'nothing_missing'
 
 
 @pytest.mark.parametrize(('force', 'frequency', 'axis'), [(0.5, 0.9, 0), (2.0, 1.6, 0), (1.0, 1.1, 1)])
 def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: float, axis: int) -> None:
-    (found,) = swaying_loads(RIG, read(swung(force, frequency, axis)), HUNG)
+    (found,) = swaying_loads(RIG, read(swung(force, frequency, axis)), HELD)
     assert found.plateau.number == 3
     assert found.frequency == pytest.approx(frequency, abs=0.02)
     assert found.force == pytest.approx(force, rel=0.1)
     # How it swung, but for how much more a link of 14 Hz swings than under a load that rests.
     assert found.swung is not None
-    true = (swung(force, frequency, axis) - HUNG)[3 * DWELL : 4 * DWELL]
+    true = (swung(force, frequency, axis) - HELD)[3 * DWELL : 4 * DWELL]
     assert np.abs(found.swung - true).max() < 0.03 * force
-    assert sway.swung(len(HUNG), []) is None
-    every = sway.swung(len(HUNG), [found])
+    assert sway.swung(len(HELD), []) is None
+    every = sway.swung(len(HELD), [found])
     assert every is not None
     np.testing.assert_array_equal(every[3 * DWELL : 4 * DWELL], found.swung)
 
 
 def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
-    asked, noted = asked_beside_rig(RIG, SWUNG, HUNG), plateaus(RIG, SWUNG, HUNG, noted=True)
+    asked, noted = implied_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, annotated_only=True)
     cut = 3 * DWELL + 1200
     pieces = [
         *noted[:3],
@@ -101,7 +80,7 @@ def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
 def test_a_clamp_that_sticks_keeps_the_last_of_a_sway() -> None:
     """Without the sway its friction would hold the link on the other side, as a law that switches then."""
     friction = {'effects__e__name': 'clamp_friction', 'effects__e__width': 3e-6, 'effects__e__axis': 3}
-    found = discover([Observation('x', RIG, read(swung(0.8, 1.4375, number=6), **friction), HUNG)])
+    found = discover([Observation('x', RIG, read(swung(0.8, 1.4375, number=6), **friction), HELD)])
     assert [(e.active.effect.name, e.active.values['axis']) for e in found.effects] == [('clamp_friction', 3)]
     assert found.effects[0].active.values['width'] == pytest.approx(3e-6, rel=0.02)
     assert (found.verdict, found.unknown, found.law) == ('effects_found', (), None)
@@ -115,19 +94,7 @@ STICKS = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'ef
 
 @pytest.mark.parametrize('true', [{}, TURNED, STICKS, {'dynamics__bending_damping_ratio': 0.01}, {'link__length': 0.6}])
 def test_what_no_weight_does_is_no_sway(true: dict[str, object]) -> None:
-    assert swaying_loads(RIG, read(HUNG, **true), HUNG) == []
-
-
-def test_a_load_that_was_never_noted_a_wrong_sign_and_a_moving_beam_are_no_sway() -> None:
-    forgotten = HUNG.copy()
-    forgotten[2 * DWELL : 3 * DWELL] = LEVELS[1]
-    quiet = read(HUNG)
-    assert swaying_loads(RIG, quiet, forgotten) == []
-    turned = quiet * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
-    assert swaying_loads(RIG, turned, HUNG) == []
-    beam = quiet.copy()
-    beam[12_000:16_000, 3] += 0.02 * np.sin(2.0 * np.pi * 1.3 * T[:4000])
-    assert swaying_loads(RIG, beam, HUNG) == []
+    assert swaying_loads(RIG, read(HELD, **true), HELD) == []
 
 
 def test_the_time_is_left_out_until_the_link_has_come_to_rest() -> None:
@@ -135,16 +102,16 @@ def test_the_time_is_left_out_until_the_link_has_come_to_rest() -> None:
     volts = np.zeros((9000, 6))
     swayed = [SwayingLoad(Plateau(0, 2000, 5000, 1, False, np.zeros(3)), 1.0, 1.0, 1e-3)]
     rest = round(5.0 / (2.0 * math.pi * 10.0 * 0.05) / 1e-3)
-    gone = np.flatnonzero(np.isnan(left_out(rig, volts, swayed)).all(axis=1))
+    gone = np.flatnonzero(np.isnan(excluded(rig, volts, swayed)).all(axis=1))
     assert gone.tolist() == list(range(2000, 5000 + rest))
     assert not volts.any()
 
 
-def test_the_top_of_three_powers_is_that_of_a_parabola_through_their_logarithms() -> None:
+def test_a_peak_is_the_vertex_of_a_log_parabola() -> None:
     f = np.array([0.5, 1.0, 1.5, 2.0])
     top = np.exp(-(((f - 1.1) / 0.4) ** 2))
-    assert sway._strongest(f, top) == pytest.approx(1.1)
-    assert sway._strongest(f, np.array([1.0, 0.5, 0.2, 0.1])) == pytest.approx(0.5, abs=0.01)
-    assert sway._strongest(f, np.zeros(4)) == 0.0
-    assert sway._strongest(f[:2], np.array([1.0, 3.0])) == 1.0
-    assert sway._strongest(np.zeros(0), np.zeros(0)) == 0.0
+    assert sway.peak_frequency(f, top) == pytest.approx(1.1)
+    assert sway.peak_frequency(f, np.array([1.0, 0.5, 0.2, 0.1])) == pytest.approx(0.5, abs=0.01)
+    assert sway.peak_frequency(f, np.zeros(4)) == 0.0
+    assert sway.peak_frequency(f[:2], np.array([1.0, 3.0])) == 1.0
+    assert sway.peak_frequency(np.zeros(0), np.zeros(0)) == 0.0

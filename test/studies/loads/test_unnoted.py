@@ -7,19 +7,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from psd_deflection.model.simulation.simulator import RigSimulator
-from psd_deflection.records import FloatArray
-from psd_deflection.rig.config import load_rig, replace_values
-from psd_deflection.studies.calibrate.from_recordings import as_acted
-from psd_deflection.studies.calibrate.observation import CalibrationRun
-from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.loads.acted import loads_that_acted
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads
-from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
+from psd_deflection.studies.loads.unnoted import unnoted_times
+from test.studies.held_loads import RIG, answers, read
 
-RIG = load_rig()
 LEVELS = np.array(
     [
         *[(0, 0, 0), (30, 0, 0), (0, -50, -29), (0, 0, 0)],
@@ -28,42 +22,29 @@ LEVELS = np.array(
     float,
 )
 DWELL = 2000
-HUNG = np.repeat(LEVELS, DWELL, axis=0)
-T = np.arange(len(HUNG)) / 1000.0
-TURNED = {'effects.e.name': 'sensor_rotation', 'effects.e.psd': 1, 'effects.e.angle': 0.02}
+HELD = np.repeat(LEVELS, DWELL, axis=0)
+TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.02}
 WORDS = 'nobody noted it: note each change; this time is left out'
 
 
-def read(acting: FloatArray, **true: object) -> FloatArray:
-    """What the device reads (n, 6), V, under ``acting`` loads, of a rig that differs by ``true``."""
-    return np.asarray(
-        RigSimulator(replace_values(RIG, true), 3).step(acting).counts * RIG.converter.volts_per_count,
-        dtype=np.float64,
-    )
-
-
-STOPPED = HUNG.copy()
+STOPPED = HELD.copy()
 STOPPED[4 * DWELL :] = 0.0
 """Somebody noted nothing any more after the second load was taken off."""
-VOLTS = read(HUNG)
+VOLTS = read(HELD)
 
 
 def test_check_calibrate_and_discover_say_the_same() -> None:
     words = f'x: from 8.000 s to the end the load changed 8 times, and {WORDS}'
-    checked = check(of_recording(RIG, VOLTS, STOPPED, 'x'))
+    checked, known, log, found = answers(VOLTS, STOPPED)
     # The loads that are left move all readings, but none of them along Y alone.
     told, pushes = checked.findings
     assert (told.name, told.where, told.fix) == ('load_coverage', 'load_fx load_fy load_tz', words)
     assert (pushes.name, pushes.where) == ('load_coverage', 'fy tz')
     assert checked.verdict == 'wrong'
     assert f'load_fx load_fy load_tz: not seen: {words}' in checked.sentences()
-    heard: list[str] = []
-    run = CalibrationRun('x', T, VOLTS, np.zeros(0), np.zeros((0, 3)), STOPPED)
-    known = as_acted(run, RIG, heard.append)
-    assert heard == [words]
+    assert log == [words]
     assert np.isnan(known.volts[8_000:]).all()
     assert np.isfinite(known.volts[:8_000]).all()
-    found = discover([Observation('x', RIG, VOLTS, STOPPED)])
     (told,) = found.setup
     assert (told.name, told.fix) == ('load_coverage', words)
     assert told.value == pytest.approx(16 / 24)
@@ -73,7 +54,7 @@ def test_check_calibrate_and_discover_say_the_same() -> None:
 
 @pytest.mark.statistics
 def test_an_effect_beside_loads_that_were_not_noted_is_named() -> None:
-    found = discover([Observation('x', RIG, read(HUNG, **TURNED), STOPPED)])
+    found = discover([Observation('x', RIG, read(HELD, **TURNED), STOPPED)])
     assert [f.name for f in found.setup] == ['load_coverage']
     assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
     assert found.effects[0].active.values['angle'] == pytest.approx(0.02, abs=4.0 * found.effects[0].sd['angle'])
@@ -81,7 +62,7 @@ def test_an_effect_beside_loads_that_were_not_noted_is_named() -> None:
 
 
 def test_loads_missing_in_the_middle_are_left_out_until_the_next_note() -> None:
-    noted = HUNG.copy()
+    noted = HELD.copy()
     noted[2 * DWELL : 10 * DWELL] = LEVELS[1]
     acted = loads_that_acted(RIG, VOLTS, noted)
     assert [n.words('x') for n in acted.notes] == [f'x: from 4.000 s to 20.000 s the load changed 8 times, and {WORDS}']
@@ -91,7 +72,7 @@ def test_loads_missing_in_the_middle_are_left_out_until_the_next_note() -> None:
 
 
 def test_two_loads_that_were_not_noted_are_told_one_by_one() -> None:
-    noted = HUNG.copy()
+    noted = HELD.copy()
     noted[2 * DWELL : 4 * DWELL] = LEVELS[1]
     acted = loads_that_acted(RIG, VOLTS, noted)
     assert [n.name for n in acted.notes] == ['missing_load', 'missing_load']
@@ -99,35 +80,9 @@ def test_two_loads_that_were_not_noted_are_told_one_by_one() -> None:
 
 
 def test_a_recording_without_any_noted_load_stays_as_it_is() -> None:
-    acted = loads_that_acted(RIG, VOLTS, np.zeros_like(HUNG))
+    acted = loads_that_acted(RIG, VOLTS, np.zeros_like(HELD))
     assert not acted.notes
     assert np.isfinite(acted.volts).all()
-
-
-@pytest.mark.parametrize(
-    'true',
-    [
-        {'effects.e.name': 'clamp_friction', 'effects.e.width': 1.4e-5, 'effects.e.axis': 3},
-        {
-            'effects.e.name': 'laser_pointing_drift',
-            'effects.e.psd': 2,
-            'effects.e.rate_x': 5e-5,
-            'effects.e.rate_y': 0.0,
-        },
-        TURNED,
-        {'link.length': 0.6},
-    ],
-)
-def test_what_effects_do_is_no_load(true: dict[str, object]) -> None:
-    assert not any(isinstance(n, UnnotedTime) for n in loads_that_acted(RIG, read(HUNG, **true), HUNG).notes)
-
-
-def test_a_beam_that_jumps_three_times_is_no_load() -> None:
-    volts = VOLTS.copy()
-    for i, at in enumerate((21_000, 22_300, 22_700)):
-        volts[at:, 3] += 0.2 * (-1) ** i
-    noted = HUNG.copy()
-    assert not any(isinstance(n, UnnotedTime) for n in loads_that_acted(RIG, volts, noted).notes)
 
 
 def asked(more: list[float], *, alone: int, across: float = 0.0, noted: float = 10.0) -> PlateauLoads:
@@ -161,17 +116,3 @@ def test_a_change_counts_by_three_times_what_effects_may_do_to_the_load() -> Non
 def test_two_changes_are_too_few_and_noted_ones_do_not_count() -> None:
     assert unnoted_times(asked([0.0, 9.0, 0.0], alone=1), 20_000, 0.001) == []
     assert unnoted_times(asked([0.0, 9.0, 0.0, 9.0], alone=2), 20_000, 0.001) == []
-
-
-def test_the_readings_are_those_of_a_plate() -> None:
-    """Within 5 % of how far the largest of these loads moves it, and 0.2 µm."""
-    limit = 0.05 * 9.0 * 4e-5 + 2e-7
-    assert unnoted_times(asked([0.0, 9.0, 0.0, 9.0], alone=1, across=0.99 * limit), 20_000, 0.001)
-    assert unnoted_times(asked([0.0, 9.0, 0.0, 9.0], alone=1, across=-1.01 * limit), 20_000, 0.001) == []
-
-
-def test_the_times_are_taken_out_and_nothing_else() -> None:
-    volts = np.ones((100, 6))
-    out = without_times(volts, [UnnotedTime(10, 20, 100, 3, 0.001), UnnotedTime(90, 100, 100, 4, 0.001)])
-    assert np.flatnonzero(np.isnan(out).all(axis=1)).tolist() == [*range(10, 20), *range(90, 100)]
-    assert np.isfinite(volts).all()

@@ -9,7 +9,6 @@ import pytest
 from numpy.polynomial import Polynomial
 
 from psd_deflection.records import FloatArray
-from psd_deflection.studies.validate import motion as module
 from psd_deflection.studies.validate.motion import Motion
 
 PERIOD = 2.0**-10
@@ -85,54 +84,6 @@ def test_nothing_is_known_of_instants_outside_the_samples() -> None:
     motion = of(np.arange(40.0))
     values, _, _ = motion.dots_at(np.array([-5.0, 2.0, 2.5, 3.0, 36.0, 36.5, 37.5, 60.0]) * PERIOD)
     assert np.isfinite(values[:, 0]).tolist() == [False, False, True, True, True, True, False, False]
-
-
-def test_many_instants_are_fitted_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    motion = of(np.arange(60.0))
-    at = np.linspace(10.0, 50.0, 22) * PERIOD
-    whole = motion.dots_at(at, 2e-3)
-    monkeypatch.setattr(module, 'ROWS', 7)
-    for a, b in zip(whole, motion.dots_at(at, 2e-3), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-12)
-
-
-def test_no_instants_have_no_answers() -> None:
-    assert [a.shape for a in of(np.arange(60.0)).dots_at(np.empty(0))] == [(0, 4)] * 3
-
-
-def test_the_speed_is_that_of_the_pose_not_of_the_dots() -> None:
-    t = np.arange(100.0) * PERIOD
-    dots = np.stack([1.0 + 30.0 * t, 2.0 - 50.0 * t, 0.3 + t**2, 1000.0 * t], axis=1)
-
-    def solve(d: FloatArray) -> FloatArray:
-        return np.stack([d[:, 0] * d[:, 1], d[:, 2] - d[:, 0], np.sin(d[:, 3])], axis=1)
-
-    at = np.array([0.02, 0.05, 0.07])
-    poses, speeds = Motion(t, dots, PERIOD, solve).poses_at(at)
-    a, b = 1.0 + 30.0 * at, 2.0 - 50.0 * at
-    expected = np.stack([30.0 * b - 50.0 * a, 2.0 * at - 30.0, 1000.0 * np.cos(1000.0 * at)], axis=1)
-    np.testing.assert_allclose(poses, np.stack([a * b, 0.3 + at**2 - a, np.sin(1000.0 * at)], axis=1), rtol=1e-8)
-    # The sine turns by a tenth of a radian over a tenth of a sample.
-    np.testing.assert_allclose(speeds, expected, rtol=2e-3)
-
-
-def test_where_samples_are_missing_pose_and_speed_are_unknown() -> None:
-    motion = of(np.arange(60.0))
-    poses, speeds = motion.poses_at(np.array([-1.0, 0.02, 1.0]))
-    assert np.isnan(poses).all(axis=1).tolist() == [True, False, True]
-    assert np.isnan(speeds).all(axis=1).tolist() == [True, False, True]
-    assert np.isfinite(poses[1]).all()
-    assert np.isfinite(speeds[1]).all()
-
-
-def test_a_solver_is_not_asked_for_nothing() -> None:
-    def solve(dots: FloatArray) -> FloatArray:
-        raise AssertionError(len(dots))
-
-    motion = Motion(np.arange(60.0) * PERIOD, np.zeros((60, 4)), PERIOD, solve)
-    poses, speeds = motion.poses_at(np.array([7.0, 8.0]))
-    assert np.isnan(poses).all()
-    assert np.isnan(speeds).all()
 
 
 def test_single_samples_lie_on_an_even_grid() -> None:

@@ -49,7 +49,7 @@ PLAIN = Validated(
     offset=BEHIND,
     applied=False,
     covered=(math.nan, math.nan, math.nan),
-    left_out=0,
+    excluded=0,
 )
 
 
@@ -101,7 +101,7 @@ def test_cover_is_said_if_the_reference_states_its_deviations() -> None:
 
 
 def test_what_was_left_out_and_refused_is_counted() -> None:
-    found = replace(PLAIN, left_out=3, problem=replace(PROBLEM, refused={'too dark': 2, 'blurred': 5}))
+    found = replace(PLAIN, excluded=3, problem=replace(PROBLEM, refused={'too dark': 2, 'blurred': 5}))
     assert found.sentences()[-2:] == [
         '3 of 7 references have no samples about them and are left out.',
         'The reference gave no answer 7 times: blurred 5, too dark 2.',
@@ -128,7 +128,7 @@ def test_the_table_has_the_solvers_in_units_that_people_read() -> None:
 
 
 def test_programs_get_si_units() -> None:
-    tree = replace(PLAIN, left_out=3, problem=replace(PROBLEM, refused={'blurred': 5})).tree()
+    tree = replace(PLAIN, excluded=3, problem=replace(PROBLEM, refused={'blurred': 5})).tree()
     assert tree['solver'] == 'exact'
     assert tree['references'] == 4
     assert tree['left_out'] == 3

@@ -35,7 +35,7 @@ LOADS, POSE = ('load_fx', 'load_fy', 'load_tz'), ('dx', 'dy', 'theta')
 
 
 def sought(psds: int) -> tuple[str, ...]:
-    """The targets that are looked at of so many PSDs. A law on a load does what one on the static pose does."""
+    """Return the targets that are looked at of so many PSDs. A law on a load does what one on the static pose does."""
     sums = (f'sum{n}' for n in range(1, psds + 1))
     return (*(f'static_{n}' for n in POSE), *POSE, *dot_names(psds), *sums)
 
@@ -81,7 +81,7 @@ def _jacobian(pose: FloatArray, beams: FloatArray, model: ForwardModel) -> Float
 
 
 def _unwhiten(rows: FloatArray, ar: FloatArray) -> FloatArray:
-    """The adjoint of whitening, without its scale, of one channel's rows (k, nf)."""
+    """Return the adjoint of whitening, without its scale, of one channel's rows (k, nf)."""
     out = rows.copy()
     for j in range(1, len(ar) + 1):
         out[:, :-j] -= ar[j - 1] * rows[:, j:]
@@ -108,8 +108,8 @@ def responses(ws: Workspace, fit: Fit) -> list[Response]:
         if noise.slow is not None:
             vectors = [noise.slow.whiten(v) for v in vectors]
         # Each vector, as it multiplies unwhitened fine blocks: (3P, 1 + p, nf).
-        own = [np.stack([v[c] * scale[c] for v in vectors]) for c in range(channels)]
-        back = np.stack([_unwhiten(rows, ar) for rows, ar in zip(own, noise.ar, strict=True)])
+        simulated = [np.stack([v[c] * scale[c] for v in vectors]) for c in range(channels)]
+        back = np.stack([_unwhiten(rows, ar) for rows, ar in zip(simulated, noise.ar, strict=True)])
         gain = (scale * (1.0 - noise.ar.sum(axis=1))[:, None]) ** 2
         mixing = np.zeros((len(targets), channels, nf))
         for t, name in enumerate(targets):
@@ -164,23 +164,23 @@ def known_fine(ws: Workspace, effects: Sequence[ActiveEffect], name: str) -> lis
     return [fine_means(known(_variables(ws, effects, i)[1], name)[None, :], size)[0] for i, size in enumerate(ws.fine)]
 
 
-def _spread(parts: Sequence[FloatArray]) -> float:
+def _deviation(parts: Sequence[FloatArray]) -> float:
     return float(np.max(np.abs(np.concatenate(parts))))
 
 
 def _levels(parts: Sequence[FloatArray], count: int) -> list[float]:
     """Between the values that a variable takes, evenly by rank of the distinct ones."""
-    whole = np.concatenate(parts)
-    low, high = float(whole.min()), float(whole.max())
+    values = np.concatenate(parts)
+    low, high = float(values.min()), float(values.max())
     if high <= low:
         return []
     return [low + (high - low) * (k + 0.5) / count for k in range(count)]
 
 
-def terms(found: Sequence[Response]) -> Iterator[LawTerm]:
+def terms(responses_of_rig: Sequence[Response]) -> Iterator[LawTerm]:
     """Every term that is tried, with a grid for its shapes; variables that never change are left out."""
-    parts = {name: [r.known[name] for r in found] for name in found[0].known}
-    size = {name: _spread(values) for name, values in parts.items()}
+    parts = {name: [r.known[name] for r in responses_of_rig] for name in responses_of_rig[0].known}
+    size = {name: _deviation(values) for name, values in parts.items()}
     moving = [n for n in parts if size[n] > 0.0]
     placed = [n for n in moving if n != 'time']
     for k in (1, 2, 3):
@@ -244,7 +244,7 @@ class Scored:
 
 
 def allowed(target: str, term: LawTerm) -> bool:
-    """Whether the term's variables are known where it acts."""
+    """Return whether the term's variables are known where it acts."""
     return all(v in TARGETS[target].variables for v in term.depends_on)
 
 
@@ -261,11 +261,11 @@ def _through(r: Response, way: int, row: FloatArray) -> FloatArray:
     return row if way == 0 else np.asarray(lfilter(*r.modes[way - 1], row))
 
 
-def score(found: Sequence[Response], listed: Sequence[LawTerm], targets: Sequence[str] = ()) -> list[Scored]:
-    """Each term on each of ``targets``, by default all, the best first."""
+def score(responses_of_rig: Sequence[Response], listed: Sequence[LawTerm], targets: Sequence[str] = ()) -> list[Scored]:
+    """Return each term on each of ``targets``, by default all, the best first."""
     out: list[Scored] = []
-    every = found[0].targets
-    targets, count, k = targets or every, len(every), found[0].weight.shape[1] // len(every)
+    every = responses_of_rig[0].targets
+    targets, count, k = targets or every, len(every), responses_of_rig[0].weight.shape[1] // len(every)
     listed = [t for t in listed if any(allowed(name, t) for name in targets)]
     ways = sorted({_way(name) for name in targets})
     for start in range(0, len(listed), _BATCH):
@@ -273,7 +273,7 @@ def score(found: Sequence[Response], listed: Sequence[LawTerm], targets: Sequenc
         # In place, and through the modes of bending and torsion.
         totals = np.zeros((3, len(batch), count, k))
         lengths = np.zeros((3, len(batch), count))
-        for r in found:
+        for r in responses_of_rig:
             rows = [t.evaluate(r.known.__getitem__, len(r.known['time']), r.period, {}) for t in batch]
             for way in ways:
                 # Only loads and what is like them drive a mode.
@@ -303,29 +303,29 @@ TOGGLE_COST = 24.0
 """Chi-square that each switching must gain: twice the logarithm of the blocks of a recording, and some more."""
 
 
-def switchings(found: Sequence[Response], targets: Sequence[str] = ()) -> list[LawTerm]:
+def switchings(responses_of_rig: Sequence[Response], targets: Sequence[str] = ()) -> list[LawTerm]:
     """Terms that are on between times which the residual of the only recording shows, on ``targets``, by default all.
 
     The states are the likeliest of two levels, 0 and A (Viterbi's algorithm), with A fitted in turn. What the link
     rings after a switching is averaged over its period first, and the times are improved with the modes in the model.
     """
-    seen: list[Scored] = []
-    (r,) = found
+    scored: list[Scored] = []
+    (r,) = responses_of_rig
     for t, name in enumerate(r.targets):
         if (targets and name not in targets) or TARGETS[name].point == 'static':
             continue
-        own = [n for n in DOTS if name in DOTS and (n[1] == name[1])]
+        dots_of_axis = [n for n in DOTS if name in DOTS and (n[1] == name[1])]
         on_link = TARGETS[name].point == 'pose'
-        for of in ((), *((n,) for n in own)):
+        for of in ((), *((n,) for n in dots_of_axis)):
             v = _blocks(r, r.known[of[0]]) if of else np.ones(r.error.shape[1])
             error = _averaged(r.error[t], r.rings[int(name == 'theta')]) if on_link else r.error[t]
-            times = _two_levels(error, r.power[t] * v * v, v)
+            times = two_levels(error, r.power[t] * v * v, v)
             if 0 < len(times) <= MOST_TIMES:
                 term = LawTerm('switched', of, times=tuple(float(k * r.fine * r.period) for k in times))
                 places = (name, f'static_{name}') if on_link else (name,)
-                seen += score(found, [term], places)
-    seen.sort(key=lambda s: -s.gain)
-    better = [with_better_times(found, s.target, s.term) for s in seen[:REFINED]]
+                scored += score(responses_of_rig, [term], places)
+    scored.sort(key=lambda s: -s.gain)
+    better = [with_better_times(responses_of_rig, s.target, s.term) for s in scored[:REFINED]]
     return list({(t.of, t.times): t for t in better}.values())
 
 
@@ -336,9 +336,9 @@ def _averaged(values: FloatArray, blocks: int) -> FloatArray:
     return np.asarray(np.convolve(values, np.ones(blocks) / blocks, mode='same'))
 
 
-def with_better_times(found: Sequence[Response], target: str, term: LawTerm) -> LawTerm:
-    """Each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
-    step = found[0].period
+def with_better_times(responses_of_rig: Sequence[Response], target: str, term: LawTerm) -> LawTerm:
+    """Return each time moved to where the term explains most on ``target``: by up to 0.08 s, then to a sample."""
+    step = responses_of_rig[0].period
     for reach, pitch in ((0.08, 8.0 * step), (0.08, 8.0 * step), (8.0 * step, step)):
         for k in range(len(term.times)):
             tries = []
@@ -347,26 +347,26 @@ def with_better_times(found: Sequence[Response], target: str, term: LawTerm) -> 
                 times[k] = round(times[k] + shift, 9)
                 if times == sorted(set(times)):
                     tries.append(LawTerm(term.form, term.of, times=tuple(times)))
-            best = score(found, tries, (target,))
+            best = score(responses_of_rig, tries, (target,))
             if best:
                 term = LawTerm(term.form, term.of, times=best[0].term.times)
     return term
 
 
-def with_better_level(found: Sequence[Response], s: Scored) -> Scored:
-    """The term with the threshold at which it explains most: no refit moves one at which the form jumps.
+def with_better_level(responses_of_rig: Sequence[Response], s: Scored) -> Scored:
+    """Return the term with the threshold at which it explains most: no refit moves one at which the form jumps.
 
     It is the middle between the two values of the variable around it, which are as good; they are its uncertainty.
     """
     if 'threshold' not in FORMS[s.term.form].fixed:
         return s
-    values = np.unique(np.concatenate([r.known[s.term.of[0]] for r in found]))
+    values = np.unique(np.concatenate([r.known[s.term.of[0]] for r in responses_of_rig]))
     best, reach = s, float(np.ptp(values)) / LEVELS
     for _ in range(3):
         middle = best.term.shapes['threshold']
         levels = (middle + reach * np.linspace(-1.0, 1.0, 17)).tolist()
         tries = [dataclasses.replace(best.term, shapes={'threshold': level}) for level in levels]
-        best = max([best, *score(found, tries, (s.target,))], key=lambda t: t.gain)
+        best = max([best, *score(responses_of_rig, tries, (s.target,))], key=lambda t: t.gain)
         reach /= 8.0
     above = int(np.searchsorted(values, best.term.shapes['threshold']))
     if 0 < above < len(values):
@@ -377,12 +377,12 @@ def with_better_level(found: Sequence[Response], s: Scored) -> Scored:
     return best
 
 
-def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int]:
+def two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[int]:
     """Where the state changes: ``error`` (nf,) is A v s with s 0 or 1, each with ``weight`` in units of A."""
-    own = np.where(np.abs(v) > 1e-12, error / np.where(np.abs(v) > 1e-12, v, 1.0), 0.0)
+    ratio = np.where(np.abs(v) > 1e-12, error / np.where(np.abs(v) > 1e-12, v, 1.0), 0.0)
     # The best box, on a coarse grid, gives the first A.
-    step = max(1, len(own) // 240)
-    p = np.concatenate(([0.0], np.cumsum(own * weight)))[::step]
+    step = max(1, len(ratio) // 240)
+    p = np.concatenate(([0.0], np.cumsum(ratio * weight)))[::step]
     n = np.concatenate(([0.0], np.cumsum(weight)))[::step]
     top, below = p[None, :] - p[:, None], n[None, :] - n[:, None]
     gain = np.where(below > 1e-9 * n[-1], top**2 / np.maximum(below, 1e-9 * n[-1] + 1e-300), 0.0)
@@ -391,15 +391,15 @@ def _two_levels(error: FloatArray, weight: FloatArray, v: FloatArray) -> list[in
         return []
     level = float(top[a, b] / below[a, b])
     for _ in range(4):
-        state = _likeliest(weight * level * (2.0 * own - level))
+        state = likeliest_states(weight * level * (2.0 * ratio - level))
         on = state == 1
         if not on.any():
             return []
-        level = float((own * weight)[on].sum() / max(float(weight[on].sum()), 1e-300))
+        level = float((ratio * weight)[on].sum() / max(float(weight[on].sum()), 1e-300))
     return [int(k) for k in np.flatnonzero(np.diff(state, prepend=0))]
 
 
-def _likeliest(gain: FloatArray) -> IntArray:
+def likeliest_states(gain: FloatArray) -> IntArray:
     """States (n,) 0 or 1 that gain most, each change for ``TOGGLE_COST``; 0 before the first."""
     off, on = 0.0, -TOGGLE_COST
     came = np.empty((len(gain), 2), dtype=np.int64)

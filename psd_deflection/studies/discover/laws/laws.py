@@ -92,7 +92,7 @@ class FoundLaw:
         return (self.law, *self.further)
 
     def adopted(self, name: str) -> Law:
-        """All of it as one law of that name."""
+        """Return all of it as one law of that name."""
         return dataclasses.replace(self.law, name=name, further=self.further)
 
     @property
@@ -102,29 +102,35 @@ class FoundLaw:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
+class LawTrial:
+    """Laws with the fit that has them; ``cost``: its chi-square with a penalty for each parameter."""
+
     laws: tuple[Law, ...]
     fit: Fit
     cost: float
 
     @property
     def beside(self) -> tuple[ActiveEffect, ...]:
+        """The effects of the fit without the laws."""
         return self.fit.effects[: len(self.fit.effects) - len(self.laws)]
 
     @property
     def terms(self) -> int:
+        """The number of terms of all laws."""
         return sum(len(law.terms) for law in self.laws)
 
     @property
     def variables(self) -> tuple[str, ...]:
+        """The variables of all laws, each once."""
         return tuple(dict.fromkeys(v for law in self.laws for v in law.variables))
 
 
-def _on(target: str, *listed: LawTerm) -> Law:
+def law_on(target: str, *listed: LawTerm) -> Law:
+    """Return the law on a quantity that has these terms."""
     return Law(f'law_{target}', TARGETS[target].stage, target, listed)
 
 
-def _covariance(fit: Fit) -> FloatArray:
+def term_covariance(fit: Fit) -> FloatArray:
     """(p, p) of the parameters of ``fit``; those that the recording does not determine get large values.
 
     A threshold below which only one level of a load lies is such a one.
@@ -135,24 +141,26 @@ def _covariance(fit: Fit) -> FloatArray:
     return np.asarray((vectors / np.maximum(values, 1e-9)) @ vectors.T / np.outer(lengths, lengths))
 
 
-def _fitted(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
-    """The law with the values and standard deviations of effect ``index`` of ``fit``."""
+def fitted_law(law: Law, fit: Fit, covariance: FloatArray, index: int) -> Law:
+    """Return the law with the values and standard deviations of effect ``index`` of ``fit``."""
     values = fit.effects[index].values
     sd = {fit.free[j][1]: math.sqrt(max(covariance[j, j], 0.0)) for j in fit.columns_of(index)}
     out = []
     for i, t in enumerate(law.terms, 1):
-        own = {'coefficient': sd.get(f'c{i}', 0.0)}
-        own.update({k: sd[f'{k}{i}'] for k in t.shapes if f'{k}{i}' in sd})
+        deviations = {'coefficient': sd.get(f'c{i}', 0.0)}
+        deviations.update({k: sd[f'{k}{i}'] for k in t.shapes if f'{k}{i}' in sd})
         shapes = {k: values[f'{k}{i}'] for k in t.shapes}
         sizes = {'coefficient': values[f'c{i}'], **shapes}
         # What the recording does not determine has no standard deviation.
-        own = {k: v for k, v in own.items() if v < UNDETERMINED * abs(sizes[k]) and k not in FORMS[t.form].fixed}
-        own.update({k: t.sd[k] for k in FORMS[t.form].fixed if k in t.sd})
-        out.append(dataclasses.replace(t, coefficient=values[f'c{i}'], shapes=shapes, sd=own))
+        deviations = {
+            k: v for k, v in deviations.items() if v < UNDETERMINED * abs(sizes[k]) and k not in FORMS[t.form].fixed
+        }
+        deviations.update({k: t.sd[k] for k in FORMS[t.form].fixed if k in t.sd})
+        out.append(dataclasses.replace(t, coefficient=values[f'c{i}'], shapes=shapes, sd=deviations))
     return dataclasses.replace(law, terms=tuple(out))
 
 
-class _Seeker:
+class LawSearch:
     """The search beside one set of effects."""
 
     def __init__(self, ws: Workspace, start: Fit, penalty: float) -> None:
@@ -170,11 +178,11 @@ class _Seeker:
         more = sum(len(FORMS[t.form].fixed) + len(t.times) for law in laws for t in law.terms)
         return fit.chi2 + self.penalty * (fit.parameters + more)
 
-    def trial(self, laws: Sequence[Law], beside: Sequence[ActiveEffect], iterations: int) -> _Trial:
-        """The laws refitted in the simulation."""
+    def trial(self, laws: Sequence[Law], beside: Sequence[ActiveEffect], iterations: int) -> LawTrial:
+        """Return the laws refitted in the simulation."""
         fit = refit(self.ws, [*beside, *(ActiveEffect(effect_of(law), values_of(law)) for law in laws)], iterations)
-        covariance = _covariance(fit)
-        better = tuple(_fitted(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
+        covariance = term_covariance(fit)
+        better = tuple(fitted_law(law, fit, covariance, len(beside) + i) for i, law in enumerate(laws))
         # A shape at its bound means that the form is not the right one; one that is not fitted has no room.
         fixed = {
             (len(beside) + i, f'{name}{k}')
@@ -183,29 +191,29 @@ class _Seeker:
             for name in FORMS[t.form].fixed
         }
         bound = any(i >= len(beside) and (i, name) not in fixed for i, name in fit.at_bound)
-        return _Trial(better, fit, math.inf if bound else self.cost(better, fit))
+        return LawTrial(better, fit, math.inf if bound else self.cost(better, fit))
 
-    def done(self, trial: _Trial) -> bool:
-        """Whether no more than noise is left, or enough has been tried."""
+    def done(self, trial: LawTrial) -> bool:
+        """Return whether no more than noise is left, or enough has been tried."""
         size = float(self.ws.size)
         return trial.fit.chi2 < size + 4.0 * math.sqrt(2.0 * size) or self.ws.simulations > self.last
 
-    def first(self) -> list[_Trial]:
+    def first(self) -> list[LawTrial]:
         """Laws of one term, the best first."""
         scored = score(self.found, self.listed)
-        seen: set[tuple[str, str, tuple[str, ...]]] = set()
+        known: set[tuple[str, str, tuple[str, ...]]] = set()
         picked: list[Scored] = []
         for s in scored:
             key = (s.target, s.term.form, s.term.of)
-            if key not in seen and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
-                seen.add(key)
+            if key not in known and s.gain >= 0.3 * scored[0].gain and len(picked) < TRIED:
+                known.add(key)
                 picked.append(with_better_level(self.found, s))
-        quick = [self.trial([_on(s.target, s.term)], self.start.effects, 3) for s in picked]
+        quick = [self.trial([law_on(s.target, s.term)], self.start.effects, 3) for s in picked]
         quick.sort(key=lambda t: t.cost)
         full = [self.trial(t.laws, t.beside, 8) for t in quick[:FOLLOWED]]
         return sorted([*full, *quick[FOLLOWED:]], key=lambda t: t.cost)
 
-    def grown(self, trial: _Trial) -> _Trial:
+    def grown(self, trial: LawTrial) -> LawTrial:
         """Further terms while BIC improves by enough; then terms that it does not miss go."""
         while trial.terms < MAX_TERMS and not self.done(trial):
             more = responses(self.ws, trial.fit)
@@ -216,24 +224,24 @@ class _Seeker:
                     continue
             scored = score(more, [t for t in self.listed if t.form != 'switched'])
             better = [with_better_level(more, s) for s in scored[:2]]
-            tries = [self.trial(_with(trial.laws, s), trial.beside, 4) for s in better]
+            tries = [self.trial(with_term(trial.laws, s), trial.beside, 4) for s in better]
             best = min(tries, key=lambda t: t.cost, default=trial)
             if best.cost > trial.cost - BIC_ACCEPT:
                 break
             trial = best
         while trial.terms > 1:
-            fewer = [self.trial(laws, trial.beside, 5) for laws in _fewer(trial.laws)]
+            fewer = [self.trial(laws, trial.beside, 5) for laws in subsets_without_a_term(trial.laws)]
             best = min(fewer, key=lambda t: t.cost)
             if best.cost > trial.cost + BIC_ACCEPT:
                 break
             trial = best
         return trial
 
-    def _switched_again(self, trial: _Trial, left: Sequence[Response]) -> _Trial:
+    def _switched_again(self, trial: LawTrial, residuals: Sequence[Response]) -> LawTrial:
         """With the further times of switching that show once the law is in the model."""
         (law,), best = trial.laws, trial
         term = law.terms[0]
-        for more in switchings(left, (law.acts_on.removeprefix('static_'),)):
+        for more in switchings(residuals, (law.acts_on.removeprefix('static_'),)):
             times = tuple(sorted({*term.times} ^ {*more.times}))
             if more.of == term.of and times:
                 better = with_better_times(self.found, law.acts_on, LawTerm(term.form, term.of, times=times))
@@ -242,7 +250,7 @@ class _Seeker:
                 best = min(best, self.trial([now], trial.beside, 4), key=lambda t: t.cost)
         return best
 
-    def lean(self, trial: _Trial) -> _Trial:
+    def lean(self, trial: LawTrial) -> LawTrial:
         """Without the effects that only stood in for the law."""
         while trial.beside:
             fewer = [self.trial(trial.laws, [a for a in trial.beside if a is not gone], 5) for gone in trial.beside]
@@ -252,9 +260,9 @@ class _Seeker:
             trial = best
         return trial
 
-    def same_elsewhere(self, trial: _Trial) -> list[_Trial]:
-        """The first law at the other stages that show alike: a beam for a dot, a load for a static pose."""
-        law, others = trial.laws[0], trial.laws[1:]
+    def same_elsewhere(self, trial: LawTrial) -> list[LawTrial]:
+        """Return the first law at the other stages that show alike: a beam for a dot, a load for a static pose."""
+        law, further_laws = trial.laws[0], trial.laws[1:]
         moved: list[Law] = []
         if f'beam_{law.acts_on}' in TARGETS:
             moved.append(dataclasses.replace(law, acts_on=f'beam_{law.acts_on}', stage='optics'))
@@ -264,24 +272,24 @@ class _Seeker:
             per = p.torque_compliance if row == 2 else p.force_compliance
             of_load = tuple(dataclasses.replace(t, coefficient=t.coefficient / per) for t in law.terms)
             moved.append(dataclasses.replace(law, acts_on=LOADS[row], stage='load', terms=of_load))
-        out = [self.trial([m, *others], trial.beside, 4) for m in moved]
+        out = [self.trial([m, *further_laws], trial.beside, 4) for m in moved]
         if law.acts_on in DOTS:
             # A voltage is a dot over a constant: by no recording can the two be told apart.
-            out.append(_Trial((dataclasses.replace(law, stage='electronics'), *others), trial.fit, trial.cost))
+            out.append(LawTrial((dataclasses.replace(law, stage='electronics'), *further_laws), trial.fit, trial.cost))
         return out
 
 
-def _with(laws: Sequence[Law], s: Scored) -> tuple[Law, ...]:
-    """The laws and one more term, in the law on its target if there is one."""
+def with_term(laws: Sequence[Law], s: Scored) -> tuple[Law, ...]:
+    """Return the laws and one more term, in the law on its target if there is one."""
     if any(law.acts_on == s.target for law in laws):
         return tuple(
             dataclasses.replace(law, terms=(*law.terms, s.term)) if law.acts_on == s.target else law for law in laws
         )
-    return (*laws, _on(s.target, s.term))
+    return (*laws, law_on(s.target, s.term))
 
 
-def _fewer(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
-    """Each way to leave out one term."""
+def subsets_without_a_term(laws: Sequence[Law]) -> list[tuple[Law, ...]]:
+    """Return each way to leave out one term."""
     out = []
     for gone in (t for law in laws for t in law.terms):
         rest = [dataclasses.replace(law, terms=tuple(t for t in law.terms if t is not gone)) for law in laws]
@@ -298,74 +306,74 @@ def find_law(
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> FoundLaw | None:
-    """The law that explains what ``fit`` leaves, or None.
+    """Return the law that explains what ``fit`` leaves, or None.
 
     ``null``: the rig file's own model, tried as well, because effects of the catalogue may stand in for the law.
     ``excess``: chi-square beyond noise that ``fit`` leaves; ``penalty``: of BIC, for each parameter.
     """
     progress('a law for what remains')
-    found = _law_of_the_mean(ws, null, fit, penalty, excess, rng)
-    return found or find_jitter(ws, fit, penalty)
+    found_law = _law_of_the_mean(ws, null, fit, penalty, excess, rng)
+    return found_law or find_jitter(ws, fit, penalty)
 
 
 def _law_of_the_mean(
     ws: Workspace, null: Fit, fit: Fit, penalty: float, excess: float, rng: np.random.Generator
 ) -> FoundLaw | None:
     starts = [fit, null] if fit.effects else [null]
-    trials: list[tuple[_Trial, _Seeker]] = []
+    trials: list[tuple[LawTrial, LawSearch]] = []
     for start in starts:
-        seeker = _Seeker(ws, start, penalty)
+        seeker = LawSearch(ws, start, penalty)
         trials += [(t, seeker) for t in seeker.first()]
     trials = [(t, s) for t, s in trials if t.cost < math.inf]
     if not trials:
         return None
     trials.sort(key=lambda t: t[0].cost)
     # Where one law leaves nothing but noise, others get no further terms.
-    followed: list[tuple[_Trial, _Seeker]] = []
+    followed: list[tuple[LawTrial, LawSearch]] = []
     for t, s in trials[:FOLLOWED]:
         followed.append((t if s.done(t) else s.grown(t), s))
         if s.done(followed[-1][0]):
             break
     best, seeker = min(followed, key=lambda t: t[0].cost)
     best = seeker.lean(best)
-    others = [t for t, _ in (*followed, *trials)]
-    best = _simplest(best, others)
-    found = best.fit
+    alternatives = [t for t, _ in (*followed, *trials)]
+    best = simplest(best, alternatives)
+    fit_with_law = best.fit
     without = refit(ws, best.beside, 6) if best.beside else null
-    gain = without.chi2 - found.chi2
-    parameters = found.parameters - without.parameters
+    gain = without.chi2 - fit_with_law.chi2
+    parameters = fit_with_law.parameters - without.parameters
     chosen = sum(len(t.times) for law in best.laws for t in law.terms)
     # Every term on every target might have been taken, and every block as a time of a switching.
     chances = best.terms * math.log(seeker.tried) + chosen * math.log(max(ws.size / (3.0 * ws.psds), 2.0))
     p = math.exp(chances + float(chi2_law.logsf(gain, max(parameters, 1))))
-    bic = gain - (best.cost - found.chi2 - penalty * without.parameters)
-    held = heldout_gain(ws, without, found, rng)
-    left = heldout_gap(ws, found)
-    enough = fit.chi2 - found.chi2 > EXPLAINS * excess and _predicts(ws, fit, left)
+    bic = gain - (best.cost - fit_with_law.chi2 - penalty * without.parameters)
+    held = heldout_gain(ws, without, fit_with_law, rng)
+    residual_gap = heldout_gap(ws, fit_with_law)
+    enough = fit.chi2 - fit_with_law.chi2 > EXPLAINS * excess and _predicts(ws, fit, residual_gap)
     enough &= not _at_changes(ws, best.laws)
     enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_ACCEPT
-    if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.holds or not enough:
+    if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.significant or not enough:
         return None
     return FoundLaw(
         best.laws[0],
         best.laws[1:],
-        found,
+        fit_with_law,
         without,
-        _channels(ws, best),
-        _tied(best, [*others, *seeker.same_elsewhere(best)]),
+        dominant_channels(ws, best),
+        tied_laws(best, [*alternatives, *seeker.same_elsewhere(best)]),
         p,
         bic,
         held,
-        left,
+        residual_gap,
     )
 
 
-def _predicts(ws: Workspace, fit: Fit, left: float) -> bool:
-    """Whether a law that leaves a gap ``left``, m, on unseen load cases closes half of what ``fit`` leaves, as energies
+def _predicts(ws: Workspace, fit: Fit, residual_gap: float) -> bool:
+    """Whether a law with ``residual_gap``, m, on unseen load cases closes half of the gap of ``fit``, as energies
     beyond noise.
     """
     floor = ws.floor()
-    return left**2 - floor**2 <= (1.0 - EXPLAINS) * max(ws.gap(fit.difference) ** 2 - floor**2, 0.0)
+    return residual_gap**2 - floor**2 <= (1.0 - EXPLAINS) * max(ws.gap(fit.difference) ** 2 - floor**2, 0.0)
 
 
 def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
@@ -380,7 +388,7 @@ def _at_changes(ws: Workspace, laws: Sequence[Law]) -> bool:
 
 
 def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
-    """The channel and the variable that its noise grows with, or None: variance = a + b v^2."""
+    """Return the channel and the variable that its noise grows with, or None: variance = a + b v^2."""
     known = {name: known_fine(ws, fit.effects, name) for name in variables_of(ws.psds)}
     folds = [ws.folds()[case] for case in ws.case]
     fold = np.concatenate(folds)
@@ -393,13 +401,13 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     v2 = np.concatenate(known[name]) ** 2 / full
     held = []
     for k in np.unique(fold):
-        other, own = (fold != k) & (squares > 0.0), (fold == k) & (squares > 0.0)
-        a, b = variance(squares[other], v2[other])
-        flat = float(squares[other].mean())
-        held.append(likelihood(squares[own], a + b * v2[own]) - likelihood(squares[own], flat))
+        training, held_out = (fold != k) & (squares > 0.0), (fold == k) & (squares > 0.0)
+        a, b = variance(squares[training], v2[training])
+        flat = float(squares[training].mean())
+        held.append(likelihood(squares[held_out], a + b * v2[held_out]) - likelihood(squares[held_out], flat))
     heldout = HeldOut(0.5 * float(sum(held)), math.sqrt(max(gain, 1.0)))
     p = tried * float(chi2_law.sf(gain, 1))
-    if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.holds or slope <= 0.0:
+    if p > P_ACCEPT or gain - penalty <= BIC_ACCEPT or not heldout.significant or slope <= 0.0:
         return None
     # Noise that grows with the motion explains no gap: what remains in means is a movement.
     if ws.gap(fit.difference) > MOVES * ws.floor():
@@ -418,15 +426,15 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     more = ws.gap(fit.difference) ** 2 - ws.floor() ** 2
     if ws.gap(fit.difference) > NOTED * ws.floor() and added < EXPLAINS * more:
         return None
-    whole = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
-    others = [dataclasses.replace(law, stage='psd')]
+    with_jitter = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
+    alternatives = [dataclasses.replace(law, stage='psd')]
     return FoundLaw(
         law,
         (),
-        whole,
+        with_jitter,
         fit,
         (channel,),
-        tuple(others),
+        tuple(alternatives),
         p,
         gain - penalty,
         heldout,
@@ -434,7 +442,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     )
 
 
-def _simplest(best: _Trial, others: Sequence[_Trial]) -> _Trial:
+def simplest(best: LawTrial, alternatives: Sequence[LawTrial]) -> LawTrial:
     """Of the laws beside the same effects that this recording cannot tell apart, the one with the fewest variables.
 
     A sensor's own dot goes before the pose, on which its dot depends.
@@ -442,33 +450,33 @@ def _simplest(best: _Trial, others: Sequence[_Trial]) -> _Trial:
     beside = [a.effect.name for a in best.beside]
     near = [
         t
-        for t in (best, *others)
+        for t in (best, *alternatives)
         if t.fit.chi2 - best.fit.chi2 < TIED
         and t.cost - best.cost < BIC_ACCEPT
         and [a.effect.name for a in t.beside] == beside
     ]
 
-    def rank(t: _Trial) -> tuple[int, int, int, float]:
+    def rank(t: LawTrial) -> tuple[int, int, int, float]:
         foreign = sum(v in POSE for law in t.laws if law.acts_on in DOTS for v in law.variables)
         return t.terms, len(t.variables), foreign, t.cost
 
     return min(near, key=rank)
 
 
-def _tied(best: _Trial, others: Sequence[_Trial]) -> tuple[Law, ...]:
-    """Each other first law, by stage, target and variables, that the recording cannot exclude."""
+def tied_laws(best: LawTrial, alternatives: Sequence[LawTrial]) -> tuple[Law, ...]:
+    """Return each other first law, by stage, target and variables, that the recording cannot exclude."""
 
     def key(law: Law) -> tuple[str, str, tuple[str, ...]]:
         return law.stage, law.acts_on, law.variables
 
     out = {key(best.laws[0]): best.laws[0]}
-    for t in sorted(others, key=lambda t: t.cost):
+    for t in sorted(alternatives, key=lambda t: t.cost):
         if t.fit.chi2 - best.fit.chi2 < TIED and t.cost - best.cost < TIED:
             out.setdefault(key(t.laws[0]), t.laws[0])
     return tuple(out.values())[1:]
 
 
-def _channels(ws: Workspace, best: _Trial) -> tuple[str, ...]:
+def dominant_channels(ws: Workspace, best: LawTrial) -> tuple[str, ...]:
     """Where the law shows: the channels with more than a twentieth of its energy."""
     _, alone = ws.residual([*ws.base, *best.fit.nuisance, *best.beside])
     moved = ws.whiten([a - b for a, b in zip(alone, best.fit.difference, strict=True)])

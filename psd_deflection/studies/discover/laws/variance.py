@@ -51,6 +51,6 @@ def variance(squares: FloatArray, v2: FloatArray) -> tuple[float, float]:
     columns = np.stack([np.ones_like(v2), v2], axis=1)
     for _ in range(8):
         weight = 1.0 / (a + b * v2)
-        found = np.linalg.lstsq(columns * weight[:, None], squares * weight, rcond=None)[0]
-        a, b = max(float(found[0]), 0.05), max(float(found[1]), 0.0)
+        solution = np.linalg.lstsq(columns * weight[:, None], squares * weight, rcond=None)[0]
+        a, b = max(float(solution[0]), 0.05), max(float(solution[1]), 0.0)
     return a, b

@@ -64,7 +64,7 @@ def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
     sizes = _amplitudes(fit, physics, covariance)
     out = []
     for count in (2, 3):
-        compared = [group for group in itertools.combinations(sizes, count) if _may_be_one(fit, group)]
+        compared = [group for group in itertools.combinations(sizes, count) if _may_coincide(fit, group)]
         for group in compared:
             odds = _odds(group, covariance) / len(compared)
             if odds >= ODDS:
@@ -73,8 +73,8 @@ def coincidences(fit: Fit, physics: Physics | None) -> list[Coincidence]:
     return sorted(out, key=lambda c: -c.odds)
 
 
-def _may_be_one(fit: Fit, group: Sequence[tuple[int, float, str]]) -> bool:
-    """Whether these amplitudes are of different effects and of one unit, and no known cause ties them."""
+def _may_coincide(fit: Fit, group: Sequence[tuple[int, float, str]]) -> bool:
+    """Return whether these amplitudes are of different effects and of one unit, and no known cause ties them."""
     effects = [fit.free[column][0] for column, _, _ in group]
     # What ties two stiffnesses is known, and told by :mod:`.ties`.
     stiff = [i for i in effects if MOVES_FREQUENCY in fit.effects[i].effect.parameters]
@@ -87,9 +87,9 @@ def _odds(group: Sequence[tuple[int, float, str]], covariance: FloatArray) -> fl
     of_logs = covariance[np.ix_(columns, columns)] / np.outer(sizes, sizes)
     # The logarithm of the first less those of the others.
     less = np.column_stack((np.ones(len(group) - 1), -np.eye(len(group) - 1)))
-    spread = less @ (of_logs + 0.5 * EXACT**2 * np.eye(len(group))) @ less.T
+    size_covariance = less @ (of_logs + 0.5 * EXACT**2 * np.eye(len(group))) @ less.T
     off = less @ np.log(np.abs(sizes))
-    density = math.exp(-0.5 * float(off @ np.linalg.solve(spread, off))) / math.sqrt(
-        np.linalg.det(2.0 * np.pi * spread)
+    density = math.exp(-0.5 * float(off @ np.linalg.solve(size_covariance, off))) / math.sqrt(
+        np.linalg.det(2.0 * np.pi * size_covariance)
     )
     return float((DECADES * math.log(10.0)) ** len(off) * density)

@@ -70,7 +70,7 @@ class Comparison(ABC):
         return self.tally.count
 
     def replaced(self, **changes: Any) -> Self:
-        """A copy with other attributes, such as ``base``, ``nuisance`` or ``noise``."""
+        """Return a copy with other attributes, such as ``base``, ``nuisance`` or ``noise``."""
         out = copy.copy(self)
         for name, value in changes.items():
             setattr(out, name, value)
@@ -102,13 +102,13 @@ class Comparison(ABC):
 
     @abstractmethod
     def whiten(self, tables: Sequence[FloatArray]) -> FloatArray:
-        """One vector, of unit variance if the noise model holds; 0 where nothing was measured."""
+        """Return one vector, of unit variance if the noise model holds; 0 where nothing was measured."""
 
     @abstractmethod
     def renoised(self, effects: Sequence[ActiveEffect]) -> Self:
         """With the noise as it is with ``effects`` in the model; this one if that is the same."""
 
-    def settled_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
+    def refitted_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
         """With what is free besides the effects as ``difference`` of a fit of these asks for; this one if little is."""
         return self
 
@@ -126,10 +126,10 @@ class Comparison(ABC):
 
     @abstractmethod
     def floor(self) -> float:
-        """The gap from noise alone; NaN if nobody knows the noise."""
+        """Return the gap from noise alone; NaN if nobody knows the noise."""
 
-    def most_by_noise(self) -> float:
-        """The gap that noise alone exceeds in one of a thousand recordings; NaN if nobody knows the noise."""
+    def noise_limit(self) -> float:
+        """Return the gap that noise alone exceeds in one of a thousand recordings; NaN if nobody knows the noise."""
         size = self.effective_size() * len(self.channels) / len(self.measured[0])
         return self.floor() * float(np.sqrt(chi2_law.isf(EXCEEDED, size) / size))
 
@@ -139,11 +139,11 @@ class Comparison(ABC):
 
     @abstractmethod
     def unwhitened(self, white: FloatArray) -> list[FloatArray]:
-        """The tables of a slow change of a vector (D,)."""
+        """Return the tables of a slow change of a vector (D,)."""
 
     @abstractmethod
     def folds(self) -> IntArray:
-        """The fold of each load case, for the hold-out."""
+        """Return the fold of each load case, for the hold-out."""
 
     @property
     @abstractmethod
@@ -152,33 +152,33 @@ class Comparison(ABC):
 
     @property
     @abstractmethod
-    def scale_shown(self) -> tuple[float, str]:
+    def display_scale(self) -> tuple[float, str]:
         """By what a gap is multiplied for people, and the unit that it has then."""
 
     @property
     @abstractmethod
-    def units_shown(self) -> tuple[str, ...]:
-        """Of the rows of ``shown``."""
+    def display_units(self) -> tuple[str, ...]:
+        """Of the rows of ``displayed``."""
 
     @abstractmethod
-    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
-        """A residual by ``channels``, as the gap counts it, for pictures; NaN where nothing was measured."""
+    def displayed(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return a residual by ``channels``, as the gap counts it, for pictures; NaN where nothing was measured."""
 
     @abstractmethod
     def along(self) -> tuple[str | TimeAxis, list[FloatArray]]:
-        """The time of what is ``shown``, or the number of the reading."""
+        """Return the time of what is ``displayed``, or the number of the reading."""
 
     @abstractmethod
     def against(self) -> dict[str, list[FloatArray]]:
-        """What else ``shown`` may be held against in a picture, by name with unit."""
+        """What else ``displayed`` may be held against in a picture, by name with unit."""
 
     @abstractmethod
     def provenance(self) -> list[dict[str, object]]:
         """Of each recording, for result.json."""
 
     def worded(self, size: float, digits: str = '.3g') -> str:
-        """A gap with its unit, for people."""
-        scale, unit = self.scale_shown
+        """Return a gap with its unit, for people."""
+        scale, unit = self.display_scale
         return f'{scale * size:{digits}} {unit}'.rstrip() if np.isfinite(size) else 'not known'
 
     def sd(self, jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
@@ -197,7 +197,7 @@ class Comparison(ABC):
         return np.concatenate([part[channel] for part in self.split(self.whiten(tables))])
 
     def split(self, vector: FloatArray) -> list[FloatArray]:
-        """The tables of a vector."""
+        """Return the tables of a vector."""
         out, at = [], 0
         for m in self.measured:
             out.append(vector[at : at + m.size].reshape(m.shape))
@@ -205,7 +205,7 @@ class Comparison(ABC):
         return out
 
     def row_cases(self) -> IntArray:
-        """The load case of every element of a vector."""
+        """Return the load case of every element of a vector."""
         return np.concatenate([np.tile(c, len(m)) for c, m in zip(self.case, self.measured, strict=True)])
 
     def residual(self, effects: Sequence[ActiveEffect]) -> tuple[FloatArray, list[FloatArray]]:

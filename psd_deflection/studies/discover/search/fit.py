@@ -46,7 +46,7 @@ class Fit:
     nuisance: tuple[ActiveEffect, ...] = ()
 
     @property
-    def whole(self) -> tuple[ActiveEffect, ...]:
+    def coefficients_with_nuisance(self) -> tuple[ActiveEffect, ...]:
         """Nuisance and effects."""
         return (*self.nuisance, *self.effects)
 

@@ -66,7 +66,7 @@ def added(more: Sequence[tuple[Direction, float]]) -> list[tuple[int, FloatArray
 
 
 def moved(more: Sequence[tuple[Direction, float]]) -> tuple[Direction, ...]:
-    """The directions, with the sizes that the loads have after so much ``more``."""
+    """Return the directions, with the sizes that the loads have after so much ``more``."""
     sizes = _sizes(more)
     return tuple(
         dataclasses.replace(d, sizes=sizes.get(id(d.of), d.sizes)) if isinstance(d, LoadDirection) else d
@@ -75,7 +75,7 @@ def moved(more: Sequence[tuple[Direction, float]]) -> tuple[Direction, ...]:
 
 
 def _sizes(more: Sequence[tuple[Direction, float]]) -> dict[int, tuple[float, ...]]:
-    """All numbers after so much ``more``, by the id of what they belong to."""
+    """Return all numbers after so much ``more``, by the id of what they belong to."""
     out: dict[int, tuple[float, ...]] = {}
     for d, size in more:
         if isinstance(d, LoadDirection) and d.exact is not None:

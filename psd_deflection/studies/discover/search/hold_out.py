@@ -25,7 +25,9 @@ RIDGE = 1e-6
 """Of the squared length of a signature: so little of it on the cases of a fit does not tell its size."""
 
 
-def _steps(workspace: Comparison, fit: Fit, home: bool = False) -> Iterator[tuple[npt.NDArray[np.bool_], FloatArray]]:
+def fold_steps(
+    workspace: Comparison, fit: Fit, home: bool = False
+) -> Iterator[tuple[npt.NDArray[np.bool_], FloatArray]]:
     """For each fold its elements (D,), and by how much the parameters (p,) move if it is left out of the fit.
 
     What only this fold shows, the zero of a run, stays where it is, or with ``home`` goes back to where it is off.
@@ -68,7 +70,7 @@ def heldout_residual(workspace: Comparison, fit: Fit, home: bool = True) -> Floa
     if not fit.free:
         return fit.residual
     out = fit.residual.copy()
-    for test, step in _steps(workspace, fit, home):
+    for test, step in fold_steps(workspace, fit, home):
         out[test] -= fit.jacobian[test] @ step
     return out
 
@@ -78,7 +80,7 @@ def scatter(workspace: Comparison, fit: Fit) -> FloatArray:
 
     The jackknife (Tukey 1958). It sees what the noise does not: that the model fits each case a little differently.
     """
-    steps = np.array([step for _, step in _steps(workspace, fit)])
+    steps = np.array([step for _, step in fold_steps(workspace, fit)])
     n = len(steps)
     return np.asarray(np.sqrt((n - 1) / n * np.sum((steps - steps.mean(axis=0)) ** 2, axis=0)))
 
@@ -114,7 +116,7 @@ class HeldOut:
     error: float
 
     @property
-    def holds(self) -> bool:
+    def significant(self) -> bool:
         """Whether the gain exceeds two standard errors."""
         return self.gain > 2.0 * self.error
 
@@ -128,6 +130,6 @@ def heldout_gain(workspace: Comparison, without: Fit, fit: Fit, rng: np.random.G
     """
     piece = workspace.pieces(heldout_residual(workspace, without, False), heldout_residual(workspace, fit, False))
     draws = rng.integers(0, len(piece), size=(BOOTSTRAPS, len(piece)))
-    spread = float(np.std(piece[draws].sum(axis=1)))
+    deviation = float(np.std(piece[draws].sum(axis=1)))
     gain = float(piece.sum())
-    return HeldOut(gain, min(spread, float(np.sqrt(2.0 * max(abs(gain), 1.0)))))
+    return HeldOut(gain, min(deviation, float(np.sqrt(2.0 * max(abs(gain), 1.0)))))

@@ -39,7 +39,7 @@ class Terms:
 def further_terms(
     screen: Screen, fit: Fit, passes: Callable[[Score], bool], taken: frozenset[str], most: int = MOST_TERMS
 ) -> Terms | None:
-    """The terms of ``screen`` that pass one by one beside ``fit``, to first order; None if no term passes.
+    """Return the terms of ``screen`` that pass one by one beside ``fit``, to first order; None if no term passes.
 
     No simulation is made. ``passes``: the rule for one more term; ``taken``: names of effects that are not asked.
     """

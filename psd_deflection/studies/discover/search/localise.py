@@ -149,7 +149,7 @@ def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArra
         time = np.arange(n) / n
         warmer = np.zeros(n) if o.temperature is None else fine_means(chunk.warmer[None, :], size)[0]
         axes = ('fx', 'fy', 'tz')
-        for psd, own in enumerate(out):
+        for psd, columns_of_psd in enumerate(out):
             x, y = dots[2 * psd], dots[2 * psd + 1]
             named = {
                 'constant': np.ones(n),
@@ -175,7 +175,7 @@ def regressors(workspace: Workspace) -> list[tuple[str, dict[str, list[FloatArra
                 'temperature^2': warmer**2,
             }
             for name, values in named.items():
-                own.setdefault(name, []).append(values)
+                columns_of_psd.setdefault(name, []).append(values)
     return [(channel, out[c // 3]) for c, channel in enumerate(channel_names(workspace.psds))]
 
 
@@ -186,7 +186,7 @@ def dependences(
     known: FloatArray | None,
     explained: FloatArray | None = None,
 ) -> list[Dependence]:
-    """Every channel against every regressor, after projecting out ``known`` (D, p).
+    """Return every channel against every regressor, after projecting out ``known`` (D, p).
 
     ``table``: the name of each channel, and its regressors. What the simulation of ``explained`` (D,) may be wrong by
     does not count.
@@ -194,7 +194,7 @@ def dependences(
     q = None
     if known is not None and known.shape[1]:
         q, _ = np.linalg.qr(known / np.maximum(np.linalg.norm(known, axis=0), 1e-300))
-    found: list[tuple[str, str, float]] = []
+    relations: list[tuple[str, str, float]] = []
     for c, (channel, named) in enumerate(table):
         names = list(named)
         matrix = np.stack([workspace.row(c, values) for values in named.values()], axis=1)
@@ -203,8 +203,8 @@ def dependences(
         g = matrix.T @ e
         wrong = 0.0
         if explained is not None:
-            own = np.concatenate([part[c] for part in workspace.split(explained)])
-            wrong = RELATIVE * np.sqrt(lengths) * np.linalg.norm(own)
+            channel_values = np.concatenate([part[c] for part in workspace.split(explained)])
+            wrong = RELATIVE * np.sqrt(lengths) * np.linalg.norm(channel_values)
         f = lengths.copy()
         if q is not None:
             fitted = np.stack([np.concatenate([part[c] for part in workspace.split(col)]) for col in q.T])
@@ -214,11 +214,11 @@ def dependences(
         g = np.maximum(np.abs(g) - wrong, 0.0)
         for k, name in enumerate(names):
             if lengths[k] > 0.0 and f[k] > 1e-6 * lengths[k]:
-                found.append((channel, name, float(g[k] ** 2 / f[k])))
-    count = len(found)
+                relations.append((channel, name, float(g[k] ** 2 / f[k])))
+    count = len(relations)
     out = [
         Dependence(ch, name, gain, float(-np.expm1(count * np.log1p(-min(float(chi2_law.sf(gain, 1)), 1 - 1e-16)))))
-        for ch, name, gain in found
+        for ch, name, gain in relations
     ]
     out.sort(key=lambda d: -d.gain)
     return out
@@ -263,7 +263,7 @@ def localise(
     main: dict[str, list[str]] = {}
     for d in depends:
         if d.p < 0.01 and len(main.setdefault(d.channel, [])) < 2:
-            name = _plain(d.regressor)
+            name = plain_word(d.regressor)
             if name not in main[d.channel]:
                 main[d.channel].append(name)
     order, channels = np.argsort(-z, axis=None), channel_names(workspace.psds)
@@ -288,8 +288,8 @@ def localise(
     return Localisation(tuple(cells), tuple(depends), total, p, raw_z, spans)
 
 
-def _plain(regressor: str) -> str:
-    """The word of result.json for a regressor: a load, its rate, the dot's position, temperature, time."""
+def plain_word(regressor: str) -> str:
+    """Return the word of result.json for a regressor: a load, its rate, the dot's position, temperature, time."""
     for word in ('load_fx', 'load_fy', 'load_tz'):
         if word in regressor:
             return word

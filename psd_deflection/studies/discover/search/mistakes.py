@@ -28,50 +28,50 @@ FARTHEST_ERROR, HALVED = -0.7, -0.5
 
 
 def mistake(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit:
-    """One of the mistakes that touch every channel if it explains nearly all by itself, else ``null``.
+    """Return one of the mistakes that touch every channel if it explains nearly all by itself, else ``null``.
 
     Late loads may be taken with one effect, if they explain nearly all together: each would hide the other.
     """
     if not scores or min(s.p for s in scores) > trials.workspace.p_accept:
         return null
-    found = trials.best_of(_mistaken(trials, null, scores), 2, 12)
-    if not _nearly_all(trials, null, found):
-        found = _late_beside_an_effect(trials, null, scores)
-    if found is None or not _nearly_all(trials, null, found) or _is_a_mass(found):
+    best = trials.best_of(_mistaken(trials, null, scores), 2, 12)
+    if not _nearly_all(trials, null, best):
+        best = _delays_beside_an_effect(trials, null, scores)
+    if best is None or not _nearly_all(trials, null, best) or _is_a_mass(best):
         return null
-    trials.say('the set-up: ' + ', '.join(a.label for a in found.effects))
-    return found
+    trials.log('the set-up: ' + ', '.join(a.label for a in best.effects))
+    return best
 
 
-def _nearly_all(trials: Trials, null: Fit, found: Fit | None) -> bool:
-    """Whether ``found`` passes and leaves next to nothing."""
+def _nearly_all(trials: Trials, null: Fit, fit: Fit | None) -> bool:
+    """Return whether ``fit`` passes and leaves next to nothing."""
     size = trials.workspace.size
-    if found is None or not trials.passes(null, found, null):
+    if fit is None or not trials.passes(null, fit, null):
         return False
-    return found.chi2 - size <= NEARLY_ALL * (null.chi2 - size)
+    return fit.chi2 - size <= NEARLY_ALL * (null.chi2 - size)
 
 
-def _late_beside_an_effect(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit | None:
+def _delays_beside_an_effect(trials: Trials, null: Fit, scores: Sequence[Score]) -> Fit | None:
     """Late loads with the best effect beside them."""
-    late = [s for s in scores if s.candidate.effect.name == LATE and s.p <= trials.workspace.p_accept]
-    alone = trials.best_of([[s.candidate.from_coefficients(s.coefficients)] for s in late], 1, 6)
+    delays = [s for s in scores if s.candidate.effect.name == LATE and s.p <= trials.workspace.p_accept]
+    alone = trials.best_of([[s.candidate.from_coefficients(s.coefficients)] for s in delays], 1, 6)
     if alone is None or not trials.passes(null, alone, null):
         return None
-    both = _beside_late(trials, alone, trials.screen)
+    both = _effect_beside_delays(trials, alone, trials.screen)
     if far(alone) and not _nearly_all(trials, null, both) and alone.chi2 < MOST_CLOSED * null.chi2:
         # Late loads hide the spectral lines of a small effect, and change its signature.
-        both = _beside_late(trials, alone, trials.screen_beside(alone))
+        both = _effect_beside_delays(trials, alone, trials.screen_beside(alone))
     return both if both is not None and trials.passes(alone, both, null) else None
 
 
-def _beside_late(trials: Trials, alone: Fit, screen: Screen) -> Fit | None:
-    """The late loads of ``alone`` with the best effect of ``screen`` beside them."""
+def _effect_beside_delays(trials: Trials, alone: Fit, screen: Screen) -> Fit | None:
+    """Return the late loads of ``alone`` with the best effect of ``screen`` beside them."""
     scores = screen.score(alone.residual, unbound(alone))
     return trials.further(alone, [s for s in scores if s.candidate.effect.name not in trials.workspace.first])
 
 
 def _mistaken(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
-    """The starts of :meth:`mistake`."""
+    """Return the starts of :meth:`mistake`."""
     best = max((s.gain for s in scores), default=0.0)
     starts: list[list[ActiveEffect]] = []
     for s in scores:
@@ -85,10 +85,10 @@ def _mistaken(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[A
         if name == 'sample_rate' and far(null):
             # A linear step does not reach another frequency of the ringing.
             starts += [[ActiveEffect(start.effect, {'error': v})] for v in OTHER_RATES]
-    return starts + _other_frequencies(trials, null, [s for s in scores if s.gain > RINGS * best])
+    return starts + _frequency_starts(trials, null, [s for s in scores if s.gain > RINGS * best])
 
 
-def _other_frequencies(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
+def _frequency_starts(trials: Trials, null: Fit, scores: Sequence[Score]) -> list[list[ActiveEffect]]:
     """Starts: either natural frequency is wrong, or both are."""
     near = []
     for s in scores:
@@ -98,12 +98,12 @@ def _other_frequencies(trials: Trials, null: Fit, scores: Sequence[Score]) -> li
 
 
 def frequency(ws: Comparison, beside: Fit, score: Score) -> ActiveEffect:
-    """The best start for another natural frequency: from far away a linear step does not reach it."""
+    """Return the best start for another natural frequency: from far away a linear step does not reach it."""
     start = score.candidate.from_coefficients(score.coefficients)
-    others = OTHER_FREQUENCIES if far(beside) else ()
+    starts = OTHER_FREQUENCIES if far(beside) else ()
     return min(
-        [start, *(ActiveEffect(start.effect, {'error': v}) for v in others)],
-        key=lambda a: ws.loss(ws.residual([*ws.base, *beside.whole, a])[0]),
+        [start, *(ActiveEffect(start.effect, {'error': v}) for v in starts)],
+        key=lambda a: ws.loss(ws.residual([*ws.base, *beside.coefficients_with_nuisance, a])[0]),
     )
 
 

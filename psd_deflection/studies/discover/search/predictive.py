@@ -63,18 +63,18 @@ class PredictingTerm:
 class Predictive:
     """``effects``: the model that predicts best, nuisance first. ``terms``: beyond the named effects, the largest
     first. ``unseen``: the gap on cases for which terms and sizes were chosen without them; ``unseen_named``: that of
-    the named effects, refitted without them. ``remains``: whether the difference is beyond chance.
+    the named effects, refitted without them. ``unexplained``: whether the difference is beyond chance.
     """
 
     effects: tuple[ActiveEffect, ...]
     terms: tuple[PredictingTerm, ...]
     unseen: float
     unseen_named: float
-    remains: bool
+    unexplained: bool
 
     def tree(self) -> dict[str, Any] | None:
         """As result.json has it; None if nothing remains."""
-        if not self.remains:
+        if not self.unexplained:
             return None
         terms = [{'name': t.name, 'value': t.value, 'unit': t.unit, 'weight': t.weight} for t in self.terms]
         return {'terms': terms, 'unseen': self.unseen, 'unseen_named': self.unseen_named, 'nested': True}
@@ -118,7 +118,7 @@ class _Library:
     always: int
 
     def at(self, x: FloatArray) -> list[ActiveEffect]:
-        """The effects with the numbers ``x``; those that are off are left out."""
+        """Return the effects with the numbers ``x``; those that are off are left out."""
         values = [dict(a.values) for a in self.effects]
         on = [i < self.fixed for i in range(len(values))]
         for place, v in zip(self.places, x.tolist(), strict=True):
@@ -145,7 +145,7 @@ class _Library:
 
 def _library(ws: Comparison, fit: Fit, screen: Screen) -> tuple[_Library, FloatArray]:
     """What may take part, and the numbers of ``fit``."""
-    effects, places, x = list(fit.whole), list[_Number](), list[float]()
+    effects, places, x = list(fit.coefficients_with_nuisance), list[_Number](), list[float]()
     fixed = len(fit.nuisance)
 
     def add(index: int, name: str) -> None:
@@ -160,8 +160,8 @@ def _library(ws: Comparison, fit: Fit, screen: Screen) -> tuple[_Library, FloatA
         i >= fixed and not effects[i].effect.finite and effects[i].effect.parameter(name).kind == 'amplitude'
         for i, name in named
     ]
-    kept = [place not in fit.at_bound for place in fit.free]
-    for (i, name), is_term, is_kept in zip(named, straight, kept, strict=True):
+    inside_bounds = [place not in fit.at_bound for place in fit.free]
+    for (i, name), is_term, is_kept in zip(named, straight, inside_bounds, strict=True):
         if is_kept and not is_term:
             add(i, name)
     always = len(places)
@@ -183,7 +183,7 @@ def _shape(candidate: Candidate) -> dict[str, float]:
 
 def _best_shapes(ws: Comparison, fit: Fit, screen: Screen) -> list[Candidate]:
     """Of each further effect whose sizes count in proportion the candidate that explains most beside ``fit``."""
-    taken = {slot(a.effect, a.values) for a in fit.whole}
+    taken = {slot(a.effect, a.values) for a in fit.coefficients_with_nuisance}
     best: dict[tuple[object, ...], Candidate] = {}
     for score in screen.score(fit.residual, unbound(fit)):
         c = score.candidate
@@ -223,25 +223,25 @@ def _solved(f: FloatArray, g: FloatArray) -> FloatArray:
 
 
 def averaged(
-    f: FloatArray, g: FloatArray, whole: float, size: float, rng: np.random.Generator
+    f: FloatArray, g: FloatArray, energy: float, size: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Mean sizes (k,) of the terms over all subsets, and how likely each takes part (k,).
 
-    ``f`` (k, k), ``g`` (k,), ``whole``: products of terms and target, whose ``size`` is a number of independent values;
+    ``f`` (k, k), ``g`` (k,), ``energy``: products of terms and target, of ``size`` independent values;
     terms of unit rms have ``f`` about ``size`` on the diagonal. Noise: Jeffreys' prior; each number of terms is as
     likely.
     """
     count = len(g)
     diagonal = np.diag(f).copy()
     usable = diagonal > LEAST_LENGTH * size
-    if not usable.any() or whole <= 0.0:
+    if not usable.any() or energy <= 0.0:
         return np.zeros(count), np.zeros(count)
     inside = np.zeros(count, dtype=bool)
     slab = 1.0
     steps = min(max(WALK[0], WALK[1] * count), WALK[2])
     sizes, weights, total = np.zeros(count), np.zeros(count), 0.0
     for step in range(steps):
-        odds, chosen, mean = _flips(f, g, whole, size, diagonal, inside, slab)
+        odds, chosen, mean = _flips(f, g, energy, size, diagonal, inside, slab)
         odds[~usable] = -50.0
         flip = 1.0 / (1.0 + np.exp(-np.clip(odds, -500.0, 500.0)))
         member = np.where(inside, 1.0 - flip, flip)
@@ -252,48 +252,54 @@ def averaged(
             weights += weight * member
             total += weight
         if step % 5 == 4:
-            slab = _slab(f, g, whole, size, chosen, rng)
+            slab = _slab(f, g, energy, size, chosen, rng)
         turned = int(rng.choice(count, p=pull * weight))
         inside[turned] = not inside[turned]
     return sizes / total, weights / total
 
 
 def _flips(
-    f: FloatArray, g: FloatArray, whole: float, size: float, diagonal: FloatArray, inside: BoolArray, slab: float
+    f: FloatArray, g: FloatArray, energy: float, size: float, diagonal: FloatArray, inside: BoolArray, slab: float
 ) -> tuple[FloatArray, npt.NDArray[np.intp], FloatArray]:
     """Logarithms (k,) of the odds for each term being turned on or off; the terms that are on, and their sizes."""
     chosen = np.flatnonzero(inside)
     n, count = len(chosen), len(g)
-    left, room, pull = whole, diagonal + slab, g
-    mean, spread = np.zeros(0), np.zeros(0)
+    residual_energy, room, pull = energy, diagonal + slab, g
+    mean, deviation = np.zeros(0), np.zeros(0)
     if n:
         inverse = np.linalg.inv(f[np.ix_(chosen, chosen)] + slab * np.eye(n))
-        mean, spread = inverse @ g[chosen], np.diag(inverse)
+        mean, deviation = inverse @ g[chosen], np.diag(inverse)
         across = f[chosen]
-        left = max(whole - float(mean @ g[chosen]), 1e-12 * whole)
+        residual_energy = max(energy - float(mean @ g[chosen]), 1e-12 * energy)
         room = np.maximum(room - np.einsum('ij,ij->j', across, inverse @ across), slab)
         pull = g - mean @ across
-    with_it = np.maximum(left - pull**2 / room, 1e-12 * whole)
-    odds = 0.5 * np.log(slab / room) - 0.5 * size * np.log(with_it / left) + np.log((1.0 + n) / max(count - n, 1))
+    with_it = np.maximum(residual_energy - pull**2 / room, 1e-12 * energy)
+    odds = (
+        0.5 * np.log(slab / room)
+        - 0.5 * size * np.log(with_it / residual_energy)
+        + np.log((1.0 + n) / max(count - n, 1))
+    )
     if n:
-        without = left + mean**2 / spread
+        without = residual_energy + mean**2 / deviation
         odds[chosen] = (
-            -0.5 * np.log(slab * spread) - 0.5 * size * np.log(without / left) - np.log(n / (count - n + 1.0))
+            -0.5 * np.log(slab * deviation)
+            - 0.5 * size * np.log(without / residual_energy)
+            - np.log(n / (count - n + 1.0))
         )
     return odds, chosen, mean
 
 
 def _slab(
-    f: FloatArray, g: FloatArray, whole: float, size: float, chosen: npt.NDArray[np.intp], rng: np.random.Generator
+    f: FloatArray, g: FloatArray, energy: float, size: float, chosen: npt.NDArray[np.intp], rng: np.random.Generator
 ) -> float:
-    """A precision of the sizes, drawn by how likely it is with the ``chosen`` terms."""
+    """Return a precision of the sizes, drawn by how likely it is with the ``chosen`` terms."""
     if not len(chosen):
         return float(rng.choice(SLABS))
     values, vectors = np.linalg.eigh(f[np.ix_(chosen, chosen)])
     along = vectors.T @ g[chosen]
     room = values[None, :] + SLABS[:, None]
-    left = np.maximum(whole - (along**2 / room).sum(axis=1), 1e-12 * whole)
-    logs = 0.5 * np.log(SLABS[:, None] / room).sum(axis=1) - 0.5 * size * np.log(left)
+    residual_energy = np.maximum(energy - (along**2 / room).sum(axis=1), 1e-12 * energy)
+    logs = 0.5 * np.log(SLABS[:, None] / room).sum(axis=1) - 0.5 * size * np.log(residual_energy)
     p = np.exp(logs - logs.max())
     return float(rng.choice(SLABS, p=p / p.sum()))
 
@@ -316,14 +322,14 @@ class _Line:
 
     def moments(self, without: int = -1) -> _Moments:
         """Of all folds but one."""
-        seen = [t for i, t in enumerate(self.tables) if i != without]
+        tables_used = [t for i, t in enumerate(self.tables) if i != without]
         share = float(np.mean(self.fold != without))
-        return _Moments(np.sum(seen, axis=0), self.library.always, self.size * share)
+        return _Moments(np.sum(tables_used, axis=0), self.library.always, self.size * share)
 
     def solved(self, moments: _Moments, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         """Sizes (p,) of everything, columns being of unit rms, and how likely each takes part."""
-        f, g, whole = moments.beside()
-        sizes, weights = averaged(f, g, whole, max(moments.size - moments.always, 2.0), rng)
+        f, g, energy = moments.beside()
+        sizes, weights = averaged(f, g, energy, max(moments.size - moments.always, 2.0), rng)
         return moments.with_always(sizes), np.concatenate([np.ones(moments.always), weights])
 
     def refitted(self, moments: _Moments) -> FloatArray:
@@ -355,11 +361,11 @@ def _line(library: _Library, x: FloatArray, named: BoolArray) -> _Line:
 
 
 def predictive_of(ws: Comparison, fit: Fit, screen: Screen, rng: np.random.Generator) -> Predictive | None:
-    """The model that predicts best, with its error on unseen cases; None if there is nothing to choose from."""
+    """Return the model that predicts best, with its error on unseen cases; None if there is nothing to choose from."""
     library, x = _library(ws, fit, screen)
     if len(library.places) == library.always or len(np.unique(ws.folds())) < 2:
         return None
-    named = np.arange(len(x)) < len(x) - sum(p.index >= len(fit.whole) for p in library.places)
+    named = np.arange(len(x)) < len(x) - sum(p.index >= len(fit.coefficients_with_nuisance) for p in library.places)
     start = x
     line = _line(library, x, named)
     weights = np.zeros(len(x))
@@ -406,7 +412,7 @@ def _reached(line: _Line, x: FloatArray, sizes: FloatArray) -> tuple[FloatArray,
 
 
 def _as_line(line: _Line, residual: FloatArray) -> FloatArray:
-    """A whitened residual in the scale of the line."""
+    """Return a whitened residual in the scale of the line."""
     ws = line.library.ws
     return residual if ws.open_level else residual * np.sqrt(line.size / max(ws.size, 1))
 

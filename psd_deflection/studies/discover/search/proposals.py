@@ -51,10 +51,10 @@ def spectral_peaks(
                 return -float((np.cos(angle) @ x) ** 2 + (np.sin(angle) @ x) ** 2)
 
             step = 1.0 / (n * period)
-            found = minimize_scalar(
+            peak = minimize_scalar(
                 loss, bounds=((k - 1) * step, (k + 1) * step), method='bounded', options={'xatol': 1e-3 * step}
             )
-            best.append((float(power[k] / median), float(found.x)))
+            best.append((float(power[k] / median), float(peak.x)))
             power[max(0, k - 12) : k + 13] = 0.0
     best.sort(reverse=True)
     out: list[float] = []
@@ -82,13 +82,13 @@ def persistent(
             scaled = residual[: 4 * n] / sigma
             there = np.any(scaled != 0.0, axis=1)
             shares = there.reshape(4, n).mean(axis=1)
-            told = shares >= LEAST_THERE
-            if told.sum() < FEWEST_QUARTERS:
+            persistent_terms = shares >= LEAST_THERE
+            if persistent_terms.sum() < FEWEST_QUARTERS:
                 steady = False
                 break
             centred = np.where(there[:, None], scaled - scaled[there].mean(axis=0), 0.0)
             turned = np.exp(-2j * np.pi * f * t)[:, None] * centred
-            quarters = turned.reshape(4, n, -1).mean(axis=1)[told] / shares[told, None]
+            quarters = turned.reshape(4, n, -1).mean(axis=1)[persistent_terms] / shares[persistent_terms, None]
             strongest = int(np.argmax(np.abs(quarters).sum(axis=0)))
             q = quarters[:, strongest]
             size = np.abs(q)
@@ -115,7 +115,7 @@ class CoarseStep(NamedTuple):
 
 
 def coarse_step(observation: Observation) -> CoarseStep | None:
-    """The step on whose multiples all readings lie, or all positions, if it is coarser than the converter's.
+    """Return the step on whose multiples all readings lie, or all positions, if it is coarser than the converter's.
 
     The gaps between neighbouring values are whole multiples of the step. The smallest common step
     is refined until all readings are multiples of it within the converter's own rounding.
@@ -123,12 +123,12 @@ def coarse_step(observation: Observation) -> CoarseStep | None:
     lsb = observation.rig.converter.volts_per_count
     volts = observation.volts[np.all(np.isfinite(observation.volts), axis=1)]
     volts = volts[:: max(1, len(volts) // 20_000)]
-    found = _common_step(volts, lsb)
-    if found is not None:
-        return CoarseStep(*found)
+    step = _common_step(volts, lsb)
+    if step is not None:
+        return CoarseStep(*step)
     # A sum signal may have another converter, or another range.
-    found = _common_step(volts[:, dot_channels(observation.psds)], lsb)
-    return None if found is None else CoarseStep(*found, sums=False)
+    step = _common_step(volts[:, dot_channels(observation.psds)], lsb)
+    return None if step is None else CoarseStep(*step, sums=False)
 
 
 def _common_step(volts: FloatArray, lsb: float) -> tuple[float, float] | None:

@@ -41,7 +41,7 @@ class Remainder:
 
     @classmethod
     def of(cls, function: Smooth) -> Remainder:
-        """A smooth function."""
+        """Return a smooth function."""
         rms = float(np.sqrt(function.before**2 - function.heldout**2))
         return cls(function.variables, rms, function.heldout, function)
 
@@ -57,12 +57,12 @@ class Remainder:
         return Unknown(words, self.depends_on, share, rms=self.rms)
 
 
-def remainder_of(ws: Comparison, fit: Fit, left: Localisation, table: Table) -> Remainder | None:
-    """What ``fit`` leaves as a sum of those terms of ``table`` that ``left`` found strong.
+def remainder_of(ws: Comparison, fit: Fit, residual: Localisation, table: Table) -> Remainder | None:
+    """What ``fit`` leaves as a sum of those terms of ``table`` that ``residual`` found strong.
 
     None if there are none, or if they predict nothing on unseen load cases.
     """
-    strong = [d for d in left.dependences if d.p < STRONG_P][:MOST_REGRESSORS]
+    strong = [d for d in residual.dependences if d.p < STRONG_P][:MOST_REGRESSORS]
     if not strong:
         return None
     columns = [fit.jacobian[:, j] for j, name in enumerate(fit.free) if name not in fit.at_bound]
@@ -79,7 +79,7 @@ def remainder_of(ws: Comparison, fit: Fit, left: Localisation, table: Table) -> 
 
 
 def _as_vector(ws: Comparison, channel: int, row: FloatArray) -> FloatArray:
-    """The vector (D,) that is ``row``, whitened, on one channel and 0 on the others."""
+    """Return the vector (D,) that is ``row``, whitened, on one channel and 0 on the others."""
     parts = ws.split(np.zeros(sum(m.size for m in ws.measured)))
     at = 0
     for part in parts:

@@ -39,21 +39,21 @@ class Score:
 
 
 def promising(scores: Sequence[Score], penalty: float, share: float, limit: int) -> list[Score]:
-    """The best candidate of each variant, those that gain at least ``share`` of the best gain."""
+    """Return the best candidate of each variant, those that gain at least ``share`` of the best gain."""
     out: list[Score] = []
-    seen: set[tuple[object, ...]] = set()
+    visited: set[tuple[object, ...]] = set()
     best = max((s.gain for s in scores), default=0.0)
     for s in sorted(scores, key=lambda s: -(s.gain - penalty * s.dof)):
-        if s.candidate.variant in seen or s.gain < share * best or s.gain <= 0.0:
+        if s.candidate.variant in visited or s.gain < share * best or s.gain <= 0.0:
             continue
-        seen.add(s.candidate.variant)
+        visited.add(s.candidate.variant)
         out.append(s)
         if len(out) == limit:
             break
     return out
 
 
-def solve_seen(fisher: FloatArray, score: FloatArray, original: FloatArray) -> tuple[float, int, FloatArray]:
+def solve_observable(fisher: FloatArray, score: FloatArray, original: FloatArray) -> tuple[float, int, FloatArray]:
     """Gain, rank and coefficients of F c = g, without directions that cannot be seen.
 
     ``original`` (k,): squared lengths of the columns before projection.
@@ -73,13 +73,13 @@ def solve_seen(fisher: FloatArray, score: FloatArray, original: FloatArray) -> t
 class Screen:
     """All candidates' signatures, whitened, side by side."""
 
-    def __init__(self, workspace: Comparison, found: Sequence[tuple[Candidate, Columns]]) -> None:
+    def __init__(self, workspace: Comparison, signatures: Sequence[tuple[Candidate, Columns]]) -> None:
         self.candidates: list[Candidate] = []
         self.slices: list[slice] = []
         # One array from the start: a recording of minutes has hundreds of megabytes of signatures.
-        rows = np.empty((sum(len(c) for _, c in found), sum(m.size for m in workspace.measured)), dtype=np.float32)
+        rows = np.empty((sum(len(c) for _, c in signatures), sum(m.size for m in workspace.measured)), dtype=np.float32)
         at = 0
-        for candidate, columns in found:
+        for candidate, columns in signatures:
             white = rows[at : at + len(columns)]
             for row, column in zip(white, columns, strict=True):
                 row[:] = workspace.whiten(column)
@@ -94,11 +94,11 @@ class Screen:
         self.lengths = np.diag(self.fisher)
 
     def columns_of(self, candidate: Candidate) -> list[FloatArray]:
-        """The whitened signatures (D,) of one of its candidates."""
+        """Return the whitened signatures (D,) of one of its candidates."""
         return list(self.rows[self.slice_of(candidate)].astype(np.float64))
 
     def slice_of(self, candidate: Candidate) -> slice:
-        """The rows of one of its candidates."""
+        """Return the rows of one of its candidates."""
         return next(s for c, s in zip(self.candidates, self.slices, strict=True) if c is candidate)
 
     def _projected(self, residual: FloatArray, known: FloatArray | None) -> tuple[FloatArray, FloatArray]:
@@ -112,12 +112,12 @@ class Screen:
         return g, fisher
 
     def score(self, residual: FloatArray, known: FloatArray | None = None) -> list[Score]:
-        """Every candidate on ``residual`` (D,), the best first; ``known`` (D, p): columns in the model."""
+        """Return every candidate on ``residual`` (D,), the best first; ``known`` (D, p): columns in the model."""
         g, fisher = self._projected(residual, known)
         count = len(self.candidates)
         out = []
         for candidate, s in zip(self.candidates, self.slices, strict=True):
-            gain, dof, c = solve_seen(fisher[s, s], g[s], self.lengths[s])
+            gain, dof, c = solve_observable(fisher[s, s], g[s], self.lengths[s])
             if candidate.one_sided and dof and c[0] < 0.0:
                 gain = 0.0
             p = -np.expm1(count * np.log1p(-min(float(chi2.sf(gain, max(dof, 1))), 1.0 - 1e-16)))
@@ -128,7 +128,7 @@ class Screen:
     def pairs(
         self, residual: FloatArray, penalty: float, limit: int, known: FloatArray | None = None
     ) -> list[tuple[Score, Score, float]]:
-        """The ``limit`` best pairs by joint gain minus ``penalty`` per column; greedy steps may miss these."""
+        """Return the ``limit`` best pairs by joint gain minus ``penalty`` per column; greedy steps may miss these."""
         g, fisher = self._projected(residual, known)
         singles = self.score(residual, known)
         # For each effect and its choices the best shape is enough; thousands of pairs take milliseconds.
@@ -136,17 +136,17 @@ class Screen:
         for score in singles:
             best.setdefault(score.candidate.variant, score)
         where = {id(c): s for c, s in zip(self.candidates, self.slices, strict=True)}
-        found = []
+        scored = []
         for a, b in itertools.combinations(best.values(), 2):
             sa, sb = where[id(a.candidate)], where[id(b.candidate)]
             index = np.r_[sa, sb]
-            gain, dof, c = solve_seen(fisher[np.ix_(index, index)], g[index], self.lengths[index])
+            gain, dof, c = solve_observable(fisher[np.ix_(index, index)], g[index], self.lengths[index])
             na = sa.stop - sa.start
             if (a.candidate.one_sided and c[0] < 0.0) or (b.candidate.one_sided and c[na] < 0.0):
                 continue
-            found.append((gain - penalty * dof, a, b, gain, c, na))
-        found.sort(key=lambda item: -item[0])
+            scored.append((gain - penalty * dof, a, b, gain, c, na))
+        scored.sort(key=lambda item: -item[0])
         out = []
-        for _, a, b, gain, c, na in found[:limit]:
+        for _, a, b, gain, c, na in scored[:limit]:
             out.append((replace(a, coefficients=c[:na]), replace(b, coefficients=c[na:]), gain))
         return out

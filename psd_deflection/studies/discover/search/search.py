@@ -27,12 +27,12 @@ from psd_deflection.studies.discover.search.trials import (
     NEAR,
     STANDS_IN,
     Trials,
-    by_its_size,
     counted,
     far,
     key_of,
     slot,
     unbound,
+    wald_chi_square,
 )
 
 ROUNDS = 3
@@ -87,22 +87,22 @@ class Search(Trials):
         """What :meth:`run` gives beside itself; it changes this search."""
         scores = self.screen.score(null.residual, unbound(null))
         first_scores = scores
-        null, grown = self._settled(null, mistake(self, null, scores) if begun is None else begun)
+        null, grown = self._refitted(null, mistake(self, null, scores) if begun is None else begun)
         grown = self._without_weak(grown)
-        current, others = self.swap(null, grown)
+        current, alternatives = self.swap(null, grown)
         if self._much_closer(grown, current):
             # Beside the wrong effect nothing held that holds beside the right one; what that cost is not counted.
             self._begun = self.workspace.simulations
             self._screen_anew(current)
-            null, more = self._settled(null, current)
+            null, more = self._refitted(null, current)
             more = self._without_weak(more)
             if len(more.effects) > len(current.effects):
-                current, others = self.swap(null, more)
+                current, alternatives = self.swap(null, more)
         p, delta_bic, delta_chi2 = self.weigh(null, current)
         limits = self._limits(current)
-        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, others, self.trace, limits)
+        return SearchResult(null, current, p, delta_bic, delta_chi2, first_scores, alternatives, self.trace, limits)
 
-    def _settled(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
+    def _refitted(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
         """The fit of no effect, and ``current`` with all that passes, beside the noise that is estimated then."""
         for _ in range(ROUNDS):
             null, current = self._grown(null, current)
@@ -123,24 +123,24 @@ class Search(Trials):
         What is put in their places is much work for nothing, and the right one may show beside the others alone.
         """
         while len(current.effects) > 1 and not self.workspace.open_level:
-            left = current.chi2 - self.workspace.size
-            sizes = [by_its_size(self.workspace, current, i) for i in range(len(current.effects))]
+            excess = current.chi2 - self.workspace.size
+            sizes = [wald_chi_square(self.workspace, current, i) for i in range(len(current.effects))]
             weakest = int(np.argmin(sizes))
-            if left <= NEAR * self.workspace.size or sizes[weakest] >= left:
+            if excess <= NEAR * self.workspace.size or sizes[weakest] >= excess:
                 break
-            self.say(f'{current.effects[weakest].label} explains less than what remains')
+            self.log(f'{current.effects[weakest].label} explains less than what remains')
             rest = [a for i, a in enumerate(current.effects) if i != weakest]
             current = refit(self.workspace, rest, iterations=6)
         return current
 
     def _much_closer(self, before: Fit, current: Fit) -> bool:
-        """Whether a swap closed most of what was open, and left something."""
+        """Return whether a swap closed most of what was open, and left something."""
         size = self.workspace.size
-        left = current.chi2 - size
-        return left < MOST_CLOSED * (before.chi2 - size) and left > NEAR * size
+        excess = current.chi2 - size
+        return excess < MOST_CLOSED * (before.chi2 - size) and excess > NEAR * size
 
     def _limits(self, current: Fit) -> tuple[Limit, ...]:
-        """The limit that kept further effects out, with what lies beyond it."""
+        """Return the limit that kept further effects out, with what lies beyond it."""
         little = current.chi2 <= (1.0 + NEAR) * self.workspace.size and not self.workspace.open_level
         if not self._stopped or little:
             return ()
@@ -149,7 +149,7 @@ class Search(Trials):
         return (Limit(self._stopped, beyond(self.workspace, current, terms)),) if terms is not None else ()
 
     def _grown(self, null: Fit, current: Fit) -> tuple[Fit, Fit]:
-        """The fit of no effect, and ``current`` with all that passes added."""
+        """Return the fit of no effect, and ``current`` with all that passes added."""
         renoised = bool(current.effects)
         while True:
             self._stopped = ''
@@ -161,7 +161,7 @@ class Search(Trials):
                 better = self._added(null, current)
             if better is None:
                 break
-            null, current = self.settle(null, better)
+            null, current = self.refit(null, better)
             if not renoised or self.workspace.open_level:
                 renoised = True
                 current = self.renoise(current)
@@ -202,8 +202,8 @@ class Search(Trials):
         better = self.further(current, scores)
         passes = better is not None and self.passes(current, better, null)
         if better is not None and passes:
-            if not self.stands_in(current, better):
-                self.say('adding ' + better.effects[-1].label)
+            if not self.is_substitute(current, better):
+                self.log('adding ' + better.effects[-1].label)
                 return better
             self._stopped = (
                 f'{better.effects[-1].effect.name} beside {counted(current)} explains less than '
@@ -214,7 +214,7 @@ class Search(Trials):
             return None
         better = self._try_pairs(null, current)
         holds = better is not current and self.passes(current, better, null)
-        return better if holds and not self.stands_in(current, better) else None
+        return better if holds and not self.is_substitute(current, better) else None
 
     def _chosen_anew(self, current: Fit, screened: Sequence[Score], least: float) -> Fit | None:
         """``current`` with another choice of one of its effects, another axis of the clamp, if that is the better one.
@@ -224,10 +224,12 @@ class Search(Trials):
         if self.workspace.open_level or current.chi2 <= (1.0 + NEAR) * self.workspace.size:
             return None
         known, best = {key_of(a) for a in current.effects}, current
-        others = [s for s in screened if s.gain >= CHOICE_REACH * least and s.candidate.variant not in known]
+        other_choices = [s for s in screened if s.gain >= CHOICE_REACH * least and s.candidate.variant not in known]
         for i, active in enumerate(current.effects):
             place = slot(active.effect, active.values)
-            mine = [s for s in others if self.may_pass(s) and slot(s.candidate.effect, s.candidate.start) == place]
+            mine = [
+                s for s in other_choices if self.may_pass(s) and slot(s.candidate.effect, s.candidate.start) == place
+            ]
             for chosen in {s.candidate.variant: s.candidate for s in mine}.values():
                 choices = {p.name: chosen.start[p.name] for p in active.effect.parameters if p.kind == 'choice'}
                 moved = ActiveEffect(active.effect, {**active.values, **choices})
@@ -235,27 +237,27 @@ class Search(Trials):
                 best = min(best, refit(self.workspace, [*rest, moved], iterations=8), key=self.bic)
         if self.bic(best) > self.bic(current) - BIC_ACCEPT:
             return None
-        self.say(f'choosing {best.effects[-1].label}')
+        self.log(f'choosing {best.effects[-1].label}')
         return best
 
     def swap(self, null: Fit, current: Fit) -> tuple[Fit, list[list[Fit]]]:
         """Try to replace each effect by its alternatives and keep the better model; at most two rounds."""
-        others: list[list[Fit]] = []
+        alternatives: list[list[Fit]] = []
         for swaps in range(3):
-            others = []
+            alternatives = []
             _, _, gains = self.weigh(null, current)
             best = current
             for i in range(len(current.effects)):
                 fits = self.alternatives(null, current, i, gains[i])
-                others.append(fits)
+                alternatives.append(fits)
                 best = min([best, *fits], key=self.bic)
             spent = self.spent > 1.5 * self.budget_of(current)
             if swaps == 2 or spent or self.bic(best) > self.bic(current) - 2.0:
                 break
-            self.say('swapping to ' + ', '.join(a.label for a in best.effects))
+            self.log('swapping to ' + ', '.join(a.label for a in best.effects))
             current = refit(self.workspace, best.effects, iterations=8)
             current = self._drop(null, current)
-        return current, others
+        return current, alternatives
 
     def _try_pairs(self, null: Fit, current: Fit) -> Fit:
         pairs = self.screen.pairs(
@@ -275,7 +277,7 @@ class Search(Trials):
                 )
         best = self.best_of(starts, 2, 8)
         if best is not None and self.bic(best) < self.bic(current) - 2.0:
-            self.say('a better pair: ' + ', '.join(a.label for a in best.effects))
+            self.log('a better pair: ' + ', '.join(a.label for a in best.effects))
             return best
         return current
 
@@ -284,7 +286,7 @@ class Search(Trials):
             best = min(self.without_each(current, null), key=self.bic)
             if self.passes(best, current, null):
                 break
-            self.say('dropping to ' + ', '.join(a.label for a in best.effects))
+            self.log('dropping to ' + ', '.join(a.label for a in best.effects))
             current = best
         return current
 
@@ -299,7 +301,7 @@ class Search(Trials):
         return p, delta_bic, delta_chi2
 
     def _in_its_place(self, current: Fit, index: int, without: Fit, gain: float) -> list[Score]:
-        """The candidates in place of effect ``index``, the best eight: an exact confounder scores as high as it.
+        """Return the candidates in place of effect ``index``, the best eight: an exact confounder scores as high as it.
 
         If the search was already expensive, the case is complicated: two only.
         """
@@ -331,8 +333,10 @@ class Search(Trials):
         fits = []
         for s in ranked:
             ringing = s.candidate.effect.name in RINGING
-            other = frequency(self.workspace, without, s) if ringing else s.candidate.from_coefficients(s.coefficients)
-            quick = refit(self.workspace, [*rest, other], iterations=10 if self.workspace.open_level else 3)
+            alternative = (
+                frequency(self.workspace, without, s) if ringing else s.candidate.from_coefficients(s.coefficients)
+            )
+            quick = refit(self.workspace, [*rest, alternative], iterations=10 if self.workspace.open_level else 3)
             if quick.chi2 - current.chi2 < max(60.0, 0.2 * gain) and self.spent < 2 * self.budget_of(current):
                 quick = refit(self.workspace, quick.effects, iterations=8)
             fits.append(quick)

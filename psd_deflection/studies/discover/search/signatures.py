@@ -112,7 +112,7 @@ def candidates(
 def signature_columns(
     candidate: Candidate, workspace: Comparison, nominal: list[FloatArray], base: Sequence[ActiveEffect]
 ) -> Columns:
-    """The candidate's signatures: change of the fine-block volts for one ``scale`` of each parameter.
+    """Return the candidate's signatures: change of the fine-block volts for one ``scale`` of each parameter.
 
     ``nominal``: the simulation with ``base`` alone.
     """
@@ -147,8 +147,8 @@ def signature_columns(
 
 
 def signatures_beside(workspace: Comparison, listed: Iterable[Candidate], fit: Fit) -> list[tuple[Candidate, Columns]]:
-    """The signatures of the candidates beside what ``fit`` has already."""
-    beside = [*workspace.base, *fit.whole]
+    """Return the signatures of the candidates beside what ``fit`` has already."""
+    beside = [*workspace.base, *fit.coefficients_with_nuisance]
     now = workspace.simulate(beside)
     return [(c, signature_columns(c, workspace, now, beside)) for c in listed]
 
@@ -162,16 +162,16 @@ class SignatureBank:
         self._base: tuple[ActiveEffect, ...] = ()
 
     def nominal(self, workspace: Comparison) -> list[FloatArray]:
-        """The simulation with what every model has, and no more."""
+        """Return the simulation with what every model has, and no more."""
         if self._nominal is None:
             self._base = (*workspace.base, *workspace.nuisance)
             self._nominal = workspace.simulate(self._base)
         return self._nominal
 
     def get(self, candidate: Candidate, workspace: Comparison) -> Columns:
-        """The candidate's columns, simulated once."""
-        found = self._kept.get(candidate.key)
-        if found is None:
-            found = signature_columns(candidate, workspace, self.nominal(workspace), self._base)
-            self._kept[candidate.key] = found
-        return found
+        """Return the candidate's columns, simulated once."""
+        columns = self._kept.get(candidate.key)
+        if columns is None:
+            columns = signature_columns(candidate, workspace, self.nominal(workspace), self._base)
+            self._kept[candidate.key] = columns
+        return columns

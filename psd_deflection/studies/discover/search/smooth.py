@@ -60,7 +60,7 @@ class Smooth:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Remains:
+class Remainders:
     """``values`` (d,), whitened, of ``channel`` (d,); ``sizes`` (d, p): what the effects can do there; ``fold`` (d,).
     ``apart``: of each variable the squared distances (d, d).
     """
@@ -71,10 +71,10 @@ class _Remains:
     fold: IntArray
     apart: Mapping[str, FloatArray]
 
-    def part(self, keep: BoolArray) -> _Remains:
+    def part(self, keep: BoolArray) -> Remainders:
         """Some of the values."""
         apart = {name: d[np.ix_(keep, keep)] for name, d in self.apart.items()}
-        return _Remains(self.values[keep], self.channel[keep], self.sizes[keep], self.fold[keep], apart)
+        return Remainders(self.values[keep], self.channel[keep], self.sizes[keep], self.fold[keep], apart)
 
 
 def smooth_of(ws: Comparison, fit: Fit, variables: Variables) -> Smooth | None:
@@ -88,13 +88,13 @@ def smooth_of(ws: Comparison, fit: Fit, variables: Variables) -> Smooth | None:
         return None
     free = np.array([name not in fit.at_bound for name in fit.free], dtype=bool)
     apart = {name: _distances(ws, values) for name, values in variables.items()}
-    remains = _Remains(fit.residual, channel, fit.jacobian[:, free], folds, apart)
+    remains = Remainders(fit.residual, channel, fit.jacobian[:, free], folds, apart)
     chosen, shapes = _chosen(remains.part(there))
     if not chosen:
         return None
 
     def gap(shaped: bool) -> float:
-        change = ws.unwhitened(_unseen(remains, chosen, shapes, there, shaped) - fit.residual)
+        change = ws.unwhitened(unseen_residual(remains, chosen, shapes, there, shaped) - fit.residual)
         return ws.gap([d + c for d, c in zip(fit.difference, change, strict=True)])
 
     heldout, before = gap(shaped=False), heldout_gap(ws, fit)
@@ -114,50 +114,52 @@ def _distances(ws: Comparison, values: Sequence[FloatArray]) -> FloatArray:
     return np.asarray(((x[:, None, :] - x[None, :, :]) ** 2).sum(axis=2))
 
 
-def _chosen(remains: _Remains) -> tuple[tuple[str, ...], FloatArray]:
-    """The variables that the likelihood asks for, one after the other, and the logarithms of the shapes."""
+def _chosen(remains: Remainders) -> tuple[tuple[str, ...], FloatArray]:
+    """Return the variables that the likelihood asks for, one after the other, and the logarithms of the shapes."""
     names: tuple[str, ...] = ()
     shapes, likelihood = _shaped(remains, names)
     while True:
         tried = [(*names, name) for name in remains.apart if name not in names]
-        found = [(*_shaped(remains, more), more) for more in tried]
-        best = max(found, key=lambda row: row[1], default=None)
+        fitted = [(*_shaped(remains, more), more) for more in tried]
+        best = max(fitted, key=lambda row: row[1], default=None)
         if best is None or 2.0 * (best[1] - likelihood) < WORTH:
             return names, shapes
         shapes, likelihood, names = best
 
 
-def _shaped(remains: _Remains, names: Sequence[str], start: FloatArray | None = None) -> tuple[FloatArray, float]:
+def _shaped(remains: Remainders, names: Sequence[str], start: FloatArray | None = None) -> tuple[FloatArray, float]:
     """Logarithms (channels, 1 + 2 len(names)) of noise, then size and length of each, and the likelihood of all."""
     channels = np.unique(remains.channel)
     usual = np.log([START[2], *(START[0], START[1]) * len(names)])
     low, high = np.log([NOISES, *(SIZES, LENGTHS) * len(names)]).T
     begin = np.tile(usual, (len(channels), 1)) if start is None else start
     bounds = Bounds(np.tile(low, len(channels)), np.tile(high, len(channels)))
-    basis = _span(remains.sizes)
-    parts = [(remains.part(own), basis[own]) for own in (remains.channel == c for c in channels)]
-    surprise: Callable[[FloatArray], tuple[float, FloatArray]] = partial(_surprise, parts=parts, names=names)
-    found = minimize(surprise, begin.ravel(), jac=True, method='L-BFGS-B', bounds=bounds, options={'maxiter': 60})
-    return np.reshape(found.x, begin.shape), -float(found.fun)
+    basis = orthonormal_basis(remains.sizes)
+    parts = [(remains.part(of_channel), basis[of_channel]) for of_channel in (remains.channel == c for c in channels)]
+    surprise: Callable[[FloatArray], tuple[float, FloatArray]] = partial(
+        negative_log_likelihood, parts=parts, names=names
+    )
+    solution = minimize(surprise, begin.ravel(), jac=True, method='L-BFGS-B', bounds=bounds, options={'maxiter': 60})
+    return np.reshape(solution.x, begin.shape), -float(solution.fun)
 
 
-def _span(columns: FloatArray) -> FloatArray:
-    """An orthonormal basis of ``columns``, which may depend on each other."""
-    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(left[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
+def orthonormal_basis(columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of ``columns``, which may depend on each other."""
+    basis, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(basis[:, sizes > 1e-9 * max(float(sizes.max(initial=0.0)), 1e-300)])
 
 
-def _surprise(
-    shapes: FloatArray, parts: Sequence[tuple[_Remains, FloatArray]], names: Sequence[str]
+def negative_log_likelihood(
+    shapes: FloatArray, parts: Sequence[tuple[Remainders, FloatArray]], names: Sequence[str]
 ) -> tuple[float, FloatArray]:
     """Minus the restricted log-likelihood, up to a constant, and its gradient. ``parts``: each channel, with what the
     effects can do there (d, p), of an orthonormal basis over all of them.
     """
     rows = np.reshape(shapes, (len(parts), -1))
     known, inverses, logs = list[FloatArray](), list[FloatArray](), 0.0
-    for shape, (own, _) in zip(rows, parts, strict=True):
-        known.append(_covariance(shape, own, names))
-        noise = np.exp(2.0 * shape[0]) * np.eye(len(own.values))
+    for shape, (of_channel, _) in zip(rows, parts, strict=True):
+        known.append(_covariance(shape, of_channel, names))
+        noise = np.exp(2.0 * shape[0]) * np.eye(len(of_channel.values))
         try:
             lower = cholesky(known[-1] + noise, lower=True)
         except LinAlgError:
@@ -165,61 +167,63 @@ def _surprise(
         inverses.append(cho_solve((lower, True), np.eye(len(lower))))
         logs += float(np.log(np.diag(lower)).sum())
     weighed = [inverse @ basis for inverse, (_, basis) in zip(inverses, parts, strict=True)]
-    pulls = [inverse @ own.values for inverse, (own, _) in zip(inverses, parts, strict=True)]
+    pulls = [inverse @ of_channel.values for inverse, (of_channel, _) in zip(inverses, parts, strict=True)]
     f = np.sum([basis.T @ w for w, (_, basis) in zip(weighed, parts, strict=True)], axis=0)
     sizes = np.linalg.pinv(f, hermitian=True)
     moved = sizes @ np.sum([basis.T @ p for p, (_, basis) in zip(pulls, parts, strict=True)], axis=0)
     logs += 0.5 * float(np.linalg.slogdet(f)[1])
     loss, gradient = logs, np.zeros_like(rows)
-    for i, (shape, (own, _)) in enumerate(zip(rows, parts, strict=True)):
+    for i, (shape, (of_channel, _)) in enumerate(zip(rows, parts, strict=True)):
         pull = pulls[i] - weighed[i] @ moved
-        loss += 0.5 * float(own.values @ pull)
+        loss += 0.5 * float(of_channel.values @ pull)
         # The derivative by a covariance V is half of P - (P y)(P y)', with P the inverse beside the effects.
-        by = 0.5 * (inverses[i] - weighed[i] @ sizes @ weighed[i].T - np.outer(pull, pull))
-        gradient[i, 0] = 2.0 * np.exp(2.0 * shape[0]) * np.trace(by)
+        curvature = 0.5 * (inverses[i] - weighed[i] @ sizes @ weighed[i].T - np.outer(pull, pull))
+        gradient[i, 0] = 2.0 * np.exp(2.0 * shape[0]) * np.trace(curvature)
         for k, name in enumerate(names):
-            part = _covariance(np.array([shape[0], *shape[1 + 2 * k : 3 + 2 * k]]), own, (name,))
-            gradient[i, 1 + 2 * k] = 2.0 * float(np.sum(by * part))
-            gradient[i, 2 + 2 * k] = float(np.exp(-2.0 * shape[2 + 2 * k]) * np.sum(by * part * own.apart[name]))
+            part = _covariance(np.array([shape[0], *shape[1 + 2 * k : 3 + 2 * k]]), of_channel, (name,))
+            gradient[i, 1 + 2 * k] = 2.0 * float(np.sum(curvature * part))
+            gradient[i, 2 + 2 * k] = float(
+                np.exp(-2.0 * shape[2 + 2 * k]) * np.sum(curvature * part * of_channel.apart[name])
+            )
     return loss, gradient.ravel()
 
 
-def _covariance(shape: FloatArray, own: _Remains, names: Sequence[str]) -> FloatArray:
+def _covariance(shape: FloatArray, remains: Remainders, names: Sequence[str]) -> FloatArray:
     """Of the function of one channel (d, d)."""
-    out = np.zeros((len(own.values), len(own.values)))
+    out = np.zeros((len(remains.values), len(remains.values)))
     for name, (size, length) in zip(names, shape[1:].reshape(-1, 2).tolist(), strict=True):
-        out += np.exp(2.0 * size - 0.5 * np.exp(-2.0 * length) * own.apart[name])
+        out += np.exp(2.0 * size - 0.5 * np.exp(-2.0 * length) * remains.apart[name])
     return out
 
 
 def _known(
-    remains: _Remains, names: Sequence[str], shapes: FloatArray, seen: BoolArray
+    remains: Remainders, names: Sequence[str], shapes: FloatArray, training: BoolArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """What is left (d,) of all values, the function there (d,), and by what the sizes (p,) move, from the ``seen``."""
+    """Return residual (d,) of all values, the function there (d,), the move of the sizes (p,), from ``training``."""
     function = np.zeros((len(remains.values), len(remains.values)))
     noise = np.zeros(len(remains.values))
     for shape, c in zip(shapes, np.unique(remains.channel).tolist(), strict=True):
-        own = remains.channel == c
-        function[np.ix_(own, own)] = _covariance(shape, remains.part(own), names)
-        noise[own] = np.exp(2.0 * shape[0])
-    factor = cho_factor((function + np.diag(noise))[np.ix_(seen, seen)])
-    sizes, values = remains.sizes[seen], remains.values[seen]
+        of_channel = remains.channel == c
+        function[np.ix_(of_channel, of_channel)] = _covariance(shape, remains.part(of_channel), names)
+        noise[of_channel] = np.exp(2.0 * shape[0])
+    factor = cho_factor((function + np.diag(noise))[np.ix_(training, training)])
+    sizes, values = remains.sizes[training], remains.values[training]
     lengths = np.maximum(np.linalg.norm(sizes, axis=0), 1e-150)
     f = (sizes / lengths).T @ cho_solve(factor, sizes / lengths)
     more = np.linalg.lstsq(f, (sizes / lengths).T @ cho_solve(factor, values), rcond=1e-9)[0] / lengths
-    value = function[:, seen] @ cho_solve(factor, values - sizes @ more)
+    value = function[:, training] @ cho_solve(factor, values - sizes @ more)
     return remains.values - remains.sizes @ more - value, value, more
 
 
-def _unseen(
-    remains: _Remains, names: Sequence[str], shapes: FloatArray, there: BoolArray, shaped: bool = False
+def unseen_residual(
+    remains: Remainders, names: Sequence[str], shapes: FloatArray, there: BoolArray, shaped: bool = False
 ) -> FloatArray:
     """What is left (d,) of each value by sizes, shapes and a function that were found without its part. ``shaped``: the
     shapes are ``shapes``.
     """
     out = np.zeros(len(remains.values))
     for fold in np.unique(remains.fold[there]):
-        seen = there & (remains.fold != fold)
-        own = shapes if shaped else _shaped(remains.part(seen), names, shapes)[0]
-        out[~seen & there] = _known(remains, names, own, seen)[0][~seen & there]
+        training = there & (remains.fold != fold)
+        shapes_used = shapes if shaped else _shaped(remains.part(training), names, shapes)[0]
+        out[~training & there] = _known(remains, names, shapes_used, training)[0][~training & there]
     return out

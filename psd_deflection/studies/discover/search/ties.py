@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from psd_deflection.model.simulation.declaration import MOVES_FREQUENCY
-from psd_deflection.studies.discover.search.weighing import NamedEffect, Rival
+from psd_deflection.studies.discover.search.weighing import Alternative, NamedEffect
 
 SAME = 3.0
 """Standard deviations of their difference up to which two shares count as the same."""
@@ -49,9 +49,9 @@ class Tie:
     @property
     def sentence(self) -> str:
         """Why they are tied, the causes with their sizes, and what tells these apart."""
-        spread = f'{100.0 * self.share:.3g} ± {100.0 * self.sd:.1g} %'
+        share_words = f'{100.0 * self.share:.3g} ± {100.0 * self.sd:.1g} %'
         factors = {c.name: f'{c.factor:.5g} ± {c.sd:.1g}' for c in self.causes}
-        words = f'Both stiffnesses, EI and GJ, differ by the same share ({spread}), as one cause makes them: '
+        words = f'Both stiffnesses, EI and GJ, differ by the same share ({share_words}), as one cause makes them: '
         radius = f"the link's radii times {factors['link_radius']} (EI and GJ grow with their fourth power)"
         if self.moves:
             return (
@@ -65,7 +65,7 @@ class Tie:
 
 
 def ties(effects: Sequence[NamedEffect]) -> tuple[Tie, ...]:
-    """The tie of the two stiffnesses among ``effects`` and their rivals, if they differ by the same share."""
+    """Return the tie of the two stiffnesses among ``effects`` and their rivals, if they differ by the same share."""
     for first, second in itertools.combinations(sorted(_shares(effects), key=lambda share: share.effect), 2):
         apart = SAME * math.hypot(first.sd, second.sd, EXACT * first.value)
         clear = min(abs(first.value) / first.sd, abs(second.value) / second.sd) > CLEAR
@@ -87,7 +87,7 @@ class _Share(NamedTuple):
 def _shares(effects: Sequence[NamedEffect]) -> Iterator[_Share]:
     """The changes of stiffnesses, wherever they are named or a rival."""
     for named in effects:
-        either: tuple[NamedEffect | Rival, ...] = (named, *named.rivals)
+        either: tuple[NamedEffect | Alternative, ...] = (named, *named.fitted_alternatives)
         for e in either:
             effect = e.active.effect
             if MOVES_FREQUENCY not in effect.parameters:

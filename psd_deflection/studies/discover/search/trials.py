@@ -50,7 +50,7 @@ def slot(effect: Effect, values: Mapping[str, float]) -> tuple[object, ...]:
 
 
 def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
-    """Whether effect ``index`` of ``fit`` has run into a bound: it fits only as something that it is not.
+    """Return whether effect ``index`` of ``fit`` has run into a bound: it fits only as something that it is not.
 
     An amplitude may end at the bound at which it is off, as long as another one is on.
     """
@@ -67,7 +67,7 @@ def unphysical(workspace: Comparison, fit: Fit, index: int) -> bool:
     return not on
 
 
-def by_its_size(workspace: Comparison, fit: Fit, index: int) -> float:
+def wald_chi_square(workspace: Comparison, fit: Fit, index: int) -> float:
     """Chi-square by which the size of effect ``index`` of ``fit`` is another than none, by its own covariance.
 
     Infinite if the size of none is no number. What is free beside it may take its place; a refit
@@ -90,12 +90,12 @@ def counted(fit: Fit) -> str:
 
 
 def far(fit: Fit) -> bool:
-    """Whether ``fit`` leaves so much that small signatures beside it would mislead."""
+    """Return whether ``fit`` leaves so much that small signatures beside it would mislead."""
     return fit.chi2 > FAR * fit.residual.size
 
 
 def unbound(fit: Fit) -> FloatArray:
-    """The Jacobian's columns (D, k) of the parameters that are free to move."""
+    """Return the Jacobian's columns (D, k) of the parameters that are free to move."""
     keep = [j for j, name in enumerate(fit.free) if name not in fit.at_bound]
     return fit.jacobian[:, keep]
 
@@ -150,17 +150,17 @@ class Trials:
 
     def without_each(self, fit: Fit, null: Fit) -> list[Fit]:
         """``fit`` refitted without each of its effects in turn; ``null``: the fit of no effect."""
-        kept = self.dropped.get(id(fit))
-        if kept is None:
+        cached = self.dropped.get(id(fit))
+        if cached is None:
             fits = []
             for i in range(len(fit.effects)):
                 rest = [a for j, a in enumerate(fit.effects) if j != i]
                 fits.append(refit(self.workspace, rest, iterations=6) if rest else null)
             # Keep the fit itself too, so that no other object gets its id.
-            kept = self.dropped[id(fit)] = (fit, fits)
-        return kept[1]
+            cached = self.dropped[id(fit)] = (fit, fits)
+        return cached[1]
 
-    def say(self, text: str) -> None:
+    def log(self, text: str) -> None:
         """Keep a step of the search, with the simulations so far, and tell it."""
         self.trace.append(f'{text} [{self.workspace.simulations}]')
         self._progress(text)
@@ -170,7 +170,7 @@ class Trials:
         return fit.chi2 + self.penalty * fit.parameters
 
     def screen_beside(self, fit: Fit) -> Screen:
-        """The signatures beside ``fit``."""
+        """Return the signatures beside ``fit``."""
         return self._make_screen(self.workspace, fit)
 
     def best_of(self, starts: Sequence[Sequence[ActiveEffect]], keep: int, iterations: int) -> Fit | None:
@@ -195,8 +195,8 @@ class Trials:
         losses = [ws.loss(ws.residual([*ws.base, *fit.nuisance, *start])[0]) for start in starts]
         if not losses or min(losses) >= fit.chi2:
             return fit
-        other = refit(ws, starts[int(np.argmin(losses))], iterations, fit.nuisance)
-        return min(fit, other, key=self.bic)
+        restarted = refit(ws, starts[int(np.argmin(losses))], iterations, fit.nuisance)
+        return min(fit, restarted, key=self.bic)
 
     def of_another_shape(self, fit: Fit) -> Fit:
         """``fit``, or a better one with the shapes of an effect elsewhere: its frequency may be in a side valley."""
@@ -212,7 +212,7 @@ class Trials:
         return best if self.bic(best) < self.bic(fit) - BIC_ACCEPT else fit
 
     def passes(self, smaller: Fit, larger: Fit, null: Fit) -> bool:
-        """Whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
+        """Return whether ``larger`` is better than ``smaller`` by more than BIC and the simulation's own error ask."""
         gain = smaller.chi2 - larger.chi2
         if not self.workspace.open_level:
             explained = null.residual - smaller.residual
@@ -220,8 +220,8 @@ class Trials:
         more = self.penalty * (larger.parameters - smaller.parameters)
         return gain - more > BIC_ACCEPT
 
-    def stands_in(self, smaller: Fit, larger: Fit) -> bool:
-        """Whether what ``larger`` adds only stands in for something that the library lacks."""
+    def is_substitute(self, smaller: Fit, larger: Fit) -> bool:
+        """Return whether what ``larger`` adds only stands in for something that the library lacks."""
         size = self.workspace.size
         if not smaller.effects or self.workspace.open_level or larger.chi2 <= (1.0 + NEAR) * size:
             return False
@@ -243,7 +243,7 @@ class Trials:
 
     def renoise(self, fit: Fit) -> Fit:
         """Estimate the noise again, now that most of the discrepancy is explained; refit if it differs."""
-        renoised = self.workspace.renoised([*self.workspace.base, *fit.whole])
+        renoised = self.workspace.renoised([*self.workspace.base, *fit.coefficients_with_nuisance])
         if renoised is self.workspace:
             return fit
         self.workspace = renoised
@@ -254,9 +254,9 @@ class Trials:
         self.screen = self.screen_beside(fit)
         return fit
 
-    def settle(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
+    def refit(self, null: Fit, fit: Fit) -> tuple[Fit, Fit]:
         """Both fits again, with free loads and times as ``fit`` asks for: else a small effect stands in for these."""
-        settled = self.workspace.settled_beside(fit.difference, fit.whole)
+        settled = self.workspace.refitted_beside(fit.difference, fit.coefficients_with_nuisance)
         if settled is self.workspace:
             return null, fit
         better = refit(settled, fit.effects, iterations=6)
@@ -267,13 +267,13 @@ class Trials:
         return refit(settled, ()), better
 
     def at(self, workspace: Comparison) -> Self:
-        """The same search over another comparison of the same recordings."""
+        """Return the same search over another comparison of the same recordings."""
         out = copy.copy(self)
         out.workspace = workspace
         return out
 
     def may_pass(self, score: Score) -> bool:
-        """Whether one more effect would pass, to first order."""
+        """Return whether one more effect would pass, to first order."""
         return score.p <= self.workspace.p_accept and score.gain - self.penalty * score.dof > BIC_ACCEPT
 
     def further(self, current: Fit, scores: Sequence[Score]) -> Fit | None:

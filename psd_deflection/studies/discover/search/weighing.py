@@ -44,7 +44,7 @@ RIVAL_BIC = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Rival:
+class Alternative:
     """An effect in place of a named one, with its fitted values; ``delta_bic``: how much worse, below 0 better.
     ``fit``: the whole model with it.
     """
@@ -59,7 +59,7 @@ class Rival:
 class NamedEffect:
     """One effect of the answer. ``sd``: per fitted parameter. ``alternatives``: (name, loss in
     chi-square, difference of BIC), the closest first; ``equivalent``: those that this data cannot exclude;
-    ``rivals``: those and what else comes close in BIC.
+    ``fitted_alternatives``: those and what else comes close in BIC.
     """
 
     active: ActiveEffect
@@ -68,7 +68,7 @@ class NamedEffect:
     delta_bic: float
     heldout: HeldOut
     equivalent: tuple[str, ...]
-    rivals: tuple[Rival, ...]
+    fitted_alternatives: tuple[Alternative, ...]
     alternatives: tuple[tuple[str, float, float], ...]
     suggestion: Suggestion | None
 
@@ -86,14 +86,14 @@ class NamedEffect:
 @dataclass(frozen=True, slots=True)
 class Unknown:
     """A discrepancy that no effect explains, or only several tied effects: ``signature`` in words,
-    ``explains``: its fraction of the gap's energy. ``remains``: whether it is still present with all effects added.
+    ``explains``: its fraction of the gap's energy. ``unexplained``: whether it is still present with all effects added.
     ``rms``: its size, as the gap counts it, without noise.
     """
 
     signature: str
     depends_on: tuple[str, ...]
     explains: float
-    remains: bool = True
+    unexplained: bool = True
     rms: float = 0.0
 
 
@@ -120,12 +120,12 @@ def covariance_of(fit: Fit, effects: Sequence[NamedEffect]) -> tuple[tuple[str, 
     columns = [fit.free.index((index[id(e.active)], n)) if id(e.active) in index else -1 for e, n in places]
     sd = np.array([e.sd[name] for e, name in places])
     fitted = fit.covariance()
-    spread = np.sqrt(np.maximum(np.diag(fitted), 0.0))
+    deviations = np.sqrt(np.maximum(np.diag(fitted), 0.0))
     out = np.diag(sd**2)
     for a, i in enumerate(columns):
         for b, j in enumerate(columns):
-            if a != b and min(i, j) >= 0 and min(spread[i], spread[j]) > 0.0:
-                out[a, b] = fitted[i, j] / (spread[i] * spread[j]) * sd[a] * sd[b]
+            if a != b and min(i, j) >= 0 and min(deviations[i], deviations[j]) > 0.0:
+                out[a, b] = fitted[i, j] / (deviations[i] * deviations[j]) * sd[a] * sd[b]
     return tuple(f'{e.active.effect.name}.{name}' for e, name in places), out
 
 
@@ -154,11 +154,11 @@ def waterfall_of(ws: Comparison, fit: Fit, gap_before: float, gap_after: float) 
 
 
 def _beyond(gap: float, floor: float) -> float:
-    """The part of a gap that noise does not explain; all of it if nobody knows the noise."""
+    """Return the part of a gap that noise does not explain; all of it if nobody knows the noise."""
     return float(np.sqrt(max(gap**2 - floor**2, 0.0))) if np.isfinite(floor) else gap
 
 
-def null_log(workspace: Comparison, before: float, after: float) -> tuple[Unknown, ...]:
+def unnamed_gap(workspace: Comparison, before: float, after: float) -> tuple[Unknown, ...]:
     """What remains although no place of it stands out: several small differences, or the simulation's own error."""
     floor = workspace.floor()
     if not after > UNSAID * floor:
@@ -168,12 +168,12 @@ def null_log(workspace: Comparison, before: float, after: float) -> tuple[Unknow
     return (Unknown(words, (), float(min((after / before) ** 2, 1.0)), rms=size),)
 
 
-def no_noise(workspace: Comparison, left: Localisation, before: float, after: float) -> tuple[Unknown, ...]:
+def no_noise(workspace: Comparison, residual: Localisation, before: float, after: float) -> tuple[Unknown, ...]:
     """What remains where nobody states a noise, if it follows something or one value is like the next."""
     if not workspace.open_level or np.isfinite(workspace.floor()) or after <= 0.0:
         return ()
     most = MOST_OF_IT * workspace.size
-    follows = [d for d in left.dependences if d.p < FOLLOWS_P or d.gain > most][:3]
+    follows = [d for d in residual.dependences if d.p < FOLLOWS_P or d.gain > most][:3]
     if not follows and not workspace.correlated:
         return ()
     names = tuple(dict.fromkeys(d.regressor for d in follows))
@@ -183,7 +183,7 @@ def no_noise(workspace: Comparison, left: Localisation, before: float, after: fl
 
 
 def unknown_of(
-    left: Localisation,
+    residual: Localisation,
     explained: float,
     gap: float = 0.0,
     floor: float = 0.0,
@@ -194,26 +194,26 @@ def unknown_of(
     """``gap``: what remains; ``floor``: what noise leaves, ``by_noise``: at most. ``steps``: chi-square that coarse
     steps explain. ``worded``: a gap with its unit.
     """
-    if left.p > UNKNOWN_P or left.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
+    if residual.p > UNKNOWN_P or residual.excess < max(UNKNOWN_EXCESS, STEPS_SHARE * steps):
         return ()
-    fast = any(c.p < 0.01 and c.band[0] >= BLOCKS_HZ for c in left.cells)
+    fast = any(c.p < 0.01 and c.band[0] >= BLOCKS_HZ for c in residual.cells)
     if 0.0 < gap <= max(floor, by_noise) < math.inf and not fast:
         # Noise alone may leave more.
         return ()
-    strong = [d for d in left.dependences if d.p < 1e-3][:6]
+    strong = [d for d in residual.dependences if d.p < 1e-3][:6]
     size = _beyond(gap, floor)
-    words = _place_of(left, strong)
+    words = _place_of(residual, strong)
     if size > 0.0:
         times = f' ({gap / floor:.1f} times the noise remain)' if floor > 0.0 else ''
         words.insert(1, f'{worded(size)} rms{times}')
-    share = left.excess / (left.excess + explained)
+    share = residual.excess / (residual.excess + explained)
     names = tuple(dict.fromkeys(d.regressor for d in strong))
     return (Unknown('; '.join(words), names, share, rms=size),)
 
 
-def _place_of(left: Localisation, strong: Sequence[Dependence]) -> list[str]:
+def _place_of(residual: Localisation, strong: Sequence[Dependence]) -> list[str]:
     """On which channels, what it follows and how, and when it is strongest."""
-    channels = list(dict.fromkeys([*(c.channel for c in left.cells if c.p < 0.01), *(d.channel for d in strong)]))
+    channels = list(dict.fromkeys([*(c.channel for c in residual.cells if c.p < 0.01), *(d.channel for d in strong)]))
     names = tuple(dict.fromkeys(d.regressor for d in strong))
     even = sum(d.gain for d in strong if _even(d.regressor))
     odd = sum(d.gain for d in strong if not _even(d.regressor))
@@ -224,8 +224,8 @@ def _place_of(left: Localisation, strong: Sequence[Dependence]) -> list[str]:
         words.append('mostly even' if even > 2.0 * odd else 'mostly odd' if odd > 2.0 * even else 'odd and even parts')
     if lagging:
         words.append('hysteretic: it depends on which way the load last changed')
-    if left.cells:
-        c = left.cells[0]
+    if residual.cells:
+        c = residual.cells[0]
         words.append(f'strongest at {c.when[0]:.1f} to {c.when[1]:.1f} s, {c.band[0]:g} to {c.band[1]:g} Hz')
     return words
 
@@ -235,16 +235,16 @@ def tied(ties: Sequence[Coincidence], fit: Fit, result: SearchResult, before: Lo
     if not ties:
         return ()
     tie = ties[0]
-    *others, last = [fit.effects[i].label for i, _ in tie.members]
+    *labels, last = [fit.effects[i].label for i, _ in tie.members]
     unit = f' {tie.unit}' if tie.unit else ''
     sizes = ', '.join(f'{name} {size:.4g}' for (_, name), size in zip(tie.members, tie.sizes, strict=True))
     words = (
-        f'{", ".join(others)} and {last} agree in size ({sizes}{unit}) as '
+        f'{", ".join(labels)} and {last} agree in size ({sizes}{unit}) as '
         f'independent effects hardly would (odds {tie.odds:.0f} to 1): one cause that is not in the catalogue'
     )
     names = tuple(dict.fromkeys(d.regressor for d in before.dependences[:6] if d.p < 1e-3))
     share = sum(result.delta_chi2[i] for i, _ in tie.members) / max(result.null.chi2 - fit.chi2, 1e-300)
-    return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), remains=False),)
+    return (Unknown(words, names, float(min(max(share, 0.0), 1.0)), unexplained=False),)
 
 
 def _even(regressor: str) -> bool:

@@ -81,8 +81,8 @@ class Workspace(Comparison):
         self.noise = self._noise_beside(self.base)
 
     def _noise_beside(self, effects: Sequence[ActiveEffect]) -> tuple[NoiseModel, ...]:
-        """The noise, with the link's motion simulated with ``effects``."""
-        out, left = list[NoiseModel](), list[FloatArray]()
+        """Return the noise, with the link's motion simulated with ``effects``."""
+        out, residuals = list[NoiseModel](), list[FloatArray]()
         self.tally.count += 1
         for i, (o, size) in enumerate(zip(self.observations, self.fine, strict=True)):
             chunk = ForwardModel(o.rig, only_in(sort_effects(effects), i)).expect(o.acting, o.temperature)
@@ -93,11 +93,11 @@ class Workspace(Comparison):
             noise = estimate_noise(o, difference, size, floors)
             present = self._present[i]
             rows = difference.T if present is None else np.where(present > 0.0, difference.T, 0.0)
-            left.append(noise.whiten(fine_means(rows, size, present), self.count[i]))
+            residuals.append(noise.whiten(fine_means(rows, size, present), self.count[i]))
             out.append(noise)
-        corners = corners_of(left, self.periods)
+        corners = corners_of(residuals, self.periods)
         blocks = [o.rig.estimator.block_size * o.period for o in self.observations]
-        both = zip(out, left, self.periods, blocks, strict=True)
+        both = zip(out, residuals, self.periods, blocks, strict=True)
         return tuple(w.with_slow_noise(corners, part.shape[1], period, block) for w, part, period, block in both)
 
     @property
@@ -157,7 +157,7 @@ class Workspace(Comparison):
         return out
 
     def whiten(self, fine: Sequence[FloatArray]) -> FloatArray:
-        """One vector of all recordings, white and of unit variance if the noise model holds.
+        """Return one vector of all recordings, white and of unit variance if the noise model holds.
 
         What is not known of the loads adds to the noise (errors in variables); a free load adds without bound.
         """
@@ -171,7 +171,7 @@ class Workspace(Comparison):
         parts = [w.whiten(f, c).ravel() for f, w, c in zip(fine, self.noise, self.count, strict=True)]
         return np.concatenate(parts)
 
-    def freed(self, directions: Sequence[Direction], effects: Sequence[ActiveEffect] = ()) -> Self:
+    def with_free(self, directions: Sequence[Direction], effects: Sequence[ActiveEffect] = ()) -> Self:
         """With what ``directions`` say free; loads are simulated beside ``effects``."""
         if not directions:
             return self
@@ -182,7 +182,7 @@ class Workspace(Comparison):
         for d in directions:
             if isinstance(d, LoadDirection):
                 # A free load is large: the change by one of its unit, in proportion.
-                more = self._loaded([(d, 1.0)]).simulate(beside)
+                more = self.with_loads([(d, 1.0)]).simulate(beside)
                 tables.append([d.sd * (a - b) for a, b in zip(more, nominal, strict=True)])
             else:
                 tables.append(d.table(nominal, self.observations[d.recording].rig.sensitivities))
@@ -195,13 +195,13 @@ class Workspace(Comparison):
             return None
         white = np.array([self._white(t) for t in free.tables])
         energy, vectors = np.linalg.eigh(white @ white.T)
-        seen = energy > max(1e-6, 1e-14 * float(energy.max()))
-        energy, vectors = energy[seen], vectors[:, seen]
+        observable = energy > max(1e-6, 1e-14 * float(energy.max()))
+        energy, vectors = energy[observable], vectors[:, observable]
         rows = (vectors / np.sqrt(energy)).T @ white
         back = np.array([d.sd for d in free.directions])[:, None] * vectors
         return Free(free.directions, free.tables, rows, energy, back)
 
-    def _loaded(self, more: Sequence[tuple[Direction, float]]) -> Self:
+    def with_loads(self, more: Sequence[tuple[Direction, float]]) -> Self:
         """With the loads changed."""
         out = self
         for recording, change, swings in added(more):
@@ -237,21 +237,21 @@ class Workspace(Comparison):
         """Whether a load or its time is free."""
         return any(isinstance(d, LoadDirection) for d in self.directions)
 
-    def settled(self, difference: Sequence[FloatArray]) -> Self:
+    def refitted(self, difference: Sequence[FloatArray]) -> Self:
         """With the free loads as the ``difference`` of a fit, measured minus simulated, asks for."""
         if self.free is None or not self.free_loads:
             return self
-        more = self._asked(self.free, difference)
-        return self._loaded(more).replaced(free=dataclasses.replace(self.free, directions=moved(more)))
+        more = self._implied_loads(self.free, difference)
+        return self.with_loads(more).replaced(free=dataclasses.replace(self.free, directions=moved(more)))
 
-    def settled_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
+    def refitted_beside(self, difference: Sequence[FloatArray], effects: Sequence[ActiveEffect]) -> Self:
         """The same, with what one more of each does beside the ``effects``, if more than noise is left to settle."""
         if self.free is None or not self.free_loads or self.gap(difference) <= UNSETTLED * self.floor():
             return self
-        more = self._asked(self.free, difference)
-        return self._loaded(more).freed(moved(more), effects)
+        more = self._implied_loads(self.free, difference)
+        return self.with_loads(more).with_free(moved(more), effects)
 
-    def _asked(self, free: Free, difference: Sequence[FloatArray]) -> list[tuple[Direction, float]]:
+    def _implied_loads(self, free: Free, difference: Sequence[FloatArray]) -> list[tuple[Direction, float]]:
         sizes = free.back @ (np.sqrt(free.energy) / (1.0 + free.energy) * (free.rows @ self._white(difference)))
         return list(zip(free.directions, sizes.tolist(), strict=True))
 
@@ -293,13 +293,13 @@ class Workspace(Comparison):
         return float(np.sqrt(np.mean(blocks**2))) if len(blocks) else 0.0
 
     def gap_per_channel(self, residual: Sequence[FloatArray]) -> FloatArray:
-        """The same for each of x1 y1 x2 y2 ..., (2P,) m."""
+        """Return the same for each of x1 y1 x2 y2 ..., (2P,) m."""
         blocks = np.concatenate(self.block_dots(residual), axis=1)
         there = np.isfinite(blocks)
         return np.asarray(np.sqrt(np.where(there, blocks**2, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)))
 
     def floor(self) -> float:
-        """The gap from noise alone, m."""
+        """Return the gap from noise alone, m."""
         total, count = 0.0, 0
         for w, o, c, s in zip(self.noise, self.observations, self.count, self.fine, strict=True):
             share = fine_means(c[self.rows], o.rig.estimator.block_size // s)
@@ -339,16 +339,16 @@ class Workspace(Comparison):
         return 'm'
 
     @property
-    def scale_shown(self) -> tuple[float, str]:
+    def display_scale(self) -> tuple[float, str]:
         """Micrometres."""
         return 1e6, 'µm'
 
     @property
-    def units_shown(self) -> tuple[str, ...]:
+    def display_units(self) -> tuple[str, ...]:
         """Micrometres."""
         return ('µm',) * len(self.channels)
 
-    def shown(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
+    def displayed(self, tables: Sequence[FloatArray]) -> list[FloatArray]:
         """Block means of the dots (2P, blocks), µm."""
         return [1e6 * d for d in self.block_dots(tables)]
 

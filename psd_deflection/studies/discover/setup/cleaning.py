@@ -23,7 +23,7 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.proposals import coarse_step
-from psd_deflection.studies.loads.noted_times import MendedLoads, mend_loads
+from psd_deflection.studies.loads.noted_times import CorrectedLoads, correct_loads
 
 FAR = 8.0
 """A sample this many standard deviations from what its neighbours predict is an outlier."""
@@ -107,7 +107,7 @@ def stuck(volts: FloatArray, period: float, noise: FloatArray, step: float) -> B
 
 
 def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Observation, list[Finding]]:
-    """The recording without what is no measurement, and what was found. ``base``: effects of the rig file."""
+    """Return the recording without what is no measurement, and what was found. ``base``: effects of the rig file."""
     o = observation
     step = o.rig.converter.volts_per_count
     findings = []
@@ -133,9 +133,9 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
         )
     volts[still] = np.nan
     simulated = ForwardModel(o.rig, base).expect(o.loads, o.temperature).volts.T
-    rough, left = outliers(volts, least), outliers(volts - simulated, least)
+    rough, beside_model = outliers(volts, least), outliers(volts - simulated, least)
     # Loads in a wrong unit make the simulation rougher than the readings; else it explains their steps.
-    volts[rough if left.sum() > 2 * rough.sum() else left] = np.nan
+    volts[rough if beside_model.sum() > 2 * rough.sum() else beside_model] = np.nan
     if o.stated_rate_hz:
         rate = o.rig.converter.sample_rate_hz
         factor = rate / o.stated_rate_hz
@@ -162,12 +162,12 @@ def clean(observation: Observation, base: Sequence[ActiveEffect]) -> tuple[Obser
     return dataclasses.replace(o, volts=volts, digest=o.digest or o.hashed()), findings
 
 
-def time_loads(observation: Observation) -> tuple[Observation, MendedLoads | None]:
+def time_loads(observation: Observation) -> tuple[Observation, CorrectedLoads | None]:
     """The recording with its loads at the times at which they acted, by the motion, and what was noted otherwise."""
     o = observation
-    mended = mend_loads(o.rig, o.volts[:, dot_channels(o.psds)] * o.rig.sensitivities.ravel(), o.loads)
-    if mended is None:
+    corrected = correct_loads(o.rig, o.volts[:, dot_channels(o.psds)] * o.rig.sensitivities.ravel(), o.loads)
+    if corrected is None:
         return o, None
     volts = o.volts.copy()
-    volts[mended.unused] = np.nan
-    return dataclasses.replace(o, volts=volts, loads=mended.loads, digest=o.digest or o.hashed()), mended
+    volts[corrected.unused] = np.nan
+    return dataclasses.replace(o, volts=volts, loads=corrected.loads, digest=o.digest or o.hashed()), corrected

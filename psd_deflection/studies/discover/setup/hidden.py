@@ -94,9 +94,9 @@ def _torsion(physics: Physics, values: Values) -> None:
 
 def _delay(chunk: SimulatedSamples, values: Values, state: State) -> None:
     at = np.arange(chunk.loads.shape[1]) + values['late_by'] / chunk.physics.period
-    whole = np.arange(chunk.loads.shape[1])
+    samples = np.arange(chunk.loads.shape[1])
     for row in range(3):
-        chunk.loads[row] = np.interp(at, whole, chunk.loads[row])
+        chunk.loads[row] = np.interp(at, samples, chunk.loads[row])
 
 
 def zero_moved(values: Values, psds: int) -> FloatArray:
@@ -133,7 +133,7 @@ def _factor(name: str, configure: Callable[[Physics, Values], None], stage: Stag
 def mistakes(
     recordings: int, delays: Sequence[float], jumps: Sequence[tuple[int, int, float]], psds: int = 2
 ) -> list[Effect]:
-    """The mistakes of the set-up of a rig of so many ``psds`` that have a size.
+    """Return the mistakes of the set-up of a rig of so many ``psds`` that have a size.
 
     ``delays``: by how much the loads may be noted late, s. ``jumps``: recording, PSD, time, s, of steps that the
     readings seem to have.
@@ -146,7 +146,7 @@ def mistakes(
         _factor('torsion_frequency', _torsion, 'link', 'natural frequency of the torsion'),
     ]
     if delays:
-        late = EffectParameter('late_by', 's', -2.0, 2.0, 1e-3, 'the loads are noted late by', grid=tuple(delays))
+        delay = EffectParameter('late_by', 's', -2.0, 2.0, 1e-3, 'the loads are noted late by', grid=tuple(delays))
         late_loads = Effect(
             'load_delay',
             'load',
@@ -154,7 +154,7 @@ def mistakes(
             '',
             '',
             '',
-            (late,),
+            (delay,),
             'load',
             apply=_delay,
             order=-1,

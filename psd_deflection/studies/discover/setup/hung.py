@@ -26,8 +26,8 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.free import Direction, LoadDirection
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.loads.load_cell import MeasuredLoad
-from psd_deflection.studies.loads.noted_times import MendedNote, shifted
-from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, asked_for, plateaus
+from psd_deflection.studies.loads.noted_times import CorrectedNote, shifted
+from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, implied_loads, plateaus
 from psd_deflection.studies.loads.sway import SwayingLoad, swaying
 
 FREE_MOMENTS = 40.0
@@ -53,16 +53,16 @@ def times(o: Observation, recording: int) -> list[Plateau]:
 
 
 def levels(ws: Workspace, recording: int, difference: FloatArray, listed: Sequence[Plateau]) -> PlateauLoads:
-    """The loads that ``difference`` (3P, m), V, measured minus simulated, asks for."""
+    """Return the loads that ``difference`` (3P, m), V, measured minus simulated, asks for."""
     o = ws.observations[recording]
-    return asked_for(o.rig, difference, ws.count[recording], len(o.loads), ws.fine[recording], listed)
+    return implied_loads(o.rig, difference, ws.count[recording], len(o.loads), ws.fine[recording], listed)
 
 
-def swayed(ws: Workspace, recording: int, difference: FloatArray, found: PlateauLoads) -> list[SwayingLoad]:
-    """Loads that swayed; ``found``: what ``difference`` asks for between all steps."""
+def swayed(ws: Workspace, recording: int, difference: FloatArray, implied: PlateauLoads) -> list[SwayingLoad]:
+    """Loads that swayed; ``implied``: what ``difference`` asks for between all steps."""
     o = ws.observations[recording]
-    noted = plateaus(o.rig, o.volts, o.loads, recording, noted=True)
-    return swaying(found, noted, partial(levels, ws, recording, difference), o.period)
+    annotated = plateaus(o.rig, o.volts, o.loads, recording, annotated_only=True)
+    return swaying(implied, annotated, partial(levels, ws, recording, difference), o.period)
 
 
 def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
@@ -73,18 +73,20 @@ def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
         out += of_plateau(o, p.recording, p, free)
         for at in _unnoted(p):
             out += in_time(
-                o, p.recording, MendedNote(p.number, tuple(p.of(o.loads).tolist()), at * o.period, at * o.period, 0.0)
+                o,
+                p.recording,
+                CorrectedNote(p.number, tuple(p.of(o.loads).tolist()), at * o.period, at * o.period, 0.0),
             )
     return out
 
 
 def _unnoted(p: Plateau) -> list[int]:
-    """The samples at which it began and ended, if nothing was noted then."""
-    return [*([p.first] if p.unnoted else []), *([p.last] if p.left else [])]
+    """Return the samples at which it began and ended, if nothing was noted then."""
+    return [*([p.first] if p.unnoted else []), *([p.last] if p.end_unnoted else [])]
 
 
-def in_time(o: Observation, recording: int, note: MendedNote) -> list[LoadDirection]:
-    """The time of a ``note`` and, if its load was applied slowly, how long that took."""
+def in_time(o: Observation, recording: int, note: CorrectedNote) -> list[LoadDirection]:
+    """Return the time of a ``note`` and, if its load was applied slowly, how long that took."""
     acted = shifted(note, o.loads, o.period)
     none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
     changes = [acted([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
@@ -124,11 +126,11 @@ def ringing_on(o: Observation, recording: int, effects: Sequence[ActiveEffect]) 
 
 
 def unseen(ws: Workspace, direction: Direction) -> bool:
-    """Whether it is the time of a load that was hung in what is left out."""
-    if not isinstance(direction, LoadDirection) or not isinstance(direction.of, MendedNote):
+    """Return whether it is the time of a load that was hung in what is left out."""
+    if not isinstance(direction, LoadDirection) or not isinstance(direction.of, CorrectedNote):
         return False
     o = ws.observations[direction.recording]
-    at = min(round(direction.of.hung / o.period), len(o.volts) - 1)
+    at = min(round(direction.of.applied / o.period), len(o.volts) - 1)
     return bool(np.isnan(o.volts[at]).all())
 
 
@@ -138,7 +140,7 @@ def _decays(p: Physics) -> list[tuple[float, float]]:
     return [*[(bending, bending * p.bending_damping_ratio)] * 2, (torsion, torsion * p.torsion_damping_ratio)]
 
 
-def told(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding]:
+def wrong_load_findings(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding]:
     """What hung in each of ``wrong``, after the search."""
     sds = ws.direction_sd()
     out = []
@@ -155,8 +157,8 @@ def _timed(ws: Workspace, p: Plateau) -> Plateau:
     """``p`` between the times that were fitted, in whole samples."""
     moved = {}
     for d in ws.directions:
-        if isinstance(d, LoadDirection) and d.recording == p.recording and isinstance(d.of, MendedNote):
+        if isinstance(d, LoadDirection) and d.recording == p.recording and isinstance(d.of, CorrectedNote):
             period = ws.observations[d.recording].period
-            moved[round(d.of.hung / period)] = round(d.of.moved(d.sizes, period).hung / period)
+            moved[round(d.of.applied / period)] = round(d.of.moved(d.sizes, period).applied / period)
     first, last = (moved.get(at, at) if at in _unnoted(p) else at for at in (p.first, p.last))
     return dataclasses.replace(p, first=first, last=last)

@@ -90,7 +90,7 @@ class NoiseModel:
         return np.zeros(len(self.sigma)) if self.slow is None else self.slow.corners
 
     def like(self, other: NoiseModel) -> bool:
-        """Whether a search need not tell it from ``other``."""
+        """Return whether a search need not tell it from ``other``."""
         return (
             self.coloured == other.coloured
             and np.allclose(self.innovation, other.innovation, rtol=0.02)
@@ -186,7 +186,7 @@ def _filled(values: FloatArray, there: BoolArray) -> FloatArray:
     return np.interp(at, at[there], values[there])
 
 
-def _kept(there: BoolArray, upper: BoolArray) -> float:
+def _power_share(there: BoolArray, upper: BoolArray) -> float:
     """Share of the power of white noise that straight lines across the missing samples leave at ``upper`` frequencies.
 
     Measured on white noise of a fixed seed.
@@ -214,10 +214,10 @@ def _memories(residual: FloatArray, rest: list[slice], floors: FloatArray) -> li
         filled = _filled(residual[:, c], there)
         # A residual is 0 where a sample is missing, so that each product counts two that were measured.
         rows = [strip_lines(detrend(filled[w])) * there[w] for w in rest]
-        seen = [there[w].astype(np.float64) for w in rest]
-        count = int(sum(s.sum() for s in seen))
+        valid = [there[w].astype(np.float64) for w in rest]
+        count = int(sum(s.sum() for s in valid))
         if count > LEAST_REST:
-            pooled[c] = [_product(rows, k) / max(_product(seen, k), 1.0) for k in range(ORDER + 1)]
+            pooled[c] = [_product(rows, k) / max(_product(valid, k), 1.0) for k in range(ORDER + 1)]
             if pooled[c, 0] > floor**2:
                 significant[c] = abs(pooled[c, 1]) / pooled[c, 0] * np.sqrt(count)
     most = 2 * int(np.sum(significant > SIGNIFICANT)) > len(significant)
@@ -244,7 +244,7 @@ def estimate_noise(observation: Observation, residual: FloatArray, fine: int, fl
     for c in range(channels):
         there = np.isfinite(residual[:, c])
         filled = _filled(residual[:, c], there)
-        power = np.abs(np.fft.rfft(filled * np.hanning(n))) ** 2 / (0.375 * n) / _kept(there, upper)
+        power = np.abs(np.fft.rfft(filled * np.hanning(n))) ** 2 / (0.375 * n) / _power_share(there, upper)
         level = _level(power[upper])
         floor = float(floors[c])
         white = max(np.sqrt(level), floor)

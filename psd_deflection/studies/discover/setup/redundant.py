@@ -74,8 +74,8 @@ def _orthonormal(rows: FloatArray) -> list[FloatArray]:
     out: list[FloatArray] = []
     for row in rows:
         # Twice: the first time leaves what rounding makes of it.
-        for other in (*out, *out):
-            row = row - (other @ row) * other
+        for basis_vector in (*out, *out):
+            row = row - (basis_vector @ row) * basis_vector
         out.append(row / np.linalg.norm(row))
     return out
 
@@ -99,7 +99,7 @@ def excess(ws: Workspace, residual: FloatArray) -> tuple[float, float]:
 
 
 def solved(ws: Workspace, difference: Sequence[FloatArray]) -> FloatArray:
-    """The whitened residual (D,) of the poses that the readings say; ``difference``: of the simulated ones."""
+    """Return the whitened residual (D,) of the poses that the readings say; ``difference``: of the simulated ones."""
     moves = [np.zeros((3, d.shape[1])) for d in difference]
     for _ in range(2):
         for i, (o, part) in enumerate(zip(ws.observations, difference, strict=True)):
@@ -110,12 +110,12 @@ def solved(ws: Workspace, difference: Sequence[FloatArray]) -> FloatArray:
     return residual
 
 
-def _moved(recording: int, count: int, by: FloatArray) -> ActiveEffect:
-    """The pose of one recording moved ``by`` (3, n)."""
+def _moved(recording: int, count: int, shift: FloatArray) -> ActiveEffect:
+    """Return the pose of one recording moved ``shift`` (3, n)."""
 
     def move(chunk: SimulatedSamples, values: Values, state: State) -> None:
-        n = min(chunk.pose.shape[1], by.shape[1])
-        chunk.pose[:, :n] += by[:, :n]
+        n = min(chunk.pose.shape[1], shift.shape[1])
+        chunk.pose[:, :n] += shift[:, :n]
 
     choices = tuple(range(1, count + 1))
     which = EffectParameter('recording', '', 1, count, 1, '', nominal=1, kind='choice', choices=choices, each=True)
@@ -125,11 +125,11 @@ def _moved(recording: int, count: int, by: FloatArray) -> ActiveEffect:
 
 
 def visible(ws: Workspace, columns: Sequence[Sequence[FloatArray]]) -> float:
-    """The least share of its energy that an effect with signatures ``columns`` shows in the fourth reading."""
+    """Return the least share of its energy that an effect with signatures ``columns`` shows in the fourth reading."""
     white = np.array([ws.whiten(c) for c in columns])
-    own = fourth(ws, white)
-    whole = white @ white.T
-    lengths = np.sqrt(np.maximum(np.diag(whole), 1e-300))
-    whole = whole / np.outer(lengths, lengths) + 1e-9 * np.eye(len(white))
-    seen = (own @ own.T) / np.outer(lengths, lengths)
-    return float(eigh(seen, whole, eigvals_only=True)[0])
+    patterns = fourth(ws, white)
+    gram = white @ white.T
+    lengths = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+    gram = gram / np.outer(lengths, lengths) + 1e-9 * np.eye(len(white))
+    cosines = (patterns @ patterns.T) / np.outer(lengths, lengths)
+    return float(eigh(cosines, gram, eigvals_only=True)[0])

@@ -77,13 +77,14 @@ def _blocks(rows: FloatArray, size: int) -> FloatArray:
     return np.where(count >= size // 2, np.where(there, cut, 0.0).sum(axis=2) / np.maximum(count, 1), np.nan)
 
 
-def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> _Movement:
+def movement_sums(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> _Movement:
+    """Return the sums over blocks of what dots and simulated loads moved, m^2."""
     count = 2 * observations[0].psds
-    squared, cross, own = 0.0, np.zeros((3, count, count)), np.zeros((3, 3))
+    squared, cross, load_products = 0.0, np.zeros((3, count, count)), np.zeros((3, 3))
     for o in observations:
         size, physics = o.rig.estimator.block_size, Physics.of(o.rig)
         device = Wiring.from_rig(o.rig).to_device(o.volts)[:, dot_channels(o.psds)].T
-        seen = _blocks(device * o.rig.amplifier.sensitivity, size)
+        block_means = _blocks(device * o.rig.amplifier.sensitivity, size)
         still = _moved(o.rig, base, np.zeros_like(o.loads), o.temperature)
         alone = []
         for k, compliance in enumerate((physics.force_compliance, physics.force_compliance, physics.torque_compliance)):
@@ -92,23 +93,23 @@ def _movement(observations: Sequence[Observation], base: Sequence[ActiveEffect])
             share = SMALL / max(compliance * float(np.abs(o.loads[:, k]).max()), SMALL)
             only[:, k] = share * o.loads[:, k]
             alone.append(_blocks(_moved(o.rig, base, only, o.temperature) - still, size) / share)
-        there = np.isfinite(seen).all(axis=0)
+        there = np.isfinite(block_means).all(axis=0)
         if there.sum() < 4:
             continue
-        seen = seen[:, there] - seen[:, there].mean(axis=1, keepdims=True)
+        block_means = block_means[:, there] - block_means[:, there].mean(axis=1, keepdims=True)
         moves = np.stack(alone)[:, :, there]
         moves = moves - moves.mean(axis=2, keepdims=True)
         # The volts of one PSD may have a sensitivity of their own; the channels are compared by the amplifier's.
         moves = moves / (o.rig.sensitivities.reshape(-1, 1) / o.rig.amplifier.sensitivity)
-        squared += float((seen**2).sum())
-        cross += np.einsum('kdt,ct->kdc', moves, seen)
-        own += np.einsum('kdt,jdt->kj', moves, moves)
+        squared += float((block_means**2).sum())
+        cross += np.einsum('kdt,ct->kdc', moves, block_means)
+        load_products += np.einsum('kdt,jdt->kj', moves, moves)
     first = observations[0].rig
     noise = float(np.mean(first.noises[:, :2] ** 2)) * first.amplifier.sensitivity**2 / first.estimator.block_size
-    return _Movement(squared, cross, own, noise)
+    return _Movement(squared, cross, load_products, noise)
 
 
-def _sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
+def load_sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     """What ``wiring`` leaves of the movement, and the size of each load (3,) over the noted one; NaN for none."""
     dots = dot_channels(len(wiring.axes))
     columns = [dots.index(wiring.columns[c]) for c in dots]
@@ -123,11 +124,11 @@ def _sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     f = m.own[np.ix_(at, at)]
     scale = np.sqrt(np.diag(f))
     sizes[at] = np.linalg.lstsq(f / np.outer(scale, scale), along[at] / scale, rcond=1e-6)[0] / scale
-    left = max(m.squared - float(along[at] @ sizes[at]), 0.0)
+    residual = max(m.squared - float(along[at] @ sizes[at]), 0.0)
     # A load that moved nothing that stands out has no size.
     with np.errstate(invalid='ignore'):
-        sizes[sizes**2 * np.diag(m.own) < SEEN * m.noise + 1e-3 * left] = np.nan
-    return left, sizes
+        sizes[sizes**2 * np.diag(m.own) < SEEN * m.noise + 1e-3 * residual] = np.nan
+    return residual, sizes
 
 
 def _over_simulated(observations: Sequence[Observation], base: Sequence[ActiveEffect]) -> FloatArray:
@@ -157,51 +158,58 @@ def wire(
 ) -> tuple[list[Observation], list[Finding], dict[str, object]]:
     """The recordings as they would be if wiring, signs and units were right; what was wrong; lines for the rig file."""
     file = Wiring.from_rig(observations[0].rig)
-    m = _movement(observations, base)
+    m = movement_sums(observations, base)
     if m.squared <= 0.0 or float(np.trace(m.own)) <= 0.0:
         return list(observations), [], {}
-    noise = _noise_energy(observations)
+    noise = noise_energy(observations)
     tried = []
     for wiring in wirings_of(file):
-        left, sizes = _sizes(m, wiring)
-        tried.append((left + noise, wiring, sizes))
-    best = min(left for left, _, _ in tried)
-    as_good = [(_changes(w, file, s), left, i) for i, (left, w, s) in enumerate(tried) if left <= AS_GOOD * best]
-    _, left, chosen = min(as_good)
+        residual, sizes = load_sizes(m, wiring)
+        tried.append((residual + noise, wiring, sizes))
+    best = min(residual for residual, _, _ in tried)
+    as_good = [
+        (_changes(w, file, s), residual, i) for i, (residual, w, s) in enumerate(tried) if residual <= AS_GOOD * best
+    ]
+    _, residual, chosen = min(as_good)
     _, wiring, sizes = tried[chosen]
-    told, told_sizes = next((x, s) for x, w, s in tried if w == file)
+    stated, told_sizes = next((x, s) for x, w, s in tried if w == file)
     # With the wiring and the signs of the rig file: a load that pulled the wrong way explains nothing.
-    plain = told if not np.any(told_sizes < 0.0) else m.squared + noise
+    plain = stated if not np.any(told_sizes < 0.0) else m.squared + noise
     findings: list[Finding] = []
     lines: dict[str, object] = {}
     crossed: tuple[int, ...] = ()
     loads = np.ones(3)
-    if plain > BETTER * left:
-        others = tuple(_words(tried[i][1], file, tried[i][2]) for _, _, i in sorted(as_good)[1:3])
-        findings, lines = wiring_findings(wiring, file, plain / left, others)
+    if plain > BETTER * residual:
+        alternatives = tuple(_words(tried[i][1], file, tried[i][2]) for _, _, i in sorted(as_good)[1:3])
+        findings, lines = wiring_findings(wiring, file, plain / residual, alternatives)
         crossed = wiring.crossed
         turned = [k for k in range(3) if sizes[k] < 0.0]
         loads[turned] = -1.0
         findings += [
             Finding(
-                'load_sign', LOADS[k][5:], -1.0, f'turn the sign of {LOADS[k]} in the recording', plain / left, others
+                'load_sign',
+                LOADS[k][5:],
+                -1.0,
+                f'turn the sign of {LOADS[k]} in the recording',
+                plain / residual,
+                alternatives,
             )
             for k in turned
         ]
     if unit_findings(sizes)[0]:
         # kg mm and N cm are 2 % apart, and a large movement is not in proportion to its load.
         sizes = np.abs(sizes) * _over_simulated(
-            [_mended(o, lines, crossed, np.nan_to_num(sizes, nan=1.0)) for o in observations], base
+            [_corrected(o, lines, crossed, np.nan_to_num(sizes, nan=1.0)) for o in observations], base
         )
-    units, factors = unit_findings(sizes, plain / left)
+    units, factors = unit_findings(sizes, plain / residual)
     findings += units
     loads = loads * factors
     if not findings:
         return list(observations), [], {}
-    return [_mended(o, lines, crossed, loads) for o in observations], findings, lines
+    return [_corrected(o, lines, crossed, loads) for o in observations], findings, lines
 
 
-def _noise_energy(observations: Sequence[Observation]) -> float:
+def noise_energy(observations: Sequence[Observation]) -> float:
     """What noise adds to the sum over block means, by the rig file, m^2."""
     out = 0.0
     for o in observations:
@@ -221,7 +229,7 @@ def _words(wiring: Wiring, file: Wiring, sizes: FloatArray) -> str:
     return ' and '.join(out) or 'as the rig file says'
 
 
-def _mended(o: Observation, lines: dict[str, object], crossed: tuple[int, ...], loads: FloatArray) -> Observation:
+def _corrected(o: Observation, lines: dict[str, object], crossed: tuple[int, ...], loads: FloatArray) -> Observation:
     rig, volts = o.rig, o.volts
     if lines or crossed:
         rig = replace_values(o.rig, lines)
@@ -244,8 +252,8 @@ def likely_delays(workspace: Workspace) -> list[float]:
             a = np.where(there, m[k] - m[k][there].mean(), 0.0) / noise.sigma[k]
             b = (s[k] - s[k].mean()) / noise.sigma[k]
             n = 2 * len(a)
-            found = np.fft.irfft(np.fft.rfft(a, n) * np.conj(np.fft.rfft(b, n)), n)
-            around = np.concatenate((found[-reach:], found[: reach + 1]))
+            correlation = np.fft.irfft(np.fft.rfft(a, n) * np.conj(np.fft.rfft(b, n)), n)
+            around = np.concatenate((correlation[-reach:], correlation[: reach + 1]))
             total = around if total is None else total + around
     if total is None:
         return []
@@ -278,7 +286,9 @@ def likely_jumps(workspace: Workspace, residual: FloatArray) -> list[tuple[int, 
     return out
 
 
-def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[list[Finding], dict[str, object]]:
+def finding_of_effect(
+    workspace: Workspace, fit: Fit, index: int, evidence: float
+) -> tuple[list[Finding], dict[str, object]]:
     """Effect ``index`` of ``fit``, a mistake of the set-up, in words, and the lines for the rig file."""
     active = fit.effects[index]
     v, rig = active.values, workspace.observations[0].rig
@@ -291,8 +301,10 @@ def said(workspace: Workspace, fit: Fit, index: int, evidence: float) -> tuple[l
         )
         return [Finding(name, f'psd_{int(v["psd"])}', 1e-6 * v['time_us'], words, evidence)], {}
     if name == 'load_delay':
-        late = 'late' if v['late_by'] > 0.0 else 'early'
-        words = f'the loads are noted {abs(v["late_by"]):.4g} s {late}: subtract {v["late_by"]:.4g} s from their times'
+        direction = 'late' if v['late_by'] > 0.0 else 'early'
+        words = (
+            f'the loads are noted {abs(v["late_by"]):.4g} s {direction}: subtract {v["late_by"]:.4g} s from their times'
+        )
         return [Finding(name, ' '.join(LOADS), v['late_by'], words, evidence)], {}
     if name == 'zero':
         o = workspace.observations[int(v['recording']) - 1]

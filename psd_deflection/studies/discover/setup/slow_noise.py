@@ -45,17 +45,17 @@ def corners_of(parts: Sequence[FloatArray], periods: Sequence[float]) -> FloatAr
     channels = len(parts[0])
     gains = np.array([_gains([p[c] for p in parts], periods) for c in range(channels)])
     light = gains[2::3]
-    own = np.where(gains.max(axis=1) > 0.0, CORNERS[np.argmax(gains, axis=1)], 0.0)
-    dots = np.sort(own[list(dot_channels(channels // 3))])
+    corners = np.where(gains.max(axis=1) > 0.0, CORNERS[np.argmax(gains, axis=1)], 0.0)
+    dots = np.sort(corners[list(dot_channels(channels // 3))])
     # What moves some of the dots (three of four), or one light, alone is more than this noise.
     if light.sum(axis=0).max() < CLEAR or light.max(axis=1).min() <= 0.0 or dots[1] == 0.0:
         return np.zeros(channels)
-    low, high = own[2::3].min(), own[2::3].max()
-    return np.asarray(np.minimum(own, WIDER * min(high, APART * low, dots[1])))
+    low, high = corners[2::3].min(), corners[2::3].max()
+    return np.asarray(np.minimum(corners, WIDER * min(high, APART * low, dots[1])))
 
 
 def _gains(rows: Sequence[FloatArray], periods: Sequence[float]) -> FloatArray:
-    """The log-likelihood that each of ``CORNERS`` gains over white noise, of one channel (P. Whittle, 1953)."""
+    """Return the log-likelihood that each of ``CORNERS`` gains over white noise, of one channel (P. Whittle, 1953)."""
     gains = np.zeros(len(CORNERS))
     for row, period in zip(rows, periods, strict=True):
         values = np.clip(row, -CLIP, CLIP)
