@@ -75,7 +75,8 @@ class Score(NamedTuple):
     ellipsoid; ``axes`` (3,): within 1.96 standard deviations; ``noise_only``: within the ellipsoid of the noise.
     ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``unreported``:
     parameters that the Fisher information leaves open and calibrate does not report; ``said``: the reverse.
-    ``moved``: the group that was moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it cannot tell that from.
+    ``moved``: the group that was moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it
+    cannot tell that from.
     """
 
     z: dict[str, float]
