@@ -84,7 +84,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 
 types: $(READY)
-	$(BIN)/mypy
+	MYPY_NUM_WORKERS=2 $(BIN)/mypy
 
 contracts: $(READY)
 	$(BIN)/lint-imports --no-cache
