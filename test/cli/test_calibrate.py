@@ -81,7 +81,7 @@ def test_the_rig_file_is_the_one_that_was_given_and_corrects(made: Path, tmp_pat
     text = (made / 'out' / 'rig.yaml').read_text()
     assert text.startswith('# Calibrated by psd-deflection ')
     assert 'run.csv (sha256 ' in text
-    assert '# k: 3/2 for a force at the tip' in text
+    assert 'k of phi = -k dY/L: 3/2 for a force at the tip' in text
     rig = load_rig(made / 'out' / 'rig.yaml')
     assert rig.psds[0].zero == pytest.approx((3e-4, -2e-4), abs=5e-6)
     assert rig.values['min_samples'] == 10
