@@ -93,7 +93,6 @@ BOUNDED_BY = {
     'run/monitor/start.py:parts': 'three views',
     'run/processing.py:_latencies': 'one second',
     'run/processing.py:_requests': 'MOST_WAITING; of those that are waited for, one a thread',
-    'ros/gate.py:_latched': 'the topics of a node',
     'run/reading/arrivals.py:_items': 'queue_blocks, RECORDED_RESTARTS',
     'run/reading/arrivals.py:flags': 'one block',
     'run/reading/arrivals.py:readings': 'one block',

@@ -347,7 +347,6 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         rivals = self.rivals() if self._drive else []
         other = f'another node publishes {rivals[0]}' if rivals else ''
         if self._drive and now - self._begun < LOOK_S:
-            self.gate.look_for_latched()
             other = other or 'it looks whether another node commands the robot'
         with self._lock:
             self.compensator.stop(other or self._robot.fault(now), rival=bool(other))

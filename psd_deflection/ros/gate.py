@@ -20,7 +20,7 @@ from rclpy.action import GoalResponse
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind
+from rclpy.qos import QoSPolicyKind
 from rclpy.qos_overriding_options import InvalidQosOverridesError
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.subscription import Subscription
@@ -50,8 +50,6 @@ class InputGate:
     def __init__(self, node: Node, log: LogCallback, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
         self._limited_log = RateLimitedLog(log)
-        # Names of topics whose latched row waits for a publisher that is latched, with what subscribes to it.
-        self._latched: dict[str, Callable[[], Subscription]] = {}
         self.refused = Tally()
         self.why: BoundedMap[str, str] = BoundedMap()
 
@@ -70,22 +68,9 @@ class InputGate:
         for a topic without a row, ImportError if its message is not installed, and ConfigError for a QoS override that
         ROS does not take.
         """
-        rows = HEARD[topic]
-        if len(rows) > 1 and rows[0].delivery.latched:
-            latched, rows = rows[0], rows[1:]
-            name = name or graph_name(latched)
-            self._latched[name] = functools.partial(self._subscribe, latched, check, take, name, latched.type)
-        return [self._subscribe(row, check, take, name or graph_name(row), type_name or row.type) for row in rows]
-
-    def look_for_latched(self) -> None:
-        """Subscribe to what a latched publisher said before we came.
-
-        Not before there is one: DDS would warn every publisher that is not latched of a QoS that does not fit.
-        """
-        for name in list(self._latched):
-            publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(name))
-            if any(p.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in publishers):
-                self._latched.pop(name)()
+        return [
+            self._subscribe(row, check, take, name or graph_name(row), type_name or row.type) for row in HEARD[topic]
+        ]
 
     def serve(
         self,
@@ -172,8 +157,7 @@ class InputGate:
         self._limited_log.log(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
 
     def settle(self) -> None:
-        """Say what was counted and is due, and look for latched publishers; to be called once a second."""
-        self.look_for_latched()
+        """Say what was counted and is due; to be called now and then."""
         self._limited_log.settle(self._clock())
 
     def values(self) -> list[tuple[str, str]]:

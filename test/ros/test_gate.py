@@ -12,13 +12,11 @@ import pytest
 pytestmark = pytest.mark.ros
 rclpy = pytest.importorskip('rclpy')
 
-from rclpy.event_handler import PublisherEventCallbacks  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from std_msgs.msg import String  # noqa: E402
 
-from msg_adapters import INPUTS, LATCHED, LOAD, MARK, Delivery  # noqa: E402
+from msg_adapters import INPUTS, LOAD, MARK, Delivery  # noqa: E402
 from psd_deflection.base.log import INFO, WARNING  # noqa: E402
-from psd_deflection.ros.endpoints import qos  # noqa: E402
 from psd_deflection.ros.gate import MOST_A_SECOND, InputGate  # noqa: E402
 from psd_deflection.ros.topics import HEARD, MOST_BYTES, GraphTopic  # noqa: E402
 
@@ -126,26 +124,6 @@ def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> No
     assert gated.gate.why[TOPIC] == f'more than {MOST_A_SECOND} messages a second'
     gated.now += 1.0
     peer.until(lambda: not flooded() or len(gated.heard) > MOST_A_SECOND, 'the next second')
-
-
-def test_a_latched_value_comes_and_no_other_publisher_is_warned(
-    peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    row = GraphTopic(TOPIC, 'std_msgs/msg/String', 'gated', 'words', Delivery(1))
-    monkeypatch.setitem(cast(dict[str, Any], HEARD), TOPIC, (row._replace(delivery=LATCHED), row))
-    gated.listen()
-    warned: list[Any] = []
-    plain = peer.node.create_publisher(
-        String, TOPIC, 5, event_callbacks=PublisherEventCallbacks(incompatible_qos=warned.append)
-    )
-    peer.until(lambda: plain.publish(String(data='plain')) or 'plain' in gated.heard, 'the publisher without memory')
-    gated.gate.settle()
-    plain.publish(String(data='last'))
-    peer.until(lambda: 'last' in gated.heard, 'its last word')
-    assert not warned
-    peer.node.destroy_publisher(plain)
-    peer.node.create_publisher(String, TOPIC, qos(LATCHED)).publish(String(data='latched'))
-    peer.until_sent(gated.gate.settle, lambda: 'latched' in gated.heard, 'what was said before')
 
 
 def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
