@@ -349,7 +349,9 @@ def _law_of_the_mean(
     bic = gain - (best.cost - fit_with_law.chi2 - penalty * without.parameters)
     held = heldout_gain(ws, without, fit_with_law, rng)
     residual_gap = heldout_gap(ws, fit_with_law)
-    enough = fit.chi2 - fit_with_law.chi2 > EXPLAINS * excess and _predicts(ws, fit, residual_gap)
+    # As of effects: no other case can speak for or against what one case alone shows.
+    predicts = _predicts(ws, fit, heldout_gap(ws, fit_with_law, home=False))
+    enough = predicts and fit.chi2 - fit_with_law.chi2 > EXPLAINS * excess
     enough &= not _at_changes(ws, best.laws)
     enough &= best.cost < fit.chi2 + penalty * fit.parameters - BIC_ACCEPT
     if p > P_ACCEPT or bic <= BIC_ACCEPT or not held.significant or not enough:

@@ -85,17 +85,17 @@ def scatter(workspace: Comparison, fit: Fit) -> FloatArray:
     return np.asarray(np.sqrt((n - 1) / n * np.sum((steps - steps.mean(axis=0)) ** 2, axis=0)))
 
 
-def heldout_tables(workspace: Comparison, fit: Fit) -> list[FloatArray]:
-    """Measured minus simulated on load cases that the fit has not seen."""
+def heldout_tables(workspace: Comparison, fit: Fit, home: bool = True) -> list[FloatArray]:
+    """Return measured minus simulated, m, on load cases that the fit has not seen; ``home``: as of the residual."""
     if not fit.free:
         return fit.difference
-    change = workspace.unwhitened(heldout_residual(workspace, fit) - fit.residual)
+    change = workspace.unwhitened(heldout_residual(workspace, fit, home) - fit.residual)
     return [d + c for d, c in zip(fit.difference, change, strict=True)]
 
 
-def heldout_gap(workspace: Comparison, fit: Fit) -> float:
-    """Gap on load cases that the fit has not seen."""
-    return workspace.gap(heldout_tables(workspace, fit))
+def heldout_gap(workspace: Comparison, fit: Fit, home: bool = True) -> float:
+    """Return the gap on load cases that the fit has not seen, m; ``home``: what only one case shows is off there."""
+    return workspace.gap(heldout_tables(workspace, fit, home))
 
 
 def unseen_gap(workspace: Comparison, fit: Fit, columns: FloatArray) -> float:
