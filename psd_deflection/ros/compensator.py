@@ -394,6 +394,8 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
                 less = offsets - np.clip(offsets, -step, step)
                 self._publish(command._replace(offsets=less, positions=None if pose is None else pose + less))
                 offsets = less
+        # The process may end as soon as this does.
+        self._ended.wait(LEAVE_S)
         self.command = command._replace(offsets=offsets, sends=False)
 
     def _report(self) -> None:
