@@ -68,6 +68,12 @@ def compensator(domain: int) -> Iterator[Program]:
     print(*one.lines[-50:], sep='\n')
 
 
+def longest_rest(plant: Plant, since: int) -> int:
+    """The most offsets in a row that are equal, from the one of number ``since`` on."""
+    changes = np.flatnonzero(np.any(np.diff(np.array(plant.offsets[since:]), axis=0), axis=1))
+    return int(np.diff([-1, *changes, len(plant.offsets) - since - 1]).max())
+
+
 def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any) -> None:
     plant = Plant(peer.node)
     peer.until(lambda: 'once it is enabled' in compensator.text, 'the node')
@@ -89,18 +95,16 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
         ('tell_joints', *JOINTS['stale joints']),
         ('tell_joints', *JOINTS['leaping joints']),
     ):
-        stated = len(compensator.text)
+        stated, since = len(compensator.text), len(plant.offsets)
         setattr(plant, topic, fault)
 
         def holds(stated: int = stated, why: str = why) -> bool:
             return re.search(f'holding: .*{why}', compensator.text[stated:]) is not None
 
         peer.until(holds, why)
-        # What was on its way before it held has come, however much that was.
-        peer.until(lambda: not np.ptp(plant.offsets[-20:], axis=0).any(), 'offsets that are held')
-        held = len(plant.offsets)
-        peer.until(lambda held=held: len(plant.offsets) > held + 20, 'more of them')
-        assert not np.ptp(plant.offsets[held - 20 :], axis=0).any()
+        # Joints that leapt once are followed again after 25 good estimates.
+        least = 15 if why == 'leap by' else 60
+        peer.until(lambda since=since, least=least: longest_rest(plant, since) >= least, 'offsets that are held')
         stated = len(compensator.text)
         plant.tell = plant.tell_joints = faithful
         peer.until(lambda stated=stated: 'following' in compensator.text[stated:], 'following')
