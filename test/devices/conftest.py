@@ -91,6 +91,8 @@ class Wired:
         self.device: LineDevice | None = None
 
     def plug(self, device: LineDevice) -> None:
+        """Connect it, 50 ms after whatever came before: slots of a polled device pass meanwhile."""
+        self._clock.sleep(0.05)
         self._waiting, self._powered = b'', self._clock.now
         self.device = device
 
