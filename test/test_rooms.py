@@ -135,6 +135,7 @@ def test_forks_and_parameters_are_counted() -> None:
 def test_private_names_are_counted(tmp_path: Path) -> None:
     (tmp_path / 'test_it.py').write_text(
         'module._part(self._own, cls._own)\na.b._cut = Other._D = __name__ + one._two()\n'
+        'point._replace(x=1)._asdict()\n'
     )
     assert private_names(tmp_path) == ['module._part', 'b._cut', 'one._two']
 
