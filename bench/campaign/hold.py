@@ -8,7 +8,8 @@ compensator drives it. Each fault is injected again and again while the offsets 
 the last time at which an offset changed after it (at most 0.2 s), the time that the offsets take to
 go back to zero when they are let go during the fault (at most that of ``max_rate`` and 0.2 s),
 whether they follow again, and the one criterion for whatever moves an arm: no step between two
-commands is larger than ``max_rate`` times the time between them, from the first to the last.
+commands is larger than ``max_rate`` times the time between them, from the first to the last. Then the controller
+applies something else than it reports, or keeps offsets (:mod:`bench.campaign.controller_faults`).
 
 The shaper drives a stand-in of joint_trajectory_controller by trajectories that replace each other,
 and gets what it must refuse in between; then the same by goals of FollowJointTrajectory.
@@ -24,28 +25,25 @@ import os
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, Float64MultiArray
-from std_srvs.srv import SetBool
 
 from bench.campaign.action_faults import action_faults
-from bench.campaign.plant import DEFLECTIONS, FOLLOW_ERROR, JOINTS, LOAD, MAX_RATE, Plant, faithful
+from bench.campaign.controller_faults import CONTROLLER_FAULTS, controller_faults
+from bench.campaign.graph import LONGEST_S, Graph
+from bench.campaign.plant import DEFLECTIONS, FOLLOW_ERROR, JOINTS, LOAD, MAX_RATE, faithful
 from bench.campaign.shaper_faults import shaper_faults
 from blind.campaign import conclude, options
 from psd_deflection.ros.running import TRANSPORTS
-from tools.program import ROOT, Program
+from tools.program import ROOT
 
-URDF = ROOT / 'config' / 'two_links.urdf'
 HOLD_S = 0.2
 """The offsets must not change later than this after a fault."""
 RELEASE_S = 0.2
@@ -58,31 +56,11 @@ TRIES = 5
 WATCHED_S = 0.4
 """How long offsets are watched after a fault, s. After half a second they follow a deflection that
 jumped and stays."""
-LONGEST_S = 60.0
-ASK_AGAIN_S = 5.0
 RELAYED = {
     'estimator': ('/arm/deflection', '/end_effector/deflection', PoseWithCovarianceStamped),
     'driver': ('/arm/joints', '/joint_states', JointState),
 }
 """What a process passes on: from the arm, to the compensator, and the type."""
-
-BREAKS = """
-import sys, time
-from pathlib import Path
-from psd_deflection.cli.main import main
-from psd_deflection.ros.compensator import CompensatorNode
-told = CompensatorNode.health
-def health(self):
-    if Path(sys.argv[1]).exists():
-        if not Path(sys.argv[1]).read_text():
-            Path(sys.argv[1]).write_text(repr(time.time()))
-        raise RuntimeError('an error of its own')
-    return told(self)
-CompensatorNode.health = health
-sys.exit(main(sys.argv[2:]))
-"""
-"""Our program, which has an error of its own as soon as the file exists that is its first argument.
-"""
 
 SENT: dict[str, tuple[int, tuple[str, ...]]] = {
     'estimator killed': (signal.SIGKILL, ('estimator',)),
@@ -93,7 +71,7 @@ SENT: dict[str, tuple[int, tuple[str, ...]]] = {
 
 ROBOT = ('protective stop', 'speed scaling 0', 'controller ended', 'joints do not follow', 'another publisher')
 """Faults of the robot and its controller."""
-COMPENSATOR, SHAPER, ACTION = 'compensator', 'shaper', 'action'
+COMPENSATOR, CONTROLLER, SHAPER, ACTION = 'compensator', 'controller', 'shaper', 'action'
 """All of their faults."""
 OWN = ('killed and started again', 'an error of its own')
 """Faults of the compensator."""
@@ -149,53 +127,17 @@ class Injected(NamedTuple):
     allowed: float = math.nan
 
 
-class Campaign:
-    """The graph with all of it."""
+class Campaign(Graph):
+    """The graph with processes that stand for the estimator and the driver."""
 
     def __init__(self) -> None:
-        rclpy.init()
-        self.node = rclpy.create_node('campaign')
-        self.executor = SingleThreadedExecutor()
-        self.executor.add_node(self.node)
-        self.plant = Plant(self.node, *(heard for heard, _, _ in RELAYED.values()))
+        super().__init__(*(topic for topic, _, _ in RELAYED.values()))
         self._robot_runs = self.node.create_publisher(Bool, '/compensator/robot_running', 5)
         self._scaling = self.node.create_publisher(Float64, '/compensator/speed_scaling', 5)
         self._scale = 1.0
         self.node.create_timer(0.05, lambda: self._scaling.publish(Float64(data=self._scale)))
         self.relays = {name: Relay(name) for name in RELAYED}
-        self._flag = Path(tempfile.mkdtemp()) / 'flag'
-        self.compensator = self._started()
         self.repeated = 0
-
-    def _started(self) -> Program:
-        arguments = ['compensator', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive']
-        return Program([sys.executable, '-c', BREAKS, str(self._flag), *arguments])
-
-    def spin(self, condition: Callable[[], bool], longest_s: float, what: str = '') -> None:
-        """Spin until ``condition``, or for ``longest_s``; then it is an error if there is a ``what``."""
-        until = time.monotonic() + longest_s
-        while not condition():
-            if time.monotonic() > until:
-                if what:
-                    raise RuntimeError(f'waited {longest_s:g} s for {what}\n{self.compensator.text[-1000:]}')
-                return
-            self.executor.spin_once(timeout_sec=0.02)
-
-    def enable(self, wanted: bool = True) -> None:
-        """Let the offsets follow, or let them go."""
-        client = self.node.create_client(SetBool, '/compensator/enable')
-        self.spin(client.service_is_ready, LONGEST_S, 'the service')
-        asked: list[Any] = []
-
-        def answered() -> bool:
-            # DDS loses a request to a service that it has just found.
-            if not asked or time.monotonic() - began > ASK_AGAIN_S * len(asked):
-                asked.append(client.call_async(SetBool.Request(data=wanted)))
-            return any(answer.done() for answer in asked)
-
-        began = time.monotonic()
-        self.spin(answered, LONGEST_S, 'its answer')
-        self.node.destroy_client(client)
 
     def follows(self) -> bool:
         """Whether the offsets changed of late; the noise of the deflection sees to that."""
@@ -288,18 +230,18 @@ class Campaign:
         plant, began = self.plant, time.time()
         if name == 'an error of its own':
             largest = float(np.abs(plant.offsets[-1]).max())
-            self._flag.touch()
+            self.flag.touch()
             self.spin(lambda: self.compensator.process.poll() is not None, LONGEST_S, 'its end')
             self.spin(lambda: not np.any(plant.offsets[-1]), 1.0)
-            failed = float(self._flag.read_text())
-            self._flag.unlink()
+            failed = float(self.flag.read_text())
+            self.flag.unlink()
             out = Injected(math.nan, plant.stamps[-1] - failed, largest / MAX_RATE + RELEASE_S)
         else:
             self.compensator.process.kill()
             self.compensator.wait()
             out = Injected(max(self._changed_last() - began, 0.0))
-        self.compensator = self._started()
-        self.spin(lambda: 'once it is enabled' in self.compensator.text, LONGEST_S, 'the node')
+        self.start()
+        self.until_ready()
         self.enable()
         self.spin(self.follows, LONGEST_S, f'offsets that follow after: {name}')
         return out
@@ -317,12 +259,9 @@ class Campaign:
 
     def close(self) -> None:
         """End everything."""
-        self.compensator.end()
         for one in self.relays.values():
             one.close()
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown()
+        super().close()
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -330,8 +269,8 @@ def main(argv: list[str] | None = None) -> int:
     names = (*DEFLECTIONS, *JOINTS, *ROBOT, *SENT, *OWN)
     parser = options(__doc__)
     parser.add_argument('--times', type=int, default=20, help='of each fault')
-    all_of = (COMPENSATOR, SHAPER, ACTION)
-    only = (*names, *all_of)
+    all_of = (COMPENSATOR, CONTROLLER, SHAPER, ACTION)
+    only = (*names, *CONTROLLER_FAULTS, *all_of)
     parser.add_argument('--only', nargs='+', choices=only, default=all_of, help='these faults alone')
     parser.add_argument('--relay', choices=tuple(RELAYED), help=argparse.SUPPRESS)
     args = parser.parse_args(argv)
@@ -342,6 +281,10 @@ def main(argv: list[str] | None = None) -> int:
         return 0
     wanted = names if COMPENSATOR in args.only else [name for name in args.only if name in names]
     missed, worst = compensator_faults(wanted, args.times) if wanted else (0, 0.0)
+    wrong = CONTROLLER_FAULTS if CONTROLLER in args.only else [n for n in args.only if n in CONTROLLER_FAULTS]
+    for name in wrong:
+        failed, step = controller_faults(name, args.times)
+        missed, worst = missed + failed, max(worst, step)
     if SHAPER in args.only:
         worst = max(worst, shaper_faults(args.times))
     if ACTION in args.only:

@@ -144,7 +144,9 @@ class Plant:
     deflection and its joints.
 
     ``tell`` and ``tell_joints`` may change what it says, and withhold it by False. ``stands``: a
-    protective stop. ``applies``: the controller runs, and tells what it applies: ``held``.
+    protective stop. ``applies``: the controller runs, and tells what it has: ``held``. ``share``: how much of that it
+    adds, whatever it tells. ``droop``, rad: how far its servos leave the joints below their command. ``commands``: it
+    takes commands, not offsets; ``held`` is its command less the nominal one.
     ``offsets``: all that were heard, and ``stamps`` when they were sent, s. ``late``: whether a
     step was later than ``LATE_S``.
     """
@@ -158,28 +160,42 @@ class Plant:
         self.tell: Tell = faithful
         self.tell_joints: Tell = faithful
         self.stands, self.applies, self.held = False, True, np.zeros(2)
+        self.share, self.droop, self.commands = 1.0, 0.0, False
         self.late = False
         self._noise = np.random.default_rng(0)
         self._deflections = node.create_publisher(PoseWithCovarianceStamped, topic, 5)
         self._joints = node.create_publisher(JointState, joints, 5)
-        node.create_subscription(Float64MultiArray, '/compensator/offsets', self._heard, 5)
+        node.create_subscription(Float64MultiArray, '/compensator/offsets', self._offset, 5)
+        node.create_subscription(Float64MultiArray, '/compensator/commands', self._commanded, 5)
         self._applied = node.create_publisher(Float64MultiArray, '/compensator/applied', 5)
+        self._reference = node.create_publisher(JointState, '/compensator/reference', 5)
         self._then = time.monotonic()
         node.create_timer(PERIOD_S, self._step)
 
-    def _heard(self, message: Any, info: Any) -> None:
-        self.offsets.append(np.array(message.data))
+    def _offset(self, message: Any, info: Any) -> None:
+        if not self.commands:
+            self._take(np.array(message.data), info)
+
+    def _commanded(self, message: Any, info: Any) -> None:
+        if self.commands:
+            self._take(np.array(message.data) - NOMINAL, info)
+
+    def _take(self, offsets: FloatArray, info: Any) -> None:
+        self.offsets.append(offsets)
         self.stamps.append(info['source_timestamp'] / 1e9)
         if self.applies:
             self.held = self.offsets[-1]
 
     def _step(self) -> None:
         now = time.monotonic()
-        self.arm.step(self.arm.angles.copy() if self.stands else NOMINAL + self.held, now - self._then)
+        commanded = NOMINAL + self.share * self.held - self.droop
+        self.arm.step(self.arm.angles.copy() if self.stands else commanded, now - self._then)
         self.late |= now - self._then > LATE_S
         self._then = now
         if self.applies:
             self._applied.publish(Float64MultiArray(data=self.held.tolist()))
+            has = (NOMINAL + self.held)[::-1].tolist()
+            self._reference.publish(JointState(name=['elbow', 'shoulder'], position=has))
         stamp_s, stamp_ns = divmod(time.time_ns(), 10**9)
         joints = JointState(name=['elbow', 'shoulder'], position=self.arm.angles[::-1].tolist())
         deflection = self.arm.end().deflection

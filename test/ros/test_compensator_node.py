@@ -33,7 +33,8 @@ from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Bool, Float64, String  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
-from bench.campaign.hold import BREAKS, URDF, WITHIN  # noqa: E402
+from bench.campaign.graph import BREAKS, URDF  # noqa: E402
+from bench.campaign.hold import WITHIN  # noqa: E402
 from bench.campaign.plant import DEFLECTIONS, JOINTS, Plant, faithful  # noqa: E402
 from psd_deflection.arms.compensation.settings import SETTINGS  # noqa: E402
 from test.ros.conftest import WARNINGS  # noqa: E402
@@ -351,7 +352,7 @@ def test_a_controller_state_that_is_not_installed_is_refused(domain: int) -> Non
 def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(domain: int, peer: Any, tmp_path: Path) -> None:
     flag = tmp_path / 'flag'
     plant = Plant(peer.node)
-    node = Program([sys.executable, '-c', BREAKS, str(flag), *ARGUMENTS, '--stale', STALE])
+    node = Program([sys.executable, '-c', BREAKS, str(flag), 'health', *ARGUMENTS, '--stale', STALE])
     try:
         peer.until(lambda: plant.error() > 2e-3, 'a deflection')
         assert peer.call(SetBool, '/compensator/enable', SetBool.Request(data=True)).success

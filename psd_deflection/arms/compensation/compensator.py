@@ -336,8 +336,11 @@ class Compensator:
                 return f'{self.arm.names[worst]} is {away[worst]:.3g} from the command of the controller: follow_error'
         if self._sent is not None:
             sent, then = self._sent
-            if np.abs((offsets if pose is None else pose) - sent).max() > settings.max_rate * (now - then):
+            away = np.abs((offsets if pose is None else pose) - sent).max()
+            if away > settings.max_rate * (now - then):
                 return 'the controller is elsewhere than it was sent last: the rate allows for it soon'
+            if known and away > FOREIGN and self._has_t - then <= FOLLOW_S:
+                return 'the controller does not yet report what it was sent last'
         self._offsets = self._wanted = self._at_joints = offsets
         self._at_has = offsets if pose is None else pose
         self._pose, self._speaks, self._owed, self._verified = pose, True, False, self._dry

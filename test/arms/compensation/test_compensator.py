@@ -662,6 +662,29 @@ def test_with_commands_it_begins_at_the_command_of_the_controller(arm: Arm, droo
     assert loop.step() <= 1.0 + 1e-9
 
 
+@pytest.mark.parametrize('output', ['commands', 'offsets'])
+def test_a_report_older_than_the_last_command_begins_nothing(arm: Arm, output: str) -> None:
+    """Enabled right after a release, it would begin there, and creep by as much each time."""
+    loop = Loop(arm, output=output, takeover=True)
+    loop.plant.force = PAYLOAD
+    loop.run(0.4)
+    loop.compensator.enable(True)
+    loop.run(0.6)
+    loop.compensator.enable(False)
+    while loop.run(PERIOD).state is not State.OFF:
+        pass
+    (_, before), (_, last) = loop.sent[-2:]
+    assert np.abs(before - last).max() > 1e-5
+    loop.t += PERIOD
+    loop.compensator.controller_has(loop.t, before)
+    loop.compensator.enable(True)
+    command = loop.send(loop.t)
+    assert (command.sends, command.why) == (False, 'the controller does not yet report what it was sent last')
+    count = len(loop.sent)
+    loop.run(0.2)
+    assert np.array_equal(loop.sent[count][1], last)
+
+
 @pytest.mark.parametrize(
     ('tells', 'away', 'why'),
     [(False, 0.0, 'does not tell the command that it has'), (True, 0.05, 'is 0.05 from the command of the controller')],
