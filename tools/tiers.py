@@ -307,6 +307,11 @@ SLOW: Mapping[str, tuple[str, ...]] = {
         'test/run/test_session_end.py -k hangs',
     ),
     'a copy of the package in a process': ('test/cli/test_elsewhere.py',),
+    'pages that are looked at, and streams that run, for long': (
+        'test/run/monitor/test_hours.py -k leaves_the_heap',
+        'test/run/monitor/test_browser.py -k leaves_the_heap',
+        'test/measure/uncertainty/test_vibration.py -k does_not_fire',
+    ),
     'processes that are killed, hang, or start again and again; another vendor': (
         'test/ros/test_estimator_node.py -k another_vendors or a_disk_that_hangs or a_dump_of or the_log_file or '
         'signals_end_it',

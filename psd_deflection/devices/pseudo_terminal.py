@@ -13,7 +13,7 @@ from pathlib import Path
 
 from psd_deflection.base.errors import ConfigError
 
-ABSENT_S = 1e-3
+ABSENT_S = 0.05
 """A line that nobody has open is always "ready": how long to wait instead."""
 
 PORT_LINE = 'port: '

@@ -618,7 +618,7 @@ def test_an_arm_that_moves_by_itself_is_not_blamed(arm: Arm, delayed: float) -> 
     """Motions begin with the loads that they cause, of all sizes; then the slope is as it was."""
     loop = telling(arm)
     rng, at = np.random.default_rng(7), ELBOW
-    for n in range(40):
+    for n in range(20):
         to = at + rng.normal(size=2) * rng.choice([0.03, 0.1, 0.5])
         begun = loop.t
         while loop.t < begun + 1.0:
@@ -766,7 +766,7 @@ EVENT = st.one_of(
 )
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.lists(EVENT, max_size=30), st.sampled_from(['offsets', 'commands']), st.booleans())
 def test_whatever_comes_no_step_is_larger_than_the_rate_allows(
     events: list[tuple[str, Any]], output: str, takeover: bool
