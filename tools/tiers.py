@@ -311,6 +311,8 @@ SLOW: Mapping[str, tuple[str, ...]] = {
         'test/run/monitor/test_hours.py -k leaves_the_heap',
         'test/run/monitor/test_browser.py -k leaves_the_heap',
         'test/measure/uncertainty/test_vibration.py -k does_not_fire',
+        'test/run/test_rig_publisher.py -k modal',
+        'test/model/simulation/test_added_effect.py -k it_is_discovered',
     ),
     'processes that are killed, hang, or start again and again; another vendor': (
         'test/ros/test_estimator_node.py -k another_vendors or a_disk_that_hangs or a_dump_of or the_log_file or '
