@@ -19,26 +19,31 @@ PAGE = ROOT / 'docs' / 'performance.md'
 README = ROOT / 'README.md'
 PRINTED_BY = '| `make bench ARGS=--full` |'
 """How the rows of README end that are made here."""
+SMALL = 2.0
+"""Per cent of the CPU, below which parts are added up."""
 
 
-def cell(f: Figure, unit: str) -> str:
-    spread = '' if f.runs == 1 else f' ({f.low:.3g} to {f.high:.3g})'
-    return f'{f.median:.3g}{spread} {unit}'
+def cell(f: Figure, unit: str = '') -> str:
+    spread = '' if f.runs == 1 else f' [{f.low:.3g}–{f.high:.3g}]'
+    return f'{f.median:.3g}{spread} {unit}'.rstrip()
 
 
 def lines_of(row: Row) -> list[str]:
-    """The rows of the table."""
-    lines = []
-    for i, f in enumerate(row.figures):
+    """The rows of the table: one for each figure that ours stand beside, or one of ours alone."""
+    ours = [f for f in row.figures if f.kind == 'ours']
+    if len(ours) > 1:
+        each = '; '.join(f'{f.name}: {f.median:.3g}' for f in ours)
+        return [f'| {row.work}, {row.unit} | {each} | | | |']
+    work, first, lines = row.work, cell(ours[0], row.unit), []
+    for f in row.figures[1:]:
+        ratio = f'{row.ratio(f):.2f} ×'
+        bound = '' if f.bound is None else f'{"≥" if f.kind == "peer" else "≤"} {f.bound:g}: '
         verdict = row.verdict(f).replace('not met', '**not met**')
-        if f.kind == 'ours':
-            ratio, bound = '', '' if f.bound is None else f'≥ {f.bound:g}'
-        elif f.kind == 'peer':
-            ratio, bound = f'{row.ratio(f):.2f} × as fast', '' if f.bound is None else f'≥ {f.bound:g} ×'
-        else:
-            ratio, bound = f'{row.ratio(f):.2f} × the limit', '' if f.bound is None else f'≤ {f.bound:g} ×'
-        name = f.name if f.kind == 'ours' else f'{f.kind}: {f.name}'
-        lines.append(f'| {row.work if i == 0 else ""} | {name} | {cell(f, row.unit)} | {ratio} | {bound} | {verdict} |')
+        lines.append(f'| {work} | {first} | {f.kind}: {f.name}, {cell(f)} | {ratio} | {bound}{verdict} |')
+        work = first = ''
+    if not lines:
+        bound = '' if ours[0].bound is None else f'≥ {ours[0].bound:g}: {row.verdict(ours[0])}'
+        return [f'| {row.work} | {first} ({ours[0].name}) | | | {bound.replace("not met", "**not met**")} |']
     return lines
 
 
@@ -52,17 +57,28 @@ def measured(machine: Mapping[str, Any]) -> str:
 
 
 def shares(rows: Sequence[Row], machine: Mapping[str, Any]) -> str:
-    """What :mod:`bench.cpu` found."""
+    """What :mod:`bench.cpu` measured: a row for each thread."""
     lines = [measured(machine)]
     for row in rows:
         lines += ['', f'| {row.work} | {row.unit} |', '|---|---|']
-        lines += [f'| {f.name} | {f.median:.1f} |' for f in row.figures]
+        threads: dict[str, list[str]] = {}
+        small = 0.0
+        for f in row.figures:
+            thread, colon, part = f.name.partition(': ')
+            if f.median < SMALL:
+                small += f.median
+            elif row is rows[0] and colon:
+                threads.setdefault(thread, []).append(f'{part} {f.median:.1f}')
+            else:
+                threads[f.name] = [f'{f.median:.1f}']
+        lines += [f'| {thread} | {"; ".join(parts)} |' for thread, parts in threads.items()]
+        lines += [f'| parts below {SMALL:g} % | {small:.1f} |'] if small else []
     return '\n'.join(lines)
 
 
 def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cpu_machine: Mapping[str, Any]) -> str:
     """The text of the page: of ``rows``, and of those of :mod:`bench.cpu`."""
-    table = ['| work | what | time | ours | wanted | |', '|---|---|---|---|---|---|']
+    table = ['| work | psd_deflection | beside | ratio | wanted |', '|---|---|---|---|---|']
     for row in rows:
         table += lines_of(row)
     text = TEMPLATE.read_text(encoding='utf-8')

@@ -33,6 +33,10 @@ from tools.program import ROOT
 PAGE = ROOT / 'docs' / 'gallery.md'
 FIGURES = ROOT / 'docs' / 'figures' / 'gallery'
 NUMBER = re.compile(r'(?<![\w.])[+\-−]?\d+(?:\.(\d+))?(?:e([+-]?\d+))?')
+ALIKE = re.compile(r'[\w.]*\d[\w.]*|[+\-−]?Δ?[XYθ]\b|[+\-−](?=#)')
+"""What lines of the same kind differ in: names of channels and axes, numbers."""
+LONGEST = 80
+"""Characters of a line; the rest is cut."""
 WIDTH = 760
 """Pixels of a picture, as wide as the column of the site."""
 COLOURS = 24
@@ -91,7 +95,8 @@ def said_live(path: Path) -> str:
     line = line_entry(rig, spectrum.frequencies, spectrum.density())
     entries += [line] if line.level > OK else []
     wrong = [entry for entry in entries if entry.level > OK]
-    return '\n'.join(f'{e.name.partition(": ")[2]}: {e.message}' for e in wrong or entries)
+    lines = [f'{e.name.partition(": ")[2]}: {e.message}' for e in wrong or entries]
+    return '\n'.join(without_repeats(lines))
 
 
 def answered(case: Case, folder: Path) -> str:
@@ -102,8 +107,24 @@ def answered(case: Case, folder: Path) -> str:
     study = STUDIES[case.study]
     names = {'REC': str(path), 'OUT': str(folder / 'out')}
     answer = run([names.get(word, word) for word in study.command.split()])
-    said = '\n'.join(line.strip() for found in re.findall(study.said, answer, re.M) for line in found.splitlines())
-    return said.replace(f'{folder}/', '')
+    lines = [line.strip() for found in re.findall(study.said, answer, re.M) for line in found.splitlines()]
+    return '\n'.join(without_repeats(lines)).replace(f'{folder}/', '')
+
+
+def without_repeats(lines: list[str]) -> list[str]:
+    """Return the lines, cut to LONGEST; of lines that differ only in names and numbers, the later ones are named."""
+    first: dict[str, tuple[int, str]] = {}
+    alike: dict[int, list[str]] = {}
+    texts: list[str] = []
+    for line in lines:
+        label = line.partition(': ')[0]
+        at, name = first.setdefault(ALIKE.sub('#', line), (len(texts), label))
+        if label == name:
+            texts.append(line)
+        else:
+            alike.setdefault(at, []).append(label.split()[-1])
+    texts = [text if len(text) <= LONGEST else f'{text[:LONGEST].rpartition(" ")[0]} …' for text in texts]
+    return [f'{text} [{", ".join(alike[i])}: alike]' if i in alike else text for i, text in enumerate(texts)]
 
 
 def picture(case: Case, folder: Path) -> bytes:
@@ -120,22 +141,20 @@ def picture(case: Case, folder: Path) -> bytes:
 def section(case: Case, said: str) -> str:
     """The part of the page about one case."""
     quoted = '\n'.join(f'    {line}' for line in said.splitlines())
-    return (
-        f'### {case.title}\n\n![{case.title}: the recording](figures/gallery/{case.name}.png)\n\n'
-        f'It says:\n\n{quoted}\n\n{case.do}\n'
-    )
+    parts = (f'### {case.title}', f'![Recording](figures/gallery/{case.name}.png)', quoted, case.do)
+    return '\n\n'.join(filter(None, parts)) + '\n'
 
 
 def page(said: dict[str, str]) -> str:
     """The whole page; ``said``: by the name of the case."""
     parts = [
-        '# Gallery\n\nHow a good rig looks, and how typical faults look. Below each picture stand the words that the '
-        'program said, and what to do.\n\n`make docs STEP=gallery` makes this page: it simulates each rig, runs the '
-        'command, and copies what it says. The tests run them again.\n'
+        '# Gallery\n\nA good rig and typical faults: the recording, the first lines of the output (… marks a cut), and '
+        'the remedy. `make docs STEP=gallery` makes this page; the tests compare it.\n'
     ]
     for name, study in STUDIES.items():
         parts.append(f'## {study.title}\n\n{study.about}\n')
         parts += [section(case, said[case.name]) for case in CASES if case.study == name and case.name in said]
+    parts.append('Where next: [troubleshooting](troubleshooting.md).\n')
     return '\n'.join(parts)
 
 
@@ -143,7 +162,7 @@ def kept() -> dict[str, str]:
     """What the page has of each case, by its name."""
     if not PAGE.exists():
         return {}
-    found = re.findall(r'figures/gallery/(\w+)\.png\)\n\nIt says:\n\n((?: {4}.*\n)+)', PAGE.read_text())
+    found = re.findall(r'figures/gallery/(\w+)\.png\)\n\n((?: {4}.*\n)+)', PAGE.read_text())
     return {name: '\n'.join(line[4:] for line in text.splitlines()) for name, text in found}
 
 

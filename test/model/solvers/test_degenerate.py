@@ -83,7 +83,7 @@ def test_refused_by_name(method: str, geometry: Geometry, options: dict[str, Any
 
 
 def test_the_refusal_under_torsion_says_how_bad_it_is(rays: Any) -> None:
-    """0.1 degree of twist is read as -1.02 mm of dY (thesis 5.3; docs/methods.md)."""
+    """0.1 degree of twist is read as -1.02 mm of dY (thesis 5.3; docs/audit.md)."""
     geometry = rig(CORNER, [-0.585, -0.485])
     with pytest.raises(SolverError, match=r'one degree of twist looks like 10\.2 mm of ΔY'):
         make_solver('base_pair', geometry, assume='nothing')

@@ -90,7 +90,7 @@ def test_the_default_is_as_good_as_the_readings_allow(golden: Any, rays: Any) ->
 
 
 def test_the_best_place_for_two_psds_is_on_opposite_sides() -> None:
-    """Thesis rig 1.63, 1.83 um, 1.33 mdeg; the same base line, opposite: 1.41, 1.41, 1.33 (docs/methods.md)."""
+    """Thesis rig 1.63, 1.83 um, 1.33 mdeg; the same base line, opposite: 1.41, 1.41, 1.33 (docs/mechanics.md)."""
     half = np.hypot(0.1, 0.07) / 2.0
     geometry = Geometry(np.array([[half, 0.0], [-half, 0.0]]), np.zeros((2, 2)), np.zeros(2), 0.585)
     one = make_solver('exact', geometry).solve((0.0,) * 4, (4e-12,) * 4)
