@@ -9,16 +9,18 @@ Kinematics come from the topic ``robot_description``. With ``drive`` it is silen
         output:=commands commands:=/forward_position_controller/commands
 """
 
-from typing import Any
-
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction
-from launch.conditions import IfCondition, UnlessCondition
+from launch.conditions import IfCondition
 from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
 from launch_ros.actions import Node, SetParameter, SetParametersFromFile
 from launch_ros.parameter_descriptions import ParameterValue
 
 PARAMETERS: dict[str, tuple[type, str]] = {
+    'tip': (str, 'link of the end effector'),
+    'base': (str, 'link from which on joints count (empty: the root)'),
+    'urdf': (str, 'URDF file with the kinematics (empty: the topic robot_description)'),
+    'drive': (bool, 'publish for a controller (empty: proposals)'),
     'output': (str, 'offsets, which your controller adds, or commands, position plus offset (empty: offsets)'),
     'max_offset': (float, 'largest offset of a joint, rad or m (empty: 0.05)'),
     'max_rate': (float, 'largest rate of an offset, rad/s or m/s (empty: 0.1)'),
@@ -37,22 +39,18 @@ TOPIC_OF = {'controller_state': 'controller_state_topic'}
 
 def generate_launch_description() -> LaunchDescription:
     """One node."""
-    drive, tip, file = (LaunchConfiguration(name) for name in ('drive', 'tip', 'params_file'))
-    node: dict[str, Any] = {
-        'package': 'psd_deflection',
-        'executable': 'compensator',
-        'name': 'compensator',
-        'namespace': LaunchConfiguration('namespace'),
-        'output': 'screen',
-        'remappings': [(f'~/{name}', LaunchConfiguration(TOPIC_OF.get(name, name))) for name in TOPICS],
-    }
+    file = LaunchConfiguration('params_file')
+    node = Node(
+        package='psd_deflection',
+        executable='compensator',
+        name='compensator',
+        namespace=LaunchConfiguration('namespace'),
+        output='screen',
+        remappings=[(f'~/{name}', LaunchConfiguration(TOPIC_OF.get(name, name))) for name in TOPICS],
+    )
     return LaunchDescription(
         [
-            DeclareLaunchArgument('tip', description='link of the end effector'),
             DeclareLaunchArgument('namespace', default_value='', description='namespace of the node and its topics'),
-            DeclareLaunchArgument(
-                'drive', default_value='false', description='publish for a controller; false: proposals'
-            ),
             DeclareLaunchArgument('params_file', default_value='', description='ROS parameters of the node'),
             *(
                 DeclareLaunchArgument(name, default_value='', description=what)
@@ -73,8 +71,7 @@ def generate_launch_description() -> LaunchDescription:
                         )
                         for name, (kind, _) in PARAMETERS.items()
                     ),
-                    Node(**node, arguments=['--tip', tip, '--drive'], condition=IfCondition(drive)),
-                    Node(**node, arguments=['--tip', tip], condition=UnlessCondition(drive)),
+                    node,
                 ]
             ),
         ]

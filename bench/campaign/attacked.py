@@ -31,7 +31,6 @@ from bench.steps import largest_step
 from blind.render import Pose, Scene, photograph
 from msg_adapters import ACCELERATION, LOAD, MARK, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
 from psd_deflection.arms.chains.chain_file import read_chain
-from psd_deflection.arms.compensation.arm import read_arm
 from psd_deflection.arms.compensation.compensator import State
 from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.arms.compensation.shaping import ShaperSettings
@@ -339,14 +338,31 @@ def _listen(topic: str, heard: Callable[[Any], None]) -> None:
 class Compensator(Attacked):
     """Offsets that follow: silence and holds are what it may do, a step is not."""
 
-    words = (str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive', '--controller-state', 'std_msgs/msg/Bool')
+    words = (
+        '--urdf',
+        str(URDF),
+        '--tip',
+        'tool',
+        '--axes',
+        'x,z',
+        '--drive',
+        '--controller-state',
+        'std_msgs/msg/Bool',
+    )
 
     def __init__(self, folder: Path) -> None:
         # A busy machine is late, and what is right would be stale.
         settings = CompensatorSettings(
-            axes=('x', 'z'), joints=tuple(NAMES), good=1, stale=1.0, controller_state='std_msgs/msg/Bool'
+            tip='tool',
+            urdf=str(URDF),
+            drive=True,
+            axes=('x', 'z'),
+            joints=tuple(NAMES),
+            good=1,
+            stale=1.0,
+            controller_state='std_msgs/msg/Bool',
         )
-        self._node = CompensatorNode(read_arm(URDF, 'tool'), settings, null_log, True)
+        self._node = CompensatorNode(settings, null_log, str)
         super().__init__(self._node)
         self._stamps: list[float] = []
         self._commands: list[FloatArray] = []

@@ -59,7 +59,7 @@ class Graph:
 
     def start(self, *arguments: str, breaks: str = 'health') -> Program:
         """Start the compensator with further arguments; ``breaks``: what fails once ``flag`` exists."""
-        base = ['compensator', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive']
+        base = ['compensator', '--urdf', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive']
         self.compensator = Program([sys.executable, '-c', BREAKS, str(self.flag), breaks, *base, *arguments])
         return self.compensator
 

@@ -75,6 +75,8 @@ def section_options(parser: argparse._ActionsContainer, section: Section[Any]) -
             type=functools.partial(_of_section, declared),
             default=default,
             metavar='X,Y' if isinstance(default, list) else 'VALUE',
+            nargs='?' if isinstance(default, bool) else None,
+            const=True if isinstance(default, bool) else None,
             help=f'{declared.description}{unit}{bounds} (default {text or "none"})'.replace('%', '%%'),
         )
 

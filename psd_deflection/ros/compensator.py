@@ -26,7 +26,7 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -35,7 +35,7 @@ from std_srvs.srv import SetBool
 
 from msg_adapters import END_EFFECTOR
 from psd_deflection.arms.chains.transform import Transform
-from psd_deflection.arms.compensation.arm import Arm, arm_of
+from psd_deflection.arms.compensation.arm import NO_TIP, Arm, arm_of, read_arm
 from psd_deflection.arms.compensation.compensator import Command, Compensator, Observed, State
 from psd_deflection.arms.compensation.robot import RobotWatch
 from psd_deflection.arms.compensation.settings import ALL_JOINTS, SETTINGS, CompensatorSettings
@@ -44,7 +44,7 @@ from psd_deflection.arms.inputs import LARGEST_POSITION, frame_fault, joints_fau
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.base.log import INFO, WARNING, LogCallback
 from psd_deflection.records import FloatArray
-from psd_deflection.ros.declared import DeclaredParameters
+from psd_deflection.ros.declared import DeclaredParameters, given_of
 from psd_deflection.ros.description import robot_description
 from psd_deflection.ros.endpoints import message_class
 from psd_deflection.ros.names import END_REST
@@ -89,21 +89,20 @@ _LEVELS = {State.OFF: OK, State.FOLLOWING: OK, State.RELEASING: WARN, State.HOLD
 
 
 class CompensatorNode(BaseNode[CompensatorSettings]):
-    """The node; ``drive``: publish offsets for a controller, else proposals. Raises ConfigError for a bad parameter.
+    """The node. Raises ConfigError for a bad parameter or arm.
 
-    ``hurried``: whether its end is not to wait for the offsets to go back to zero.
+    ``describe``: returns the text on ``robot_description``, which it waits for. ``hurried``: whether its end is not to
+    wait for the offsets to go back to zero.
     """
 
     def __init__(
         self,
-        arm: Arm,
         settings: CompensatorSettings,
         log: LogCallback,
-        drive: bool,
+        describe: Callable[[], str],
         hurried: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._arm, self._given, self._drive, self._hurried = arm, settings, drive, hurried
-        self._names = list(arm.names)
+        self._given, self._describe, self._hurried = settings, describe, hurried
         self._places: tuple[list[str], list[int]] = ([], [])
         self._lock = threading.Lock()
         """Of the compensator and of what was sent."""
@@ -119,8 +118,22 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         super().__init__(NODE_NAME, log)
 
     def declare(self) -> DeclaredParameters[CompensatorSettings]:
-        """Those of a compensator."""
+        """Those of a compensator; ``joints`` names those of its arm."""
+        given = given_of(self.node, SETTINGS, SETTINGS.values(self._given))
+        self._drive = given.drive
+        self._arm = arm = self._read(given)
+        self._names = list(arm.names)
+        if self._given.joints == (ALL_JOINTS,):
+            self._given = dataclasses.replace(self._given, joints=arm.names)
         return self.declared(SETTINGS, self._given, self._changed)
+
+    def _read(self, given: CompensatorSettings) -> Arm:
+        if given.urdf:
+            return read_arm(given.urdf, given.tip, given.base)
+        if not given.tip:
+            # Before it waits for the robot.
+            raise ConfigError(NO_TIP)
+        return arm_of(self._describe(), ROBOT_DESCRIPTION, given.tip, given.base)
 
     def set_up(self) -> None:
         """Listen to deflections, joints and the robot; make the outputs."""
@@ -474,28 +487,10 @@ def _order(arm: Arm, joints: Sequence[str]) -> list[int]:
     return [arm.names.index(name) for name in joints]
 
 
-class DescribedArm(NamedTuple):
-    """An arm that ``robot_description`` describes, to the link ``tip`` from the link ``base``, '' for the root."""
-
-    tip: str
-    base: str
-
-
-def run_compensator(
-    ros_args: Sequence[str],
-    robot: Arm | DescribedArm,
-    settings: CompensatorSettings,
-    log: LogCallback,
-    drive: bool,
-) -> int:
+def run_compensator(ros_args: Sequence[str], settings: CompensatorSettings, log: LogCallback) -> int:
     """Run the node until SIGINT or SIGTERM; then let the offsets go back to zero, unless a second signal comes."""
     with ros(NODE_NAME, ros_args) as signals, contextlib.suppress(StopRequestedError):
-        arm = robot
-        if isinstance(arm, DescribedArm):
-            arm = arm_of(robot_description(signals, log), ROBOT_DESCRIPTION, arm.tip, arm.base)
-        if settings.joints == (ALL_JOINTS,):
-            settings = dataclasses.replace(settings, joints=arm.names)
-        owner = CompensatorNode(arm, settings, log, drive, lambda: bool(signals.stop))
+        owner = CompensatorNode(settings, log, lambda: robot_description(signals, log), lambda: bool(signals.stop))
         try:
             serve(owner, signals, owner.runs)
         finally:

@@ -147,5 +147,15 @@ def refuse_unknown(node: Node, known: Mapping[str, Parameter]) -> dict[str, Any]
     return given
 
 
+def given_of(node: Node, section: Section[T], values: Mapping[str, Value]) -> T:
+    """The settings of ``section`` before they are declared: ``values``, and what ROS was given.
+
+    Raises ConfigError for a value that is not valid.
+    """
+    own = {p.name: p for p in section.parameters.values()}
+    given = {name: plain(p) for name, p in node.get_parameters_by_prefix('').items() if name in own}
+    return section.of({**values, **{name: check_value(own[name], value, SOURCE) for name, value in given.items()}})
+
+
 def _is_ros_own(name: str) -> bool:
     return name in ROS_OWN or name.startswith(QOS_OVERRIDES_PREFIX)

@@ -37,7 +37,12 @@ def test_the_page_has_the_defaults_of_the_compensator() -> None:
 def test_what_may_be_set_while_a_node_runs_is_what_the_pages_say() -> None:
     assert {p.name for p in shaping.SHAPING.parameters.values() if p.live} == {'max_step', 'lead'}
     at_start = {p.name for p in settings.SETTINGS.parameters.values() if not p.live}
-    assert at_start == {'axes', 'output', 'joints', 'takeover', 'controller_state', 'frame_prefix'}
+    of_the_arm = {'tip', 'base', 'urdf', 'joints'}
+    of_the_controller = {'drive', 'output', 'takeover', 'controller_state'}
+        {'tip', 'base', 'urdf', 'joints'},
+        {'drive', 'output', 'takeover', 'controller_state'},
+    )
+    assert at_start == {'axes', 'frame_prefix', *of_the_arm, *of_the_controller}
 
 
 @pytest.mark.parametrize('section', SECTIONS, ids=lambda s: next(iter(s.parameters)))

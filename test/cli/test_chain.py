@@ -43,10 +43,12 @@ def test_two_simulated_links_as_json_and_csv(tmp_path: Path, capsys: pytest.Capt
         (['chain', EXAMPLE, '--no-ros', '--out', 'x.txt'], 2, 'must end in .csv'),
         (['chain', EXAMPLE, '--no-ros', '--out', 'gone/x.csv'], 4, 'there is no folder gone'),
         (['chain', 'gone.yaml', '--no-ros'], 3, 'gone.yaml: no such chain file'),
-        (['compensator', URDF, '--tip', 'tol'], 3, 'tip: no link tol; did you mean tool?'),
-        (['compensator', URDF, '--tip', 'tool', '--axes', 'x,u'], 2, "--axes = ['x', 'u']: each must be one of"),
-        (['compensator', URDF, '--tip', 'tool', '--stale', 'nan'], 2, '--stale = nan s: must be finite'),
-        (['compensator', 'gone.urdf', '--tip', 'tool'], 3, 'gone.urdf: no such URDF file'),
+        (['compensator', '--urdf', URDF, '--tip', 'tol'], 3, 'tip: no link tol; did you mean tool?'),
+        (['compensator', '--tip', 'tool', '--axes', 'x,u'], 2, "--axes = ['x', 'u']: each must be one of"),
+        (['compensator', '--urdf', URDF], 3, 'tip: the link of the end effector must be named'),
+        (['compensator', '--drive'], 3, 'tip: the link of the end effector must be named'),
+        (['compensator', '--urdf', URDF, '--tip', 'tool', '--stale', 'nan'], 2, '--stale = nan s: must be finite'),
+        (['compensator', '--urdf', 'gone.urdf', '--tip', 'tool'], 3, 'gone.urdf: no such URDF file'),
     ],
 )
 def test_refused(argv: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:

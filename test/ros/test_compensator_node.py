@@ -42,7 +42,7 @@ from tools.program import PSD_DEFLECTION, ROOT, WAIT_S, Program  # noqa: E402
 
 STALE = '0.8'
 """s. On a busy machine this process is late too; test/arms/compensation has the default of 0.08 s."""
-ARGUMENTS = ('compensator', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive')
+ARGUMENTS = ('compensator', '--urdf', str(URDF), '--tip', 'tool', '--axes', 'x,z', '--drive')
 
 HANGS = """
 import sys

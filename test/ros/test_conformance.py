@@ -337,7 +337,7 @@ PROFILES: Mapping[str, Profile] = {
         sim_time='refused',
     ),
     'compensator': Profile(
-        words=(str(ROOT / 'config' / 'two_links.urdf'), '--tip', 'tool', '--axes', 'x,z'),
+        words=('--urdf', str(ROOT / 'config' / 'two_links.urdf'), '--tip', 'tool', '--axes', 'x,z'),
         params={'max_offset': 0.01, 'frame_prefix': PREFIX},
         published=(Float64MultiArray, 'compensator/proposed'),
         fixed=('output', 'commands'),

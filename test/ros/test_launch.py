@@ -135,16 +135,15 @@ def test_arguments_reach_the_shaper(launched: Launched) -> None:
 @of('compensator')
 def test_arguments_reach_the_compensator(launched: Launched) -> None:
     topics = {launched.names['TOPIC_OF'].get(name, name) for name in launched.names['TOPICS']}
-    assert launched.arguments == {'tip', 'namespace', 'drive', 'params_file', *launched.names['PARAMETERS'], *topics}
+    assert launched.arguments == {'namespace', 'params_file', *launched.names['PARAMETERS'], *topics}
     launched.check_types(settings.SETTINGS.parameters)
     before, node = launched.start(drive='true', params_file='p.yaml')
-    assert [words[0].name for words in before] == ['params_file']
-    assert told(node) == ['--tip', 'tip', '--drive']
+    assert [words[0] if isinstance(words[0], str) else words[0].name for words in before] == ['params_file', 'drive']
     assert {(a, b.name) for a, b in node.remappings} == {
         (f'~/{name}', launched.names['TOPIC_OF'].get(name, name)) for name in launched.names['TOPICS']
     }
-    before, node = launched.start(drive='false')
-    assert (before, told(node)) == ([], ['--tip', 'tip'])
+    before, node = launched.start()
+    assert (before, hasattr(node, 'arguments')) == ([], False)
 
 
 @pytest.mark.skipif(shutil.which('ros2') is None, reason='ros2 launch comes with a ROS installation')

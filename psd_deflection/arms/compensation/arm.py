@@ -24,6 +24,7 @@ from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.spelling import did_you_mean
 from psd_deflection.records import FloatArray
 
+NO_TIP = 'tip: the link of the end effector must be named'
 MOST_BYTES = 5_000_000
 MOVABLE = ('revolute', 'continuous', 'prismatic')
 
@@ -142,6 +143,8 @@ def read_arm(path: str | Path, tip: str, base: str = '') -> Arm:
 
 def arm_of(text: str, where: str, tip: str, base: str = '') -> Arm:
     """The same of the text of one, which comes from ``where``."""
+    if not tip:
+        raise ConfigError(NO_TIP)
     root = _robot(text, where)
     links = [link.get('name', '') for link in root.iterfind('link')]
     parents = {}

@@ -22,6 +22,10 @@ class CompensatorSettings:
     bounds.
     """
 
+    tip: str = parameter('', '', 'link of the end effector in the URDF; it must be named')
+    base: str = parameter('', '', 'link from which on joints count; empty: the root')
+    urdf: str = parameter('', '', 'URDF file with the kinematics of the arm; empty: the topic robot_description')
+    drive: bool = parameter(False, '', 'publish offsets for a controller; false: proposals')
     axes: tuple[str, ...] = parameter(
         ('x', 'y', 'z'), '', "axes of the end effector's rigid pose that are corrected", choices=AXES
     )
