@@ -30,7 +30,6 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from bench.steps import largest_step
 from blind.render import Pose, Scene, photograph
 from msg_adapters import ACCELERATION, LOAD, MARK, REFERENCE, REFERENCE_WITH_COVARIANCE, TEMPERATURE
-from psd_deflection.arms.chains.chain_file import read_chain
 from psd_deflection.arms.compensation.compensator import State
 from psd_deflection.arms.compensation.settings import CompensatorSettings
 from psd_deflection.arms.compensation.shaping import ShaperSettings
@@ -271,7 +270,7 @@ class Chain(Attacked):
     words = (str(CHAIN),)
 
     def __init__(self, folder: Path) -> None:
-        self._node = ChainNode(read_chain(str(CHAIN), {'bag_dir': str(folder)}, None), null_log, Signals())
+        self._node = ChainNode(str(CHAIN), {'bag_dir': str(folder)}, None, null_log, Signals())
         super().__init__(self._node)
 
     def _sessions(self) -> list[Session]:

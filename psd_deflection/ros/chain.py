@@ -11,19 +11,23 @@ executor runs in the main thread; estimates are published by the pipeline thread
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from msg_adapters import DEFLECTION_WITH_COVARIANCE, END_EFFECTOR
 from msg_adapters.pose_with_covariance_stamped import from_end_effector
-from psd_deflection.arms.chains.chain_file import SETTINGS, ChainFile, ChainSettings
+from psd_deflection.arms.chains.chain_file import NO_CHAIN, SETTINGS, ChainFile, ChainSettings, read_chain
 from psd_deflection.arms.chains.transform import Transform
 from psd_deflection.arms.inputs import joints_fault
+from psd_deflection.base.errors import ConfigError
 from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.recordings import cdr
-from psd_deflection.ros.declared import DeclaredParameters
+from psd_deflection.rig.declarations import BY_NAME
+from psd_deflection.rig.parameters import Parameter, Value, check_value
+from psd_deflection.ros.declared import SOURCE, DeclaredParameters, refuse_unknown
 from psd_deflection.ros.names import BASE, END, END_REST, RECORD, REST, TIP, ZERO
-from psd_deflection.ros.node import BaseNode, Health, serve
+from psd_deflection.ros.node import AUTOSTART, BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.services import Zeroed, add_rig_services
 from psd_deflection.ros.topics import JOINT_STATES, PUBLISHED
@@ -39,6 +43,9 @@ from psd_deflection.run.session_texts import why_no_zero, zero_text
 from psd_deflection.run.signals import Signals, StopRequestedError
 
 NODE_NAME = 'chain'
+OF_LINKS = (BY_NAME['record'], BY_NAME['bag_dir'])
+"""Parameters of the node that each of its rigs gets."""
+CHAIN = Parameter('chain', 'string', '', '', 'chain file with the links')
 
 
 class ChainNode(BaseNode[ChainSettings]):
@@ -46,9 +53,12 @@ class ChainNode(BaseNode[ChainSettings]):
 
     SYSTEM_TIME = True
 
-    def __init__(self, file: ChainFile, log: LogCallback, signals: Signals) -> None:
+    def __init__(
+        self, path: str, given: Mapping[str, Value], slopes: str | None, log: LogCallback, signals: Signals
+    ) -> None:
+        """``path``, ``given``, ``slopes``: as :func:`read_chain` takes them, unless ROS parameters say otherwise."""
         self.chain: ChainSession | None = None
-        self._file = file
+        self._path, self._given, self._slopes = path, given, slopes
         self._signals = signals
         self._wires: list[PublisherSink] = []
         self._inputs: list[InputRecorder] = []
@@ -59,8 +69,17 @@ class ChainNode(BaseNode[ChainSettings]):
         super().__init__(NODE_NAME, log)
 
     def declare(self) -> DeclaredParameters[ChainSettings]:
-        """Those of a chain."""
-        return self.declared(SETTINGS, self._file.settings)
+        """Those of a chain, its file, and whether and where its links are recorded."""
+        more = (AUTOSTART, *(replace(p, default=self._given.get(p.name, p.default)) for p in OF_LINKS))
+        chain = replace(CHAIN, default=self._path)
+        known = {p.name: p for p in (*SETTINGS.parameters.values(), *more, chain)}
+        given = refuse_unknown(self.node, known)
+        of_links = {p.name: check_value(p, given[p.name], SOURCE) for p in OF_LINKS if p.name in given}
+        path = check_value(chain, given.get(chain.name, self._path), SOURCE)
+        if not path:
+            raise ConfigError(NO_CHAIN)
+        self._file = read_chain(str(path), {**self._given, **of_links}, self._slopes)
+        return DeclaredParameters(self.node, SETTINGS, SETTINGS.values(self._file.settings), more=(*more, chain))
 
     def set_up(self) -> None:
         """Make what is on the graph while the node lives."""
@@ -219,14 +238,19 @@ def chain_transforms(file: ChainFile, composed: Composed) -> list[Any]:
 
 
 def run_chain(
-    ros_args: Sequence[str], file: ChainFile, log: LogCallback, watch: Callable[[ChainSession], object]
+    ros_args: Sequence[str],
+    path: str,
+    given: Mapping[str, Value],
+    slopes: str | None,
+    log: LogCallback,
+    watch: Callable[[ChainSession], object],
 ) -> int:
-    """Run the node until SIGINT or SIGTERM. ``watch``: called about ten times a second.
+    """Run the node of the chain file ``path`` until SIGINT or SIGTERM. ``watch``: called about ten times a second.
 
     Raises the errors of the package if the run cannot start, or if a pipeline failed.
     """
     with ros(NODE_NAME, ros_args) as signals:
-        owner, watchdog = ChainNode(file, log, signals), Watchdog()
+        owner, watchdog = ChainNode(path, given, slopes, log, signals), Watchdog()
 
         def runs() -> bool:
             chain = owner.chain

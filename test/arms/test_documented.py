@@ -39,9 +39,6 @@ def test_what_may_be_set_while_a_node_runs_is_what_the_pages_say() -> None:
     at_start = {p.name for p in settings.SETTINGS.parameters.values() if not p.live}
     of_the_arm = {'tip', 'base', 'urdf', 'joints'}
     of_the_controller = {'drive', 'output', 'takeover', 'controller_state'}
-        {'tip', 'base', 'urdf', 'joints'},
-        {'drive', 'output', 'takeover', 'controller_state'},
-    )
     assert at_start == {'axes', 'frame_prefix', *of_the_arm, *of_the_controller}
 
 

@@ -50,6 +50,9 @@ LARGEST = 1000.0
 _WITHIN: Mapping[str, Any] = {'minimum': -LARGEST, 'maximum': LARGEST}
 
 
+NO_CHAIN = 'chain: a chain file must be named'
+
+
 @dataclass(frozen=True, slots=True)
 class ChainSettings:
     """What the file says of the chain as a whole; the node has it as ROS parameters."""

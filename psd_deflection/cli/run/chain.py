@@ -11,6 +11,7 @@ the end effector has none.
   psd-deflection chain config/two_links.yaml --no-ros --json --count 3
   psd-deflection chain config/two_links.yaml --no-ros --out end.csv --record
   ros2 run psd_deflection chain my_arm.yaml
+  ros2 run psd_deflection chain --ros-args -p chain:=my_arm.yaml -p record:=true
 """
 
 from __future__ import annotations
@@ -24,15 +25,16 @@ from pathlib import Path
 from typing import TextIO
 
 from psd_deflection.arms.chains.chain import SLOPES
-from psd_deflection.arms.chains.chain_file import read_chain
+from psd_deflection.arms.chains.chain_file import NO_CHAIN, read_chain
 from psd_deflection.base.axes import SHOWN, SHOWN_UNITS
-from psd_deflection.base.errors import RecordingError, UsageError
+from psd_deflection.base.errors import ConfigError, RecordingError, UsageError
 from psd_deflection.base.files import creating
 from psd_deflection.cli._display import Display
 from psd_deflection.cli._options import need_folder
 from psd_deflection.cli._report import print_json
 from psd_deflection.cli._values import whole
 from psd_deflection.cli.run._ros import require_ros
+from psd_deflection.rig.parameters import Value
 from psd_deflection.run.chain import ChainSession, Composed
 from psd_deflection.run.headless import run_until_signal
 
@@ -46,7 +48,9 @@ _SHOWN = tuple((axis, *shown) for axis, shown in zip(AXES, 3 * [_ALONG] + 3 * [_
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument('chain', metavar='CHAIN.yaml', help='the links')
+    parser.add_argument(
+        'chain', metavar='CHAIN.yaml', nargs='?', default='', help='the links (with ROS also the parameter chain)'
+    )
     parser.add_argument(
         '--record',
         nargs='?',
@@ -66,11 +70,15 @@ def run(args: argparse.Namespace) -> int:
     """Run until Ctrl-C, or for ``--count`` blocks."""
     if not args.no_ros and (args.out or args.json or args.count):
         raise UsageError('--out, --json and --count need --no-ros')
-    given: dict[str, object] = {}
+    given: dict[str, Value] = {}
     if args.record is not None:
         given = {'record': True, **({'bag_dir': args.record} if args.record else {})}
-    file = read_chain(args.chain, given, args.slopes)
     display = Display()
+    if args.no_ros or not args.ros_arguments:
+        # Before ROS is started; else ROS may have parameters that change it.
+        if not args.chain:
+            raise ConfigError(NO_CHAIN)
+        file = read_chain(args.chain, given, args.slopes)
     if args.no_ros:
         with display.telling_recorded(), _written(args.out) as stream:
             teller = _Teller(args, display, stream)
@@ -80,7 +88,7 @@ def run(args: argparse.Namespace) -> int:
 
     with display.telling_recorded():
         teller = _Teller(args, display, None)
-        return run_chain(args.ros_arguments, file, display.log, teller.watch)
+        return run_chain(args.ros_arguments, args.chain, given, args.slopes, display.log, teller.watch)
 
 
 @contextlib.contextmanager

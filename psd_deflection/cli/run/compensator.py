@@ -9,7 +9,7 @@ enabled. They hold their last value within a tenth of a second if the deflection
 Each option is a ROS parameter, too.
 
   psd-deflection compensator --urdf config/two_links.urdf --tip tool --axes x,z
-  psd-deflection compensator --urdf arm.urdf --tip tool0 --drive --max-offset 0.01
+  psd-deflection compensator --urdf arm.urdf --tip tool0 --drive
   ros2 run psd_deflection compensator --ros-args -p tip:=tool0 -p drive:=true
   ros2 service call /compensator/enable std_srvs/srv/SetBool "{data: true}"
 
