@@ -34,7 +34,8 @@ EXAMPLE = ROOT / 'config' / 'two_links.yaml'
 @pytest.fixture
 def chain(domain: int, tmp_path: Path) -> Iterator[Program]:
     """The node on the example, which records below ``tmp_path`` when it is asked to."""
-    one = Program([*PSD_DEFLECTION, 'chain', str(EXAMPLE)], env={'PYTHONWARNINGS': WARNINGS}, cwd=tmp_path)
+    command = [*PSD_DEFLECTION, 'chain', '--ros-args', '-p', f'chain:={EXAMPLE}']
+    one = Program(command, env={'PYTHONWARNINGS': WARNINGS}, cwd=tmp_path)
     yield one
     one.end()
     print(*one.lines[-50:], sep='\n')

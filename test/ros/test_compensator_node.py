@@ -434,13 +434,13 @@ def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> No
 
 
 def test_without_a_file_the_arm_is_the_one_of_robot_description(domain: int, peer: Any) -> None:
-    words = (*PSD_DEFLECTION, 'compensator', '--tip', 'tool')
+    words = (*PSD_DEFLECTION, 'compensator', '--ros-args', '-p', 'tip:=tool', '-p', 'drive:=true')
     node = Program(words, env={'PYTHONWARNINGS': WARNINGS})
     try:
         node.until('waiting for the robot on /robot_description')
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         peer.node.create_publisher(String, '/robot_description', latched).publish(String(data=URDF.read_text()))
-        node.until('publishing /compensator/proposed for shoulder, elbow')
+        node.until('publishing /compensator/offsets for shoulder, elbow, once it is enabled')
     finally:
         assert node.end() == 0
 
