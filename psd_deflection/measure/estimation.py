@@ -9,6 +9,7 @@ The state is the last twist that was measured, for ``degraded: hold``.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import nan, pi
@@ -20,6 +21,7 @@ from psd_deflection.base.arithmetic import FIXED, Arithmetic
 from psd_deflection.measure.health import FROZEN_BLOCKS, OpticsHealth, Verdict
 from psd_deflection.measure.state import State, Value, numbers
 from psd_deflection.measure.uncertainty.block_estimator import BlockEstimator
+from psd_deflection.measure.uncertainty.block_fit import Fitted
 from psd_deflection.measure.uncertainty.consistency import ConsistencyResult, Unexplained, widened
 from psd_deflection.measure.uncertainty.psd_set import PsdSet
 from psd_deflection.model.detector import dot_noise_variances
@@ -73,19 +75,14 @@ class HeldTwist(NamedTuple):
 class BlockReadings(NamedTuple):
     """Readings of one block that are solved together.
 
-    ``psds``: whose they are. ``dots`` (C,) m; ``variances`` (C,) m^2; ``covariance`` (C, C)
-    m^2 of the dots, None if ``variances`` are all of it.
+    ``psds``: whose they are. ``dots`` (C,) m; ``variances`` (C,) m^2, the weights; ``covariance`` (C, C) m^2 of the
+    dots.
     """
 
     psds: PsdSet
     dots: Dots
     variances: tuple[float, ...]
-    covariance: FloatArray | None = None
-
-    @property
-    def dense_covariance(self) -> FloatArray:
-        """(C, C), m^2, whichever is given."""
-        return np.diag(self.variances) if self.covariance is None else self.covariance
+    covariance: FloatArray
 
 
 class SolvedReadings(NamedTuple):
@@ -220,12 +217,24 @@ class Estimation:
         """Variances (2P,), m^2, of the dots of a whole block of ``size`` samples at rest."""
         return self.estimator.mean_variances(size) if self.estimator.on_plate else self.variances[-1]
 
-    def solve(self, block: SeenBlock) -> BlockSolution:
-        """Return the primary solver's estimate of a block whose verdict is OK or names sound detectors."""
+    def fits(self, blocks: Sequence[SeenBlock]) -> Iterator[Fitted]:
+        """Yield the fit of all readings of each block whose verdict is OK; those with the same places are computed
+        together.
+        """
+        good = [block for block in blocks if block.verdict.status is BlockStatus.OK]
+        for _, same in itertools.groupby(good, key=lambda block: block.slots.tobytes()):
+            run = list(same)
+            yield from self.estimator.fits(self.estimator.full, run[0].slots, np.stack([own.samples for own in run]))
+
+    def solve(self, block: SeenBlock, fits: Iterator[Fitted]) -> BlockSolution:
+        """Return the primary solver's estimate of a block whose verdict is OK or names sound detectors.
+
+        ``fits``: as :meth:`fits` has them, from this block on.
+        """
         verdict = block.verdict
         variances = self._variances_of(block)
         if verdict.status is BlockStatus.OK:
-            readings = self._fitted(self.estimator.full, block, variances)
+            readings = self._readings(self.estimator.full, next(fits), block, variances)
             return self._solve_consistent(block, readings.dots, variances, readings)
         if self.estimator.on_plate and verdict.sound:
             variances = self.estimator.mean_variances(len(block.slots))
@@ -237,10 +246,8 @@ class Estimation:
 
     def other_estimates(self, block: SeenBlock, used: CheckedReadings) -> Iterator[DeflectionEstimate]:
         """Yield the estimates of the other solvers."""
-        for number in range(1, len(self._solvers)):
-            solution, _ = self._solution(number, used.readings)
-            if solution is not None:
-                yield self._estimate(number, block, solution, used)
+        answers = [(number, self._solution(number, used.readings)[0]) for number in range(1, len(self._solvers))]
+        yield from self._estimates(block, [(number, s) for number, s in answers if s is not None], used)
 
     def excluded(self, used: CheckedReadings | None) -> tuple[int, ...]:
         """Return the PSDs (from 1) without which a block was solved."""
@@ -275,7 +282,7 @@ class Estimation:
         if solution is None:
             return SolvedReadings(readings, None, failure)
         factor = None if self.spread is None else self.spread.factor(solution.dx, solution.dy, solution.theta)
-        covariance = readings.dense_covariance
+        covariance = readings.covariance
         if factor is not None:
             covariance = covariance + self._by.einsum('ik,jk->ij', factor, factor)
         return SolvedReadings(readings, solution, '', factor, self._unexplained(readings, solution, covariance))
@@ -299,7 +306,7 @@ class Estimation:
             return False
         readings, found = solved.readings, solved.unexplained
         if solved.factor is not None:
-            found = self._unexplained(readings, solved.solution, readings.dense_covariance)
+            found = self._unexplained(readings, solved.solution, readings.covariance)
         return readings.psds.check.agrees(found, self.estimator.limit_factor)
 
     def _check(self, solved: SolvedReadings, blamed: Collection[int] | None) -> ConsistencyResult | None:
@@ -333,20 +340,24 @@ class Estimation:
             words = 'four readings' if len(self._rig.psds) == 2 else 'readings'
             reason = f'the {words} contradict each other: chi-square {checked.chi_square:.0f} of {checked.freedom}'
             return BlockSolution(dots, used, None, (BlockStatus.INCONSISTENT, reason))
-        estimate = self._estimate(0, block, solved.solution, used)
+        self.systematic = None
+        (estimate,) = self._estimates(block, [(0, solved.solution)], used)
         self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
         return BlockSolution(dots, used, estimate)
 
-    def _fitted(self, psds: PsdSet, block: SeenBlock, variances: tuple[float, ...]) -> BlockReadings:
+    def _readings(self, psds: PsdSet, fitted: Fitted, block: SeenBlock, variances: tuple[float, ...]) -> BlockReadings:
         """Return the readings of ``psds`` at the block's timestamp; ``variances`` (2P,) m^2 of all."""
-        dots, covariance = self.estimator.fit(psds, block.slots, block.samples)
-        own = tuple(variances[i] for i in psds.columns)
-        return BlockReadings(psds, dots, own, self._covariance_of(block, covariance, psds.columns))
+        own = tuple([variances[i] for i in psds.columns])
+        return BlockReadings(psds, fitted.dots, own, self._covariance_of(block, fitted.covariance, psds.columns))
 
     def _subset(self, psds: tuple[int, ...], block: SeenBlock, variances: tuple[float, ...]) -> BlockReadings | None:
         """Return the readings of ``psds`` (from 0) alone; None if the primary method cannot do with them."""
         solver = self._solver(0, psds)
-        return None if solver is None else self._fitted(self.estimator.subset(psds, solver.tilts), block, variances)
+        if solver is None:
+            return None
+        own = self.estimator.subset(psds, solver.tilts)
+        fitted = next(self.estimator.fits(own, block.slots, block.samples[None]))
+        return self._readings(own, fitted, block, variances)
 
     def _solver(self, number: int, psds: tuple[int, ...]) -> Solver | None:
         """Return solver ``number`` for ``psds`` (from 0); None if it cannot do with them."""
@@ -369,13 +380,32 @@ class Estimation:
             return None, f'{name}: {s.status.name.lower().replace("_", " ")}'
         return s, ''
 
-    def _estimate(self, number: int, block: SeenBlock, s: Solution, used: CheckedReadings) -> DeflectionEstimate:
-        """Return a solution with its covariance as an estimate."""
+    def _estimates(
+        self, block: SeenBlock, answers: Sequence[tuple[int, Solution]], used: CheckedReadings
+    ) -> list[DeflectionEstimate]:
+        """Return the solutions of some solvers, by their numbers, with their covariances as estimates."""
+        readings = used.readings
+        gains = [self._gain(number, s, readings) for number, s in answers]
+        known = np.array([gain for gain in gains if gain is not None])
+        # Of all solvers at once: of so few numbers the calls cost most.
+        noises = iter(self._by.einsum('sic,ck,sjk->sij', known, readings.covariance, known) if len(known) else ())
+        out = []
+        for (number, s), gain in zip(answers, gains, strict=True):
+            covariance: tuple[float, ...] = s.covariance
+            if gain is not None:
+                covariance = self._covariance(number, gain, next(noises), used)
+            out.append(self._estimate(number, block, s, covariance, used.checked))
+        return out
+
+    def _estimate(
+        self,
+        number: int,
+        block: SeenBlock,
+        s: Solution,
+        covariance: tuple[float, ...],
+        checked: ConsistencyResult | None,
+    ) -> DeflectionEstimate:
         name, _, primary = self._solvers[number]
-        checked = used.checked
-        covariance, systematic = self._covariance(number, s, used)
-        if primary:
-            self.systematic = systematic
         return DeflectionEstimate(
             t_ns=block.t_ns,
             block=block.index,
@@ -392,33 +422,28 @@ class Estimation:
             on_own_topic=block.due,
         )
 
-    def _covariance(
-        self, number: int, s: Solution, used: CheckedReadings
-    ) -> tuple[tuple[float, ...], FloatArray | None]:
-        """Return the covariance of a solution, and what it holds besides noise, None if nothing."""
-        readings, checked, factor = used.readings, used.checked, used.factor
+    def _gain(self, number: int, s: Solution, readings: BlockReadings) -> FloatArray | None:
+        """Return the gain (3, C); None of a printed threshold method, which has no covariance and no slope either."""
         solver = self._solver(number, readings.psds.psds)
-        possible = () if checked is None or self._rig.estimator.consistency != 'widen' else checked.possible
-        # A printed threshold method has no covariance, and no slope either.
         if solver is None or s.covariance[0] != s.covariance[0]:
-            return s.covariance, None
-        if readings.covariance is None and factor is None and not any(possible):
-            return s.covariance, None
-        gain = solver.gain(readings.dots, readings.variances, s)
-        noise = own = self._noise_of(solver, gain, s, readings)
-        if factor is not None:
-            own = own + _through(gain, factor, self._by)
-        if any(possible):
-            own = widened(own, gain, possible, self._by)
-        return tuple(own.ravel().tolist()), own - noise if own is not noise else None
+            return None
+        return solver.gain(readings.dots, readings.variances, s)
 
-    def _noise_of(self, solver: Solver, gain: FloatArray, s: Solution, readings: BlockReadings) -> FloatArray:
-        """Return the covariance (3, 3) by the noise of the readings alone."""
-        if readings.covariance is None:
-            return np.array(s.covariance).reshape(3, 3)
-        own = self._by.einsum('ic,ck,jk->ij', gain, readings.covariance, gain)
-        allowance = solver.allowance(readings.dots, readings.variances)
-        return own if allowance is None else own + allowance
+    def _covariance(self, number: int, gain: FloatArray, noise: FloatArray, used: CheckedReadings) -> tuple[float, ...]:
+        """Return the covariance of a solution; ``noise`` (3, 3): by the noise of the readings alone."""
+        readings, checked = used.readings, used.checked
+        solver = self._solver(number, readings.psds.psds)
+        allowance = None if solver is None else solver.allowance(readings.dots, readings.variances)
+        if allowance is not None:
+            noise = noise + allowance
+        own = noise
+        if used.factor is not None:
+            own = own + _through(gain, used.factor, self._by)
+        if checked is not None and self._rig.estimator.consistency == 'widen' and any(checked.possible):
+            own = widened(own, gain, checked.possible, self._by)
+        if number == 0 and own is not noise:
+            self.systematic = own - noise
+        return tuple(own.ravel().tolist())
 
     def _covariance_of(self, block: SeenBlock, covariance: FloatArray, columns: Sequence[int]) -> FloatArray:
         """Return the fit's covariance (C, C) of the readings ``columns``, widened as in :meth:`_variances_of`."""

@@ -88,10 +88,6 @@ class Stillness:
     def __init__(self, psds: int) -> None:
         self.blocks: tuple[int, ...] = (0,) * psds
 
-    def count(self, still: tuple[bool, ...]) -> None:
-        """Take one block, as :meth:`OpticsHealth.still` has it."""
-        self.blocks = tuple(n + 1 if same else 0 for n, same in zip(self.blocks, still, strict=True))
-
     def state_dict(self) -> State:
         """The counts, if there are any."""
         return {FROZEN: self.blocks} if any(self.blocks) else {}
@@ -173,6 +169,10 @@ class OpticsHealth:
         if len(measures.volts) < max(self._min_samples, 2):
             return (False,) * self._psds
         return tuple([moves and same for moves, same in zip(self._moves, measures.same, strict=True)])
+
+    def frozen(self, before: tuple[int, ...], measures: BlockMeasures) -> tuple[int, ...]:
+        """Blocks in a row without change, per PSD, with this block; ``before``: without it."""
+        return tuple([n + 1 if same else 0 for n, same in zip(before, self.still(measures), strict=True)])
 
     def judge(self, block: SampleBlock, measures: BlockMeasures, frozen: tuple[int, ...]) -> Verdict:
         """The block's verdict, causes before consequences.

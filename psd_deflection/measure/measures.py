@@ -21,7 +21,7 @@ from psd_deflection.records import FloatArray, SampleBlock
 Volts = npt.NDArray[np.float32]
 
 AT_ONCE = 50
-"""Blocks that are measured together, at the most."""
+"""Blocks that are computed together, at the most: those of one segment of the noise, which changes after it."""
 
 _THIRD_DIFFERENCE = 20.0
 """Variance of the third difference of white noise of variance 1: 1 + 9 + 9 + 1."""
@@ -49,11 +49,9 @@ class BlockMeasures(NamedTuple):
 
 
 def of_one_length(blocks: Sequence[SampleBlock]) -> Iterator[list[SampleBlock]]:
-    """The blocks in turn, those of one length that follow each other together."""
-    for _, same in itertools.groupby(blocks, key=lambda block: len(block.seq)):
-        run = list(same)
-        for at in range(0, len(run), AT_ONCE):
-            yield run[at : at + AT_ONCE]
+    """The blocks in turn, those of one length and segment that follow each other together."""
+    for _, same in itertools.groupby(blocks, key=lambda block: (len(block.seq), block.index // AT_ONCE)):
+        yield list(same)
 
 
 def measured(volts: Sequence[Volts], samples: Sequence[FloatArray]) -> list[BlockMeasures]:

@@ -30,6 +30,7 @@ from psd_deflection.measure.measures import BlockMeasures, measured, of_one_leng
 from psd_deflection.measure.motion.known import joined_ns, split_ns
 from psd_deflection.measure.motion.motion import ModalFilter
 from psd_deflection.measure.state import STATE, WHOLE, Part, State, Value, load_states, numbers
+from psd_deflection.measure.uncertainty.block_fit import Fitted
 from psd_deflection.measure.uncertainty.rest import why_moving
 from psd_deflection.model.detector import VoltsToDots, counts_to_volts, dot_noise_variances
 from psd_deflection.model.simulation.catalogue import effects_of_rig
@@ -349,19 +350,26 @@ class Pipeline:
             changes = self._changes
             volts = [self._calibration.seen(block.volts) for block in blocks]
             samples = [self._dots(block, own) for block, own in zip(blocks, volts, strict=True)]
+            measures = measured(volts, samples)
+            seen = list(self._judged(blocks, measures))
+            fits = self.estimation.fits(seen)
             done = 0
-            for block, measures in zip(blocks, measured(volts, samples), strict=True):
-                yield from self._block(block, measures)
+            for own in zip(blocks, measures, seen, strict=True):
+                yield from self._block(*own, fits)
                 done += 1
                 if self._changes != changes:
                     break
             blocks = blocks[done:]
 
-    def _block(self, block: SampleBlock, measures: BlockMeasures) -> Iterator[Record]:
-        seen = self._judged(block, measures)
+    def _block(
+        self, block: SampleBlock, measures: BlockMeasures, seen: SeenBlock, fits: Iterator[Fitted]
+    ) -> Iterator[Record]:
+        self.counters.samples += len(block.seq)
+        self._end_ns = int(block.t_ns[-1])
+        self._stillness.blocks = seen.frozen
         verdict = seen.verdict
         solvable = verdict.status is BlockStatus.OK or verdict.sound
-        answer = self.estimation.solve(seen) if solvable else BlockSolution(seen.means)
+        answer = self.estimation.solve(seen, fits) if solvable else BlockSolution(seen.means)
         self.last_estimate = answer.estimate
         self.estimator.excluded = self.estimation.excluded(answer.used)
         status, reason = answer.failure or (verdict.status, verdict.reason)
@@ -386,24 +394,22 @@ class Pipeline:
         yield self.last_spots
         yield block
 
-    def _judged(self, block: SampleBlock, measures: BlockMeasures) -> SeenBlock:
-        """The dots of a block, and whether lasers and detectors are sound."""
-        self.counters.samples += len(block.seq)
-        self._end_ns = int(block.t_ns[-1])
-        if self._optics.refuses_frozen:
-            self._stillness.count(self._optics.still(measures))
+    def _judged(self, blocks: Iterable[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[SeenBlock]:
+        """The dots of each block, and whether lasers and detectors are sound."""
         frozen = self._stillness.blocks
-        return SeenBlock(
-            t_ns=block_middle_ns(block, self._cutter.block_size, self._period_ns),
-            index=block.index,
-            slots=block.seq - block.index * self._cutter.block_size,
-            samples=measures.samples,
-            means=measures.means,
-            mean_sums=measures.mean_sums,
-            verdict=self._optics.judge(block, measures, frozen),
-            frozen=frozen,
-            due=block.index % self.rig.estimator.decimation == 0,
-        )
+        for block, own in zip(blocks, measures, strict=True):
+            frozen = self._optics.frozen(frozen, own)
+            yield SeenBlock(
+                t_ns=block_middle_ns(block, self._cutter.block_size, self._period_ns),
+                index=block.index,
+                slots=block.seq - block.index * self._cutter.block_size,
+                samples=own.samples,
+                means=own.means,
+                mean_sums=own.mean_sums,
+                verdict=self._optics.judge(block, own, frozen),
+                frozen=frozen,
+                due=block.index % self.rig.estimator.decimation == 0,
+            )
 
     def _count(self, status: BlockStatus, verdict: Verdict, answer: BlockSolution) -> None:
         counters = self.counters
@@ -457,9 +463,7 @@ class Pipeline:
             self._learn(seen, measures)
         if answer.complete and used is not None and used.checked is not None:
             self.estimator.search_outliers(seen.index, used.readings.dots, used.checked)
-        if not self._optics.refuses_frozen:
-            self._stillness.count(self._optics.still(measures))
-        findings += self._optics.late_findings(measures, seen.verdict, self._stillness.blocks, self._loudness)
+        findings += self._optics.late_findings(measures, seen.verdict, seen.frozen, self._loudness)
         if vibrates:
             findings += (f'vibrates: {vibrates}',)
         if answer.estimate is not None:

@@ -15,19 +15,22 @@ from psd_deflection.measure.measures import AT_ONCE, measured, of_one_length
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import rig_at_start
-from psd_deflection.records import FLAG_OVER_RANGE, FloatArray, IntArray, RawChunk, Record
+from psd_deflection.records import FLAG_OVER_RANGE, FloatArray, IntArray, RawChunk, Record, SampleBlock
 from psd_deflection.rig.config import Rig, load_rig
 
 BAGS = Path(__file__).parents[2] / 'bags'
 
 
 def in_chunks(rig: Rig, samples: RawChunk, blocks: int) -> Iterator[str]:
-    """The records of ``samples`` that come so many blocks at a time, with all digits."""
+    """The records of ``samples`` that come so many blocks at a time, and some states in between, with all digits."""
     pipeline, size = Pipeline(rig), rig.estimator.block_size * blocks
     cuts = np.flatnonzero(np.diff(samples.seq // size)) + 1
     for rows in np.split(np.arange(len(samples.seq)), cuts):
         chunk = RawChunk(samples.seq[rows], samples.t_ns[rows], samples.readings[rows], samples.flags[rows])
-        yield from map(told, pipeline.process(chunk))
+        for record in pipeline.process(chunk):
+            yield told(record)
+            if isinstance(record, SampleBlock) and record.index % 37 == 5:
+                yield repr(pipeline.memory(rig))
     yield from map(told, pipeline.flush())
 
 
@@ -70,7 +73,9 @@ def test_blocks_by_chance_have_the_same_bits_one_by_one_and_together(seed: int) 
     kept: IntArray = np.flatnonzero(rng.random(n) > 0.15 * (np.arange(n) // 500 % 2))
     flags = np.where(rng.random(len(kept)) < 2e-4, FLAG_OVER_RANGE, 0).astype(np.uint8)
     samples = RawChunk(kept, kept * 1_000_000, volts[kept].astype(np.float32), flags)
-    assert list(in_chunks(rig, samples, 50)) == list(in_chunks(rig, samples, 1))
+    one = list(in_chunks(rig, samples, 1))
+    for blocks in (7, 1000):
+        assert list(in_chunks(rig, samples, blocks)) == one
 
 
 def test_measures_are_those_of_numpy() -> None:
@@ -89,9 +94,9 @@ def test_measures_are_those_of_numpy() -> None:
     assert (alone.means, alone.covariance.any()) == (tuple(samples[0, 0].tolist()), np.False_)
 
 
-def test_blocks_that_follow_each_other_go_together_if_they_are_of_one_length() -> None:
+def test_blocks_of_one_length_and_one_segment_go_together() -> None:
     recording = open_recording(BAGS / 'lost_samples')
     together = list(of_one_length(list(recording.blocks())))
     assert [len(b) for b in together][:4] == [2, 1, 7, 1]
     assert max(map(len, together)) <= AT_ONCE
-    assert all(len({len(b.seq) for b in run}) == 1 for run in together)
+    assert all(len({(len(b.seq), b.index // AT_ONCE) for b in run}) == 1 for run in together)

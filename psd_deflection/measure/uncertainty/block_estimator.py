@@ -8,11 +8,12 @@ of PSDs (:mod:`psd_deflection.measure.uncertainty.psd_set`), and knows their sta
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
 from psd_deflection.measure.state import State, Value, mismatch, numbers
+from psd_deflection.measure.uncertainty.block_fit import Fitted
 from psd_deflection.measure.uncertainty.combinations import Left
 from psd_deflection.measure.uncertainty.consistency import UNMEASURED, ConsistencyResult, Unexplained, survival
 from psd_deflection.measure.uncertainty.converter import ConverterSteps, Volts
@@ -91,14 +92,14 @@ class BlockEstimator:
                 own.load_state(self._pending.pop(psds))
         return own
 
-    def fit(self, psds: PsdSet, slots: IntArray, samples: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
-        """Return the dots (C,) m of ``psds`` at the middle of a block, and their covariance (C, C) m^2.
+    def fits(self, psds: PsdSet, slots: IntArray, samples: FloatArray) -> Iterator[Fitted]:
+        """Yield the dots of ``psds`` at the middle of each block.
 
-        ``slots`` (n,): which samples are present; ``samples`` (n, 2P), m, of all PSDs.
+        ``slots`` (n,): which samples are present; ``samples`` (B, n, 2P), m, of all PSDs.
         """
-        fitted = psds.fitted(slots, samples)
-        self.misfits += fitted.misfit
-        return fitted.dots, fitted.covariance
+        for fitted in psds.fits(slots, samples):
+            self.misfits += fitted.misfit
+            yield fitted
 
     def mean_variances(self, present: int) -> tuple[float, ...]:
         """Return the variances (C,), m^2, of the mean of so many samples of each reading."""

@@ -23,13 +23,14 @@ that motion is sought where the link moves the dots.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import pi
 from typing import NamedTuple
 
 import numpy as np
 
 from psd_deflection.base.arithmetic import FIXED, Arithmetic
+from psd_deflection.base.arithmetic.matrices import AT_ONCE
 from psd_deflection.measure.uncertainty.combinations import combinations_of
 from psd_deflection.measure.uncertainty.vibration import Tone
 from psd_deflection.records import FloatArray, IntArray
@@ -110,46 +111,64 @@ class _Vibration(NamedTuple):
 class _Terms(NamedTuple):
     """What the samples that are present say of the coefficients, for K orders of which ``told`` can be told.
 
-    ``q`` (n, K). ``u`` (C, n, K): precision times q. ``information`` (C, K, K): of the coefficients. ``v`` (C, told):
-    variances of the first ones. ``all`` (C, n, K + told + n): u, u times the covariance of the first ones, precision.
-    ``used``: orders above 0 that the middle needs. Once order 0, of which nothing is known beforehand, is taken out:
-    ``rest`` (C, k, k) and ``right`` (C, k) are the equations of those; ``first`` (C,) and ``share`` (C, k) give its
-    weight from theirs.
+    ``q`` (n, K). ``u`` (C, n, K): precision times q. ``information`` (C, K, K): of the coefficients. ``v`` (told, C):
+    variances of the first ones; ``sure`` (told, C): how much a block says of them, 1 of a whole one.
+    ``all`` (n, K + told + n, C): u, u times the covariance of the first ones, precision. ``used``: orders above 0 that
+    the middle needs. Once order 0, of which nothing is known beforehand, is taken out: ``rest`` (k, k, C) and
+    ``right`` (k, C) are the equations of those; ``first`` (C,) and ``share`` (k, C) give its weight from theirs.
     """
 
     q: FloatArray
     u: FloatArray
     information: FloatArray
     v: FloatArray
+    sure: FloatArray
     all: FloatArray
     used: slice
-    rest: list[list[list[float]]]
-    right: list[list[float]]
-    first: list[float]
-    share: list[list[float]]
+    rest: FloatArray
+    right: FloatArray
+    first: FloatArray
+    share: FloatArray
 
 
-def _terms(q: FloatArray, precision: FloatArray, middle: FloatArray, whole: bool, by: Arithmetic) -> _Terms:
+def _terms(
+    q: FloatArray, precision: FloatArray, middle: FloatArray, usual_v: FloatArray | None, by: Arithmetic
+) -> _Terms:
+    """``usual_v`` (K, C): ``v`` of a whole block, None for one."""
     samples, orders = q.shape
     told = min(orders, (samples + 1) // 2)
     u = by.einsum('ast,tk->ask', precision, q)
     information = by.einsum('sj,ask->ajk', q, u)
     inverted = inverse(information[:, :told, :told])
-    v = np.diagonal(inverted, axis1=1, axis2=2).copy()
+    v = np.diagonal(inverted, axis1=1, axis2=2).T.copy()
+    # A block with gaps says less the more noise its coefficients have.
+    sure = np.ones(v.shape) if usual_v is None else np.minimum(usual_v[:told] / v, 1.0) ** 2
     estimate = by.einsum('ask,akj->asj', u[:, :, :told], inverted)
     # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
-    used = slice(2, told, 2) if whole else slice(1, told)
-    own, mixed = information[:, 0, 0], information[:, 0, used]
-    share = mixed / own[:, None]
-    rest = (information[:, used, used] - share[:, :, None] * mixed[:, None, :]).tolist()
-    right = (middle[used] - share * middle[0]).tolist()
-    # In memory sample by sample: that is how they are summed.
-    every = np.concatenate((u, estimate, precision), axis=2).transpose(1, 0, 2).copy().transpose(1, 0, 2)
-    return _Terms(q, u, information, v, every, used, rest, right, (middle[0] / own).tolist(), share.tolist())
+    used = slice(2, told, 2) if usual_v is None else slice(1, told)
+    own, mixed = information[:, 0, 0], information[:, 0, used].T
+    share = mixed / own
+    rest = information[:, used, used].transpose(1, 2, 0) - share[:, None] * mixed
+    right = middle[used, None] - share * middle[0]
+    every = np.concatenate((u, estimate, precision), axis=2).transpose(1, 2, 0).copy()
+    return _Terms(q, u, information, v, sure, every, used, rest, right, middle[0] / own, share)
+
+
+class _Memory(NamedTuple):
+    """What is known of motion after a block. ``recent`` (2, K, C): running mean of c_k^2 less its noise, m^2, and its
+    weight; ``lasting`` (2, K, C): mean of what goes on alike, m^2, and over how many blocks.
+    """
+
+    recent: FloatArray
+    lasting: FloatArray
 
 
 class BlockFit:
-    """Fits block after block; see the module's text. It remembers how much motion there was."""
+    """Fits blocks in turn; see the module's text. Its state is how much motion there was.
+
+    Blocks with the same places are computed together, as far as the noise stays the same; the bits of a block do not
+    depend on that.
+    """
 
     def __init__(
         self,
@@ -170,12 +189,9 @@ class BlockFit:
         self._middle = _at_middle(self._q, by)
         self._count = 2 * len(centers)
         self._diagonal = np.arange(self._count)
-        self._squares = np.zeros((self._count, self._orders))
+        nothing = np.zeros((self._orders, self._count))
         # Until motion is seen there was none.
-        self._weight = np.ones((self._count, self._orders))
-        self._gaps = False
-        self._long = np.zeros((self._count, self._orders))
-        self._blocks = np.full((self._count, self._orders), 1.0 / _FORGET)
+        self._memory = _Memory(np.stack((nothing, nothing + 1.0)), np.stack((nothing, nothing + 1.0 / _FORGET)))
         self.set_geometry(centers, beams, slopes)
 
     def set_geometry(self, centers: FloatArray, beams: FloatArray, slopes: FloatArray | None = None) -> None:
@@ -191,12 +207,9 @@ class BlockFit:
         self._between = np.lib.stride_tricks.sliding_window_view(both, self._size, axis=2)[:, :, :, ::-1]
         own = turned[self._diagonal, self._diagonal]
         self._precision = _precision(own, white=self._size > LARGEST)
-        self._whole = _terms(self._q, self._precision, self._middle, True, by)
-        self._bias, self._least = _BIAS * self._whole.v, 1e-9 * self._whole.v
-        self._long_bias = _LASTING_BIAS * self._whole.v
-        self._before: FloatArray | None = None
+        self._whole = _terms(self._q, self._precision, self._middle, None, by)
         u = self._whole.u
-        self._of_whole = by.einsum('ask,absj->akbj', u, by.einsum('abts,btj->absj', self._between, u))
+        self._of_whole = by.einsum('ask,absj->kjab', u, by.einsum('abts,btj->absj', self._between, u))
         self._vibrations = [self._vibration(tone) for tone in tones]
 
     def _vibration(self, tone: Tone) -> _Vibration:
@@ -207,151 +220,173 @@ class BlockFit:
         return _Vibration(covariance, waves, by.einsum('ask,s->ak', self._whole.u, waves[0]))
 
     def _left_of(self, vibration: _Vibration, x: FloatArray, weights: FloatArray | None) -> FloatArray:
-        """Covariance (C, C), m^2, of what the answer leaves of a tone; ``weights`` (C, N) of a block with gaps."""
+        """Covariance (B, C, C), m^2, of what the answers leave of a tone; ``weights`` (B, C, N) of blocks with gaps."""
         by = self._by
         if weights is None:
-            left = 1.0 - by.einsum('ak,ak->a', x, vibration.whole)
-            return vibration.covariance * (left[:, None] * left)
-        kept = by.einsum('as,ws->wa', weights, vibration.waves)
-        left = 1.0 - kept[0]
-        return np.asarray(vibration.covariance * (left[:, None] * left + kept[1][:, None] * kept[1]))
+            left = 1.0 - by.einsum('kza,ak->za', x, vibration.whole)
+            return np.asarray(vibration.covariance * (left[:, :, None] * left[:, None, :]))
+        kept = by.einsum('zas,ws->wza', weights, vibration.waves)
+        left, sine = 1.0 - kept[0], kept[1]
+        both = left[:, :, None] * left[:, None, :] + sine[:, :, None] * sine[:, None, :]
+        return np.asarray(vibration.covariance * both)
 
     def fit(self, slots: IntArray, dots: FloatArray) -> Fitted:
-        """The dots at the middle of the block. ``slots`` (n,): which samples are present. ``dots`` (n, C), m."""
-        by = self._by
-        z = self._combinations.of(dots)
-        # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
-        offset = by.sum(z, 1) / len(slots)
-        z -= offset[:, None]
+        """The dots at the middle of one block. ``slots`` (n,): which samples are present. ``dots`` (n, C), m."""
+        return next(self.fits(slots, dots[None]))
+
+    def fits(self, slots: IntArray, dots: FloatArray) -> Iterator[Fitted]:
+        """The dots at the middle of each of B blocks. ``slots`` (n,): which samples they have. ``dots`` (B, n, C), m.
+
+        The state is that after the block that was taken last. Noise that is set in between counts from the next one.
+        """
         whole = len(slots) == self._size
-        terms = self._whole if whole else _terms(self._q[slots], self._without(slots), self._middle, False, by)
-        orders, told = self._orders, terms.v.shape[1]
-        seen = by.einsum('asj,as->aj', terms.all, z)
-        more = None
-        if orders > 1:
-            c = seen[:, orders : orders + told]
-            motion = self._motion(c, terms.v)
-            x, more = _weights(terms, motion, self._middle, by)
-            left = len(slots) - told
-            # In units of the noise: a chi-square of n - K degrees of freedom.
-            squares = by.sum(z * seen[:, orders + told :], 1) - by.sum(seen[:, :told] * c, 1)
-        else:
-            x = np.array(terms.first)[:, None]
-        value = by.sum(x * seen[:, :orders], 1) + offset
+        # Sums over more numbers than that take another order.
+        most = max(AT_ONCE // dots[0].size, 1) if whole else 1
+        at = 0
+        while at < len(dots):
+            terms = self._whole
+            for memory, fitted in self._together(slots, dots[at : at + most]):
+                self._memory = memory
+                at += 1
+                yield fitted
+                if self._whole is not terms:
+                    break
+
+    def _together(self, slots: IntArray, dots: FloatArray) -> Iterator[tuple[_Memory, Fitted]]:
+        """The memory after each block and its fit, as far as the present noise holds."""
+        by, count = self._by, self._count
+        blocks, samples, _ = dots.shape
+        # Samples first, then orders, blocks and combinations: sums are over what is first.
+        z = self._combinations.of(dots.swapaxes(0, 1).reshape(-1, count)).T.reshape(samples, blocks, count)
+        # Of numbers about their mean: motion of millimetres leaves no rounding in what is left of it.
+        offset = by.sum(z, 0) / samples
+        z = z - offset
+        whole = samples == self._size
+        terms = self._whole if whole else self._terms_without(slots)
+        orders, told = self._orders, len(terms.v)
+        seen = by.einsum('sja,sza->jza', terms.all, z)
+        c = seen[orders : orders + told]
+        memories, motion = self._motion(c, terms)
+        x, missed = _weights(terms, motion, self._middle, by)
+        value = by.sum(x * seen[:orders], 0) + offset
         weights: FloatArray | None = None
         if whole:
-            covariance = by.einsum('ak,akbj,bj->ab', x, self._of_whole, x)
+            covariance = by.einsum('kza,kjab,jzb->zab', x, self._of_whole, x)
         else:
-            weights = np.zeros((self._count, self._size))
-            weights[:, slots] = by.einsum('ask,ak->as', terms.u, x)
+            weights = np.zeros((blocks, count, self._size))
+            weights[:, :, slots] = by.einsum('ask,kza->zas', terms.u, x)
             covariance = self._spread(weights)
-        misfit = False
-        if more is not None:
-            limit = left + _MISFIT * by.root(2.0 * left)
-            misfit = left > 0 and max(squares.tolist()) > limit
-            if misfit:
-                rest = z - by.einsum('sk,ak->as', terms.q[:, :told], c)
-                more += np.where(squares > limit, _WIDEN * _WIDEN * by.sum(rest * rest, 1) / left, 0.0)
-            covariance.flat[:: self._count + 1] += more
+        misfit = [False] * blocks
+        if orders > 1:
+            left = samples - told
+            # In units of the noise: a chi-square of n - K degrees of freedom.
+            squares = by.sum(z * seen[orders + told :], 0) - by.sum(seen[:told] * c, 0)
+            over = squares > (left + _MISFIT * by.root(2.0 * left) if left else np.inf)
+            if np.count_nonzero(over):
+                misfit = [any(row) for row in over.tolist()]
+                rest = z - by.einsum('sk,kza->sza', terms.q[:, :told], c)
+                missed += np.where(over, _WIDEN * _WIDEN * by.sum(rest * rest, 0) / left, 0.0)
+            covariance[:, self._diagonal, self._diagonal] += missed
         for vibration in self._vibrations:
             covariance += self._left_of(vibration, x, weights)
-        return Fitted(*self._combinations.back(value.tolist(), covariance), misfit)
+        rows, covariance = self._combinations.back(value, covariance)
+        return zip(memories, map(Fitted, map(tuple, rows.tolist()), covariance, misfit), strict=True)
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
-        own = (self._squares, self._weight, self._long, self._blocks)
-        return tuple(v for one in own for v in one.ravel().tolist())
+        return tuple(np.concatenate(self._memory).swapaxes(1, 2).ravel().tolist())
 
     def set_state(self, values: tuple[float, ...]) -> None:
         """Go on from :meth:`state` of another one. Raises ValueError where it is not of this block size."""
-        wanted = 4 * self._squares.size
+        wanted = 4 * self._count * self._orders
         if len(values) != wanted:
             raise ValueError(f'a fit of {self._size} samples a block has {wanted} values, not {len(values)}')
-        parts = np.array(values).reshape(-1, self._count, self._orders)
-        self._squares, self._weight, self._long, self._blocks = (part.copy() for part in parts)
-        self._gaps, self._before = True, None
+        self._memory = _Memory(*np.array(values).reshape(2, 2, self._count, self._orders).swapaxes(2, 3))
 
-    def _without(self, slots: IntArray) -> FloatArray:
-        """The precision (C, n, n) of the samples that are present: a block of a matrix's inverse, inverted."""
+    def _terms_without(self, slots: IntArray) -> _Terms:
+        """Of the samples that are present: their precision is a block of a matrix's inverse, inverted."""
         lost = np.ones(self._size, dtype=bool)
         lost[slots] = False
         gone = np.flatnonzero(lost)
         p = self._precision
         cross = p[:, slots[:, None], gone]
         inner = inverse(p[:, gone[:, None], gone])
-        return np.asarray(
-            p[:, slots[:, None], slots]
-            - self._by.einsum('asg,atg->ast', self._by.einsum('asg,agh->ash', cross, inner), cross)
-        )
+        by = self._by
+        own = p[:, slots[:, None], slots] - by.einsum('asg,atg->ast', by.einsum('asg,agh->ash', cross, inner), cross)
+        return _terms(self._q[slots], own, self._middle, self._whole.v, by)
 
-    def _motion(self, c: FloatArray, v: FloatArray) -> FloatArray:
-        """tau^2 (C, K) after this block; order 0, of which nothing is known beforehand, is not meant.
+    def _motion(self, c: FloatArray, terms: _Terms) -> tuple[Sequence[_Memory], FloatArray]:
+        """The memory after each block, and tau^2 (K, B, C) by it; of order 0 nothing is known beforehand.
 
-        ``c``, ``v`` (C, told): coefficients and their variances of the orders that this block tells of.
+        ``c`` (told, B, C): coefficients of the orders that the blocks tell of.
         """
-        told = v.shape[1]
+        c = c.swapaxes(0, 1)
+        if self._orders == 1:
+            return [self._memory] * len(c), c.swapaxes(0, 1)
+        told, usual_v = c.shape[1], self._whole.v
         square = c * c
-        excess = square - v
-        before = self._before if self._before is not None else self._usual(self._late())
-        squares, weight = self._squares[:, :told], self._weight[:, :told]
-        sure: FloatArray | None = None
-        if v is self._whole.v:
-            squares += _FORGET * (excess - squares)
-            if self._gaps:
-                weight += _FORGET * (1.0 - weight)
-        else:
-            # A block with gaps says less the more noise its coefficients have.
-            sure = np.minimum(self._whole.v[:, :told] / v, 1.0) ** 2
-            squares += _FORGET * (sure * excess - squares)
-            weight += _FORGET * (sure - weight)
-            self._gaps = True
-        late = self._late()
-        self._remember(excess, sure, late[:, :told])
-        self._before = self._usual(late)
-        tau = self._before.copy()
-        sudden = square > _SUDDEN * (v + before[:, :told])
-        if np.count_nonzero(sudden):
-            usual = tau[:, :told]
-            np.maximum(excess, usual, out=usual, where=sudden)
+        excess = square - terms.v
+        recent = _recent_after(self._memory.recent, excess, terms.sure)
+        late = recent[:, 0] / np.maximum(recent[:, 1], 1e-12)
+        # Of the noise and the motion of late.
+        expected = usual_v[:told] + np.maximum(late[1:, :told], 0.0)
+        lasting = _lasting_after(self._memory.lasting, excess, terms.sure, late[1:, :told], expected)
+        usual = np.maximum(late - _BIAS * usual_v, 1e-9 * usual_v)
+        np.maximum(usual, lasting[:, 0] - _LASTING_BIAS * usual_v, out=usual)
+        before, tau = usual[:-1], usual[1:].copy()
+        sudden = square > _SUDDEN * (terms.v + before[:, :told])
+        np.maximum(excess, tau[:, :told], out=tau[:, :told], where=sudden)
         # What does not move with the link has no motion that this block alone tells of: that would be noise, chosen
         # for being large.
-        still = slice(self._combinations.still, None)
-        tau[still] = before[still]
-        return tau
-
-    def _late(self) -> FloatArray:
-        """Mean of c_k^2 less its noise (C, K), of the blocks of late."""
-        if not self._gaps:
-            # All weights are 1.
-            return self._squares
-        return np.asarray(self._squares / np.maximum(self._weight, 1e-12))
-
-    def _remember(self, excess: FloatArray, sure: FloatArray | None, late: FloatArray) -> None:
-        """Take a block into the mean of what goes on alike; where that is over, begin with what is of ``late``."""
-        told = late.shape[1]
-        long, blocks, v = self._long[:, :told], self._blocks[:, :told], self._whole.v[:, :told]
-        blocks += 1.0 if sure is None else sure
-        np.minimum(blocks, _LASTING, out=blocks)
-        step = excess - long
-        step /= blocks
-        if sure is not None:
-            step *= sure
-        long += step
-        # Of the noise and the motion of late: three standard deviations of the short mean; less where both began alike.
-        over = long - late > (_OVER + blocks * ((1.0 - _OVER) / _LASTING)) * (v + np.maximum(late, 0.0))
-        if np.count_nonzero(over):
-            long[over] = late[over]
-            blocks[over] = 1.0 / _FORGET
-
-    def _usual(self, late: FloatArray) -> FloatArray:
-        """tau^2 (C, K) by the blocks so far; ``late``: by those of late."""
-        usual = np.maximum(late - self._bias, self._least)
-        return np.asarray(np.maximum(usual, self._long - self._long_bias))
+        still = self._combinations.still
+        tau[:, :, still:] = before[:, :, still:]
+        return list(map(_Memory, recent[1:], lasting[1:])), tau.swapaxes(0, 1)
 
     def _spread(self, weights: FloatArray) -> FloatArray:
-        """Covariance (C, C) of the weighted sums; ``weights`` (C, N)."""
+        """Covariance (B, C, C) of the weighted sums; ``weights`` (B, C, N)."""
         by = self._by
-        return by.einsum('as,abs->ab', weights, by.einsum('abts,bt->abs', self._between, weights))
+        return by.einsum('zas,zabs->zab', weights, by.einsum('abts,zbt->zabs', self._between, weights))
+
+
+def _recent_after(recent: FloatArray, excess: FloatArray, sure: FloatArray) -> FloatArray:
+    """:attr:`_Memory.recent` (B + 1, 2, K, C) before the first block and after each.
+
+    ``excess`` (B, told, C): c_k^2 less its noise; ``sure`` (told, C): how much a block says of it.
+    """
+    told = len(sure)
+    out = np.empty((len(excess) + 1, *recent.shape))
+    out[0] = recent
+    news = np.empty((len(excess), 2, *sure.shape))
+    news[:, 0], news[:, 1] = sure * excess, sure
+    for before, after, new in zip(out, out[1:], news, strict=False):
+        after[:] = before
+        own = after[:, :told]
+        own += _FORGET * (new - own)
+    return out
+
+
+def _lasting_after(
+    lasting: FloatArray, excess: FloatArray, sure: FloatArray, late: FloatArray, expected: FloatArray
+) -> FloatArray:
+    """:attr:`_Memory.lasting` (B + 1, 2, K, C) before the first block and after each; what is over begins anew.
+
+    ``late`` (B, told, C): the mean of late; ``expected`` (B, told, C): with the noise.
+    """
+    told = len(sure)
+    out = np.empty((len(excess) + 1, *lasting.shape))
+    out[0] = lasting
+    for before, after, new, short, limit in zip(out, out[1:], excess, late, expected, strict=False):
+        after[:] = before
+        mean, blocks = after[:, :told]
+        blocks += sure
+        np.minimum(blocks, _LASTING, out=blocks)
+        mean += (new - mean) / blocks * sure
+        # Three standard deviations of the short mean; less where both began alike.
+        over = mean - short > (_OVER + blocks * ((1.0 - _OVER) / _LASTING)) * limit
+        if np.count_nonzero(over):
+            mean[over] = short[over]
+            blocks[over] = 1.0 / _FORGET
+    return out
 
 
 def inverse(matrices: FloatArray) -> FloatArray:
@@ -373,54 +408,49 @@ def inverse(matrices: FloatArray) -> FloatArray:
 
 
 def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, by: Arithmetic) -> tuple[FloatArray, FloatArray]:
-    """Weights (C, K) of the sums h in the middle, and the variance (C,), m^2, of the motion that they leave out.
+    """Weights (K, B, C) of the sums h in the middle, and the variance (B, C), m^2, of the motion that they leave out.
 
-    A few numbers: floats, of which numpy's calls would cost a multiple.
+    ``motion``: tau^2 (K, B, C).
     """
-    used, orders = terms.used, motion.shape[1]
-    priors = (1.0 / motion[:, used]).tolist()
-    rows = []
-    more = []
-    for rest, right, first, share, prior in zip(terms.rest, terms.right, terms.first, terms.share, priors, strict=True):
-        found = _solved(rest, prior, right)
-        # What the weights miss of an order is its weight times its prior's precision.
-        missed = 0.0
-        for w, p, s in zip(found, prior, share, strict=True):
-            missed += w * w * p
-            first -= s * w
-        row = [0.0] * orders
-        row[used] = found
-        row[0] = first
-        rows.append(row)
-        more.append(missed)
-    x, left_out = np.array(rows), np.array(more)
-    told = terms.v.shape[1]
-    if told < orders:
+    told, used = len(terms.v), terms.used
+    priors = 1.0 / motion[used]
+    found = _solved(terms.rest, priors, terms.right)
+    x, missed = np.zeros(motion.shape), np.zeros(motion.shape[1:])
+    first: FloatArray = terms.first
+    # What the weights miss of an order is its weight times its prior's precision.
+    for w, prior, share in zip(found, priors, terms.share, strict=True):
+        missed += w * w * prior
+        first = first - share * w
+    x[0] = first
+    if found:
+        x[used] = found
+    if told < len(motion):
         # So few samples cannot tell of these.
-        untold = middle[told:] - by.einsum('akj,aj->ak', terms.information[:, told:], x)
-        left_out += by.sum(untold * untold * motion[:, told:], 1)
-    return x, left_out
+        untold = middle[told:, None, None] - by.einsum('akj,jza->kza', terms.information[:, told:], x)
+        missed += by.sum(untold * untold * motion[told:], 0)
+    return x, missed
 
 
-def _solved(matrix: list[list[float]], added: list[float], right: list[float]) -> list[float]:
-    """x (k,) of ``matrix`` (k, k), positive definite once ``added`` is on its diagonal, times x = ``right`` (k,)."""
-    size = len(right)
-    x = right.copy()
-    pivots: list[list[float]] = []
-    for i, row in enumerate(matrix):
-        row = row.copy()
-        row[i] += added[i]
-        for j, pivot in enumerate(pivots):
+def _solved(matrix: FloatArray, added: FloatArray, right: FloatArray) -> list[FloatArray]:
+    """The k unknowns (B, C) of ``matrix`` (k, k, C), positive definite once ``added`` (k, B, C) is on its diagonal,
+    times them = ``right`` (k, C).
+    """
+    rows: list[list[FloatArray]] = []
+    x: list[FloatArray] = []
+    for i, (line, more, own) in enumerate(zip(matrix, added, right, strict=True)):
+        row = list(line)
+        row[i] = row[i] + more
+        for j, pivot in enumerate(rows):
             factor = row[j] / pivot[j]
-            for m in range(j + 1, size):
-                row[m] -= factor * pivot[m]
-            x[i] -= factor * x[j]
-        pivots.append(row)
-    for i in range(size - 1, -1, -1):
-        row = pivots[i]
-        for m in range(i + 1, size):
-            x[i] -= row[m] * x[m]
-        x[i] /= row[i]
+            for m in range(j + 1, len(row)):
+                row[m] = row[m] - factor * pivot[m]
+            own = own - factor * x[j]
+        rows.append(row)
+        x.append(own)
+    for i in range(len(x) - 1, -1, -1):
+        for m in range(i + 1, len(x)):
+            x[i] = x[i] - rows[i][m] * x[m]
+        x[i] = x[i] / rows[i][i]
     return x
 
 

@@ -41,8 +41,8 @@ class Combinations(abc.ABC):
         """The combinations (C, n) of ``dots`` (n, C), m."""
 
     @abc.abstractmethod
-    def back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
-        """Dots (C,) m and their covariance (C, C) m^2 from those of the combinations."""
+    def back(self, value: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Dots (B, C) m and their covariance (B, C, C) m^2 from those of the combinations, of B blocks."""
 
     @abc.abstractmethod
     def fixed(self, dots: FloatArray) -> FloatArray:
@@ -57,7 +57,6 @@ class _BaseLine(Combinations):
     def __init__(self, centers: FloatArray, beams: FloatArray, by: Arithmetic) -> None:
         self._by = by
         self.turn = combinations(beams, by)
-        self._columns = [tuple(column) for column in self.turn.T.tolist()]
         apart = self._apart = centers[0] - centers[1]
         self._across, self._along = (float(by.einsum('i,i->', row[:2], apart)) for row in (self.turn[2], self.turn[3]))
         self._beams_apart = float(by.hypot_many(*(beams[0] - beams[1])))
@@ -70,18 +69,21 @@ class _BaseLine(Combinations):
         z[3] = self._by.hypot_many(z[3] + self._along, z[2] + self._across) - self._base_line
         return np.asarray(z)
 
-    def back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
+    def back(self, value: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See :class:`Combinations`."""
         # From the length to the part along the base line at rest.
-        x, y, twist, length = value[0], value[1], value[2], value[3] + self._base_line
+        x, y, twist, length = value.T[:, :, None]
+        length = length + self._base_line
         across = twist + self._across
-        along = self._by.root(max(length * length - across * across, 1e-4 * length * length))
-        back = self.turn.copy()
-        back[2] -= (across / along) * back[3]
-        back[3] *= length / along
+        along = np.sqrt(np.maximum(length * length - across * across, 1e-4 * length * length))
+        to_x, to_y, to_twist, to_length = self.turn
         longer = along - self._along
-        dots = tuple([x * p + y * q + twist * r + longer * s for p, q, r, s in self._columns])
-        return dots, self._by.einsum('ac,ab,bd->cd', back, covariance, back)
+        dots = x * to_x + y * to_y + twist * to_twist + longer * to_length
+        back = np.empty(covariance.shape)
+        back[:] = self.turn
+        back[:, 2] -= (across / along) * to_length
+        back[:, 3] *= length / along
+        return dots, self._by.einsum('zac,zab,zbd->zcd', back, covariance, back)
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""
@@ -104,10 +106,10 @@ class _Several(Combinations):
         """See :class:`Combinations`."""
         return self._by.einsum('ac,sc->as', self.turn, dots)
 
-    def back(self, value: list[float], covariance: FloatArray) -> tuple[tuple[float, ...], FloatArray]:
+    def back(self, value: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
         """See :class:`Combinations`."""
-        dots = self._by.einsum('ac,a->c', self.turn, np.array(value))
-        return tuple(dots.tolist()), self._by.einsum('ac,ab,bd->cd', self.turn, covariance, self.turn)
+        dots = self._by.einsum('ac,za->zc', self.turn, value)
+        return dots, self._by.einsum('ac,zab,bd->zcd', self.turn, covariance, self.turn)
 
     def fixed(self, dots: FloatArray) -> FloatArray:
         """See :class:`Combinations`."""

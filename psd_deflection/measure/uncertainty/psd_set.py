@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -55,9 +55,9 @@ class PsdSet:
         own = np.ix_(self.columns, self.columns)
         self.fit.set_noise(noise.gamma[own], [Tone(t.frequency, t.covariance[own]) for t in noise.tones])
 
-    def fitted(self, slots: IntArray, samples: FloatArray) -> Fitted:
-        """Fit a block: its places ``slots`` (n,) and the ``samples`` (n, 2P) m of all PSDs."""
-        return self.fit.fit(slots, samples if self.is_full else samples[:, self.columns])
+    def fits(self, slots: IntArray, samples: FloatArray) -> Iterator[Fitted]:
+        """Fit blocks in turn: their places ``slots`` (n,) and the ``samples`` (B, n, 2P) m of all PSDs."""
+        return self.fit.fits(slots, samples if self.is_full else samples[:, :, self.columns])
 
     def unexplained(
         self, dots: tuple[float, ...], residual: tuple[float, ...], covariance: FloatArray, pose: Sequence[float]

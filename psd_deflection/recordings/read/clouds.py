@@ -94,7 +94,8 @@ class Samples(NamedTuple):
 
 def joined_points(messages: Sequence[tuple[int, npt.NDArray[np.void]]]) -> Samples:
     """The samples of messages of one layout, given as (stamp, points)."""
-    points = np.concatenate([p for _, p in messages])
+    # Byte by byte: np.concatenate compares the fields of all of them first, which costs more than the copy.
+    points = np.frombuffer(b''.join([p.tobytes() for _, p in messages]), messages[0][1].dtype)
     stamps = np.repeat([stamp for stamp, _ in messages], [len(p) for _, p in messages])
     names = points.dtype.names or ()
     seq = points['seq'].astype(np.uint32).astype(np.int64)

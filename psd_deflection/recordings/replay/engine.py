@@ -139,7 +139,7 @@ def _steps(
             yield from beside.until(block)
         waiting.append(block)
         ended = block.t_ns[0] >= end_ns
-        if ended or len(waiting) == AT_ONCE:
+        if ended or block.index % AT_ONCE == AT_ONCE - 1 or len(waiting) == AT_ONCE:
             yield from _processed(pipeline, waiting)
         if ended:
             # The blocks of the part are complete, as they were in the run.

@@ -122,7 +122,7 @@ def test_new_zeros_are_those_of_a_rig_that_always_had_them(psds: int) -> None:
     moved.set_zeros(new)
     rng = np.random.default_rng(3)
     samples, residual = (new.zeros.ravel() + 1e-6 * rng.normal(size=(n, 2 * psds)) for n in (20, 1))
-    one, other = (of.fit(of.full, ALL, samples) for of in (moved, fresh))
+    one, other = (next(of.fits(of.full, ALL, samples[None])) for of in (moved, fresh))
     assert one[0] == other[0]
     np.testing.assert_array_equal(one[1], other[1])
     answers = [checked(of, np.array(one[0]), residual[0], one[1]) for of in (moved, fresh)]
@@ -145,7 +145,7 @@ def test_segments_change_the_noise_of_all_sets() -> None:
     assert [b for b, samples in enumerate(blocks) if of.learn(b, ALL, samples, VOLTS)] == [49, 99, 149]
     still = np.tile(rig.zeros.ravel(), (20, 1))
     for psds, count in ((of.full, 6), (subset, 4)):
-        dots, covariance = of.fit(psds, ALL, still)
+        dots, covariance, _ = next(of.fits(psds, ALL, still[None]))
         assert np.sqrt(np.diag(covariance)) == pytest.approx(3e-6 / 20.0**0.5, rel=0.2)
         assert len(dots) == count
     assert not BlockEstimator(rig_of(), False).learn(49, ALL, np.zeros((20, 4)), VOLTS[:, :6])

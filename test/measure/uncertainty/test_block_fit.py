@@ -62,7 +62,7 @@ def test_the_last_combination_is_the_length_of_the_base_line_wherever_the_beams_
         np.testing.assert_allclose(of.of(dots)[3], (length - np.linalg.norm(beams[0] - beams[1])) / 2**0.5, atol=1e-15)
         np.testing.assert_allclose(of.fixed(dots), of.of(dots)[3], atol=1e-15)
         for row, z in zip(dots, of.of(dots).T, strict=True):
-            np.testing.assert_allclose(of.back(z.tolist(), np.eye(4))[0], row, atol=1e-15)
+            np.testing.assert_allclose(of.back(z[None], np.eye(4)[None])[0][0], row, atol=1e-15)
 
 
 @pytest.mark.parametrize('slots', GAPS, ids=lambda s: f'{len(s)} samples')
@@ -180,7 +180,8 @@ class Dense:
                 misfit = True
                 more[a] += float(left @ left) / free
         covariance = np.einsum('as,abst,bt->ab', weights, self.spread, weights) + np.diag(more)
-        return *self.of.back(value.tolist(), covariance), misfit
+        dots, spread = self.of.back(value[None], covariance[None])
+        return tuple(dots[0].tolist()), spread[0], misfit
 
 
 @pytest.mark.parametrize('size', [5, 12, 20])

@@ -30,9 +30,9 @@ def test_the_first_ones_move_with_the_link_and_the_others_do_not(psds: int, unkn
     mixed = RNG.normal(size=(count, count))
     covariance = mixed @ mixed.T
     for row, z in zip(dots, of.of(dots).T, strict=True):
-        back, spread = of.back(z.tolist(), covariance)
-        np.testing.assert_allclose(back, row, atol=1e-17)
-        np.testing.assert_allclose(spread, of.turn.T @ covariance @ of.turn, rtol=1e-12)
+        back, spread = of.back(z[None], covariance[None])
+        np.testing.assert_allclose(back[0], row, atol=1e-17)
+        np.testing.assert_allclose(spread[0], of.turn.T @ covariance @ of.turn, rtol=1e-12)
     # What does not move is of what the model leaves, if it is asked.
     half = combinations_of(centers, centers, slopes, lambda d: np.asarray(0.5 * d))
     np.testing.assert_allclose(half.fixed(dots), 0.5 * of.fixed(dots), rtol=1e-12)
@@ -64,8 +64,8 @@ def test_slopes_that_all_but_agree_with_a_reading_leave_no_rounding() -> None:
 
 def base_line_back(value: list[float], covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
     of = combinations_of(CENTERS[:2], CENTERS[:2] + ZEROS[:2])
-    dots, spread = of.back(value, covariance)
-    return np.array(dots), spread
+    dots, spread = of.back(np.array([value]), covariance[None])
+    return dots[0], spread[0]
 
 
 def test_the_covariance_of_two_psds_goes_back_as_the_dots_do() -> None:
@@ -92,7 +92,7 @@ def test_a_base_line_shorter_than_its_twist_has_a_hundredth_left_along() -> None
     beams = CENTERS[:2] + ZEROS[:2]
     of = combinations_of(CENTERS[:2], beams)
     for twist in (0.2, 5.0):
-        dots = np.array(of.back([0.0, 0.0, twist, 0.0], np.eye(4))[0])
+        dots = of.back(np.array([[0.0, 0.0, twist, 0.0]]), np.eye(4)[None])[0][0]
         # The length is that of the beams, and what is along the base line at rest a hundredth of it.
         length = np.hypot(*(beams[0] - beams[1]))
         way = (beams[0] - beams[1]) / length
