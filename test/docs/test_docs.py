@@ -411,7 +411,7 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
     # What is left is numbers and words: a new kind of value is to be put here or among the paths. Options that may be
     # repeated have an action of their own and are not completed.
     assert {str(values[name]) for name in set(values) - as_path} == {
-        '/NAME', 'ADDRESS', 'COMMAND', 'LINK', 'LOADS', 'M', 'N', 'NAME', 'PPM', 'S', 'SECONDS', 'SEED', 'SOURCE',
+        '/NAME', 'ADDRESS', 'COMMAND', 'LOADS', 'M', 'N', 'NAME', 'PPM', 'S', 'SECONDS', 'SEED', 'SOURCE',
         'TEXT', 'T0[,T1...]', 'TZ', 'URL', 'VALUE', 'W', 'WEBHOOK', 'WHERE', 'X', 'X,Y', 'XY,THETA', "('W', 'W')",
         "('FX', 'FY', 'TZ')", "('DX', 'DY', 'THETA')", "('X_MIN', 'Y_MIN', 'X_MAX', 'Y_MAX')",
     }  # fmt: skip
