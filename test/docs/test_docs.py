@@ -232,8 +232,11 @@ def test_what_the_page_of_python_shows_is_there() -> None:
     assert [name for name in names if pydoc.locate(name) is None] == []
 
 
-def test_the_readme_is_short() -> None:
+def test_the_pages_are_short() -> None:
     assert len((ROOT / 'README.md').read_text().splitlines()) <= 100
+    words = {page: len(page.read_text().split()) for page in PAGES}
+    assert [page for page, count in words.items() if count > 2500] == []
+    assert sum(words.values()) <= 52_000
 
 
 def test_links_lead_somewhere() -> None:
