@@ -56,7 +56,7 @@ WIDE = SampleFrame(0, 1, 1000, (8388607, -1, 4194304, 256, -8388608, 4194304))
 
 
 def test_the_page_and_the_code_say_the_same_bytes() -> None:
-    on_the_page = [bytes.fromhex(h) for h in re.findall(r'\| `((?:[0-9a-f]{2} )+00)` \|', PAGE.read_text())]
+    on_the_page = [bytes.fromhex(h) for h in re.findall(r'\| `((?:[0-9a-f]{2})+00)` \|', PAGE.read_text())]
     sent = [encode(frame) for frame in EXAMPLES]
     sent.insert(-1, encode(WIDE, wide=True))
     assert on_the_page == sent
