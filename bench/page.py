@@ -33,17 +33,18 @@ def lines_of(row: Row) -> list[str]:
     ours = [f for f in row.figures if f.kind == 'ours']
     if len(ours) > 1:
         each = '; '.join(f'{f.name}: {f.median:.3g}' for f in ours)
-        return [f'| {row.work}, {row.unit} | {each} | | | |']
+        return [f'| {row.work}, {row.unit} | {each} | | |']
     work, first, lines = row.work, cell(ours[0], row.unit), []
     for f in row.figures[1:]:
         ratio = f'{row.ratio(f):.2f} ×'
         bound = '' if f.bound is None else f'{"≥" if f.kind == "peer" else "≤"} {f.bound:g}: '
         verdict = row.verdict(f).replace('not met', '**not met**')
-        lines.append(f'| {work} | {first} | {f.kind}: {f.name}, {cell(f)} | {ratio} | {bound}{verdict} |')
+        bound = f' ({bound}{verdict})' if bound else ''
+        lines.append(f'| {work} | {first} | {f.kind}: {f.name}, {cell(f)} | {ratio}{bound} |')
         work = first = ''
     if not lines:
         bound = '' if ours[0].bound is None else f'≥ {ours[0].bound:g}: {row.verdict(ours[0])}'
-        return [f'| {row.work} | {first} ({ours[0].name}) | | | {bound.replace("not met", "**not met**")} |']
+        return [f'| {row.work} | {first} ({ours[0].name}) | | {bound.replace("not met", "**not met**")} |']
     return lines
 
 
@@ -58,7 +59,9 @@ def measured(machine: Mapping[str, Any]) -> str:
 
 def shares(rows: Sequence[Row], machine: Mapping[str, Any]) -> str:
     """What :mod:`bench.cpu` measured: a row for each thread."""
-    lines = [measured(machine)]
+    lines = [
+        f'{machine["date"]}, commit {machine["commit"]}, {machine["processor"]}, load {machine["load"]} at the end.'
+    ]
     for row in rows:
         lines += ['', f'| {row.work} | {row.unit} |', '|---|---|']
         threads: dict[str, list[str]] = {}
@@ -78,7 +81,7 @@ def shares(rows: Sequence[Row], machine: Mapping[str, Any]) -> str:
 
 def page(rows: Sequence[Row], machine: Mapping[str, Any], cpu: Sequence[Row], cpu_machine: Mapping[str, Any]) -> str:
     """The text of the page: of ``rows``, and of those of :mod:`bench.cpu`."""
-    table = ['| work | psd_deflection | beside | ratio | wanted |', '|---|---|---|---|---|']
+    table = ['| work | psd_deflection | beside | ratio (wanted) |', '|---|---|---|---|']
     for row in rows:
         table += lines_of(row)
     text = TEMPLATE.read_text(encoding='utf-8')

@@ -21,9 +21,9 @@ def test_ratios_and_bounds_are_those_of_peers_and_limits() -> None:
     assert [row.met(f) for f in row.figures] == [True, True, False, False]
     assert not Row('rigs', 'rigs', [few := figure('8', 'ours', [8], 32)]).met(few)
     assert page.lines_of(row) == [
-        '| work | 2 [1.9–2.1] s | peer: theirs, 6 | 3.00 × | ≥ 3: met |',
-        '|  |  | limit: least, 1 | 2.00 × | ≤ 1.5: **not met** |',
-        '|  |  | peer: theirs, 6 | 3.00 × | ≥ 3.1: **not met** |',
+        '| work | 2 [1.9–2.1] s | peer: theirs, 6 | 3.00 × (≥ 3: met) |',
+        '|  |  | limit: least, 1 | 2.00 × (≤ 1.5: **not met**) |',
+        '|  |  | peer: theirs, 6 | 3.00 × (≥ 3.1: **not met**) |',
     ]
 
 
@@ -31,7 +31,7 @@ def test_a_row_in_which_outside_load_shows_is_not_judged() -> None:
     steady, torn = figure('mine', 'ours', [1.0, 1.1, 0.9]), figure('least', 'limit', [1.0, 1.0, 1.6], 0.5)
     said = 'not judged: quartiles 30 % apart, load from outside'
     assert Row('work', 's', [steady, torn]).verdict(torn) == said
-    assert page.lines_of(Row('work', 's', [steady, torn]))[0].endswith(f': {said} |')
+    assert page.lines_of(Row('work', 's', [steady, torn]))[0].endswith(f': {said}) |')
     once = figure('least', 'limit', [1.0], 0.5)
     assert Row('work', 's', [steady, once]).verdict(once) == 'not met'
     assert Row('work', 's', [figure('mine', 'ours', [1.0, 1.0, 1.6]), once]).verdict(once) == said
