@@ -26,6 +26,9 @@ OWN_EFFECTS = {path.stem for path in (ROOT / 'psd_deflection/model/simulation/ef
 """Not those of the person who writes the pages."""
 
 
+_CHANNEL = re.compile(r'_(?:x|y|sum)\d$')
+
+
 def topics() -> str:
     """A row for each topic, or for those of several PSDs or solvers, and one for each action."""
     heard = (rows[0] for rows in HEARD.values())
@@ -44,17 +47,17 @@ def exit_statuses() -> str:
 
 
 def parameters() -> str:
-    """A row for each section of the rig file, with the default of each parameter: those of the PSDs and beams once."""
+    """A row for each section of the rig file with its parameters: those of the PSDs and beams once."""
     rows = []
     for section in SECTIONS:
         if not re.match(r'(psd|beam)_[2-9]', section.prefix):
-            found = (_default(p, len(section.prefix)) for p in section.parameters.values())
-            rows.append(f'| {section.prefix.replace("_1", "_N") or "none"} | {"; ".join(found)} |')
-    return _table('prefix | parameters with defaults', rows)
+            found = (_named(p, len(section.prefix)) for p in section.parameters.values())
+            rows.append(f'| {section.prefix.replace("_1", "_N") or "none"} | {", ".join(found)} |')
+    return _table('prefix | parameters', rows)
 
 
-def _default(p: Parameter, start: int) -> str:
-    return f'`{p.name[start:]}{"*" if p.live else ""}` {p.default if p.default != "" else "–"} {p.unit}'.strip()
+def _named(p: Parameter, start: int) -> str:
+    return f'`{p.name[start:]}{"*" if p.live else ""}`'
 
 
 def effects() -> str:
@@ -64,8 +67,9 @@ def effects() -> str:
 
 
 def _effect(effect: Effect) -> str:
-    values = (f'`{p.name}`{f" ({p.unit})" if p.unit else ""}' for p in effect.parameters)
-    return f'| `{effect.name}` | {effect.summary} | {", ".join(values)} |'
+    # Those of the channels are one: amplitude_x1, amplitude_y1 … is `amplitude_…`.
+    values = (f'`{_CHANNEL.sub("_…", p.name)}`{f" ({p.unit})" if p.unit else ""}' for p in effect.parameters)
+    return f'| `{effect.name}` | {effect.summary} | {", ".join(dict.fromkeys(values))} |'
 
 
 def _table(head: str, rows: Iterable[str]) -> str:
