@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes the tables of docs/ that the program has already: topics, commands, parameters, exit statuses, effects.
 
-python -m tools.pages
+``python -m tools.pages`` prints the number of words of docs/, too.
 """
 
 from __future__ import annotations
@@ -101,6 +101,17 @@ TABLES = {
 }
 PAGES = tuple(ROOT / 'docs' / name for name in ('topics.md', 'commands.md', 'effects.md'))
 
+MOST_WORDS = 45_000
+
+
+def words() -> int:
+    """Return how many words all pages have: what has a letter or a digit. Rules of tables and operators are none."""
+    return sum(
+        re.search(r'\w', word) is not None
+        for page in (ROOT / 'docs').rglob('*.md')
+        for word in page.read_text(encoding='utf-8').split()
+    )
+
 
 def written(page: str) -> str:
     """Return the text of ``page`` with the current tables."""
@@ -116,6 +127,7 @@ def main(pages: Iterable[Path] = PAGES) -> None:
     """Write the tables of ``pages`` into them."""
     for page in pages:
         page.write_text(written(page.read_text(encoding='utf-8')), encoding='utf-8')
+    print(f'{words()} words in docs/, of at most {MOST_WORDS}')
 
 
 if __name__ == '__main__':

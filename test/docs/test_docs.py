@@ -365,6 +365,10 @@ def test_tables_of_a_page_are_current(page: Path) -> None:
     assert pages.written(text) == text, 'python -m tools.pages'
 
 
+def test_the_pages_have_few_words() -> None:
+    assert 20_000 < pages.words() <= pages.MOST_WORDS
+
+
 def test_every_table_of_the_program_is_on_a_page() -> None:
     text = ''.join(page.read_text() for page in pages.PAGES)
     assert [name for name in pages.TABLES if f'<!-- {name}: ' not in text] == []
