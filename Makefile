@@ -84,7 +84,7 @@ lint: $(READY)
 	$(BIN)/ruff format --check .
 
 types: $(READY)
-	MYPY_NUM_WORKERS=2 $(BIN)/mypy
+	$(BIN)/mypy
 
 contracts: $(READY)
 	$(BIN)/lint-imports --no-cache

@@ -62,6 +62,10 @@ _SUDDEN = 16.0
 _MISFIT = 5.0
 """Standard deviations of the sum of squares that is left, above which the polynomial does not fit."""
 
+_CONTRADICTED = 3.0
+"""Standard deviations of the chi-square of all coefficients of a block with gaps above which they contradict what the
+blocks before let expect."""
+
 LARGEST = 64
 """Samples a block up to which the colour of the noise makes the weights; of larger ones it makes the variance alone."""
 
@@ -116,6 +120,7 @@ class _Terms(NamedTuple):
     ``all`` (n, K + told + n, C): u, u times the covariance of the first ones, precision. ``used``: orders above 0 that
     the middle needs. Once order 0, of which nothing is known beforehand, is taken out: ``rest`` (k, k, C) and
     ``right`` (k, C) are the equations of those; ``first`` (C,) and ``share`` (k, C) give its weight from theirs.
+    ``together`` (C, told - 1, told - 1): covariances of the first ones but order 0.
     """
 
     q: FloatArray
@@ -129,6 +134,7 @@ class _Terms(NamedTuple):
     right: FloatArray
     first: FloatArray
     share: FloatArray
+    together: FloatArray
 
 
 def _terms(
@@ -151,7 +157,7 @@ def _terms(
     rest = information[:, used, used].transpose(1, 2, 0) - share[:, None] * mixed
     right = middle[used, None] - share * middle[0]
     every = np.concatenate((u, estimate, precision), axis=2).transpose(1, 2, 0).copy()
-    return _Terms(q, u, information, v, sure, every, used, rest, right, middle[0] / own, share)
+    return _Terms(q, u, information, v, sure, every, used, rest, right, middle[0] / own, share, inverted[:, 1:, 1:])
 
 
 class _Memory(NamedTuple):
@@ -336,11 +342,26 @@ class BlockFit:
         before, tau = usual[:-1], usual[1:].copy()
         sudden = square > _SUDDEN * (terms.v + before[:, :told])
         np.maximum(excess, tau[:, :told], out=tau[:, :told], where=sudden)
+        if terms is not self._whole and told > 1:
+            self._believe(c, terms, tau)
         # What does not move with the link has no motion that this block alone tells of: that would be noise, chosen
         # for being large.
         still = self._combinations.still
         tau[:, :, still:] = before[:, :, still:]
         return list(map(_Memory, recent[1:], lasting[1:])), tau.swapaxes(0, 1)
+
+    def _believe(self, c: FloatArray, terms: _Terms, tau: FloatArray) -> None:
+        """Give ``tau`` (B, K, C) what a block alone says where its coefficients ``c`` contradict it together.
+
+        Those of a block with gaps depend on each other: each may be within its noise, and all of them not.
+        """
+        blocks, told, count = c.shape
+        own, usual = c[:, 1:], tau[:, 1:told]
+        expected = terms.together + usual.swapaxes(1, 2)[..., None] * np.eye(told - 1)
+        inverted = inverse(expected.reshape(-1, told - 1, told - 1)).reshape(blocks, count, told - 1, told - 1)
+        squares = self._by.einsum('zja,zajk,zka->za', own, inverted, own)
+        over = squares > told - 1 + _CONTRADICTED * self._by.root(2.0 * (told - 1))
+        np.maximum(usual, own * own + terms.v[1:], out=usual, where=over[:, None])
 
     def _spread(self, weights: FloatArray) -> FloatArray:
         """Covariance (B, C, C) of the weighted sums; ``weights`` (B, C, N)."""
