@@ -197,7 +197,7 @@ def compensated(arm: Arm, programs: list[Program]) -> None:
         '--activate',
         'forward_position_controller',
     )
-    words = ['urdf:=' + str(URDF), 'tip:=tool', 'axes:=x,z', 'drive:=true', 'output:=commands']
+    words = ['urdf:=' + str(URDF), 'tip:=tool', 'axes:=[x, z]', 'drive:=true', 'output:=commands']
     remap = 'commands:=/forward_position_controller/commands'
     launch = ['ros2', 'launch', 'psd_deflection', 'compensator.launch.py']
     programs.append(started(*launch, *words, remap, until='once it is enabled'))

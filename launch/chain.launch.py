@@ -29,7 +29,7 @@ def generate_launch_description() -> LaunchDescription:
         name='chain',
         namespace=LaunchConfiguration('namespace'),
         output='screen',
-        parameters=[{'chain': LaunchConfiguration('chain')}],
+        parameters=[{'chain': ParameterValue(LaunchConfiguration('chain'), value_type=str)}],
     )
     return LaunchDescription(
         [

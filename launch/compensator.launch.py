@@ -9,6 +9,8 @@ Kinematics come from the topic ``robot_description``. With ``drive`` it is silen
         output:=commands commands:=/forward_position_controller/commands
 """
 
+from typing import List  # noqa: UP035, launch knows no list[str]
+
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, GroupAction
 from launch.conditions import IfCondition
@@ -17,10 +19,11 @@ from launch_ros.actions import Node, SetParameter, SetParametersFromFile
 from launch_ros.parameter_descriptions import ParameterValue
 
 PARAMETERS: dict[str, tuple[type, str]] = {
-    'tip': (str, 'link of the end effector'),
+    'tip': (str, 'link of the end effector; must be given, here or in params_file'),
     'base': (str, 'link from which on joints count (empty: the root)'),
     'urdf': (str, 'URDF file with the kinematics (empty: the topic robot_description)'),
-    'drive': (bool, 'publish for a controller (empty: proposals)'),
+    'drive': (bool, 'publish for a controller, once enabled (empty: false, proposals alone)'),
+    'axes': (List[str], 'axes that are corrected, as [x, z] (empty: [x, y, z])'),  # noqa: UP006
     'output': (str, 'offsets, which your controller adds, or commands, position plus offset (empty: offsets)'),
     'max_offset': (float, 'largest offset of a joint, rad or m (empty: 0.05)'),
     'max_rate': (float, 'largest rate of an offset, rad/s or m/s (empty: 0.1)'),

@@ -221,3 +221,25 @@ def test_every_extra_that_is_asked_for_is_there() -> None:
             asked |= {extra: file.name for group in found for extra in group.split(',')}
     assert {'ros', 'monitor', 'camera'} <= set(asked)
     assert {extra: name for extra, name in asked.items() if extra not in setup['options.extras_require']} == {}
+
+
+SOURCES = (
+    'psd_deflection',
+    'msg_adapters',
+    'launch',
+    'test',
+    'bench',
+    'blind',
+    'tools',
+    'resource/ros2_run',
+    'setup.py',
+)
+
+
+@pytest.mark.parametrize('place', SOURCES)
+def test_every_source_file_names_its_licence(place: str) -> None:
+    files = [ROOT / place] if place.endswith('.py') else [p for p in (ROOT / place).rglob('*') if p.is_file()]
+    ours = [p for p in files if p.suffix in ('.py', '.c', '.pyx', '.pxd', '.sh') or p.parent.name == 'ros2_run']
+    assert ours
+    heads = {p: p.read_text(encoding='utf-8')[:300] for p in ours if p.stat().st_size}
+    assert [str(p) for p, head in heads.items() if 'SPDX-License-Identifier: Apache-2.0' not in head] == []
