@@ -11,11 +11,10 @@ Kinematics come from the topic ``robot_description``. With ``drive`` it is silen
 
 from typing import List  # noqa: UP035, launch knows no list[str]
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
-from launch_ros.actions import Node, SetParameter, SetParametersFromFile
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 PARAMETERS: dict[str, tuple[type, str]] = {
@@ -40,8 +39,13 @@ TOPIC_OF = {'controller_state': 'controller_state_topic'}
 """The argument of a topic, if it has another name."""
 
 
-def generate_launch_description() -> LaunchDescription:
-    """One node."""
+def start(context: LaunchContext) -> list[Node]:
+    """Return the node. What is given here is written under its full name, so it wins over any line of a file."""
+    given = {
+        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
+        for name, (kind, _) in PARAMETERS.items()
+        if LaunchConfiguration(name).perform(context)
+    }
     file = LaunchConfiguration('params_file')
     node = Node(
         package='psd_deflection',
@@ -49,8 +53,16 @@ def generate_launch_description() -> LaunchDescription:
         name='compensator',
         namespace=LaunchConfiguration('namespace'),
         output='screen',
+        # Not under `parameters`: launch_ros passes over a file that is not there with a warning.
+        ros_arguments=['--params-file', file] if file.perform(context) else [],
+        parameters=[given] if given else [],
         remappings=[(f'~/{name}', LaunchConfiguration(TOPIC_OF.get(name, name))) for name in TOPICS],
     )
+    return [node]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """One node."""
     return LaunchDescription(
         [
             DeclareLaunchArgument('namespace', default_value='', description='namespace of the node and its topics'),
@@ -63,19 +75,6 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(TOPIC_OF.get(name, name), default_value=topic, description=f'topic of the {name}')
                 for name, topic in TOPICS.items()
             ),
-            GroupAction(
-                [
-                    SetParametersFromFile(file, condition=IfCondition(NotEqualsSubstitution(file, ''))),
-                    *(
-                        SetParameter(
-                            name,
-                            ParameterValue(LaunchConfiguration(name), value_type=kind),
-                            condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration(name), '')),
-                        )
-                        for name, (kind, _) in PARAMETERS.items()
-                    ),
-                    node,
-                ]
-            ),
+            OpaqueFunction(function=start),
         ]
     )

@@ -10,11 +10,10 @@ Parameters that are not given here come from ``params_file``. Two rigs on one gr
 ``autostart:=false`` leaves the transitions to you or to a lifecycle manager.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
-from launch_ros.actions import Node, SetParameter
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
@@ -35,8 +34,13 @@ PARAMETERS: dict[str, tuple[type, str]] = {
 """Parameters of the node that may be given as arguments, with their types."""
 
 
-def generate_launch_description() -> LaunchDescription:
-    """One node; an argument that is not given leaves the parameter as params_file or its default has it."""
+def start(context: LaunchContext) -> list[Node]:
+    """Return the node. What is given here is written under its full name, so it wins over any line of a file."""
+    given = {
+        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
+        for name, (kind, _) in PARAMETERS.items()
+        if LaunchConfiguration(name).perform(context)
+    }
     node = Node(
         package='psd_deflection',
         executable='estimator',
@@ -50,7 +54,13 @@ def generate_launch_description() -> LaunchDescription:
             '--log-level',
             LaunchConfiguration('log_level'),
         ],
+        parameters=[given] if given else [],
     )
+    return [node]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """One node; an argument that is not given leaves the parameter as params_file or its default has it."""
     return LaunchDescription(
         [
             DeclareLaunchArgument(
@@ -68,18 +78,6 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value='', description=f'{what} (empty: as params_file says)')
                 for name, (_, what) in PARAMETERS.items()
             ),
-            GroupAction(
-                [
-                    *(
-                        SetParameter(
-                            name,
-                            ParameterValue(LaunchConfiguration(name), value_type=kind),
-                            condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration(name), '')),
-                        )
-                        for name, (kind, _) in PARAMETERS.items()
-                    ),
-                    node,
-                ]
-            ),
+            OpaqueFunction(function=start),
         ]
     )

@@ -5,11 +5,10 @@
 Shapes the trajectories of the topic ``given`` so that no link rings, and publishes them on ``shaped``.
 """
 
-from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, GroupAction
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, NotEqualsSubstitution
-from launch_ros.actions import Node, SetParameter
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
 PARAMETERS: dict[str, tuple[type, str]] = {
@@ -28,16 +27,27 @@ TOPICS = {'given': ('~/trajectory', 'shaper/trajectory'), 'shaped': ('~/shaped',
 """Arguments with the topic of the node and its name in the namespace."""
 
 
-def generate_launch_description() -> LaunchDescription:
-    """One node; an argument that is not given leaves the parameter at its default."""
+def start(context: LaunchContext) -> list[Node]:
+    """Return the node with the parameters that are given."""
+    given = {
+        name: ParameterValue(LaunchConfiguration(name), value_type=kind)
+        for name, (kind, _) in PARAMETERS.items()
+        if LaunchConfiguration(name).perform(context)
+    }
     node = Node(
         package='psd_deflection',
         executable='shaper',
         name='shaper',
         namespace=LaunchConfiguration('namespace'),
         output='screen',
+        parameters=[given] if given else [],
         remappings=[(topic, LaunchConfiguration(name)) for name, (topic, _) in TOPICS.items()],
     )
+    return [node]
+
+
+def generate_launch_description() -> LaunchDescription:
+    """One node; an argument that is not given leaves the parameter at its default."""
     return LaunchDescription(
         [
             DeclareLaunchArgument('namespace', default_value='', description='namespace of the node and its topics'),
@@ -49,18 +59,6 @@ def generate_launch_description() -> LaunchDescription:
                 DeclareLaunchArgument(name, default_value=topic, description=f'topic of the {name} trajectories')
                 for name, (_, topic) in TOPICS.items()
             ),
-            GroupAction(
-                [
-                    *(
-                        SetParameter(
-                            name,
-                            ParameterValue(LaunchConfiguration(name), value_type=kind),
-                            condition=IfCondition(NotEqualsSubstitution(LaunchConfiguration(name), '')),
-                        )
-                        for name, (kind, _) in PARAMETERS.items()
-                    ),
-                    node,
-                ]
-            ),
+            OpaqueFunction(function=start),
         ]
     )

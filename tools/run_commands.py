@@ -118,7 +118,7 @@ TOOLS = {
 """Programs without which a command is skipped with a message."""
 
 ADMINISTRATION = re.compile(
-    r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|rosdep|ssh|sudo|systemctl|udevadm|useradd) '
+    r'/opt/psd_deflection|^DASK_CONFIG=|^(apt|install|journalctl|rosdep|source|ssh|sudo|systemctl|udevadm|useradd) '
 )
 """Lines for root or for another machine: never typed here. test/docs/test_deploy.py checks the files they install."""
 
