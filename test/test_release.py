@@ -31,6 +31,7 @@ NEEDED = (
     'LICENSE',
     'CHANGELOG.md',
     'CITATION.cff',
+    'docs/dependencies.md',
     '.github',
     'packaging',
     'psd_deflection/__init__.py',
@@ -66,6 +67,7 @@ def ready(root: Path) -> None:
     change(root / 'CHANGELOG.md', '(unreleased)', '(2026-12-01)')
     table = root / 'packaging/rosdep_keys.csv'
     table.write_text(table.read_text().replace('none', 'apt'))
+    change(root / 'docs/dependencies.md', 'none yet: `apt install python3-zstandard`', 'python3-zstandard')
     for name, made in MAKERS.items():
         (root / name).write_text(made(root))
 
@@ -109,12 +111,16 @@ def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None
             lambda root: change(root / 'packaging/rosdep_keys.csv', 'python3-yaml,apt', 'python3-yaml,none'),
             'key python3-yaml has no row for noble',
         ),
+        (
+            lambda root: change(root / 'docs/dependencies.md', '| python3-zstandard |', '| none yet |'),
+            'package.xml: lacks zstandard, for which rosdep has no key yet',
+        ),
     ],
     ids=[
         'a key of pip', 'an action that can be moved', 'no licence', 'no licence of what is not ours',
         'an address that leads nowhere', 'another address',
         'a stale citation', 'a stale changelog', 'another version', 'no date',
-        'no entry', 'a key without a row',
+        'no entry', 'a key without a row', 'no key',
     ],
 )  # fmt: skip
 def test_what_a_release_must_not_have_is_said(
