@@ -51,6 +51,7 @@ def apart(shown: dict[tuple[str, str], FloatArray], first: tuple[str, str], othe
     shown[other] = shown[other] - a * np.sum(a * shown[other])
 
 
+@pytest.mark.repeatable
 def test_each_step_adds_what_it_finds_and_changes_nothing_before_it() -> None:
     shown = pictures(A, B, ('c', 'x'))
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
