@@ -195,8 +195,8 @@ QUESTIONS = {
     'Can I calibrate without a reference?': ('calibration.md', '**Without a reference.**'),
     'What does a calibration still lack?': ('calibration.md', 'calibrate --live'),
     'Are the clocks of two computers the same?': ('topics.md', 'chrony'),
-    'How is a trajectory of MoveIt shaped?': ('shaping.md', '### MoveIt'),
-    'How is the drift of a night seen?': ('monitor.md', '### The last hours and days'),
+    'How is a trajectory of MoveIt shaped?': ('shaping.md', '## MoveIt'),
+    'How is the drift of a night seen?': ('monitor.md', '## The last hours and days'),
     'What happens if the disk is full?': ('robustness.md', '| disk nearly full |'),
 }
 """What newcomers looked for, and the words that answer it."""
