@@ -90,11 +90,11 @@ class ServedController:
         self.late = 0
         self._handle: Any = None
         self._told = 0.0
-        self.refused: list[str] = []
+        self.rejected: list[str] = []
         kind = action_class(SERVED[FOLLOW].type)
         self._kind = kind
         self._server = GuardedServer(
-            node, kind, name, self.refused.append, self._asked, self._accepted, self._cancelled
+            node, kind, name, self.rejected.append, self._asked, self._accepted, self._cancelled
         )
 
     def _asked(self, goal: Any) -> Any:

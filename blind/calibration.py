@@ -131,7 +131,7 @@ def measured(rig: Rig, volts: Array, zero_after: int = 25) -> tuple[Array, Array
         if first:
             found += records
         elif pipeline.zero() is None:
-            raise RuntimeError(f'no zero: {pipeline.zero_refused}')
+            raise RuntimeError(f'no zero: {pipeline.zero_rejected}')
     return (
         np.array([e.block for e in found]),
         np.array([e.pose for e in found]),

@@ -308,7 +308,7 @@ def test_every_study_can_be_asked_from_python(tmp_path: Path) -> None:
     assert psd_deflection.load_rig(tmp_path / 'calibrate' / 'rig.yaml').link.length == 0.585
 
 
-def test_a_dot_off_its_detector_is_refused() -> None:
+def test_a_dot_off_its_detector_is_rejected() -> None:
     assert psd_deflection.solve([0.0, -9.9e-3, 0.0, -9.9e-3]).status == 0
     with pytest.raises(ConfigError, match=r'dots\[1\] = -1 m: must be at most 0.01 m, the width of its detector'):
         psd_deflection.solve([0.0, -1.0, 0.0, -2.0])  # mm for m
@@ -366,7 +366,7 @@ def test_the_budget_of_python_is_that_of_the_command(capsys: pytest.CaptureFixtu
         (lambda: psd_deflection.check('bags/clean'), 'holds no loads'),
     ],
 )
-def test_what_a_study_is_asked_wrongly_is_refused(
+def test_what_a_study_is_asked_wrongly_is_rejected(
     ask: Callable[[], Any], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(ROOT)

@@ -65,7 +65,7 @@ def test_the_answers_of_rosdep_are_by_key_and_system(tmp_path: Path) -> None:
     }
 
 
-def test_what_bloom_warns_of_is_said_and_a_refusal_is_an_error(tmp_path: Path) -> None:
+def test_what_bloom_warns_of_is_said_and_a_rejection_is_an_error(tmp_path: Path) -> None:
     said = 'mkdir debian; touch debian/control; echo "No CHANGELOG.rst found"; echo fine'
     path = program(tmp_path, 'bloom-generate', said)
     env = {'PATH': f'{path / "bin"}:/usr/bin:/bin'}

@@ -38,7 +38,7 @@ def truth(name: str) -> npt.NDArray[np.float64]:
 
 
 @pytest.mark.parametrize('name', sorted(WITHOUT_ESTIMATE))
-def test_a_golden_recording_gives_its_estimates_and_refusals(name: str) -> None:
+def test_a_golden_recording_gives_its_estimates_and_rejections(name: str) -> None:
     recording = open_recording(BAGS / name)
     assert recording.complete
     assert recording.hello is not None

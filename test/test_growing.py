@@ -55,7 +55,7 @@ BOUNDED_BY = {
     'measure/motion/known.py:_waiting': 'MOST_LOADS',
     'measure/pipeline.py:misfits': 'one a part of the rig',
     'measure/pipeline.py:findings': 'our own sentences',
-    'measure/pipeline.py:refused': 'our own causes',
+    'measure/pipeline.py:rejected': 'our own causes',
     'measure/timing.py:_minima': 'WINDOW_S',
     'measure/uncertainty/noise.py:_blocks': 'emptied when it is full',
     'measure/uncertainty/noise.py:_sums': 'emptied with the blocks',

@@ -105,7 +105,7 @@ def test_what_a_third_psd_leaves_out_has_its_default_and_goes_round(three: Rig) 
         ({'psd_3.center': [0.08, 0.0], 'psd_3.axes': ['x', '-x']}, 'must name x once and y once'),
     ],
 )
-def test_a_gap_and_a_psd_without_a_place_are_refused_by_name(values: dict[str, object], words: str) -> None:
+def test_a_gap_and_a_psd_without_a_place_are_rejected_by_name(values: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         load_rig(overrides=values)
 
@@ -120,7 +120,7 @@ def test_a_gap_and_a_psd_without_a_place_are_refused_by_name(values: dict[str, o
         ({'calibration.names': ['psd_1.rotation'], 'calibration.sds': [0.001]}, 'psd_3.center is given: a calibration'),
     ],
 )
-def test_what_is_made_for_two_is_refused(three: Rig, changes: dict[str, object], words: str) -> None:
+def test_what_is_made_for_two_is_rejected(three: Rig, changes: dict[str, object], words: str) -> None:
     with pytest.raises(PsdDeflectionError, match=words):
         Pipeline(replace_values(three, changes))
 
@@ -295,11 +295,11 @@ def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: 
     assert pipeline.counters.findings['psd_3 stands still'] == 6
 
 
-def test_refuse_refuses_only_what_cannot_be_told(three: Rig) -> None:
+def test_reject_rejects_only_what_cannot_be_told(three: Rig) -> None:
     told, _, _ = run(with_solver(three, 'exact', consistency='refuse', **LEVEL), inverted(2))
     assert len(primaries(told)) > 110
     not_told, _, pipeline = run(replace_values(three, {'consistency': 'refuse'}), inverted(2))
-    assert pipeline.counters.refused['inconsistent'] > 60
+    assert pipeline.counters.rejected['inconsistent'] > 60
     assert spots_of(not_told)[-1].status is BlockStatus.INCONSISTENT
     assert spots_of(not_told)[-1].reason.startswith('the readings contradict each other')
     reported, _, pipeline = run(with_solver(three, 'exact', consistency='report', **LEVEL), inverted(2))
@@ -315,7 +315,7 @@ def test_with_one_psd_left_the_rule_for_one_holds(three: Rig) -> None:
 
     records, _, pipeline = run(with_solver(three, 'exact', **LEVEL), two_dark)
     assert len(primaries(records)) == 90
-    assert pipeline.counters.refused == {'laser_lost': 90}
+    assert pipeline.counters.rejected == {'laser_lost': 90}
     records, truth, _ = run(with_solver(three, 'exact', degraded='hold', **LEVEL), two_dark)
     assert {e.solver for e in primaries(records)[90:]} == {'one_psd'}
     assert_inside(records, truth)
@@ -407,14 +407,14 @@ def test_commands_for_two_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[s
         ('t,x1,y1,sum1', 'the header lacks x2, y2, sum2'),
     ],
 )
-def test_a_csv_with_part_of_a_psd_is_refused(tmp_path: Path, header: str, words: str) -> None:
+def test_a_csv_with_part_of_a_psd_is_rejected(tmp_path: Path, header: str, words: str) -> None:
     path = tmp_path / 'a.csv'
     path.write_text('\n'.join([header, '0,' + '0,' * (header.count(',') - 1) + '0']))
     with pytest.raises(RecordingError, match=words):
         open_recording(path)
 
 
-def test_a_bag_whose_number_of_psds_changes_is_refused(tmp_path: Path, three: Rig) -> None:
+def test_a_bag_whose_number_of_psds_changes_is_rejected(tmp_path: Path, three: Rig) -> None:
     blocks = []
     for index, rig in enumerate((three, load_rig())):
         counts = RigSimulator(rig).step(np.zeros((20, 3))).counts

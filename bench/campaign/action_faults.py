@@ -17,7 +17,7 @@ from typing import Any
 
 from rclpy.action import ActionClient
 
-from bench.campaign.shaper_faults import LONGEST_S, NAMES, REFUSED, Moved, injected
+from bench.campaign.shaper_faults import LONGEST_S, NAMES, REJECTED, Moved, injected
 from bench.campaign.strange import Stranger
 from bench.trajectory_controller import ACTION, ServedController
 from tools.control_msgs import available
@@ -89,7 +89,7 @@ class Followed(Moved):
     def inject(self, name: str) -> None:
         """One fault while a goal is under way."""
         assert self._served is not None
-        if name in REFUSED:
+        if name in REJECTED:
             super().inject(name)
         elif name == 'strange goals':
             self.under_way()
@@ -144,4 +144,4 @@ def action_faults(times: int) -> float:
     if not available():
         print('action: control_msgs is not installed and cannot be built: not tried')
         return 0.0
-    return injected(Followed(), (*REFUSED, *OTHERS), times, 'action')
+    return injected(Followed(), (*REJECTED, *OTHERS), times, 'action')

@@ -201,9 +201,9 @@ class Attacked(ABC):
         """Hand over what is right, if the node needs any."""
         self.give()
 
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """Messages, as the node counts them."""
-        return self.owner.gate.refused.total()
+        return self.owner.gate.rejected.total()
 
     @abstractmethod
     def faults(self) -> list[str]:
@@ -251,9 +251,9 @@ class Estimator(Attacked):
             if not session.processing.alive:
                 raise session.failed or RuntimeError('the pipeline has ended')
 
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """By the session, or dropped on the way to it."""
-        return sum(s.refused.total() + s.processing.requests_dropped for s in self._sessions())
+        return sum(s.rejected.total() + s.processing.requests_dropped for s in self._sessions())
 
     def faults(self) -> list[str]:
         """It must still measure."""
@@ -282,9 +282,9 @@ class Chain(Attacked):
         if chain is not None and not chain.alive:
             raise chain.failed or RuntimeError('a pipeline has ended')
 
-    def refused(self) -> int:
+    def rejected(self) -> int:
         """By the sessions and by the chain."""
-        return super().refused() + sum(s.refused.total() + s.processing.requests_dropped for s in self._sessions())
+        return super().rejected() + sum(s.rejected.total() + s.processing.requests_dropped for s in self._sessions())
 
     def faults(self) -> list[str]:
         """It must still measure."""

@@ -227,14 +227,14 @@ def off_by(answer: FrameAnswer, truth: tuple[float, float, float]) -> float:
 
 def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS, *, first: int = 1, lens: bool = True) -> bool:
     """Print what became of each kind of frame; True if no answer is wrong."""
-    refused: Counter[str] = Counter()
+    rejected: Counter[str] = Counter()
     reasons: dict[str, Counter[str]] = {}
     sigmas: dict[str, list[float]] = {}
     sds: dict[str, list[float]] = {}
     for hurt, answer, truth in runs(frames, seed, hurts, lens=lens):
         sigmas.setdefault(hurt, [])
         if answer.status is not Status.OK:
-            refused[hurt] += 1
+            rejected[hurt] += 1
             reasons.setdefault(hurt, Counter())[str(answer.status)] += 1
             continue
         sigmas[hurt].append(off_by(answer, truth))
@@ -244,13 +244,13 @@ def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS, *, first
     total = wrong = 0
     for hurt in hurts:
         found = np.array(sigmas.get(hurt, []))
-        count = len(found) + refused[hurt]
+        count = len(found) + rejected[hurt]
         total, wrong = total + count, wrong + int(np.sum(found > SIGMAS))
         worst = f'{found.max():8.2f} {np.sqrt(np.mean(found**2)):7.2f}' if len(found) else f'{"":8} {"":7}'
         sd = f'{np.median(sds[hurt]):6.2f}' if hurt in sds else f'{"":6}'
         reason = ', '.join(f'{r} {n}' for r, n in reasons.get(hurt, Counter()).most_common(3))
-        print(f'{hurt:24} {count:6} {100 * refused[hurt] / max(count, 1):7.1f}%  {worst} {sd}  {reason}')
-    share = 100 * sum(refused.values()) / max(total, 1)
+        print(f'{hurt:24} {count:6} {100 * rejected[hurt] / max(count, 1):7.1f}%  {worst} {sd}  {reason}')
+    share = 100 * sum(rejected.values()) / max(total, 1)
     print(f'{total} adverse frames: {share:.1f} % refused, {wrong} answers beyond {SIGMAS:g} sd of their own')
     return wrong == 0
 

@@ -54,11 +54,11 @@ def timed() -> Iterator[None]:
 
 def judged(target: Target, content: bytes) -> list[str]:
     """``target(content)``. AssertionError if a refusal is not one line."""
-    refused = target(content)
-    for text in refused:
+    rejected = target(content)
+    for text in rejected:
         if '\n' in text:
             raise AssertionError(f'more than one line: {text!r}')
-    return refused
+    return rejected
 
 
 def frames_target() -> tuple[Target, list[bytes]]:
@@ -107,15 +107,15 @@ def _file_target(suffix: str, *steps: Callable[[Path], object]) -> Target:
 
     def target(content: bytes) -> list[str]:
         path.write_bytes(content)
-        refused = []
+        rejected = []
         for step in steps:
             try:
                 with timed():
                     step(path)
             except PsdDeflectionError as error:
-                refused.append(str(error))
+                rejected.append(str(error))
         path.with_name(path.name + '.cut').unlink(missing_ok=True)
-        return refused
+        return rejected
 
     return target
 
@@ -251,7 +251,7 @@ def hello_target() -> tuple[Target, list[bytes]]:
     def target(content: bytes) -> list[str]:
         choices = Choices(content)
         gate = HelloGate(rig)
-        refused = []
+        rejected = []
         while choices:
             try:
                 frames = FrameDecoder().feed(b'\0' + encode(HelloFrame(1, hello_words(choices, good))))
@@ -264,13 +264,13 @@ def hello_target() -> tuple[Target, list[bytes]]:
                 try:
                     gate.take(frame, 'port', volts=False)
                 except DeviceError as error:
-                    refused.append(str(error)[:300])
+                    rejected.append(str(error)[:300])
             if gate.hello is not None:
                 words = json.dumps(gate.hello.info, allow_nan=False, ensure_ascii=False)
                 rate = gate.hello.info['sample_rate_hz']
                 if not words.isprintable() or not isinstance(rate, int | float) or not abs(rate - 1000.0) <= 1.0:
                     raise AssertionError(f'taken: {words!r}')
-        return refused
+        return rejected
 
     return target, [b'\0\0', bytes(range(256))]
 
@@ -359,15 +359,15 @@ def yaml_target() -> tuple[Target, list[bytes]]:
     @timed()
     def target(content: bytes) -> list[str]:
         text = said(Choices(content), 0, [])
-        refused = []
+        rejected = []
         for head, read in (('/**: {ros__parameters: ', load_rig), ('rosbag2_bagfile_information: ', read_information)):
             path = folder / 'input.yaml'
             path.write_text(head + text + ('}' if head.startswith('/') else ''), errors='replace')
             try:
                 read(path)
             except PsdDeflectionError as error:
-                refused.append(str(error))
-        return refused
+                rejected.append(str(error))
+        return rejected
 
     return target, [bytes([4, 3, 1, 5, 2, 0, 4, 1]) * 20, bytes(range(256))]
 
@@ -399,7 +399,7 @@ def corrupted(count: int) -> int:
         originals.append((frame, encode(frame)))
     decoder = FrameDecoder()
     decoder.feed(b'\x00')
-    wrong = same = refused = lost = 0
+    wrong = same = rejected = lost = 0
     bits, below = chance.getrandbits, chance.randrange
     for number in range(count):
         frame, sent = originals[number & 255]
@@ -419,7 +419,7 @@ def corrupted(count: int) -> int:
             damaged[:-1] = bits(8 * (len(sent) - 1)).to_bytes(len(sent) - 1, 'little')
         accepted = [f for f in decoder.feed(bytes(damaged) + b'\x00') if type(f) is not BadFrame]
         if not accepted:
-            refused += 1
+            rejected += 1
         elif accepted == [frame]:
             same += 1
         elif any(type(f) is SampleFrame and f != frame for f in accepted):
@@ -428,7 +428,7 @@ def corrupted(count: int) -> int:
         else:
             lost += 1
     print(
-        f'{count} damaged frames: {refused} refused, {same} came out as they were sent, '
+        f'{count} damaged frames: {rejected} refused, {same} came out as they were sent, '
         f'{lost} taken for another kind, {wrong} accepted with a wrong content (chance alone: {count * 2.0**-32:.4f})'
     )
     return 1 if wrong else 0

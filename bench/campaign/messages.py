@@ -226,7 +226,7 @@ class Inside:
         """How far it is."""
         return (
             f'{self.number} messages on {len(self.sent)} inputs and {self.asked} requests, '
-            f'{self.attacked.refused()} refused of which {self.undecodable} could not be decoded, '
+            f'{self.attacked.rejected()} refused of which {self.undecodable} could not be decoded, '
             f'{memory() / 1e6:.0f} MB; {self.attacked.summary()}'
         )
 
@@ -312,8 +312,8 @@ def attack(name: str, args: argparse.Namespace) -> int:
             faults += inside.attacked.faults()
             if grown > MOST_GROWTH:
                 faults.append(f'it grew by {grown / 1e6:.1f} MB')
-            if inside.attacked.refused() < inside.undecodable:
-                faults.append(f'of {inside.undecodable} that cannot be decoded it counts {inside.attacked.refused()}')
+            if inside.attacked.rejected() < inside.undecodable:
+                faults.append(f'of {inside.undecodable} that cannot be decoded it counts {inside.attacked.rejected()}')
             took = time.monotonic() - began
             print(f'{name}: in {took:.0f} s {inside.told()}; {grown / 1e6:+.1f} MB after the first tenth')
             for topic, count in sorted(inside.sent.items()):

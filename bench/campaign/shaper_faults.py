@@ -77,7 +77,7 @@ def _in_motion(message: Any) -> None:
     message.points[-1].velocities = [1.0, 0.0]
 
 
-REFUSED: dict[str, Change] = {
+REJECTED: dict[str, Change] = {
     'not finite': _nan,
     '1e300': _huge,
     'before 1970': _before_1970,
@@ -175,8 +175,8 @@ class Moved:
         """One fault while a trajectory is under way."""
         self.under_way()
         heard = self.heard
-        if name in REFUSED:
-            self.move(REFUSED[name])
+        if name in REJECTED:
+            self.move(REJECTED[name])
             self.spin(0.2)
             if self.heard != heard:
                 raise RuntimeError(f'{name}: was not refused')
@@ -233,4 +233,4 @@ def injected(moved: Moved, names: Sequence[str], times: int, by: str = 'shaper')
 
 def shaper_faults(times: int) -> float:
     """All of the topic; as :func:`injected`."""
-    return injected(Moved(), (*REFUSED, *OTHERS), times)
+    return injected(Moved(), (*REJECTED, *OTHERS), times)

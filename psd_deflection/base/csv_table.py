@@ -49,17 +49,17 @@ class Row(NamedTuple):
         """The finite number in a column, at most ``largest`` in size. Raises RecordingError with line and column."""
         cell = self.text(name)
         if NUMBER.fullmatch(cell) is None:
-            raise self.refuse(f'{self._holds(name)}, which is not a number{why_no_number(name, cell)}')
+            raise self.reject(f'{self._holds(name)}, which is not a number{why_no_number(name, cell)}')
         value = float(cell)
         if not math.isfinite(value):
-            raise self.refuse(f'{self._holds(name)}, which is not finite')
+            raise self.reject(f'{self._holds(name)}, which is not finite')
         if abs(value) > largest:
-            raise self.refuse(f'{self._holds(name)}, which is beyond ±{largest:g}')
+            raise self.reject(f'{self._holds(name)}, which is beyond ±{largest:g}')
         return value
 
-    def refuse(self, why: str) -> RecordingError:
+    def reject(self, why: str) -> RecordingError:
         """The error for this row."""
-        return self.table.refuse(why, self.line)
+        return self.table.reject(why, self.line)
 
     def _holds(self, name: str) -> str:
         return f'column {name} holds {sanitize(self.text(name), LONGEST_CELL)!r}'
@@ -72,12 +72,12 @@ class CsvTable:
         self.path = path
         first = next(self._cells(None, 0), None)
         if first is None:
-            raise self.refuse('is empty')
+            raise self.reject('is empty')
         self.header_line, names = first
         self.header = [name.strip() for name in names]
         self.columns = {name: i for i, name in enumerate(self.header)}
 
-    def refuse(self, why: str, line: int | None = None) -> RecordingError:
+    def reject(self, why: str, line: int | None = None) -> RecordingError:
         """The error that says so of this file."""
         return RecordingError(f'{self.path}{"" if line is None else f":{line}"}: {why}')
 
@@ -88,28 +88,28 @@ class CsvTable:
         """
         lacking = [name for name in names if name not in self.columns]
         if lacking:
-            raise self.refuse_header(lacking, form, (*names, *known))
+            raise self.reject_header(lacking, form, (*names, *known))
         for name in (*names, *known):
             if self.header.count(name) > 1:
-                raise self.refuse(f'column {name} is there twice', self.header_line)
+                raise self.reject(f'column {name} is there twice', self.header_line)
 
-    def refuse_header(self, lacking: Sequence[str], form: str, known: Collection[str]) -> RecordingError:
+    def reject_header(self, lacking: Sequence[str], form: str, known: Collection[str]) -> RecordingError:
         """The error for a header without the columns ``lacking``: what it has, what was meant, how it is converted."""
         why = what_of_header(self.path, head_of(self.path), self.header, lacking, form, known)
-        return self.refuse(why, self.header_line)
+        return self.reject(why, self.header_line)
 
     def table_rows(self) -> Iterator[Row]:
         """The rows behind the header that are not blank. Raises RecordingError for one of another width than it has."""
         width = len(self.header)
         for line, cells in self._cells(0, 0):
             if len(cells) != width:
-                raise self.refuse_width(len(cells), line)
+                raise self.reject_width(len(cells), line)
             yield Row(self, line, cells)
 
-    def refuse_width(self, cells: int, line: int) -> RecordingError:
+    def reject_width(self, cells: int, line: int) -> RecordingError:
         """The error for a row of another number of cells."""
         commas = '; are its decimals written with a comma? Save it with points' if cells == 2 * len(self.header) else ''
-        return self.refuse(f'has {cells} cells, the header has {len(self.header)}{commas}', line)
+        return self.reject(f'has {cells} cells, the header has {len(self.header)}{commas}', line)
 
     def _cells(self, begin: int | None, line: int) -> Iterator[tuple[int, list[str]]]:
         """(line number, cells) of every line that is not blank, from byte ``begin`` on, behind line number ``line``.
@@ -127,7 +127,7 @@ class CsvTable:
                         continue
                     yield line + reader.line_num, cells
         except csv.Error as error:
-            raise self.refuse(f'is no row of a CSV ({error})', line + reader.line_num) from None
+            raise self.reject(f'is no row of a CSV ({error})', line + reader.line_num) from None
 
     def _lines(self, begin: int, line: int) -> Iterator[str]:
         try:
@@ -135,19 +135,19 @@ class CsvTable:
                 while text := stream.readline(MAX_LINE + 1):
                     line += 1
                     if len(text) > MAX_LINE:
-                        raise self.refuse(f'is longer than {MAX_LINE} characters', line)
+                        raise self.reject(f'is longer than {MAX_LINE} characters', line)
                     if '\0' in text:
-                        raise self._refuse_text()
+                        raise self._reject_text()
                     yield text
         except OSError as error:
-            raise self.refuse(f'cannot be read ({error.strerror or error})') from None
+            raise self.reject(f'cannot be read ({error.strerror or error})') from None
         except UnicodeDecodeError:
-            raise self._refuse_text() from None
+            raise self._reject_text() from None
 
-    def _refuse_text(self) -> RecordingError:
+    def _reject_text(self) -> RecordingError:
         with self.path.open('rb') as stream:
             line, why = text_fault(self.path, stream)
-        return self.refuse(why, line)
+        return self.reject(why, line)
 
     def _opened(self, begin: int) -> TextIO:
         stream = self.path.open(encoding='utf-8' if begin else 'utf-8-sig', newline=None)

@@ -99,7 +99,7 @@ def parse_yaml(text: str, *, unique: bool = False) -> object:
                 return None
             _measure(root, {}, set())
             if unique:
-                _refuse_doubles(root)
+                _reject_doubles(root)
             return loader.construct_document(root)
         finally:
             loader.dispose()
@@ -171,7 +171,7 @@ def _count(text: str) -> None:
             raise YamlError(f'malformed YAML: more than {MAX_NODES} keys and values', event.start_mark)
 
 
-def _refuse_doubles(root: yaml.Node) -> None:
+def _reject_doubles(root: yaml.Node) -> None:
     """Refuse a key that is in one map twice: one of its values would be lost without a word. Merge keys may repeat."""
     seen: set[int] = set()
     waiting = [root]

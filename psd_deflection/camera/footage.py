@@ -162,10 +162,10 @@ def _listed(folder: Path) -> list[tuple[Path, int, int]]:
     for row in table.table_rows():
         name = row.text('file')
         if not name or Path(name).name != name:
-            raise row.refuse(f'file {name!r}: must be the name of an image in {folder}')
+            raise row.reject(f'file {name!r}: must be the name of an image in {folder}')
         t, exposure = _seconds(row, 't'), _seconds(row, 'exposure')
         if exposure < 0 or (out and t <= out[-1][1]):
-            raise row.refuse('exposure is negative' if exposure < 0 else 't does not increase')
+            raise row.reject('exposure is negative' if exposure < 0 else 't does not increase')
         out.append((folder / name, t, exposure))
     if not out:
         raise RecordingError(f'{path}: lists no frame')

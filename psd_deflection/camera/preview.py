@@ -12,7 +12,7 @@ import numpy as np
 from psd_deflection.camera.answer import FrameAnswer, Status
 from psd_deflection.camera.opencv import opencv
 
-FOUND, REFUSED = (80, 200, 60), (60, 60, 230)
+FOUND, REJECTED = (80, 200, 60), (60, 60, 230)
 """Blue, green, red."""
 ARM = 12
 """Half the size of a cross, px."""
@@ -29,7 +29,7 @@ def preview(image: Any, answer: FrameAnswer) -> bytes:
         grey = (grey >> 8).astype(np.uint8)
     drawn = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
     good = answer.status is Status.OK
-    color = FOUND if good else REFUSED
+    color = FOUND if good else REJECTED
     if answer.target is not None:
         for u, v in np.rint(answer.target.points).astype(int).tolist():
             cv2.line(drawn, (u - ARM, v), (u + ARM, v), color, 1)

@@ -14,7 +14,7 @@ from typing import Any
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
-from psd_deflection.cli._options import in_the_world, refuse, world_option
+from psd_deflection.cli._options import in_the_world, reject, world_option
 from psd_deflection.cli._values import given_as_option, whole
 from psd_deflection.model.simulation.effect_words import with_effects
 from psd_deflection.recordings.replay.simulated_run import SimulatedRun
@@ -83,9 +83,9 @@ def limits(args: argparse.Namespace) -> Limits:
     if args.make_it and not args.next:
         raise UsageError('--run is for --next')
     if not args.next:
-        refuse(args, {'limit': []}, 'is for --next')
+        reject(args, {'limit': []}, 'is for --next')
     if not args.make_it:
-        refuse(args, {'effect': [], 'world': [], 'at_most': 3}, 'is for the simulated rig of --next --run')
+        reject(args, {'effect': [], 'world': [], 'at_most': 3}, 'is for the simulated rig of --next --run')
     return limits_from_words(args.limit)
 
 

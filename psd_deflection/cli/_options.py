@@ -124,7 +124,7 @@ def given_parameters(args: argparse.Namespace) -> dict[str, object]:
 DEMO = 'without a port: weights hang on the simulated rig in turn, so that there is motion to look at'
 
 
-def refuse_demo(args: argparse.Namespace) -> None:
+def reject_demo(args: argparse.Namespace) -> None:
     """Raise UsageError if --demo is given for a real device, on which it would do nothing."""
     if args.demo and args.port is not None:
         raise UsageError('--demo is for the simulated rig: leave out --port')
@@ -291,7 +291,7 @@ def make_writable(out: str) -> Path:
     return folder
 
 
-def refuse(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -> None:
+def reject(args: argparse.Namespace, defaults: Mapping[str, object], why: str) -> None:
     """Raise UsageError if one of the options ``defaults`` has another value: it would be ignored silently."""
     for name, default in defaults.items():
         if getattr(args, name) != default:

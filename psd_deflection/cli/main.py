@@ -120,7 +120,7 @@ _WIDEST = 100
 AGAIN_S = 0.05
 """After so long, s, an interrupt that was dropped comes again."""
 
-_REFUSED_OUTPUT = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
+_REJECTED_OUTPUT = (errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.EFBIG)
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -194,7 +194,7 @@ def make_parser(
             sub.description = module.__doc__
             module.add_arguments(sub)
             options = tuple(sub._option_string_actions)  # noqa: SLF001
-            sub.set_defaults(run=module.run, refuse=sub.error, known_options=options)
+            sub.set_defaults(run=module.run, reject=sub.error, known_options=options)
     return parser
 
 
@@ -254,12 +254,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         _tell(f'psd-deflection: {machine}')
         return machine.exit_status
     except OSError as error:
-        if error.errno not in _REFUSED_OUTPUT or error.filename is not None:
+        if error.errno not in _REJECTED_OUTPUT or error.filename is not None:
             raise
         _discard_output()
-        refused = RecordingError(f'the standard output cannot be written ({error.strerror})')
-        _tell(f'psd-deflection: {refused}')
-        return refused.exit_status
+        rejected = RecordingError(f'the standard output cannot be written ({error.strerror})')
+        _tell(f'psd-deflection: {rejected}')
+        return rejected.exit_status
     return status
 
 
@@ -303,14 +303,14 @@ def _run(argv: list[str]) -> int:
     if unknown:
         # Let the subcommand's parser report the error, so that its own usage is printed.
         hint = _ros_hint(unknown) or _option_hint(unknown, args.known_options)
-        args.refuse(f'unrecognized arguments: {" ".join(unknown)}{hint}')
+        args.reject(f'unrecognized arguments: {" ".join(unknown)}{hint}')
     args.ros_arguments = ros_arguments
     return _answer(args)
 
 
 def _parser_of(own: list[str], chosen: list[str]) -> argparse.ArgumentParser:
     """The parser that knows the command ``chosen``, which is none or one. Raises UsageError for an unknown command."""
-    _refuse_empty(own)
+    _reject_empty(own)
     # Looked for only if they may be meant: it takes longer than a short command of ours.
     others = {} if chosen and chosen[0] in COMMANDS else plugged_in()
     names = {*COMMANDS, *others}
@@ -340,12 +340,12 @@ def _answer(args: argparse.Namespace) -> int:
         _tell(f'psd-deflection {args.command}: {error}')
         return error.exit_status
     except (PsdDeflectionError, ModuleNotFoundError) as error:
-        refused = not_installed(error) if isinstance(error, ModuleNotFoundError) else error
-        if refused is None:
+        rejected = not_installed(error) if isinstance(error, ModuleNotFoundError) else error
+        if rejected is None:
             raise
         aside = set_aside(unfinished) if unfinished else ''
-        _tell(f'psd-deflection {args.command}: {refused}{aside}')
-        return refused.exit_status
+        _tell(f'psd-deflection {args.command}: {rejected}{aside}')
+        return rejected.exit_status
 
 
 @contextlib.contextmanager
@@ -412,7 +412,7 @@ def set_aside(out: Path) -> str:
     return f'; {partial} holds what came before'
 
 
-def _refuse_empty(argv: Sequence[str]) -> None:
+def _reject_empty(argv: Sequence[str]) -> None:
     """Raise UsageError for an empty argument, as from a variable that is not set in a script."""
     for before, argument in itertools.pairwise(['', *argv]):
         option, equals, value = argument.partition('=')

@@ -85,13 +85,13 @@ class ContractFrames(PortSource):
             raise DeviceError(
                 f'{self._given}: no port of such a name is there; `psd-deflection devices` lists those that are'
             )
-        refusals = []
+        rejections = []
         for name in ports:
             try:
                 return self._open(name, timeout / len(ports))
             except DeviceError as error:
-                refusals.append(str(error))
-        raise DeviceError('; '.join(refusals))
+                rejections.append(str(error))
+        raise DeviceError('; '.join(rejections))
 
     def _open(self, name: str, timeout: float) -> HelloFrame:
         """Open ``name`` and wait for its HELLO; the first read returns the frames that came before it."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from psd_deflection import __version__
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe
-from psd_deflection.devices.port_source import PortSource, refuse_datagrams
+from psd_deflection.devices.port_source import PortSource, reject_datagrams
 from psd_deflection.devices.protocol.dataq import (
     ANALOG,
     CLOCK_HZ,
@@ -67,7 +67,7 @@ class Dataq(PortSource):
 
     def __init__(self, rig: Rig) -> None:
         super().__init__(rig.acquisition.port)
-        refuse_datagrams('dataq', self.name)
+        reject_datagrams('dataq', self.name)
         self._wanted = rig.converter.sample_rate_hz
         if abs(rig.converter.volts_per_count - VOLTS_PER_COUNT) > 1e-3 * VOLTS_PER_COUNT:
             raise ConfigError(

@@ -65,7 +65,7 @@ class PortSource(Source):
             port.close()
 
 
-def refuse_datagrams(source: str, *names: str) -> None:
+def reject_datagrams(source: str, *names: str) -> None:
     """Raise ConfigError if one of these ports takes datagrams, for a device that sends only when it is asked."""
     for name in names:
         address = network_address(name)

@@ -85,13 +85,13 @@ def source_names() -> list[str]:
 def known_devices() -> tuple[list[Device], list[str]]:
     """Every device, and the errors of plug-ins that cannot be loaded."""
     devices: list[Device] = []
-    refusals: list[str] = []
+    rejections: list[str] = []
     for name in source_names():
         try:
             devices.append(find_device(name))
         except ConfigError as error:
-            refusals.append(str(error))
-    return devices, refusals
+            rejections.append(str(error))
+    return devices, rejections
 
 
 class SimulatedNames:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from psd_deflection.base.errors import ConfigError, DeviceError
 from psd_deflection.devices.device import OUTPUT_LIMIT, Answer, Device, PowerUp, Probe
 from psd_deflection.devices.port import OpenPort
-from psd_deflection.devices.port_source import refuse_datagrams
+from psd_deflection.devices.port_source import reject_datagrams
 from psd_deflection.devices.ports import open_port
 from psd_deflection.devices.protocol.apt import (
     DEVICE_ADDRESS,
@@ -78,7 +78,7 @@ class ThorlabsPair(Source):
                 f'source = thorlabs: port = {self.name!r}: two ports are needed, PSD 1 first, with a comma between: '
                 '/dev/ttyUSB0,/dev/ttyUSB1'
             )
-        refuse_datagrams('thorlabs', *self._names)
+        reject_datagrams('thorlabs', *self._names)
         self._rate = rig.converter.sample_rate_hz
         self._period_ns = round(SECOND_NS / self._rate)
         # Two independent drivers found that x has the opposite sign; here a parameter sets it.

@@ -79,7 +79,7 @@ class PipelineCounters:
     blocks: int = 0
     estimates: int = 0
     degraded: int = 0
-    refused: dict[str, int] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)
     findings: dict[str, int] = field(default_factory=dict)
 
     def count_findings(self, findings: Iterable[str]) -> None:
@@ -103,7 +103,7 @@ class Pipeline:
         self._by = FIXED
         self._cutter = BlockCutter(config.block_size)
         self._period_ns = 1e9 / rig.converter.sample_rate_hz
-        self.zero_refused = ''
+        self.zero_rejected = ''
         self._end_ns: int | None = None
         self.misfits: list[str] = []
         self._changes = 0
@@ -186,16 +186,16 @@ class Pipeline:
     def zero(self) -> ParameterChange | None:
         """Use the mean dots of the last blocks as the unloaded dots, from the next block on.
 
-        None if the last block was not good, if there is none yet, or if the link moves; ``zero_refused`` says the
+        None if the last block was not good, if there is none yet, or if the link moves; ``zero_rejected`` says the
         last. Replay applies the returned record again.
         """
-        self.zero_refused = ''
+        self.zero_rejected = ''
         if not self._recent:
             return None
         recent = np.array(self._recent)
         noise = self.estimation.zero_noise(self._cutter.block_size)
-        self.zero_refused = why_moving(recent, noise)
-        if self.zero_refused:
+        self.zero_rejected = why_moving(recent, noise)
+        if self.zero_rejected:
             return None
         means = [self._by.total(column) / len(self._recent) for column in zip(*self._recent, strict=True)]
         values: dict[str, float | str | tuple[float, ...]] = dict(
@@ -416,7 +416,7 @@ class Pipeline:
         counters.blocks += 1
         if answer.estimate is None:
             name = status.name.lower()
-            counters.refused[name] = counters.refused.get(name, 0) + 1
+            counters.rejected[name] = counters.rejected.get(name, 0) + 1
             return
         counters.estimates += 1
         counters.degraded += verdict.status is not BlockStatus.OK or not answer.complete

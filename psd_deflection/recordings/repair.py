@@ -176,7 +176,7 @@ def _recover_file(path: Path) -> RecoveredFile:
     return RecoveredFile(path, cut, count, list(copy.topics.values()), source.warnings)
 
 
-def _refuse_if_written(path: Path) -> None:
+def _reject_if_written(path: Path) -> None:
     with path.open('rb') as stream:
         if not lock(stream, shared=True):
             raise RecordingError(f'{path}: is being recorded at this moment; end the recording first')
@@ -194,7 +194,7 @@ def recover(path: str | Path) -> Recovered:
             return _recover_folder(path)
         if not path.is_file():
             raise RecordingError(f'{path}: no such recording')
-        _refuse_if_written(path)
+        _reject_if_written(path)
         file = _recover_file(path)
         if path.stat().st_size <= len(MAGIC):
             raise RecordingError(f'{path}: has no more than its first bytes; there is nothing to recover')
@@ -219,7 +219,7 @@ def _recover_folder(folder: Path) -> Recovered:
     if not paths:
         raise RecordingError(f'{folder}: is no bag: it holds no .mcap file')
     for file in paths:
-        _refuse_if_written(file)
+        _reject_if_written(file)
     files, set_aside = [], []
     for file in paths:
         # A file without its first bytes holds nothing.

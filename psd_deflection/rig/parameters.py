@@ -185,11 +185,11 @@ def check_value(parameter: Parameter, value: object, source: str) -> Value:
     """
     try:
         return _CHECKS[parameter.kind](parameter, value)
-    except _RefusedError as why:
+    except _RejectedError as why:
         raise ConfigError(f'{source}: {parameter.with_value(value)}: {why}') from None
 
 
-class _RefusedError(Exception):
+class _RejectedError(Exception):
     """A value is not valid; the text says what it must be."""
 
 
@@ -199,51 +199,51 @@ def _number(parameter: Parameter, value: object) -> float:
         try:
             value = plain_number(value)
         except ValueError:
-            raise _RefusedError('must be a number') from None
+            raise _RejectedError('must be a number') from None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise _RefusedError('must be a number')
+        raise _RejectedError('must be a number')
     try:
         number = float(value)
     except OverflowError:
         number = math.inf
     if not math.isfinite(number):
-        raise _RefusedError('must be finite')
+        raise _RejectedError('must be finite')
     p = parameter
     above_ok = p.above is None or number > p.above
     if not (above_ok and (p.minimum is None or number >= p.minimum) and (p.maximum is None or number <= p.maximum)):
-        raise _RefusedError(f'must be {p.bound_text()}')
+        raise _RejectedError(f'must be {p.bound_text()}')
     return number
 
 
 def _integer(parameter: Parameter, value: object) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
-        raise _RefusedError('must be a whole number')
+        raise _RejectedError('must be a whole number')
     return int(_number(parameter, value))
 
 
 def _bool(parameter: Parameter, value: object) -> bool:
     if not isinstance(value, bool):
-        raise _RefusedError('must be true or false')
+        raise _RejectedError('must be true or false')
     return value
 
 
 def _string(parameter: Parameter, value: object) -> str:
     value = parameter.meant(value)
     if not isinstance(value, str):
-        raise _RefusedError('must be text')
+        raise _RejectedError('must be text')
     if not value.isprintable():
-        raise _RefusedError('must be text that can be printed')
+        raise _RejectedError('must be text that can be printed')
     if parameter.choices is not None and value not in parameter.choices:
-        raise _RefusedError(f'must be {parameter.bound_text()}')
+        raise _RejectedError(f'must be {parameter.bound_text()}')
     return value
 
 
 def _items(parameter: Parameter, value: object) -> list[object]:
     if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
-        raise _RefusedError('must be a list')
+        raise _RejectedError('must be a list')
     items = list(value)
     if parameter.length is not None and len(items) != parameter.length:
-        raise _RefusedError(f'must have {parameter.length} elements, has {len(items)}')
+        raise _RejectedError(f'must have {parameter.length} elements, has {len(items)}')
     return items
 
 
@@ -255,9 +255,9 @@ def _strings(parameter: Parameter, value: object) -> list[str]:
     items = _items(parameter, value)
     names = [item for item in map(parameter.meant, items) if isinstance(item, str)]
     if not names or len(names) != len(items):
-        raise _RefusedError('must be a list of names')
+        raise _RejectedError('must be a list of names')
     if parameter.choices is not None and not set(names) <= set(parameter.choices):
-        raise _RefusedError(f'each must be {parameter.bound_text()}')
+        raise _RejectedError(f'each must be {parameter.bound_text()}')
     return names
 
 

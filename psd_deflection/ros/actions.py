@@ -29,9 +29,9 @@ MOST_ASKED = 200
 
 
 class _Guarded:
-    """``refuse``: is told why something that came is not taken."""
+    """``reject``: is told why something that came is not taken."""
 
-    refuse: Callable[[str], None]
+    reject: Callable[[str], None]
 
     def take_data(self) -> Mapping[str, Any]:
         """As of rclpy's."""
@@ -39,7 +39,7 @@ class _Guarded:
             return dict(super().take_data())  # type: ignore[misc]
         except OF_RCLPY:
             # Its reason is that of the library, with paths of the machine that built it.
-            self.refuse('no message of this type')
+            self.reject('no message of this type')
             return {}
 
     async def execute(self, taken_data: Mapping[str, Any]) -> None:
@@ -48,7 +48,7 @@ class _Guarded:
             try:
                 await super().execute({what: content})  # type: ignore[misc]
             except OF_RCLPY as error:
-                self.refuse(f'{what}: {type(error).__name__}: {error}')
+                self.reject(f'{what}: {type(error).__name__}: {error}')
 
 
 class GuardedServer(_Guarded, ActionServer):  # type: ignore[misc]
@@ -63,12 +63,12 @@ class GuardedServer(_Guarded, ActionServer):  # type: ignore[misc]
         node: Any,
         kind: Any,
         name: str,
-        refuse: Callable[[str], None],
+        reject: Callable[[str], None],
         asked: Callable[[Any], Any],
         accepted: Callable[[Any], None],
         cancelled: Callable[[Any], None],
     ) -> None:
-        self.refuse = refuse
+        self.reject = reject
         self._asked_for = RateLimit(MOST_ASKED)
 
         def run(handle: ServerGoalHandle) -> None:
@@ -103,13 +103,13 @@ class GuardedServer(_Guarded, ActionServer):  # type: ignore[misc]
         for what in ('cancel', 'result'):
             if what in out and not self._asked_for.allows(time.monotonic()):
                 del out[what]
-                self.refuse(f'more than {MOST_ASKED} requests a second')
+                self.reject(f'more than {MOST_ASKED} requests a second')
         return out
 
 
 class GuardedClient(_Guarded, ActionClient):  # type: ignore[misc]
     """A client of the action ``name`` of the class ``kind``."""
 
-    def __init__(self, node: Any, kind: Any, name: str, refuse: Callable[[str], None]) -> None:
-        self.refuse = refuse
+    def __init__(self, node: Any, kind: Any, name: str, reject: Callable[[str], None]) -> None:
+        self.reject = reject
         super().__init__(node, kind, name)

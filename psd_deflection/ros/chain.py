@@ -25,7 +25,7 @@ from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.recordings import cdr
 from psd_deflection.rig.declarations import BY_NAME
 from psd_deflection.rig.parameters import Parameter, Value, check_value
-from psd_deflection.ros.declared import SOURCE, DeclaredParameters, refuse_unknown
+from psd_deflection.ros.declared import SOURCE, DeclaredParameters, reject_unknown
 from psd_deflection.ros.names import BASE, END, END_REST, RECORD, REST, TIP, ZERO
 from psd_deflection.ros.node import AUTOSTART, BaseNode, Health, serve
 from psd_deflection.ros.running import ros
@@ -73,7 +73,7 @@ class ChainNode(BaseNode[ChainSettings]):
         more = (AUTOSTART, *(replace(p, default=self._given.get(p.name, p.default)) for p in OF_LINKS))
         chain = replace(CHAIN, default=self._path)
         known = {p.name: p for p in (*SETTINGS.parameters.values(), *more, chain)}
-        given = refuse_unknown(self.node, known)
+        given = reject_unknown(self.node, known)
         of_links = {p.name: check_value(p, given[p.name], SOURCE) for p in OF_LINKS if p.name in given}
         path = check_value(chain, given.get(chain.name, self._path), SOURCE)
         if not path:

@@ -105,7 +105,7 @@ class DeclaredParameters(Generic[T]):
     ) -> None:
         self._section, self._changed = section, changed
         self._declared = {p.name: p for p in (*section.parameters.values(), *more)}
-        given = refuse_unknown(node, self._declared)
+        given = reject_unknown(node, self._declared)
         checked = {name: check_value(self._declared[name], value, SOURCE) for name, value in given.items()}
         self.values: dict[str, Value] = {**{p.name: p.default for p in more}, **values, **checked}
         self.settings = section.of(self.values)
@@ -137,7 +137,7 @@ class DeclaredParameters(Generic[T]):
             self.values, self.settings = new, settings
 
 
-def refuse_unknown(node: Node, known: Mapping[str, Parameter]) -> dict[str, Any]:
+def reject_unknown(node: Node, known: Mapping[str, Parameter]) -> dict[str, Any]:
     """What ``node`` was given, by name. Raises ConfigError if a parameter is not ``known``."""
     given = {name: plain(p) for name, p in node.get_parameters_by_prefix('').items() if not _is_ros_own(name)}
     for name, value in given.items():

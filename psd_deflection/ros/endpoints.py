@@ -60,7 +60,7 @@ def overriding(row: GraphTopic) -> QoSOverridingOptions | None:
     return QoSOverridingOptions.with_default_policies() if row.overridable else None
 
 
-def refused_qos(error: Exception) -> ConfigError:
+def rejected_qos(error: Exception) -> ConfigError:
     """The error of a ``qos_overrides`` parameter that ROS does not take."""
     return ConfigError(f'{SOURCE}: qos_overrides: {error}')
 
@@ -78,4 +78,4 @@ def publisher_of(node: Node, topic: str, below: str = '') -> Publisher:
             kind, graph_name(row, below), qos(row.delivery), qos_overriding_options=overriding(row)
         )
     except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
-        raise refused_qos(error) from None
+        raise rejected_qos(error) from None

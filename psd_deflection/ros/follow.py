@@ -208,7 +208,7 @@ class Follower:
                 if not future.cancelled():
                     do(future.result())
             except OF_RCLPY as error:
-                self._owner.gate.refuse(self.action, f'{type(error).__name__}: {error}')
+                self._owner.gate.reject(self.action, f'{type(error).__name__}: {error}')
 
         future.add_done_callback(done)
 
@@ -302,7 +302,7 @@ class Follower:
     def _abort(self, goal: _Goal, why: str, code: str = INVALID) -> None:
         if not goal.ended:
             gate = self._owner.gate
-            gate.refuse(FOLLOW, why)
+            gate.reject(FOLLOW, why)
             self._end(goal, GoalStatus.STATUS_ABORTED, self._said(gate.why[FOLLOW], code))
 
     def _end(self, goal: _Goal, status: int, result: Any) -> None:

@@ -29,7 +29,7 @@ from psd_deflection.base.bounds import BoundedMap, RateLimit, Tally
 from psd_deflection.base.log import WARNING, LogCallback
 from psd_deflection.base.sanitize import sanitize
 from psd_deflection.ros.actions import FAILURES, GuardedClient, GuardedServer
-from psd_deflection.ros.endpoints import action_class, graph_name, message_class, overriding, qos, refused_qos
+from psd_deflection.ros.endpoints import action_class, graph_name, message_class, overriding, qos, rejected_qos
 from psd_deflection.ros.topics import HEARD, MOST_GOALS, SERVED, GraphTopic
 from psd_deflection.run.repeats import RateLimitedLog
 
@@ -44,13 +44,13 @@ MOST_A_SECOND = 2000
 class InputGate:
     """Subscriptions of ``node``. ``log`` gets the refusals. ``clock``: monotonic, s.
 
-    ``refused``: messages by topic; ``why``: the last reason of each.
+    ``rejected``: messages by topic; ``why``: the last reason of each.
     """
 
     def __init__(self, node: Node, log: LogCallback, clock: Callable[[], float] = time.monotonic) -> None:
         self._node, self._clock = node, clock
         self._limited_log = RateLimitedLog(log)
-        self.refused = Tally()
+        self.rejected = Tally()
         self.why: BoundedMap[str, str] = BoundedMap()
 
     def listen(
@@ -90,18 +90,18 @@ class InputGate:
             why = self._let_in(len(serialize_message(goal)), row.most_bytes, rate, 'goals')
             why = why or self._taken(goal, check, lambda _: None)
             if why:
-                self.refuse(row.name, why)
+                self.reject(row.name, why)
             return GoalResponse.REJECT if why else GoalResponse.ACCEPT
 
-        refuse, kind = functools.partial(self.refuse, row.name), action_class(row.type)
-        return GuardedServer(self._node, kind, row.name, refuse, asked, accepted, cancelled)
+        reject, kind = functools.partial(self.reject, row.name), action_class(row.type)
+        return GuardedServer(self._node, kind, row.name, reject, asked, accepted, cancelled)
 
     def ask(self, action: str, name: str) -> GuardedClient:
         """A client of the action ``name`` of another node, of the type of ``action``.
 
         Raises as :meth:`serve`, and what rclpy raises for a name that is none.
         """
-        return GuardedClient(self._node, action_class(SERVED[action].type), name, functools.partial(self.refuse, name))
+        return GuardedClient(self._node, action_class(SERVED[action].type), name, functools.partial(self.reject, name))
 
     def take_in(self) -> None:
         """Take the messages that have come, while a transition keeps the executor waiting.
@@ -127,11 +127,11 @@ class InputGate:
         def heard(encoded: bytes) -> None:
             why = self._let_in(len(encoded), row.most_bytes, rate) or self._carry_out(kind, encoded, check, take)
             if why:
-                self.refuse(name, why)
+                self.reject(name, why)
 
         def hidden(event: Any) -> None:
             if event.last_policy_kind == QoSPolicyKind.RELIABILITY:
-                self.refuse(name, 'a publisher is best effort, and this has to be reliable: none of its messages come')
+                self.reject(name, 'a publisher is best effort, and this has to be reliable: none of its messages come')
 
         try:
             return self._node.create_subscription(
@@ -144,15 +144,15 @@ class InputGate:
                 qos_overriding_options=overriding(row),
             )
         except (InvalidQosOverridesError, ValueError, RuntimeError) as error:
-            raise refused_qos(error) from None
+            raise rejected_qos(error) from None
 
     def unpack(self, kind: Any, encoded: bytes) -> Any:
         """The message that check and take get."""
         return deserialize_message(encoded, kind)
 
-    def refuse(self, topic: str, why: str) -> None:
+    def reject(self, topic: str, why: str) -> None:
         """Count a message and say why it is refused."""
-        self.refused.add(topic)
+        self.rejected.add(topic)
         self.why[topic] = sanitize(why, LONGEST)
         self._limited_log.log(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
 
@@ -162,7 +162,7 @@ class InputGate:
 
     def values(self) -> list[tuple[str, str]]:
         """For the node's diagnostics."""
-        counted = sorted(self.refused.items())
+        counted = sorted(self.rejected.items())
         return [
             *((f'messages refused: {topic}', str(count)) for topic, count in counted),
             *((f'refused last: {topic}', self.why[topic]) for topic, _ in counted),
@@ -211,6 +211,6 @@ class GatedNode(LifecycleNode):  # type: ignore[misc]
                 callback(message)
             except FAILURES as error:
                 if self.gate is not None:
-                    self.gate.refuse(topic, str(error))
+                    self.gate.reject(topic, str(error))
 
         return super().create_subscription(msg_type, topic, guarded, *more, **options)

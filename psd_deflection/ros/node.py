@@ -126,7 +126,7 @@ class BaseNode(abc.ABC, Generic[T]):
         try:
             self.parameters = self.declare()
             self.set_up()
-            self._refuse_sim_time()
+            self._reject_sim_time()
             self._survive_requests()
             # A steady clock: health is published even if a simulated clock stops or the system clock is set.
             self.node.create_timer(1.0, self._every_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -286,7 +286,7 @@ class BaseNode(abc.ABC, Generic[T]):
         if action == self.activate and names_frames and not self.frame_prefix and self.node.get_namespace() != '/':
             self.log('frames have no prefix: where several run, give each its own (frame_prefix)', WARNING)
 
-    def _refuse_sim_time(self) -> None:
+    def _reject_sim_time(self) -> None:
         if not self.SYSTEM_TIME:
             return
         why = 'what is measured is stamped by the system clock'
@@ -314,7 +314,7 @@ class BaseNode(abc.ABC, Generic[T]):
                 except Exception as error:
                     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
                     self.log(f'{name}: refused: {reason}', WARNING)
-                    return _refusal(request, response, reason)
+                    return _rejection(request, response, reason)
 
             return answer
 
@@ -350,13 +350,13 @@ def _made(name: str, overrides: Mapping[str, object]) -> _ManagedNode:
         raise ConfigError('ROS: ' + ' '.join(str(error).split())) from None
 
 
-def _refusal(request: Any, response: Any, reason: str) -> Any:
+def _rejection(request: Any, response: Any, reason: str) -> Any:
     """``response``, in which each parameter that was to be set has the reason why it is not."""
-    refused = SetParametersResult(successful=False, reason=reason)
+    rejected = SetParametersResult(successful=False, reason=reason)
     if hasattr(response, 'results') and hasattr(request, 'parameters'):
-        response.results = [refused for _ in request.parameters]
+        response.results = [rejected for _ in request.parameters]
     elif hasattr(response, 'result'):
-        response.result = refused
+        response.result = rejected
     return response
 
 

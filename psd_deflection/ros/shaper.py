@@ -48,7 +48,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
     def __init__(self, settings: ShaperSettings, log: LogCallback) -> None:
         self._asked = settings
         self._known = KnownJoints()
-        self._shaped = self._refused = 0
+        self._shaped = self._rejected = 0
         self._why = ''
         self._follow: Follower | None = None
         super().__init__(NODE_NAME, log)
@@ -94,7 +94,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
         try:
             shaped = self._shape(message)
         except ConfigError as error:
-            self._refused += 1
+            self._rejected += 1
             self._why = sanitize(str(error), LONGEST)
             kind = 'undescribed' if self._undescribed else 'refused'
             self._limited_log.log(kind, f'trajectory refused: {self._why}', WARNING, time.monotonic(), NEWS)
@@ -173,7 +173,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
             ('shaper', shaper.name),
             ('delay (s)', f'{shaper.duration:.4f}'),
             ('trajectories shaped', str(self._shaped)),
-            ('trajectories refused', str(self._refused)),
+            ('trajectories refused', str(self._rejected)),
         )
         yield Health('trajectories', level, text, values)
         if self._follow is not None:

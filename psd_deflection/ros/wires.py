@@ -109,10 +109,10 @@ class InputRecorder(InputGate):
         """The message as it came: the session records these bytes."""
         return bytes(encoded)
 
-    def refuse(self, topic: str, why: str) -> None:
+    def reject(self, topic: str, why: str) -> None:
         """Let the session count it and say why."""
         if self.session is not None:
-            self.session.refuse_input('/' + topic.removeprefix(self._below).removeprefix('/'), why)
+            self.session.reject_input('/' + topic.removeprefix(self._below).removeprefix('/'), why)
 
     def _fault(self, topic: str, message: bytes) -> str:
         session = self.session
@@ -129,4 +129,4 @@ class InputRecorder(InputGate):
             try:
                 self.session.temperature(record.celsius)
             except TimeoutError as error:
-                self.session.refuse_input(topic, str(error))
+                self.session.reject_input(topic, str(error))

@@ -280,7 +280,7 @@ class Recorder:
         try:
             bag = self._open(rig, hello)
         except Exception as error:
-            self._refuse(take, error)
+            self._reject(take, error)
             return
         take.folder = bag.folder
         thread = threading.current_thread()
@@ -299,7 +299,7 @@ class Recorder:
         try:
             self._between_blocks(attach)
         except Exception as error:
-            self._refuse(take, error)
+            self._reject(take, error)
         if not take.attached:
             with contextlib.suppress(OSError, RecordingError):
                 bag.discard()
@@ -334,7 +334,7 @@ class Recorder:
             except RecordingError as error:
                 raise RecordingError(f'{error}; {ELSEWHERE}') from None
 
-    def _refuse(self, take: RecordingJob, error: Exception) -> None:
+    def _reject(self, take: RecordingJob, error: Exception) -> None:
         """Resolve ``take.opened`` with an error, unless it is resolved already."""
         with self._lock:
             if self._opening is not take:

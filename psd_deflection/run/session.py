@@ -68,8 +68,8 @@ LONGEST_LINE = 2000
 class Session:
     """Opens the device on construction. ``log`` and every function in ``listeners`` get one line for each
     change of state, from any thread. ``input_sinks`` get known loads, references and temperatures as they come.
-    ``load``: the known load that is held now, or None. ``refused``: messages of other nodes that could not
-    be used, by topic, ``why_refused``: the last one of each. ``node``: full name of the ROS node, for recordings.
+    ``load``: the known load that is held now, or None. ``rejected``: messages of other nodes that could not
+    be used, by topic, ``why_rejected``: the last one of each. ``node``: full name of the ROS node, for recordings.
     ``unzeroed``: ``rig`` with the zero that it was given, if it has one that was taken in an earlier session.
 
     Raises DeviceError, ConfigError, SolverError or RecordingError if the run cannot start.
@@ -83,8 +83,8 @@ class Session:
         self.input_sinks: list[RecordSink] = []
         self.load: AppliedLoad | None = None
         self._zeroed_ns = 0
-        self.refused = Tally()
-        self.why_refused: BoundedMap[str, str] = BoundedMap()
+        self.rejected = Tally()
+        self.why_rejected: BoundedMap[str, str] = BoundedMap()
         log = self._report
         self._limited_log = RateLimitedLog(log)
         self._mark_rate = RateLimit(MARKS_A_SECOND)
@@ -205,7 +205,7 @@ class Session:
                 self._report(
                     'the disk does not answer; the recording begins when it does, samples flow meanwhile', WARNING
                 )
-                asked.add_done_callback(self._tell_refused)
+                asked.add_done_callback(self._tell_rejected)
         self.acquisition.start()
 
     def record(self, wanted: bool) -> Future[Path | None]:
@@ -233,7 +233,7 @@ class Session:
         asked.add_done_callback(tell)
         return asked
 
-    def _tell_refused(self, done: Future[Path | None]) -> None:
+    def _tell_rejected(self, done: Future[Path | None]) -> None:
         error = done.exception()
         if error is not None:
             self.recorder.failure = str(error)
@@ -257,11 +257,11 @@ class Session:
         try:
             record = from_fields(topic, cdr.decode(TOPIC_TYPES[topic], message))
         except ValueError as error:
-            self.refuse_input(topic, str(error))
+            self.reject_input(topic, str(error))
             return None
         numbers = (n for field in record for n in (field if isinstance(field, tuple) else (field,)))
         if not all(math.isfinite(n) for n in numbers if not isinstance(n, str)):
-            self.refuse_input(topic, 'a number is not finite')
+            self.reject_input(topic, 'a number is not finite')
             return None
         if record.t_ns == 0:
             record = record._replace(t_ns=self.acquisition.now_ns())
@@ -295,7 +295,7 @@ class Session:
         try:
             record = accel_stamped.to_base(cdr.decode(TOPIC_TYPES[ACCELERATION], message))
         except ValueError as error:
-            self.refuse_input(ACCELERATION, str(error))
+            self.reject_input(ACCELERATION, str(error))
             return None
         self.processing.later(partial(self._accelerate, record, message))
         return record
@@ -304,7 +304,7 @@ class Session:
         try:
             known_ns = self.pipeline.accelerate(record)
         except ValueError as error:
-            self._refuse(ACCELERATION, str(error))
+            self._reject(ACCELERATION, str(error))
             return
         if known_ns is None:
             return
@@ -322,7 +322,7 @@ class Session:
         try:
             fields = string.from_mark(string.to_mark({'data': text}))
         except ValueError as error:
-            self.refuse_input(MARK, str(error))
+            self.reject_input(MARK, str(error))
             raise
         return self._take_mark(cdr.encode(TOPIC_TYPES[MARK], fields), late_s)
 
@@ -334,7 +334,7 @@ class Session:
             if not self._mark_rate.allows(time.monotonic()):
                 raise ValueError(f'more than {MARKS_A_SECOND} marks a second')
         except ValueError as error:
-            self.refuse_input(MARK, str(error))
+            self.reject_input(MARK, str(error))
             raise
         mark = mark._replace(t_ns=self.acquisition.now_ns() - round(1e9 * late_s))
         self.recorder.put(MARK, TOPIC_TYPES[MARK], message, mark.t_ns)
@@ -345,14 +345,14 @@ class Session:
         self._report(mark_text(mark))
         return mark
 
-    def refuse_input(self, topic: str, why: str) -> None:
+    def reject_input(self, topic: str, why: str) -> None:
         """Count a message of another node that cannot be used, and say so."""
-        self.processing.later(partial(self._refuse, topic, why))
+        self.processing.later(partial(self._reject, topic, why))
 
-    def _refuse(self, topic: str, why: str) -> None:
+    def _reject(self, topic: str, why: str) -> None:
         # The reason first: the main thread asks for it as soon as there is a count.
-        self.why_refused[topic] = why
-        self.refused.add(topic)
+        self.why_rejected[topic] = why
+        self.rejected.add(topic)
         self._limited_log.log(f'refused {topic}', f'{topic}: refused: {why}', WARNING, time.monotonic())
 
     def settle(self) -> None:

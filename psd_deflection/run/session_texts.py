@@ -30,7 +30,7 @@ def mark_text(mark: Mark) -> str:
 
 def why_no_zero(pipeline: Pipeline) -> str:
     """Why :meth:`Pipeline.zero` took no zero, as text."""
-    if pipeline.zero_refused:
-        return pipeline.zero_refused
+    if pipeline.zero_rejected:
+        return pipeline.zero_rejected
     last = pipeline.last_spots
     return f'no good block now: {last.reason}' if last is not None and last.reason else 'no good block yet'

@@ -84,7 +84,7 @@ def readers(path: Path) -> list[type[PsdDeflectionError]]:
 
 
 @pytest.mark.parametrize('text', TAGS)
-def test_what_is_no_plain_tree_is_refused_by_every_reader(tmp_path: Path, text: str) -> None:
+def test_what_is_no_plain_tree_is_rejected_by_every_reader(tmp_path: Path, text: str) -> None:
     with pytest.raises(YamlError, match='malformed YAML'):
         parse_yaml(text)
     path = tmp_path / 'strange.yaml'
@@ -93,7 +93,7 @@ def test_what_is_no_plain_tree_is_refused_by_every_reader(tmp_path: Path, text: 
 
 
 @pytest.mark.parametrize('text', BOMBS, ids=['merge keys', 'aliases', 'keys'])
-def test_a_bomb_is_refused_before_it_is_built(tmp_path: Path, text: str) -> None:
+def test_a_bomb_is_rejected_before_it_is_built(tmp_path: Path, text: str) -> None:
     with pytest.raises(YamlError, match=f'more than {MAX_NODES} keys and values'):
         parse_yaml(text)
     path = tmp_path / 'bomb.yaml'
@@ -112,7 +112,7 @@ def test_a_bomb_is_refused_before_it_is_built(tmp_path: Path, text: str) -> None
         ),
     ],
 )
-def test_a_key_that_is_there_twice_is_refused_with_its_lines(tmp_path: Path, body: str, said: str) -> None:
+def test_a_key_that_is_there_twice_is_rejected_with_its_lines(tmp_path: Path, body: str, said: str) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text('/**:\n  ros__parameters:\n' + body)
     with pytest.raises(ConfigError, match=said):
@@ -145,7 +145,7 @@ PIECES = st.sampled_from(WORDS.split(' '))
 
 
 @given(st.lists(PIECES | st.sampled_from([' ', '  ', '\n', '\t']) | st.text(max_size=3), max_size=30).map(''.join))
-def test_any_text_is_read_or_refused(text: str) -> None:
+def test_any_text_is_read_or_rejected(text: str) -> None:
     with contextlib.suppress(YamlError):
         parse_yaml(text)
 

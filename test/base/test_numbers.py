@@ -32,7 +32,7 @@ ALLOWED = {
 
 
 @pytest.mark.parametrize('text', ODD)
-def test_what_is_no_number_is_refused(text: str) -> None:
+def test_what_is_no_number_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match='is not a number'):
         plain_number(text)
 
@@ -48,7 +48,7 @@ def test_what_is_not_finite_is_for_the_caller_to_judge() -> None:
 
 
 @pytest.mark.parametrize('text', ['-1_0', '٣'])
-def test_parameters_options_loads_frames_and_arms_refuse_it(text: str, tmp_path: Path) -> None:
+def test_parameters_options_loads_frames_and_arms_reject_it(text: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match='must be a number'):
         load_rig(overrides={'link.length': text})
     with pytest.raises(ConfigError, match='not a list of numbers'):

@@ -43,15 +43,15 @@ def test_a_plug_in_that_ends_is_an_error_of_either_group(
 
     monkeypatch.setattr(registry, 'entry_points', points)
     monkeypatch.setattr('importlib.metadata.entry_points', points)
-    with pytest.raises(ConfigError, match=cause) as refused:
+    with pytest.raises(ConfigError, match=cause) as rejected:
         find_device('ending')
-    assert "source = 'ending': ending_plug_in:THING" in str(refused.value)
-    devices, refusals = known_devices()
+    assert "source = 'ending': ending_plug_in:THING" in str(rejected.value)
+    devices, rejections = known_devices()
     assert devices
-    assert len(refusals) == 1
-    with pytest.raises(ConfigError, match=cause) as refused:
+    assert len(rejections) == 1
+    with pytest.raises(ConfigError, match=cause) as rejected:
         catalogue.catalogue()
-    assert 'ending_plug_in:THING' in str(refused.value)
+    assert 'ending_plug_in:THING' in str(rejected.value)
 
 
 def test_ctrl_c_still_ends_the_program() -> None:

@@ -153,7 +153,7 @@ def test_a_time_that_goes_back_is_told_and_the_last_time_counts() -> None:
     assert of.follows([11], [9.5])
 
 
-def test_a_message_in_which_number_or_time_stands_still_is_refused() -> None:
+def test_a_message_in_which_number_or_time_stands_still_is_rejected() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     with pytest.raises(ValueError, match='seq does not rise'):
         of.extended([8, 9, 9], [8.0, 9.0, 10.0])
@@ -191,7 +191,7 @@ def test_the_number_after_the_last_of_32_bits_is_0_and_goes_on() -> None:
     assert (of.said, of.restarts) == ([], [])
 
 
-def test_whole_numbers_that_go_back_within_a_message_are_refused() -> None:
+def test_whole_numbers_that_go_back_within_a_message_are_rejected() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     with pytest.raises(ValueError, match='seq does not rise'):
         of.extended([9, 8], [8.0, 9.0], whole=True)

@@ -162,12 +162,12 @@ def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixt
 def test_any_choice_within_a_grammar_is_answered(name: str) -> None:
     target, seeds = TARGETS[name]()
     chance = random.Random(7)
-    refused = [judged(target, c) for c in [*seeds, b'', *(chance.randbytes(200) for _ in range(10))]]
-    assert any(refused)
+    rejected = [judged(target, c) for c in [*seeds, b'', *(chance.randbytes(200) for _ in range(10))]]
+    assert any(rejected)
 
 
 @pytest.mark.parametrize('name', [n for n in TARGETS if n not in GRAMMARS])
-def test_fuzz_targets_take_what_is_good_and_refuse_what_was_found_bad(name: str) -> None:
+def test_fuzz_targets_take_what_is_good_and_reject_what_was_found_bad(name: str) -> None:
     target, seeds = TARGETS[name]()
     assert judged(target, seeds[0]) == []
     assert judged(target, b'\x00\x03nonsense\x00') != []
@@ -180,7 +180,7 @@ def test_fuzz_targets_take_what_is_good_and_refuse_what_was_found_bad(name: str)
             judged(target, bytes(spoiled))
 
 
-def test_a_hang_and_a_refusal_of_two_lines_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_hang_and_a_rejection_of_two_lines_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     assert judged(lambda content: ['refused'], b'') == ['refused']
     with pytest.raises(AssertionError, match='more than one line'):
         judged(lambda content: ['refused\nat length'], b'')
@@ -191,6 +191,6 @@ def test_a_hang_and_a_refusal_of_two_lines_are_found(monkeypatch: pytest.MonkeyP
             judged(target, seeds[0])
 
 
-def test_damaged_frames_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_frames_are_rejected(capsys: pytest.CaptureFixture[str]) -> None:
     assert corrupted(20_000) == 0
     assert ' 0 accepted with a wrong content' in capsys.readouterr().out

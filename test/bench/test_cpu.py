@@ -48,11 +48,11 @@ def test_a_part_has_its_own_time_without_that_of_the_parts_inside() -> None:
 def test_a_part_that_raises_is_left() -> None:
     clocks = cpu.Clocks(Ticks())
 
-    def refuses() -> None:
+    def rejects() -> None:
         raise ValueError
 
     with pytest.raises(ValueError):
-        clocks.timed('refused', refuses)()
+        clocks.timed('refused', rejects)()
     clocks.timed('next', lambda: None)()
     assert clocks.calls[threading.get_native_id()] == {'refused': 1, 'next': 1}
 

@@ -11,7 +11,7 @@ from psd_deflection.camera.answer import Status
 
 
 @pytest.mark.statistics
-def test_a_bad_frame_is_refused_or_right() -> None:
+def test_a_bad_frame_is_rejected_or_right() -> None:
     found = [(hurt, off_by(answer, truth)) for hurt, answer, truth in runs(24, 3) if answer.status is Status.OK]
     assert len(found) >= 5
     assert [f for f in found if f[1] > SIGMAS] == []

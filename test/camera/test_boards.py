@@ -88,7 +88,7 @@ def test_an_edge_along_the_rows_of_the_image_is_drawn_where_it_is() -> None:
         assert rows_above(moved) - rows_above(0.0) == pytest.approx(moved, abs=0.02)
 
 
-def test_half_a_board_and_none_are_refused() -> None:
+def test_half_a_board_and_none_are_rejected() -> None:
     rng = np.random.default_rng(3)
     image = shot(SMALL, BOARD, Pose(), rng)
     hidden = image.copy()

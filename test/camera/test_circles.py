@@ -179,12 +179,12 @@ def test_a_small_thing_beside_a_disc_is_noticed_in_a_large_image() -> None:
         (Status.OBLIQUE, Scene(tilt=(0.0, 1.1))),
     ],
 )
-def test_what_cannot_be_measured_is_refused_with_the_reason(status: Status, scene: Scene) -> None:
+def test_what_cannot_be_measured_is_rejected_with_the_reason(status: Status, scene: Scene) -> None:
     (answer,) = measured(scene, [Pose()])
     assert (answer.status, answer.covariance) == (status, None)
 
 
-def test_an_overexposed_target_is_refused() -> None:
+def test_an_overexposed_target_is_rejected() -> None:
     scene, rng = Scene(black=60.0, white=900.0), np.random.default_rng(1)
     reference = CameraReference(settings_of(scene), target_of)
     (answer,) = reference.take(0, photograph(scene, [Pose()], rng))

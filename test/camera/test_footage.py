@@ -48,12 +48,12 @@ def test_a_folder_gives_the_middles_of_its_exposures(tmp_path: Path) -> None:
         ('file,t,exposure\n', 'lists no frame'),
     ],
 )
-def test_a_wrong_table_is_refused_by_line(tmp_path: Path, table: str, complaint: str) -> None:
+def test_a_wrong_table_is_rejected_by_line(tmp_path: Path, table: str, complaint: str) -> None:
     with pytest.raises(RecordingError, match=complaint):
         Footage(folder(tmp_path / 'f', table), 0.0)
 
 
-def test_what_is_no_source_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_source_is_rejected(tmp_path: Path) -> None:
     (tmp_path / 'text.avi').write_text('no video')
     with pytest.raises(RecordingError, match='not a video'):
         Footage(str(tmp_path / 'text.avi'), 0.0)
@@ -120,7 +120,7 @@ def test_the_parameter_file_may_have_any_of_its_forms(tmp_path: Path, text: str)
         ('- 1\n', 'has no parameters of a camera'),
     ],
 )
-def test_a_wrong_parameter_is_refused_by_name(tmp_path: Path, text: str, complaint: str) -> None:
+def test_a_wrong_parameter_is_rejected_by_name(tmp_path: Path, text: str, complaint: str) -> None:
     path = tmp_path / 'camera.yaml'
     path.write_text(text)
     with pytest.raises(ConfigError, match=complaint):

@@ -147,6 +147,6 @@ def test_a_board_of_tiny_squares_costs_a_bounded_time(square: int) -> None:
 
 def test_too_many_outlines_are_a_reason() -> None:
     blocks = np.random.default_rng(1).integers(0, 2, (1000, 1500), np.uint8) * np.uint8(255)
-    with pytest.raises(NoPoseError) as refused:
+    with pytest.raises(NoPoseError) as rejected:
         find_discs(np.kron(blocks, np.ones((3, 3), np.uint8)), 3.0)
-    assert refused.value.status is Status.CLUTTERED
+    assert rejected.value.status is Status.CLUTTERED

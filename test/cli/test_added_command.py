@@ -87,7 +87,7 @@ def test_help_lists_what_is_added_and_of_which_package(capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize('name', ['absent', 'hollow'])
-def test_an_added_command_that_is_none_is_refused(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_added_command_that_is_none_is_rejected(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([name]) == 3
     (line,) = capsys.readouterr().err.splitlines()
     assert f"command '{name}': my_package" in line

@@ -156,7 +156,7 @@ def test_the_method_follows_the_rigs_solver(tmp_path: Path, capsys: pytest.Captu
         (['--params-file', 'absent.yaml'], 3, 'absent.yaml'),
     ],
 )
-def test_bad_input_is_refused_in_one_line(
+def test_bad_input_is_rejected_in_one_line(
     arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['budget', *arguments]) == status

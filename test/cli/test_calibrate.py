@@ -146,7 +146,7 @@ def test_the_page_is_self_contained(made: Path) -> None:
         (['--check', str(RIG)], 3, 'calibration.names: not there; --check takes the rig.yaml of a calibration'),
     ],
 )
-def test_what_does_not_fit_is_refused(
+def test_what_does_not_fit_is_rejected(
     made: Path, argv: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     try:
@@ -224,7 +224,7 @@ def test_dark_levels_alone_change_nothing_else(off: Path, tmp_path: Path, capsys
         ),
     ],
 )
-def test_what_does_not_go_with_dark_levels_is_refused(
+def test_what_does_not_go_with_dark_levels_is_rejected(
     made: Path, off: Path, argv: list[str], status: int, words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     named = {'RUN': str(made / 'run.csv'), 'OFF': str(off), 'RIG': str(made / 'out' / 'rig.yaml')}

@@ -155,7 +155,7 @@ def _with(tree: dict[str, object], **changes: object) -> str:
     return json.dumps({**tree, **changes})
 
 
-def test_what_cannot_be_certified_is_refused(
+def test_what_cannot_be_certified_is_rejected(
     calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     tree = json.loads((calibrated / 'calibration.json').read_text())
@@ -165,7 +165,7 @@ def test_what_cannot_be_certified_is_refused(
     for text, words in (
         ('{', 'no JSON'),
         ('[]', 'no map'),
-        (_with(tree, refused='worse'), 'nothing to certify'),
+        (_with(tree, rejected='worse'), 'nothing to certify'),
         (_with(tree, kind='loads'), 'traceable to nothing'),
         (_with(tree, range=None), 'range: not there'),
         (_with(tree, range={'low': [1, 2], 'high': [1, 2, 3]}), 'range.low'),
@@ -194,7 +194,7 @@ def test_what_cannot_be_certified_is_refused(
         (['--fields', 'absent.yaml'], 3, 'absent.yaml'),
     ],
 )
-def test_bad_input_is_refused_in_one_line(
+def test_bad_input_is_rejected_in_one_line(
     more: list[str], status: int, words: str, calibrated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['certificate', str(calibrated), '--out', str(tmp_path), *more]) == status

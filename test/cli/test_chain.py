@@ -51,7 +51,7 @@ def test_two_simulated_links_as_json_and_csv(tmp_path: Path, capsys: pytest.Capt
         (['compensator', '--urdf', 'gone.urdf', '--tip', 'tool'], 3, 'gone.urdf: no such URDF file'),
     ],
 )
-def test_refused(argv: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rejected(argv: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(argv) == status
     output = capsys.readouterr().err
     assert message in output

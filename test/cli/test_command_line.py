@@ -56,7 +56,7 @@ def test_an_unknown_command_is_one_line_with_a_hint(typed: str, hint: str, capsy
         (['estimator', '--prot', '/dev/ttyACM0'], False),
     ],
 )
-def test_arguments_that_are_none_are_refused_by_the_command(
+def test_arguments_that_are_none_are_rejected_by_the_command(
     argv: list[str], hinted: bool, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as done:
@@ -98,7 +98,7 @@ def test_ros_arguments_go_through_untouched(monkeypatch: pytest.MonkeyPatch) -> 
     assert taken == [ros]
 
 
-def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
+def rejected(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
     status = main(list(argv))
     err = capsys.readouterr().err.strip()
     assert err.count('\n') == 0, err
@@ -128,7 +128,7 @@ def test_recordings_that_are_none(tmp_path: Path, capsys: pytest.CaptureFixture[
         (no_column, 'y2'),
         (no_number, "b.csv:3: column y2 holds 'abc'"),
     ):
-        status, err = refused(capsys, 'replay', str(path))
+        status, err = rejected(capsys, 'replay', str(path))
         assert status == 4
         assert message in err
         assert str(path) in err
@@ -149,11 +149,11 @@ def test_a_bag_that_lost_its_tail_is_read_up_to_the_cut(tmp_path: Path, capsys: 
 def test_bad_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**:\n  ros__parameters:\n    block_size: 0\n')
-    status, err = refused(capsys, 'replay', str(BAGS / 'clean'), '--params-file', str(rig))
+    status, err = rejected(capsys, 'replay', str(BAGS / 'clean'), '--params-file', str(rig))
     assert status == 3
     assert f'{rig}: block_size = 0 samples: must be at least 1' in err
     rig.write_text('/**: [')
-    status, err = refused(capsys, 'params', '--params-file', str(rig))
+    status, err = rejected(capsys, 'params', '--params-file', str(rig))
     assert status == 3
     assert f'{rig}:2:1: malformed YAML' in err
 
@@ -161,7 +161,7 @@ def test_bad_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_a_rig_that_cannot_be_solved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**:\n  ros__parameters:\n    psd_2:\n      center: [0.0, 0.07]\n')
-    status, err = refused(capsys, 'replay', str(BAGS / 'clean'), '--params-file', str(rig))
+    status, err = rejected(capsys, 'replay', str(BAGS / 'clean'), '--params-file', str(rig))
     assert status == 6
     assert 'coincide' in err
 
@@ -174,7 +174,7 @@ def test_a_rig_that_cannot_be_solved(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_options_that_do_not_go_together_are_usage(
     argv: list[str], told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, err = refused(capsys, *argv)
+    status, err = rejected(capsys, *argv)
     assert status == 2
     assert told in err
 
@@ -182,7 +182,7 @@ def test_options_that_do_not_go_together_are_usage(
 def test_output_that_is_there_already_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / 'out.csv'
     out.write_text('mine')
-    status, err = refused(capsys, 'replay', str(BAGS / 'clean'), '--out', str(out))
+    status, err = rejected(capsys, 'replay', str(BAGS / 'clean'), '--out', str(out))
     assert status == 4
     assert 'never overwritten' in err
     assert out.read_text() == 'mine'

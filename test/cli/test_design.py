@@ -73,7 +73,7 @@ def test_the_drawing_is_written(tmp_path: Path, name: str, capsys: pytest.Captur
         (['--params-file', RIG, '--out', 'no/such/folder/plan.png'], 4, 'cannot be written'),
     ],
 )
-def test_bad_input_is_refused_in_one_line(
+def test_bad_input_is_rejected_in_one_line(
     arguments: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['design', *arguments]) == status

@@ -37,7 +37,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def refused(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
+def rejected(capsys: pytest.CaptureFixture[str], *argv: str) -> tuple[int, str]:
     """Exit status and the one line of error; nothing else is said."""
     status = main(list(argv))
     out, err = capsys.readouterr()
@@ -99,7 +99,7 @@ def test_a_value_that_an_option_does_not_take_is_status_2(
     argv: list[str], message: str, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (folder / 'taken').touch()
-    status, err = refused(capsys, *argv)
+    status, err = rejected(capsys, *argv)
     assert status == 2
     assert message in err
     assert [p.name for p in folder.iterdir()] == ['taken']
@@ -112,7 +112,7 @@ def test_a_recording_is_not_written_under_the_ending_of_something_else(
     arguments = [] if command == 'simulate' else [CLEAN]
     for suffix in sorted(FOREIGN - {*also.split()}):
         for name in (f'run{suffix}', f'run_0.5N{suffix.upper()}'):
-            status, err = refused(capsys, command, *arguments, '--out', name)
+            status, err = rejected(capsys, command, *arguments, '--out', name)
             assert status == 2
             assert f'--out {name}: {suffix} cannot be written; use X.csv, X.mcap' in err
             assert ('X.rrd' in err) == bool(also)
@@ -155,7 +155,7 @@ def test_an_output_that_was_not_finished_does_not_pretend_to_be_whole(
 ) -> None:
     bad = bad_from_row(folder, 2000)
     for partial in (f'{name}.partial', f'{name}.partial2'):
-        status, err = refused(capsys, command, str(bad), '--out', name)
+        status, err = rejected(capsys, command, str(bad), '--out', name)
         assert status == 4
         assert "column y2 holds 'abc'" in err
         assert f'{partial} holds what came before' in err
@@ -241,7 +241,7 @@ def test_an_existing_output_is_not_moved(
 
     out = folder / 'out.csv'
     out.write_text('mine')
-    status, err = refused(capsys, 'convert', CLEAN, '--out', 'out.csv')
+    status, err = rejected(capsys, 'convert', CLEAN, '--out', 'out.csv')
     assert (status, 'never overwritten' in err) == (4, True)
     monkeypatch.setattr('psd_deflection.cli.recordings.simulate.run', interrupted)
     for name in ('out.csv', 'none.csv'):
@@ -254,7 +254,7 @@ def test_an_existing_output_is_not_moved(
 def test_discover_leaves_no_folder_where_it_found_nothing_to_read(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert refused(capsys, 'discover', CLEAN, '--out', 'found')[0] == 4
+    assert rejected(capsys, 'discover', CLEAN, '--out', 'found')[0] == 4
     assert list(folder.iterdir()) == []
 
 
@@ -339,10 +339,10 @@ def test_a_name_that_is_no_text_is_drawn_as_far_as_it_is(folder: Path) -> None:
 def strict(text: str) -> Any:
     """``text`` as JSON; NaN and Infinity are none."""
 
-    def refuse(constant: str) -> float:
+    def reject(constant: str) -> float:
         raise AssertionError(constant)
 
-    return json.loads(text, parse_constant=refuse)
+    return json.loads(text, parse_constant=reject)
 
 
 def odd_recording(folder: Path) -> Path:
@@ -482,7 +482,7 @@ def rig_file(folder: Path, body: str) -> str:
         ('effects: {creap: {amplitude: 0.1}}', 3, 'did you mean creep?'),
     ],
 )
-def test_params_refuses_a_rig_that_cannot_be_evaluated(
+def test_params_rejects_a_rig_that_cannot_be_evaluated(
     body: str, status: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['params', '--params-file', rig_file(tmp_path, body)]) == status

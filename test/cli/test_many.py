@@ -141,7 +141,7 @@ def test_each_recording_is_calibrated_for_itself(archive: Path, capsys: pytest.C
         (['info', 'a', 'b', '--out', 'x.csv'], 'must end in .parquet'),
     ],
 )
-def test_what_does_not_fit_is_refused_before_the_work(
+def test_what_does_not_fit_is_rejected_before_the_work(
     words: list[str], message: str, archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(words) == 2

@@ -51,14 +51,14 @@ def test_the_mode_comes_from_the_rig_file_or_the_options(tmp_path: Path) -> None
         (['--shaper', 'none', '--urdf', 'gone.urdf'], 3, 'gone.urdf: no such URDF file'),
     ],
 )
-def test_refused(options: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_rejected(options: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['shaper', *options]) == status
     output = capsys.readouterr().err
     assert message in output
     assert output.count('\n') == 1
 
 
-def test_a_rig_file_without_modes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rig_file_without_modes_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**:\n  ros__parameters:\n    link.length: 0.6\n')
     assert main(['shaper', '--params-file', str(rig)]) == 3

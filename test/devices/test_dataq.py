@@ -219,7 +219,7 @@ def test_a_busy_host_measures_again(wired: Any, unloaded: Any, trials: int) -> N
     assert float(source.describe()['scan rate at start (1/s)']) == pytest.approx(1000.0, rel=0.1)
 
 
-def test_another_rate_than_was_set_is_refused(wired: Any, unloaded: Any) -> None:
+def test_another_rate_than_was_set_is_rejected(wired: Any, unloaded: Any) -> None:
     port = wired(SimulatedDataq(unloaded(load_rig()), PowerUp(skew_ppm=-3e5)))
     source = make_source(load_rig(overrides={'source': 'dataq', 'port': str(port.link)}))
     with pytest.raises(DeviceError, match=r'does 7\d\d\.\d scans/s where 1000\.0 were set'):
@@ -274,7 +274,7 @@ def test_a_rate_out_of_reach_is_named(wired: Any, unloaded: Any) -> None:
         source.open(2.0)
 
 
-def test_another_range_is_refused() -> None:
+def test_another_range_is_rejected() -> None:
     with pytest.raises(ConfigError, match=r'converter\.full_scale = 10'):
         make_source(load_rig(overrides={'source': 'dataq', 'port': 'x', 'converter.full_scale': 5.0}))
 

@@ -144,7 +144,7 @@ def test_why_there_is_no_connection(scheme: str, error: OSError, message: str, m
     assert '\n' not in str(told.value)
 
 
-def test_a_real_refusal(listener: socket.socket) -> None:
+def test_a_real_rejection(listener: socket.socket) -> None:
     name = named(listener)
     listener.close()
     with pytest.raises(DeviceError, match='nothing listens on its port'):
@@ -185,10 +185,10 @@ def test_a_connection_that_does_not_come_is_not_waited_for(
 
 
 def test_no_thread_is_left_for_a_connection(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(**_: object) -> threading.Thread:
+    def reject(**_: object) -> threading.Thread:
         raise RuntimeError("can't start new thread")
 
-    monkeypatch.setattr(threading, 'Thread', refuse)
+    monkeypatch.setattr(threading, 'Thread', reject)
     with pytest.raises(DeviceError, match=r"socket://rig:4000: cannot be opened \(can't start new thread"):
         open_port('socket://rig:4000', BAUD)
 

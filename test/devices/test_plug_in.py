@@ -49,8 +49,8 @@ def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> Non
 @pytest.mark.usefixtures('installed')
 def test_it_is_listed_made_and_known_to_be_simulated() -> None:
     assert source_names()[-1] == NAME
-    devices, refusals = known_devices()
-    assert (devices[-1].name, devices[-1].help, refusals) == (NAME, 'six voltages a line', [])
+    devices, rejections = known_devices()
+    assert (devices[-1].name, devices[-1].help, rejections) == (NAME, 'six voltages a line', [])
     assert NAME in SIMULATED
     assert list(SIMULATED)[-1] == NAME
     source = make_source(load_rig(overrides={'source': NAME, 'port': '/nowhere'}))
@@ -101,7 +101,7 @@ def test_the_survey_recognises_it(
     assert found['ports'][0]['answer'] == 'my converter 7'
 
 
-def test_one_without_a_twin_is_refused_where_a_twin_is_needed(
+def test_one_without_a_twin_is_rejected_where_a_twin_is_needed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str
 ) -> None:
     install(tmp_path, monkeypatch, code, f'{NAME} = my_package.converter:MyConverter')
@@ -113,7 +113,7 @@ def test_one_without_a_twin_is_refused_where_a_twin_is_needed(
         Session(load_rig(overrides={'source': NAME}), null_log)
 
 
-def test_one_that_declares_another_name_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+def test_one_that_declares_another_name_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     install(tmp_path, monkeypatch, code, 'other = my_package.converter:DEVICE')
     with pytest.raises(ConfigError, match=f"source = 'other': .* declares itself as '{NAME}'"):
         find_device('other')

@@ -112,7 +112,7 @@ def test_error_names_a_file_that_is_not_a_recording(tmp_path: Path) -> None:
         make_source(load_rig(overrides={'source': 'replay'}))
 
 
-def test_a_rig_of_another_rate_is_refused(tmp_path: Path) -> None:
+def test_a_rig_of_another_rate_is_rejected(tmp_path: Path) -> None:
     rows = ''.join(f'{i / 500:.3f},0,0,5,0,0,5\n' for i in range(100))
     path = tmp_path / 'slow.csv'
     path.write_text('t,x1,y1,sum1,x2,y2,sum2\n' + rows)

@@ -128,7 +128,7 @@ def test_a_plug_in_is_found_by_its_entry_point() -> None:
         ('odd', 'neither a psd_deflection.devices.Device nor derived from Source'),
     ],
 )
-def test_a_name_that_makes_no_source_is_refused(name: str, message: str) -> None:
+def test_a_name_that_makes_no_source_is_rejected(name: str, message: str) -> None:
     with pytest.raises(ConfigError, match=message) as error:
         make_source(load_rig(overrides={'source': name}))
     assert f"source = '{name}'" in str(error.value)

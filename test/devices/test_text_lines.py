@@ -240,7 +240,7 @@ class Says:
         (b'\n1,2,0,0,5,0,0,5\n', 'no line that describes them'),
     ],
 )
-def test_another_device_is_refused_by_name(wired: Any, text: bytes, message: str) -> None:
+def test_another_device_is_rejected_by_name(wired: Any, text: bytes, message: str) -> None:
     port = wired(Says(text))
     with pytest.raises(DeviceError, match=message):
         make_source(load_rig(overrides={'source': 'lines', 'port': str(port.link)})).open(2.0)

@@ -181,7 +181,7 @@ def test_it_reads_the_rig_in_slots_of_its_rate(pair: Any, run: Any, volts: Any, 
     assert float(state['rate done (1/s)']) > 0
 
 
-def test_a_rate_out_of_reach_is_refused_with_the_one_that_is_not(pair: Any) -> None:
+def test_a_rate_out_of_reach_is_rejected_with_the_one_that_is_not(pair: Any) -> None:
     _, _, rig = pair(**{'converter.sample_rate_hz': 5000.0})
     with pytest.raises(DeviceError, match=r'gives \d+ readings/s, .* = 5000 is out of reach; set it to at most \d+'):
         make_source(rig).open(2.0)

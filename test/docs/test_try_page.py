@@ -123,20 +123,20 @@ def test_the_site_gets_the_interpreter_the_wheels_and_our_modules(cache: Path, t
     assert {'psd_deflection/__init__.py', 'msg_adapters/__init__.py', 'yaml/__init__.py'} <= set(names)
 
 
-def test_a_wheel_that_the_lock_file_does_not_name_is_refused(cache: Path, tmp_path: Path) -> None:
+def test_a_wheel_that_the_lock_file_does_not_name_is_rejected(cache: Path, tmp_path: Path) -> None:
     carry(cache, {'numpy': b'a wheel', 'scipy': b'another', 'blas': b'a wheel'})
     with pytest.raises(pyodide_site.WrongFileError, match=r'scipy\.whl is not the file that pyodide-lock\.json names'):
         pyodide_site.fill(tmp_path / 'site', cache)
     assert not (tmp_path / 'site').exists()
 
 
-def test_a_wheel_that_is_not_carried_is_refused(cache: Path, tmp_path: Path) -> None:
+def test_a_wheel_that_is_not_carried_is_rejected(cache: Path, tmp_path: Path) -> None:
     carry(cache, {'numpy': b'a wheel', 'scipy': b'a wheel'})
     with pytest.raises(pyodide_site.WrongFileError, match=r'has no blas\.whl'):
         pyodide_site.fill(tmp_path / 'site', cache)
 
 
-def test_another_interpreter_is_refused_and_not_kept(cache: Path, tmp_path: Path) -> None:
+def test_another_interpreter_is_rejected_and_not_kept(cache: Path, tmp_path: Path) -> None:
     packed = cache / f'pyodide-{pyodide_site.VERSION}.tgz'
     packed.write_bytes(packed.read_bytes() + b'\0')
     with pytest.raises(pyodide_site.WrongFileError, match='its hash is sha512-'):

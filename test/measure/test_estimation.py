@@ -190,7 +190,7 @@ def test_a_reading_that_contradicts_the_others_widens_the_covariance() -> None:
     assert max(np.abs(reported.pose) / np.sqrt(np.array(reported.covariance)[[0, 4, 8]])) > 100.0
 
 
-def test_four_readings_that_contradict_each_other_are_refused_if_that_is_asked_for() -> None:
+def test_four_readings_that_contradict_each_other_are_rejected_if_that_is_asked_for() -> None:
     volts = at_rest(1)
     volts[:, 0] = 1e-3 / 5e-4
     records = list(Pipeline(load_rig(overrides={'consistency': 'refuse'})).process(chunk(volts)))

@@ -62,7 +62,7 @@ def test_off_is_the_default_and_nothing_is_estimated() -> None:
     records = records_of(pipeline, dark(moving(12), 2, slice(4, 8)))
     assert sorted(primaries(records)) == [0, 1, 2, 3, 8, 9, 10, 11]
     assert pipeline.counters.degraded == 0
-    assert pipeline.counters.refused == {'laser_lost': 4}
+    assert pipeline.counters.rejected == {'laser_lost': 4}
 
 
 @pytest.mark.parametrize('psd', [1, 2])
@@ -89,7 +89,7 @@ def test_with_one_laser_lost_the_translation_goes_on_by_the_rule_and_returns(psd
     # What a block shows of motion differs from block to block, and with it the covariance, by a few per cent.
     np.testing.assert_allclose(found[30].covariance, full.covariance, rtol=0.1)
     assert pipeline.counters.degraded == 20
-    assert pipeline.counters.refused == {}
+    assert pipeline.counters.rejected == {}
     statuses = [s.status for s in spots(records)]
     assert statuses[10:30] == [BlockStatus.LASER_LOST] * 20
     # The torque is not measured: no load is told.
@@ -114,7 +114,7 @@ def test_what_is_saturated_is_said_with_the_parameter_of_the_range() -> None:
 # ---- findings
 
 
-def test_a_detector_that_stands_still_is_reported_and_refused_where_it_shall_be() -> None:
+def test_a_detector_that_stands_still_is_reported_and_rejected_where_it_shall_be() -> None:
     counts = moving(12)
     counts[2 * SIZE : 10 * SIZE, 0:3] = counts[2 * SIZE, 0:3]
     quiet = Pipeline(load_rig())
@@ -229,6 +229,6 @@ def test_outside_the_calibrated_range_the_block_says_so() -> None:
 
 
 @pytest.mark.parametrize('given', [[1.0], [0.0, 0.0], [0.0, 0.0, 1.0, 1.0, 1.0, 0.5]])
-def test_a_range_that_is_none_is_refused(given: list[float]) -> None:
+def test_a_range_that_is_none_is_rejected(given: list[float]) -> None:
     with pytest.raises(ConfigError, match=r'calibration\.range: '):
         Pipeline(load_rig(overrides={'calibration.range': given}))

@@ -267,10 +267,10 @@ def test_a_zero_is_the_mean_of_the_last_half_second(rig: Rig) -> None:
     values = dict(change.values)
     assert values['psd_1.zero'] == pytest.approx((17e-8, 34e-8), rel=1e-4)
     assert values['psd_2.zero'] == pytest.approx((-17e-8, 51e-8), rel=1e-4)
-    assert pipeline.zero_refused == ''
+    assert pipeline.zero_rejected == ''
 
 
-def test_a_zero_is_refused_while_the_link_moves(rig: Rig) -> None:
+def test_a_zero_is_rejected_while_the_link_moves(rig: Rig) -> None:
     """14 Hz of 20 um on y1, which the mean of half a second would hide."""
     t = np.arange(600) * 1e-3
     dots = np.zeros((600, 4))
@@ -314,7 +314,7 @@ def test_counters_count(rig: Rig) -> None:
     # Blocks 0 and 3 are good, of block 5 half is there; lasers are lost in 1 and 2, block 4 is saturated.
     counters = pipeline.counters
     assert (counters.samples, counters.blocks, counters.estimates, counters.degraded) == (110, 6, 3, 0)
-    assert counters.refused == {'laser_lost': 2, 'saturated': 1}
+    assert counters.rejected == {'laser_lost': 2, 'saturated': 1}
 
 
 def test_the_stamp_goes_by_the_rate_of_the_rig_file() -> None:

@@ -383,7 +383,7 @@ def test_a_cloud_is_of_as_many_psds_as_have_all_their_channels(psds: int) -> Non
     assert point_cloud2.psds_of(np.zeros(1, [(name, '<f4') for name in names])) == psds
 
 
-def test_points_that_contradict_themselves_are_refused() -> None:
+def test_points_that_contradict_themselves_are_rejected() -> None:
     (m,) = to_messages(block(0))
     for change, message in (
         ({'width': 21}, 'do not make'),
@@ -457,7 +457,7 @@ def test_an_end_effector_has_its_whole_pose_in_the_frame_of_its_chain() -> None:
     assert fields['pose']['covariance'] == [*map(float, range(36))]
 
 
-def test_a_vector_of_two_or_four_numbers_is_refused() -> None:
+def test_a_vector_of_two_or_four_numbers_is_rejected() -> None:
     e = EndEffectorDeflection(T0, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3, 0.9), (0.0,) * 36)
     for numbers in ((1.0, 2.0), (1.0,) * 5):
         for wrong in (e._replace(position=numbers), e._replace(quaternion=numbers)):
@@ -549,7 +549,7 @@ def test_samples_are_stamped_with_their_first_one() -> None:
 
 
 @given(st.binary(max_size=200), st.sampled_from(sorted(MESSAGE_TYPES)))
-def test_bytes_are_a_message_or_refused(junk: bytes, name: str) -> None:
+def test_bytes_are_a_message_or_rejected(junk: bytes, name: str) -> None:
     try:
         fields = cdr.decode(name, junk)
     except ValueError as error:
@@ -562,7 +562,7 @@ def test_bytes_are_a_message_or_refused(junk: bytes, name: str) -> None:
 @given(
     st.sampled_from(sorted({*MESSAGE_TYPES} - {'diagnostic_msgs/msg/DiagnosticArray', string.MESSAGE.name})), st.data()
 )
-def test_a_message_that_is_cut_is_refused(name: str, data: st.DataObject) -> None:
+def test_a_message_that_is_cut_is_rejected(name: str, data: st.DataObject) -> None:
     record = next(m for r in run(60) for m in to_messages(r) if m.type == name)
     whole = cdr.encode(name, record.fields)
     assert cdr.decode(name, whole) == record.fields
@@ -604,7 +604,7 @@ def test_what_the_pipeline_remembers_is_told_or_not() -> None:
 
 
 @pytest.mark.parametrize('text', ['', '[]', '{"version": 1}', '[' * 100_000, 'x' * (string.MAX_CHARACTERS + 1)])
-def test_a_text_that_is_no_rig_is_refused(text: str) -> None:
+def test_a_text_that_is_no_rig_is_rejected(text: str) -> None:
     with pytest.raises(ValueError, match=r'lacks|Expecting|nested|characters'):
         string.to_rig({'data': text})
 

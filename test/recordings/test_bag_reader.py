@@ -405,7 +405,7 @@ def information(folder: Path, **changes: object) -> Path:
         ({'relative_file_paths': ['../../etc/passwd']}, 'passwd: is named by metadata.yaml and is not there'),
     ],
 )
-def test_bags_of_another_kind_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+def test_bags_of_another_kind_are_rejected(tmp_path: Path, changes: dict[str, object], message: str) -> None:
     folder = information(tmp_path / 'b', **changes)
     with pytest.raises(RecordingError, match=message) as caught:
         open_recording(folder)
@@ -425,7 +425,7 @@ def test_bags_of_another_kind_are_refused(tmp_path: Path, changes: dict[str, obj
         ('metadata.yaml', b'[' * 5000, 'malformed YAML'),
     ],
 )
-def test_files_that_are_none_are_refused_in_one_line(tmp_path: Path, name: str, content: bytes, message: str) -> None:
+def test_files_that_are_none_are_rejected_in_one_line(tmp_path: Path, name: str, content: bytes, message: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(RecordingError, match=message) as caught:
         list(open_recording(tmp_path / name).blocks())
@@ -433,14 +433,14 @@ def test_files_that_are_none_are_refused_in_one_line(tmp_path: Path, name: str, 
     assert '\n' not in str(caught.value)
 
 
-def test_what_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_what_is_not_there_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='no such recording'):
         open_recording(tmp_path / 'nothing')
     with pytest.raises(RecordingError, match='is no bag'):
         open_recording(tmp_path)
 
 
-def test_another_type_on_our_topic_is_refused(tmp_path: Path) -> None:
+def test_another_type_on_our_topic_is_rejected(tmp_path: Path) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         (m,) = to_messages(TemperatureReading(T0, 20.0))
         out.write_encoded(SAMPLES, m.type, cdr.encode(m.type, m.fields), T0)
@@ -455,7 +455,7 @@ def test_another_type_on_our_topic_is_refused(tmp_path: Path) -> None:
         (lambda points: points['dt'].__setitem__(5, 0), 'dt does not rise'),
     ],
 )
-def test_points_out_of_order_are_refused(tmp_path: Path, change: Any, message: str) -> None:
+def test_points_out_of_order_are_rejected(tmp_path: Path, change: Any, message: str) -> None:
     (m,) = to_messages(block(0))
     points = np.frombuffer(bytearray(m.fields['data']), np.dtype([('seq', '<u4'), ('dt', '<u4'), ('v', '<f4', 6)]))
     change(points)

@@ -52,7 +52,7 @@ def test_bytes_are_those_of_an_independent_encoder(type_name: str, data: st.Data
 
 @pytest.mark.parametrize('type_name', sorted(MESSAGE_TYPES))
 @given(junk=st.binary(max_size=300), data=st.data())
-def test_bytes_that_are_no_message_are_refused_or_a_message(type_name: str, junk: bytes, data: st.DataObject) -> None:
+def test_bytes_that_are_no_message_are_rejected_or_a_message(type_name: str, junk: bytes, data: st.DataObject) -> None:
     encoded = cdr.encode(type_name, data.draw(values(MESSAGE_TYPES[type_name])))
     cut = encoded[: data.draw(st.integers(0, len(encoded) - 1))]
     for wrong in (junk, cut, b'\0\1\0\0' + junk, b'\0\0\0\0' + junk):
@@ -95,7 +95,7 @@ def test_the_encoder_takes_every_kind_of_field() -> None:
         cdr.encoder_of(made_up)({**values_of, 'three': [1, 2]})
 
 
-def test_a_type_that_is_not_ours_is_refused() -> None:
+def test_a_type_that_is_not_ours_is_rejected() -> None:
     with pytest.raises(KeyError):
         cdr.encode('std_msgs/msg/Empty', {})
 

@@ -211,7 +211,7 @@ def test_errors_name_file_line_and_column(tmp_path: Path, lines: list[str], mess
     assert '\n' not in str(caught.value)
 
 
-def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
+def test_what_is_no_text_is_rejected(tmp_path: Path) -> None:
     (tmp_path / 'a.csv').write_bytes(b'\xff\xfe\x00')
     with pytest.raises(RecordingError, match='is not text in UTF-8'):
         open_recording(tmp_path / 'a.csv')
@@ -303,7 +303,7 @@ def test_spaces_and_exponents_are_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('name', ['run.csv', 'run.mcap', 'run'])
-def test_a_pipe_is_refused_and_not_waited_for(tmp_path: Path, name: str) -> None:
+def test_a_pipe_is_rejected_and_not_waited_for(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / name)
     with pytest.raises(RecordingError, match='is no file'):
         open_recording(tmp_path / name)

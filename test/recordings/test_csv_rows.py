@@ -89,7 +89,7 @@ def test_a_blank_line_ends_the_plain_rows_and_not_the_reading(tmp_path: Path) ->
     assert [(list(r.lines), list(r.t_ns)) for r in SampleRows(path).rows()] == [([2, 4], [100_000_000, 200_000_000])]
 
 
-def test_a_line_without_an_end_is_refused_before_it_is_held(tmp_path: Path) -> None:
+def test_a_line_without_an_end_is_rejected_before_it_is_held(tmp_path: Path) -> None:
     path = tmp_path / 'a.csv'
     path.write_text('t,x1\n0.1,1\n0.2,' + '1' * 200_000)
     table = SampleRows(path)

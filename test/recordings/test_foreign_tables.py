@@ -135,7 +135,7 @@ CONVERTIBLE: dict[str, tuple[bytes, tuple[str, ...]]] = {
 }
 
 
-def refusal(path: Path) -> str:
+def rejection(path: Path) -> str:
     """What is said of the file, one line that names it; '' if it is read whole."""
     why = ''
     try:
@@ -154,7 +154,7 @@ def test_a_logger_s_table_follows_its_advice(tmp_path: Path, name: str) -> None:
     path.write_bytes(content)
     logged = []
     for n in range(6):
-        why = refusal(path)
+        why = rejection(path)
         if not why:
             break
         logged.append(why)
@@ -202,7 +202,7 @@ ROWS = table().splitlines()
 def test_what_no_line_converts_is_named_by_row(tmp_path: Path, content: bytes, words: tuple[str, ...]) -> None:
     path = tmp_path / 'a.csv'
     path.write_bytes(content)
-    why = refusal(path)
+    why = rejection(path)
     assert all(word in why for word in words), why
 
 
@@ -220,7 +220,7 @@ def test_what_no_line_converts_is_named_by_row(tmp_path: Path, content: bytes, w
 )
 def test_a_file_of_another_program_is_named(tmp_path: Path, name: str, head: bytes, words: str) -> None:
     (tmp_path / name).write_bytes(head)
-    assert words in refusal(tmp_path / name)
+    assert words in rejection(tmp_path / name)
 
 
 @pytest.mark.parametrize('reader', ['recording', 'references', 'readings', 'loads', 'frames'])

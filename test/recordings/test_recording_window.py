@@ -129,7 +129,7 @@ def test_bounds_may_be_times_of_the_clock() -> None:
         ((-5.0, 0.0), RecordingError, 'has no sample'),
     ],
 )
-def test_a_part_without_samples_is_refused(
+def test_a_part_without_samples_is_rejected(
     bounds: tuple[float | None, float | None], error: type[Exception], words: str
 ) -> None:
     with pytest.raises(error, match=words):
@@ -161,7 +161,9 @@ def test_a_part_is_written_and_studied(tmp_path: Path, capsys: pytest.CaptureFix
         (['--from', '2026-11-24T14:03:10'], 4, 'has no sample from 2026-11-24'),
     ],
 )
-def test_a_wrong_bound_is_refused(words: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_bound_is_rejected(
+    words: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main(['info', str(BAGS / 'clean'), *words]) == status
     assert told in capsys.readouterr().err
 

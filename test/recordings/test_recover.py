@@ -143,7 +143,7 @@ def test_only_a_damaged_chunk_is_lost_and_it_is_reported(tmp_path: Path) -> None
     assert 120 <= len(theirs(folder)['/psd/samples']) < 200
 
 
-def test_recover_refuses_a_running_recording(tmp_path: Path) -> None:
+def test_recover_rejects_a_running_recording(tmp_path: Path) -> None:
     bag = BagWriter(tmp_path / 'run', rig_values={})
     bag.put(block(0))
     bag.flush()

@@ -36,7 +36,7 @@ def test_frames_without_an_answer_are_counted_not_read(tmp_path: Path) -> None:
     assert found.poses.tolist() == [[0.0, 0.0, 0.0], [1e-3, 2e-3, 0.01]]
     assert found.sd is not None
     assert found.sd[1].tolist() == [1e-5, 2e-5, 1e-4]
-    assert found.refused == {'blurred': 2}
+    assert found.rejected == {'blurred': 2}
 
 
 def test_a_stage_needs_four_columns_only(tmp_path: Path) -> None:
@@ -71,7 +71,7 @@ def test_a_fault_is_named(tmp_path: Path, text: str, message: str) -> None:
         read_references(written(tmp_path, text))
 
 
-def test_a_table_that_is_no_text_is_refused(tmp_path: Path) -> None:
+def test_a_table_that_is_no_text_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / 'camera.csv'
     path.write_bytes(b't,dx,dy,theta\n0,0,0,\xff\xfe\n')
     with pytest.raises(RecordingError, match='is not text in UTF-8'):

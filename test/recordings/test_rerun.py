@@ -83,7 +83,7 @@ def test_help_names_the_ending(capsys: pytest.CaptureFixture[str]) -> None:
     assert 'X.rrd' in capsys.readouterr().out
 
 
-def test_a_disk_that_refuses_is_one_line(
+def test_a_disk_that_rejects_is_one_line(
     stand_in: MagicMock, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     stand_in.RecordingStream.return_value.flush.side_effect = RuntimeError('File-writer thread shut down')

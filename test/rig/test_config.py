@@ -35,7 +35,7 @@ def test_the_shipped_rig_file_is_the_default() -> None:
         ('record', 'yes', 'true or false'),
     ],
 )
-def test_a_bad_value_is_refused_by_name(key: str, value: object, said: str) -> None:
+def test_a_bad_value_is_rejected_by_name(key: str, value: object, said: str) -> None:
     with pytest.raises(ConfigError) as error:
         rig_from_values({key: value}, 'rig.yaml')
     message = str(error.value)
@@ -66,7 +66,7 @@ def test_whole_bounds_are_written_whole() -> None:
 
 
 @pytest.mark.parametrize('value', [10**400, 10**6000, -(10**400)], ids=['long', 'longer', 'negative'])
-def test_a_number_of_very_many_digits_is_refused_like_any_other(value: int) -> None:
+def test_a_number_of_very_many_digits_is_rejected_like_any_other(value: int) -> None:
     with pytest.raises(ConfigError, match=r'^rig\.yaml: baud = .{0,400}: must be'):
         rig_from_values({'baud': value}, 'rig.yaml')
 
@@ -113,6 +113,6 @@ def test_no_estimate_from_one_detector_has_three_words(tmp_path: Path, word: str
 
 
 @pytest.mark.parametrize('word', [True, 0, 'no', None])
-def test_other_words_for_it_are_refused(word: object) -> None:
+def test_other_words_for_it_are_rejected(word: object) -> None:
     with pytest.raises(ConfigError, match=r'degraded = '):
         load_rig(None, {'degraded': word})

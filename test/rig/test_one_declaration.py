@@ -31,9 +31,9 @@ def calls(tree: ast.AST, name: str) -> Iterator[ast.Call]:
 def checks_a_number(function: ast.FunctionDef) -> bool:
     """Whether it looks at the type of a value and refuses it as a parameter."""
     raised = (n.exc for n in ast.walk(function) if isinstance(n, ast.Raise) and n.exc is not None)
-    refuses = any('ConfigError' in ast.unparse(error) for error in raised)
+    rejects = any('ConfigError' in ast.unparse(error) for error in raised)
     kinds = {n.id for call in calls(function, 'isinstance') for n in ast.walk(call.args[1]) if isinstance(n, ast.Name)}
-    return refuses and bool(kinds & NUMBERS)
+    return rejects and bool(kinds & NUMBERS)
 
 
 def test_a_number_of_a_file_is_checked_in_one_place() -> None:

@@ -23,7 +23,7 @@ from psd_deflection.rig.parameter_files import flat_parameters, read_parameter_f
         ('!!python/object/apply:os.system ["true"]', 'malformed'),
     ],
 )
-def test_a_malformed_file_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
+def test_a_malformed_file_is_rejected_by_name(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
@@ -92,7 +92,7 @@ def test_effects_are_put_into_the_users_file(tmp_path: Path) -> None:
         ('/**:\n  ros__parameters: {block_size: !!python/object/apply:os.system [ls]}\n', 'malformed YAML'),
     ],
 )  # fmt: skip
-def test_a_file_that_cannot_be_edited_is_refused(text: str, why: str, tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_edited_is_rejected(text: str, why: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=why) as caught:
         with_effects_section(text, {'creep': {'amplitude': 0.1}}, tmp_path / 'rig.yaml')
     assert str(tmp_path / 'rig.yaml') in str(caught.value)

@@ -78,7 +78,7 @@ def test_a_dark_detector_is_dark_on_the_input_that_it_is_wired_to() -> None:
         ({'psd_1.axes': [True, 'x']}, r'list of names'),
     ],
 )
-def test_a_wiring_that_cannot_be_is_refused(values: dict[str, object], said: str) -> None:
+def test_a_wiring_that_cannot_be_is_rejected(values: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         rig_from_values(values, 'rig.yaml')
 

@@ -31,7 +31,7 @@ def message(image: Any, seconds: int) -> Image:
     return out
 
 
-def test_images_become_references_and_a_refused_one_its_reason(domain: int, peer: Any, tmp_path: Path) -> None:
+def test_images_become_references_and_a_rejected_one_its_reason(domain: int, peer: Any, tmp_path: Path) -> None:
     scene, rng = Scene(), np.random.default_rng(0)
     parameters = tmp_path / 'camera.yaml'
     parameters.write_text(f'camera.matrix: {scene.matrix}\ncamera.exposure: 0.01\nrest.frames: 1\n')
@@ -59,10 +59,10 @@ def test_images_become_references_and_a_refused_one_its_reason(domain: int, peer
         assert [at.x, at.y] == pytest.approx([1e-3, -2e-3], abs=10e-6)
         assert 0.0 < certain[-1].pose.covariance[0] < 1e-10
 
-        def refused() -> bool:
+        def rejected() -> bool:
             return any('no target' in s.message for r in reports for s in r.status)
 
-        peer.until(told(dark, refused), 'the reason')
+        peer.until(told(dark, rejected), 'the reason')
     finally:
         node.end(signal.SIGINT)
 

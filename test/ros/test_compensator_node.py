@@ -235,7 +235,7 @@ def strange_messages() -> dict[str, tuple[Any, str, str]]:
     return {name: (m, topic, told[name]) for topic, some in topics.items() for name, m in some.items()}
 
 
-def test_what_strangers_send_is_refused_and_moves_nothing(compensator: Program, peer: Any) -> None:
+def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program, peer: Any) -> None:
     plant = Plant(peer.node)
     free = 2e-3
     peer.until(lambda: plant.error() > free, 'a deflection')
@@ -251,13 +251,13 @@ def test_what_strangers_send_is_refused_and_moves_nothing(compensator: Program, 
         values = {v.key: v.value for s in states[-1].status for v in s.values} if states else {}
         return int(values.get(f'messages refused: {topic.strip("/")}', '0'))
 
-    def refused(topic: str, why: str) -> Callable[[], bool]:
+    def rejected(topic: str, why: str) -> Callable[[], bool]:
         wanted, before = compensator.text.count(why), counted(topic)
         return lambda: compensator.text.count(why) > wanted or (before >= 3 and counted(topic) > before)
 
     for name, (message, topic, why) in strange_messages().items():
         send = partial(senders[topic].publish, message)
-        peer.until_sent(send, refused(topic, why), f'the refusal of what is {name}')
+        peer.until_sent(send, rejected(topic, why), f'the refusal of what is {name}')
     peer.until(lambda: counted('/end_effector/deflection') >= 4 and counted('/joint_states') >= 5, 'their counts')
     assert compensator.process.poll() is None
     assert plant.step() <= WITHIN
@@ -277,8 +277,8 @@ def test_settings_are_parameters(compensator: Program, peer: Any) -> None:
     assert rate.floating_point_range[0].to_value == 10.0
 
     assert changed(peer, 'max_rate', 0.05).successful
-    refused = changed(peer, 'max_rate', 20.0)
-    assert not refused.successful
+    rejected = changed(peer, 'max_rate', 20.0)
+    assert not rejected.successful
     assert not changed(peer, 'max_rat', 0.05).successful
 
 
@@ -291,7 +291,7 @@ def test_settings_are_parameters(compensator: Program, peer: Any) -> None:
         (['-p', 'joints:=[a,b]'], 'must be those of the arm, in any order: shoulder, elbow'),
     ],
 )
-def test_a_parameter_that_cannot_be_is_refused(domain: int, words: list[str], told: str) -> None:
+def test_a_parameter_that_cannot_be_is_rejected(domain: int, words: list[str], told: str) -> None:
     command = [*PSD_DEFLECTION, *ARGUMENTS, '--ros-args', *words]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3
@@ -342,7 +342,7 @@ def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> 
         node.end()
 
 
-def test_a_controller_state_that_is_not_installed_is_refused(domain: int) -> None:
+def test_a_controller_state_that_is_not_installed_is_rejected(domain: int) -> None:
     command = [*PSD_DEFLECTION, *ARGUMENTS, '--controller-state', 'control_msgs/msg/NoSuchThing']
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3

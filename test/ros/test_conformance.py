@@ -76,14 +76,14 @@ class Profile:
 
     ``words``: what the command needs. ``params``: the parameter file of the run. ``published``: a topic of its own.
     ``fixed``: a parameter that is read at the start; ``live``: one that may be set; each with another value than it
-    has. ``used``: whether that of ``live`` acts. ``beyond``: a value out of bounds. ``refused``: messages by check.
+    has. ``used``: whether that of ``live`` acts. ``beyond``: a value out of bounds. ``rejected``: messages by check.
     ``frames``: whether the prefix among the parameters acts.
     """
 
     published: tuple[type, str]
     fixed: tuple[str, object]
     beyond: tuple[str, object]
-    refused: Mapping[str, Sent | str]
+    rejected: Mapping[str, Sent | str]
     live: tuple[str, object] | str
     frames: Callable[[Running], bool] | str
     words: tuple[str, ...] = ()
@@ -155,7 +155,7 @@ class Running:
         statuses = [s for report in self.reports[since:] for s in report.status]
         return ' '.join([s.message for s in statuses] + [v.value for s in statuses for v in s.values])
 
-    def refusals(self) -> int:
+    def rejections(self) -> int:
         """As its diagnostics count them."""
         own = f'{NAMESPACE}/{self.name}'.removeprefix('/')
         last = {s.name: s for report in self.reports for s in report.status if s.name.startswith(own)}
@@ -251,21 +251,21 @@ def age_acts(running: Running) -> bool:
         return message
 
     running.send((JointState, 'joint_states', old(3)))
-    count = running.refusals()
+    count = running.rejections()
     subscribers = running.peer.node.count_subscribers
     running.peer.until(lambda: subscribers(f'{NAMESPACE}/joint_states') > 0, 'the subscription')
     for _ in range(50):
         running.send((JointState, 'joint_states', old(3)))
     told = 0
 
-    def refused() -> bool:
+    def rejected() -> bool:
         nonlocal told
         running.send((JointState, 'joint_states', old(30)))
         told += 1
-        return running.refusals() > count
+        return running.rejections() > count
 
-    running.peer.until(refused, 'a refusal')
-    return running.refusals() - count <= told
+    running.peer.until(rejected, 'a refusal')
+    return running.rejections() - count <= told
 
 
 def frame_of(kind: type, topic: str, frame: str) -> Callable[[Running], bool]:
@@ -288,7 +288,7 @@ def frame_of(kind: type, topic: str, frame: str) -> Callable[[Running], bool]:
 def taken_in_the_prefixed_frame_alone(running: Running) -> bool:
     """A deflection in the frame without the prefix is refused."""
     sent = PoseWithCovarianceStamped, 'end_effector/deflection', deflection()
-    return refuses(running, sent, ("'end_effector_rest': must be left_end_effector_rest",))
+    return rejects(running, sent, ("'end_effector_rest': must be left_end_effector_rest",))
 
 
 def follow_of(name: str) -> tuple[str, ...]:
@@ -305,7 +305,7 @@ PROFILES: Mapping[str, Profile] = {
         live=('sum_min', 2.25),
         used=sum_min_acts,
         beyond=('amplifier.noise', -1.0),
-        refused=loads_at('link_tip/load'),
+        rejected=loads_at('link_tip/load'),
         frames=frame_of(PoseStamped, 'link_tip/deflection', 'left_link_tip_rest'),
         sim_time='refused',
     ),
@@ -316,7 +316,7 @@ PROFILES: Mapping[str, Profile] = {
         live=('camera.exposure', 0.5),
         used=exposure_acts,
         beyond=('target.radius', -1.0),
-        refused={
+        rejected={
             'nan': (CameraInfo, 'camera_info', CameraInfo(k=[math.nan] * 9)),
             'huge': (CameraInfo, 'camera_info', CameraInfo(k=[1e300] * 9)),
             'frame': 'an image is in the frame of its camera, whatever its name is',
@@ -332,7 +332,7 @@ PROFILES: Mapping[str, Profile] = {
         fixed=('base_frame', 'stand'),
         live='all its parameters are read at the start',
         beyond=('slopes', 'none'),
-        refused=loads_at('upper/link_tip/load'),
+        rejected=loads_at('upper/link_tip/load'),
         frames=frame_of(PoseWithCovarianceStamped, 'end_effector/deflection', 'left_end_effector_rest'),
         sim_time='refused',
     ),
@@ -344,7 +344,7 @@ PROFILES: Mapping[str, Profile] = {
         live=('stale', 10.0),
         used=age_acts,
         beyond=('max_rate', -1.0),
-        refused={
+        rejected={
             'nan': (JointState, 'joint_states', JointState(name=['shoulder'], position=[math.nan])),
             'huge': (JointState, 'joint_states', JointState(name=['elbow'], position=[1e300])),
             'frame': (PoseWithCovarianceStamped, 'end_effector/deflection', deflection(frame='world')),
@@ -361,7 +361,7 @@ PROFILES: Mapping[str, Profile] = {
         live=('lead', 0.9),
         used=lead_acts,
         beyond=('max_step', -1.0),
-        refused={
+        rejected={
             'nan': (JointTrajectory, 'shaper/trajectory', trajectory(math.nan)),
             'huge': (JointTrajectory, 'shaper/trajectory', trajectory(1e300)),
             'frame': 'joint positions are in no frame; that of a trajectory is passed on',
@@ -393,9 +393,9 @@ def running(
     print(*one.program.lines[-30:], sep='\n')
 
 
-def refuses(running: Running, sent: Sent, words: tuple[str, ...]) -> bool:
+def rejects(running: Running, sent: Sent, words: tuple[str, ...]) -> bool:
     """Whether the message is counted as refused in the node's diagnostics, for a reason with one of ``words``."""
-    before, reports = running.refusals(), len(running.reports)
+    before, reports = running.rejections(), len(running.reports)
 
     def send() -> None:
         running.send(sent)
@@ -405,17 +405,17 @@ def refuses(running: Running, sent: Sent, words: tuple[str, ...]) -> bool:
 
     def counted() -> bool:
         why = running.texts(reports)
-        return running.refusals() > before and any(word in why for word in words)
+        return running.rejections() > before and any(word in why for word in words)
 
     running.peer.until_sent(send, counted, f'the refusal of {sent[1]} for one of {words}')
     return running.program.process.poll() is None
 
 
-def refused_kind(running: Running, kind: str, *words: str) -> None:
-    sent = running.profile.refused[kind]
+def rejected_kind(running: Running, kind: str, *words: str) -> None:
+    sent = running.profile.rejected[kind]
     if isinstance(sent, str):
         pytest.skip(sent)
-    assert refuses(running, sent, words)
+    assert rejects(running, sent, words)
 
 
 def test_parameters_are_described(running: Running) -> None:
@@ -524,7 +524,7 @@ def test_frame_prefix_acts(running: Running) -> None:
     assert framed(running)
 
 
-def test_simulated_time_acts_or_is_refused(running: Running) -> None:
+def test_simulated_time_acts_or_is_rejected(running: Running) -> None:
     answer = running.set('use_sim_time', True)
     if running.profile.sim_time == 'refused':
         assert not answer.successful
@@ -532,7 +532,7 @@ def test_simulated_time_acts_or_is_refused(running: Running) -> None:
         return
     assert answer.successful, answer.reason
     clock = running.peer.node.create_publisher(Clock, '/clock', 5)
-    seen, refused = len(running.reports), running.refusals()
+    seen, rejected = len(running.reports), running.rejections()
 
     def told(sec: int) -> None:
         message = Clock()
@@ -545,36 +545,36 @@ def test_simulated_time_acts_or_is_refused(running: Running) -> None:
     try:
         running.peer.until_sent(lambda: told(1234), of_that_time, 'diagnostics in simulated time')
         running.peer.until_sent(
-            lambda: told(-5), lambda: running.refusals() > refused, 'the refusal of a time before 1970'
+            lambda: told(-5), lambda: running.rejections() > rejected, 'the refusal of a time before 1970'
         )
     finally:
         running.peer.node.destroy_publisher(clock)
         assert running.set('use_sim_time', False).successful
 
 
-def test_not_a_number_is_refused(running: Running) -> None:
-    refused_kind(running, 'nan', 'nan', 'finite')
+def test_not_a_number_is_rejected(running: Running) -> None:
+    rejected_kind(running, 'nan', 'nan', 'finite')
 
 
-def test_absurd_number_is_refused(running: Running) -> None:
-    refused_kind(running, 'huge', '1e+300', 'beyond')
+def test_absurd_number_is_rejected(running: Running) -> None:
+    rejected_kind(running, 'huge', '1e+300', 'beyond')
 
 
-def test_other_frame_is_refused(running: Running) -> None:
-    refused_kind(running, 'frame', 'frame_id')
+def test_other_frame_is_rejected(running: Running) -> None:
+    rejected_kind(running, 'frame', 'frame_id')
 
 
-def test_stamp_that_is_no_time_is_refused(running: Running) -> None:
-    refused_kind(running, 'stamp', 'is no time')
+def test_stamp_that_is_no_time_is_rejected(running: Running) -> None:
+    rejected_kind(running, 'stamp', 'is no time')
 
 
-def test_oversized_message_is_refused(running: Running) -> None:
-    refused_kind(running, 'size', ' bytes: must be at most')
+def test_oversized_message_is_rejected(running: Running) -> None:
+    rejected_kind(running, 'size', ' bytes: must be at most')
 
 
-def test_refusals_are_warnings(running: Running) -> None:
+def test_rejections_are_warnings(running: Running) -> None:
     # Each test may run in a process of its own: what the others sent may not have been sent here.
-    sent = next(sent for sent in running.profile.refused.values() if not isinstance(sent, str))
+    sent = next(sent for sent in running.profile.rejected.values() if not isinstance(sent, str))
 
     running.peer.until_sent(lambda: running.send(sent), lambda: running.logged('refused', 30), 'a warning')
     levels = {line.level for line in running.lines if 'refused: ' in line.msg}
@@ -631,7 +631,7 @@ def test_its_actions_are_rows_of_the_table(running: Running) -> None:
     running.peer.until(found, f'{rows} and no other action')
 
 
-def test_goal_that_cannot_be_used_is_refused(running: Running) -> None:
+def test_goal_that_cannot_be_used_is_rejected(running: Running) -> None:
     (name,) = served(running)
     from control_msgs.action import FollowJointTrajectory
     from control_msgs.msg import JointTolerance
@@ -647,10 +647,10 @@ def test_goal_that_cannot_be_used_is_refused(running: Running) -> None:
     try:
         running.peer.until(client.server_is_ready, name)
         for why, sent in strange.items():
-            before, reports = running.refusals(), len(running.reports)
+            before, reports = running.rejections(), len(running.reports)
 
             def counted(before: int = before, reports: int = reports, why: str = why) -> bool:
-                return running.refusals() > before and why in running.texts(reports)
+                return running.rejections() > before and why in running.texts(reports)
 
             future = client.send_goal_async(sent)
             running.peer.until(future.done, 'the answer to a goal')

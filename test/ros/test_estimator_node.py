@@ -276,7 +276,7 @@ def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     assert [f.name for f in (tmp_path / 'bags').iterdir()] == [folder.name]
 
 
-def test_parameters_have_units_and_ranges_and_are_refused_by_name(start: Callable[..., Any], peer: Any) -> None:
+def test_parameters_have_units_and_ranges_and_are_rejected_by_name(start: Callable[..., Any], peer: Any) -> None:
     # YAML takes the word for a boolean.
     start('--ros-args', '-p', 'degraded:=off')
     poses = peer.collect(PoseStamped, '/link_tip/deflection')

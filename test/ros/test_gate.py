@@ -80,7 +80,7 @@ def test_good_ones_are_taken_and_others_counted_and_said(
     def sent() -> bool:
         for text in ('good', '', 'x' * 2000):
             publisher.publish(String(data=text))
-        return bool(gated.heard) and gated.gate.refused[TOPIC] >= 2
+        return bool(gated.heard) and gated.gate.rejected[TOPIC] >= 2
 
     peer.until(sent, 'the messages')
     assert set(gated.heard) == {'good'}
@@ -90,7 +90,7 @@ def test_good_ones_are_taken_and_others_counted_and_said(
     }
     assert set(gated.levels) == {WARNING}
     count, why = gated.gate.values()
-    assert count == (f'messages refused: {TOPIC}', str(gated.gate.refused[TOPIC]))
+    assert count == (f'messages refused: {TOPIC}', str(gated.gate.rejected[TOPIC]))
     assert why[0] == f'refused last: {TOPIC}'
     assert f'{TOPIC}: refused: {why[1]}' in gated.logged
 
@@ -104,7 +104,7 @@ def test_a_text_that_is_no_text_ends_nothing(peer: Any, gated: Gated) -> None:
     def sent() -> bool:
         publisher.publish(wrong)
         publisher.publish(String(data='good'))
-        return bool(gated.heard) and (gated.gate.refused[TOPIC] > 0 or len(gated.heard) > 20)
+        return bool(gated.heard) and (gated.gate.rejected[TOPIC] > 0 or len(gated.heard) > 20)
 
     peer.until(sent, 'the good one')
     assert 'good' in gated.heard
@@ -117,7 +117,7 @@ def test_a_flood_is_cut_off_until_the_next_second(peer: Any, gated: Gated) -> No
     def flooded() -> bool:
         for _ in range(20):
             publisher.publish(String(data='x'))
-        return gated.gate.refused[TOPIC] > 0
+        return gated.gate.rejected[TOPIC] > 0
 
     peer.until(flooded, 'the end of the flood')
     assert len(gated.heard) == MOST_A_SECOND
@@ -134,5 +134,5 @@ def test_a_load_must_come_reliably_and_who_does_not_send_so_is_named(
     heard_as(monkeypatch, HEARD[LOAD][0].delivery)
     gated.listen()
     peer.node.create_publisher(String, TOPIC, QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
-    peer.until(lambda: gated.gate.refused[TOPIC] > 0, 'the publisher that is best effort')
+    peer.until(lambda: gated.gate.rejected[TOPIC] > 0, 'the publisher that is best effort')
     assert 'a publisher is best effort, and this has to be reliable' in gated.logged[0]

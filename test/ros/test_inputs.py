@@ -81,7 +81,7 @@ def test_an_acceleration_says_its_frame() -> None:
 
 
 @pytest.mark.parametrize('part', ['force.z', 'torque.x', 'torque.y'])
-def test_a_component_that_cannot_be_used_is_refused(part: str) -> None:
+def test_a_component_that_cannot_be_used_is_rejected(part: str) -> None:
     text = fault(LOAD, {f'wrench.{part}': 50.0})
     assert text == f'{part.replace(".", " ")} = 50: cannot be used, only force x, force y and torque z can'
     assert fault(LOAD, {f'wrench.{part}': -0.0}) == ''
@@ -101,7 +101,7 @@ def test_a_component_that_cannot_be_used_is_refused(part: str) -> None:
         (ACCELERATION, 'accel.angular.x'),
     ],
 )
-def test_numbers_that_cannot_be_are_refused(topic: str, name: str, value: float) -> None:
+def test_numbers_that_cannot_be_are_rejected(topic: str, name: str, value: float) -> None:
     assert fault(topic, {name: value}) != ''
 
 
@@ -117,17 +117,17 @@ def test_kelvin_is_no_celsius() -> None:
 
 
 @pytest.mark.parametrize('topic', [*sorted({*RECORDS} - {MARK}), REFERENCE_WITH_COVARIANCE])
-def test_a_stamp_that_is_no_time_is_refused(topic: str) -> None:
+def test_a_stamp_that_is_no_time_is_rejected(topic: str) -> None:
     for stamp in ({'sec': -(2**31), 'nanosec': 0}, {'sec': 5, 'nanosec': 2_000_000_000}):
         assert 'is no time' in fault(topic, {'header.stamp': stamp})
 
 
 @pytest.mark.parametrize('topic', [LOAD, TEMPERATURE, ACCELERATION])
-def test_a_stamp_of_another_clock_is_refused_but_that_of_a_reference(topic: str) -> None:
+def test_a_stamp_of_another_clock_is_rejected_but_that_of_a_reference(topic: str) -> None:
     seconds = NOW_NS // 10**9
-    for away, refused in ((0, False), (50, False), (-50, False), (70, True), (-70, True), (2**31 - 1 - seconds, True)):
+    for away, rejected in ((0, False), (50, False), (-50, False), (70, True), (-70, True), (2**31 - 1 - seconds, True)):
         stamp = {'sec': seconds + away, 'nanosec': 0}
-        assert bool(fault(topic, {'header.stamp': stamp})) == refused, away
+        assert bool(fault(topic, {'header.stamp': stamp})) == rejected, away
         # Its offset is found afterwards, from the motion.
         assert fault(REFERENCE, {'header.stamp': stamp}) == ''
 

@@ -268,10 +268,10 @@ def test_an_unforeseen_error_at_the_start_is_not_swallowed(domain: int, monkeypa
         estimator.run(['--ros-args'], {}, null_log)
 
 
-def test_a_refusal_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refused(*args: Any, **options: Any) -> Any:
+def test_a_rejection_by_dds_is_one_line(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def rejected(*args: Any, **options: Any) -> Any:
         raise RuntimeError('error creating node: no security libraries\nPlease compile')
 
-    monkeypatch.setattr(node, '_ManagedNode', refused)
+    monkeypatch.setattr(node, '_ManagedNode', rejected)
     with pytest.raises(ConfigError, match=r'^ROS: error creating node: no security libraries Please compile$'):
         estimator.run(['--ros-args'], {}, null_log)

@@ -216,7 +216,7 @@ def test_what_cannot_be_followed_is_aborted_with_the_reason(begin: Callable[...,
     assert arm.shaper.text.count('follow_joint_trajectory: refused: point 0 is not finite') == 1
 
 
-def test_what_no_goal_may_be_is_refused_at_the_gate(begin: Callable[..., Arm]) -> None:
+def test_what_no_goal_may_be_is_rejected_at_the_gate(begin: Callable[..., Arm]) -> None:
     arm = begin()
 
     def rejected(goal: Any, why: str) -> None:
@@ -325,19 +325,19 @@ def test_a_controller_that_does_not_answer_ends_a_goal(
     assert arm.followed(arm.goal())[0] == SUCCEEDED
 
 
-def test_what_rclpy_cannot_take_is_refused(control_msgs: None, peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_rclpy_cannot_take_is_rejected(control_msgs: None, peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
     from control_msgs.action import FollowJointTrajectory
 
-    refused: list[str] = []
+    rejected: list[str] = []
     node = rclpy.create_node('served', context=peer.context)
-    server = GuardedServer(node, FollowJointTrajectory, '/goals', refused.append, print, print, print)
+    server = GuardedServer(node, FollowJointTrajectory, '/goals', rejected.append, print, print, print)
 
     def broken(self: Any) -> None:
         raise UnicodeDecodeError('utf-8', b'x', 0, 1, '/a/path of the library')
 
     monkeypatch.setattr(rclpy.action.ActionServer, 'take_data', broken)
     assert server.take_data() == {}
-    assert refused == ['no message of this type']
+    assert rejected == ['no message of this type']
     server.destroy()
     node.destroy_node()
 
@@ -370,7 +370,9 @@ sys.exit(main())
         (('--action', FOLLOW), 'must be the action of a controller, not our own'),
     ],
 )
-def test_an_action_that_cannot_be_is_refused(control_msgs: None, domain: int, words: tuple[str, ...], why: str) -> None:
+def test_an_action_that_cannot_be_is_rejected(
+    control_msgs: None, domain: int, words: tuple[str, ...], why: str
+) -> None:
     command = [*PSD_DEFLECTION, 'shaper', '--shaper', 'none', *words]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3, ended.stderr

@@ -57,7 +57,7 @@ def told(peer: Any, **positions: float) -> None:
     peer.node.create_timer(0.02, lambda: out.publish(stated))
 
 
-def test_a_move_is_shaped_and_a_bad_one_refused(node: Program, peer: Any) -> None:
+def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> None:
     node.until('publishing /shaper/shaped: ZVD for 12 Hz, damping ratio 0.02; motions take 83 ms longer')
     heard = peer.collect(JointTrajectory, '/shaper/shaped')
     reports = peer.collect(DiagnosticArray, '/diagnostics')
@@ -137,18 +137,18 @@ def test_the_limits_come_from_the_robots_description(domain: int, peer: Any) -> 
         told(peer, shoulder=START[0], elbow=START[1])
         move_of = {'slow': (2.0 * MOVE_S, END.tolist()), 'far': (MOVE_S, [1e3, 0.0])}
 
-        def refused(why: str, kind: str) -> None:
+        def rejected(why: str, kind: str) -> None:
             good = message(point(0.0, START.tolist()), point(*move_of[kind]))
             peer.until(lambda: given.publish(good) or why in node.text, why)
 
-        refused('trajectory refused: nobody has told the limits of the joints on robot_description yet', 'slow')
+        rejected('trajectory refused: nobody has told the limits of the joints on robot_description yet', 'slow')
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         described = peer.node.create_publisher(String, '/robot_description', latched)
         described.publish(String(data='<robot'))
         peer.until(lambda: 'robot_description: refused' in node.text, 'a refusal of what is no URDF')
         described.publish(String(data=URDF.read_text()))
         peer.until(lambda: 'limits of shoulder, elbow' in node.text, 'the limits')
-        refused('trajectory refused: shoulder', 'far')
+        rejected('trajectory refused: shoulder', 'far')
         good = message(point(0.0, START.tolist()), point(*move_of['slow']))
         peer.until(lambda: given.publish(good) or bool(heard), 'the shaped trajectory')
     finally:
@@ -189,7 +189,7 @@ def test_settings_are_parameters(node: Program, peer: Any) -> None:
         (['-p', 'urdf:=gone.urdf'], 'gone.urdf: no such URDF file'),
     ],
 )
-def test_a_parameter_that_cannot_be_is_refused(domain: int, words: list[str], why: str) -> None:
+def test_a_parameter_that_cannot_be_is_rejected(domain: int, words: list[str], why: str) -> None:
     command = [*PSD_DEFLECTION, 'shaper', *ZVD, '--ros-args', *words]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3

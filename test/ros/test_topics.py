@@ -66,7 +66,7 @@ def test_every_topic_of_a_record_has_a_row() -> None:
     assert {m.topic for m in to_messages(estimate(3))} <= PUBLISHED.keys()
 
 
-def test_a_topic_without_a_row_is_refused() -> None:
+def test_a_topic_without_a_row_is_rejected() -> None:
     endpoints = pytest.importorskip('psd_deflection.ros.endpoints')
     with pytest.raises(KeyError, match='/made/up'):
         endpoints.publisher_of(None, '/made/up')

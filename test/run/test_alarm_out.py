@@ -183,9 +183,9 @@ def test_an_address_that_is_a_secret_stays_in_its_file(server: Server, tmp_path:
     out, _ = handed_on('', str(tmp_path / 'address'))
     assert (len(server.got), out.sent) == (1, 1)
     (tmp_path / 'address').write_text('file:///secret')
-    with pytest.raises(ConfigError) as refused:
+    with pytest.raises(ConfigError) as rejected:
         AlarmOut('', str(tmp_path / 'address'), texts(lambda text: None))
-    assert 'secret' not in str(refused.value)
+    assert 'secret' not in str(rejected.value)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_an_address_that_is_a_secret_stays_in_its_file(server: Server, tmp_path:
         ('', '/nowhere/address', 'no file that can be read'),
     ],
 )
-def test_what_cannot_be_used_is_refused_at_the_start(command: str, webhook: str, words: str) -> None:
+def test_what_cannot_be_used_is_rejected_at_the_start(command: str, webhook: str, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         AlarmOut(command, webhook, texts(lambda text: None))
 

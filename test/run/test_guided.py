@@ -35,7 +35,7 @@ def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
     assert max(shown) > 0.9
 
 
-def test_a_port_where_nothing_is_is_refused(tmp_path: Any) -> None:
+def test_a_port_where_nothing_is_is_rejected(tmp_path: Any) -> None:
     rig = load_rig(overrides={'port': str(tmp_path / 'nothing')})
     with pytest.raises(DeviceError, match='no such port'):
         run_guided(rig, rig, null_log, lambda guide: None)

@@ -216,12 +216,12 @@ def test_estimates_flow_while_the_disk_hangs_at_the_end_of_a_recording(live: Liv
 def test_stop_reports_a_recording_that_cannot_be_closed(
     live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refuse(fd: int) -> None:
+    def reject(fd: int) -> None:
         raise OSError(5, 'Input/output error')
 
     live.record(True)
     live.flow()
-    monkeypatch.setattr(os, 'fsync', refuse)
+    monkeypatch.setattr(os, 'fsync', reject)
     with pytest.raises(RecordingError, match=r'Input/output error.*psd-deflection recover'):
         live.session.record(False).result(WAIT_S)
 
@@ -279,13 +279,13 @@ def test_a_start_that_hangs_does_not_hold_up_the_end_of_the_run(live: Live, disk
 def test_starts_and_ends_without_end_on_a_disk_that_hangs_make_a_few_threads(live: Live, disk: Disk) -> None:
     disk.hang('open')
     before = threading.active_count()
-    refusals = []
+    rejections = []
     for _ in range(50):
         started = live.session.record(True)
         live.session.record(False).result(WAIT_S)
-        refusals.append(str(started.exception(WAIT_S)))
+        rejections.append(str(started.exception(WAIT_S)))
     assert threading.active_count() - before <= recorder_module.MOST_THREADS
-    assert refusals[-1] == f'not recorded: {recorder_module.MOST_THREADS} recordings wait for the disk already'
+    assert rejections[-1] == f'not recorded: {recorder_module.MOST_THREADS} recordings wait for the disk already'
     disk.go_on.set()
 
 
@@ -339,7 +339,7 @@ def test_a_late_disk_error_is_reported(
     one.session.close()
 
 
-def test_a_disk_that_refuses_at_once_ends_the_start(device: ScriptedDevice, sample: Sample, tmp_path: Path) -> None:
+def test_a_disk_that_rejects_at_once_ends_the_start(device: ScriptedDevice, sample: Sample, tmp_path: Path) -> None:
     (tmp_path / 'bags').write_text('a file')
     one = Live(device, sample, tmp_path / 'bags', record=True)
     with pytest.raises(RecordingError, match='cannot be made'):

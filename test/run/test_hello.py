@@ -77,7 +77,7 @@ def gate(first: Mapping[str, object] | None = None, *, volts: bool = False) -> H
         ({'channels': {'x1': 1}}, 'channels'),
     ],
 )
-def test_what_does_not_fit_is_refused_at_the_start_and_later(changes: dict[str, object], message: str) -> None:
+def test_what_does_not_fit_is_rejected_at_the_start_and_later(changes: dict[str, object], message: str) -> None:
     for before in (gate(), gate(GOOD)):
         kept = before.hello
         with pytest.raises(DeviceError, match=f'port: HELLO has {message}') as error:
@@ -126,7 +126,7 @@ VALUES = st.recursive(
 
 
 @given(st.dictionaries(st.sampled_from([*GOOD, 'other']), VALUES, max_size=6), st.booleans(), st.booleans())
-def test_any_hello_is_taken_or_refused_with_a_device_error(changes: dict[str, Any], volts: bool, first: bool) -> None:
+def test_any_hello_is_taken_or_rejected_with_a_device_error(changes: dict[str, Any], volts: bool, first: bool) -> None:
     before = gate(info(volts_per_count=None) if volts else GOOD, volts=volts) if first else gate()
     scale = before.volts_per_count
     with contextlib.suppress(DeviceError):
@@ -278,7 +278,7 @@ THREE = {**GOOD, 'psds': 3, 'channels': list(channel_names(3))}
         (True, {**THREE, 'channels': list(CHANNELS)}, 'HELLO has channels'),
     ],
 )
-def test_a_device_with_other_psds_than_the_rig_file_is_refused(
+def test_a_device_with_other_psds_than_the_rig_file_is_rejected(
     third: bool, hello: dict[str, object], message: str
 ) -> None:
     rig = load_rig(overrides={'psd_3.center': [0.08, 0.0]} if third else {})

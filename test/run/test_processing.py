@@ -100,15 +100,15 @@ def test_timeout_of_a_begun_request_says_that_it_was_begun(items: ItemQueue, mon
 
 
 def test_errors_of_a_request_come_through(items: ItemQueue) -> None:
-    def refuse() -> None:
+    def reject() -> None:
         raise TimeoutError('its own')
 
     processing = Processing(items, Pipeline(load_rig()), texts(print))
     with pytest.raises(TimeoutError, match='its own'):
-        processing.request(refuse)
+        processing.request(reject)
     processing.start()
     with pytest.raises(TimeoutError, match='its own'):
-        processing.request(refuse)
+        processing.request(reject)
     items.put(Ended())
     processing.join(WAIT_S)
 

@@ -86,11 +86,11 @@ def test_watchdog_does_nothing_without_systemd(
     systemd.socket.close()
 
 
-def test_refused_system_resources_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*args: Any) -> None:
+def test_rejected_system_resources_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def reject(*args: Any) -> None:
         raise PermissionError(errno.EPERM, 'Operation not permitted')
 
-    monkeypatch.setattr(os, 'sched_setscheduler', refuse)
+    monkeypatch.setattr(os, 'sched_setscheduler', reject)
     assert 'SCHED_FIFO 50 is refused (Operation not permitted' in prefer_reader()
     monkeypatch.setattr(os, 'sched_setscheduler', lambda *args: None)
     assert prefer_reader() == 'reader: SCHED_FIFO 50'

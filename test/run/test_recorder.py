@@ -205,15 +205,15 @@ def test_with_nothing_to_delete_it_ends(tmp_path: Path, disk: Disk) -> None:
     assert 'no older file of this recording' in run.heard()
 
 
-def test_a_disk_that_refuses_ends_the_recording_and_says_the_way_out(
+def test_a_disk_that_rejects_ends_the_recording_and_says_the_way_out(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     run = Run(rig_for(tmp_path))
 
-    def refuse(fd: int) -> None:
+    def reject(fd: int) -> None:
         raise OSError(errno.EIO, 'Input/output error')
 
-    monkeypatch.setattr(os, 'fsync', refuse)
+    monkeypatch.setattr(os, 'fsync', reject)
     run.put(60)
     text = run.heard()
     assert 'Input/output error' in text

@@ -26,7 +26,7 @@ from psd_deflection.run import processing
 from psd_deflection.run import session as module
 from psd_deflection.run.diagnostics import STALE, WARN, HealthReporter
 from psd_deflection.run.monitor.metrics import text_of
-from psd_deflection.run.monitor.shown import RefusedError, ShownSession
+from psd_deflection.run.monitor.shown import RejectedError, ShownSession
 from psd_deflection.run.repeats import RateLimitedLog
 from psd_deflection.run.session import Session
 from test.heard import WAIT_S
@@ -87,15 +87,15 @@ def test_a_zero_that_was_taken_under_a_load_is_told(running: Running) -> None:
     session.note_load(0.0, 0.0, 0.0)
     assert session.zero() is not None
     session.note_load(0.0, -30.0, 0.0)
-    session.refuse_input(LOAD, 'the end')
+    session.reject_input(LOAD, 'the end')
     told = []
     while 'refused: the end' not in (text := running.logged.get(timeout=WAIT_S)):
         told.append(text)
     assert not [text for text in told if 'anew' in text]
 
 
-def test_metrics_count_what_came_was_lost_and_was_refused(running: Running) -> None:
-    running.session.refuse_input(LOAD, 'a number is not finite')
+def test_metrics_count_what_came_was_lost_and_was_rejected(running: Running) -> None:
+    running.session.reject_input(LOAD, 'a number is not finite')
     running.session.processing.request(lambda: None)
     families = ShownSession(running.session).metrics()
     found = {
@@ -202,9 +202,9 @@ def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_told_now(
     # From the page, as far as the daemon knows when the dots moved.
     shown = ShownSession(session)
     assert shown.step() == ''
-    with pytest.raises(RefusedError, match='not noted: the dots have not stepped in the last 60 s'):
+    with pytest.raises(RejectedError, match='not noted: the dots have not stepped in the last 60 s'):
         shown.load(0.0, -20.0, 0.0, False, None, 0.0)
-    with pytest.raises(RefusedError, match='not noted: another load is noted'):
+    with pytest.raises(RejectedError, match='not noted: another load is noted'):
         shown.load(0.0, -20.0, 0.0, False, 9.0, 0.0)
     device.send_frames(*(sample(seq) for seq in range(200, 300)))
     assert session.record(False).result(WAIT_S) == folder
@@ -272,7 +272,7 @@ def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDe
     assert open_recording(folder).marks() == [first, last] == seen.records
 
 
-def test_a_mark_that_is_none_or_comes_too_often_is_refused_and_counted(
+def test_a_mark_that_is_none_or_comes_too_often_is_rejected_and_counted(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     session, seen = running.session, Seen()
@@ -287,7 +287,7 @@ def test_a_mark_that_is_none_or_comes_too_often_is_refused_and_counted(
     with pytest.raises(ValueError, match='more than 10 marks a second'):
         session.note_mark('one more')
     session.processing.request(lambda: None)
-    assert session.refused[MARK] >= 6
+    assert session.rejected[MARK] >= 6
     assert [mark.text for mark in seen.records if isinstance(mark, Mark)] == ['good']
 
 
@@ -310,14 +310,14 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
     assert seen.records == [good, now]
     # Both are counted, and the last reason is told.
     running.session.processing.request(lambda: None)
-    assert running.session.refused == {REFERENCE: 2}
+    assert running.session.rejected == {REFERENCE: 2}
     entry = HealthReporter(running.session).report(0).entries[0]
     assert dict(entry.values)[f'messages refused: {REFERENCE}'] == '2'
     assert entry.level == WARN
     assert entry.message.startswith(f'{REFERENCE}: refused: ')
 
 
-def test_what_was_counted_of_refused_messages_is_said_though_no_more_come(
+def test_what_was_counted_of_rejected_messages_is_said_though_no_more_come(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The health is asked once a second, whatever the run publishes."""

@@ -109,7 +109,7 @@ def test_the_command_says_which_rule_is_broken(capsys: pytest.CaptureFixture[str
         (['--splitter', '1e-3', '1e-3', '--allowed', '1e-3', '--radius', '0.1'], 'not for --splitter'),
     ],
 )
-def test_what_cannot_be_is_refused(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_is_rejected(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['design', '--params-file', FILE, *words]) != 0
     assert message in capsys.readouterr().err
 

@@ -167,7 +167,7 @@ def test_the_watch_shows_a_mark_before_its_first_alarm() -> None:
     assert result.seconds == pytest.approx(19.999)
 
 
-def test_a_drawing_that_is_not_there_is_refused() -> None:
+def test_a_drawing_that_is_not_there_is_rejected() -> None:
     sound = WatchedRun((), 'all', 0, {})
     assert sound.drawings() == []
     with pytest.raises(ConfigError, match=r'^number: 0: no such drawing; there are none, for nothing was found$'):

@@ -235,7 +235,7 @@ class Compensator:
 
     def observe(self, now: float, seen: Observed) -> Command:
         """Take a deflection at the time ``now``; return what :meth:`watch` gave last, with the state of now."""
-        before, fault = self._last, self._refusal(now, seen)
+        before, fault = self._last, self._rejection(now, seen)
         if fault:
             self._hold(fault)
             return self.command()
@@ -430,7 +430,7 @@ class Compensator:
             return self._pose
         return self._joints - self._at_joints
 
-    def _refusal(self, now: float, seen: Observed) -> str:
+    def _rejection(self, now: float, seen: Observed) -> str:
         settings = self.settings
         finite = all(np.all(np.isfinite(part)) for part in (*seen.deflection, seen.covariance))
         if not finite or not math.isfinite(seen.t):

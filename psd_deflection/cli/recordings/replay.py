@@ -39,7 +39,7 @@ from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import texts
 from psd_deflection.base.tables import Column
 from psd_deflection.cli._fleet import absolute, executor_option, recordings_argument, run_each, several, tell_each
-from psd_deflection.cli._options import namespace_option, parameter_option, recording_name, refuse, span_options
+from psd_deflection.cli._options import namespace_option, parameter_option, recording_name, reject, span_options
 from psd_deflection.cli._progress import progress_of, told
 from psd_deflection.cli._report import print_json, show, show_text, warn
 from psd_deflection.cli._values import given_as_option
@@ -115,7 +115,7 @@ class Totals:
     first_ns: int = 0
     last_ns: int = 0
     poses: list[tuple[float, float, float]] = field(default_factory=list)
-    refused: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)
     _estimated: int | None = None
 
     def add(self, record: Record) -> None:
@@ -131,7 +131,7 @@ class Totals:
             self._estimated = record.block
         elif isinstance(record, SpotMeans) and record.index != self._estimated:
             # The estimate of a block comes before its means.
-            self.refused[record.status.name.lower()] += 1
+            self.rejected[record.status.name.lower()] += 1
 
     @property
     def seconds(self) -> float:
@@ -163,7 +163,7 @@ class ReplayTask:
             'lost': self.totals.lost,
             'blocks': self.totals.blocks,
             'estimates': len(self.totals.poses),
-            'refused': dict(self.totals.refused),
+            'refused': dict(self.totals.rejected),
             'solver': self.rig.estimator.solver,
             'seconds': self.totals.seconds,
             'compared': None if self.comparison is None else self.comparison.counts(),
@@ -173,12 +173,12 @@ class ReplayTask:
 def run(args: argparse.Namespace) -> int:
     """Replay."""
     if not args.compare:
-        refuse(args, {'strict': False}, 'needs --compare')
+        reject(args, {'strict': False}, 'needs --compare')
     if not args.watch:
-        refuse(args, {'watch_command': None, 'watch_webhook': None}, 'needs --watch')
+        reject(args, {'watch_command': None, 'watch_webhook': None}, 'needs --watch')
     names = several(args)
     if names is not None:
-        refuse(args, {'watch': False}, 'is for one recording')
+        reject(args, {'watch': False}, 'is for one recording')
         return _many(args, names)
     path = args.recordings[0]
     recording, rig = open_for_replay(path, args.params_file, args.namespace)
@@ -333,12 +333,12 @@ def _line(found: Mapping[str, Any], strict: bool) -> list[str]:
     state = 'replayed'
     if found['compared'] is not None:
         state = 'the same' if _agrees(_counts(found), strict) else 'DIFFERS'
-    refused = sum(found['refused'].values())
+    rejected = sum(found['refused'].values())
     return [
         state,
         f'{found["seconds"]:.1f}',
         *(str(found[key]) for key in ('samples', 'lost', 'blocks', 'estimates')),
-        str(refused),
+        str(rejected),
     ]
 
 
@@ -373,7 +373,7 @@ def _print_summary(args: argparse.Namespace, done: ReplayTask) -> None:
         f'{path}: {totals.samples} samples, {totals.lost} lost, {totals.blocks} blocks, '
         f'{len(totals.poses)} estimates ({done.rig.estimator.solver})'
     )
-    for cause, count in sorted(totals.refused.items()):
+    for cause, count in sorted(totals.rejected.items()):
         show(f'  no estimate: {count} {"block" if count == 1 else "blocks"}, {cause.replace("_", " ")}')
     if len(poses):
         show('  ' + ', '.join(' '.join(row) for row in ranges(poses)))

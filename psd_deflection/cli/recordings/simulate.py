@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
-from psd_deflection.cli._options import in_the_world, recording_name, refuse, world_option
+from psd_deflection.cli._options import in_the_world, recording_name, reject, world_option
 from psd_deflection.cli._report import print_json, show
 from psd_deflection.cli._values import given_as_option, seed
 from psd_deflection.cli.run import serve
@@ -96,11 +96,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Serve or write."""
     if args.serve is not None:
-        refuse(args, OF_A_RECORDING, 'is for a recording (--out), not for a device (--serve)')
+        reject(args, OF_A_RECORDING, 'is for a recording (--out), not for a device (--serve)')
         return serve.run_device(args)
     if args.out is None:
         raise UsageError('--out OUT (a recording) or --serve (a device) is needed')
-    refuse(args, serve.OF_A_DEVICE, 'is for a device: give --serve and no --out')
+    reject(args, serve.OF_A_DEVICE, 'is for a device: give --serve and no --out')
     # With its own effects first, so that what is wrong in the file is not laid to the options.
     known = with_effects(load_rig(args.params_file), (), '')
     with given_as_option():

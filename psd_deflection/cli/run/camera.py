@@ -228,7 +228,7 @@ def _report(
     found: list[FrameAnswer],
 ) -> None:
     good = reasons[str(Status.OK)]
-    frames, refused = reasons.total(), {words: count for words, count in reasons.most_common() if words != Status.OK}
+    frames, rejected = reasons.total(), {words: count for words, count in reasons.most_common() if words != Status.OK}
     median = [
         sorted(math.sqrt(float(a.covariance[i, i])) for a in found if a.covariance is not None)[len(found) // 2]
         for i in range(3)
@@ -241,7 +241,7 @@ def _report(
                 'out': args.out,
                 'frames': frames,
                 'answers': good,
-                'refused': refused,
+                'refused': rejected,
                 'sd': dict(zip(('dx', 'dy', 'theta'), median, strict=False)),
                 'turn': None if rest is None else reference.turn,
                 'radius_scale': None if rest is None else rest.scale,
@@ -250,7 +250,7 @@ def _report(
         )
         return
     show(f'{args.out}: {good} of {frames} frames have an answer')
-    for reason, count in refused.items():
+    for reason, count in rejected.items():
         show(f'  {count} refused: {reason}')
     if rest is not None and median:
         dx, dy, theta = median

@@ -37,14 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the survey; the exit status is 0 unless a named port could not be asked."""
-    devices, refusals = known_devices()
-    for refusal in refusals:
-        show(f'psd-deflection devices: not asked for: {refusal}', aside=True)
+    devices, rejections = known_devices()
+    for rejection in rejections:
+        show(f'psd-deflection devices: not asked for: {rejection}', aside=True)
     with told('asking; a port that stays silent takes some seconds', quiet=args.json), given_as_option():
         ports = survey(devices, args.ports)
     if args.json:
         print_json({'ports': [asdict(p) for p in ports], 'suggested': suggestions(devices, ports)}, indent=2)
-        _refuse_unasked(args.ports, ports)
+        _reject_unasked(args.ports, ports)
         return 0
     if not ports:
         show('no serial ports; is the device plugged in? (a pseudo-terminal has to be named)')
@@ -58,11 +58,11 @@ def run(args: argparse.Namespace) -> int:
     for suggested in suggestions(devices, ports):
         show('')
         show_text(parameter_lines(suggested))
-    _refuse_unasked(args.ports, ports)
+    _reject_unasked(args.ports, ports)
     return 0
 
 
-def _refuse_unasked(named: list[str], ports: list[Port]) -> None:
+def _reject_unasked(named: list[str], ports: list[Port]) -> None:
     unasked = [p for p in ports if not p.asked]
     if named and unasked:
         raise DeviceError('; '.join(f'{p.port}: {p.answer}' for p in unasked))

@@ -24,7 +24,7 @@ from collections.abc import Mapping, Sequence
 
 from psd_deflection.base.errors import UsageError
 from psd_deflection.cli._display import Display
-from psd_deflection.cli._options import DEMO, given_parameters, over_file, parameter_option, refuse_demo
+from psd_deflection.cli._options import DEMO, given_parameters, over_file, parameter_option, reject_demo
 from psd_deflection.cli._values import given_as_option
 from psd_deflection.cli.run._ros import require_ros
 from psd_deflection.devices.registry import DEVICES, source_names
@@ -79,7 +79,7 @@ def simulates_at_once(overrides: Mapping[str, object], ros_arguments: Sequence[s
 
 def run(args: argparse.Namespace) -> int:
     """Run until Ctrl-C."""
-    refuse_demo(args)
+    reject_demo(args)
     # `ros2 launch` adds others; they can be ignored.
     if args.no_ros and any(a in ('-p', '--param', '--params-file') for a in args.ros_arguments):
         raise UsageError(

@@ -35,8 +35,8 @@ from psd_deflection.cli._options import (
     namespace_option,
     over_file,
     parameter_option,
-    refuse,
-    refuse_demo,
+    reject,
+    reject_demo,
     span_options,
 )
 from psd_deflection.cli._report import warn
@@ -96,11 +96,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _check(args: argparse.Namespace) -> None:
     if not math.isfinite(args.speed) or args.speed <= 0.0:
         raise UsageError(f'--speed {args.speed:g}: must be above 0')
-    refuse_demo(args)
+    reject_demo(args)
     if args.recording is None:
         if args.span != WHOLE:
             raise UsageError('--from and --to are for a recording: give REC')
-        refuse(args, {'speed': 1.0, 'loop': False, 'namespace': None}, 'is for a recording: give REC')
+        reject(args, {'speed': 1.0, 'loop': False, 'namespace': None}, 'is for a recording: give REC')
     for name in ('port', 'baud', 'record', 'demo'):
         if args.recording is not None and getattr(args, name) not in (None, False):
             raise UsageError(f'--{name} is for a rig; {args.recording} is played')

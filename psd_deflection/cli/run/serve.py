@@ -10,7 +10,7 @@ import shlex
 import sys
 from collections.abc import Sequence
 
-from psd_deflection.cli._options import in_the_world, refuse
+from psd_deflection.cli._options import in_the_world, reject
 from psd_deflection.cli._program import program
 from psd_deflection.cli._values import given_as_option, number, whole
 from psd_deflection.devices.device import PowerUp
@@ -75,7 +75,7 @@ def run_device(args: argparse.Namespace) -> int:
             hand = Hand(CyclicLoads(load_histories(args.loads, rig.converter.sample_rate_hz, '--loads')))
     devices = simulated_devices(name, rig, args.seed, PowerUp(args.skew_ppm, args.first_seq), hand)
     if args.serve:
-        refuse(args, {'link': None}, 'is for a pseudo-terminal: give --serve alone')
+        reject(args, {'link': None}, 'is for a pseudo-terminal: give --serve alone')
     links = link_names(args.link, len(devices))
     with contextlib.ExitStack() as stack:
         ports: Sequence[HostSide]

@@ -165,8 +165,8 @@ def picture(progress: CalibrationProgress) -> list[str]:
     known = f'{progress.determined} of {len(progress.parameters)} parameters determined'
     head = f'{progress.seconds:.1f} s, by {BY[progress.kind]}: {known}'
     lines = [head, '', *(line(parameter) for parameter in progress.parameters), '']
-    if progress.refused:
-        lines.append(f'refused: {progress.refused}')
+    if progress.rejected:
+        lines.append(f'refused: {progress.rejected}')
     lines += [next_words(need) for need in progress.needs[:MOST_NEEDS]]
     return lines if progress.needs else [*lines, 'nothing is open']
 

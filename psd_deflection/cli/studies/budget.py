@@ -26,7 +26,7 @@ from tqdm import tqdm
 from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
-from psd_deflection.cli._options import PICTURES, make_writable, need_folder, picture_or_folder, refuse
+from psd_deflection.cli._options import PICTURES, make_writable, need_folder, picture_or_folder, reject
 from psd_deflection.cli._report import save_figure, show, show_text
 from psd_deflection.cli._values import given_as_option, need_finite, seed, whole
 from psd_deflection.cli.studies._answer import answer, print_answer
@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the table; draw the chart if a name is given."""
     if args.explain:
-        refuse(args, {'json': False, 'out': None, 'monte_carlo': None, 'load': None}, 'does nothing beside --explain')
+        reject(args, {'json': False, 'out': None, 'monte_carlo': None, 'load': None}, 'does nothing beside --explain')
     rig = load_rig(args.params_file)
     # Of the file alone first, so that what is wrong in it is not laid to the options.
     read_inputs(args.inputs, {})

@@ -52,7 +52,7 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import make_writable, namespace_option, refuse, span_options
+from psd_deflection.cli._options import make_writable, namespace_option, reject, span_options
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.cli._values import number
@@ -126,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--json', action='store_true', help='print the content of calibration.json, or of the check')
 
 
-def _refuse_mixed(args: argparse.Namespace) -> None:
+def _reject_mixed(args: argparse.Namespace) -> None:
     """Refuse options that contradict each other."""
     if args.reference and len(args.reference) != len(args.recordings):
         raise UsageError(
@@ -144,7 +144,7 @@ def _refuse_mixed(args: argparse.Namespace) -> None:
             'dark': [],
             'namespace': None,
         }
-        refuse(args, made, 'is for recordings that are there: --live makes its own')
+        reject(args, made, 'is for recordings that are there: --live makes its own')
     elif args.url is not None:
         raise UsageError('--url: is for --live')
     elif not args.recordings and (args.check is not None or args.alone or args.each or not args.dark):
@@ -161,7 +161,7 @@ def _refuse_mixed(args: argparse.Namespace) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Read, calibrate or check, write, and say it in a sentence."""
-    _refuse_mixed(args)
+    _reject_mixed(args)
     if args.check is not None:
         return _check(args)
     asked = CalibrationOptions(
@@ -225,7 +225,7 @@ def answer_of(path: str, asked: CalibrationOptions) -> TaskResult:
     found, files, tree = answer.found, answer.files(), answer.tree()
     cells: dict[str, object] = {
         'kind': found.kind,
-        'refused': found.refused or '',
+        'refused': found.rejected or '',
         'undetermined': len(found.undetermined),
         'heldout_before': found.gap.heldout_before,
         'heldout_after': found.gap.heldout_after,

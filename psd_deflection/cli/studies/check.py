@@ -31,7 +31,7 @@ from psd_deflection.cli._options import (
     given_parameters,
     in_the_world,
     parameter_option,
-    refuse,
+    reject,
     span_options,
     world_option,
 )
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Check and print."""
     if args.recording is not None:
-        refuse(args, {'port': None, 'source': None, 'baud': None, 'world': []}, 'is for the guide: give no REC')
+        reject(args, {'port': None, 'source': None, 'baud': None, 'world': []}, 'is for the guide: give no REC')
         recording = open_recording(args.recording, span=args.span)
         rig = load_rig(args.params_file) if args.params_file else rig_at_end(recording)
         with told('reading', quiet=args.json):
@@ -95,7 +95,7 @@ def _guided(args: argparse.Namespace) -> Checkup:
         values['source'] = args.source
     rig = load_rig(args.params_file, values)
     if rig.acquisition.port:
-        refuse(args, {'world': []}, 'is for the simulated rig: give no --port')
+        reject(args, {'world': []}, 'is for the simulated rig: give no --port')
     shown = GuideDisplay(quiet=args.json)
     found = run_guided(rig, in_the_world(rig, args.world), texts(shown.say), shown.update)
     shown.end()

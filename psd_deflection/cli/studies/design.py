@@ -28,7 +28,7 @@ from psd_deflection.base.axes import MDEG
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.numbers import plain_number
 from psd_deflection.base.tables import columns
-from psd_deflection.cli._options import PICTURES, need_folder, picture_name, refuse
+from psd_deflection.cli._options import PICTURES, need_folder, picture_name, reject
 from psd_deflection.cli._report import print_json, save_figure, show, show_text
 from psd_deflection.cli._values import given_as_option
 from psd_deflection.model.link import LinkStatics
@@ -92,10 +92,10 @@ def run(args: argparse.Namespace) -> int:
     """Print the tables or the study."""
     if args.splitter is not None:
         return splitter_of(args)
-    refuse(args, {'allowed': None, 'warm_up': None, 'apart': None}, 'is of two lasers: give --splitter W W')
+    reject(args, {'allowed': None, 'warm_up': None, 'apart': None}, 'is of two lasers: give --splitter W W')
     if args.params_file is None:
         placing = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None, 'json': False}
-        refuse(args, placing, 'is for the placement of a rig: give --params-file RIG.yaml')
+        reject(args, placing, 'is for the placement of a rig: give --params-file RIG.yaml')
         show_text(appendix_b())
         return 0
     rig = load_rig(args.params_file)
@@ -135,7 +135,7 @@ def run(args: argparse.Namespace) -> int:
 def splitter_of(args: argparse.Namespace) -> int:
     """Print the rules and the simulation; 1 if a rule is broken."""
     of_placements = {'out': None, 'sigma': None, 'radius': None, 'keep_out': 0.0, 'box': None}
-    refuse(args, of_placements, 'is for the placement of a rig, not for --splitter')
+    reject(args, of_placements, 'is for the placement of a rig, not for --splitter')
     if args.allowed is None:
         raise UsageError('--splitter: give --allowed W too, the power that one PSD is allowed to get')
     rig = load_rig(args.params_file)

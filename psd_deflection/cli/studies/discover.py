@@ -55,7 +55,7 @@ from psd_deflection.cli._fleet import (
     each_option,
     recordings_argument,
 )
-from psd_deflection.cli._options import make_writable, namespace_option, refuse, span_options
+from psd_deflection.cli._options import make_writable, namespace_option, reject, span_options
 from psd_deflection.cli._progress import told
 from psd_deflection.cli._report import save_all, show, warn
 from psd_deflection.cli._values import given_as_option, seed
@@ -141,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError('REC: needed: one recording or several; --isolable LOADS needs none')
     names = each_for_itself(args)
     if names is not None:
-        refuse(args, {'next': False}, 'is not for --each')
+        reject(args, {'next': False}, 'is not for --each')
         return _each(args, names, asked)
     limits = _next.limits(args)
     if args.adopt is not None:
@@ -150,7 +150,7 @@ def run(args: argparse.Namespace) -> int:
         except ConfigError as error:
             raise UsageError(f'--adopt {error}') from None
     if tables := asked.tables(args.recordings, warn):
-        refuse(args, {'next': False, 'adopt': None}, 'is for recordings of samples, not for readings of a link at rest')
+        reject(args, {'next': False, 'adopt': None}, 'is for recordings of samples, not for readings of a link at rest')
         if args.span != WHOLE:
             raise UsageError('--from, --to: are for recordings of samples, not for readings of a link at rest')
         make_writable(args.out)
@@ -172,7 +172,7 @@ def run(args: argparse.Namespace) -> int:
 def _before(args: argparse.Namespace, asked: DiscoverOptions) -> int:
     if args.recordings:
         raise UsageError(f'{args.recordings[0]}: --isolable {args.isolable} needs no recording')
-    refuse(args, {'adopt': None, 'each': False, 'next': False, 'make_it': False, 'namespace': None}, 'needs a REC')
+    reject(args, {'adopt': None, 'each': False, 'next': False, 'make_it': False, 'namespace': None}, 'needs a REC')
     if args.span != WHOLE:
         raise UsageError('--from, --to: need a REC')
     rig = asked.rig() or load_rig()

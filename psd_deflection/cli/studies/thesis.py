@@ -46,7 +46,7 @@ from psd_deflection.studies.thesis.comparison import (
     grid,
     methods,
     printed_bound,
-    refused,
+    rejected,
     table_5_1,
     thesis_geometry,
 )
@@ -130,7 +130,7 @@ def error_table() -> list[str]:
             lines.append(
                 f'{label:{width}}  ' + ''.join(f'{_cell(c, largest):25}' for c in row) + f'{" to ".join(silent)} %'
             )
-    for name, why in refused().items():
+    for name, why in rejected().items():
         lines += textwrap.wrap(f'{name} is not in the table: {why}', 118, subsequent_indent='  ')
     return lines
 

@@ -124,11 +124,11 @@ def from_csv(path: str | Path, rate: float = 1000.0) -> LoadHistory:
     for row in table.table_rows():
         numbers = [row.number(name) for name in names]
         if times and numbers[0] <= times[-1]:
-            raise row.refuse('column t does not rise')
+            raise row.reject('column t does not rise')
         times.append(numbers[0])
         rows.append(numbers[1:])
     if not rows:
-        raise table.refuse('no rows below the header')
+        raise table.reject('no rows below the header')
     t = np.asarray(times) - times[0]
     step = float(np.median(np.diff(t))) if len(t) > 1 else 1.0
     wanted = np.arange(_count(float(t[-1]) + step, rate)) / rate

@@ -77,14 +77,14 @@ class BasePairSolver(Solver):
         else:
             raise ConfigError(f'assume = {assume!r}: must be one of beam, no_twist, nothing')
         self._spread, self._columns = self._matrix.tolist(), self._matrix.T.tolist()
-        self._refuse_what_is_unseen(geometry, assume)
+        self._reject_what_is_unseen(geometry, assume)
 
     @classmethod
     def options_from_rig(cls, rig: Rig) -> dict[str, Any]:
         """``base_pair.assume``."""
         return {'assume': rig.estimator.base_pair_assume}
 
-    def _refuse_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
+    def _reject_what_is_unseen(self, geometry: Geometry, assume: Assume) -> None:
         heights = np.asarray(geometry.heights)
         at_rest = [landing(place, (0.0, 0.0, 0.0, 0.0, 0.0)) for place in self._rows]
         jacobian = np.array([row for rows in at_rest for row in rows[2:]])

@@ -53,7 +53,7 @@ class CsvRecording(Recording):
         super().__init__(path, block_size)
         self._warnings: list[str] = []
         self._source = SampleRows(self.path)
-        self._refuse = self._source.refuse
+        self._reject = self._source.reject
         self._columns = self._read_header()
         self._channels = channel_names(self.psds)
         self._step_ns = 1e9 / sample_rate_hz if sample_rate_hz else self._find_step()
@@ -75,20 +75,20 @@ class CsvRecording(Recording):
         if 't' not in columns and ('mass' in columns or LOAD_COLUMNS[0] in columns):
             form += '; discover and info take a table of readings without times'
         self._source.require(REQUIRED, form, [name for name in KNOWN if name not in REQUIRED])
-        self._refuse_parts(columns, number)
+        self._reject_parts(columns, number)
         self.psds = self._count_psds(columns, number)
         unknown = [n for n in names if n not in KNOWN]
         if unknown:
             self._warnings.append(f'{self.path}:{number}: columns that are not read: {", ".join(unknown)}')
         return columns
 
-    def _refuse_parts(self, columns: Collection[str], number: int) -> None:
+    def _reject_parts(self, columns: Collection[str], number: int) -> None:
         """Refuse a header with a part of a group."""
         for group in (LOAD_COLUMNS, REFERENCE_COLUMNS):
             there = [n for n in group if n in columns]
             if there and len(there) < len(group):
                 lacking = ', '.join(n for n in group if n not in columns)
-                raise self._refuse(f'has {", ".join(there)} without {lacking}', number)
+                raise self._reject(f'has {", ".join(there)} without {lacking}', number)
 
     def _count_psds(self, columns: Collection[str], line: int) -> int:
         """PSDs of which there are columns, 2 or more; none may be left out, and none in part."""
@@ -96,18 +96,18 @@ class CsvRecording(Recording):
         psds = int(further[-1].lstrip('xysum')) if further else 2
         lacking = [name for name in channel_names(psds) if name not in columns]
         if lacking:
-            raise self._refuse(f'has {", ".join(further)} without {", ".join(lacking)}', line)
+            raise self._reject(f'has {", ".join(further)} without {", ".join(lacking)}', line)
         return psds
 
     def _number(self, cells: list[str], name: str, line: int, largest: float = math.inf) -> float:
         cell = cells[self._columns[name]].strip()
         if NUMBER.fullmatch(cell) is None:
-            raise self._refuse(f'column {name} holds {cell!r}, which is not a number{why_no_number(name, cell)}', line)
+            raise self._reject(f'column {name} holds {cell!r}, which is not a number{why_no_number(name, cell)}', line)
         value = float(cell)
         if not math.isfinite(value):
-            raise self._refuse(f'column {name} holds {cell!r}, which is not finite', line)
+            raise self._reject(f'column {name} holds {cell!r}, which is not finite', line)
         if abs(value) > largest:
-            raise self._refuse(f'column {name} holds {cell!r}, which is beyond ±{largest:g}', line)
+            raise self._reject(f'column {name} holds {cell!r}, which is beyond ±{largest:g}', line)
         return value
 
     def _find_step(self) -> float:
@@ -122,14 +122,14 @@ class CsvRecording(Recording):
                 break
         del times[_RATE_ROWS:]
         if len(times) < 2:
-            raise self._refuse(f'holds {len(times)} samples; a recording has at least 2')
+            raise self._reject(f'holds {len(times)} samples; a recording has at least 2')
         steps = np.diff(np.array(times, dtype=np.int64)).astype(np.float64)
         median = float(np.median(steps))
         near = steps[(steps > 0.5 * median) & (steps < 1.5 * median)]
         # If the steps differ very much, the median may be close to none of them.
         step = float(near.mean()) if len(near) else float(steps.min())
         if why := why_rate(self.path, self._columns['t'], 1e9 / step, times[0] / 1e9):
-            raise self._refuse(why)
+            raise self._reject(why)
         return step
 
     def _chunks(self) -> Iterator[RawChunk]:
@@ -211,7 +211,7 @@ class CsvRecording(Recording):
         """The numbers of a row in these columns; none if all are empty."""
         filled = [n for n in names if cells[self._columns[n]].strip()]
         if filled and len(filled) < len(names):
-            raise self._refuse(f'has {", ".join(filled)} without the others of {", ".join(names)}', line)
+            raise self._reject(f'has {", ".join(filled)} without the others of {", ".join(names)}', line)
         return tuple(self._number(cells, n, line) for n in filled)
 
     @cached_property

@@ -67,7 +67,7 @@ class SampleRows(CsvTable):
                         return
                     begin = at
         except OSError as error:
-            raise self.refuse(f'cannot be read ({error.strerror or error})') from None
+            raise self.reject(f'cannot be read ({error.strerror or error})') from None
         yield from self._any(begin, line, last)
 
     def _behind_header(self, stream: BinaryIO) -> int:
@@ -125,10 +125,10 @@ class SampleRows(CsvTable):
         try:
             for number, cells in self._cells(begin, line):
                 if len(cells) != width:
-                    raise self.refuse_width(len(cells), number)
+                    raise self.reject_width(len(cells), number)
                 t_ns = self._nanoseconds(cells[at], number, last)
                 if t_ns <= last:
-                    raise self._refuse_falling(last, cells, number)
+                    raise self._reject_falling(last, cells, number)
                 last = t_ns
                 lines.append(number)
                 times.append(t_ns)
@@ -145,12 +145,12 @@ class SampleRows(CsvTable):
         if lines:
             yield CsvRows(lines, times, together)
 
-    def _refuse_falling(self, last: int, cells: Sequence[str], line: int) -> RecordingError:
+    def _reject_falling(self, last: int, cells: Sequence[str], line: int) -> RecordingError:
         cell = cells[self.columns['t']].strip()
         why = why_falling(self.path, self.columns['t'], line, last / 1e9, float(cell))
         if not why and any(not cells[self.columns[n]].strip() for n in self.header if n == 'sum1'):
             why = ': cells are empty; did the program that wrote it split one sample into two rows?'
-        return self.refuse(f'column t holds {cell!r}, which is not after the row before{why}', line)
+        return self.reject(f'column t holds {cell!r}, which is not after the row before{why}', line)
 
     def _nanoseconds(self, cell: str, line: int, last: int = -1) -> int:
         """The time of a cell, ns; ``last``: that of the row before, for the message."""
@@ -159,7 +159,7 @@ class SampleRows(CsvTable):
         if plain is not None:
             return int(plain[1] + plain[2].ljust(9, '0'))
         if NUMBER.fullmatch(text) is None:
-            raise self.refuse(f'column t holds {text!r}, which is not a number{why_no_number("t", text)}', line)
+            raise self.reject(f'column t holds {text!r}, which is not a number{why_no_number("t", text)}', line)
         seconds = Decimal(text)
         finite = seconds.is_finite() and 0 <= seconds < MAX_SECONDS
         t_ns = int((seconds * 1_000_000_000).to_integral_value()) if finite else -1
@@ -170,5 +170,5 @@ class SampleRows(CsvTable):
                 why = why_falling(self.path, at, line, last / 1e9, float(seconds))
             elif seconds.is_finite():
                 why = why_beyond(self.path, at, float(seconds))
-            raise self.refuse(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read{why}', line)
+            raise self.reject(f'column t holds {text!r}; seconds from 0 to {MAX_SECONDS} are read{why}', line)
         return t_ns

@@ -71,14 +71,14 @@ class McapReader:
             with path.open('rb') as stream:
                 self._scan(stream)
         except OSError as error:
-            raise self._refuse(f'cannot be read ({error.strerror or error})') from None
+            raise self._reject(f'cannot be read ({error.strerror or error})') from None
 
     @property
     def channels(self) -> list[RecordedChannel]:
         """The topics that are known by now; all of them if the file is complete, or once it was read."""
         return list(self._channels.values())
 
-    def _refuse(self, why: str) -> RecordingError:
+    def _reject(self, why: str) -> RecordingError:
         return RecordingError(f'{self.path}: {why}')
 
     @property
@@ -125,9 +125,9 @@ class McapReader:
         """Look at every record's head; read the records that describe the file."""
         magic = stream.read(len(MAGIC))
         if not magic:
-            raise self._refuse('is empty')
+            raise self._reject('is empty')
         if magic != MAGIC[: len(magic)]:
-            raise self._refuse('is not an MCAP file')
+            raise self._reject('is not an MCAP file')
         if len(magic) < len(MAGIC):
             self._cut(len(magic))
             return
@@ -180,7 +180,7 @@ class McapReader:
                     with self._damage_told(at):
                         yield at, _unpacked(content, allowance)
         except OSError as error:
-            raise self._refuse(f'cannot be read ({error.strerror or error})') from None
+            raise self._reject(f'cannot be read ({error.strerror or error})') from None
 
     def _lacks(self, wanted: Collection[int], stream: BinaryIO, at: int) -> bool:
         """Whether the index behind a chunk, from byte ``at`` on, names known channels and none of ``wanted``."""

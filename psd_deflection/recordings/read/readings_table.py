@@ -79,11 +79,11 @@ class ReadingsTable:
         self._table.require((), FORM, KNOWN)
         self.rows = list(self._table.table_rows())
         if not self.rows:
-            raise self._table.refuse('holds no row of readings')
+            raise self._table.reject('holds no row of readings')
 
-    def refuse(self, line: int, why: str) -> RecordingError:
+    def reject(self, line: int, why: str) -> RecordingError:
         """The error for a line."""
-        return self._table.refuse(why, line)
+        return self._table.reject(why, line)
 
     def column(self, name: str, *, empty: bool = False) -> FloatArray:
         """The numbers of a column; ``empty``: a cell without one is NaN, else an error."""
@@ -97,7 +97,7 @@ class ReadingsTable:
         """(n, 3) N, N, N m. A mass hangs ``arm`` m beside the link, towards +X."""
         there = [n for n in LOAD_COLUMNS if n in self.names]
         if there and MASS in self.names:
-            raise self.refuse(self.head, f'has {MASS} and {", ".join(there)}: only one of them says the load')
+            raise self.reject(self.head, f'has {MASS} and {", ".join(there)}: only one of them says the load')
         if MASS in self.names:
             weight = GRAVITY * self.column(MASS)
             arm = self.column(ARM) if ARM in self.names else np.zeros(len(weight))
@@ -109,14 +109,14 @@ class ReadingsTable:
         """The names of the columns that hold readings."""
         there = [group for group in kinds_of(self.names) if set(group) & set(self.names)]
         if not there:
-            raise self.refuse(self.head, f'the header has no readings; {FORM}')
+            raise self.reject(self.head, f'the header has no readings; {FORM}')
         if TIMES in self.names and there != [REFERENCE_COLUMNS]:
-            raise self.refuse(self.head, f'has {TIMES}: beside times only {",".join(REFERENCE_COLUMNS)} are read')
+            raise self.reject(self.head, f'has {TIMES}: beside times only {",".join(REFERENCE_COLUMNS)} are read')
         if len(there) > 1:
-            raise self.refuse(self.head, f'has {" and ".join(",".join(g) for g in there)}: leave one of them')
+            raise self.reject(self.head, f'has {" and ".join(",".join(g) for g in there)}: leave one of them')
         lacking = [n for n in there[0] if n not in self.names]
         if lacking:
-            raise self.refuse(self.head, f'the header lacks {", ".join(lacking)} beside the other readings; {FORM}')
+            raise self.reject(self.head, f'the header lacks {", ".join(lacking)} beside the other readings; {FORM}')
         return there[0]
 
 

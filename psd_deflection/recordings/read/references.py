@@ -43,14 +43,14 @@ LONGEST_STATUS = 80
 class References:
     """Measurements in order of time.
 
-    ``t_ns`` int64 (k,). ``poses`` (k, 3): m, m, rad. ``sd`` (k, 3) if the instrument states them. ``refused``: status
+    ``t_ns`` int64 (k,). ``poses`` (k, 3): m, m, rad. ``sd`` (k, 3) if the instrument states them. ``rejected``: status
     of the measurements that have no answer, and how many there are of each.
     """
 
     t_ns: IntArray
     poses: FloatArray
     sd: FloatArray | None = None
-    refused: Mapping[str, int] = field(default_factory=dict)
+    rejected: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -99,9 +99,9 @@ def read_references(path: str | Path) -> References:
     return references_of(open_recording(path))
 
 
-def _in_order(t_ns: IntArray, poses: FloatArray, sd: FloatArray | None, refused: Mapping[str, int]) -> References:
+def _in_order(t_ns: IntArray, poses: FloatArray, sd: FloatArray | None, rejected: Mapping[str, int]) -> References:
     order = np.argsort(t_ns, kind='stable')
-    return References(t_ns[order], poses[order], None if sd is None else sd[order], refused)
+    return References(t_ns[order], poses[order], None if sd is None else sd[order], rejected)
 
 
 def _of_table(table: CsvTable) -> References:
@@ -109,20 +109,20 @@ def _of_table(table: CsvTable) -> References:
     table.require(wanted, f'a table has {",".join(wanted)}', (*DEVIATIONS, 'status'))
     deviations = DEVIATIONS if all(name in table.columns for name in DEVIATIONS) else ()
     rows: list[list[float]] = []
-    refused: Counter[str] = Counter()
+    rejected: Counter[str] = Counter()
     for row in table.table_rows():
         if len(rows) >= MAX_ROWS:
-            raise row.refuse(f'has more than {MAX_ROWS} rows')
+            raise row.reject(f'has more than {MAX_ROWS} rows')
         word = row.text('status') if 'status' in table.columns else 'ok'
         if word != 'ok':
-            refused[sanitize(word, LONGEST_STATUS)] += 1
+            rejected[sanitize(word, LONGEST_STATUS)] += 1
             continue
         rows.append([row.number(name, MAX_SECONDS) for name in (*wanted, *deviations)])
     if not rows:
-        raise table.refuse('holds no measurement with the status ok')
+        raise table.reject('holds no measurement with the status ok')
     values = np.array(rows)
     t_ns = np.rint(values[:, 0] * 1e9).astype(np.int64)
-    return _in_order(t_ns, values[:, 1:4], values[:, 4:7] if deviations else None, dict(refused))
+    return _in_order(t_ns, values[:, 1:4], values[:, 4:7] if deviations else None, dict(rejected))
 
 
 def read_run(recording: Recording, pipeline: Pipeline, blocks: Iterable[SampleBlock] | None = None) -> TrustedSamples:

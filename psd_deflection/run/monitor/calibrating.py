@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from psd_deflection.run.monitor.shown import RefusedError
+from psd_deflection.run.monitor.shown import RejectedError
 
 LONGEST = 1 << 20
 """Bytes of one line of the process; a look at 25 parameters has some 5 kB."""
@@ -43,7 +43,7 @@ class PageCalibration:
     async def start(self, url: str, token_variable: str, token: str, out: Path) -> str:
         """Begin one that speaks to the page at ``url`` and writes into ``out``. Raises RefusedError."""
         if self._listener is not None and not self._listener.done():
-            raise RefusedError('a calibration runs already')
+            raise RejectedError('a calibration runs already')
         command = [sys.executable, '-m', 'psd_deflection', 'calibrate', '--live', '--json']
         self._out, self._said, self._last = out, {}, ''
         try:
@@ -59,14 +59,14 @@ class PageCalibration:
                 start_new_session=True,
             )
         except OSError as error:
-            raise RefusedError(f'not calibrated: {error.strerror or error}') from None
+            raise RejectedError(f'not calibrated: {error.strerror or error}') from None
         self._listener = asyncio.create_task(self._listen(self._process))
         return 'calibrating: zero the unloaded link, then hang known loads and note each'
 
     def stop(self) -> str:
         """Let it end with what it has. Raises RefusedError if none runs."""
         if self._process is None or self._listener is None or self._listener.done():
-            raise RefusedError('no calibration runs')
+            raise RejectedError('no calibration runs')
         with contextlib.suppress(ProcessLookupError):
             # As Ctrl-C; SIGINT itself is ignored by whatever a script has started in the background.
             self._process.terminate()
@@ -76,7 +76,7 @@ class PageCalibration:
         """End it with the daemon: it writes what it has, if it is quick."""
         if self._listener is None or self._listener.done() or self._process is None:
             return
-        with contextlib.suppress(RefusedError):
+        with contextlib.suppress(RejectedError):
             self.stop()
         await asyncio.wait([self._listener], timeout=ENDS_S)
         with contextlib.suppress(ProcessLookupError):

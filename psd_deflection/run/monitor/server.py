@@ -53,7 +53,7 @@ from psd_deflection.run.monitor.served import (
     announce,
     withdraw,
 )
-from psd_deflection.run.monitor.shown import RefusedError, Shown
+from psd_deflection.run.monitor.shown import RejectedError, Shown
 from psd_deflection.run.monitor.spectrum import Spectrum, density_json, line_entry
 from psd_deflection.run.recorder import new_folder
 
@@ -385,7 +385,7 @@ class MonitorServer(GatedServer):
             if not wanted:
                 return self._calibration.stop()
             if self._shown.describe()['kind'] == 'replay':
-                raise RefusedError('a recording is played; psd-deflection calibrate takes it')
+                raise RejectedError('a recording is played; psd-deflection calibrate takes it')
             parent = Path(self._shown.rig.acquisition.bag_dir).expanduser().absolute()
             out = new_folder(parent, 'calibration')
             return await self._calibration.start(self.url, TOKEN_VARIABLE, self.token, out)
@@ -456,7 +456,7 @@ class MonitorServer(GatedServer):
             text = await action(body)
         except _BadBodyError as error:
             return _answer(400, str(error))
-        except RefusedError as error:
+        except RejectedError as error:
             return _answer(409, str(error))
         if name:
             # What came of it is told by the run itself.

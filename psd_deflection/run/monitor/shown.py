@@ -22,7 +22,7 @@ from psd_deflection.run.session_texts import load_text, mark_text, why_no_zero, 
 from psd_deflection.run.state import device_file
 
 
-class RefusedError(Exception):
+class RejectedError(Exception):
     """The request cannot be carried out now; the message says why, in one line."""
 
 
@@ -108,9 +108,9 @@ class ShownSession:
         try:
             change = self._session.zero()
         except (TimeoutError, PsdDeflectionError) as error:
-            raise RefusedError(f'not zeroed: {error}') from None
+            raise RejectedError(f'not zeroed: {error}') from None
         if change is None:
-            raise RefusedError(f'not zeroed: {why_no_zero(self._session.pipeline)}')
+            raise RejectedError(f'not zeroed: {why_no_zero(self._session.pipeline)}')
         return zero_text(self._session.rig)
 
     async def record(self, wanted: bool) -> str:
@@ -120,7 +120,7 @@ class ShownSession:
             # Not in a thread pool: a disk that hangs would block one thread after the other, and delay the exit.
             folder = await asyncio.wrap_future(asked)
         except (TimeoutError, PsdDeflectionError) as error:
-            raise RefusedError(str(error)) from None
+            raise RejectedError(str(error)) from None
         if folder is None:
             return 'no recording runs'
         return f'recording to {folder}' if wanted else f'recording ended: {folder}'
@@ -130,11 +130,11 @@ class ShownSession:
         if ago_s is None:
             ago_s, late_s = self._step_s(), 0.0
         if ago_s is None:
-            raise RefusedError(f'not noted: the dots have not stepped in the last {REACH_S:g} s')
+            raise RejectedError(f'not noted: the dots have not stepped in the last {REACH_S:g} s')
         try:
             return load_text(self._session.note_load(fx, fy, tz, add=add, ago_s=ago_s, late_s=late_s), ago_s)
         except ValueError as error:
-            raise RefusedError(f'not noted: {error}') from None
+            raise RejectedError(f'not noted: {error}') from None
 
     def step(self) -> str:
         """How long ago the dots stepped last."""
@@ -150,13 +150,13 @@ class ShownSession:
         try:
             mark = self._session.note_mark(text, late_s)
         except ValueError as error:
-            raise RefusedError(f'not marked: {error}') from None
+            raise RejectedError(f'not marked: {error}') from None
         unkept = '' if self._session.recorder.folder is not None else ' (nothing is recorded now)'
         return mark_text(mark) + unkept
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Refuse: what is measured cannot be paused."""
-        raise RefusedError('only a recording can be paused')
+        raise RejectedError('only a recording can be paused')
 
     def alarm(self) -> Alarm | None:
         """Of the watch, if it is on."""

@@ -31,7 +31,7 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.run.diagnostics import ERROR, OK, WARN
 from psd_deflection.run.monitor.feed import QUEUE_ITEMS, Feed
 from psd_deflection.run.monitor.metrics import Family, of_pipeline
-from psd_deflection.run.monitor.shown import RefusedError
+from psd_deflection.run.monitor.shown import RejectedError
 from psd_deflection.run.session_texts import why_no_zero, zero_text
 
 LONGEST_WAIT_S = 2.0
@@ -165,7 +165,7 @@ class ShownRecording:
                 (('rate (samples/s)', str(rates[0])), ('samples', str(samples)), ('lost', str(lost))),
             )
         ]
-        refused = tuple((f'refused: {cause}', str(count)) for cause, count in sorted(counters.refused.items()))
+        rejected = tuple((f'refused: {cause}', str(count)) for cause, count in sorted(counters.rejected.items()))
         level, message = OK, 'end of the recording' if self._ended else 'estimates flow'
         if spots is not None and spots.reason:
             level, message = ERROR, spots.reason
@@ -179,7 +179,7 @@ class ShownRecording:
                 (
                     ('rate (estimates/s)', str(rates[1])),
                     ('estimates', str(estimates)),
-                    *refused,
+                    *rejected,
                     *self._pipeline.estimator.words(),
                 ),
             )
@@ -193,24 +193,24 @@ class ShownRecording:
     def zero(self) -> str:
         """Take the zero between two blocks; it holds for the rest of the playback."""
         if self._ended or self._thread.ident is None:
-            raise RefusedError('not zeroed: the recording has ended')
+            raise RejectedError('not zeroed: the recording has ended')
         return self._between_blocks(self._take_zero, 'not zeroed: no data flows')
 
     async def record(self, wanted: bool) -> str:
         """Refuse: a recording is not recorded again."""
-        raise RefusedError('a recording is not recorded again; the command replay writes its answers')
+        raise RejectedError('a recording is not recorded again; the command replay writes its answers')
 
     def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None, late_s: float) -> str:
         """Refuse: what is recorded is not changed."""
-        raise RefusedError('a recording is played: its loads are those that were recorded')
+        raise RejectedError('a recording is played: its loads are those that were recorded')
 
     def step(self) -> str:
         """Refuse: nothing is noted here."""
-        raise RefusedError('a recording is played: its loads are those that were recorded')
+        raise RejectedError('a recording is played: its loads are those that were recorded')
 
     def mark(self, text: str, late_s: float) -> str:
         """Refuse: what is recorded is not changed."""
-        raise RefusedError('a recording is played: its marks are those that were recorded')
+        raise RejectedError('a recording is played: its marks are those that were recorded')
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
         """Pause or resume, go to a time from the first block. What lies between is computed as fast as possible."""
@@ -242,14 +242,14 @@ class ShownRecording:
             return asked.result(REQUEST_TIMEOUT_S)
         except TimeoutError:
             if asked.cancel():
-                raise RefusedError(too_late) from None
+                raise RejectedError(too_late) from None
             # It was begun at this very moment: its answer is the true one.
             return asked.result(REQUEST_TIMEOUT_S)
 
     def _take_zero(self) -> str:
         change = self._pipeline.zero()
         if change is None:
-            raise RefusedError(f'not zeroed: {why_no_zero(self._pipeline)}')
+            raise RejectedError(f'not zeroed: {why_no_zero(self._pipeline)}')
         self._feed.put(change)
         text = zero_text(self._pipeline.rig)
         self._log(text)
@@ -364,5 +364,5 @@ class ShownRecording:
                 continue
             try:
                 asked.set_result(action())
-            except RefusedError as error:
+            except RejectedError as error:
                 asked.set_exception(error)

@@ -128,7 +128,7 @@ class Acquisition:
 
         # The connection: whether there is one, and why the last try to have it back failed.
         self._connected = False
-        self._refusal = ''
+        self._rejection = ''
 
         self._stop = threading.Event()
         self._ready = threading.Event()
@@ -299,7 +299,7 @@ class Acquisition:
         self.source.close()
         self._connected = False
         self._was_away = True
-        self._refusal = ''
+        self._rejection = ''
         self._limited_log.log('away', f'{error}; waiting for it to come back', ERROR, time.monotonic(), NEWS)
 
     def _reopen(self) -> None:
@@ -311,13 +311,13 @@ class Acquisition:
             self.source.close()
             if self._stop.is_set():
                 return
-            self.counters.refused_reopenings += 1
-            refusal = str(error)
+            self.counters.rejected_reopenings += 1
+            rejection = str(error)
             # Report once why the device is refused; a port that is still missing is not worth a
             # line.
-            if 'no such port' not in refusal and refusal != self._refusal:
-                self._refusal = refusal
-                self._limited_log.log('refused', f'{refusal}; still trying', WARNING, time.monotonic(), NEWS)
+            if 'no such port' not in rejection and rejection != self._rejection:
+                self._rejection = rejection
+                self._limited_log.log('refused', f'{rejection}; still trying', WARNING, time.monotonic(), NEWS)
             return
         self._connected = True
         self._name = self.source.name

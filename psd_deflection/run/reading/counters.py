@@ -40,7 +40,7 @@ class AcquisitionCounters:
     restarts: int = 0
     disconnects: int = 0
     silences: int = 0
-    refused_reopenings: int = 0
+    rejected_reopenings: int = 0
     clock_jumps: int = 0
     map_steps: int = 0
     squeezed: int = 0

@@ -91,7 +91,7 @@ class Calibration:
     """The answer. ``values``, ``sd`` by name of ``NAMES``; ``covariance`` (SIZE, SIZE).
 
     ``vector``, ``prior``: what the rig file says. ``noise`` (4,): of a sample of each reading, V rms. ``clock``: the
-    offset of the reference's clock, s, to be added to its times. ``refused``: why the rig file was left as it is, or
+    offset of the reference's clock, s, to be added to its times. ``rejected``: why the rig file was left as it is, or
     ''. ``widened``: parameters whose tolerance the recordings contradict. ``dropped``: terms that unseen motion
     refused. ``rows``, ``fit``: for pictures. ``dark``: what was measured with the lasers off; ``rig`` has it already.
     """
@@ -107,7 +107,7 @@ class Calibration:
     gap: Gap
     undetermined: list[Direction]
     clock: float
-    refused: str = ''
+    rejected: str = ''
     widened: list[str] = field(default_factory=list)
     dropped: list[str] = field(default_factory=list)
     dark: Sequence[DarkLevel] = ()
@@ -177,14 +177,14 @@ def calibrate(
     free = _determined(first, prior, free)
     full_fit = fit(rows, rig, prior, kind, free=free, start=first)
     progress('held-out motion')
-    full_fit, believed, dropped = _without_refused_terms(full_fit, rows, rig, prior, kind)
+    full_fit, believed, dropped = _without_rejected_terms(full_fit, rows, rig, prior, kind)
     before = before_of(vector, prior)
     gap, worse = _heldout(full_fit, rows, rig, believed, kind, before)
     if kind == 'reference':
         full_fit = with_clamp(full_fit, rows, rig, prior)
-    refused = ''
+    rejected = ''
     if worse:
-        refused = (
+        rejected = (
             f'on motion that was not fitted the calibrated rig predicts the readings worse than the rig file '
             f'({gap.heldout_after * 1e6:.2f} µm rms against {gap.heldout_before * 1e6:.2f} µm); '
             f'the rig file keeps its values'
@@ -201,7 +201,7 @@ def calibrate(
         gap,
         undetermined(full_fit, prior),
         clock,
-        refused,
+        rejected,
         widened,
         dropped,
     )
@@ -347,7 +347,7 @@ def _heldout(
     return gap, bool(new.sum() > old.sum() or gap.heldout_after > WORSE * gap.heldout_before)
 
 
-def _without_refused_terms(
+def _without_rejected_terms(
     full_fit: CalibrationFit, rows: Rows, rig: Rig, prior: Prior, kind: Kind
 ) -> tuple[CalibrationFit, Prior, list[str]]:
     """Drop a non-linearity that unseen motion contradicts: the file's value stays, within what the rows leave open."""

@@ -42,7 +42,7 @@ def sections(calibration: Calibration) -> list[PageSection]:
 def advice(calibration: Calibration) -> list[str]:
     """What a person should do with the answer."""
     out = []
-    if calibration.refused:
+    if calibration.rejected:
         out.append('Check the reference: its axes, units, signs and clock. The rig file was left as it is.')
     for name in calibration.widened:
         out.append(

@@ -65,7 +65,7 @@ class CalibrationProgress(NamedTuple):
     seconds: float
     parameters: tuple[ParameterProgress, ...]
     needs: tuple[Need, ...]
-    refused: str
+    rejected: str
 
     @property
     def determined(self) -> int:
@@ -104,5 +104,5 @@ def progress_of(calibration: Calibration) -> CalibrationProgress:
             for i in REPORTED
         ),
         needs=tuple(sorted(needs, key=lambda need: MOTIONS.index(need.motion))),
-        refused=calibration.refused,
+        rejected=calibration.rejected,
     )

@@ -92,10 +92,10 @@ class Calibrated(StudyResult):
 
         def edit(text: str, path: Path) -> str:
             # Without a calibration the effects are those of the file.
-            plain = text if calibration.refused else with_effects_section(text, effects_to_values(effects), path)
+            plain = text if calibration.rejected else with_effects_section(text, effects_to_values(effects), path)
             return with_values(plain, values, f'Calibrated by {source_of(calibration, self.date)}', path)
 
-        kept_effects = effects_of_rig(self.rig) if calibration.refused else effects
+        kept_effects = effects_of_rig(self.rig) if calibration.rejected else effects
         return edited_rig_file(self.params_file, 'rig.yaml', lambda: described(self.rig, kept_effects), edit, self.tell)
 
     def files(self) -> dict[str, str]:
@@ -139,7 +139,7 @@ def result(calibration: Calibration, date: str) -> dict[str, Any]:
         if reference_range is None
         else {'low': reference_range[0].tolist(), 'high': reference_range[1].tolist()},
         'dark': result_of_levels(calibration.dark) or None,
-        'refused': calibration.refused or None,
+        'refused': calibration.rejected or None,
         'widened': calibration.widened,
         'dropped': calibration.dropped,
         'provenance': {
@@ -164,7 +164,7 @@ def values_of(calibration: Calibration, date: str) -> tuple[dict[str, object], l
     """Flat values that a rig file gets, and its effects; noise and dark levels alone if the calibration was refused."""
     noise = {f'psd_{n}.noise': [float(f'{v:.4g}') for v in calibration.noise[2 * n - 2 : 2 * n]] for n in (1, 2)}
     measured = {**noise, **values_of_levels(calibration.dark)}
-    if calibration.refused:
+    if calibration.rejected:
         return measured, []
     clamp = {name: float(calibration.values[CLAMP_AT + i]) for i, name in enumerate(CLAMP)}
     values, effects = rig_values(calibration.vector, calibration.values[:COUNT], clamp)
@@ -191,8 +191,8 @@ def values_of(calibration: Calibration, date: str) -> tuple[dict[str, object], l
 
 def sentence(calibration: Calibration) -> str:
     """Return the answer in one sentence."""
-    if calibration.refused:
-        return f'Refused: {calibration.refused}.'
+    if calibration.rejected:
+        return f'Refused: {calibration.rejected}.'
     g = calibration.gap
     known = int(sum(calibration.fit.free[i] for i in REPORTED))
     what = {'reference': 'the reference', 'loads': 'the known loads', 'self': 'the redundant reading'}[calibration.kind]

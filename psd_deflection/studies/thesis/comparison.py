@@ -88,7 +88,7 @@ def methods() -> tuple[Method, ...]:
     return (*VARIANTS, *(Method(name, name, {}) for name, why in _other_methods().items() if not why))
 
 
-def refused() -> dict[str, str]:
+def rejected() -> dict[str, str]:
     """Return the methods that cannot solve the thesis's rig, and why."""
     return {name: why for name, why in _other_methods().items() if why}
 

@@ -29,7 +29,7 @@ class ValidateProblem:
     """``motion``: what the detectors saw. ``solvers``: those that are compared, the rig's first.
 
     ``t`` (k,), s, by the reference's clock, increasing. ``reference`` (k, 3), m, m, rad; ``sd`` (k, 3) of it if it is
-    known; ``refused``: measurements without an answer, by reason. ``estimate_sd`` (3,): of the published estimates.
+    known; ``rejected``: measurements without an answer, by reason. ``estimate_sd`` (3,): of the published estimates.
     ``align``: remove the offset between the clocks if it is told. ``largest``: offset that is looked for, s.
     ``exposure``: time over which each reference is a mean, s. ``sources``: what is compared, by name.
     ``marks``: of the recording, by the clock of the samples.
@@ -40,7 +40,7 @@ class ValidateProblem:
     t: FloatArray
     reference: FloatArray
     sd: FloatArray | None
-    refused: Mapping[str, int]
+    rejected: Mapping[str, int]
     estimate_sd: FloatArray
     align: bool
     largest: float
@@ -82,7 +82,7 @@ def read_validate(
         t=_seconds(references.t_ns, start),
         reference=references.poses,
         sd=references.sd,
-        refused=references.refused,
+        rejected=references.rejected,
         estimate_sd=run.estimate_sd,
         align=align,
         largest=largest,

@@ -79,9 +79,9 @@ class Validated(StudyResult):
         if self.excluded:
             total = len(self.t) + self.excluded
             out.append(f'{self.excluded} of {total} references have no samples about them and are left out.')
-        if refused := self.problem.refused:
-            reasons = ', '.join(f'{reason} {count}' for reason, count in sorted(refused.items()))
-            out.append(f'The reference gave no answer {sum(refused.values())} times: {reasons}.')
+        if rejected := self.problem.rejected:
+            reasons = ', '.join(f'{reason} {count}' for reason, count in sorted(rejected.items()))
+            out.append(f'The reference gave no answer {sum(rejected.values())} times: {reasons}.')
         return out
 
     def lines(self) -> list[str]:
@@ -115,7 +115,7 @@ class Validated(StudyResult):
             'solver': self.solver,
             'references': len(self.t),
             'left_out': self.excluded,
-            'refused': dict(self.problem.refused),
+            'refused': dict(self.problem.rejected),
             'offset': {**offset, 'applied': self.applied, 'unit': 's', 'sentence': self.offset.sentence},
             'solvers': {
                 name: {axis: {'unit': unit, **asdict(a)} for axis, unit, a in zip(AXES, UNITS, three, strict=True)}

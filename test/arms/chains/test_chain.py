@@ -230,7 +230,7 @@ def test_joints_turn_what_follows_them() -> None:
     assert in_base(found)[3:] == pytest.approx([0.0, 0.0, 0.01], abs=1e-12)
 
 
-def test_what_is_no_chain_is_refused() -> None:
+def test_what_is_no_chain_is_rejected() -> None:
     link = ChainLink('BC', IDENTITY, LinkStatics(0.5, 1500.0, 1000.0))
     with pytest.raises(ConfigError, match='at least one link'):
         Chain([])

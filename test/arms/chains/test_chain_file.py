@@ -79,7 +79,7 @@ def test_each_link_has_its_own_rig(tmp_path: Path) -> None:
         ('links: [{name: a}]\nend_effector: {xyz: 1}', 'end_effector: xyz = 1 m: must be a list'),
     ],
 )
-def test_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_rejected(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / 'chain.yaml'
     path.write_text(text)
     with pytest.raises(ConfigError) as caught:

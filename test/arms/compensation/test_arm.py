@@ -69,7 +69,7 @@ def test_the_jacobian_is_the_derivative(tmp_path: Path, base: str) -> None:
         ('<child link="b"/>', '', 'no joints lead from a to d'),
     ],
 )
-def test_refused(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_rejected(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = tmp_path / 'arm.urdf'
     path.write_text(WRIST.replace(old, new))
     with pytest.raises(ConfigError) as caught:

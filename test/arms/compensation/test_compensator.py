@@ -689,7 +689,7 @@ def test_a_report_older_than_the_last_command_begins_nothing(arm: Arm, output: s
     ('tells', 'away', 'why'),
     [(False, 0.0, 'does not tell the command that it has'), (True, 0.05, 'is 0.05 from the command of the controller')],
 )
-def test_with_commands_an_unknown_or_far_command_is_refused(arm: Arm, tells: bool, away: float, why: str) -> None:
+def test_with_commands_an_unknown_or_far_command_is_rejected(arm: Arm, tells: bool, away: float, why: str) -> None:
     loop = Loop(arm, output='commands')
     loop.tells, loop.droop = tells, away
     loop.compensator.enable(True)

@@ -184,7 +184,7 @@ def test_a_stop_is_forgotten() -> None:
     ]
 
 
-def test_a_jump_under_way_is_refused_and_nothing_changes() -> None:
+def test_a_jump_under_way_is_rejected_and_nothing_changes() -> None:
     by = TrajectoryShaper(ZV)
     by.shape(0, moved(1), ZERO)
     far = checked(NAMES, [0.0, 1.0], [[[2.0, 0.0], [], []], [[0.0, 0.0], [], []]])
@@ -233,7 +233,7 @@ GOOD = [[0.0], [], []]
         (['a'], [0.0, 1.0], [[[0.0], [0.0], []], [[1.0], [0.2], []]], 'ends in motion: a at 0.2 rad/s'),
     ],
 )
-def test_what_cannot_be_followed_is_refused(
+def test_what_cannot_be_followed_is_rejected(
     names: list[str], times: list[float], points: list[list[list[float]]], why: str
 ) -> None:
     with pytest.raises(ConfigError, match=why):

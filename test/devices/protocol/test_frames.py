@@ -145,7 +145,7 @@ def test_empty_frames_are_nothing() -> None:
     assert decode(b'\x00\x00' + SAMPLE_BYTES + b'\x00') == [SAMPLE]
 
 
-def test_a_hello_that_does_not_fit_is_refused() -> None:
+def test_a_hello_that_does_not_fit_is_rejected() -> None:
     with pytest.raises(ValueError, match='at most 512'):
         encode(HelloFrame(1, {'serial': 'x' * 600}))
 
@@ -164,7 +164,7 @@ def test_a_hello_of_512_bytes_encoded_is_sent_and_received() -> None:
     assert isinstance(decode(sent)[0], HelloFrame)
 
 
-def test_a_field_that_does_not_fit_is_refused() -> None:
+def test_a_field_that_does_not_fit_is_rejected() -> None:
     with pytest.raises(ValueError, match='SampleFrame'):
         encode(SAMPLE._replace(seq=1 << 32))
 

@@ -112,7 +112,7 @@ def test_it_holds_for_a_tenth_of_a_second_and_the_first_one_is_doubted() -> None
         (BaseAcceleration(1000 * MS, NONE, (0.0, 0.0, -2e4)), r'accel.angular.z is -20000, the bound is 10000'),
     ],
 )
-def test_what_cannot_be_used_is_refused(base: BaseAcceleration, why: str) -> None:
+def test_what_cannot_be_used_is_rejected(base: BaseAcceleration, why: str) -> None:
     known = Inertia(MODES, L)
     with pytest.raises(ValueError, match=why):
         known.tell(base, 1000 * MS)
@@ -219,7 +219,7 @@ def test_what_comes_late_is_put_right(run: motion.Run, monkeypatch: pytest.Monke
 
 def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> None:
     pipeline = Pipeline(motion.rig_of())
-    session: Any = SimpleNamespace(pipeline=pipeline, refused=Counter(), why_refused={})
+    session: Any = SimpleNamespace(pipeline=pipeline, rejected=Counter(), why_rejected={})
     health = HealthReporter(session)
 
     def entry() -> DiagnosticEntry:
@@ -234,7 +234,7 @@ def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> Non
     told = list(run.told)
     through(pipeline, run, range(25), told)
     assert said() == (0, 'the modes foretell the samples')
-    session.refused[ACCELERATION], session.why_refused[ACCELERATION] = 3, 'no frame'
+    session.rejected[ACCELERATION], session.why_rejected[ACCELERATION] = 3, 'no frame'
     through(pipeline, run, range(25, 30), told)
     assert said() == (1, '3 base accelerations refused: no frame')
     # Of four messages in a block two come late.
@@ -245,7 +245,7 @@ def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> Non
     assert dict(entry().values)['base accelerations, not ended by another'] == '1'
 
 
-def test_a_memory_that_is_none_is_refused() -> None:
+def test_a_memory_that_is_none_is_rejected() -> None:
     filtered = Pipeline(motion.rig_of()).motion_filter
     assert filtered is not None
     one = (5.0, 1.0, 0.0, 0.0, 0.0, 0.0)

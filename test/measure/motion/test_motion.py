@@ -223,7 +223,7 @@ def test_a_restart_begins_anew(operation: motion.Run) -> None:
     assert np.all(np.abs(pose(found) - operation.pose[4019]) < 5.0 * np.sqrt(found.covariance[::4]))
 
 
-def test_no_filter_no_motion_and_a_long_block_is_refused(operation: motion.Run) -> None:
+def test_no_filter_no_motion_and_a_long_block_is_rejected(operation: motion.Run) -> None:
     pipeline = Pipeline(load_rig())
     assert pipeline.motion_filter is None
     assert pipeline.load(AppliedLoad(0, 1.0, 0.0, 0.0)) is None

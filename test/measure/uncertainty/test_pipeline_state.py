@@ -138,7 +138,7 @@ def run(rig: Rig, samples: generator.Array) -> tuple[Pipeline, list[Record]]:
     return pipeline, list(pipeline.process(chunk(samples)))
 
 
-def test_a_dead_reading_is_widened_named_and_refused_if_asked() -> None:
+def test_a_dead_reading_is_widened_named_and_rejected_if_asked() -> None:
     samples = volts(9, 2, dead=1)
     pipeline, records = run(load_rig(), samples)
     late = [e for e in estimates(records) if e.primary and e.block > 200]

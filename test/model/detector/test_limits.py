@@ -88,7 +88,7 @@ def test_the_devices_flag_blames_no_detector_unless_a_cause_is_seen() -> None:
 
 
 @pytest.mark.parametrize(('blocks', 'status'), [(4, BlockStatus.OK), (5, BlockStatus.FROZEN)])
-def test_a_detector_is_frozen_after_five_blocks_if_that_is_to_be_refused(blocks: int, status: BlockStatus) -> None:
+def test_a_detector_is_frozen_after_five_blocks_if_that_is_to_be_rejected(blocks: int, status: BlockStatus) -> None:
     for psd, frozen in ((1, (blocks, 0)), (2, (0, blocks))):
         got = judge_frozen(frozen)
         assert got.status is status
@@ -250,8 +250,8 @@ def test_a_frozen_detector_is_a_finding_unless_it_is_a_fault() -> None:
     assert health.late_findings(of(volts), ok, (5, 7), Loudness()) == said
     assert health.late_findings(of(volts), ok, (4, 7), Loudness()) == said[1:]
     assert health.late_findings(of(volts), blamed, (5, 7), Loudness()) == said[:1]
-    refuses = OpticsHealth(load_rig(overrides={'frozen': 'refuse'}))
-    assert refuses.late_findings(of(volts), ok, (5, 7), Loudness()) == ()
+    rejects = OpticsHealth(load_rig(overrides={'frozen': 'refuse'}))
+    assert rejects.late_findings(of(volts), ok, (5, 7), Loudness()) == ()
 
 
 def test_noise_of_just_a_step_may_stand_still() -> None:

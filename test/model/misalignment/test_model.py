@@ -113,7 +113,7 @@ def test_a_rig_file_of_a_vector_corrects_the_dots(truth: dict[str, float], poses
         ),
     ],
 )
-def test_a_covariance_that_is_none_is_refused(values: dict[str, object], words: str) -> None:
+def test_a_covariance_that_is_none_is_rejected(values: dict[str, object], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         known_of_rig(rig_from_values(values))
 

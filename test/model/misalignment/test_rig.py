@@ -83,7 +83,7 @@ def test_a_calibration_takes_an_effect_of_the_users_own_for_what_it_declares(
         ('plane_tilt', {'slope_ratio': 'gain_x'}, 'a calibration finds of the link: link.slope_ratio, clamp'),
     ],
 )
-def test_a_declaration_that_a_calibration_cannot_use_is_refused(name: str, called: dict[str, str], words: str) -> None:
+def test_a_declaration_that_a_calibration_cannot_use_is_rejected(name: str, called: dict[str, str], words: str) -> None:
     with pytest.raises(ValueError, match=words):
         replace(catalogue()[name], calibrated_as=called)
 
@@ -94,7 +94,7 @@ def test_what_a_declaration_may_name_is_what_a_calibration_finds() -> None:
     assert set(CALIBRATED_OF_LINK) == {*CLAMP, 'link.slope_ratio'}
 
 
-def test_an_effect_that_is_declared_wrongly_is_refused_by_its_file_and_only_if_it_is_listed(
+def test_an_effect_that_is_declared_wrongly_is_rejected_by_its_file_and_only_if_it_is_listed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / 'my_gain.py').write_text(OWN.replace("'gain_x'", "'gian_x'"))
@@ -108,7 +108,7 @@ def test_an_effect_that_is_declared_wrongly_is_refused_by_its_file_and_only_if_i
     assert [a.effect.name for a in effects if 'psd' in a.values] == ['sensor_gain']
 
 
-def test_two_effects_that_give_one_parameter_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_effects_that_give_one_parameter_are_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'my_gain.py').write_text(OWN)
     monkeypatch.setenv(FOLDERS, str(tmp_path))
     own = {'effects.a.name': 'my_gain', 'effects.a.psd': 2, 'effects.a.x': 0.01}
@@ -120,7 +120,7 @@ def test_two_effects_that_give_one_parameter_are_refused(tmp_path: Path, monkeyp
         assert vector_of_rig(load_rig(overrides={**own, **ours, **apart})).values[INDEX['psd_2.gain_x']] == 0.01
 
 
-def test_an_effect_listed_twice_is_refused() -> None:
+def test_an_effect_listed_twice_is_rejected() -> None:
     twice = {f'effects.{key}.{name}': value for key in 'ab' for name, value in
              {'name': 'sensor_gain', 'psd': 1, 'x': 0.01}.items()}  # fmt: skip
     with pytest.raises(ConfigError, match='listed twice'):

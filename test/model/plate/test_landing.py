@@ -58,7 +58,7 @@ def test_a_beam_that_leans_meets_the_plate_where_its_ray_does(height: float) -> 
         (np.full((2, 2), np.nan), 2, 'centers must be finite'),
     ],
 )
-def test_arrays_that_are_no_geometry_are_refused(centers: np.ndarray, heights: int, said: str) -> None:
+def test_arrays_that_are_no_geometry_are_rejected(centers: np.ndarray, heights: int, said: str) -> None:
     with pytest.raises(SolverError, match=said):
         check_shapes(Geometry(centers, np.zeros(centers.shape), np.zeros(heights), 0.585))
 
@@ -94,7 +94,7 @@ def test_what_is_not_finite_is_named(name: str) -> None:
         check_shapes(Geometry(arrays['centers'], arrays['zeros'], arrays['heights'], 0.585))
 
 
-def test_arrays_of_another_count_are_refused_one_by_one() -> None:
+def test_arrays_of_another_count_are_rejected_one_by_one() -> None:
     for zeros, heights in (((3, 2), 2), ((2, 2), 3), ((2, 1), 2)):
         with pytest.raises(SolverError, match='must all be of the same 2 PSDs'):
             check_shapes(Geometry(np.zeros((2, 2)), np.zeros(zeros), np.zeros(heights), 0.585))

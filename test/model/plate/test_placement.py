@@ -120,14 +120,14 @@ def test_the_search_finds_what_lies_between_its_candidates() -> None:
         (math.inf, 0.0, None, '^radius = '),
     ],
 )
-def test_an_impossible_room_is_refused(
+def test_an_impossible_room_is_rejected(
     radius: float, keep_out: float, box: tuple[float, float, float, float] | None, said: str
 ) -> None:
     with pytest.raises(ConfigError, match=said):
         Room(radius, keep_out, box)
 
 
-def test_a_room_too_small_for_two_is_refused() -> None:
+def test_a_room_too_small_for_two_is_rejected() -> None:
     with pytest.raises(ConfigError, match='no room'):
         placement.best_pair(Room(0.1, box=(0.2, 0.2, 0.3, 0.3)))
 

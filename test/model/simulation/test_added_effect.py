@@ -104,7 +104,7 @@ def test_it_is_discovered_and_named(rig: Rig, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(('name', 'row'), [('temperature', 'warmer'), ('time', 't')])
-def test_a_correction_that_reads_what_it_does_not_declare_is_refused(folder: Path, name: str, row: str) -> None:
+def test_a_correction_that_reads_what_it_does_not_declare_is_rejected(folder: Path, name: str, row: str) -> None:
     (folder / f'{NAME}.py').write_text(CODE.replace("{'temperature'}", '').replace('reading.warmer', f'reading.{row}'))
     with pytest.raises(ConfigError, match=f'{NAME}.*fails on a reading.*uses'):
         Pipeline(load_rig(overrides=EFFECT))
@@ -129,7 +129,7 @@ EFFECT = Effect('heavier', 'load', 's', 'e', 's', 'n', (EffectParameter('by', ''
 """
 
 
-def test_its_load_is_traced_back_and_a_trace_that_fails_is_refused(folder: Path) -> None:
+def test_its_load_is_traced_back_and_a_trace_that_fails_is_rejected(folder: Path) -> None:
     (folder / 'heavier.py').write_text(LOADED)
     rig = load_rig(overrides={'effects.heavier.by': 0.25})
     load = Pipeline(rig).tip_loads.tip_load(0, *LinkStatics.from_rig(rig).deflection(10.0, -20.0, 5.0))
@@ -181,7 +181,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path: Path, monkeypatch: pytest
     assert NAME not in effect_names()
 
 
-def test_two_effects_of_one_name_are_refused(folder: Path) -> None:
+def test_two_effects_of_one_name_are_rejected(folder: Path) -> None:
     file = folder / 'creep.py'
     file.write_text(CODE)
     with pytest.raises(ConfigError) as error:

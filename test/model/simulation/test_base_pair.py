@@ -66,7 +66,7 @@ CONTRADICTIONS = [
 
 
 @pytest.mark.parametrize(('more', 'said'), CONTRADICTIONS)
-def test_a_contradiction_is_refused_and_not_simulated(more: dict[str, object], said: str) -> None:
+def test_a_contradiction_is_rejected_and_not_simulated(more: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         RigSimulator(load_rig(overrides={**BASE, **more}))
 

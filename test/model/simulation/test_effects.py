@@ -117,7 +117,7 @@ def test_a_rig_file_carries_it_there_and_back(active: ActiveEffect, tmp_path: Pa
         ({'effects.a.name': 'sensor_rotation', 'effects.a.psd': 1, 'effects.a.turn': 4.0}, 'turn'),
     ],
 )
-def test_a_bad_effect_is_refused_by_name(values: dict[str, object], said: str) -> None:
+def test_a_bad_effect_is_rejected_by_name(values: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError) as error:
         effects_of_rig(rig_from_values(values))
     assert said in str(error.value)

@@ -187,7 +187,7 @@ def test_a_law_travels_with_the_recording_and_the_rig_file(
         ('7', 'law: must be a map'),
     ],
 )
-def test_a_malformed_law_in_a_rig_file_is_refused_with_its_key(text: str, said: str) -> None:
+def test_a_malformed_law_in_a_rig_file_is_rejected_with_its_key(text: str, said: str) -> None:
     rig = load_rig(overrides={'effects.e.name': 'e', 'effects.e.c1': 1.0, 'effects.e.law': text})
     with pytest.raises(ConfigError) as error:
         effects_of_rig(rig)
@@ -215,7 +215,7 @@ def test_units_and_words_are_those_of_the_variables() -> None:
         ({'acts_on: y2': 'acts_on: load_fx', '- load_fx': '- y1'}, "terms[0].of = 'y1': unknown"),
     ],
 )
-def test_a_malformed_law_is_refused_with_file_and_key(tmp_path: Path, change: dict[str, str], said: str) -> None:
+def test_a_malformed_law_is_rejected_with_file_and_key(tmp_path: Path, change: dict[str, str], said: str) -> None:
     text = law_text(Law('yielding', 'psd', 'y2', (LawTerm('above', ('load_fx',), 2.5e-7, {'threshold': 10.0}),)))
     for old, new in change.items():
         assert old in text

@@ -111,7 +111,7 @@ def test_load_file_is_held_between_rows(tmp_path: Path) -> None:
         ('t,load_fx,load_fy,load_tz\n0,1,2,3\n0,1,2,3\n', ':3: column t does not rise'),
     ],
 )
-def test_bad_load_file_is_refused_by_line(tmp_path: Path, text: str, said: str) -> None:
+def test_bad_load_file_is_rejected_by_line(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / 'loads.csv'
     path.write_text(text)
     with pytest.raises(RecordingError) as error:

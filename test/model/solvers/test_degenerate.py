@@ -77,12 +77,12 @@ def test_one_of_the_two_rank_conditions_is_enough(rays: Any, method: str, center
         ('appendix_d_ols', rig(THREE), {}, r'takes two PSDs'),
     ],
 )
-def test_refused_by_name(method: str, geometry: Geometry, options: dict[str, Any], said: str) -> None:
+def test_rejected_by_name(method: str, geometry: Geometry, options: dict[str, Any], said: str) -> None:
     with pytest.raises(SolverError, match=said):
         make_solver(method, geometry, **options)
 
 
-def test_the_refusal_under_torsion_says_how_bad_it_is(rays: Any) -> None:
+def test_the_rejection_under_torsion_says_how_bad_it_is(rays: Any) -> None:
     """0.1 degree of twist is read as -1.02 mm of dY (thesis 5.3; docs/audit.md)."""
     geometry = rig(CORNER, [-0.585, -0.485])
     with pytest.raises(SolverError, match=r'one degree of twist looks like 10\.2 mm of ΔY'):

@@ -149,7 +149,7 @@ def test_a_base_line_too_short_for_any_tilt_is_inadmissible(golden: Any) -> None
         assert one.phi == one.omega == 0.0
 
 
-def test_an_unknown_method_is_refused_with_the_known_ones(golden: Any) -> None:
+def test_an_unknown_method_is_rejected_with_the_known_ones(golden: Any) -> None:
     with pytest.raises(ConfigError, match=r"'exakt': must be one of exact, .*did you mean exact\?"):
         make_solver('exakt', golden.geometry())
 
@@ -168,14 +168,14 @@ def test_options_are_checked(golden: Any) -> None:
 
 
 @pytest.mark.parametrize('method', ['exact', 'wls', 'wls_exact', 'beam'])
-def test_a_variance_of_zero_is_refused(golden: Any, method: str) -> None:
+def test_a_variance_of_zero_is_rejected(golden: Any, method: str) -> None:
     with pytest.raises(SolverError, match=r'variances must be above 0'):
         make_solver(method, golden.geometry()).solve((0.0,) * 4, (0.0,) * 4)
     with pytest.raises(SolverError, match=r'variances must be above 0'):
         make_solver(method, golden.geometry()).solve_many(np.zeros((1, 4)), np.array([1.0, 1.0, float('nan'), 1.0]))
 
 
-def test_a_variance_of_zero_is_refused_elsewhere_too() -> None:
+def test_a_variance_of_zero_is_rejected_elsewhere_too() -> None:
     for method, geometry in (('pose', STAGGERED), ('base_pair', AT_THE_BASE)):
         count = 2 * len(geometry.centers)
         with pytest.raises(SolverError, match=r'variances must be above 0'):

@@ -99,7 +99,7 @@ def test_a_new_method_is_budgeted_as_it_declares(tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.usefixtures('joined')
-def test_a_new_method_is_compared_or_refused_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_new_method_is_compared_or_rejected_by_name(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['thesis', 'compare-methods']) == 0
     lines = capsys.readouterr().out.splitlines()
     rows = [[line[30:] for line in lines if line.startswith(name + '  ')] for name in ('made_up', 'exact (default)')]

@@ -375,7 +375,7 @@ def test_a_quarter_turn_has_a_way_out_of_where_no_angle_is_better() -> None:
     assert one[:3] == pytest.approx((0.0, 0.0, np.pi / 2.0), abs=1e-14)
 
 
-def test_a_link_without_end_and_a_weight_without_end_are_refused() -> None:
+def test_a_link_without_end_and_a_weight_without_end_are_rejected() -> None:
     for length in (0.0, -1.0, float('inf')):
         with pytest.raises(SolverError, match=r'link\.length = .* must be above 0'):
             make_solver('beam', Geometry(TWO.centers, TWO.zeros, TWO.heights, length))

@@ -143,7 +143,7 @@ def test_a_base_line_is_too_short_from_three_standard_deviations_on(deviations: 
 
 
 @pytest.mark.parametrize(('k', 'taken'), [(-0.9995, False), (-0.9985, True), (-1.0005, False), (-1.0015, True)])
-def test_a_surface_at_which_the_turn_undoes_the_deflection_is_refused(k: float, taken: bool) -> None:
+def test_a_surface_at_which_the_turn_undoes_the_deflection_is_rejected(k: float, taken: bool) -> None:
     """1 + k h/L below a thousandth."""
     geometry = Geometry(TWO.centers, TWO.zeros, np.array([0.585, 0.0]), 0.585, k)
     if taken:

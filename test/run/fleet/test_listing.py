@@ -59,7 +59,7 @@ def test_a_list_is_relative_to_its_folder(archive: Path) -> None:
         (b'\n' * (LARGEST_LIST + 1), 'larger than 16 MiB'),
     ],
 )
-def test_a_bad_list_is_refused(archive: Path, content: bytes, message: str) -> None:
+def test_a_bad_list_is_rejected(archive: Path, content: bytes, message: str) -> None:
     (archive / 'list.txt').write_bytes(content)
     with pytest.raises(RecordingError, match=message):
         listed(['list.txt'])

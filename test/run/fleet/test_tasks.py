@@ -151,12 +151,12 @@ def test_a_run_that_is_given_up_leaves_no_process() -> None:
 @pytest.mark.parametrize(
     'word', ['process', 'processes:0', 'processes:-1', 'dask://host', 'dask://:1', 'dask://a:b', '']
 )
-def test_another_word_is_refused(word: str) -> None:
+def test_another_word_is_rejected(word: str) -> None:
     with pytest.raises(UsageError, match='must be serial, processes'):
         check_engine(word)
 
 
-def test_encryption_without_certificates_is_refused_before_it_is_tried() -> None:
+def test_encryption_without_certificates_is_rejected_before_it_is_tried() -> None:
     pytest.importorskip('distributed')
     with (
         pytest.raises(ConfigError, match=r"^--executor dask\+tls://127\.0\.0\.1:1: Dask's configuration has no cert"),

@@ -24,7 +24,7 @@ from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.monitor.feed import Feed
 from psd_deflection.run.monitor.metrics import Family, counter
 from psd_deflection.run.monitor.server import MonitorServer
-from psd_deflection.run.monitor.shown import RefusedError
+from psd_deflection.run.monitor.shown import RejectedError
 from test.heard import until
 
 START_NS = 1_700_000_000_000_000_000
@@ -32,7 +32,7 @@ BLOCK_NS = 20_000_000
 
 
 class StillShown:
-    """Remembers what was asked of it; ``refusal`` is what it answers, where there is one."""
+    """Remembers what was asked of it; ``rejection`` is what it answers, where there is one."""
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -44,7 +44,7 @@ class StillShown:
         self.marks: list[str] = []
         self.played: list[tuple[bool | None, float | None]] = []
         self.recordings: list[str | None] = []
-        self.refusal = ''
+        self.rejection = ''
         self.folder = 'recordings/test'
         self.reports = 0
         self.alarmed: Alarm | None = None
@@ -63,34 +63,34 @@ class StillShown:
         return [counter('samples', 'Samples that came', 40)]
 
     def zero(self) -> str:
-        if self.refusal:
-            raise RefusedError(self.refusal)
+        if self.rejection:
+            raise RejectedError(self.rejection)
         self.zeros += 1
         self.acted.set()
         return 'unloaded dots taken'
 
     async def record(self, wanted: bool) -> str:
-        if self.refusal:
-            raise RefusedError(self.refusal)
+        if self.rejection:
+            raise RejectedError(self.rejection)
         self.recordings.append(self.folder if wanted else None)
         return 'recording' if wanted else 'recording ended'
 
     def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None, late_s: float) -> str:
-        if self.refusal:
-            raise RefusedError(self.refusal)
+        if self.rejection:
+            raise RejectedError(self.rejection)
         self.loads.append((fx, fy, tz, add))
         self.agos.append(ago_s)
         self.lates.append(late_s)
         return 'load noted'
 
     def step(self) -> str:
-        if self.refusal:
-            raise RefusedError(self.refusal)
+        if self.rejection:
+            raise RejectedError(self.rejection)
         return self.stepped
 
     def mark(self, text: str, late_s: float) -> str:
-        if self.refusal:
-            raise RefusedError(self.refusal)
+        if self.rejection:
+            raise RejectedError(self.rejection)
         self.marks.append(text)
         self.lates.append(late_s)
         return f'mark: {text}'

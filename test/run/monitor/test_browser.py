@@ -555,19 +555,19 @@ def test_a_label_of_the_time_axis_has_every_decimal_of_its_step(page: Page, serv
     assert digits == [0, 0, 1, 0, 2, 2, 3]
 
 
-def test_a_load_of_the_page_takes_a_decimal_comma_or_refuses(page: Page, serve: Callable[..., Serving]) -> None:
+def test_a_load_of_the_page_takes_a_decimal_comma_or_rejects(page: Page, serve: Callable[..., Serving]) -> None:
     serving = serve()
     serving.give(0, 20)
     page.open(serving.url)
     page.until('document.getElementById("load").offsetParent !== null && document.body.dataset.rows >= 1')
     page.driver.find_element(By.ID, 'load').click()
     field = page.driver.find_element(By.ID, 'fy')
-    refused, taken = ('1,500', '1,500.5', 'ten', ''), ('-1.5', '-1e1', '-1,5')
-    for typed in (*refused, *taken):
+    rejected, taken = ('1,500', '1,500.5', 'ten', ''), ('-1.5', '-1e1', '-1,5')
+    for typed in (*rejected, *taken):
         field.clear()
         field.send_keys(typed)
         assert page.js('document.getElementById("fy").checkValidity()') is (typed in taken), typed
-        if typed in refused:
+        if typed in rejected:
             page.driver.find_element(By.CSS_SELECTOR, '#weigh button.main').click()
     assert serving.shown.loads == []
     page.driver.find_element(By.CSS_SELECTOR, '#weigh button.main').click()

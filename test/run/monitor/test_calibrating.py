@@ -84,7 +84,7 @@ def test_it_ends_with_the_daemon(serve: Serve, bag: Path, tmp_path: Path) -> Non
     assert process.returncode is not None
 
 
-def test_a_played_recording_and_nonsense_are_refused(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_played_recording_and_nonsense_are_rejected(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     serving = serve()
     assert asked(serving.url, 1) == (400, 'refused: expected {"calibrate": true} or {"calibrate": false}')
     described = {'kind': 'replay', 'name': 'test', 'recording': None}

@@ -63,9 +63,9 @@ def test_zero_record_load_and_mark_reach_the_daemon(serve: Serve, capsys: pytest
     ]
 
 
-def test_a_refusal_is_an_error_with_its_reason(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rejection_is_an_error_with_its_reason(serve: Serve, capsys: pytest.CaptureFixture[str]) -> None:
     serving = serve()
-    serving.shown.refusal = 'not zeroed: no data flows'
+    serving.shown.rejection = 'not zeroed: no data flows'
     assert main(['zero']) == 7
     assert capsys.readouterr().err == f'psd-deflection zero: {serving.url}: not zeroed: no data flows\n'
 
@@ -74,7 +74,7 @@ def test_zero_waits_for_a_link_that_moves(
     serve: Serve, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     serving = serve()
-    serving.shown.refusal = 'not zeroed: the link moves: y1 varied by 80.0 µm rms'
+    serving.shown.rejection = 'not zeroed: the link moves: y1 varied by 80.0 µm rms'
     assert main(['zero', '--wait', '0']) == 7
     assert 'the link moves: y1 varied' in capsys.readouterr().err
     waited: list[float] = []
@@ -82,7 +82,7 @@ def test_zero_waits_for_a_link_that_moves(
     def rests(seconds: float) -> None:
         waited.append(seconds)
         if len(waited) == 3:
-            serving.shown.refusal = ''
+            serving.shown.rejection = ''
 
     monkeypatch.setattr('psd_deflection.cli.run.zero.time.sleep', rests)
     assert main(['zero']) == 0

@@ -188,8 +188,8 @@ def test_another_site_cannot_look(served: Served, headers: dict[str, str]) -> No
         async with aiohttp.ClientSession() as client:
             try:
                 await connected(client, served.server.address, **given)
-            except aiohttp.WSServerHandshakeError as refused:
-                return refused.status
+            except aiohttp.WSServerHandshakeError as rejected:
+                return rejected.status
         return 101
 
     assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == 403
@@ -214,8 +214,8 @@ def test_which_pages_may_look_is_a_parameter() -> None:
         async with aiohttp.ClientSession() as client:
             try:
                 await connected(client, server.address, Origin=origin)
-            except aiohttp.WSServerHandshakeError as refused:
-                return refused.status
+            except aiohttp.WSServerHandshakeError as rejected:
+                return rejected.status
         return 101
 
     try:

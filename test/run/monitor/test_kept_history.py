@@ -255,7 +255,7 @@ def test_a_folder_that_cannot_be_written_costs_the_history_alone(keep: Callable[
     assert logged.startswith(f'{tmp_path}/state/history.sqlite: the history of the page cannot be kept (')
 
 
-def test_what_the_disk_refused_is_written_the_next_time(
+def test_what_the_disk_rejected_is_written_the_next_time(
     keep: Callable[[], Keeping], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = keep()

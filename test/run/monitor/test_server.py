@@ -175,7 +175,7 @@ def test_on_this_machine_the_buttons_work_and_report_the_result(serve: Serve) ->
         'monitor: zero was asked for by 127.0.0.1',
         *['monitor: record was asked for by 127.0.0.1'] * 2,
     ]
-    serving.shown.refusal = 'no good block yet'
+    serving.shown.rejection = 'no good block yet'
     status, text, _ = ask(serving.url + 'api/zero')
     assert (status, json.loads(text)) == (409, {'ok': False, 'message': 'no good block yet'})
 
@@ -196,7 +196,7 @@ def test_on_this_machine_the_buttons_work_and_report_the_result(serve: Serve) ->
         ({}, {'record': 'yes'}, 400),
     ],
 )
-def test_requests_from_another_site_are_refused(
+def test_requests_from_another_site_are_rejected(
     serve: Serve, headers: dict[str, str], body: object, status: int
 ) -> None:
     serving = serve(monitor_control=True)
@@ -253,7 +253,7 @@ def test_a_load_is_noted(serve: Serve) -> None:
         ('zero', {'record': True}),
     ],
 )
-def test_a_body_of_another_kind_is_refused(serve: Serve, path: str, body: object) -> None:
+def test_a_body_of_another_kind_is_rejected(serve: Serve, path: str, body: object) -> None:
     serving = serve()
     status, text, _ = ask(f'{serving.url}api/{path}', body=body, headers={'Content-Type': 'application/json'})
     assert (status, json.loads(text)['message'].startswith('refused: expected')) == (400, True)
@@ -269,7 +269,7 @@ def test_a_body_of_another_kind_is_refused(serve: Serve, path: str, body: object
         ({'ago': 601}, 'not noted: a load has hung for 0 to 600 s when it is noted'),
     ],
 )
-def test_a_load_out_of_bounds_is_refused_in_a_person_s_words(serve: Serve, body: object, words: str) -> None:
+def test_a_load_out_of_bounds_is_rejected_in_a_person_s_words(serve: Serve, body: object, words: str) -> None:
     assert isinstance(body, dict)
     serving = serve()
     status, text, _ = ask(f'{serving.url}api/load', body={'fx': 0, 'fy': 0, 'tz': 0, **body})
@@ -485,7 +485,7 @@ def test_a_port_in_use_is_reported_and_another_taken(serve: Serve) -> None:
     assert ask(second.url, 'GET')[0] == 200
 
 
-def test_an_address_of_another_machine_is_refused() -> None:
+def test_an_address_of_another_machine_is_rejected() -> None:
     rig = load_rig(overrides={'monitor_address': '192.0.2.1', 'monitor_port': 0})
     server = MonitorServer(StillShown(rig), Feed(), rig.monitor, null_log)
     with pytest.raises(ConfigError, match=r"monitor_address = '192\.0\.2\.1'"):

@@ -16,7 +16,7 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.replay.engine import replayed, rig_at_start
 from psd_deflection.records import AppliedLoad, BlockStatus, ParameterChange, Record, ReferencePose, SpotMeans
 from psd_deflection.run.monitor.feed import BlockResult, Feed
-from psd_deflection.run.monitor.shown import RefusedError
+from psd_deflection.run.monitor.shown import RejectedError
 from psd_deflection.run.monitor.shown_recording import ShownRecording
 
 BAGS = Path(__file__).parents[3] / 'bags'
@@ -65,9 +65,9 @@ def test_a_recording_is_shown_as_it_is_with_its_losses() -> None:
     report = source.health(0)
     assert ('lost', '176') in report.entries[0].values
     assert report.entries[0].message == 'end of the recording'
-    with pytest.raises(RefusedError, match='has ended'):
+    with pytest.raises(RejectedError, match='has ended'):
         source.zero()
-    with pytest.raises(RefusedError, match='not recorded again'):
+    with pytest.raises(RejectedError, match='not recorded again'):
         asyncio.run(source.record(True))
     assert wanted == ['lost_samples: end of the recording']
 
@@ -162,11 +162,11 @@ def test_a_recording_can_be_paused_and_sought() -> None:
     feed.until(lambda: len(feed.times) > before)
     assert feed.times[before] == start
     source.close()
-    with pytest.raises(RefusedError, match='those that were recorded'):
+    with pytest.raises(RejectedError, match='those that were recorded'):
         source.load(0.0, 0.0, 0.0, False, 0.0, 0.0)
-    with pytest.raises(RefusedError, match='those that were recorded'):
+    with pytest.raises(RejectedError, match='those that were recorded'):
         source.mark('x', 0.0)
-    with pytest.raises(RefusedError, match='those that were recorded'):
+    with pytest.raises(RejectedError, match='those that were recorded'):
         source.step()
 
 

@@ -477,14 +477,14 @@ def _changed(*path: str | int, to: object) -> dict[str, Any]:
     ],
     ids=lambda v: v if isinstance(v, str) and len(v) < 60 else '',
 )
-def test_what_calibrate_does_not_write_is_refused(tree: object, words: str, tmp_path: Path) -> None:
+def test_what_calibrate_does_not_write_is_rejected(tree: object, words: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError) as error:
         read_calibration(_folder(tmp_path, tree))
     assert f'calibration.json: {words}'.partition('calibration.json: ')[2] in str(error.value)
     assert str(error.value).startswith(str(tmp_path / 'calibration.json'))
 
 
-def test_a_file_that_is_too_long_or_not_there_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_is_too_long_or_not_there_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = _folder(tmp_path, _tree())
     size = (folder / 'calibration.json').stat().st_size
     # One of thirty parameters has 40 kB.

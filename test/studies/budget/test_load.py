@@ -91,7 +91,7 @@ def test_without_room_there_is_no_load() -> None:
     assert [abs(v) for v in default_load(rig)] == [0.0, 0.0, 0.0]
 
 
-def test_a_rig_of_three_detectors_is_refused_in_words() -> None:
+def test_a_rig_of_three_detectors_is_rejected_in_words() -> None:
     three = replace_values(RIG, {'psd_3.center': [0.1, 0.0]})
     with pytest.raises(ConfigError, match='two PSDs'):
         budget(BudgetProblem(three))

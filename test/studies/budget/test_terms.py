@@ -200,7 +200,7 @@ def test_shares_add_to_one_where_one_bias_stands_alone() -> None:
         ({'temperature': 20.0}, 'above 223.15'),
     ],
 )
-def test_a_bad_input_is_refused_by_name(settings: dict[str, object], said: str) -> None:
+def test_a_bad_input_is_rejected_by_name(settings: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError) as error:
         read_inputs(None, settings)
     assert said in str(error.value)
@@ -208,7 +208,7 @@ def test_a_bad_input_is_refused_by_name(settings: dict[str, object], said: str) 
 
 
 @pytest.mark.parametrize(('text', 'said'), [('- 1', 'name: value'), ('{', 'malformed YAML'), ('x: 1', 'no such input')])
-def test_a_bad_file_of_inputs_is_refused_by_name(tmp_path: Path, text: str, said: str) -> None:
+def test_a_bad_file_of_inputs_is_rejected_by_name(tmp_path: Path, text: str, said: str) -> None:
     path = tmp_path / 'inputs.yaml'
     path.write_text(text)
     with pytest.raises(ConfigError) as error:

@@ -165,19 +165,19 @@ def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
     assert found.gap.heldout_after < 1.2 * calibrate([run], nominal).gap.heldout_after
 
 
-def test_a_reference_that_is_no_reference_is_refused(nominal: Rig, pose: FloatArray) -> None:
+def test_a_reference_that_is_no_reference_is_rejected(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose, np.random.default_rng(2)))
     wrong = CalibrationRun(
         run.name, run.t, run.volts, run.reference_t, np.random.default_rng(1).permutation(run.reference)
     )
     found = calibrate([wrong], nominal)
-    assert found.refused.startswith('on motion that was not fitted')
+    assert found.rejected.startswith('on motion that was not fitted')
     values, effects = values_of(found, 'today')
     assert not effects
     assert set(values) == {'psd_1.noise', 'psd_2.noise'}
 
 
-def test_a_recording_without_reference_and_loads_is_refused(nominal: Rig, pose: FloatArray) -> None:
+def test_a_recording_without_reference_and_loads_is_rejected(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(), pose[:2000], np.random.default_rng(2)))
     with pytest.raises(RecordingError, match=r'neither a reference .* nor known loads; --self'):
         calibrate([CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal)

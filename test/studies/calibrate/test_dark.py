@@ -137,7 +137,7 @@ def test_lost_samples_are_left_out(nominal: Rig) -> None:
         (slice(700, 702), 1, 9.95, r'^off\.csv: y1 is saturated with the laser off: 9\.950 V, .*is 10 V'),
     ],
 )
-def test_a_recording_that_tells_no_dark_level_is_refused(
+def test_a_recording_that_tells_no_dark_level_is_rejected(
     nominal: Rig, rows: slice, column: int, value: float, words: str
 ) -> None:
     volts = darkness()
@@ -146,7 +146,7 @@ def test_a_recording_that_tells_no_dark_level_is_refused(
         dark_levels([run_of(volts)], nominal)
 
 
-def test_a_drift_is_refused_if_it_moves_a_dot(nominal: Rig) -> None:
+def test_a_drift_is_rejected_if_it_moves_a_dot(nominal: Rig) -> None:
     """2 mV of the sum are 2 µm at the edge; 2 mV of x are 1 µm of 2 % of the light."""
     ramp = np.linspace(-1e-3, 1e-3, 5000)
     volts = white((3.0, -2.0, 0.12, -1.0, 0.5, 0.06))
@@ -173,9 +173,9 @@ def test_light_is_not_taken_off_twice(nominal: Rig) -> None:
     found = replace_values(
         nominal, {'effects.a.name': 'ambient_light', 'effects.a.psd': 1, 'effects.a.level': 0.1, 'effects.a.x': 1e-3}
     )
-    for refused in (lambda: dark_levels(runs, found), lambda: calibrate(runs, found)):
+    for rejected in (lambda: dark_levels(runs, found), lambda: calibrate(runs, found)):
         with pytest.raises(ConfigError, match=r'^effects: ambient_light.*would count it twice; take it out'):
-            refused()
+            rejected()
     old = replace_values(nominal, {'calibration.names': ['psd_1.gain_x'], 'calibration.sds': [1e-3]})
     with pytest.raises(ConfigError, match=r'^psd_1\.dark: this rig file was calibrated without it'):
         dark_levels(runs, old)

@@ -66,8 +66,8 @@ def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
     }
 
 
-def test_a_refusal_is_in_the_file_and_none_is_null() -> None:
+def test_a_rejection_is_in_the_file_and_none_is_null() -> None:
     made = psd_deflection.simulate(None, [(0, 0, 0), (40, 0, 0)], seconds=1, seed=3)
     found = psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found
-    assert result(replace(found, refused=''), '2026-11-26')['refused'] is None
-    assert result(replace(found, refused='worse than before'), '2026-11-26')['refused'] == 'worse than before'
+    assert result(replace(found, rejected=''), '2026-11-26')['refused'] is None
+    assert result(replace(found, rejected='worse than before'), '2026-11-26')['refused'] == 'worse than before'

@@ -331,7 +331,7 @@ def test_a_simulated_recording_can_be_wired_otherwise_than_its_rig_file_says(
         (['check', '--port', '/dev/null', '--world', 'link.length=1'], 2, '--world is for the simulated rig'),
     ],
 )
-def test_what_cannot_be_checked_is_refused(
+def test_what_cannot_be_checked_is_rejected(
     args: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(args) == status

@@ -370,7 +370,7 @@ def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pyte
         ('- [', 'malformed YAML'),
     ],
 )
-def test_a_bad_list_is_refused_by_name(
+def test_a_bad_list_is_rejected_by_name(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], listed: str, said: str
 ) -> None:
     simulate(tmp_path, '--loads', 'constant:0,0,0:1')
@@ -392,14 +392,14 @@ def test_a_bad_list_is_refused_by_name(
         (['--temperature', 'warm'], 'not a list of numbers'),
     ],
 )
-def test_bad_words_of_simulate_are_refused(
+def test_bad_words_of_simulate_are_rejected(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
     assert main(['simulate', '--out', str(tmp_path / 'x.csv'), *arguments]) == 2
     assert said in capsys.readouterr().err
 
 
-def test_a_recording_without_loads_is_refused_with_the_way_out(
+def test_a_recording_without_loads_is_rejected_with_the_way_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / 'bare.csv'

@@ -338,7 +338,7 @@ def test_a_load_case_begins_after_a_quarter_of_a_second_of_rest() -> None:
         ({'volts': np.zeros((79, 6)), 'loads': np.zeros((79, 3))}, '79 samples: discover needs at least 4 blocks'),
     ],
 )
-def test_what_is_no_recording_is_refused(change: dict[str, Any], said_of_it: str) -> None:
+def test_what_is_no_recording_is_rejected(change: dict[str, Any], said_of_it: str) -> None:
     with pytest.raises(RecordingError, match=said_of_it):
         dataclasses.replace(observed(), **change)
 

@@ -92,7 +92,7 @@ def test_the_answer_for_people_and_programs() -> None:
     assert found.files().keys() == {'report.html', 'isolable.json'}
 
 
-def test_loads_too_short_for_a_search_are_refused() -> None:
+def test_loads_too_short_for_a_search_are_rejected() -> None:
     with pytest.raises(RecordingError, match='79 samples: discover needs at least 4 blocks'):
         isolable(RIG, LOADS[:79])
 

@@ -164,10 +164,10 @@ def test_limits_are_read(words: list[str], expected: Limits) -> None:
         ('seconds=1', 'at least 5'),
     ],
 )
-def test_a_bad_limit_is_refused(word: str, part: str) -> None:
-    with pytest.raises(UsageError, match=r'--limit ') as refused:
+def test_a_bad_limit_is_rejected(word: str, part: str) -> None:
+    with pytest.raises(UsageError, match=r'--limit ') as rejected:
         limits_from_words([word])
-    assert part in str(refused.value)
+    assert part in str(rejected.value)
 
 
 class Searches:
@@ -289,7 +289,7 @@ def test_a_plan_is_written_as_files_that_the_commands_take(
         (['--next', '--run', '--effect', 'nonsense,a=1'], 'no effect of that name'),
     ],
 )
-def test_options_that_would_be_ignored_are_refused(
+def test_options_that_would_be_ignored_are_rejected(
     soft: Path, words: list[str], part: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['discover', str(soft), '--out', str(tmp_path), '--quiet', *words]) == 2

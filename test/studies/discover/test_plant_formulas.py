@@ -363,7 +363,7 @@ def test_what_a_plant_simulates_is_what_the_model_says() -> None:
         ({'library': (size_of('a'), size_of('b'), size_of('b'), size_of('a'))}, 'library: a, b is there twice'),
     ],
 )
-def test_tables_that_do_not_fit_are_refused(change: Mapping[str, object], words: str) -> None:
+def test_tables_that_do_not_fit_are_rejected(change: Mapping[str, object], words: str) -> None:
     plant = Pictures(tables(0), {})
     for name, value in change.items():
         setattr(plant, name, value)

@@ -199,7 +199,7 @@ def test_the_answer_is_the_same_again() -> None:
         ({'seen': [np.zeros((1, 50))] * 5}, 'measured: 5 tables for 6 cases'),
     ],
 )
-def test_a_plant_that_contradicts_itself_is_refused(change: Mapping[str, object], words: str) -> None:
+def test_a_plant_that_contradicts_itself_is_rejected(change: Mapping[str, object], words: str) -> None:
     plant = Spring(0.3)
     for name, value in change.items():
         setattr(plant, name, value)

@@ -98,7 +98,7 @@ def test_a_law_may_act_on_the_third_psd(tmp_path: Path) -> None:
     assert (effect.least_psds, effect_of(found.law.law).least_psds) == (3, 3)
 
 
-def test_a_rig_without_the_psd_of_a_law_refuses_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rig_without_the_psd_of_a_law_rejects_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = 'name: lifts\nacts_on: sum3\nterms:\n  - {form: product, of: [y4], coefficient: 100.0}\n'
     (tmp_path / 'lifts.yaml').write_text(text, encoding='utf-8')
     monkeypatch.setenv('PSD_DEFLECTION_EFFECTS', str(tmp_path))
@@ -300,7 +300,7 @@ def test_recordings_of_one_search_are_of_as_many_psds() -> None:
         discover(both[:1], TWO)
 
 
-def test_volts_of_another_number_of_psds_than_the_rig_has_are_refused() -> None:
+def test_volts_of_another_number_of_psds_than_the_rig_has_are_rejected() -> None:
     with pytest.raises(RecordingError, match=r'volts \(7000, 9\)'):
         Observation('x', SIX, observed(RIG).volts, LOADS)
 

@@ -14,7 +14,7 @@ from psd_deflection.studies.thesis.comparison import (
     Method,
     errors,
     methods,
-    refused,
+    rejected,
     table_5_1,
 )
 
@@ -99,8 +99,8 @@ def test_table_5_1_by_cause(label: str) -> None:
     np.testing.assert_allclose(100.0 * np.array(got), TABLE_5_1[label], atol=0.06)
 
 
-def test_every_method_is_a_row_or_is_refused_with_a_reason() -> None:
-    rows, without = [m.name for m in methods()], refused()
+def test_every_method_is_a_row_or_is_rejected_with_a_reason() -> None:
+    rows, without = [m.name for m in methods()], rejected()
     assert {*rows, *without} >= set(SOLVERS)
     assert not {*rows} & {*without}
     assert all(without.values())

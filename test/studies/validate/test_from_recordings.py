@@ -67,7 +67,7 @@ def test_the_references_are_those_of_the_recording_or_of_a_file(run: Opened) -> 
     found = read_validate(run)
     assert found.reference is OWN.poses
     assert found.sd is OWN.sd
-    assert found.refused == {'blurred': 2}
+    assert found.rejected == {'blurred': 2}
     assert found.estimate_sd is SAMPLES.estimate_sd
     assert found.sources == {'recording': 'run.csv', 'rig': 'rig.yaml', 'reference': 'run.csv'}
     found = read_validate(run, 'camera.csv', align=True, largest=3.0, exposure=0.01)

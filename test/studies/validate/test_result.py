@@ -33,7 +33,7 @@ PROBLEM = ValidateProblem(
     t=np.arange(4.0),
     reference=np.zeros((4, 3)),
     sd=None,
-    refused={},
+    rejected={},
     estimate_sd=np.ones(3),
     align=False,
     largest=1.0,
@@ -100,8 +100,8 @@ def test_cover_is_said_if_the_reference_states_its_deviations() -> None:
     )
 
 
-def test_what_was_left_out_and_refused_is_counted() -> None:
-    found = replace(PLAIN, excluded=3, problem=replace(PROBLEM, refused={'too dark': 2, 'blurred': 5}))
+def test_what_was_left_out_and_rejected_is_counted() -> None:
+    found = replace(PLAIN, excluded=3, problem=replace(PROBLEM, rejected={'too dark': 2, 'blurred': 5}))
     assert found.sentences()[-2:] == [
         '3 of 7 references have no samples about them and are left out.',
         'The reference gave no answer 7 times: blurred 5, too dark 2.',
@@ -128,7 +128,7 @@ def test_the_table_has_the_solvers_in_units_that_people_read() -> None:
 
 
 def test_programs_get_si_units() -> None:
-    tree = replace(PLAIN, excluded=3, problem=replace(PROBLEM, refused={'blurred': 5})).tree()
+    tree = replace(PLAIN, excluded=3, problem=replace(PROBLEM, rejected={'blurred': 5})).tree()
     assert tree['solver'] == 'exact'
     assert tree['references'] == 4
     assert tree['left_out'] == 3

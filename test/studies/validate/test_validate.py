@@ -41,7 +41,7 @@ def problem() -> ValidateProblem:
         t=STAMPS - LATE,
         reference=pose(STAMPS) - [0.1, -0.2, 0.3] + NOISE,
         sd=None,
-        refused={},
+        rejected={},
         estimate_sd=np.array([0.0, 0.0, 0.0]),
         align=True,
         largest=0.5,
