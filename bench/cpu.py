@@ -204,22 +204,22 @@ def node(port: str, folder: str, seconds: float) -> int:
             time.sleep(0.2)
         before, began = clocks.state(), time.monotonic()
         time.sleep(seconds)
-        told = {'before': before, 'after': clocks.state(), 'took': time.monotonic() - began}
+        reported = {'before': before, 'after': clocks.state(), 'took': time.monotonic() - began}
         more = {'cost': clocks.cost_ns(), 'blocks': blocks() - fits}
-        print(json.dumps({**told, **more}), file=out, flush=True)
+        print(json.dumps({**reported, **more}), file=out, flush=True)
 
     threading.Thread(target=watch, name='measurement', daemon=True).start()
     return command_line(['estimator', '--port', port, '--record', folder])
 
 
-def parts(told: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float, float]:
+def parts(reported: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float, float]:
     """Of :func:`node`: CPU time (s) by thread and part, the window, s, and the clocks' share of it."""
     out: defaultdict[tuple[str, str], float] = defaultdict(float)
     calls = 0
-    for number, after in told['after'].items():
+    for number, after in reported['after'].items():
         if after['name'] == 'measurement':
             continue
-        before = told['before'].get(number, {'used': 0, 'spent': {}, 'calls': 0})
+        before = reported['before'].get(number, {'used': 0, 'spent': {}, 'calls': 0})
         name = after['name']
         used = after['used'] - before['used']
         spent = {part: ns - before['spent'].get(part, 0) for part, ns in after['spent'].items()}
@@ -228,7 +228,7 @@ def parts(told: dict[str, Any]) -> tuple[dict[tuple[str, str], float], float, fl
         for part, ns in {**spent, shown: used - sum(spent.values())}.items():
             out[name, part] += ns / 1e9
     found = {key: s for key, s in out.items() if s > 0.0}
-    return found, told['took'], calls * told['cost'] / 1e9 / sum(found.values())
+    return found, reported['took'], calls * reported['cost'] / 1e9 / sum(found.values())
 
 
 def kind_of(frames: list[str]) -> str:
@@ -279,14 +279,14 @@ def measure(seconds: float, with_perf: bool) -> tuple[dict[tuple[str, str], floa
             child.wait(60.0)
             device.stop.set()
             device.thread.join()
-    told = json.loads(line)
-    if told['blocks'] < ENOUGH * BLOCKS_PER_S * told['took']:
+    reported = json.loads(line)
+    if reported['blocks'] < ENOUGH * BLOCKS_PER_S * reported['took']:
         print(
-            f'bench.cpu: {told["blocks"]} blocks in {told["took"]:.0f} s: others take the processors, '
+            f'bench.cpu: {reported["blocks"]} blocks in {reported["took"]:.0f} s: others take the processors, '
             f'and the parts of the threads that wait for them come out too small',
             file=sys.stderr,
         )
-    return (*parts(told), found)
+    return (*parts(reported), found)
 
 
 def rows_of(spent: dict[tuple[str, str], float], took: float, clocks: float, samples: Counter[str]) -> list[Row]:

@@ -23,7 +23,7 @@ import numpy as np
 
 import psd_deflection
 from bench.live import Device, Node, child, cpu_seconds
-from bench.rows import RESULTS, ROOT, Row, figure, keep, tell
+from bench.rows import RESULTS, ROOT, Row, figure, keep, notify
 from blind.campaign import options
 
 BUSY_LOOP = (sys.executable, '-c', 'while True: pass')
@@ -125,7 +125,7 @@ def main() -> int:
         more[1] = f'min_samples:={args.block}'
     rows = measured(Node(args.checkout.resolve(), more), args.seconds, args.block, args.busy)
     for row in rows:
-        tell(row)
+        notify(row)
     if args.checkout.resolve() == ROOT:
         keep(rows, args.results)
     return 0

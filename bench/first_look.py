@@ -37,8 +37,8 @@ DOT = 'const y = document.querySelector("#detector_1 canvas")?.dataset.y'
 
 def busy_s(browser: webdriver.Chrome) -> float:
     """CPU time of the page's thread so far, s."""
-    told = browser.execute_cdp_cmd('Performance.getMetrics', {})['metrics']
-    return float(next(m['value'] for m in told if m['name'] == 'TaskDuration'))
+    reported = browser.execute_cdp_cmd('Performance.getMetrics', {})['metrics']
+    return float(next(m['value'] for m in reported if m['name'] == 'TaskDuration'))
 
 
 def look(browser: webdriver.Chrome, folder: str) -> tuple[float, float, float, str]:

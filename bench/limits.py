@@ -38,7 +38,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.signal import lsim
 
 from bench.live import make_recording
-from bench.rows import RESULTS, ROOT, Row, figure, in_turns, keep, tell
+from bench.rows import RESULTS, ROOT, Row, figure, in_turns, keep, notify
 from msg_adapters import SAMPLES, point_cloud2
 from psd_deflection.devices.protocol.frames import FrameDecoder, SampleFrame, encode
 from psd_deflection.measure.pipeline import Pipeline
@@ -390,7 +390,7 @@ def searched(
 
 def used_by(checkout: Path, *arguments: str) -> tuple[float, float]:
     """(s, MB): time and most memory of the command ``psd-deflection`` of ``checkout``."""
-    command = [sys.executable, '-c', _TELLS_MEMORY, *arguments]
+    command = [sys.executable, '-c', _REPORTS_MEMORY, *arguments]
     began = time.perf_counter()
     done = subprocess.run(command, cwd=checkout, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -398,7 +398,7 @@ def used_by(checkout: Path, *arguments: str) -> tuple[float, float]:
     return time.perf_counter() - began, float(done.stdout.split()[-1]) / 1024
 
 
-_TELLS_MEMORY = """
+_REPORTS_MEMORY = """
 import atexit, re, runpy, sys
 # The memory that getrusage tells of is at least what the bench itself had when it started this process.
 atexit.register(lambda: print(re.search(r'VmHWM:\\s+(\\d+)', open('/proc/self/status').read())[1]))
@@ -455,7 +455,7 @@ def main() -> int:
         if args.only in (None, name):
             rows = job()
             for row in rows:
-                tell(row)
+                notify(row)
             keep(rows, args.results)
     return 0
 

@@ -36,7 +36,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.rows import RESULTS, ROOT, Row, figure, keep, tell
+from bench.rows import RESULTS, ROOT, Row, figure, keep, notify
 
 BLOCKS_PER_S = 50
 START_S = 4.0
@@ -124,7 +124,7 @@ def looker(url: str) -> None:
     print(asyncio.run(look()))
 
 
-def tell_share(seconds: float, turn: Callable[[], object]) -> None:
+def notify_share(seconds: float, turn: Callable[[], object]) -> None:
     """Prints the share of a core that this process takes, in percent, if it does ``turn`` once a block."""
     end, before = time.monotonic() + seconds, time.process_time()
     due = time.monotonic()
@@ -138,7 +138,7 @@ def tell_share(seconds: float, turn: Callable[[], object]) -> None:
 def bare_reader(port: str, seconds: float) -> None:
     """Child process: reads the port and does nothing with it."""
     fd = os.open(port, os.O_RDONLY | os.O_NOCTTY)
-    tell_share(seconds, lambda: os.read(fd, 4096))
+    notify_share(seconds, lambda: os.read(fd, 4096))
 
 
 def blocks_of(recording: str) -> Iterator[list[tuple[str, str, bytes]]]:
@@ -169,7 +169,7 @@ def bare_publishers(recording: str, seconds: float) -> None:
             if topic in publishers:
                 publishers[topic].publish(data)
 
-    tell_share(seconds, turn)
+    notify_share(seconds, turn)
 
 
 def bare_writer(recording: str, seconds: float) -> None:
@@ -191,7 +191,7 @@ def bare_writer(recording: str, seconds: float) -> None:
                     )
                 writer.add_message(channels[topic], now, data, now)
 
-        tell_share(seconds, turn)
+        notify_share(seconds, turn)
 
 
 def parts(seconds: float, times: int) -> list[float]:
@@ -313,10 +313,10 @@ def measure(node_of: Node, seconds: float, settle: float, page: bool, into: Late
         published, _ = bare.communicate()
         heard, _ = ear.communicate()
         if page:
-            told, _ = children[2].communicate()
+            reported, _ = children[2].communicate()
             # Even on a busy machine every block must arrive; up to half of them may still be under way.
-            if int(told) < 0.5 * BLOCKS_PER_S * seconds:
-                raise SystemExit(f'the page told of {told} blocks in {seconds:g} s')
+            if int(reported) < 0.5 * BLOCKS_PER_S * seconds:
+                raise SystemExit(f'the page told of {reported} blocks in {seconds:g} s')
         node.terminate()
         node.wait(60.0)
     device.stop.set()
@@ -474,7 +474,7 @@ def main() -> int:
         if args.starts:
             rows.append(start(node, args.starts))
         for row in rows:
-            tell(row)
+            notify(row)
         if node == Node():
             keep(rows, args.results)
     return 0

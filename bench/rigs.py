@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.rows import RESULTS, Row, figure, keep, tell
+from bench.rows import RESULTS, Row, figure, keep, notify
 from psd_deflection.base.log import null_log
 
 SETTLE_S = 3.0
@@ -113,8 +113,8 @@ def measure(count: int, seconds: float) -> dict[str, float]:
     ports = feeder.stdout.readline().strip()
     found, _ = child('sessions', '--ports', ports, '--seconds', str(seconds)).communicate()
     feeder.communicate()
-    told: dict[str, float] = json.loads(found.splitlines()[-1])
-    return told
+    reported: dict[str, float] = json.loads(found.splitlines()[-1])
+    return reported
 
 
 def main() -> int:
@@ -146,7 +146,7 @@ def main() -> int:
     name = f'{most} tried without a loss' if count > args.most else f'{count} lose samples'
     rigs = Row('rigs in one process on one core', 'rigs', [figure(name, 'ours', [most], WANTED)])
     for row in (rigs, curve):
-        tell(row)
+        notify(row)
     keep([rigs, curve], args.results)
     return 0
 

@@ -107,7 +107,7 @@ def in_turns(work: str, unit: str, scale: float, times: int, *jobs: Job) -> Row:
     )
 
 
-def tell(row: Row) -> None:
+def notify(row: Row) -> None:
     """Print it."""
     print(row.work)
     for f in row.figures:

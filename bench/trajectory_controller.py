@@ -89,7 +89,7 @@ class ServedController:
         self.goals: list[Any] = []
         self.late = 0
         self._handle: Any = None
-        self._told = 0.0
+        self._reported = 0.0
         self.rejected: list[str] = []
         kind = action_class(SERVED[FOLLOW].type)
         self._kind = kind
@@ -133,8 +133,8 @@ class ServedController:
         """What it does in a cycle."""
         if self._handle is None or self.mute:
             return
-        if now - self._told >= FEEDBACK_S:
-            self._told = now
+        if now - self._reported >= FEEDBACK_S:
+            self._reported = now
             feedback = self._kind.Feedback(joint_names=list(self._names))
             feedback.actual.positions = self.controller.state(now)[0].tolist()
             self._handle.publish_feedback(feedback)

@@ -212,10 +212,10 @@ def score(seed: int, lit: bool = False) -> Score:
     shares = shares_left_open(truth, pose, recorded.frames)
     own = {n: s for n, s in shares.items() if n in NAMES}
     # Told alone, or as the largest part of what moves together.
-    told = alone | {max(d.parts, key=lambda n: abs(d.parts[n])) for d in found.undetermined}
+    reported = alone | {max(d.parts, key=lambda n: abs(d.parts[n])) for d in found.undetermined}
     every = {n for d in found.undetermined for n in d.parts}
     unreported = [n for n, s in own.items() if s > OPEN + BORDER and n not in every]
-    said = [n for n in told & alone if own.get(n, 1.0) < OPEN - BORDER]
+    said = [n for n in reported & alone if own.get(n, 1.0) < OPEN - BORDER]
     group = GROUPS[seed // 2 % len(GROUPS)] if seed % 2 else ''
     again = misaligned.record(
         shifted(truth, group, rng) if group else truth, later_motion(rng), rng, outliers=0.01, light=light
@@ -410,8 +410,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     print('\n'.join(table(scores)))
     for number, s in enumerate(scores):
         if s.moved != s.named or s.unreported or s.said:
-            told = f'moved {s.moved or "nothing"}, named {s.named or "nothing"} {s.like}'
-            print(f'rig {number}: {told}; {s.unreported} {s.said}')
+            reported = f'moved {s.moved or "nothing"}, named {s.named or "nothing"} {s.like}'
+            print(f'rig {number}: {reported}; {s.unreported} {s.said}')
     return 0
 
 

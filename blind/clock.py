@@ -101,11 +101,13 @@ def motion_of(t: Array, readings: Array) -> Motion:
 
 @dataclass
 class Score:
-    """``errors``: of the offset, s. ``inside``: 95 % intervals that hold the truth. ``told``: runs with an answer."""
+    """``errors``: of the offset, s. ``inside``: 95 % intervals that hold the truth. ``reported``: runs with an
+    answer.
+    """
 
     errors: list[float]
     inside: int = 0
-    told: int = 0
+    reported: int = 0
 
 
 def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
@@ -117,7 +119,7 @@ def scored(runs: Iterable[int], exposure: float = 0.008) -> Score:
         low, high = found.interval
         score.errors.append(found.value - run.offset)
         score.inside += low <= run.offset <= high
-        score.told += found.determined
+        score.reported += found.determined
     return score
 
 
@@ -129,7 +131,7 @@ def main() -> None:
     args = parser.parse_args()
     score = scored(watched(range(args.first, args.first + args.runs)))
     errors = np.abs(score.errors)
-    print(f'offset told         {score.told} of {args.runs}')
+    print(f'offset told         {score.reported} of {args.runs}')
     print(f'inside its interval {100.0 * score.inside / args.runs:.1f} % (95 % expected)')
     print(f'error               {1e6 * np.sqrt((errors**2).mean()):.0f} µs rms, {1e6 * errors.max():.0f} µs at most')
 

@@ -205,20 +205,20 @@ def _scored(got: Sequence[DeflectionEstimate], truth: Array, rest_s: int, pipeli
     )
 
 
-def warming(told: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) -> Scored:
+def warming(reported: bool = True, rest_s: int = 60, steps: int = 8, seed: int = 1) -> Scored:
     """Readings that drift with temperature by what makers of PSDs state, ``DRIFT``, while it rises by ``RISE``.
 
-    ``told``: the rig file has the drift, and the temperature is told once a second, to 0.1 K.
+    ``reported``: the rig file has the drift, and the temperature is told once a second, to 0.1 K.
     """
     fine = _poses(rest_s, steps)
     warm = np.linspace(0.0, RISE, len(fine))
     names = [{'name': 'thermal_drift', 'psd': psd, **drift} for psd, drift in enumerate(DRIFT, 1)]
     volts = volts_of(ROWS[0], optics_of(fine, warm, names), seed)
     known = {f'effects.drift_{one["psd"]}.{key}': value for one in names for key, value in one.items()}
-    pipeline = Pipeline(rig(ROWS[0], **(known if told else {})))
+    pipeline = Pipeline(rig(ROWS[0], **(known if reported else {})))
     got: list[DeflectionEstimate] = []
     for second, part in enumerate(np.split(np.arange(len(volts)), len(volts) // 1000)):
-        if told:
+        if reported:
             pipeline.temperature(20.0 + round(float(warm[second * 1000 * generator.FINER]), 1))
         got += _published(pipeline, part, volts)
     return _scored(got, middles(fine), rest_s, pipeline)
@@ -228,11 +228,11 @@ def on_a_moving_base(seconds: int = 60, seed: int = 1) -> Inside:
     """A link without load whose base turns, as :func:`blind.motion.swung` moves it; its accelerations are told."""
     run = moving.make('joint', float(seconds), seed)
     pipeline = Pipeline(moving.rig_of())
-    told = list(run.told)
+    reported = list(run.reported)
     got: list[DeflectionEstimate] = []
     for part in np.split(np.arange(len(run.volts)), len(run.volts) // SIZE):
-        while told and told[0].t_ns < int(part[-1] + 1) * 1_000_000:
-            pipeline.accelerate(told.pop(0))
+        while reported and reported[0].t_ns < int(part[-1] + 1) * 1_000_000:
+            pipeline.accelerate(reported.pop(0))
         got += _published(pipeline, part, run.volts)
     p = run.pose[: len(run.volts) // SIZE * SIZE].reshape(-1, SIZE, 3)
     truth = (9.0 * (p[:, 9] + p[:, 10]) - p[:, 8] - p[:, 11]) / 16.0
@@ -255,13 +255,13 @@ def _errors(got: Sequence[DeflectionEstimate], truth: Array) -> tuple[Array, Arr
 
 class Shaken(NamedTuple):
     """A link that vibrates steadily. ``sd`` (3,): median of the published ones. ``named``: share of the blocks that say
-    that it vibrates; ``told``: of those whose error is beyond 3 standard deviations, NaN if there are none.
+    that it vibrates; ``reported``: of those whose error is beyond 3 standard deviations, NaN if there are none.
     """
 
     inside: Inside
     sd: tuple[float, float, float]
     named: float
-    told: float
+    reported: float
     words: str
 
 
@@ -283,8 +283,8 @@ def shaken(hz: float, row: Row = ROWS[0], seconds: int = 60, seed: int = 1, **ov
     named = np.array([bool(words[b]) for b in block.tolist()])
     beyond = (np.abs(error) > 3.0 * sd).any(axis=1)
     x, y, theta = np.median(sd, axis=0).tolist()
-    told = float(named[beyond].mean()) if beyond.any() else float('nan')
-    return Shaken(inside(error, covariance), (x, y, theta), float(named.mean()), told, words[int(block[-1])])
+    reported = float(named[beyond].mean()) if beyond.any() else float('nan')
+    return Shaken(inside(error, covariance), (x, y, theta), float(named.mean()), reported, words[int(block[-1])])
 
 
 def alarms(row: Row, seed: int) -> tuple[int, int]:
@@ -313,14 +313,14 @@ def false_alarms(seeds: int, rows: int | None = None) -> int:
     return 0
 
 
-def coarse(poses: int = 150, seed: int = 1, *, told: bool = True, **overrides: object) -> Inside:
+def coarse(poses: int = 150, seed: int = 1, *, reported: bool = True, **overrides: object) -> Inside:
     """Return a 10 bit converter, whose step is ten times the noise: the last 20 blocks of 120 in each of many poses.
 
-    ``told``: the rig file says so, not 16 bit.
+    ``reported``: the rig file says so, not 16 bit.
     """
     rng = np.random.default_rng(seed)
     row = Row('10 bit', bits=10)
-    more = {'converter.bits': 10 if told else 16, **overrides}
+    more = {'converter.bits': 10 if reported else 16, **overrides}
     errors, covariances = [], []
     for _ in range(poses):
         pose = rng.uniform(-1.0, 1.0, 3) * (1e-3, 1e-3, 1e-2)
@@ -372,11 +372,11 @@ def vibrations(seeds: int) -> int:
         rms = float(np.sqrt(np.mean([r.inside.rms[1] ** 2 for r in runs])))
         sd = float(np.mean([r.sd[1] for r in runs]))
         named = float(np.mean([r.named for r in runs]))
-        beyond = [r.told for r in runs if not np.isnan(r.told)]
-        told = f'{np.mean(beyond):.3f}' if beyond else 'none beyond'
+        beyond = [r.reported for r in runs if not np.isnan(r.reported)]
+        reported = f'{np.mean(beyond):.3f}' if beyond else 'none beyond'
         inner = ' | '.join(f'{v:.3f}' for v in shares)
         size = f'{rms * 1e6:.2f} | {sd * 1e6:.2f}'
-        print(f'| {hz:g} | {inner} | {three:.4f} | {size} | {named:.3f} | {told} |', flush=True)
+        print(f'| {hz:g} | {inner} | {three:.4f} | {size} | {named:.3f} | {reported} |', flush=True)
     return 0
 
 
@@ -418,7 +418,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     whole = args.rows is None
     pairs += [(row, 'none') for row in SLOW] if whole else []
     with ProcessPoolExecutor(args.jobs) as pool:
-        rough = {told: pool.submit(coarse, told=told) for told in (True, False)} if whole else {}
+        rough = {reported: pool.submit(coarse, reported=reported) for reported in (True, False)} if whole else {}
         for row, loss, s in pool.map(_job, pairs):
             name = row.label if loss == 'none' else ''
             tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
@@ -426,17 +426,17 @@ def main(argv: Sequence[str] | None = None) -> int:
             if cost is None:
                 cost = np.array(s.rest.rms) / bound(row)
         if whole:
-            warm = {told: pool.submit(warming, told) for told in (True, False)}
+            warm = {reported: pool.submit(warming, reported) for reported in (True, False)}
             base = pool.submit(on_a_moving_base).result()
             print(f'| white, moving base | none | | | | | {_cells(base)} | {base.three:.4f} | |')
-            for told, ramp in warm.items():
+            for reported, ramp in warm.items():
                 s = ramp.result()
-                label = 'white, temperature ramp' + ('' if told else ' that the rig file does not know')
+                label = 'white, temperature ramp' + ('' if reported else ' that the rig file does not know')
                 tail = f'{s.ringing.three:.4f} | {s.alarms:.5f}'
                 print(f'| {label} | none | {_cells(s.rest)} | {_cells(s.ringing)} | {tail} |')
-        for told, found in rough.items():
+        for reported, found in rough.items():
             r = found.result()
-            label = '10 bit, no dither' if told else '10 bit, the rig file says 16'
+            label = '10 bit, no dither' if reported else '10 bit, the rig file says 16'
             print(f'| {label} | none | {_cells(r)} | | | | | {r.three:.4f} | |')
     if cost is not None and whole:
         print('\nrms error at rest over the Cramér–Rao bound, dX, dY, theta:')

@@ -47,8 +47,8 @@ def frame(kind: int, body: bytes) -> bytes:
 
 def hello() -> bytes:
     """Who the device is."""
-    told = {**HELLO, 'channels': ['x1', 'y1', 'sum1', 'x2', 'y2', 'sum2']}
-    return frame(0x10, b'\x01' + json.dumps(told).encode())
+    reported = {**HELLO, 'channels': ['x1', 'y1', 'sum1', 'x2', 'y2', 'sum2']}
+    return frame(0x10, b'\x01' + json.dumps(reported).encode())
 
 
 class Device:
@@ -163,10 +163,10 @@ def judged(out: Path, turn: float, late: list[tuple[float, float]]) -> list[str]
         wrong.append(f'effects: {[e["name"] for e in said["effects"]]}')
     elif abs(sizes[0]['angle']['value'] - turn) > 3.0 * sizes[0]['angle']['sd'] + 1e-3 * abs(turn):
         wrong.append(f'angle {sizes[0]["angle"]}, true {turn}')
-    told = {int(re.sub(r'\D', '', s['where'])): s['value'] for s in said['setup'] if s['name'] == 'load_time'}
+    reported = {int(re.sub(r'\D', '', s['where'])): s['value'] for s in said['setup'] if s['name'] == 'load_time'}
     for i, (least, most) in enumerate(late, start=1):
-        if not least - NEAR_S < told.get(i, 0.0) < most + NEAR_S:
-            wrong.append(f'load {i}: said {told.get(i)} s late, was {least:.2f} to {most:.2f} s')
+        if not least - NEAR_S < reported.get(i, 0.0) < most + NEAR_S:
+            wrong.append(f'load {i}: said {reported.get(i)} s late, was {least:.2f} to {most:.2f} s')
     return wrong + [f'{said["verdict"]}, unknown: {u["signature"]}' for u in said['unknown']]
 
 

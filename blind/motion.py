@@ -47,7 +47,7 @@ BEHIND = 0.3
 """So far behind the base is the point about which joints turn it, m."""
 FASTEST = (6.0, 6.0, 15.0)
 """Largest angular acceleration about x, y and z, rad/s^2; twice as much in the middle of a raised cosine."""
-TOLD = 4
+REPORTED = 4
 """Samples from one message about the base's acceleration to the next."""
 PARTS = 2
 """Steps of Runge and Kutta in a sample."""
@@ -62,14 +62,14 @@ LATER = np.arange(1, BLOCK + 1) / RATE
 class Run:
     """One link in motion at 1 kHz. ``loads`` (n, 3), ``pose`` (n, 3), ``velocity`` (n, 3): truth; ``volts`` (n, 6).
 
-    ``told``: of the base, in order.
+    ``reported``: of the base, in order.
     """
 
     loads: Array
     pose: Array
     velocity: Array
     volts: Array
-    told: tuple[BaseAcceleration, ...] = ()
+    reported: tuple[BaseAcceleration, ...] = ()
 
 
 def loads_of(kind: str, seconds: float, rng: np.random.Generator) -> Array:
@@ -171,20 +171,20 @@ def swung(seconds: float, rng: np.random.Generator) -> tuple[Array, Array, tuple
         k4 = a2 @ (y + h * k3) + f2
         y = y + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
     # The mean over the time for which each holds: how far the rate of turn goes in it.
-    told = tuple(
-        BaseAcceleration(i * TOLD * 1_000_000, tuple(np.cross(mean, behind).tolist()), tuple(mean.tolist()))
-        for i, mean in enumerate(accelerations[1::3].reshape(-1, PARTS * TOLD, 3).mean(axis=1))
+    reported = tuple(
+        BaseAcceleration(i * REPORTED * 1_000_000, tuple(np.cross(mean, behind).tolist()), tuple(mean.tolist()))
+        for i, mean in enumerate(accelerations[1::3].reshape(-1, PARTS * REPORTED, 3).mean(axis=1))
     )
-    return out[:, :3], out[:, 3:], told
+    return out[:, :3], out[:, 3:], reported
 
 
 def make(kind: str, seconds: float, seed: int) -> Run:
     """Return a run of ``kind``."""
     rng = np.random.default_rng(seed)
     if kind in ('joint', UNTOLD):
-        pose, velocity, told = swung(seconds, rng)
+        pose, velocity, reported = swung(seconds, rng)
         volts = volts_of(pose, np.random.default_rng([seed, 1]))
-        return Run(np.zeros_like(pose), pose, velocity, volts, told if kind == 'joint' else ())
+        return Run(np.zeros_like(pose), pose, velocity, volts, reported if kind == 'joint' else ())
     return run_of(loads_of(kind, seconds, rng), seed)
 
 
@@ -200,8 +200,8 @@ def biased(run: Run, share: float) -> Run:
     def larger(vector: tuple[float, ...]) -> tuple[float, ...]:
         return tuple((1.0 + share) * v for v in vector)
 
-    told = tuple(BaseAcceleration(m.t_ns, larger(m.linear), larger(m.angular)) for m in run.told)
-    return replace(run, told=told)
+    reported = tuple(BaseAcceleration(m.t_ns, larger(m.linear), larger(m.angular)) for m in run.reported)
+    return replace(run, reported=reported)
 
 
 def volts_of(pose: Array, rng: np.random.Generator) -> Array:
@@ -289,7 +289,7 @@ def judge(run: Run, rig: Rig, late: int = 0) -> Result:
     if motion is None:
         raise ValueError('the rig asks for no filter')
     blocks = len(run.volts) // BLOCK
-    told = list(run.told)
+    reported = list(run.reported)
 
     def there(message: BaseAcceleration) -> int:
         return round(message.t_ns / 1e9 * RATE) + late
@@ -301,8 +301,8 @@ def judge(run: Run, rig: Rig, late: int = 0) -> Result:
     first = int(REST * RATE) // BLOCK
     for block in range(blocks):
         before = motion.innovations
-        while told and there(told[0]) < BLOCK * (block + 1):
-            pipeline.accelerate(told.pop(0))
+        while reported and there(reported[0]) < BLOCK * (block + 1):
+            pipeline.accelerate(reported.pop(0))
         for record in pipeline.process(chunk(run, block)):
             if isinstance(record, TipMotion):
                 at = BLOCK * (block + 1) - 1
@@ -322,8 +322,8 @@ def judge(run: Run, rig: Rig, late: int = 0) -> Result:
         if at < len(run.pose):
             # No samples, but messages go on.
             meanwhile = copy.deepcopy(motion)
-            for message in told[: sum(there(message) <= at for message in told[: UNSEEN + 1])]:
-                meanwhile.inertia.tell(message, message.t_ns)
+            for message in reported[: sum(there(message) <= at for message in reported[: UNSEEN + 1])]:
+                meanwhile.inertia.notify(message, message.t_ns)
             later = meanwhile.predicted(np.array([UNSEEN / RATE]))
             unseen[block] = (later.pose[0] - run.pose[at]) / np.sqrt(later.variance[0])
     part, samples = slice(first, blocks), slice(first * BLOCK, blocks * BLOCK)

@@ -44,12 +44,12 @@ THRESHOLDS: dict[str, float] = {
 
 @dataclass(frozen=True)
 class Row:
-    """A sealed truth and its answer. ``told_apart``: whether the design can tell it apart, decided beforehand."""
+    """A sealed truth and its answer. ``separated``: whether the design can tell it apart, decided beforehand."""
 
     key: str
     kind: str
     gap: float
-    told_apart: bool
+    separated: bool
     truth: list[dict[str, Any]]
     answer: dict[str, Any]
     mistake: str = ''
@@ -205,7 +205,7 @@ def _detections(sheet: _Sheet, single: Sequence[Row]) -> None:
     if single:
         size, most = float(np.mean([len(r.sets[0]) if r.sets else 1 for r in single])), THRESHOLDS['mean_set_size']
         sheet.check(size <= most, f'mean size of that set: {size:.2f}, wanted <= {most}')
-    apart = [r for r in single if r.told_apart]
+    apart = [r for r in single if r.separated]
     first = [bool(r.named) and r.named[0] == r.truth[0]['name'] for r in apart]
     wanted = THRESHOLDS['named_first_where_told_apart']
     sheet.rate('named first where the design tells it apart', apart, first, wanted, 1.0, True)
@@ -296,14 +296,14 @@ def _score_by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
     """Notes by hand: each wrong one is named, with the right line; nothing is unknown; no effect is lost."""
     if not of:
         return
-    told = [[_reported(w, r.answer['setup']) for w in r.wrong] for r in of]
+    reported = [[_reported(w, r.answer['setup']) for w in r.wrong] for r in of]
     found = [all(any(t['name'] in s for s in r.sets) for t in r.truth) for r in of]
     false = [_names_none(r) for r in of]
     unknown = [r.answer['verdict'] == 'unknown_effect' for r in of]
     some = [i for i, r in enumerate(of) if r.wrong]
-    named = [any(a for a, _ in told[i]) for i in some]
+    named = [any(a for a, _ in reported[i]) for i in some]
     sheet.rate('hand: mistake named', [of[i] for i in some], named, THRESHOLDS['mistake_named'], 1.0, True)
-    each = [b for i in some for _, b in told[i]]
+    each = [b for i in some for _, b in reported[i]]
     sheet.rate('hand: note with the right line', [], each, THRESHOLDS['hand_line'], 1.0, False)
     hidden = [i for i, r in enumerate(of) if r.truth]
     right = [found[i] for i in hidden]
@@ -315,10 +315,10 @@ def _score_by_hand(sheet: _Sheet, of: Sequence[Row]) -> None:
     for kind in dict.fromkeys(r.key.split('-')[1] for r in of):
         at = [i for i, r in enumerate(of) if r.key.split('-')[1] == kind]
         wrong = [i for i in at if of[i].wrong]
-        lines = [b for i in wrong for _, b in told[i]]
+        lines = [b for i in wrong for _, b in reported[i]]
         hid = [i for i in at if of[i].truth]
         sheet.lines.append(
-            f'        {kind:10s} {len(at):5d}  {sum(any(a for a, _ in told[i]) for i in wrong)}/{len(wrong)}'
+            f'        {kind:10s} {len(at):5d}  {sum(any(a for a, _ in reported[i]) for i in wrong)}/{len(wrong)}'
             f'    {sum(lines)}/{len(lines)}   {sum(found[i] for i in hid)}/{len(hid)}'
             f'   {sum(false[i] for i in at)}  {sum(unknown[i] for i in at)}'
         )

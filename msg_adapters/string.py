@@ -78,8 +78,8 @@ def to_rig(fields: Mapping[str, Any]) -> RigState:
     if not isinstance(tree, dict) or not all(isinstance(tree.get(name), kind) for name, kind in kinds.items()):
         raise ValueError('lacks one of ' + ', '.join(kinds))
     hello, memory = (tree.get(name) if isinstance(tree.get(name), dict) else None for name in ('hello', 'memory'))
-    told = tree.get('made_with')
-    made_with = told.items() if isinstance(told, dict) else ()
+    reported = tree.get('made_with')
+    made_with = reported.items() if isinstance(reported, dict) else ()
     return RigState(
         t_ns=tree['t_ns'],
         block=tree['block'],

@@ -350,8 +350,8 @@ def test_the_budget_of_python_is_that_of_the_command(capsys: pytest.CaptureFixtu
     words = ['budget', '--params-file', rig, '--load', '0', '-10', '0', '--set', 'rotation_tolerance=1e-3']
     assert main([*words, '--json', '--out', str(out)]) == 0
     answer = psd_deflection.budget(rig, (0, -10, 0), inputs={'rotation_tolerance': 1e-3})
-    told = capsys.readouterr().out
-    assert answer.tree() == json.loads(told) == json.loads((out / 'budget.json').read_text())
+    reported = capsys.readouterr().out
+    assert answer.tree() == json.loads(reported) == json.loads((out / 'budget.json').read_text())
     assert (out / 'report.html').read_text() == answer.report()
 
 

@@ -277,7 +277,7 @@ def test_one_degree_of_freedom_names_none_but_the_truth_stays_inside(three: Rig,
     assert pipeline.estimator.most_likely_wrong() == ''
 
 
-def test_a_stuck_psd_tells_on_itself_where_the_check_cannot(three: Rig) -> None:
+def test_a_stuck_psd_reports_on_itself_where_the_check_cannot(three: Rig) -> None:
     records, truth, _ = run(three, stuck(1))
     assert_inside(records, truth)
     assert [s.left_out for s in spots_of(records)].count((2,)) > 70
@@ -295,13 +295,13 @@ def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: 
     assert pipeline.counters.findings['psd_3 stands still'] == 6
 
 
-def test_reject_rejects_only_what_cannot_be_told(three: Rig) -> None:
-    told, _, _ = run(with_solver(three, 'exact', consistency='refuse', **LEVEL), inverted(2))
-    assert len(primaries(told)) > 110
-    not_told, _, pipeline = run(replace_values(three, {'consistency': 'refuse'}), inverted(2))
+def test_reject_rejects_only_what_cannot_be_reported(three: Rig) -> None:
+    report, _, _ = run(with_solver(three, 'exact', consistency='refuse', **LEVEL), inverted(2))
+    assert len(primaries(report)) > 110
+    not_reported, _, pipeline = run(replace_values(three, {'consistency': 'refuse'}), inverted(2))
     assert pipeline.counters.rejected['inconsistent'] > 60
-    assert spots_of(not_told)[-1].status is BlockStatus.INCONSISTENT
-    assert spots_of(not_told)[-1].reason.startswith('the readings contradict each other')
+    assert spots_of(not_reported)[-1].status is BlockStatus.INCONSISTENT
+    assert spots_of(not_reported)[-1].reason.startswith('the readings contradict each other')
     reported, _, pipeline = run(with_solver(three, 'exact', consistency='report', **LEVEL), inverted(2))
     assert len(primaries(reported)) == 180
     assert not any(s.left_out for s in spots_of(reported))

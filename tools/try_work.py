@@ -11,19 +11,20 @@ import numpy as np
 import psd_deflection
 
 
-def run(effect: str, seed: int, tell: Callable[[str, str], None]) -> None:
+def run(effect: str, seed: int, notify: Callable[[str, str], None]) -> None:
     """Simulate, estimate, discover. ``effect``: as ``simulate --effect`` takes it, or '' for none.
 
-    ``tell`` gets what is done: 'step' and a sentence; 'answer' and each sentence of discover; 'report' and a web page.
+    ``notify`` gets what is done: 'step' and a sentence; 'answer' and each sentence of discover; 'report' and a web
+    page.
     """
-    tell('step', 'Simulating 24 s of the rig under known loads')
+    notify('step', 'Simulating 24 s of the rig under known loads')
     recording = psd_deflection.simulate(loads='identification', effects=[effect] if effect else [], seed=seed)
-    tell('step', f'Estimating from {len(recording.samples)} samples')
+    notify('step', f'Estimating from {len(recording.samples)} samples')
     estimates = psd_deflection.replay(recording)
     reach = np.ptp(estimates.dy) * 1e6
-    tell('step', f'Searching: {len(estimates.t)} estimates, the tip has moved by {reach:.0f} µm')
+    notify('step', f'Searching: {len(estimates.t)} estimates, the tip has moved by {reach:.0f} µm')
     found = psd_deflection.discover([recording])
     for sentence in found.sentences():
-        tell('answer', sentence)
-    tell('step', 'Drawing the report')
-    tell('report', found.report())
+        notify('answer', sentence)
+    notify('step', 'Drawing the report')
+    notify('report', found.report())

@@ -108,10 +108,10 @@ class Relay:
 
 def relay(name: str) -> None:
     """Pass messages on until killed."""
-    heard, told, kind = RELAYED[name]
+    heard, reported, kind = RELAYED[name]
     rclpy.init()
     node = rclpy.create_node(f'stands_for_the_{name}')
-    out = node.create_publisher(kind, told, 5)
+    out = node.create_publisher(kind, reported, 5)
     node.create_subscription(kind, heard, out.publish, 5, raw=True)
     rclpy.spin(node)
 
@@ -185,9 +185,9 @@ class Campaign(Graph):
                 self.relays[victim].signal(number)
             return lambda: self._again(victims)
         if name in DEFLECTIONS:
-            plant.tell = DEFLECTIONS[name][0]
+            plant.notify = DEFLECTIONS[name][0]
         elif name in JOINTS:
-            plant.tell_joints = JOINTS[name][0]
+            plant.notify_joints = JOINTS[name][0]
         elif name == 'speed scaling 0':
             self._scale, plant.stands = 0.0, True
             self._scaling.publish(Float64(data=0.0))
@@ -214,7 +214,7 @@ class Campaign(Graph):
         if not plant.applies:
             # It starts again, without offsets.
             plant.held = np.zeros(2)
-        plant.tell = plant.tell_joints = faithful
+        plant.notify = plant.notify_joints = faithful
         plant.stands, plant.applies, self._scale = False, True, 1.0
         plant.arm.force = np.array(LOAD)
         self._robot_runs.publish(Bool(data=True))

@@ -202,7 +202,7 @@ class Inside:
 
     def run(self, budget: Budget) -> int:
         """Strange messages as long as the budget lasts; the bytes by which the process grew after the first tenth."""
-        begun, told, inputs = 0, 0.0, self.inputs()
+        begun, reported, inputs = 0, 0.0, self.inputs()
         while (share := budget.share(self.number)) < 1.0:
             if self.number % SPIN_EVERY == 0:
                 self.spin()
@@ -217,12 +217,12 @@ class Inside:
             self.number += 1
             if not begun and share >= 0.1:
                 begun = memory()
-            if share >= told:
-                told += 0.05
-                print(f'{self._node.get_name()}: {self.told()}', file=sys.stderr, flush=True)
+            if share >= reported:
+                reported += 0.05
+                print(f'{self._node.get_name()}: {self.reported()}', file=sys.stderr, flush=True)
         return memory() - begun
 
-    def told(self) -> str:
+    def reported(self) -> str:
         """How far it is."""
         return (
             f'{self.number} messages on {len(self.sent)} inputs and {self.asked} requests, '
@@ -315,7 +315,7 @@ def attack(name: str, args: argparse.Namespace) -> int:
             if inside.attacked.rejected() < inside.undecodable:
                 faults.append(f'of {inside.undecodable} that cannot be decoded it counts {inside.attacked.rejected()}')
             took = time.monotonic() - began
-            print(f'{name}: in {took:.0f} s {inside.told()}; {grown / 1e6:+.1f} MB after the first tenth')
+            print(f'{name}: in {took:.0f} s {inside.reported()}; {grown / 1e6:+.1f} MB after the first tenth')
             for topic, count in sorted(inside.sent.items()):
                 print(f'{name}:   {topic} {count}')
         finally:

@@ -31,7 +31,7 @@ LATE_S = 0.05
 """With a longer time between two steps of the arm, the compensator finds rightly that nobody tells
 it anything, s."""
 
-Tell = Callable[[Any], bool]
+Notify = Callable[[Any], bool]
 
 
 def faithful(message: Any) -> bool:
@@ -93,7 +93,7 @@ def uncertain(message: Any) -> bool:
     return True
 
 
-def by_seconds(seconds: float) -> Tell:
+def by_seconds(seconds: float) -> Notify:
     """A stamp that is so much later."""
 
     def shifted(message: Any) -> bool:
@@ -116,7 +116,7 @@ def far(message: Any) -> bool:
     return True
 
 
-DEFLECTIONS: dict[str, tuple[Tell, str]] = {
+DEFLECTIONS: dict[str, tuple[Notify, str]] = {
     'not finite': (no_number, 'not finite'),
     'jump': (jumps, 'jumps by'),
     'stale': (by_seconds(-1.0), 'is older than'),
@@ -131,7 +131,7 @@ DEFLECTIONS: dict[str, tuple[Tell, str]] = {
 }
 """What the arm tells of its deflection, and what the compensator says then."""
 
-JOINTS: dict[str, tuple[Tell, str]] = {
+JOINTS: dict[str, tuple[Notify, str]] = {
     'stale joints': (by_seconds(-1.0), 'no positions of the joints'),
     'leaping joints': (leaps, 'leap by'),
     'joints at 1e300': (far, 'no positions of the joints'),
@@ -143,7 +143,7 @@ class Plant:
     """The arm on the graph: it adds the offsets that it hears to its commands, and tells them, its
     deflection and its joints.
 
-    ``tell`` and ``tell_joints`` may change what it says, and withhold it by False. ``stands``: a
+    ``notify`` and ``notify_joints`` may change what it says, and withhold it by False. ``stands``: a
     protective stop. ``applies``: the controller runs, and tells what it has: ``held``. ``share``: how much of that it
     adds, whatever it tells. ``droop``, rad: how far its servos leave the joints below their command. ``commands``: it
     takes commands, not offsets; ``held`` is its command less the nominal one.
@@ -157,8 +157,8 @@ class Plant:
         self.rigid = self.arm.chain.rigid(NOMINAL.tolist())
         self.offsets: list[FloatArray] = [np.zeros(2)]
         self.stamps = [0.0]
-        self.tell: Tell = faithful
-        self.tell_joints: Tell = faithful
+        self.notify: Notify = faithful
+        self.notify_joints: Notify = faithful
         self.stands, self.applies, self.held = False, True, np.zeros(2)
         self.share, self.droop, self.commands = 1.0, 0.0, False
         self.late = False
@@ -206,9 +206,9 @@ class Plant:
         place.x, place.y, place.z = (deflection.position + self._noise.normal(size=3) * NOISE).tolist()
         turned.x, turned.y, turned.z, turned.w = deflection.quaternion.tolist()
         message.pose.covariance = (np.eye(6) * NOISE**2).ravel()
-        if self.tell_joints(joints):
+        if self.notify_joints(joints):
             self._joints.publish(joints)
-        if self.tell(message):
+        if self.notify(message):
             self._deflections.publish(message)
 
     def error(self) -> float:

@@ -96,7 +96,7 @@ class Moved:
     """The graph: the shaper, and what it moves.
 
     ``stamps`` (s) and ``commands`` of the joints; ``late``: the numbers of those before which a trajectory came after
-    its begin. ``heard``: how many came. ``tells``: whether the joints are told.
+    its begin. ``heard``: how many came. ``reports``: whether the joints are told.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class Moved:
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)
         self.controller = TrajectoryController(np.zeros(2))
-        self.tells = True
+        self.reports = True
         self.heard = 0
         self.stamps: list[float] = []
         self.commands: list[FloatArray] = []
@@ -136,7 +136,7 @@ class Moved:
         now = time.time()
         self.stamps.append(now)
         self.commands.append(self.controller.state(now)[0])
-        if self.tells and len(self.stamps) % 5 == 0:
+        if self.reports and len(self.stamps) % 5 == 0:
             self._joints.publish(JointState(name=list(NAMES), position=self.commands[-1].tolist()))
 
     def spin(self, seconds: float, condition: Callable[[], bool] = lambda: False, what: str = '') -> None:
@@ -185,11 +185,11 @@ class Moved:
                 self.move()
                 self.spin(float(self._rng.uniform(0.02, 0.2)))
         elif name == 'joints not told':
-            self.tells = False
+            self.reports = False
             self.spin(1.5)
             self.move()
             self.spin(0.3)
-            self.tells = True
+            self.reports = True
             if self.heard != heard:
                 raise RuntimeError(f'{name}: was not refused')
         elif name == 'killed and started again':

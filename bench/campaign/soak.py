@@ -282,17 +282,17 @@ def counted(text: str, status: int, bag: Path, taken: int, load: float) -> bool:
         fields = cdr.decode(channel.type, message)
         values |= {v['key']: v['value'] for s in fields['status'] for v in s['values']}
     lost = int(values.get('lost', 0))
-    told = len(re.findall('samples dropped here so far', text))
+    reported = len(re.findall('samples dropped here so far', text))
     print(
         f'load {load:.1f}: {len(numbers)} recorded of {taken} taken, {missing} missing between them; '
-        f'log: {total} dropped ({running} while it ran, {at_end} at the end; {told} lines); '
+        f'log: {total} dropped ({running} while it ran, {at_end} at the end; {reported} lines); '
         f'/diagnostics: {values.get("dropped by a full queue")} by a full queue, {lost} lost; '
         f'info: {recording.dropped_here}; exit status {status}',
         flush=True,
     )
     # Those that were dropped after the last block that is recorded are not between any.
     good = missing <= running + lost <= missing + taken - int(numbers[-1])
-    good &= recording.dropped_here[0] == total and status == (9 if total else 0) and bool(told) == bool(running)
+    good &= recording.dropped_here[0] == total and status == (9 if total else 0) and bool(reported) == bool(running)
     return good
 
 

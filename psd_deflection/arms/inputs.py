@@ -56,16 +56,16 @@ def standing(positions: Mapping[str, float]) -> dict[str, MeasuredJoint]:
     return {name: MeasuredJoint(position, 0.0) for name, position in positions.items()}
 
 
-class _Told(NamedTuple):
+class _Reported(NamedTuple):
     """What was told last, and two readings of before that are ``REST_S`` or more apart: (value, time)."""
 
     last: tuple[float, float]
     newer: tuple[float, float]
     older: tuple[float, float] | None
 
-    def next(self, position: float, now: float) -> _Told:
+    def next(self, position: float, now: float) -> _Reported:
         last = position, now
-        return _Told(last, last, self.newer) if now - self.newer[1] >= REST_S else self._replace(last=last)
+        return _Reported(last, last, self.newer) if now - self.newer[1] >= REST_S else self._replace(last=last)
 
     def measured(self) -> MeasuredJoint:
         (at, then), older = self.last, self.older
@@ -79,24 +79,30 @@ class KnownJoints:
     """
 
     def __init__(self) -> None:
-        self._told: dict[str, _Told] = {}
+        self._reported: dict[str, _Reported] = {}
 
-    def tell(self, now: float, names: Sequence[str], positions: Sequence[float]) -> None:
+    def notify(self, now: float, names: Sequence[str], positions: Sequence[float]) -> None:
         """Take what a message tells; a new name is passed over if there are too many of late."""
-        if len(self._told) + len(names) > LONGEST_LIST:
-            self._told = {name: told for name, told in self._told.items() if now - told.last[1] <= KNOWN_S}
+        if len(self._reported) + len(names) > LONGEST_LIST:
+            self._reported = {
+                name: reported for name, reported in self._reported.items() if now - reported.last[1] <= KNOWN_S
+            }
         for name, position in zip(names, positions, strict=False):
-            if is_position(position) and (name in self._told or len(self._told) < LONGEST_LIST):
-                known, last = self._told.get(name), (position, now)
+            if is_position(position) and (name in self._reported or len(self._reported) < LONGEST_LIST):
+                known, last = self._reported.get(name), (position, now)
                 late = known is None or now - known.last[1] > KNOWN_S
-                self._told[name] = _Told(last, last, None) if late or known is None else known.next(position, now)
+                self._reported[name] = (
+                    _Reported(last, last, None) if late or known is None else known.next(position, now)
+                )
 
     def measured(self, now: float) -> dict[str, MeasuredJoint]:
         """The joints that were told of late."""
-        return {name: told.measured() for name, told in self._told.items() if now - told.last[1] <= KNOWN_S}
+        return {
+            name: reported.measured() for name, reported in self._reported.items() if now - reported.last[1] <= KNOWN_S
+        }
 
     def __len__(self) -> int:
-        return len(self._told)
+        return len(self._reported)
 
 
 def quaternion_fault(quaternion: Sequence[float]) -> str:

@@ -163,7 +163,7 @@ def drawn(chart: Chart) -> str:
         notes |= dict.fromkeys(said)
         panels.append(
             {
-                'series': [_told(one, columns) for one in series],
+                'series': [_reported(one, columns) for one in series],
                 'x': panel.x_label,
                 'y': panel.y_label,
                 'log': panel.log,
@@ -186,7 +186,7 @@ def drawn(chart: Chart) -> str:
     )
 
 
-def _told(series: Series, columns: dict[str, int]) -> dict[str, Any]:
+def _reported(series: Series, columns: dict[str, int]) -> dict[str, Any]:
     """For the page's script; ``columns``: the place of each array, by its text. The same one is there once."""
 
     def place(values: FloatArray) -> int:

@@ -91,8 +91,8 @@ def _bars(bars: Bars) -> str:
     keys = ' '.join(
         f'<span class="tone" style="--tone:var(--{tone})">{html.escape(name)}</span>' for name, tone in bars.legend
     )
-    told = f'<p class="quiet">{keys}</p>' if keys else ''
-    return f'{told}<table class="bars"><tr><td></td>{head}</tr>{"".join(rows)}</table>'
+    reported = f'<p class="quiet">{keys}</p>' if keys else ''
+    return f'{reported}<table class="bars"><tr><td></td>{head}</tr>{"".join(rows)}</table>'
 
 
 def _matrix(matrix: Matrix) -> str:

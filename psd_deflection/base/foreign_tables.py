@@ -224,8 +224,8 @@ def what_of_header(
         words += f'; it has {sanitize(",".join(names), LONGEST_HEADER)}'
     guesses = meant([name for name in names if name not in known], lacking)
     if guesses:
-        told = ', '.join(f'{m.ours} for {sanitize(m.found, 30)}{f" ({m.unit})" if m.unit else ""}' for m in guesses)
-        words += f'; did you mean {told}?'
+        reported = ', '.join(f'{m.ours} for {sanitize(m.found, 30)}{f" ({m.unit})" if m.unit else ""}' for m in guesses)
+        words += f'; did you mean {reported}?'
     if len(guesses) == len(lacking):
         ours = {m.found: m.ours for m in guesses}
         header = ','.join(ours.get(name, name) for name in names)

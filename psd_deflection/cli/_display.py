@@ -50,16 +50,16 @@ class Display:
             self._recorded[folder] = session.recorder.ended_early
 
     @contextlib.contextmanager
-    def telling_recorded(self) -> Iterator[None]:
+    def report_recorded(self) -> Iterator[None]:
         """At the end of a run print the recordings that were made, also if something of them is missing."""
         try:
             yield
         except (SamplesDroppedError, RecordingError):
-            self._tell_recorded()
+            self._notify_recorded()
             raise
-        self._tell_recorded()
+        self._notify_recorded()
 
-    def _tell_recorded(self) -> None:
+    def _notify_recorded(self) -> None:
         """Print the recordings that were made, and how to replay them."""
         for folder, ended_early in self._recorded.items():
             if folder.is_dir():

@@ -161,11 +161,11 @@ def answer_each(
         failed = run_each(args, names, work, take)
         if out is not None:
             write_rows(out, names, rows, failed)
-    tell_each(args, names, rows, failed, head, line)
+    notify_each(args, names, rows, failed, head, line)
     return 0
 
 
-def tell_each(
+def notify_each(
     args: argparse.Namespace,
     names: Sequence[str],
     found: Mapping[str, Mapping[str, object]],

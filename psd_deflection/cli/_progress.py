@@ -24,7 +24,7 @@ def progress_of(blocks: Iterable[SampleBlock], total: int | None = None, *, quie
 
 
 @contextlib.contextmanager
-def told(words: str, *, quiet: bool = False) -> Iterator[None]:
+def stage(words: str, *, quiet: bool = False) -> Iterator[None]:
     """Show on a terminal what is being done, for work that cannot be counted; removed at the end."""
     shown = not quiet and sys.stderr is not None and sys.stderr.isatty()
     if shown:

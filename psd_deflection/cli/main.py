@@ -242,7 +242,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             if sys.stdout is not None:
                 sys.stdout.flush()
     except KeyboardInterrupt:
-        _tell('psd-deflection: interrupted')
+        _notify('psd-deflection: interrupted')
         return INTERRUPTED
     except BrokenPipeError:
         # `psd-deflection ... | head` is not an error.
@@ -251,14 +251,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         machine = _lack_of(error)
         if machine is None:
             raise
-        _tell(f'psd-deflection: {machine}')
+        _notify(f'psd-deflection: {machine}')
         return machine.exit_status
     except OSError as error:
         if error.errno not in _REJECTED_OUTPUT or error.filename is not None:
             raise
         _discard_output()
         rejected = RecordingError(f'the standard output cannot be written ({error.strerror})')
-        _tell(f'psd-deflection: {rejected}')
+        _notify(f'psd-deflection: {rejected}')
         return rejected.exit_status
     return status
 
@@ -272,7 +272,7 @@ def _lack_of(error: MemoryError | RuntimeError) -> MachineError | None:
     return None
 
 
-def _tell(line: str) -> None:
+def _notify(line: str) -> None:
     """Print on the standard error; if that cannot be written, only the exit status reports the error."""
     with contextlib.suppress(OSError):
         # It may hold words of a file or of a device.
@@ -298,7 +298,7 @@ def _run(argv: list[str]) -> int:
             return 0
         args, unknown = parser.parse_known_args(own)
     except (UsageError, ConfigError) as error:
-        _tell(f'{" ".join(["psd-deflection", *chosen])}: {error}')
+        _notify(f'{" ".join(["psd-deflection", *chosen])}: {error}')
         return error.exit_status
     if unknown:
         # Let the subcommand's parser report the error, so that its own usage is printed.
@@ -333,18 +333,18 @@ def _answer(args: argparse.Namespace) -> int:
         aside = set_aside(unfinished) if unfinished else ''
         if not aside:
             raise
-        _tell(f'psd-deflection {args.command}: interrupted{aside}')
+        _notify(f'psd-deflection {args.command}: interrupted{aside}')
         return INTERRUPTED
     except SomeFailedError as error:
         # The others are done, and their output is complete.
-        _tell(f'psd-deflection {args.command}: {error}')
+        _notify(f'psd-deflection {args.command}: {error}')
         return error.exit_status
     except (PsdDeflectionError, ModuleNotFoundError) as error:
         rejected = not_installed(error) if isinstance(error, ModuleNotFoundError) else error
         if rejected is None:
             raise
         aside = set_aside(unfinished) if unfinished else ''
-        _tell(f'psd-deflection {args.command}: {rejected}{aside}')
+        _notify(f'psd-deflection {args.command}: {rejected}{aside}')
         return rejected.exit_status
 
 
@@ -353,7 +353,7 @@ def _no_interrupt_lost() -> Iterator[None]:
     """Python drops an exception of a finaliser, also that of a signal that came during one: it comes again."""
     before = sys.unraisablehook
 
-    def told(dropped: sys.UnraisableHookArgs) -> None:
+    def reported(dropped: sys.UnraisableHookArgs) -> None:
         if issubclass(dropped.exc_type, KeyboardInterrupt):
             again = threading.Timer(AGAIN_S, _interrupt)
             again.daemon = True
@@ -361,7 +361,7 @@ def _no_interrupt_lost() -> Iterator[None]:
         else:
             before(dropped)
 
-    sys.unraisablehook = told
+    sys.unraisablehook = reported
     try:
         yield
     finally:

@@ -149,10 +149,10 @@ def waited_for(
     raise TimeoutError
 
 
-def _settle(tell: Callable[[], None]) -> bool:
+def _settle(notify: Callable[[], None]) -> bool:
     """Tell a Future how it ended; False if nobody waits for it any more."""
     try:
-        tell()
+        notify()
     except InvalidStateError:
         return False
     return True

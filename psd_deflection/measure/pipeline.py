@@ -225,24 +225,24 @@ class Pipeline:
         value that fits no part of this rig; it is left out.
         """
         self._changes += 1
-        told = dict(change.values)
+        reported = dict(change.values)
         # They say which numbers belong to no sample, and how the time map stepped; no estimate depends on them.
         for name in (RESTART, CLOCK_STEP, CLOCK_SQUEEZED):
-            told.pop(name, None)
-        load = {name: told.pop(name) for name in (KNOWN_LOAD,) if name in told}
-        memory = {name: told.pop(name) for name in tuple(told) if name in ENVIRONMENT or name.startswith(STATE)}
+            reported.pop(name, None)
+        load = {name: reported.pop(name) for name in (KNOWN_LOAD,) if name in reported}
+        memory = {name: reported.pop(name) for name in tuple(reported) if name in ENVIRONMENT or name.startswith(STATE)}
         if memory.pop(WHOLE, None) is not None:
             self._begin(self.rig)
-        if told:
-            self._change_rig(told)
+        if reported:
+            self._change_rig(reported)
         self.misfits = load_states(self._parts, memory)
         if self.motion_filter is not None:
             self.motion_filter.set_noise(self.estimator.noise.gamma)
             self._apply_load(self.motion_filter, load)
 
-    def _change_rig(self, told: Mapping[str, Value]) -> None:
-        """Use the parameters ``told``."""
-        values = {name: list(v) if isinstance(v, tuple) else v for name, v in told.items()}
+    def _change_rig(self, reported: Mapping[str, Value]) -> None:
+        """Use the parameters ``reported``."""
+        values = {name: list(v) if isinstance(v, tuple) else v for name, v in reported.items()}
         rig = replace_values(self.rig, values, 'change')
         zeroed = any(name in ZEROS for name in values)
         if rig.effects != self.rig.effects:
@@ -257,9 +257,9 @@ class Pipeline:
             # The tip did not move with its zero.
             self.motion_filter = self._new_filter()
 
-    def _apply_load(self, motion: ModalFilter, told: State) -> None:
+    def _apply_load(self, motion: ModalFilter, reported: State) -> None:
         try:
-            load = numbers(told, KNOWN_LOAD, 'seconds, nanoseconds and a load', 5)
+            load = numbers(reported, KNOWN_LOAD, 'seconds, nanoseconds and a load', 5)
         except ValueError as error:
             self.misfits.append(str(error))
             return
@@ -311,7 +311,7 @@ class Pipeline:
             there_ns = self._end_ns + 1
         if self.motion_filter is None or there_ns is None:
             return None
-        self.motion_filter.inertia.tell(base, there_ns)
+        self.motion_filter.inertia.notify(base, there_ns)
         return there_ns
 
     def temperature(self, celsius: float) -> ParameterChange | None:

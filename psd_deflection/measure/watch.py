@@ -232,7 +232,7 @@ class Watch:
         self.spoilt = 0
         self._last_index: int | None = None
         self._estimate: DeflectionEstimate | None = None
-        self._told: TipLoad | None = None
+        self._reported: TipLoad | None = None
         self.forget(rig)
 
     def forget(self, rig: Rig) -> None:
@@ -260,7 +260,7 @@ class Watch:
             if record.primary:
                 self._estimate = record
         elif isinstance(record, TipLoad):
-            self._told = record
+            self._reported = record
         elif isinstance(record, SpotMeans):
             self._block(record)
         elif isinstance(record, AppliedLoad):
@@ -301,7 +301,7 @@ class Watch:
         return 'readings, base line and load'
 
     def _block(self, spots: SpotMeans) -> None:
-        estimate, told = self._estimate, self._told
+        estimate, reported = self._estimate, self._reported
         sound = spots.status is BlockStatus.OK and not spots.left_out
         if not sound or estimate is None or estimate.block != spots.index:
             self._drop()
@@ -310,8 +310,8 @@ class Watch:
             self._drop()
         self._last_index = spots.index
         self._add_readings(spots.dots)
-        if self.load is not None and told is not None and told.t_ns == estimate.t_ns:
-            loads = zip(self._compliance, told[1:], self.load[1:], strict=True)
+        if self.load is not None and reported is not None and reported.t_ns == estimate.t_ns:
+            loads = zip(self._compliance, reported[1:], self.load[1:], strict=True)
             self._off = [off + c * (a - b) for off, (c, a, b) in zip(self._off, loads, strict=True)]
         self._pose = [total + value for total, value in zip(self._pose, estimate.pose, strict=True)]
         self._count += 1

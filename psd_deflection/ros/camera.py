@@ -77,8 +77,8 @@ class CameraNode(BaseNode[CameraSettings]):
 
     def _beside(self, topic: str, usual: str) -> str:
         """``topic`` if the user has remapped it, else the ``usual`` name beside the image."""
-        told: str = self.node.resolve_topic_name(topic)
-        return usual if told == self.node.resolve_topic_name(topic, only_expand=True) else told
+        reported: str = self.node.resolve_topic_name(topic)
+        return usual if reported == self.node.resolve_topic_name(topic, only_expand=True) else reported
 
     def _changed(self, settings: CameraSettings) -> None:
         target_of(settings)

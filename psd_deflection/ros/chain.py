@@ -62,7 +62,7 @@ class ChainNode(BaseNode[ChainSettings]):
         self._signals = signals
         self._wires: list[PublisherSink] = []
         self._inputs: list[InputRecorder] = []
-        self._told: list[RigPublisher] = []
+        self._reported: list[RigPublisher] = []
         self._health: list[HealthReporter] = []
         self._seen = (0, 0)
         self._frames: FramePublisher | None = None
@@ -101,17 +101,17 @@ class ChainNode(BaseNode[ChainSettings]):
         """Open the rigs and let samples flow; nothing is published yet. Raises the errors of a session."""
         file, name = self._file, self.full_name()
         self.chain = chain = self._signals.interruptible(
-            lambda: ChainSession(file, self.log, lambda _, rig, told: Session(rig, told, name))
+            lambda: ChainSession(file, self.log, lambda _, rig, reported: Session(rig, reported, name))
         )
         try:
             self._health = [HealthReporter(session) for session in chain.sessions]
-            self._told = []
+            self._reported = []
             for wire, inputs, session in zip(self._wires, self._inputs, chain.sessions, strict=True):
                 session.fanout.wires.insert(0, wire)
-                told = RigPublisher(wire, session)
-                session.fanout.change_sinks.append(told)
-                session.processing.sinks.append(told)
-                self._told.append(told)
+                reported = RigPublisher(wire, session)
+                session.fanout.change_sinks.append(reported)
+                session.processing.sinks.append(reported)
+                self._reported.append(reported)
                 inputs.session = session
             self._seen = (0, 0)
             chain.listeners.append(self._composed)
@@ -128,8 +128,8 @@ class ChainNode(BaseNode[ChainSettings]):
         if self._frames is not None:
             now = time.time_ns()
             self._frames.fix([t for rig in self._file.rigs for t in static_transforms(rig, now)])
-        for told in self._told:
-            told.tell()
+        for reported in self._reported:
+            reported.notify()
         topics = [self._end.topic_name, *(w.names((DEFLECTION_WITH_COVARIANCE,))[0] for w in self._wires)]
         self.log(f'publishing {", ".join(topics)} …; services {ZERO} and {RECORD} of {NODE_NAME}')
 
@@ -145,7 +145,7 @@ class ChainNode(BaseNode[ChainSettings]):
         for inputs in self._inputs:
             inputs.session = None
         chain, self.chain = self.chain, None
-        self._told, self._health = [], []
+        self._reported, self._health = [], []
         if chain is not None:
             chain.close()
 
@@ -183,9 +183,9 @@ class ChainNode(BaseNode[ChainSettings]):
         if self.chain is None:
             return
         node = self.full_name().removeprefix('/')
-        links = zip(self._file.names, self.chain.sessions, self._health, self._told, strict=True)
-        for name, session, health, told in links:
-            told.tell(again=False)
+        links = zip(self._file.names, self.chain.sessions, self._health, self._reported, strict=True)
+        for name, session, health, reported in links:
+            reported.notify(again=False)
             report = health.report(session.acquisition.now_ns())
             entries = (e._replace(name=e.name.replace('psd_deflection', f'{node}/{name}', 1)) for e in report.entries)
             session.fanout.put(report._replace(entries=tuple(entries)))

@@ -70,7 +70,7 @@ from psd_deflection.run.signals import StopRequestedError
 NODE_NAME = 'compensator'
 ENABLE = '~/enable'
 PERIOD_S = 0.01
-TOLD_S = 0.02
+REPORTED_S = 0.02
 """Changes of state that are shorter are not told, s."""
 NEWS = 6
 """Changes to one state that are told one by one, before they are counted and told together."""
@@ -140,7 +140,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._order = _order(self._arm, self.settings.joints)
         self._sums = self.settings.output == WITH_COMMANDS
         self.compensator = Compensator(self._arm, self.settings, dry=not self._drive)
-        self.command = self._told = self.compensator.command()
+        self.command = self._reported = self.compensator.command()
         self._limited_log = RateLimitedLog(self.log)
         self._listen()
         self._array = message_class(PUBLISHED[OFFSETS].type)
@@ -148,7 +148,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._publishers = {topic: self.publisher(topic) for topic in outputs}
         if self._drive:
             self.node.create_service(SetBool, ENABLE, self._enable)
-        self.node.create_timer(TOLD_S, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.node.create_timer(REPORTED_S, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._begun = time.monotonic()
         out = self._publishers[outputs[-1]].topic_name
         when = ', once it is enabled' if self._drive else ''
@@ -415,11 +415,11 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
         self._limited_log.settle(time.monotonic())
         self._check_robot()
         command = self.command
-        before, self._told = self._told, command
-        told = command.foreign != before.foreign
+        before, self._reported = self._reported, command
+        reported = command.foreign != before.foreign
         if command.state in (State.HOLDING, State.FOLLOWING):
-            told = before.why != command.why
-        if before.state is not command.state or told:
+            reported = before.why != command.why
+        if before.state is not command.state or reported:
             warns = command.foreign or (command.why and command.state is not State.OFF)
             level = WARNING if warns and command.state is not State.RELEASING else INFO
             self._limited_log.log(str(command.state), command.text, level, time.monotonic(), NEWS)
@@ -450,10 +450,10 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
             with self._lock:
                 response = self.compensator.response
                 measured = zip(self._names, response.slopes.tolist(), response.half_widths.tolist(), strict=True)
-                told = self.compensator.told_text(time.monotonic())
+                reported = self.compensator.controller_text(time.monotonic())
             slopes = [(f'moves by, of its offset: {n}', f'{s:.2f} ± {w:.2f} (measured)') for n, s, w in measured]
             values += [(name, text if 'nan' not in text else 'not yet measured') for name, text in slopes]
-            values.append(('the controller has, as it tells', told))
+            values.append(('the controller has, as it tells', reported))
         return (Health('offsets', level, text, tuple(values)),)
 
 

@@ -54,7 +54,7 @@ class EstimatorNode(BaseNode[Rig]):
         self._signals = signals
         self._health: HealthReporter | None = None
         self._views: Views | None = None
-        self._rig_told: RigPublisher | None = None
+        self._rig_reported: RigPublisher | None = None
         self._markers: RigMarkers | None = None
         self._transforms: TransformPublisher | None = None
         super().__init__(NODE_NAME, log, overrides)
@@ -102,9 +102,9 @@ class EstimatorNode(BaseNode[Rig]):
             self._live.show()
             self._health = HealthReporter(session)
             session.fanout.wires.insert(0, self._wire)
-            self._rig_told = RigPublisher(self._wire, session)
-            session.fanout.change_sinks.append(self._rig_told)
-            session.processing.sinks.append(self._rig_told)
+            self._rig_reported = RigPublisher(self._wire, session)
+            session.fanout.change_sinks.append(self._rig_reported)
+            session.processing.sinks.append(self._rig_reported)
             self._make_views(session)
             self._inputs.session = session
             session.start()
@@ -120,8 +120,8 @@ class EstimatorNode(BaseNode[Rig]):
         self._wire.active = True
         if self._transforms is not None:
             self._transforms.active = True
-        if self._rig_told is not None:
-            self._rig_told.tell()
+        if self._rig_reported is not None:
+            self._rig_reported.notify()
         if self._markers is not None:
             self._markers.session = self.session
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
@@ -147,7 +147,7 @@ class EstimatorNode(BaseNode[Rig]):
         self._inputs.session = None
         self._live.session = None
         self._health = None
-        self._rig_told = None
+        self._rig_reported = None
         views, self._views = self._views, None
         if views is not None:
             views.close()
@@ -178,8 +178,8 @@ class EstimatorNode(BaseNode[Rig]):
         if self.session is not None and self._health is not None:
             # The page may have taken a zero as well.
             self._live.show()
-            if self._rig_told is not None:
-                self._rig_told.tell(again=False)
+            if self._rig_reported is not None:
+                self._rig_reported.notify(again=False)
             # In the time of the samples, so that a recording has one time even if the system clock
             # is set.
             self.session.fanout.put(self.named(self._health.report(self.session.acquisition.now_ns())))

@@ -55,7 +55,7 @@ class _Goal:
 
     ``sent``: the controller's handle of it, once it has taken it. ``future``: the answer that is
     awaited. When, by a monotonic clock, s: ``came`` it was accepted, ``asked`` it was sent,
-    ``told`` feedback came last, ``stopped`` it was cancelled, ``replaced`` by another.
+    ``reported`` feedback came last, ``stopped`` it was cancelled, ``replaced`` by another.
     """
 
     def __init__(self, handle: Any) -> None:
@@ -65,7 +65,7 @@ class _Goal:
         self.ended = False
         self.came = time.monotonic()
         self.asked: float | None = None
-        self.told: float | None = None
+        self.reported: float | None = None
         self.stopped: float | None = None
         self.replaced: float | None = None
 
@@ -177,8 +177,8 @@ class Follower:
 
     def _send(self, goal: _Goal) -> bool:
         """Whether it was sent, or has ended; else it waits for joints that still move."""
-        told = self._newest.told if self._newest is not None else None
-        if told is not None and time.monotonic() - told > FRESH_S:
+        reported = self._newest.reported if self._newest is not None else None
+        if reported is not None and time.monotonic() - reported > FRESH_S:
             self._shaper.forget()
         request, before = goal.handle.request, self._shaper.history
         try:
@@ -248,7 +248,7 @@ class Follower:
     # What the controller says.
 
     def _fed(self, goal: _Goal, message: Any) -> None:
-        goal.told = time.monotonic()
+        goal.reported = time.monotonic()
         if not goal.ended:
             goal.handle.publish_feedback(message.feedback)
 
@@ -279,7 +279,7 @@ class Follower:
                 self._give_up(goal, silent)
             elif not self.ready():
                 self._give_up(goal, f'{self.action} has gone')
-            elif due(goal.told, SILENT_S):
+            elif due(goal.reported, SILENT_S):
                 self._give_up(goal, f'{self.action} has sent no feedback for {SILENT_S:g} s')
         self._pump()
 

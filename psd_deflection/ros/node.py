@@ -244,13 +244,13 @@ class BaseNode(abc.ABC, Generic[T]):
             self.error = error
         except Exception as error:
             self.error = error
-            self._tell_error(f'{type(error).__name__}: {error}')
+            self._notify_error(f'{type(error).__name__}: {error}')
             return TransitionCallbackReturn.ERROR
         else:
             self.error = None
-            self._tell_frames(action)
+            self._notify_frames(action)
             return TransitionCallbackReturn.SUCCESS
-        self._tell_error(str(self.error))
+        self._notify_error(str(self.error))
         return TransitionCallbackReturn.FAILURE
 
     def report(self) -> None:
@@ -276,12 +276,12 @@ class BaseNode(abc.ABC, Generic[T]):
 
     # Its own.
 
-    def _tell_error(self, text: str) -> None:
+    def _notify_error(self, text: str) -> None:
         # At the start it is raised, and the caller reports it.
         if not self._starting:
             self.log(text, ERROR)
 
-    def _tell_frames(self, action: Callable[[], None]) -> None:
+    def _notify_frames(self, action: Callable[[], None]) -> None:
         names_frames = FRAME_PREFIX in self.parameters.values
         if action == self.activate and names_frames and not self.frame_prefix and self.node.get_namespace() != '/':
             self.log('frames have no prefix: where several run, give each its own (frame_prefix)', WARNING)

@@ -80,7 +80,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
         self._shaper.max_step = settings.max_step
 
     def _joints(self, message: Any) -> None:
-        self._known.tell(time.monotonic(), message.name, message.position)
+        self._known.notify(time.monotonic(), message.name, message.position)
 
     def _given(self, message: Any) -> None:
         if not self.active:

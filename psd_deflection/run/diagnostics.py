@@ -209,8 +209,8 @@ class HealthReporter:
         ]
         level, message = OK, 'the modes foretell the samples'
         worst = max(new.means())
-        told = motion.inertia
-        base = (told.count, told.late, told.ended, self._session.rejected[ACCELERATION])
+        reported = motion.inertia
+        base = (reported.count, reported.late, reported.ended, self._session.rejected[ACCELERATION])
         came, late, ended, rejected = (max(now - then, 0) for now, then in zip(base, self._base, strict=True))
         self._base = base
         if rejected:

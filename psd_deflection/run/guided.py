@@ -86,10 +86,10 @@ def _lead(
             raw = item.raw
             scale = raw.volts_per_count
             volts = raw.readings if scale is None else counts_to_volts(raw.readings.astype(np.int32, copy=False), scale)
-            told = guide.feed(volts.astype(float))
+            reported = guide.feed(volts.astype(float))
             show(guide)
-            if told:
-                log(told)
+            if reported:
+                log(reported)
     drift, sd = guide.drift()
     return check(CheckProblem(rig, guide.pushes, levels(rig, guide.rest()), drift, sd))
 

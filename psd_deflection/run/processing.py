@@ -188,7 +188,7 @@ class Processing:
                     self.dropped_before = item.dropped_before
                     if self.give(self.pipeline.process(item.raw)):
                         self._note_latency(item.read_ns)
-                        self._tell_rejections()
+                        self._notify_rejections()
                 elif isinstance(item, Noted):
                     self.give([item.change])
                 elif isinstance(item, Restarted):
@@ -224,7 +224,7 @@ class Processing:
         while self._latencies[0][0] < now - LATENCY_NS:
             self._latencies.popleft()
 
-    def _tell_rejections(self) -> None:
+    def _notify_rejections(self) -> None:
         spots = self.pipeline.last_spots
         if spots is None:
             return

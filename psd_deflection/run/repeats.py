@@ -34,7 +34,7 @@ class _Reason:
 
 @dataclass(slots=True)
 class _Kind:
-    told: int = 0
+    reported: int = 0
     reasons: dict[str, _Reason] = field(default_factory=dict)
 
 
@@ -55,16 +55,16 @@ class RateLimitedLog:
         ``at_once``: so many of the kind are said without waiting."""
         known = self._kinds.setdefault(kind, _Kind())
         if all(reason.quiet(now_s) for reason in known.reasons.values()):
-            known.told = 0
+            known.reported = 0
         reason = _reason_of(known, line, now_s)
         if reason.quiet(now_s):
             reason.wait_s = FIRST_WAIT_S
         reason.line, reason.level = line, level
         reason.since += 1
-        news = known.told < at_once
+        news = known.reported < at_once
         if not news and now_s < reason.next_s:
             return
-        known.told += 1
+        known.reported += 1
         more = f' (and {reason.since - 1} more like it)' if reason.since > 1 else ''
         if news:
             # Those that are said at once make none wait longer.

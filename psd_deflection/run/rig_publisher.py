@@ -31,13 +31,13 @@ class RigPublisher:
 
     Changes come in the pipeline thread, between two blocks. Our own recordings hold the same without it. As a sink of
     the session's records it takes what the pipeline remembers, every ``MEMORY_S``, so that whatever recorder joins late
-    replays bit for bit from there; :meth:`tell` encodes and publishes it, in its own thread.
+    replays bit for bit from there; :meth:`notify` encodes and publishes it, in its own thread.
     """
 
     def __init__(self, wire: Wire, session: Session) -> None:
         self._wire = wire
         self._session = session
-        self._told: Mapping[str, object] | None = None
+        self._reported: Mapping[str, object] | None = None
         self._last = ParameterChange(0, 0, ())
         self._environment: dict[str, object] = {}
         rig = session.rig
@@ -74,22 +74,22 @@ class RigPublisher:
             # A reader has the load from its own topic.
             return
         # In order: what was remembered is of the rig before.
-        self._tell_memories()
+        self._notify_memories()
         with self._lock:
             self._last = change
             self._environment |= {name: value for name, value in change.values if name in ENVIRONMENT}
             self._publish(dict(change.values))
 
-    def tell(self, again: bool = True) -> None:
+    def notify(self, again: bool = True) -> None:
         """Publish what is remembered, if that is due; the present rig if ``again``, or if the hello is another one."""
-        self._tell_memories()
+        self._notify_memories()
         with self._lock:
-            if again or self._hello() != self._told:
+            if again or self._hello() != self._reported:
                 # A recorder that joins from now on waits for what comes next.
                 self._due = None
                 self._publish(self._environment)
 
-    def _tell_memories(self) -> None:
+    def _notify_memories(self) -> None:
         with self._lock:
             while self._untold:
                 rig, memory = self._untold.popleft()
@@ -101,7 +101,7 @@ class RigPublisher:
         return None if hello is None else hello.info
 
     def _publish(self, changed: Mapping[str, object]) -> None:
-        self._told = self._hello()
+        self._reported = self._hello()
         self._send(self._state(self._session.rig, self._last, changed))
 
     def _state(self, rig: Rig, at: ParameterChange, changed: Mapping[str, object]) -> RigState:
@@ -109,7 +109,7 @@ class RigPublisher:
             t_ns=at.t_ns,
             block=at.block,
             parameters=rig.flat(),
-            hello=self._told,
+            hello=self._reported,
             changed=changed,
             version=__version__,
             made_with=provenance(),

@@ -205,7 +205,7 @@ class Session:
                 self._report(
                     'the disk does not answer; the recording begins when it does, samples flow meanwhile', WARNING
                 )
-                asked.add_done_callback(self._tell_rejected)
+                asked.add_done_callback(self._notify_rejected)
         self.acquisition.start()
 
     def record(self, wanted: bool) -> Future[Path | None]:
@@ -218,7 +218,7 @@ class Session:
 
         asked_ns = self.acquisition.now_ns()
 
-        def tell(done: Future[Path | None]) -> None:
+        def notify(done: Future[Path | None]) -> None:
             if done.exception() is None and (folder := done.result()) is not None:
                 if wanted and (load := self.load) is not None:
                     # It holds already when the recording begins.
@@ -230,10 +230,10 @@ class Session:
             asked = self.recorder.start(self.rig, hello, self.pipeline.memory)
         else:
             asked = self.processing.request(self.recorder.stop)
-        asked.add_done_callback(tell)
+        asked.add_done_callback(notify)
         return asked
 
-    def _tell_rejected(self, done: Future[Path | None]) -> None:
+    def _notify_rejected(self, done: Future[Path | None]) -> None:
         error = done.exception()
         if error is not None:
             self.recorder.failure = str(error)
@@ -281,14 +281,14 @@ class Session:
         if self._simulated is not None and self.hangs:
             self._simulated.push(load[1:])
         if self.pipeline.motion_filter is not None:
-            self.processing.later(partial(self._tell_filter, load))
+            self.processing.later(partial(self._notify_filter, load))
         if self.watcher is not None:
             self.processing.later(partial(self.watcher.put, load))
 
-    def _tell_filter(self, load: AppliedLoad) -> None:
-        told = self.pipeline.load(load)
-        if told is not None:
-            self.processing.give([told])
+    def _notify_filter(self, load: AppliedLoad) -> None:
+        reported = self.pipeline.load(load)
+        if reported is not None:
+            self.processing.give([reported])
 
     def _take_acceleration(self, message: bytes) -> Record | None:
         """Unlike the other inputs it is recorded when the pipeline has it: the filter's answer depends on that."""

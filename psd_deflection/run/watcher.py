@@ -189,7 +189,7 @@ class Watcher:
             *self._out.values(),
         ]
         if alarm is not None:
-            values += _told(alarm)
+            values += _reported(alarm)
             return DiagnosticEntry(NAME, WARN, f'since {_clock(alarm.since_ns)}: {alarm.words}', tuple(values))
         if self.failure:
             return DiagnosticEntry(NAME, WARN, self.failure, tuple(values))
@@ -300,7 +300,7 @@ def _clock(t_ns: int) -> str:
     return time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(t_ns / 1e9))
 
 
-def _told(alarm: Alarm) -> list[tuple[str, str]]:
+def _reported(alarm: Alarm) -> list[tuple[str, str]]:
     unit = '(urad)' if alarm.channel == 'theta' else '(um)'
     return [
         ('since', _clock(alarm.since_ns)),

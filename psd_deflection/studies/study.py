@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
     from psd_deflection.base.figures import ShownFigure
 
-Tell = Callable[[str], None]
+Notify = Callable[[str], None]
 """Takes a warning."""
 
 GIVEN_RIG = 'the rig that was given'
@@ -162,13 +162,13 @@ class StudyResult(abc.ABC):
 class Opened(NamedTuple):
     """A recording, cut into the rig's blocks, and its rig.
 
-    ``params_file``: of the rig, if it has one. ``tell``: takes warnings. ``given``: whether the caller gave the rig.
+    ``params_file``: of the rig, if it has one. ``notify``: takes warnings. ``given``: whether the caller gave the rig.
     """
 
     recording: Recording
     rig: Rig
     params_file: Path | None
-    tell: Tell = warn_caller
+    notify: Notify = warn_caller
     given: bool = False
 
     @property
@@ -189,11 +189,11 @@ def opened(
     *,
     namespace: str | None = None,
     span: Span = WHOLE,
-    tell: Tell = warn_caller,
+    notify: Notify = warn_caller,
 ) -> Opened:
     """Return the recording and the rig that describes it: ``rig``, its parameter file, or that of the recording's end.
 
-    ``span``: the part of the recording that is meant. ``tell`` gets a warning if nobody names a rig.
+    ``span``: the part of the recording that is meant. ``notify`` gets a warning if nobody names a rig.
     Raises RecordingError and ConfigError.
     """
     if not isinstance(recording, Recording):
@@ -201,11 +201,13 @@ def opened(
     params_file = None if rig is None or isinstance(rig, Rig) else Path(rig)
     if rig is None:
         for warning in warnings_about_rig(recording):
-            tell(warning)
+            notify(warning)
         known = rig_at_end(recording)
     else:
         known = rig if isinstance(rig, Rig) else load_rig(rig)
-    return Opened(recording.with_block_size(known.estimator.block_size), known, params_file, tell, isinstance(rig, Rig))
+    return Opened(
+        recording.with_block_size(known.estimator.block_size), known, params_file, notify, isinstance(rig, Rig)
+    )
 
 
 def named(recording: str, digest: str, digits: int = 16) -> str:
@@ -230,11 +232,11 @@ def edited_rig_file(
     name: str,
     rig_text: Callable[[], str],
     edit: Callable[[str, Path], str],
-    tell: Tell = warn_caller,
+    notify: Notify = warn_caller,
 ) -> str:
     """Return the text of the file ``name``: ``edit`` of the user's file and its path, comments kept.
 
-    Without a file of the user, or if it cannot be edited, which ``tell`` gets, ``edit`` of what ``rig_text`` gives.
+    Without a file of the user, or if it cannot be edited, which ``notify`` gets, ``edit`` of what ``rig_text`` gives.
     """
     if params_file is not None:
         path = Path(params_file)
@@ -242,5 +244,5 @@ def edited_rig_file(
         try:
             return edit(text, path)
         except ConfigError as error:
-            tell(f'{error}: {name} has its values without its comments')
+            notify(f'{error}: {name} has its values without its comments')
     return edit(rig_text(), Path(name))

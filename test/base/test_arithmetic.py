@@ -164,7 +164,7 @@ def test_sums_in_threads_do_not_meet() -> None:
 
 
 @pytest.mark.parametrize('part', [1e-9, -1e-9, 1e-15, -1e-15, 0.0])
-def test_whether_a_matrix_is_positive_is_told_by_its_pivots_where_rounding_decides(part: float) -> None:
+def test_whether_a_matrix_is_positive_is_reported_by_its_pivots_where_rounding_decides(part: float) -> None:
     rng = np.random.default_rng(5)
     vectors = np.linalg.qr(rng.normal(size=(12, 12)))[0]
     a = (vectors * [part, *np.linspace(0.1, 1.0, 11)]) @ vectors.T

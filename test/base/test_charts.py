@@ -19,7 +19,7 @@ from psd_deflection.base.pages import page, table
 from psd_deflection.records import FloatArray
 
 
-def told(chart: Chart) -> dict[str, Any]:
+def reported(chart: Chart) -> dict[str, Any]:
     found = re.search(r'<script type="application/json">(.*?)</script>', drawn(chart))
     assert found is not None
     out: dict[str, Any] = json.loads(found[1])
@@ -39,7 +39,7 @@ def one(x: FloatArray, *rows: FloatArray, words: str = 'words') -> Chart:
 
 def test_the_same_array_is_there_once() -> None:
     x = np.arange(5.0)
-    content = told(Chart('words', [*one(x, x**2, x**3).panels, *one(x.copy(), x**2).panels]))
+    content = reported(Chart('words', [*one(x, x**2, x**3).panels, *one(x.copy(), x**2).panels]))
     assert len(content['columns']) == 3
     first, second = (panel['series'] for panel in content['panels'])
     assert [s['x'] for s in (*first, *second)] == [0, 0, 0]
@@ -51,7 +51,7 @@ def test_what_is_declared_reaches_the_page() -> None:
     x = np.array([1.0, 2.0])
     series = Series('a', x, x, 'red', 'points', spread=x / 10.0, bold=True)
     panel = Panel((series,), 'f / Hz', 'y / m', log='x, y', rules=[Rule(1.5, 'here')], y_range=(0.0, 3.0), height=99)
-    content = told(Chart('what it shows', [panel], beside=2))
+    content = reported(Chart('what it shows', [panel], beside=2))
     assert content['words'] == 'what it shows'
     assert content['beside'] == 2
     (only,) = content['panels']
@@ -63,7 +63,7 @@ def test_what_is_declared_reaches_the_page() -> None:
 
 def test_times_of_an_epoch_keep_their_digits() -> None:
     x = np.linspace(1.7e9, 1.7e9 + 0.06, 4)
-    content = told(one(x, np.zeros(4)))
+    content = reported(one(x, np.zeros(4)))
     assert content['columns'][0][0] == 'd'
     assert column(content, 0) == pytest.approx(x, abs=1e-6)
     assert content['columns'][1][0] == 'f'
@@ -75,7 +75,7 @@ def test_a_long_curve_keeps_its_extremes_and_its_gaps() -> None:
     y = np.random.default_rng(1).normal(size=n)
     y[51_234], y[73_210] = 100.0, -90.0
     y[20_000:20_300] = np.nan
-    content = told(one(x, y, np.zeros(n)))
+    content = reported(one(x, y, np.zeros(n)))
     at, kept = (column(content, place) for place in (0, 1))
     assert len(at) <= 4 * BUCKETS + 4
     assert kept[np.argmin(np.abs(at - 51.234))] == 100.0
@@ -89,7 +89,7 @@ def test_a_cloud_keeps_points_that_do_not_lie_on_each_other() -> None:
     rng = np.random.default_rng(2)
     x = np.repeat([0.0, 10.0], 20_000)
     y = np.concatenate([rng.normal(size=20_000), np.full(20_000, 7.0)])
-    content = told(one(x, y))
+    content = reported(one(x, y))
     at, kept = (column(content, place) for place in (0, 1))
     assert 50 < len(at) < 300
     assert np.sum(at == 10.0) == 1

@@ -145,7 +145,7 @@ def test_a_recording_goes_on_if_neither_number_nor_time_goes_back() -> None:
     assert not of.follows([8, 9], [7.0, 9.0])
 
 
-def test_a_time_that_goes_back_is_told_and_the_last_time_counts() -> None:
+def test_a_time_that_goes_back_is_reported_and_the_last_time_counts() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     assert of.extended([8, 9, 10], [6.5, 8.0, 9.0]) == [8, 9, 10]
     assert of.said == ['time goes back to 6500000 ns']

@@ -61,7 +61,7 @@ def test_what_is_in_no_part_is_the_rest_of_its_thread() -> None:
     def task(name: str, used: int, calls: int, **spent: int) -> dict[str, object]:
         return {'name': name, 'used': used, 'spent': spent, 'calls': calls}
 
-    told = {
+    reported = {
         'before': {'1': task('pipeline', 10, 1, fit=4)},
         'after': {
             '1': task('pipeline', 10 + 2 * 10**9, 3, fit=4 + 10**9),
@@ -71,7 +71,7 @@ def test_what_is_in_no_part_is_the_rest_of_its_thread() -> None:
         'took': 10.0,
         'cost': 1e7,
     }
-    spent, took, clocks = cpu.parts(told)
+    spent, took, clocks = cpu.parts(reported)
     assert spent == {('pipeline', 'fit'): 1.0, ('pipeline', cpu.REST): 1.0, ('dds.udp', 'all of it'): 1.0}
     assert (took, round(clocks, 4)) == (10.0, round(2 * 1e7 / 3e9, 4))
     (row,) = cpu.rows_of(spent, took, clocks, Counter())
@@ -90,7 +90,7 @@ def test_what_is_in_no_part_is_the_rest_of_its_thread() -> None:
         (['f (/x/other.so)', 'g (/x/libpython3.11.so)'], 'not known'),
     ],
 )
-def test_the_kind_of_a_sample_is_its_most_telling(frames: list[str], kind: str) -> None:
+def test_the_kind_of_a_sample_is_its_most_reporting(frames: list[str], kind: str) -> None:
     assert cpu.kind_of(frames) == kind
 
 

@@ -31,7 +31,7 @@ def covers(part: Inside) -> bool:
 def test_a_drift_with_temperature_that_the_rig_file_knows_is_covered() -> None:
     assert covers(warming(rest_s=26, steps=2, seed=3).rest)
     # The judge can say no.
-    assert warming(told=False, rest_s=26, steps=2, seed=3).rest.joint < 0.8
+    assert warming(reported=False, rest_s=26, steps=2, seed=3).rest.joint < 0.8
 
 
 def test_the_truth_is_inside_on_a_moving_base() -> None:

@@ -45,7 +45,7 @@ def test_a_law_has_the_gap_it_says() -> None:
     assert gap_of(designs('one'), law) == pytest.approx(law['gap'], rel=0.1)
 
 
-def told(**law: Any) -> dict[str, Any]:
+def reported(**law: Any) -> dict[str, Any]:
     whole = {'stage': 'psd', 'variables': ['x1'], 'kind': 'static', 'expression': '', 'heldout_after': 2.2e-7}
     said = {**whole, 'equivalent': [], **law}
     gap = {'floor': 2e-7, 'heldout_after': 1e-6}
@@ -54,16 +54,16 @@ def told(**law: Any) -> dict[str, Any]:
 
 def test_an_answer_is_right_if_the_law_or_one_that_ties_is() -> None:
     truth = {**law_forms.draw(1, 'psd', 'cube'), 'of': ['x1'], 'gap': 9.0}
-    row = judged(truth, told())
+    row = judged(truth, reported())
     assert (row['stage'], row['variables'], row['kind'], row['set']) == (True, True, True, 1)
     assert row['floors'] == pytest.approx(1.1)
     tie = {'stage': 'psd', 'variables': ['x1']}
-    row = judged(truth, told(stage='optics', variables=['y1'], equivalent=[tie]))
+    row = judged(truth, reported(stage='optics', variables=['y1'], equivalent=[tie]))
     assert (row['stage'], row['stage_alone'], row['variables'], row['variables_alone']) == (True, False, True, False)
-    row = judged(truth, {**told(), 'unknown': [{'law': None}]})
+    row = judged(truth, {**reported(), 'unknown': [{'law': None}]})
     assert (row['stage'], row['variables'], row['law'], row['floors']) == (False, False, None, pytest.approx(5.0))
-    assert judged(None, told())['alarm']
-    assert not judged(None, {**told(), 'unknown': []})['alarm']
+    assert judged(None, reported())['alarm']
+    assert not judged(None, {**reported(), 'unknown': []})['alarm']
 
 
 def test_a_law_that_never_acts_is_drawn_anew() -> None:
@@ -71,10 +71,10 @@ def test_a_law_that_never_acts_is_drawn_anew() -> None:
     assert gap_of(designs('one'), sized(law)) == pytest.approx(law['gap'], rel=0.1)
 
 
-def test_a_dot_that_jumps_may_be_told_as_jumps_of_its_detector() -> None:
+def test_a_dot_that_jumps_may_be_reported_as_jumps_of_its_detector() -> None:
     truth = {**law_forms.draw(1, 'optics', 'events'), 'where': 'x2', 'times': [5.4, 9.0], 'gap': 9.0}
     found = [{'name': 'jump', 'where': 'psd_2', 'value': t} for t in (9.002, 5.399)]
-    nothing = {**told(), 'unknown': [], 'verdict': 'nothing_missing'}
+    nothing = {**reported(), 'unknown': [], 'verdict': 'nothing_missing'}
     row = judged(truth, {**nothing, 'setup': found})
     assert (row['stage'], row['variables'], row['stage_alone'], row['jumps']) == (True, True, False, True)
     wrong = [
@@ -91,11 +91,11 @@ def test_a_dot_that_jumps_may_be_told_as_jumps_of_its_detector() -> None:
         assert not judged({**truth, **other}, {**nothing, 'setup': found})['jumps']
 
 
-def test_a_law_that_acts_under_one_load_only_may_be_told_as_another_load() -> None:
+def test_a_law_that_acts_under_one_load_only_may_be_reported_as_another_load() -> None:
     truth = next(law for law in drawn(1400, 12) if law['number'] == 1410)
     truth = {**truth, 'size': 0.5}
     found = [{'name': 'load_value', 'where': 'load 6', 'value': [30.0, 0.57, 0.0]}]
-    nothing = {**told(), 'unknown': [], 'verdict': 'nothing_missing'}
+    nothing = {**reported(), 'unknown': [], 'verdict': 'nothing_missing'}
     row = judged(truth, {**nothing, 'setup': found})
     assert (row['stage'], row['variables'], row['stage_alone'], row['note']) == (True, True, False, True)
     # Under forces along y it acts at five of the noted loads.
@@ -108,12 +108,12 @@ def test_a_law_that_acts_under_one_load_only_may_be_told_as_another_load() -> No
     ):
         row = judged(law, {**nothing, 'setup': said})
         assert (row['stage'], row['note']) == (False, False)
-    assert not judged(truth, {**told(stage='psd'), 'setup': found})['note']
+    assert not judged(truth, {**reported(stage='psd'), 'setup': found})['note']
 
 
 def test_a_threshold_that_is_missed_is_said() -> None:
     truth = {**law_forms.draw(1, 'psd', 'cube'), 'of': ['x1'], 'gap': 9.0}
-    good = {**judged(truth, told()), 'seconds': 1.0}
+    good = {**judged(truth, reported()), 'seconds': 1.0}
     assert summary([good] * 10) == (summary([good] * 10)[0], True)
     assert not summary([good] * 8 + [{**good, 'stage': False}] * 2)[1]
     assert not summary([good] * 7 + [{**good, 'floors': 1.3}] * 3)[1]

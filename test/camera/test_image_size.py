@@ -92,8 +92,8 @@ def test_nothing_is_unpacked_of_an_image_that_is_too_large(name: str, monkeypatc
 def test_opencv_has_the_same_bound_for_what_is_not_known_here() -> None:
     code = 'from psd_deflection.camera.opencv import opencv; opencv(); import os; print(os.environ[NAME])'
     code = code.replace('NAME', repr('OPENCV_IO_MAX_IMAGE_PIXELS'))
-    told = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
-    assert int(told) == MOST_PIXELS
+    reported = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
+    assert int(reported) == MOST_PIXELS
     # A Sun raster, which is not read here.
     head = struct.pack('>8I', 0x59A66A95, 32767, 32767, 1, 32767 * 4096, 1, 0, 0)
     code = (
@@ -103,9 +103,9 @@ def test_opencv_has_the_same_bound_for_what_is_not_known_here() -> None:
         "print(open('/proc/self/status').read().split('VmHWM:')[1].split()[0])"
     )
     # VmHWM is of this program alone: ru_maxrss keeps the peak of the process that started it.
-    told = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
-    assert told.split()[0] == 'None'
-    assert int(told.split()[1]) < 600_000
+    reported = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True, check=True).stdout
+    assert reported.split()[0] == 'None'
+    assert int(reported.split()[1]) < 600_000
 
 
 def test_a_file_that_is_too_long_is_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -125,13 +125,13 @@ def test_a_fit_stays_within_its_bounds() -> None:
     assert np.diag(moved(shape, step, light).blur) == pytest.approx([1.0, 0.0625])
 
 
-def test_a_lens_is_told_with_the_deviation_of_each_number() -> None:
+def test_a_lens_is_reported_with_the_deviation_of_each_number() -> None:
     matrix = np.array([[1000.0, 0.0, 320.0], [0.0, 1001.0, 240.0], [0.0, 0.0, 1.0]])
     made = Intrinsics((640, 480), matrix, np.array([1.0, 2.0, 3.0, 4.0]), np.zeros(5), 0.1, 12, [])
     assert made.lines() == ['focal length 1000.0 ± 1.0, 1001.0 ± 2.0 px', 'centre 320.0 ± 3.0, 240.0 ± 4.0 px']
 
 
-def test_each_image_that_does_not_show_the_board_is_told_with_the_reason() -> None:
+def test_each_image_that_does_not_show_the_board_is_reported_with_the_reason() -> None:
     images = [('a', np.zeros((48, 64), np.uint8)), ('b', np.zeros((50, 60), np.uint8)), ('c', None)]
     with pytest.raises(ConfigError, match=r'0 images show the board') as caught:
         calibrated(CameraSettings(target='charuco'), images)

@@ -102,7 +102,7 @@ def test_a_bag_has_the_poses_with_and_without_covariance(
         (['nothing', '--out', 'x.csv'], 4, 'no such video'),
     ],
 )
-def test_a_mistake_is_told_before_anything_is_written(
+def test_a_mistake_is_reported_before_anything_is_written(
     words: list[str],
     status: int,
     complaint: str,

@@ -167,16 +167,16 @@ def test_a_rig_that_cannot_be_solved(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
-    ('argv', 'told'),
+    ('argv', 'reported'),
     [(['simulate'], '--out OUT (a recording) or --serve'), (['design', '--out', 'a.png'], 'give --params-file')],
     ids=['simulate', 'design'],
 )
 def test_options_that_do_not_go_together_are_usage(
-    argv: list[str], told: str, capsys: pytest.CaptureFixture[str]
+    argv: list[str], reported: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status, err = rejected(capsys, *argv)
     assert status == 2
-    assert told in err
+    assert reported in err
 
 
 def test_output_that_is_there_already_is_not_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -205,7 +205,7 @@ def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(
-    ('found', 'called', 'told'),
+    ('found', 'called', 'reported'),
     [
         ('/usr/bin/psd-deflection', '.venv/bin/psd-deflection', 'psd-deflection'),
         (None, '.venv/bin/psd-deflection', '.venv/bin/psd-deflection'),
@@ -213,8 +213,8 @@ def test_ctrl_c_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Capt
     ],
 )
 def test_suggested_commands_can_be_typed(
-    found: str | None, called: str, told: str, monkeypatch: pytest.MonkeyPatch
+    found: str | None, called: str, reported: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr('shutil.which', lambda name: found)
     monkeypatch.setattr(sys, 'argv', [called, 'estimator'])
-    assert program() == told
+    assert program() == reported

@@ -61,7 +61,7 @@ def test_what_is_corrected_is_said() -> None:
     assert catalogue()['amplifier_lag'].corrected == ''
 
 
-def test_a_wrong_name_is_told_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_name_is_reported_with_the_right_one(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['effects', 'sensor_rotatoin']) == 2
     assert 'did you mean sensor_rotation' in capsys.readouterr().err
 

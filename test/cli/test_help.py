@@ -61,10 +61,10 @@ def test_it_is_no_wider_than_the_terminal(capsys: pytest.CaptureFixture[str], mo
         assert [line for line in narrow.splitlines() if len(line) > 60 and not line.startswith(' ')] == [], command
 
 
-def test_it_tells_the_exit_statuses(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_reports_the_exit_statuses(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     text = ' '.join(help_of('', capsys, monkeypatch, 80).split())
-    told = re.findall(r'(\d+) [a-zC]', text.partition('exit status: ')[2])
-    assert [int(status) for status in told] == list(EXIT_STATUSES)
+    reported = re.findall(r'(\d+) [a-zC]', text.partition('exit status: ')[2])
+    assert [int(status) for status in reported] == list(EXIT_STATUSES)
 
 
 def test_help_fits_one_screen_with_each_command_in_one_group(
@@ -81,9 +81,9 @@ def test_help_fits_one_screen_with_each_command_in_one_group(
 
 
 def test_no_argument_prints_help(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    told = help_of('', capsys, monkeypatch, 80)
+    reported = help_of('', capsys, monkeypatch, 80)
     assert main([]) == 0
-    assert capsys.readouterr().out == told
+    assert capsys.readouterr().out == reported
 
 
 def test_the_short_list_of_parameters_is_short(capsys: pytest.CaptureFixture[str]) -> None:

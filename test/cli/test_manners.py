@@ -199,8 +199,8 @@ def test_ctrl_c_leaves_no_output_that_looks_whole(
     before = signal.getsignal(number)
     assert main([*argv, '--out', 'out.csv']) == 130
     assert signal.getsignal(number) is before
-    told = f'psd-deflection {argv[0]}: interrupted; out.csv.partial holds what came before\n'
-    assert capsys.readouterr().err == told
+    reported = f'psd-deflection {argv[0]}: interrupted; out.csv.partial holds what came before\n'
+    assert capsys.readouterr().err == reported
 
 
 class Finalised:
@@ -452,7 +452,7 @@ def test_quantities_are_written_alike_and_nothing_is_written_to_disk(
     assert list(folder.iterdir()) == []
 
 
-def told() -> Iterator[tuple[Path, str]]:
+def reported() -> Iterator[tuple[Path, str]]:
     """Every text of the package that is no docstring."""
     for path in sorted((ROOT / 'psd_deflection').rglob('*.py')):
         tree = ast.parse(path.read_text(encoding='utf-8'))
@@ -464,7 +464,7 @@ def told() -> Iterator[tuple[Path, str]]:
 
 def test_micrometres_are_written_alike_wherever_somebody_reads_them() -> None:
     # Names that scripts read, of columns and of keys of /diagnostics, are ASCII: `shift (um)`.
-    wrong = [(path.name, text) for path, text in told() if re.search(r'(?<![\w(])(um|urad)(?!\w)', text)]
+    wrong = [(path.name, text) for path, text in reported() if re.search(r'(?<![\w(])(um|urad)(?!\w)', text)]
     assert wrong == []
 
 

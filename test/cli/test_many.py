@@ -57,9 +57,9 @@ def test_every_engine_gives_the_serial_answer(
         out = archive / f'{i}.parquet'
         words = ['replay', 'archive/*', '--compare', '--json', '--executor', executor, '--out', str(out)]
         assert main(words) == 8
-        told = capsys.readouterr()
-        assert told.err.endswith('psd-deflection replay: 1 of 3 recordings failed; the others are done\n')
-        stated[executor] = (told.out, out.read_bytes())
+        reported = capsys.readouterr()
+        assert reported.err.endswith('psd-deflection replay: 1 of 3 recordings failed; the others are done\n')
+        stated[executor] = (reported.out, out.read_bytes())
     assert stated['processes:1'] == stated['serial']
     assert stated[scheduler] == stated['serial']
     rows = [json.loads(line) for line in stated['serial'][0].splitlines()]
@@ -87,7 +87,7 @@ def test_the_estimates_of_all_are_one_table(archive: Path, capsys: pytest.Captur
     assert main(['replay', 'archive/*', '--out', 'all.parquet']) == 4
 
 
-def test_what_differs_is_told_of_each(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_differs_is_reported_of_each(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (archive / 'rig.yaml').write_text('/**:\n  ros__parameters:\n    amplifier: {sensitivity: 0.0006}\n')
     words = ['replay', 'archive/one.mcap', 'archive/two.mcap', '--compare', '--params-file', 'rig.yaml']
     assert main(words) == 1
@@ -101,9 +101,9 @@ def test_info_has_a_row_for_each(archive: Path, capsys: pytest.CaptureFixture[st
     write_bag(archive / 'run', {'sum_min': 1.5})
     (archive / 'list.txt').write_text('archive/one.mcap\narchive/broken.csv\nrun\n')
     assert main(['info', 'list.txt', '--out', 'rows.parquet']) == 8
-    told = capsys.readouterr().out
-    assert 'archive/broken.csv' in told
-    assert 'failed: ' in told
+    reported = capsys.readouterr().out
+    assert 'archive/broken.csv' in reported
+    assert 'failed: ' in reported
     frame = pandas.read_parquet('rows.parquet')
     assert [Path(name).name for name in frame.recording] == ['one.mcap', 'broken.csv', 'run']
     assert frame.lost.fillna(-1).tolist() == [0, -1, 18]

@@ -223,7 +223,7 @@ def test_the_picture_is_named_like_the_recording(
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'status', 'told'),
+    ('arguments', 'status', 'reported'),
     [
         (['no_such'], 4, 'no such recording'),
         ([str(BAGS / 'clean'), '--from', '2', '--to', '1'], 2, '--from 2.0 --to 1.0: must rise'),
@@ -235,9 +235,9 @@ def test_the_picture_is_named_like_the_recording(
     ],
 )
 def test_an_undrawable_recording_gives_one_line(
-    arguments: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], status: int, reported: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['plot', *arguments]) == status
     err = capsys.readouterr().err
-    assert told in err
+    assert reported in err
     assert err.strip().count('\n') == 0

@@ -139,9 +139,9 @@ def test_why_there_is_no_connection(scheme: str, error: OSError, message: str, m
         raise error
 
     monkeypatch.setattr(socket, 'create_connection', connect)
-    with pytest.raises(DeviceError, match=rf'^{scheme}://rig:4000: {message}') as told:
+    with pytest.raises(DeviceError, match=rf'^{scheme}://rig:4000: {message}') as reported:
         open_port(f'{scheme}://rig:4000', BAUD)
-    assert '\n' not in str(told.value)
+    assert '\n' not in str(reported.value)
 
 
 def test_a_real_rejection(listener: socket.socket) -> None:
@@ -273,7 +273,7 @@ def test_the_first_that_speaks_the_protocol_is_the_sender(udp: Datagrammed) -> N
     assert udp.port.describe()['sender'] == shown(device)
 
 
-def test_others_are_counted_and_told_once(udp: Datagrammed) -> None:
+def test_others_are_counted_and_reported_once(udp: Datagrammed) -> None:
     device, stranger = udp.sender(), udp.sender()
     device.send(b'device 1')
     all_of(udp.port, 8)

@@ -306,7 +306,7 @@ def test_electrodes_become_the_readings_of_a_divider(wired: Any) -> None:
     assert hello.info['volts_per_count'] is None
 
 
-def test_electrodes_in_counts_are_scaled_and_their_end_is_told(wired: Any) -> None:
+def test_electrodes_in_counts_are_scaled_and_their_end_is_reported(wired: Any) -> None:
     scale = 10.0 / 2**15
     info = b'"electrodes": true, "volts_per_count": %r' % scale
     _, event = sent(wired, info, b'1,1000,32767,0,100,100,100,300,200,200')

@@ -55,9 +55,9 @@ def test_the_least_that_can_be_hidden_is_named(effect: str, monkeypatch: pytest.
 def test_it_needs_only_what_the_browser_has() -> None:
     done = subprocess.run([sys.executable, '-c', SCRIPT], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    told = [line.split() for line in done.stdout.splitlines()]
-    assert [kind for kind, _ in told] == ['step', 'step', 'step', 'answer', 'step', 'report']
-    assert int(told[-1][1]) > 100_000
+    reported = [line.split() for line in done.stdout.splitlines()]
+    assert [kind for kind, _ in reported] == ['step', 'step', 'step', 'answer', 'step', 'report']
+    assert int(reported[-1][1]) > 100_000
 
 
 def test_every_choice_is_tried() -> None:

@@ -163,7 +163,7 @@ def test_by_one_detector_a_zero_counts_along_its_axis_however_the_tip_is_turned(
     np.testing.assert_allclose(more[:2, :2], own + more[2, 2] * np.outer(g, g), rtol=1e-3, atol=1e-12)
 
 
-def test_what_a_calibration_left_open_is_told_beside_the_noise() -> None:
+def test_what_a_calibration_left_open_is_reported_beside_the_noise() -> None:
     """``systematic`` is what the covariance holds besides noise, of the last estimate."""
     rig = {**calibrated(psd_1__zero_x=3e-6, psd_2__zero_y=2e-6), 'consistency': 'report', 'solvers': ['exact']}
     covariances = []
@@ -172,12 +172,12 @@ def test_what_a_calibration_left_open_is_told_beside_the_noise() -> None:
         (found,) = (r for r in pipeline.process(chunk(at_rest(1))) if isinstance(r, DeflectionEstimate) and r.primary)
         covariances.append(np.array(found.covariance).reshape(3, 3))
         if values is rig:
-            told = pipeline.estimation.systematic
+            reported = pipeline.estimation.systematic
         else:
             assert pipeline.estimation.systematic is None
-    assert told is not None
-    np.testing.assert_allclose(told, covariances[0] - covariances[1], rtol=1e-9, atol=1e-24)
-    assert told[0, 0] > 1e-12
+    assert reported is not None
+    np.testing.assert_allclose(reported, covariances[0] - covariances[1], rtol=1e-9, atol=1e-24)
+    assert reported[0, 0] > 1e-12
 
 
 def test_a_reading_that_contradicts_the_others_widens_the_covariance() -> None:

@@ -162,7 +162,7 @@ def test_a_burst_of_noise_is_not_named_after_what_came_before() -> None:
     assert levels[-1] == pytest.approx(80.0, rel=0.25)
 
 
-def test_other_light_is_told_and_widens_the_covariance() -> None:
+def test_other_light_is_reported_and_widens_the_covariance() -> None:
     counts = moving(1)
     _, clean = findings_of(load_rig(), counts)
     lit = counts.copy()
@@ -184,7 +184,7 @@ def half_lit() -> Counts:
     return counts
 
 
-def test_with_the_splitter_one_laser_lost_is_told_and_not_fatal(half_lit: Counts) -> None:
+def test_with_the_splitter_one_laser_lost_is_reported_and_not_fatal(half_lit: Counts) -> None:
     spot, estimate = findings_of(load_rig(overrides={'splitter': True}), half_lit)
     assert spot.status is BlockStatus.OK
     assert spot.findings == ('one of the two lasers is out: half the light on both detectors',)

@@ -28,13 +28,13 @@ def in_chunks(rig: Rig, samples: RawChunk, blocks: int) -> Iterator[str]:
     for rows in np.split(np.arange(len(samples.seq)), cuts):
         chunk = RawChunk(samples.seq[rows], samples.t_ns[rows], samples.readings[rows], samples.flags[rows])
         for record in pipeline.process(chunk):
-            yield told(record)
+            yield reported(record)
             if isinstance(record, SampleBlock) and record.index % 37 == 5:
                 yield repr(pipeline.memory(rig))
-    yield from map(told, pipeline.flush())
+    yield from map(reported, pipeline.flush())
 
 
-def told(record: Record) -> str:
+def reported(record: Record) -> str:
     names = [f.name for f in fields(record)] if is_dataclass(record) else record._fields
     return repr([type(record), *map(bits, (getattr(record, name) for name in names))])
 

@@ -337,9 +337,9 @@ def test_a_known_load_is_applied_again_at_its_nanosecond() -> None:
         run(pipeline.process, chunk_of(counts[:200]))
         if pipeline is live:
             pipeline.load(AppliedLoad(0, 0.0, 0.0, 0.0))
-            told = pipeline.load(AppliedLoad(200_123_456, 3.0, -2.0, 1.0))
-            assert told is not None
-            assert told.values == ((KNOWN_LOAD, (0.0, 200_123_456.0, 3.0, -2.0, 1.0)),)
+            reported = pipeline.load(AppliedLoad(200_123_456, 3.0, -2.0, 1.0))
+            assert reported is not None
+            assert reported.values == ((KNOWN_LOAD, (0.0, 200_123_456.0, 3.0, -2.0, 1.0)),)
         else:
             pipeline.apply(ParameterChange(0, 0, ((KNOWN_LOAD, (0.0,) * 5),)))
             ns = 200_123_456.0 if pipeline is again else 205_000_000.0
@@ -421,7 +421,7 @@ def test_the_filter_begins_anew_with_a_zero_and_with_nothing_else() -> None:
     assert pipeline.motion_filter is not first
 
 
-def test_what_is_told_of_a_block(rig: Rig) -> None:
+def test_what_is_reported_of_a_block(rig: Rig) -> None:
     """Means and covariance of the samples that came, by hand; the time is that of the middle of the block."""
     volts = np.random.default_rng(1).normal(0.0, 2e-3, (20, 6))
     volts[:, [2, 5]] += (4.0, 5.0)
@@ -446,16 +446,16 @@ def test_with_decimation_each_block_has_its_estimate_and_one_of_so_many_the_rest
     names += ['/link_tip/exact/deflection', '/link_tip/wls/deflection', '/link_tip/iterative/deflection']
     published: dict[int, Counter[str]] = {}
     poses: dict[int, list[tuple[float, ...]]] = {}
-    for told in (1, every):
-        pipeline = Pipeline(load_rig(overrides={'block_size': size, 'decimation': told}))
+    for reported in (1, every):
+        pipeline = Pipeline(load_rig(overrides={'block_size': size, 'decimation': reported}))
         records = list(pipeline.process(chunk_of(counts)))
-        published[told] = Counter(m.topic for record in records for m in to_messages(record))
+        published[reported] = Counter(m.topic for record in records for m in to_messages(record))
         primary = [r for r in records if isinstance(r, DeflectionEstimate) and r.primary]
-        poses[told] = [(*r.pose, *r.covariance) for r in primary]
+        poses[reported] = [(*r.pose, *r.covariance) for r in primary]
         # What runs beside the topics knows of each block.
         assert [r.index for r in records if isinstance(r, SpotMeans)] == list(range(240))
         due = [r.index for r in records if isinstance(r, SpotMeans) and r.published]
-        assert due == list(range(0, 240, told))
+        assert due == list(range(0, 240, reported))
         assert {r.block for r in records if isinstance(r, DeflectionEstimate) and not r.primary} == set(due)
     assert published[1] == dict.fromkeys(names, 240)
     assert published[every] == dict.fromkeys(names[:3], 240) | dict.fromkeys(names[3:], 240 // every)

@@ -60,8 +60,8 @@ def test_every_value_belongs_to_one_part_and_comes_back() -> None:
     again = other.memory(rig)
     # Of a pipeline that has not seen a block it tells no noise; what it took is the same.
     assert again is not None
-    told = dict(memory.values)
-    assert {name: told[name] for name, _ in again.values} == dict(again.values)
+    reported = dict(memory.values)
+    assert {name: reported[name] for name, _ in again.values} == dict(again.values)
 
 
 @pytest.mark.parametrize(
@@ -171,7 +171,7 @@ CASES = {
 }
 
 
-def told(records: Iterable[Record]) -> list[str]:
+def reported(records: Iterable[Record]) -> list[str]:
     return [repr(r) for r in records if isinstance(r, DeflectionEstimate | TipLoad | SpotMeans)]
 
 
@@ -191,7 +191,7 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(label: str) -> None:
         replay.apply(memory)
         without.apply(streams.without(memory, case.state) if start > 1 else ParameterChange(0, 0, ()))
         expected, again, other = (
-            told(p.process(streams.chunk(volts[20 * start :], 20 * start))) for p in (live, replay, without)
+            reported(p.process(streams.chunk(volts[20 * start :], 20 * start))) for p in (live, replay, without)
         )
         assert replay.misfits == []
         assert again == expected, start

@@ -119,7 +119,7 @@ def test_beams_that_wander_are_an_alarm_unless_the_rig_says_so() -> None:
     assert alarmed(fed)
 
 
-def test_a_bump_is_told_with_its_time_channel_and_size() -> None:
+def test_a_bump_is_reported_with_its_time_channel_and_size() -> None:
     fed = Fed()
     fed.load(0.0, 0.0)
     fed.run(10.0, REST)
@@ -139,7 +139,7 @@ def test_a_bump_is_told_with_its_time_channel_and_size() -> None:
     assert 'x1 is +5' in alarm.words.replace('+4.9', '+5')
 
 
-def test_a_bump_the_other_way_is_told_with_its_time_too() -> None:
+def test_a_bump_the_other_way_is_reported_with_its_time_too() -> None:
     fed = Fed()
     fed.load(0.0, 0.0)
     fed.run(10.0, REST)

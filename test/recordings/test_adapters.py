@@ -204,9 +204,9 @@ def test_each_raw_sample_as_plain_numbers() -> None:
     assert vector3_stamped.MESSAGE.type_hash == STORE.hash_rihs01(vector3_stamped.MESSAGE.name)
     encode = cdr.encoder_of(vector3_stamped.MESSAGE)
     for psd in (1, 2):
-        told = list(vector3_stamped.from_block(given_block, psd, 'left_'))
-        assert [t_ns for t_ns, _ in told] == given_block.t_ns.tolist()
-        for (t_ns, fields), volts in zip(told, given_block.volts, strict=True):
+        reported = list(vector3_stamped.from_block(given_block, psd, 'left_'))
+        assert [t_ns for t_ns, _ in reported] == given_block.t_ns.tolist()
+        for (t_ns, fields), volts in zip(reported, given_block.volts, strict=True):
             m = STORE.deserialize_cdr(encode(fields), vector3_stamped.MESSAGE.name)
             assert m.header.stamp.sec * 10**9 + m.header.stamp.nanosec == t_ns
             assert m.header.frame_id == f'left_psd_{psd}'
@@ -596,7 +596,7 @@ def test_the_longest_text_is_read_and_a_longer_one_is_not() -> None:
         string.to_rig({'data': text + ' '})
 
 
-def test_what_the_pipeline_remembers_is_told_or_not() -> None:
+def test_what_the_pipeline_remembers_is_reported_or_not() -> None:
     for memory in (None, {}, {'state.noise': [1.0, 2.5]}):
         (m,) = to_messages(RigState(5, 7, {}, None, {}, '1', memory=memory))
         assert ('memory' in m.fields['data']) == (memory is not None)

@@ -26,7 +26,7 @@ CELLS = st.sampled_from(['1.5', '-2e-3', '', 'nan', ' 7', 'ä', '1_0', '+.5'])
 ODD = st.sampled_from(['', '1.0', '1.0,2,3,4', '#', ' '])
 
 
-def told(path: Path, lines: list[str], ending: str, last: str) -> tuple[list[tuple[int, int, list[str]]], str]:
+def reported(path: Path, lines: list[str], ending: str, last: str) -> tuple[list[tuple[int, int, list[str]]], str]:
     """(line, t_ns, cells) of each row before the error, and the error without its file."""
     path.write_bytes((ending.join(lines) + last).encode())
     table = SampleRows(path)
@@ -67,8 +67,8 @@ def test_lines_in_pieces_and_lines_in_quotes_give_the_same(
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(csv_rows, '_PIECE', piece)
-        at_once = told(folder / 'a.csv', lines(''), ending, last)
-    one_by_one = told(folder / 'a.csv', lines('"'), ending, last)
+        at_once = reported(folder / 'a.csv', lines(''), ending, last)
+    one_by_one = reported(folder / 'a.csv', lines('"'), ending, last)
     assert at_once == one_by_one
 
 

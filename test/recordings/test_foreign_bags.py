@@ -55,7 +55,7 @@ def test_a_file_that_metadata_do_not_list_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize('leap_s', [-3600.0, 12.0, 1.7e9])
-def test_a_leap_of_log_times_is_told_once(tmp_path: Path, leap_s: float) -> None:
+def test_a_leap_of_log_times_is_reported_once(tmp_path: Path, leap_s: float) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         for record in RECORDS:
             leapt = int(leap_s * 1e9) if record.index >= 20 else 0

@@ -78,4 +78,4 @@ def test_an_answer_names_where_its_rig_is_from(tmp_path: Path, recording: str, r
         rows = [f'{i * 1e-3:.3f},0,0,5,0,0,5' for i in range(40)]
         path.write_text('\n'.join(['t,x1,y1,sum1,x2,y2,sum2', *rows]))
     given = {None: None, 'file': ROOT / 'config' / 'thesis_rig.yaml', 'object': psd_deflection.load_rig()}[rig]
-    assert opened(open_recording(path), given, tell=lambda _: None).sources['rig'] == words
+    assert opened(open_recording(path), given, notify=lambda _: None).sources['rig'] == words

@@ -153,7 +153,7 @@ def test_a_part_is_written_and_studied(tmp_path: Path, capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize(
-    ('words', 'status', 'told'),
+    ('words', 'status', 'reported'),
     [
         (['--from', 'noon'], 2, '--from noon: must be s from the first sample, a time such'),
         (['--to', '1e9'], 2, '--to 1e9: must be at most'),
@@ -162,10 +162,10 @@ def test_a_part_is_written_and_studied(tmp_path: Path, capsys: pytest.CaptureFix
     ],
 )
 def test_a_wrong_bound_is_rejected(
-    words: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]
+    words: list[str], status: int, reported: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['info', str(BAGS / 'clean'), *words]) == status
-    assert told in capsys.readouterr().err
+    assert reported in capsys.readouterr().err
 
 
 def actions_of(name: str) -> list[argparse.Action]:
@@ -286,7 +286,7 @@ def test_several_recordings_are_replayed_in_the_same_part(capsys: pytest.Capture
     assert [json.loads(line)['samples'] for line in capsys.readouterr().out.splitlines()] == [1000, 973]
 
 
-def test_what_comes_before_the_memory_of_a_run_is_told_cannot_be_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_comes_before_the_memory_of_a_run_is_reported_cannot_be_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     """A recorder that joins late hears of the memory some seconds later."""
     opened = psd_deflection.open(BAGS / 'clean')
     start = int(next(opened.blocks()).t_ns[0])

@@ -109,7 +109,7 @@ def test_rig_zero_and_hello_are_messages_too(run: Path, tmp_path: Path, capsys: 
     assert 'nominal' not in answer.err
 
 
-def test_every_file_of_a_bag_tells_the_rig(run: Path, tmp_path: Path) -> None:
+def test_every_file_of_a_bag_reports_the_rig(run: Path, tmp_path: Path) -> None:
     recording = open_recording(run)
     folder = tmp_path / 'split'
     with BagWriter(folder, rig_values=dict(recording.parameters), device_hello=recording.hello, max_s=1.0) as bag:
@@ -129,7 +129,7 @@ def test_a_late_subscriber_of_a_played_bag_gets_the_rig(run: Path) -> None:
     assert profile.durability.name == 'TRANSIENT_LOCAL'
 
 
-def test_another_rig_in_the_same_bag_is_told(tmp_path: Path) -> None:
+def test_another_rig_in_the_same_bag_is_reported(tmp_path: Path) -> None:
     bags = []
     for length in (0.5, 0.6):
         folder = tmp_path / f'{length}'

@@ -119,5 +119,5 @@ def test_values_are_written_where_they_are() -> None:
         with_values(out, {'psd_1.height': 0.25}, 'Calibrated by them', Path('rig.yaml')).count('# Calibrated by') == 1
     )
     # The name of a recording is a stranger's: a line end in it begins no line.
-    told = with_values(text, {}, 'Calibrated by x from a\nlink.length: 3', Path('rig.yaml'))
-    assert flat_parameters(told, Path('rig.yaml')) == flat_parameters(text, Path('rig.yaml'))
+    reported = with_values(text, {}, 'Calibrated by x from a\nlink.length: 3', Path('rig.yaml'))
+    assert flat_parameters(reported, Path('rig.yaml')) == flat_parameters(text, Path('rig.yaml'))

@@ -45,15 +45,17 @@ def test_images_become_references_and_a_rejected_one_its_reason(domain: int, pee
         moved = message(photograph(scene, [Pose(1e-3, -2e-3, 0.05)], rng), 2)
         dark = message(np.full((480, 640), 20, np.uint8), 3)
 
-        def told(image: Image, condition: Any) -> Any:
+        def reported(image: Image, condition: Any) -> Any:
             def asked() -> bool:
                 publisher.publish(image)
                 return bool(condition())
 
             return asked
 
-        peer.until(told(still, lambda: poses and certain), 'the rest')
-        peer.until(told(moved, lambda: poses[-1].header.stamp.sec == 2 and certain[-1].header.stamp.sec == 2), 'a pose')
+        peer.until(reported(still, lambda: poses and certain), 'the rest')
+        peer.until(
+            reported(moved, lambda: poses[-1].header.stamp.sec == 2 and certain[-1].header.stamp.sec == 2), 'a pose'
+        )
         at = poses[-1].pose.position
         assert (poses[-1].header.frame_id, poses[-1].header.stamp.nanosec) == ('link_tip_rest', 5_000_000)
         assert [at.x, at.y] == pytest.approx([1e-3, -2e-3], abs=10e-6)
@@ -62,7 +64,7 @@ def test_images_become_references_and_a_rejected_one_its_reason(domain: int, pee
         def rejected() -> bool:
             return any('no target' in s.message for r in reports for s in r.status)
 
-        peer.until(told(dark, rejected), 'the reason')
+        peer.until(reported(dark, rejected), 'the reason')
     finally:
         node.end(signal.SIGINT)
 

@@ -107,7 +107,7 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
         least = 15 if why == 'leap by' else 60
         peer.until(lambda since=since, least=least: longest_rest(plant, since) >= least, 'offsets that are held')
         stated = len(compensator.text)
-        plant.tell = plant.tell_joints = faithful
+        plant.notify = plant.notify_joints = faithful
         peer.until(lambda stated=stated: 'following' in compensator.text[stated:], 'following')
     assert [s.name for s in states[0].status] == ['compensator: offsets']
     # Handed over: it ends at no offset.
@@ -220,7 +220,7 @@ def strange_messages() -> dict[str, tuple[Any, str, str]]:
         'old': JointState(name=['elbow', 'shoulder'], position=[0.0, 0.0]),
     }
     joints['old'].header.stamp.sec = 1
-    told = {
+    reported = {
         'frame': "frame_id 'world': must be end_effector_rest",
         'before 1970': 'is no time',
         'no rotation': 'no unit quaternion',
@@ -232,7 +232,7 @@ def strange_messages() -> dict[str, tuple[Any, str, str]]:
         'old': 's old',
     }
     topics = {'/end_effector/deflection': poses, '/joint_states': joints}
-    return {name: (m, topic, told[name]) for topic, some in topics.items() for name, m in some.items()}
+    return {name: (m, topic, reported[name]) for topic, some in topics.items() for name, m in some.items()}
 
 
 def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program, peer: Any) -> None:
@@ -283,7 +283,7 @@ def test_settings_are_parameters(compensator: Program, peer: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ('words', 'told'),
+    ('words', 'reported'),
     [
         (['-p', 'max_ofset:=0.01'], 'max_ofset = 0.01: no parameter of that name; did you mean max_offset'),
         (['-p', 'max_offset:=-1.0'], 'max_offset = -1.0 rad or m: must be above 0'),
@@ -291,11 +291,11 @@ def test_settings_are_parameters(compensator: Program, peer: Any) -> None:
         (['-p', 'joints:=[a,b]'], 'must be those of the arm, in any order: shoulder, elbow'),
     ],
 )
-def test_a_parameter_that_cannot_be_is_rejected(domain: int, words: list[str], told: str) -> None:
+def test_a_parameter_that_cannot_be_is_rejected(domain: int, words: list[str], reported: str) -> None:
     command = [*PSD_DEFLECTION, *ARGUMENTS, '--ros-args', *words]
     ended = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=WAIT_S, check=False)
     assert ended.returncode == 3
-    assert told in ended.stderr
+    assert reported in ended.stderr
 
 
 def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> None:
@@ -307,12 +307,12 @@ def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> 
     runs.publish(Bool(data=False))
     plant, scale, active = Plant(peer.node), 1.0, True
 
-    def told() -> None:
+    def reported() -> None:
         scaling.publish(Float64(data=scale))
         if active:
             states.publish(Float64())
 
-    peer.node.create_timer(0.05, told)
+    peer.node.create_timer(0.05, reported)
     command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE, '--controller-state', 'std_msgs/msg/Float64']
     node = Program(command, env={'PYTHONWARNINGS': WARNINGS})
     try:

@@ -211,9 +211,9 @@ def photo(sec: int, size: int = 0) -> Image:
 def sum_min_acts(running: Running) -> bool:
     """The rig that the node tells has it."""
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    told = running.peer.collect(String, f'{NAMESPACE}/link_tip/rig', latched)
-    running.peer.until(lambda: bool(told), 'the rig')
-    return '"sum_min": 2.25' in told[-1].data or '"sum_min":2.25' in told[-1].data
+    reported = running.peer.collect(String, f'{NAMESPACE}/link_tip/rig', latched)
+    running.peer.until(lambda: bool(reported), 'the rig')
+    return '"sum_min": 2.25' in reported[-1].data or '"sum_min":2.25' in reported[-1].data
 
 
 def exposure_acts(running: Running) -> bool:
@@ -256,16 +256,16 @@ def age_acts(running: Running) -> bool:
     running.peer.until(lambda: subscribers(f'{NAMESPACE}/joint_states') > 0, 'the subscription')
     for _ in range(50):
         running.send((JointState, 'joint_states', old(3)))
-    told = 0
+    reported = 0
 
     def rejected() -> bool:
-        nonlocal told
+        nonlocal reported
         running.send((JointState, 'joint_states', old(30)))
-        told += 1
+        reported += 1
         return running.rejections() > count
 
     running.peer.until(rejected, 'a refusal')
-    return running.rejections() - count <= told
+    return running.rejections() - count <= reported
 
 
 def frame_of(kind: type, topic: str, frame: str) -> Callable[[Running], bool]:
@@ -534,7 +534,7 @@ def test_simulated_time_acts_or_is_rejected(running: Running) -> None:
     clock = running.peer.node.create_publisher(Clock, '/clock', 5)
     seen, rejected = len(running.reports), running.rejections()
 
-    def told(sec: int) -> None:
+    def reported(sec: int) -> None:
         message = Clock()
         message.clock.sec = sec
         clock.publish(message)
@@ -543,9 +543,9 @@ def test_simulated_time_acts_or_is_rejected(running: Running) -> None:
         return any(report.header.stamp.sec == 1234 for report in running.reports[seen:])
 
     try:
-        running.peer.until_sent(lambda: told(1234), of_that_time, 'diagnostics in simulated time')
+        running.peer.until_sent(lambda: reported(1234), of_that_time, 'diagnostics in simulated time')
         running.peer.until_sent(
-            lambda: told(-5), lambda: running.rejections() > rejected, 'the refusal of a time before 1970'
+            lambda: reported(-5), lambda: running.rejections() > rejected, 'the refusal of a time before 1970'
         )
     finally:
         running.peer.node.destroy_publisher(clock)
@@ -581,7 +581,7 @@ def test_rejections_are_warnings(running: Running) -> None:
     assert levels == {30}
 
 
-def test_second_publisher_is_told(running: Running) -> None:
+def test_second_publisher_is_reported(running: Running) -> None:
     kind, topic = running.profile.published
     name = f'{NAMESPACE}/{topic}'
     rival = running.peer.node.create_publisher(kind, name, 5)

@@ -48,14 +48,14 @@ def test_if_nobody_publishes_it_the_error_says_so(signals: Signals) -> None:
 def test_an_empty_one_is_no_description(signals: Signals, peer: Any) -> None:
     publisher = peer.node.create_publisher(String, '/left/robot_description', LATCHED)
     publisher.publish(String(data=' '))
-    told: list[str] = []
+    reported: list[str] = []
 
     def clock() -> float:
         """Its time is over once the refusal was said."""
-        return 10.0 * sum('refused' in line for line in told)
+        return 10.0 * sum('refused' in line for line in reported)
 
     with pytest.raises(ConfigError, match='it is empty'):
-        robot_description(signals, texts(told.append), wait_s=5.0, clock=clock)
+        robot_description(signals, texts(reported.append), wait_s=5.0, clock=clock)
 
 
 def test_a_signal_ends_the_waiting(signals: Signals) -> None:

@@ -203,7 +203,7 @@ def test_zero_and_record(start: Callable[..., Any], peer: Any, tmp_path: Path, s
     assert len(set(found) & set(received)) >= 50
 
 
-def test_the_rig_is_latched_and_told_again_when_it_changes(
+def test_the_rig_is_latched_and_reported_again_when_it_changes(
     start: Callable[..., Any], peer: Any, simulated_port: str
 ) -> None:
     start('--port', simulated_port, '--ros-args', '-p', 'link.length:=0.6', '-p', 'keep_zero:=false')
@@ -250,13 +250,13 @@ def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     client = peer.node.create_client(SetBool, '/estimator/record')
     peer.until(client.service_is_ready, 'the service')
 
-    def told_of_recording() -> list[str]:
+    def reported_of_recording() -> list[str]:
         return [s.message for array in health for s in array.status if s.name == 'estimator: recording']
 
     # A start that is ended while it hangs, and one that is waited for.
     begun = [client.call_async(SetBool.Request(data=True)) for _ in range(2)]
     waits = 'a recording was asked for; the disk has not answered yet'
-    peer.until(lambda: told_of_recording()[-3:] == [waits] * 3, 'three reports')
+    peer.until(lambda: reported_of_recording()[-3:] == [waits] * 3, 'three reports')
     peer.zero()
     peer.until_of_now(poses, 'estimates')
     assert not any(future.done() for future in begun)
@@ -333,9 +333,9 @@ def test_parameters_have_units_and_ranges_and_are_rejected_by_name(start: Callab
 def each_parameter_says_what_it_takes(peer: Any) -> None:
     names = [p.name for p in PARAMETERS]
     request = DescribeParameters.Request(names=names)
-    told = peer.call(DescribeParameters, '/estimator/describe_parameters', request).descriptors
-    assert [d.name for d in told] == names
-    for declared, d in zip(PARAMETERS, told, strict=True):
+    reported = peer.call(DescribeParameters, '/estimator/describe_parameters', request).descriptors
+    assert [d.name for d in reported] == names
+    for declared, d in zip(PARAMETERS, reported, strict=True):
         assert not d.read_only, d.name
         assert d.description, d.name
         ranged = d.floating_point_range or d.integer_range
@@ -344,7 +344,7 @@ def each_parameter_says_what_it_takes(peer: Any) -> None:
             assert ', '.join(declared.choices) in d.additional_constraints, d.name
         if declared.kind == 'double_array':
             assert 'at most' in d.additional_constraints, d.name
-    constraints = {d.name: d.additional_constraints for d in told}
+    constraints = {d.name: d.additional_constraints for d in reported}
     for word, name in itertools.product(('exact', 'wls', 'base_pair'), ('solver', 'solvers')):
         assert word in constraints[name]
     # A live run does not take the methods as printed as its answer.

@@ -50,15 +50,15 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
         (status,) = [s for s in health[-1].status if s.name == 'estimator: motion'] if health else [None]
         return int({v.key: v.value for v in status.values}[key]) if status is not None else 0
 
-    now, told = len(speeds), 0
+    now, reported = len(speeds), 0
     while counted('base accelerations') < 10 or counted('base accelerations, refused') < 2 or len(speeds) < now + 50:
         base = AccelStamped()
         base.header.stamp = peer.node.get_clock().now().to_msg()
-        base.header.frame_id = 'link_base' if told % 10 else 'tool0'
-        base.accel.angular.x = math.nan if told % 10 == 5 else float(told % 7)
+        base.header.frame_id = 'link_base' if reported % 10 else 'tool0'
+        base.accel.angular.x = math.nan if reported % 10 == 5 else float(reported % 7)
         turning.publish(base)
-        told += 1
-        assert told < 1000
+        reported += 1
+        assert reported < 1000
         peer.until_of_now(speeds, 'velocities of a turning base')
     peer.call(SetBool, '/estimator/record', SetBool.Request(data=False))
     assert {m.header.frame_id for m in (*speeds, *poses)} == {'link_tip_rest'}
@@ -77,7 +77,7 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     assert noted.count(KNOWN_LOAD) == 2
     # Recorded is what the filter was told, and no more.
     bases = [base for _, base in recording.accelerations()]
-    assert 10 <= len(bases) == recording.topics()['/link_base/acceleration'] <= told * 8 // 10
+    assert 10 <= len(bases) == recording.topics()['/link_base/acceleration'] <= reported * 8 // 10
     assert {base.angular[0] for base in bases} <= {0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0}
     assert recording.topics()['/link_tip/velocity'] == recording.topics()['/link_tip/filtered/deflection'] > 60
     assert main(['replay', str(folder), '--compare']) == 0

@@ -163,8 +163,8 @@ def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
     markers = peer.collect(MarkerArray, '/link_tip/markers')
     cycle(peer, 'configure', 'activate')
     peer.until(lambda: len(poses) >= 30 and len(own) >= 30 and len(markers) > 0 and rigs != [], 'estimates of ols')
-    told = json.loads(rigs[-1].data)['parameters']
-    assert [told[n] for n in ('block_size', 'sum_min', 'effects.axis_crosstalk.xy')] == [10, 2.4, 0.02]
+    reported = json.loads(rigs[-1].data)['parameters']
+    assert [reported[n] for n in ('block_size', 'sum_min', 'effects.axis_crosstalk.xy')] == [10, 2.4, 0.02]
     assert value_of(peer, 'solvers')[0] == 'ols'
     # Half a block: the stamps are closer.
     assert min(stamp(b) - stamp(a) for a, b in itertools.pairwise(poses)) < 15_000_000
@@ -181,9 +181,9 @@ def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
     daemon.until('zero of the last run')
     now = len(poses)
     peer.until(lambda: len(poses) >= now + 30 and rigs != [], 'estimates of wls')
-    told = json.loads(rigs[-1].data)['parameters']
-    assert [told[n] for n in ('solver', 'block_size', 'sum_min')] == ['wls', 10, 2.3]
-    assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == taken == [told['psd_1.zero'], told['psd_2.zero']]
+    reported = json.loads(rigs[-1].data)['parameters']
+    assert [reported[n] for n in ('solver', 'block_size', 'sum_min')] == ['wls', 10, 2.3]
+    assert parameters(peer, 'psd_1.zero', 'psd_2.zero') == taken == [reported['psd_1.zero'], reported['psd_2.zero']]
     topics = dict(peer.node.get_topic_names_and_types())
     peer.until(lambda: peer.node.count_publishers('/link_tip/markers') == 0, 'the markers to be gone')
     assert '/link_tip/wls/deflection' in topics

@@ -50,7 +50,7 @@ def point(seconds: float, positions: list[float]) -> JointTrajectoryPoint:
     return JointTrajectoryPoint(time_from_start=at, positions=positions, velocities=[0.0] * len(positions))
 
 
-def told(peer: Any, **positions: float) -> None:
+def reported(peer: Any, **positions: float) -> None:
     """Let joints be told again and again."""
     out = peer.node.create_publisher(JointState, '/joint_states', 5)
     stated = JointState(name=list(positions), position=list(positions.values()))
@@ -70,7 +70,7 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
     # Refused: a joint of which nobody tells anything, too.
     given.publish(message(point(0.0, [0.0]), names=('z',)))
     node.until('trajectory refused: the position of z is not known')
-    told(peer, shoulder=START[0], elbow=START[1])
+    reported(peer, shoulder=START[0], elbow=START[1])
     given.publish(message(point(0.0, [1.0])))
     node.until('trajectory refused: point 0 has 1 positions, must be 2')
     late = message(point(0.0, START.tolist()))
@@ -134,7 +134,7 @@ def test_the_limits_come_from_the_robots_description(domain: int, peer: Any) -> 
         given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
         heard = peer.collect(JointTrajectory, '/shaper/shaped')
         peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
-        told(peer, shoulder=START[0], elbow=START[1])
+        reported(peer, shoulder=START[0], elbow=START[1])
         move_of = {'slow': (2.0 * MOVE_S, END.tolist()), 'far': (MOVE_S, [1e3, 0.0])}
 
         def rejected(why: str, kind: str) -> None:
@@ -173,7 +173,7 @@ def test_settings_are_parameters(node: Program, peer: Any) -> None:
     assert not changed('frequency', 10.0).successful
     given = peer.node.create_publisher(JointTrajectory, '/shaper/trajectory', 5)
     peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
-    told(peer, shoulder=0.0, elbow=0.02)
+    reported(peer, shoulder=0.0, elbow=0.02)
     peer.until(
         lambda: given.publish(message(point(0.0, [0.0, 0.0]))) or 'from where elbow is' in node.text, 'a refusal'
     )

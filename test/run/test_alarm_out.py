@@ -218,10 +218,10 @@ def test_a_replay_hands_on_its_alarms(server: Server, tmp_path: Path, capsys: py
     path, kept = drifting(tmp_path / 'drift.csv'), tmp_path / 'kept'
     argv = ['replay', str(path), '--watch', '--watch-command', python(KEEP, str(kept)), '--watch-webhook', server.url]
     assert main(argv) == 0
-    told = json.loads(kept.read_text())
-    assert told == json.loads(server.got[0])
-    assert told['recording'] == str(path)
-    assert told['text'].partition(': ')[2] in capsys.readouterr().out
+    reported = json.loads(kept.read_text())
+    assert reported == json.loads(server.got[0])
+    assert reported['recording'] == str(path)
+    assert reported['text'].partition(': ')[2] in capsys.readouterr().out
     assert main(['replay', str(path), '--watch-command', 'true']) == 2
     assert main(['replay', str(path), '--watch', '--watch-command', '/nowhere/notify']) == 2
     assert '--watch-command = ' in capsys.readouterr().err

@@ -299,8 +299,8 @@ def test_an_end_that_hangs_holds_up_the_end_of_the_run_for_its_time_alone(
     if asked_for:
         live.session.record(False)
     live.session.close()
-    told = live.heard('it is not waited for, and 0 messages are not written')
-    assert told.startswith(f'{folder}: ')
+    reported = live.heard('it is not waited for, and 0 messages are not written')
+    assert reported.startswith(f'{folder}: ')
     assert not disk.go_on.is_set()
 
 

@@ -248,7 +248,7 @@ def test_a_device_that_sends_from_another_place_introduces_itself(
     assert over_udp.acquisition.counters.lost == 20
 
 
-def test_strangers_are_told_and_nothing_of_theirs_is_taken(sender: Sender, over_udp: Run, sample: Any) -> None:
+def test_strangers_are_reported_and_nothing_of_theirs_is_taken(sender: Sender, over_udp: Run, sample: Any) -> None:
     stranger = Sender(encode(HelloFrame(1, {**HELLO_INFO, 'serial': 'OTHER'})))
     stranger.place = sender.place
     try:

@@ -36,7 +36,7 @@ def test_one_is_due_at_once_and_the_next_at_a_random_time(source: Mock) -> None:
     assert len(set(waits)) > 10
 
 
-def test_an_answer_however_late_tells_when_its_question_was_sent_once(source: Mock) -> None:
+def test_an_answer_however_late_reports_when_its_question_was_sent_once(source: Mock) -> None:
     pinger = Pinger()
     pinger.ask(source, 0.0, 111)
     first = cookie_of(source)

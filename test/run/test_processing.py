@@ -143,20 +143,20 @@ def after(items: ItemQueue, read_and_end_ms: list[tuple[int, int]]) -> tuple[Pro
     return processing, clock
 
 
-def told(processing: Processing) -> tuple[float, float] | None:
+def reported(processing: Processing) -> tuple[float, float] | None:
     latency = processing.latency()
     return (round(latency.median * 1e3), round(latency.worst * 1e3)) if latency is not None else None
 
 
 def test_latency_is_from_the_last_byte_to_the_last_sink_of_the_last_second(items: ItemQueue) -> None:
     processing, clock = after(items, [(100, 400), (600, 900), (1290, 1300), (1330, 1350)])
-    assert told(processing) == (300, 300)
+    assert reported(processing) == (300, 300)
     clock.now = 1450 * MS
-    assert told(processing) == (20, 300)
+    assert reported(processing) == (20, 300)
     clock.now = 2000 * MS
-    assert told(processing) == (20, 20)
+    assert reported(processing) == (20, 20)
     clock.now = 3000 * MS
-    assert told(processing) is None
+    assert reported(processing) is None
 
 
 @pytest.mark.parametrize('blocks', [10, 400])
@@ -166,6 +166,6 @@ def test_a_second_is_a_second_however_many_blocks_it_has(items: ItemQueue, block
     ends = [5000 + every * i for i in range(blocks)]
     slow = blocks // 2 + 1
     processing, clock = after(items, [(end - (90 if i == slow else 3), end) for i, end in enumerate(ends)])
-    assert told(processing) == (3, 90)
+    assert reported(processing) == (3, 90)
     clock.now = (ends[slow] + 1001) * MS
-    assert told(processing) == (3, 3)
+    assert reported(processing) == (3, 3)

@@ -38,25 +38,25 @@ class Running:
         self.heard: list[Heard] = []
         self.pipeline = Pipeline(rig)
         session = SimpleNamespace(pipeline=self.pipeline, rig=rig, acquisition=SimpleNamespace(hello=None))
-        self.told = RigPublisher(self, cast(Any, session))
+        self.reported = RigPublisher(self, cast(Any, session))
         self._session = session
         self._fanout = Fanout()
         self._fanout.wires.append(self)
-        self._fanout.change_sinks.append(self.told)
-        self.told.tell()
+        self._fanout.change_sinks.append(self.reported)
+        self.reported.notify()
         self.records: list[Record] = []
         for block, chunk in enumerate(chunks(rig, first)):
             for record in self.pipeline.process(chunk):
                 self.records.append(record)
                 self._fanout.put(record)
-                self.told.put(record)
+                self.reported.put(record)
             if block in ZEROED:
                 change = self.pipeline.zero()
                 assert change is not None
                 session.rig = self.pipeline.rig
                 self._fanout.put(change)
             if block % 50 == 37:
-                self.told.tell(again=False)
+                self.reported.notify(again=False)
 
     def put(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
         """One message; it arrives after those before."""
@@ -100,25 +100,27 @@ def running(request: pytest.FixtureRequest) -> Running:
     return Running(load_rig(overrides=request.param), 4000)
 
 
-def test_memory_is_told_before_the_first_block_soon_and_then_every_ten_seconds(running: Running) -> None:
-    told = running.memories()
-    assert [text['block'] - 4000 for text in told] == [0, 50, 550, 1050]
-    assert told[0]['memory'] == {}
-    assert all('state.noise' in text['memory'] for text in told[1:])
+def test_memory_is_reported_before_the_first_block_soon_and_then_every_ten_seconds(running: Running) -> None:
+    reported = running.memories()
+    assert [text['block'] - 4000 for text in reported] == [0, 50, 550, 1050]
+    assert reported[0]['memory'] == {}
+    assert all('state.noise' in text['memory'] for text in reported[1:])
     # Bounded: between two segments of the noise it is small.
-    assert max(len(json.dumps(text)) for text in told) < 150_000
+    assert max(len(json.dumps(text)) for text in reported) < 150_000
 
 
-def test_telling_the_memory_changes_no_record(running: Running) -> None:
+def test_reporting_the_memory_changes_no_record(running: Running) -> None:
     silent = Pipeline(running.rig)
     records: list[Record] = []
     for block, chunk in enumerate(chunks(running.rig, 4000)):
         records += silent.process(chunk)
         if block in ZEROED:
             silent.zero()
-    without, told = ([r for r in found if isinstance(r, DeflectionEstimate)] for found in (records, running.records))
+    without, reported = (
+        [r for r in found if isinstance(r, DeflectionEstimate)] for found in (records, running.records)
+    )
     assert len(without) > BLOCKS - 10
-    assert without == told
+    assert without == reported
 
 
 @pytest.mark.parametrize(('seconds', 'start'), [(2.3, 550), (10.99, 550), (11.5, 1050)])

@@ -75,7 +75,7 @@ def test_no_zero_is_taken_of_a_device_that_is_away(running: Running, device: Scr
         running.session.zero()
 
 
-def test_a_zero_that_was_taken_under_a_load_is_told(running: Running) -> None:
+def test_a_zero_that_was_taken_under_a_load_is_reported(running: Running) -> None:
     session = running.session
     session.note_load(0.0, -10.0, 0.0)
     assert session.zero() is not None
@@ -88,10 +88,10 @@ def test_a_zero_that_was_taken_under_a_load_is_told(running: Running) -> None:
     assert session.zero() is not None
     session.note_load(0.0, -30.0, 0.0)
     session.reject_input(LOAD, 'the end')
-    told = []
+    reported = []
     while 'refused: the end' not in (text := running.logged.get(timeout=WAIT_S)):
-        told.append(text)
-    assert not [text for text in told if 'anew' in text]
+        reported.append(text)
+    assert not [text for text in reported if 'anew' in text]
 
 
 def test_metrics_count_what_came_was_lost_and_was_rejected(running: Running) -> None:
@@ -186,7 +186,7 @@ def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
     assert [r for r in seen.records if isinstance(r, AppliedLoad)] == [first, *loads]
 
 
-def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_told_now(
+def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_reported_now(
     running: Running, device: ScriptedDevice, sample: Sample
 ) -> None:
     session = running.session

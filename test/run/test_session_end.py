@@ -51,7 +51,7 @@ class Hanging:
 
 
 @pytest.mark.parametrize(
-    ('part', 'told'),
+    ('part', 'reported'),
     [
         ('acquisition', 'the source hangs; it is not waited for'),
         ('processing', 'the last block is not waited for'),
@@ -59,7 +59,7 @@ class Hanging:
     ],
 )
 def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
-    device: Any, rig: Rig, tmp_path: Path, part: str, told: str
+    device: Any, rig: Rig, tmp_path: Path, part: str, reported: str
 ) -> None:
     logged: list[str] = []
     rig = replace_values(rig, {'bag_dir': str(tmp_path), 'record': True, 'realtime': False, 'keep_zero': False})
@@ -75,7 +75,7 @@ def test_a_part_that_hangs_holds_up_the_end_for_two_seconds_at_most(
         owner._thread = hanging
     session.close()
     assert 0.0 < hanging.waited_s <= ALLOWED_S
-    assert any(told in text for text in logged)
+    assert any(reported in text for text in logged)
     # What was said to hang did not: it ends as it would have.
     thread.join(WAIT_S)
     assert not thread.is_alive()
@@ -106,7 +106,7 @@ def ended_with(session: Session) -> list[BaseException]:
     return [] if session.failed is None else [session.failed]
 
 
-def test_samples_that_found_no_room_are_told_and_counted_everywhere(
+def test_samples_that_found_no_room_are_reported_and_counted_everywhere(
     device: Any, rig: Rig, tmp_path: Path, sample: Callable[..., SampleFrame], capsys: pytest.CaptureFixture[str]
 ) -> None:
     logged: list[str] = []
@@ -178,7 +178,7 @@ def test_a_disk_that_fills_gives_a_true_sentence_and_status(
     values = {'port': rig.acquisition.port, 'bag_dir': str(tmp_path), 'record': True, 'keep_zero': False}
     begin = partial(Session, load_rig(overrides={**values, 'realtime': False}), display.log)
     early = pytest.raises(RecordingError, match=r'ended early: .* the disk has 0 MB left')
-    with early as ended, display.telling_recorded():
+    with early as ended, display.report_recorded():
         run_until_signal(begin, feed)
     assert ended.value.exit_status == 4
     (folder,) = tmp_path.glob('psd_*')

@@ -88,8 +88,8 @@ def test_an_alarm_is_handed_on(tmp_path: Path) -> None:
     chain.feed(10.0)
     chain.feed(10.0, BUMP)
     assert chain.watcher.close(WAIT_S) == ''
-    told = json.loads(kept.read_text())
-    assert (told['channel'], told['device'], told['node']) == ('x1', 'abc', '/arm/psd_estimator')
+    reported = json.loads(kept.read_text())
+    assert (reported['channel'], reported['device'], reported['node']) == ('x1', 'abc', '/arm/psd_estimator')
     values = dict(chain.watcher.entry().values)
     assert (values['alarms handed on'], values['alarms not handed on']) == ('1', '0')
 
@@ -256,9 +256,9 @@ def test_the_oldest_of_what_was_kept_is_deleted_and_nothing_else(tmp_path: Path)
     folder = an_alarm(chain)
     assert [path.exists() for path in older] == [False, False, False, True, True]
     assert all(path.exists() for path in (folder, recorded, noted, elsewhere / 'watch_2021_0.mcap'))
-    told = [line for line in chain.logged if 'deleted' in line]
-    assert len(told) == 3
-    assert told[0].startswith(f'watch: {older[0]}: deleted, the oldest')
+    reported = [line for line in chain.logged if 'deleted' in line]
+    assert len(reported) == 3
+    assert reported[0].startswith(f'watch: {older[0]}: deleted, the oldest')
 
 
 def test_what_was_kept_is_bounded_in_bytes(tmp_path: Path) -> None:

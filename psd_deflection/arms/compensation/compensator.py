@@ -169,7 +169,7 @@ class Compensator:
         """Whether offsets that the controller has are to be taken back as soon as it tells them."""
         return self._owed and not self._speaks and bool(np.any(self.left))
 
-    def told_text(self, now: float) -> str:
+    def controller_text(self, now: float) -> str:
         """What the controller tells that it has, rad or m, in words."""
         if self._has is None or now - self._has_t > FOREIGN_S:
             return 'nothing'
@@ -364,17 +364,17 @@ class Compensator:
 
     def _not_followed(self, now: float) -> str:
         """Why the joints or the controller do not do what was sent; '' if they do, as far as one can tell."""
-        told: list[tuple[FloatArray, FloatArray]] = []
+        reported: list[tuple[FloatArray, FloatArray]] = []
         known = self._has is not None and now - self._has_t <= self.settings.stale
         if not known and (self._sums or self.settings.takeover):
             # It may come back with something else, so it hears nothing until it tells what it has.
             self._fall_silent()
             return self._untold
         if self._has is not None and known:
-            told.append((self._at_has, self._has))
+            reported.append((self._at_has, self._has))
         if self._pose is not None and self._joints is not None:
-            told.append((self._pose + self._at_joints, self._joints))
-        return self._away(now, told) or self._stands_still()
+            reported.append((self._pose + self._at_joints, self._joints))
+        return self._away(now, reported) or self._stands_still()
 
     @property
     def _untold(self) -> str:

@@ -19,7 +19,7 @@ import argparse
 from pathlib import Path
 
 from psd_deflection.cli._options import namespace_option, recording_name, span_options
-from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.recordings.conversion import Beside, convert, convert_computed
 from psd_deflection.recordings.formats.registry import format_of_name
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
         return _to_viewer(args)
     recording = open_recording(args.recording, namespace=args.namespace, span=args.span)
     parameters = recording.parameters if args.params_file is None else load_rig(args.params_file).flat()
-    with told('reading loads, references, temperatures', quiet=args.json):
+    with stage('reading loads, references, temperatures', quiet=args.json):
         beside = Beside.of(recording)
     with progress_of(recording.blocks(), quiet=args.json) as blocks:
         samples = convert(recording, Path(args.out), parameters, beside, blocks)

@@ -26,14 +26,14 @@ from psd_deflection.base.sanitize import sanitize
 from psd_deflection.cli._fleet import (
     ERROR,
     executor_option,
+    notify_each,
     recordings_argument,
     run_each,
     several,
-    tell_each,
     write_rows,
 )
 from psd_deflection.cli._options import namespace_option, parquet_name, span_options
-from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, show
 from psd_deflection.recordings.provenance import NAMES
 from psd_deflection.recordings.read.readers import open_recording
@@ -89,14 +89,14 @@ def run(args: argparse.Namespace) -> int:
         return _many(args, names)
     path = Path(args.recordings[0])
     if is_table(path):
-        told_of = described(path)
+        reported_of = described(path)
         if args.json:
-            print_json({'path': str(path), 'table': told_of}, indent=2)
+            print_json({'path': str(path), 'table': reported_of}, indent=2)
         else:
-            show(f'{path}: a table of readings', *(_row_of(name, text) for name, text in told_of))
+            show(f'{path}: a table of readings', *(_row_of(name, text) for name, text in reported_of))
         return 0
     recording = open_recording(path, namespace=args.namespace, span=args.span)
-    with told('counting messages', quiet=args.json):
+    with stage('counting messages', quiet=args.json):
         topics = recording.topics()
     found = summary(recording, topics, progress_of(recording.blocks(), topics.get(SAMPLES), quiet=args.json))
     if args.json:
@@ -119,7 +119,7 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
         failed = run_each(args, names, partial(summary_of, namespace=args.namespace, span=args.span), found.__setitem__)
         if out is not None:
             write_rows(out, names, {name: _row(one) for name, one in found.items()}, failed)
-    tell_each(args, names, found, failed, HEAD, _line)
+    notify_each(args, names, found, failed, HEAD, _line)
     return 0
 
 
@@ -175,8 +175,10 @@ def _lines_of_origin(found: Mapping[str, Any]) -> list[str]:
         by = f', node {found["node"]}' if found['node'] else ''
         out.append(row('recorded by', f'psd_deflection {found["version"]}{by}'))
     if found['made_with']:
-        told = [f'{name} {sanitize(found["made_with"][name], 120)}' for name in NAMES[1:] if name in found['made_with']]
-        out.append(row('computed by', ', '.join(told)))
+        reported = [
+            f'{name} {sanitize(found["made_with"][name], 120)}' for name in NAMES[1:] if name in found['made_with']
+        ]
+        out.append(row('computed by', ', '.join(reported)))
     if found['device_hello'] is not None:
         hello = {k: ' '.join(map(str, v)) if isinstance(v, list) else v for k, v in found['device_hello'].items()}
         out.append(row('device', ', '.join(f'{k} {v}' for k, v in hello.items())))
@@ -237,6 +239,6 @@ def _lines_of_parameters(found: Mapping[str, Any]) -> list[str]:
     # What the pipeline remembered at the start is for a replay, and for --json.
     for c in found['changes']:
         values = {k: v for k, v in c['values'].items() if not k.startswith('state.')}
-        told = ', '.join(f'{k} = {v}' for k, v in values.items()) or f'{len(c["values"])} values of the state'
-        out.append(f'  from block {c["block"]} on: {told}')
+        reported = ', '.join(f'{k} = {v}' for k, v in values.items()) or f'{len(c["values"])} values of the state'
+        out.append(f'  from block {c["block"]} on: {reported}')
     return out

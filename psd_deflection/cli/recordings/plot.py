@@ -27,7 +27,7 @@ from psd_deflection.base.errors import RecordingError, UsageError
 from psd_deflection.base.sanitize import sanitize
 from psd_deflection.cli._options import PICTURES, namespace_option, need_folder, picture_name, span_options
 from psd_deflection.cli._plot_page import DrawnInputs, plot_page
-from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, save, save_figure, show, warn
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.recordings.formats.registry import endings_of_recordings
@@ -230,7 +230,7 @@ def run(args: argparse.Namespace) -> int:
         part = '' if args.span == WHOLE else ' between --from and --to'
         raise RecordingError(f'{args.recording}: has no samples to draw{part}')
     summary = summarise(drawn, rig)
-    with told('drawing', quiet=args.json):
+    with stage('drawing', quiet=args.json):
         if out.suffix.lower() == '.html':
             density = spectrum.density()
             shape = None if density is None else (spectrum.frequencies, density)

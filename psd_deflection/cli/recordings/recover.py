@@ -17,7 +17,7 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from psd_deflection.cli._progress import told
+from psd_deflection.cli._progress import stage
 from psd_deflection.cli._report import print_json, show, warn
 from psd_deflection.recordings.repair import Recovered, recover
 
@@ -32,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     """Repair and say what was done."""
     found = []
     for path in args.recording:
-        with told(f'reading and repairing {path}', quiet=args.json):
+        with stage(f'reading and repairing {path}', quiet=args.json):
             done = recover(path)
         for warning in (w for file in done.files for w in file.warnings):
             warn(warning)

@@ -38,9 +38,9 @@ from psd_deflection.base.axes import ranges
 from psd_deflection.base.errors import UsageError
 from psd_deflection.base.log import texts
 from psd_deflection.base.tables import Column
-from psd_deflection.cli._fleet import absolute, executor_option, recordings_argument, run_each, several, tell_each
+from psd_deflection.cli._fleet import absolute, executor_option, notify_each, recordings_argument, run_each, several
 from psd_deflection.cli._options import namespace_option, parameter_option, recording_name, reject, span_options
-from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, show, show_text, warn
 from psd_deflection.cli._values import given_as_option
 from psd_deflection.measure.pipeline import Pipeline
@@ -182,7 +182,7 @@ def run(args: argparse.Namespace) -> int:
         return _many(args, names)
     path = args.recordings[0]
     recording, rig = open_for_replay(path, args.params_file, args.namespace)
-    with told('looking for what was recorded', quiet=args.json):
+    with stage('looking for what was recorded', quiet=args.json):
         part = part_of(recording, args.span)
         comparison = ReplayComparison(recording, part) if args.compare else None
     sink: Sink | None = None
@@ -319,7 +319,7 @@ def _many(args: argparse.Namespace, names: list[str]) -> int:
         failed = run_each(args, names, work, take)
         if out is not None:
             out.close(failed)
-    tell_each(args, names, found, failed, HEAD, partial(_line, strict=args.strict))
+    notify_each(args, names, found, failed, HEAD, partial(_line, strict=args.strict))
     differs = args.compare and not all(_agrees(_counts(one), args.strict) for one in found.values())
     return DIFFERS if differs else 0
 

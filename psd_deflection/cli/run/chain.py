@@ -80,13 +80,13 @@ def run(args: argparse.Namespace) -> int:
             raise ConfigError(NO_CHAIN)
         file = read_chain(args.chain, given, args.slopes)
     if args.no_ros:
-        with display.telling_recorded(), _written(args.out) as stream:
+        with display.report_recorded(), _written(args.out) as stream:
             teller = _Teller(args, display, stream)
             return run_until_signal(lambda: ChainSession(file, display.log), teller.watch, teller.listen)
     require_ros(', or run with --no-ros')
     from psd_deflection.ros.chain import run_chain
 
-    with display.telling_recorded():
+    with display.report_recorded():
         teller = _Teller(args, display, None)
         return run_chain(args.ros_arguments, args.chain, given, args.slopes, display.log, teller.watch)
 

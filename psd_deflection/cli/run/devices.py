@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 from psd_deflection.base.errors import DeviceError
-from psd_deflection.cli._progress import told
+from psd_deflection.cli._progress import stage
 from psd_deflection.cli._report import print_json, show, show_text
 from psd_deflection.cli._values import given_as_option
 from psd_deflection.devices.device import Device
@@ -40,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
     devices, rejections = known_devices()
     for rejection in rejections:
         show(f'psd-deflection devices: not asked for: {rejection}', aside=True)
-    with told('asking; a port that stays silent takes some seconds', quiet=args.json), given_as_option():
+    with stage('asking; a port that stays silent takes some seconds', quiet=args.json), given_as_option():
         ports = survey(devices, args.ports)
     if args.json:
         print_json({'ports': [asdict(p) for p in ports], 'suggested': suggestions(devices, ports)}, indent=2)

@@ -61,11 +61,11 @@ def run(args: argparse.Namespace) -> int:
 async def _echo(daemon: Daemon, count: int | None, as_json: bool) -> None:
     from psd_deflection.run.monitor.client import messages
 
-    told = messages(daemon)
+    reported = messages(daemon)
     try:
-        hello = (await anext(told)).get('hello')
+        hello = (await anext(reported)).get('hello')
         left = count
-        async for message in told:
+        async for message in reported:
             for values in message.get('rows', ()):
                 try:
                     row = dict(zip(hello['columns'], values, strict=True))  # type: ignore[index]
@@ -83,7 +83,7 @@ async def _echo(daemon: Daemon, count: int | None, as_json: bool) -> None:
                 if left == 0:
                     return
     finally:
-        await told.aclose()
+        await reported.aclose()
 
 
 def line_of(row: Mapping[str, Any]) -> str:

@@ -73,8 +73,8 @@ def _live_solver(name: str) -> str:
 
 def simulates_at_once(overrides: Mapping[str, object], ros_arguments: Sequence[str] = ()) -> bool:
     """Whether a simulated rig will probably be started; ROS has not read its arguments yet."""
-    told_to_ros = any(a == '--params-file' or a.startswith(('port:=', 'source:=')) for a in ros_arguments)
-    return not told_to_ros and simulates(overrides)
+    reported_to_ros = any(a == '--params-file' or a.startswith(('port:=', 'source:=')) for a in ros_arguments)
+    return not reported_to_ros and simulates(overrides)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f'--source {args.source}: must be one of {", ".join(source_names())}')
     overrides = over_file(args.params_file, given_parameters(args))
     display = Display()
-    with display.telling_recorded(), started_early(simulates_at_once(overrides, args.ros_arguments)):
+    with display.report_recorded(), started_early(simulates_at_once(overrides, args.ros_arguments)):
         return _run(args, overrides, display)
 
 

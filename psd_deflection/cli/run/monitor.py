@@ -115,7 +115,7 @@ def run(args: argparse.Namespace) -> int:
         return _play(args, overrides)
     values = over_file(args.params_file, overrides)
     display = Display()
-    with display.telling_recorded(), started_early(simulates(values)):
+    with display.report_recorded(), started_early(simulates(values)):
         return run_headless(values, display.log, display.watch, start_views)
 
 
@@ -149,7 +149,7 @@ def _play(args: argparse.Namespace, overrides: dict[str, object]) -> int:
     def log(text: str, level: int = INFO, /) -> None:
         display.log(text, level)
         if server is not None:
-            server.tell(text, level)
+            server.notify(text, level)
 
     def find_span() -> tuple[int, int]:
         first = last = None

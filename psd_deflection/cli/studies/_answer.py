@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterable
 from types import SimpleNamespace
 
 from psd_deflection.cli._options import make_writable, namespace_option, span_options
-from psd_deflection.cli._progress import progress_of, told
+from psd_deflection.cli._progress import progress_of, stage
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.records import SampleBlock
 from psd_deflection.studies.study import Opened, StudyResult, opened
@@ -35,7 +35,7 @@ def opened_recording(args: argparse.Namespace) -> Opened:
     """The recording and the rig of ``args``; the folder of --out is made first, before the work."""
     if args.out is not None:
         make_writable(args.out)
-    return opened(args.recording, args.params_file, namespace=args.namespace, span=args.span, tell=warn)
+    return opened(args.recording, args.params_file, namespace=args.namespace, span=args.span, notify=warn)
 
 
 def counted(args: argparse.Namespace) -> Callable[[Iterable[SampleBlock]], Iterable[SampleBlock]]:
@@ -47,7 +47,7 @@ def answer(args: argparse.Namespace, result: StudyResult) -> int:
     """Print the result and write its files."""
     print_answer(args, result)
     if args.out is not None:
-        with told('drawing', quiet=args.json):
+        with stage('drawing', quiet=args.json):
             files = result.files()
         folder = make_writable(args.out)
         save_all(files, folder)

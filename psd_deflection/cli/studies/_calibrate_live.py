@@ -122,7 +122,7 @@ class LiveDisplay:
         elif step.progress is None:
             self._once(step.words, show)
         else:
-            self._tell(step.progress)
+            self._notify(step.progress)
 
     def _once(self, words: str, say: Callable[[str], None]) -> None:
         if words not in self._said:
@@ -130,7 +130,7 @@ class LiveDisplay:
             self.end()
             say(words)
 
-    def _tell(self, progress: CalibrationProgress) -> None:
+    def _notify(self, progress: CalibrationProgress) -> None:
         for parameter in progress.parameters:
             if parameter.determined and parameter.name not in self._said:
                 self._said.add(parameter.name)

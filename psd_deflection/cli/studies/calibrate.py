@@ -53,7 +53,7 @@ from psd_deflection.cli._fleet import (
     recordings_argument,
 )
 from psd_deflection.cli._options import make_writable, namespace_option, reject, span_options
-from psd_deflection.cli._progress import told
+from psd_deflection.cli._progress import stage
 from psd_deflection.cli._report import print_json, save_all, show, warn
 from psd_deflection.cli._values import number
 from psd_deflection.cli.studies._calibrate_live import calibrate_live
@@ -179,7 +179,7 @@ def run(args: argparse.Namespace) -> int:
     if names is not None:
         return _each(args, names, asked)
     rig = asked.rig(args.recordings or args.dark, warn)
-    with told('reading', quiet=args.quiet or args.json):
+    with stage('reading', quiet=args.quiet or args.json):
         runs = asked.runs(args.recordings, rig)
         levels = asked.levels(rig, runs)
     make_writable(args.out)
@@ -295,7 +295,7 @@ def _check(args: argparse.Namespace) -> int:
     rig = load_rig(args.check)
     if not is_calibrated(rig):
         raise ConfigError(f'{args.check}: calibration.names: not there; --check takes the rig.yaml of a calibration')
-    with told('checking', quiet=args.quiet or args.json):
+    with stage('checking', quiet=args.quiet or args.json):
         runs = read_runs(
             args.recordings,
             rig,

@@ -35,7 +35,7 @@ from psd_deflection.cli._options import (
     span_options,
     world_option,
 )
-from psd_deflection.cli._progress import told
+from psd_deflection.cli._progress import stage
 from psd_deflection.cli._report import LONGEST_LINE, show
 from psd_deflection.cli.studies._answer import answer, answer_arguments
 from psd_deflection.recordings.read.readers import open_recording
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
         reject(args, {'port': None, 'source': None, 'baud': None, 'world': []}, 'is for the guide: give no REC')
         recording = open_recording(args.recording, span=args.span)
         rig = load_rig(args.params_file) if args.params_file else rig_at_end(recording)
-        with told('reading', quiet=args.json):
+        with stage('reading', quiet=args.json):
             seen = read_observation(recording, rig)
         volts = Wiring.from_rig(rig).to_device(seen.volts)
         found = check(of_recording(rig, volts, seen.loads, args.recording))

@@ -56,7 +56,7 @@ from psd_deflection.cli._fleet import (
     recordings_argument,
 )
 from psd_deflection.cli._options import make_writable, namespace_option, reject, span_options
-from psd_deflection.cli._progress import told
+from psd_deflection.cli._progress import stage
 from psd_deflection.cli._report import save_all, show, warn
 from psd_deflection.cli._values import given_as_option, seed
 from psd_deflection.cli.studies._answer import print_answer
@@ -154,10 +154,10 @@ def run(args: argparse.Namespace) -> int:
         if args.span != WHOLE:
             raise UsageError('--from, --to: are for recordings of samples, not for readings of a link at rest')
         make_writable(args.out)
-        with told('searching', quiet=args.quiet or args.json):
+        with stage('searching', quiet=args.quiet or args.json):
             in_tables = asked.discovered_in_tables(tables, warn)
         return _answered(args, in_tables, in_tables.files(), [])
-    with told('reading', quiet=args.quiet or args.json):
+    with stage('reading', quiet=args.quiet or args.json):
         observations = asked.read(args.recordings, warn)
     make_writable(args.out)
     with _progress(args) as progress:
@@ -226,7 +226,7 @@ def _searched(
     limits: Limits,
     progress: Callable[[str], None],
 ) -> Discovery | LoopResult:
-    search = partial(asked.discovered, progress=progress, tell=warn)
+    search = partial(asked.discovered, progress=progress, notify=warn)
     if args.make_it:
         record = _next.simulated(args, asked.rig() or observations[0].rig, Path(args.out))
         return run_loop(observations, search, record, limits=limits, most=args.at_most, progress=progress)
@@ -267,7 +267,7 @@ def _hints(args: argparse.Namespace, answer: Discovery | LoopResult) -> list[str
 def answer_of(path: str, asked: DiscoverOptions) -> TaskResult:
     """The task for one of many recordings."""
     warnings: list[str] = []
-    found = asked.discovered(asked.read([path], warnings.append), tell=warnings.append)
+    found = asked.discovered(asked.read([path], warnings.append), notify=warnings.append)
     files = found.files()
     cells: dict[str, object] = {
         'verdict': found.verdict,

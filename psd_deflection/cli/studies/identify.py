@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import argparse
 
-from psd_deflection.cli._progress import told
+from psd_deflection.cli._progress import stage
 from psd_deflection.cli.studies._answer import answer, answer_arguments, counted, opened_recording, recording_arguments
 from psd_deflection.studies.identify.from_recordings import read_identify
 from psd_deflection.studies.identify.identify import identify
@@ -31,6 +31,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Identify."""
     problem = read_identify(opened_recording(args), counted(args))
-    with told('looking for modes', quiet=args.json):
+    with stage('looking for modes', quiet=args.json):
         found = identify(problem)
     return answer(args, found)

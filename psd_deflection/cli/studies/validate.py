@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import argparse
 
-from psd_deflection.cli._progress import told
+from psd_deflection.cli._progress import stage
 from psd_deflection.cli._values import number
 from psd_deflection.cli.studies._answer import answer, answer_arguments, counted, opened_recording, recording_arguments
 from psd_deflection.model.solvers.registry import SOLVERS
@@ -69,6 +69,6 @@ def run(args: argparse.Namespace) -> int:
         solvers=args.solver,
         counted=counted(args),
     )
-    with told('comparing', quiet=args.json):
+    with stage('comparing', quiet=args.json):
         found = validate(problem)
     return answer(args, found)

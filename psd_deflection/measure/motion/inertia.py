@@ -52,9 +52,9 @@ class Forced(NamedTuple):
 class Inertia:
     """Keeps the accelerations that may still act.
 
-    ``told``: time (ns) and static deflection (m, m, rad) of each, in order. ``count``: how many came so far, ``late``:
-    how many of them after samples on which they acted, ``ended``: how many were not 0 and had no other after them in
-    time.
+    ``reported``: time (ns) and static deflection (m, m, rad) of each, in order. ``count``: how many came so far,
+    ``late``: how many of them after samples on which they acted, ``ended``: how many were not 0 and had no other after
+    them in time.
     """
 
     def __init__(self, modes: Sequence[Oscillator], length: float) -> None:
@@ -62,7 +62,7 @@ class Inertia:
         self._modes = modes
         self._length = length
         self._gives = np.array([-1.0 / mode.by.square(mode.w) for mode in modes])
-        self.told: list[tuple[int, tuple[float, ...]]] = []
+        self.reported: list[tuple[int, tuple[float, ...]]] = []
         self.ended = 0
         self.late = 0
         self.count = 0
@@ -70,9 +70,9 @@ class Inertia:
     @property
     def known(self) -> bool:
         """Whether anything was told that may still act."""
-        return bool(self.told)
+        return bool(self.reported)
 
-    def tell(self, new: BaseAcceleration, there_ns: int) -> None:
+    def notify(self, new: BaseAcceleration, there_ns: int) -> None:
         """One more. Of two with the same stamp the later one counts. ``there_ns``: just after the last block.
 
         Raises ValueError if it acts too long before or after that, or is too large.
@@ -92,31 +92,33 @@ class Inertia:
                 f'header.stamp is {away_ns / 1e9:.3f} s after the last sample; one may come {AHEAD_NS / 1e9:g} s '
                 'before it acts'
             )
-        if len(self.told) >= MOST_TOLD:
+        if len(self.reported) >= MOST_TOLD:
             raise ValueError(f'{MOST_TOLD} accelerations wait already for their samples')
         self.count += 1
         self.late += new.t_ns < there_ns
         (bx, by, _), (ax, ay, az) = new.linear, new.angular
         deflection = self._gives * (bx + self._length * ay, by - self._length * ax, az)
-        there = bisect.bisect_left(self.told, new.t_ns, key=lambda one: one[0])
-        same = there < len(self.told) and self.told[there][0] == new.t_ns
-        self.told[there : there + same] = [(new.t_ns, tuple(deflection.tolist()))]
+        there = bisect.bisect_left(self.reported, new.t_ns, key=lambda one: one[0])
+        same = there < len(self.reported) and self.reported[there][0] == new.t_ns
+        self.reported[there : there + same] = [(new.t_ns, tuple(deflection.tolist()))]
 
     def forget_before(self, t_ns: int) -> None:
         """Keep what acts from ``t_ns`` on."""
-        while self.told and (self.told[1][0] if len(self.told) > 1 else self.told[0][0] + HOLD_NS) <= t_ns:
-            until = self.told[0][0] + HOLD_NS
-            self.ended += any(self.told[0][1]) and (len(self.told) == 1 or self.told[1][0] > until)
-            del self.told[0]
+        while (
+            self.reported and (self.reported[1][0] if len(self.reported) > 1 else self.reported[0][0] + HOLD_NS) <= t_ns
+        ):
+            until = self.reported[0][0] + HOLD_NS
+            self.ended += any(self.reported[0][1]) and (len(self.reported) == 1 or self.reported[1][0] > until)
+            del self.reported[0]
 
     def _changes(self) -> Iterator[tuple[int, FloatArray, float]]:
         """Time, static deflection from then on, and the share of its change that is doubted."""
         until: int | None = None
-        for k, (t_ns, deflection) in enumerate(self.told):
+        for k, (t_ns, deflection) in enumerate(self.reported):
             # Nobody knows for how long it acted unsaid.
             yield t_ns, np.array(deflection), SHARE if until is not None and t_ns <= until else 1.0
             until = t_ns + HOLD_NS
-            if k + 1 == len(self.told) or self.told[k + 1][0] > until:
+            if k + 1 == len(self.reported) or self.reported[k + 1][0] > until:
                 yield until, np.zeros(3), 1.0
 
     def unsure(self, t_ns: int) -> FloatArray:
@@ -125,10 +127,10 @@ class Inertia:
         If it changes there evenly, or by a step at any one time, the velocity is off by a tenth of the change times
         that time, root mean square, at three quarters of it; at its end by nothing.
         """
-        there = bisect.bisect_right(self.told, t_ns, key=lambda one: one[0])
+        there = bisect.bisect_right(self.reported, t_ns, key=lambda one: one[0])
         if there < 2:
             return np.zeros(3)
-        (before_ns, before), (now_ns, now) = self.told[there - 2 : there]
+        (before_ns, before), (now_ns, now) = self.reported[there - 2 : there]
         seconds = min(now_ns - before_ns, HOLD_NS) / 1e9
         w = np.array([mode.w for mode in self._modes])
         return np.asarray(CHANGE_SHARE * np.abs(np.subtract(now, before)) * w * seconds)

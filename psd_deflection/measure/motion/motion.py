@@ -413,11 +413,11 @@ class ModalFilter:
         elif self._known:
             out[LOADS] = (*held, *waiting)
         if self.inertia.known:
-            told = [v for t_ns, deflection in self.inertia.told for v in (*split_ns(t_ns), *deflection)]
+            reported = [v for t_ns, deflection in self.inertia.reported for v in (*split_ns(t_ns), *deflection)]
             arrays = [self._late]
             if self._taken is not None:
                 arrays += [self._taken.forced.at[..., :2], self._taken.forced.doubt, self._taken.gain]
-            out[INERTIA] = (float(len(told)), *told, *_flat(arrays))
+            out[INERTIA] = (float(len(reported)), *reported, *_flat(arrays))
         return out
 
     def load_state_dict(self, values: Mapping[str, Value]) -> None:
@@ -453,12 +453,12 @@ class ModalFilter:
 
     def _restore_inertia(self, values: tuple[float, ...]) -> None:
         n = self._size
-        told = int(values[0]) + 1 if 0.0 <= values[0] < len(values) and np.isfinite(values).all() else 0
-        known, taken = values[told:], 6 * n + 3 + 12 * n
-        if told % 5 != 1 or len(known) not in (6, 6 + taken):
+        reported = int(values[0]) + 1 if 0.0 <= values[0] < len(values) and np.isfinite(values).all() else 0
+        known, taken = values[reported:], 6 * n + 3 + 12 * n
+        if reported % 5 != 1 or len(known) not in (6, 6 + taken):
             raise mismatch(INERTIA, values, f'accelerations in blocks of {n} samples')
-        rows = np.reshape(values[1:told], (-1, 5)).tolist()
-        self.inertia.told = [(joined_ns(s, ns), tuple(deflection)) for s, ns, *deflection in rows]
+        rows = np.reshape(values[1:reported], (-1, 5)).tolist()
+        self.inertia.reported = [(joined_ns(s, ns), tuple(deflection)) for s, ns, *deflection in rows]
         # Perhaps some came after the last block.
         self._late_ones = -1
         self._late = np.reshape(known[:6], (3, 2))

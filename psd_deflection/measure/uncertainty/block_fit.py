@@ -113,7 +113,7 @@ class _Vibration(NamedTuple):
 
 
 class _Terms(NamedTuple):
-    """What the samples that are present say of the coefficients, for K orders of which ``told`` can be told.
+    """What the samples that are present say of the coefficients, for K orders of which ``reported`` can be told.
 
     ``q`` (n, K). ``u`` (C, n, K): precision times q. ``information`` (C, K, K): of the coefficients. ``v`` (told, C):
     variances of the first ones; ``sure`` (told, C): how much a block says of them, 1 of a whole one.
@@ -142,16 +142,16 @@ def _terms(
 ) -> _Terms:
     """``usual_v`` (K, C): ``v`` of a whole block, None for one."""
     samples, orders = q.shape
-    told = min(orders, (samples + 1) // 2)
+    reported = min(orders, (samples + 1) // 2)
     u = by.einsum('ast,tk->ask', precision, q)
     information = by.einsum('sj,ask->ajk', q, u)
-    inverted = inverse(information[:, :told, :told])
+    inverted = inverse(information[:, :reported, :reported])
     v = np.diagonal(inverted, axis1=1, axis2=2).T.copy()
     # A block with gaps says less the more noise its coefficients have.
-    sure = np.ones(v.shape) if usual_v is None else np.minimum(usual_v[:told] / v, 1.0) ** 2
-    estimate = by.einsum('ask,akj->asj', u[:, :, :told], inverted)
+    sure = np.ones(v.shape) if usual_v is None else np.minimum(usual_v[:reported] / v, 1.0) ** 2
+    estimate = by.einsum('ask,akj->asj', u[:, :, :reported], inverted)
     # In a whole block odd orders are 0 in the middle and uncorrelated with even ones.
-    used = slice(2, told, 2) if usual_v is None else slice(1, told)
+    used = slice(2, reported, 2) if usual_v is None else slice(1, reported)
     own, mixed = information[:, 0, 0], information[:, 0, used].T
     share = mixed / own
     rest = information[:, used, used].transpose(1, 2, 0) - share[:, None] * mixed
@@ -269,9 +269,9 @@ class BlockFit:
         z = z - offset
         whole = samples == self._size
         terms = self._whole if whole else self._terms_without(slots)
-        orders, told = self._orders, len(terms.v)
+        orders, reported = self._orders, len(terms.v)
         seen = by.einsum('sja,sza->jza', terms.all, z)
-        c = seen[orders : orders + told]
+        c = seen[orders : orders + reported]
         memories, motion = self._motion(c, terms)
         x, missed = _weights(terms, motion, self._middle, by)
         value = by.sum(x * seen[:orders], 0) + offset
@@ -284,13 +284,13 @@ class BlockFit:
             covariance = self._spread(weights)
         misfit = [False] * blocks
         if orders > 1:
-            left = samples - told
+            left = samples - reported
             # In units of the noise: a chi-square of n - K degrees of freedom.
-            squares = by.sum(z * seen[orders + told :], 0) - by.sum(seen[:told] * c, 0)
+            squares = by.sum(z * seen[orders + reported :], 0) - by.sum(seen[:reported] * c, 0)
             over = squares > (left + _MISFIT * by.root(2.0 * left) if left else np.inf)
             if np.count_nonzero(over):
                 misfit = [any(row) for row in over.tolist()]
-                rest = z - by.einsum('sk,kza->sza', terms.q[:, :told], c)
+                rest = z - by.einsum('sk,kza->sza', terms.q[:, :reported], c)
                 missed += np.where(over, _WIDEN * _WIDEN * by.sum(rest * rest, 0) / left, 0.0)
             covariance[:, self._diagonal, self._diagonal] += missed
         for vibration in self._vibrations:
@@ -329,20 +329,20 @@ class BlockFit:
         c = c.swapaxes(0, 1)
         if self._orders == 1:
             return [self._memory] * len(c), c.swapaxes(0, 1)
-        told, usual_v = c.shape[1], self._whole.v
+        reported, usual_v = c.shape[1], self._whole.v
         square = c * c
         excess = square - terms.v
         recent = _recent_after(self._memory.recent, excess, terms.sure)
         late = recent[:, 0] / np.maximum(recent[:, 1], 1e-12)
         # Of the noise and the motion of late.
-        expected = usual_v[:told] + np.maximum(late[1:, :told], 0.0)
-        lasting = _lasting_after(self._memory.lasting, excess, terms.sure, late[1:, :told], expected)
+        expected = usual_v[:reported] + np.maximum(late[1:, :reported], 0.0)
+        lasting = _lasting_after(self._memory.lasting, excess, terms.sure, late[1:, :reported], expected)
         usual = np.maximum(late - _BIAS * usual_v, 1e-9 * usual_v)
         np.maximum(usual, lasting[:, 0] - _LASTING_BIAS * usual_v, out=usual)
         before, tau = usual[:-1], usual[1:].copy()
-        sudden = square > _SUDDEN * (terms.v + before[:, :told])
-        np.maximum(excess, tau[:, :told], out=tau[:, :told], where=sudden)
-        if terms is not self._whole and told > 1:
+        sudden = square > _SUDDEN * (terms.v + before[:, :reported])
+        np.maximum(excess, tau[:, :reported], out=tau[:, :reported], where=sudden)
+        if terms is not self._whole and reported > 1:
             self._believe(c, terms, tau)
         # What does not move with the link has no motion that this block alone tells of: that would be noise, chosen
         # for being large.
@@ -355,12 +355,14 @@ class BlockFit:
 
         Those of a block with gaps depend on each other: each may be within its noise, and all of them not.
         """
-        blocks, told, count = c.shape
-        own, usual = c[:, 1:], tau[:, 1:told]
-        expected = terms.together + usual.swapaxes(1, 2)[..., None] * np.eye(told - 1)
-        inverted = inverse(expected.reshape(-1, told - 1, told - 1)).reshape(blocks, count, told - 1, told - 1)
+        blocks, reported, count = c.shape
+        own, usual = c[:, 1:], tau[:, 1:reported]
+        expected = terms.together + usual.swapaxes(1, 2)[..., None] * np.eye(reported - 1)
+        inverted = inverse(expected.reshape(-1, reported - 1, reported - 1)).reshape(
+            blocks, count, reported - 1, reported - 1
+        )
         squares = self._by.einsum('zja,zajk,zka->za', own, inverted, own)
-        over = squares > told - 1 + _CONTRADICTED * self._by.root(2.0 * (told - 1))
+        over = squares > reported - 1 + _CONTRADICTED * self._by.root(2.0 * (reported - 1))
         np.maximum(usual, own * own + terms.v[1:], out=usual, where=over[:, None])
 
     def _spread(self, weights: FloatArray) -> FloatArray:
@@ -374,14 +376,14 @@ def _recent_after(recent: FloatArray, excess: FloatArray, sure: FloatArray) -> F
 
     ``excess`` (B, told, C): c_k^2 less its noise; ``sure`` (told, C): how much a block says of it.
     """
-    told = len(sure)
+    reported = len(sure)
     out = np.empty((len(excess) + 1, *recent.shape))
     out[0] = recent
     news = np.empty((len(excess), 2, *sure.shape))
     news[:, 0], news[:, 1] = sure * excess, sure
     for before, after, new in zip(out, out[1:], news, strict=False):
         after[:] = before
-        own = after[:, :told]
+        own = after[:, :reported]
         own += _FORGET * (new - own)
     return out
 
@@ -393,12 +395,12 @@ def _lasting_after(
 
     ``late`` (B, told, C): the mean of late; ``expected`` (B, told, C): with the noise.
     """
-    told = len(sure)
+    reported = len(sure)
     out = np.empty((len(excess) + 1, *lasting.shape))
     out[0] = lasting
     for before, after, new, short, limit in zip(out, out[1:], excess, late, expected, strict=False):
         after[:] = before
-        mean, blocks = after[:, :told]
+        mean, blocks = after[:, :reported]
         blocks += sure
         np.minimum(blocks, _LASTING, out=blocks)
         mean += (new - mean) / blocks * sure
@@ -433,7 +435,7 @@ def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, by: Arithmet
 
     ``motion``: tau^2 (K, B, C).
     """
-    told, used = len(terms.v), terms.used
+    reported, used = len(terms.v), terms.used
     priors = 1.0 / motion[used]
     found = _solved(terms.rest, priors, terms.right)
     x, missed = np.zeros(motion.shape), np.zeros(motion.shape[1:])
@@ -445,10 +447,10 @@ def _weights(terms: _Terms, motion: FloatArray, middle: FloatArray, by: Arithmet
     x[0] = first
     if found:
         x[used] = found
-    if told < len(motion):
+    if reported < len(motion):
         # So few samples cannot tell of these.
-        untold = middle[told:, None, None] - by.einsum('akj,jza->kza', terms.information[:, told:], x)
-        missed += by.sum(untold * untold * motion[told:], 0)
+        untold = middle[reported:, None, None] - by.einsum('akj,jza->kza', terms.information[:, reported:], x)
+        missed += by.sum(untold * untold * motion[reported:], 0)
     return x, missed
 
 

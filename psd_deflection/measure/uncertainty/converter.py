@@ -109,12 +109,12 @@ class ConverterSteps:
 
     def _found(self) -> FloatArray:
         fine = self._fine
-        told = (self._divisor > 0.0) & ~fine & (self._divisor <= self._coarsest) & (self._off >= BELIEVED)
-        out = np.where(told, self._divisor, 0.0)
+        reported = (self._divisor > 0.0) & ~fine & (self._divisor <= self._coarsest) & (self._off >= BELIEVED)
+        out = np.where(reported, self._divisor, 0.0)
         silent = (self._off < BELIEVED) & ~fine
         if silent.any():
             # The same converter has the others; if none of them tells, the levels themselves.
-            common = float(out.max()) if told.any() else 0.0 if fine.any() else self._of_levels()
+            common = float(out.max()) if reported.any() else 0.0 if fine.any() else self._of_levels()
             out[silent & (self._first != 0.0)] = common
         return out
 

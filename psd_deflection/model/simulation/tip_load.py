@@ -97,8 +97,8 @@ class TipLoads:
 
     def load_state_dict(self, values: Mapping[str, float | str | tuple[float, ...]]) -> None:
         """Go on from another one's :meth:`state_dict`. Raises ValueError if it had other effects."""
-        told = values.get(TIP_LOADS, ())
-        numbers = told if isinstance(told, tuple) else ()
+        reported = values.get(TIP_LOADS, ())
+        numbers = reported if isinstance(reported, tuple) else ()
         taken: list[list[float]] = []
         at = 2
         while 2 <= at < len(numbers):

@@ -177,7 +177,7 @@ class McapReader:
                     if opcode != Opcode.CHUNK:
                         yield at, RECORD_HEAD.pack(opcode, length) + content
                         continue
-                    with self._damage_told(at):
+                    with self._damage_reported(at):
                         yield at, _unpacked(content, allowance)
         except OSError as error:
             raise self._reject(f'cannot be read ({error.strerror or error})') from None
@@ -199,7 +199,7 @@ class McapReader:
             at += RECORD_HEAD.size + length
 
     @contextlib.contextmanager
-    def _damage_told(self, at: int) -> Iterator[None]:
+    def _damage_reported(self, at: int) -> Iterator[None]:
         try:
             yield
         except DamagedError as error:
@@ -217,7 +217,7 @@ class McapReader:
         wanted = {n: c for n, c in self._channels.items() if topics is None or c.topic in topics}
         only = None if topics is None else wanted
         for at, records in self._parts((Opcode.CHUNK, Opcode.MESSAGE), allowance, only):
-            with self._damage_told(at):
+            with self._damage_reported(at):
                 yield from self._messages_in(records, topics, wanted, allowance)
 
     def _messages_in(
@@ -255,7 +255,7 @@ class McapReader:
         kinds = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.METADATA, Opcode.MESSAGE)
         allowance = Allowance(self._size)
         for at, records in self._parts((*kinds, Opcode.CHUNK), allowance):
-            with self._damage_told(at):
+            with self._damage_reported(at):
                 for opcode, start, end in _records_in(records, allowance):
                     if opcode in kinds:
                         if opcode != Opcode.MESSAGE:

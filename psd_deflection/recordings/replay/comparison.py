@@ -297,9 +297,9 @@ def _check_memory(recording: Recording, part: RecordingWindow) -> None:
     first = next(recording.blocks())
     memory = recording.memory_from(first.index)
     if memory is not None and memory.block > first.index and memory.t_ns >= part.end_ns:
-        told_s = (memory.t_ns - int(first.t_ns[0])) / 1e9
+        reported_s = (memory.t_ns - int(first.t_ns[0])) / 1e9
         raise RecordingError(
-            f'{recording.path}: starts in mid-run and says {told_s:.1f} s after its first sample what the pipeline '
+            f'{recording.path}: starts in mid-run and says {reported_s:.1f} s after its first sample what the pipeline '
             'remembers; nothing before that can be compared: give a later --to'
         )
 

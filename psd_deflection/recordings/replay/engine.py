@@ -61,10 +61,10 @@ def zero_variances_at_end(recording: Recording, rig: Rig) -> tuple[float, ...]:
     """Variances (2P,), m^2, of the zero that was taken last in the recording; () if none was. ``rig``: its rig."""
     variances: tuple[float, ...] = ()
     for change in recording.changes:
-        told = dict(change.values)
-        if any(name in ZEROS for name in told):
+        reported = dict(change.values)
+        if any(name in ZEROS for name in reported):
             variances = zero_variances(rig)
-        row = told.get(ZERO_VARIANCES)
+        row = reported.get(ZERO_VARIANCES)
         if isinstance(row, tuple) and len(row) == 2 * len(rig.psds):
             variances = row
     return variances
@@ -238,8 +238,8 @@ def _with_memory(recording: Recording, first: int, changes: list[ParameterChange
     if memory is not None:
         before = [change for change in changes if change.block < memory.block]
         return [*before, memory, *changes[len(before) :]]
-    told = () if recording.own else (*recording.memories[:1], *recording.changes[:1])
-    if any(0 < one.block < first for one in told):
+    reported = () if recording.own else (*recording.memories[:1], *recording.changes[:1])
+    if any(0 < one.block < first for one in reported):
         recording.warn(
             f'{recording.path}: starts in mid-run, and ends before the pipeline said what it remembers (it does every '
             '10 s): the estimates may differ from the recorded ones'

@@ -194,7 +194,7 @@ class McapFile(_RecordSink):
     def _state(self, t_ns: int, block: int, changed: Mapping[str, object]) -> RigState:
         return RigState(t_ns, block, dict(self._present), self._hello, changed, __version__, provenance())
 
-    def _tell_rig(self, t_ns: int) -> None:
+    def _notify_rig(self, t_ns: int) -> None:
         """The rig as messages: what rosbag2 makes of a bag keeps them, and no metadata."""
         untold, self._untold = self._untold, []
         for state in untold:
@@ -207,7 +207,7 @@ class McapFile(_RecordSink):
         Raises KeyError for a type that no adapter of :mod:`msg_adapters` declares.
         """
         if self._untold:
-            self._tell_rig(t_ns)
+            self._notify_rig(t_ns)
         self._write(topic, type_name, message, t_ns)
 
     def _write(self, topic: str, type_name: str, message: bytes, t_ns: int) -> None:
@@ -268,7 +268,7 @@ class McapFile(_RecordSink):
         if self._stream is None:
             return
         if self._untold and self.topics:
-            self._tell_rig(self.end_ns)
+            self._notify_rig(self.end_ns)
         with self._guard():
             information = bag_information([self.count()], list(self.topics.values()), self.custom)
             self._writer.add_metadata('rosbag2', {'serialized_metadata': to_yaml(information)})

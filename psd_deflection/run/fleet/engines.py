@@ -129,10 +129,10 @@ def _cores() -> int:
 
 
 @contextlib.contextmanager
-def open_engine(word: str, tell: Callable[[str], None] = lambda _: None) -> Iterator[Engine]:
+def open_engine(word: str, notify: Callable[[str], None] = lambda _: None) -> Iterator[Engine]:
     """The engine of that name. At the end its processes have ended; a cluster of others is left as it is.
 
-    ``tell`` is told if a cluster has no worker yet. Raises UsageError for another word, DaemonError if no scheduler
+    ``notify`` is told if a cluster has no worker yet. Raises UsageError for another word, DaemonError if no scheduler
     answers, ConfigError if Dask is not installed.
     """
     check_engine(word)
@@ -149,7 +149,7 @@ def open_engine(word: str, tell: Callable[[str], None] = lambda _: None) -> Iter
     else:
         with _connected(word) as client:
             if not client.scheduler_info()['workers']:
-                tell(f'{word} has no worker yet: the work begins with the first one')
+                notify(f'{word} has no worker yet: the work begins with the first one')
             yield _Dask(client.get_executor())
 
 

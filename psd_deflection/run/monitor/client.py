@@ -133,8 +133,8 @@ def recording_of(daemon: Daemon) -> str | None:
 
 
 async def _recording_of(daemon: Daemon) -> str | None:
-    async with contextlib.aclosing(messages(daemon)) as told:
-        hello = (await anext(told)).get('hello')
+    async with contextlib.aclosing(messages(daemon)) as reported:
+        hello = (await anext(reported)).get('hello')
     if not isinstance(hello, dict):
         raise DaemonError(f'{daemon.url}: no page of this program is there')
     folder = hello.get('recording')

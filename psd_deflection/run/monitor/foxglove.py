@@ -50,7 +50,7 @@ class _Viewer:
     """What one viewer looks at, and what waits for it; messages may come from any thread."""
 
     def __init__(self) -> None:
-        self.told = 0
+        self.reported = 0
         self.subscriptions: dict[int, int] = {}
         self._budget = ByteBudget(BACKLOG_BYTES)
         self._waiting: deque[bytes] = deque()
@@ -149,9 +149,9 @@ class FoxgloveServer(GatedServer):
                 {'op': 'serverInfo', 'name': 'psd_deflection', 'capabilities': [], 'sessionId': self._session}
             )
             while True:
-                if viewer.told < len(self._channels):
-                    new = self._channels[viewer.told :]
-                    viewer.told += len(new)
+                if viewer.reported < len(self._channels):
+                    new = self._channels[viewer.reported :]
+                    viewer.reported += len(new)
                     await socket.send_json({'op': 'advertise', 'channels': new})
                 while (message := viewer.take()) is not None:
                     await socket.send_bytes(message)
@@ -197,7 +197,7 @@ class FeedBeside(Feed):
     def __init__(self, server: FoxgloveServer, rig: Rig) -> None:
         super().__init__()
         self._present = dict(rig.flat())
-        self._told = False
+        self._reported = False
         self._fanout = Fanout(rig.monitor.frame_prefix)
         self._fanout.wires.append(server)
 
@@ -207,10 +207,10 @@ class FeedBeside(Feed):
         self._fanout.put(record)
         if isinstance(record, ParameterChange):
             self._report(record.t_ns, record.block, dict(record.values))
-        elif isinstance(record, SpotMeans) and not self._told:
+        elif isinstance(record, SpotMeans) and not self._reported:
             self._report(record.t_ns, record.index, {})
 
     def _report(self, t_ns: int, block: int, changed: dict[str, object]) -> None:
-        self._told = True
+        self._reported = True
         self._present |= changed
         self._fanout.put(RigState(t_ns, block, self._present, None, changed, __version__, provenance()))

@@ -116,7 +116,7 @@ class HistoryKeeper:
         self._shape = (history.kind, history.names, history.kept_length)
         self._todo: queue.Queue[Kept | None] = queue.Queue(maxsize=1)
         self._loaded: Kept | None = None
-        self._restored = self._told = False
+        self._restored = self._reported = False
         self._failed_from: int | None = None
         self._idle = threading.Event()
         self._thread = threading.Thread(target=self._run, name='history', daemon=True)
@@ -174,7 +174,7 @@ class HistoryKeeper:
                     break
                 try:
                     file.save(kept)
-                    self._told = False
+                    self._reported = False
                 except (sqlite3.Error, OSError) as error:
                     self._failed_from = kept.from_key
                     self._fail(error)
@@ -200,8 +200,8 @@ class HistoryKeeper:
             raise
 
     def _fail(self, error: Exception) -> None:
-        if not self._told:
-            self._told = True
+        if not self._reported:
+            self._reported = True
             self._log(f'{self._path}: the history of the page cannot be kept ({error})', WARNING)
 
 

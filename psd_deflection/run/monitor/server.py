@@ -144,7 +144,7 @@ class MonitorServer(GatedServer):
             self._keeper.end()
             self._keeper = None
 
-    def tell(self, text: str, level: int = INFO, /) -> None:
+    def notify(self, text: str, level: int = INFO, /) -> None:
         """Show a message on the page; from any thread."""
         self._message_count += 1
         self._messages.append((self._message_count, time.time(), text))
@@ -314,9 +314,9 @@ class MonitorServer(GatedServer):
                 references = self._reference_count
                 parts.append('"references":[' + ','.join([self._references[i] for i in range(-new, 0)]) + ']')
             if self._message_count > messages:
-                told = [m for m in tuple(self._messages) if m[0] > messages]
+                reported = [m for m in tuple(self._messages) if m[0] > messages]
                 messages = self._message_count
-                parts.append('"messages":' + json.dumps([m[1:] for m in told]))
+                parts.append('"messages":' + json.dumps([m[1:] for m in reported]))
             if self._health[0] > health:
                 health, text = self._health
                 parts.append('"health":' + text)

@@ -63,7 +63,7 @@ def _start_page(session: Session, log: LogCallback) -> MonitorServer:
     # After publishing and recording.
     session.processing.sinks.append(feed)
     session.input_sinks.append(feed)
-    session.listeners.append(server.tell)
+    session.listeners.append(server.notify)
     return server
 
 
@@ -77,10 +77,10 @@ def _start_foxglove(session: Session, log: LogCallback, views: Views, reports: b
     log(server.words())
     fanout = Fanout(session.rig.monitor.frame_prefix)
     fanout.wires.append(server)
-    rig_told = RigPublisher(server, session)
-    rig_told.tell()
+    rig_reported = RigPublisher(server, session)
+    rig_reported.notify()
     session.fanout.wires.append(server)
-    session.fanout.change_sinks.append(rig_told)
+    session.fanout.change_sinks.append(rig_reported)
     session.input_sinks.append(fanout)
     if reports:
         views.parts.append(Reports(session, fanout))

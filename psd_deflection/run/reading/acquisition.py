@@ -124,7 +124,7 @@ class Acquisition:
         self._was_away = False
 
         # Bad frames of each reason when a silence was last told.
-        self._bad_told: dict[str, int] = {}
+        self._bad_reported: dict[str, int] = {}
 
         # The connection: whether there is one, and why the last try to have it back failed.
         self._connected = False
@@ -279,8 +279,8 @@ class Acquisition:
         self.counters.silences += 1
         what = 'no sample'
         if size:
-            new = {reason: n - self._bad_told.get(reason, 0) for reason, n in self.counters.bad_frames.items()}
-            self._bad_told = dict(self.counters.bad_frames)
+            new = {reason: n - self._bad_reported.get(reason, 0) for reason, n in self.counters.bad_frames.items()}
+            self._bad_reported = dict(self.counters.bad_frames)
             most = max(new, key=lambda reason: new[reason], default='')
             why = f'{new[most]} bad frames: {most}' if most and new[most] else 'is the baud rate right?'
             what = f'bytes but no sample ({why})'

@@ -27,7 +27,7 @@ from psd_deflection.studies.calibrate.observation import CalibrationRun, usable_
 from psd_deflection.studies.calibrate.result import Calibrated
 from psd_deflection.studies.loads.acted import loads_that_acted
 from psd_deflection.studies.loads.noted_times import correct_loads
-from psd_deflection.studies.study import Tell, opened
+from psd_deflection.studies.study import Notify, opened
 
 
 def read_run(
@@ -106,8 +106,8 @@ def read_runs(
     ]
 
 
-def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
-    """``run`` with the loads that hung, at the times at which they acted, without what swayed; ``tell`` gets what was
+def as_acted(run: CalibrationRun, rig: Rig, notify: Notify) -> CalibrationRun:
+    """``run`` with the loads that hung, at the times at which they acted, without what swayed; ``notify`` gets what was
     noted wrong.
     """
     if run.loads is None:
@@ -116,7 +116,7 @@ def as_acted(run: CalibrationRun, rig: Rig, tell: Tell) -> CalibrationRun:
     loads, notes = (run.loads, ()) if corrected is None else (corrected.loads, corrected.notes)
     acted = loads_that_acted(rig, run.volts, loads)
     for note in (*notes, *acted.notes):
-        tell(note.words(run.name))
+        notify(note.words(run.name))
     if corrected is None and not acted.notes:
         return run
     return replace(run, volts=acted.volts, loads=acted.loads)
@@ -146,11 +146,11 @@ class CalibrationOptions:
     date: str = field(default_factory=today)
     span: Span = WHOLE
 
-    def rig(self, recordings: Sequence[Recording | str | Path], tell: Tell) -> Rig:
-        """Return the known rig; ``tell`` gets a warning if neither a file nor the recording names one."""
+    def rig(self, recordings: Sequence[Recording | str | Path], notify: Notify) -> Rig:
+        """Return the known rig; ``notify`` gets a warning if neither a file nor the recording names one."""
         if self.params_file is not None:
             return load_rig(self.params_file)
-        return opened(recordings[0], namespace=self.namespace, span=self.span, tell=tell).rig
+        return opened(recordings[0], namespace=self.namespace, span=self.span, notify=notify).rig
 
     def runs(self, recordings: Sequence[Recording | str | Path], rig: Rig) -> list[CalibrationRun]:
         """Return the recordings with their references."""
@@ -175,10 +175,12 @@ class CalibrationOptions:
         rig: Rig,
         levels: Sequence[DarkLevel],
         progress: Callable[[str], None],
-        tell: Tell,
+        notify: Notify,
     ) -> Calibrated:
-        """Return the answer; ``tell`` gets a warning if a load was noted late, or if the rig file cannot be edited."""
-        runs = [as_acted(run, rig, tell) for run in runs]
+        """Return the answer; ``notify`` gets a warning if a load was noted late, or if the rig file cannot be
+        edited.
+        """
+        runs = [as_acted(run, rig, notify) for run in runs]
         lit = replace_values(rig, values_of_levels(levels))
         calibration = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
-        return Calibrated(calibration, lit, self.params_file, self.date, tell)
+        return Calibrated(calibration, lit, self.params_file, self.date, notify)

@@ -24,14 +24,22 @@ from psd_deflection.studies.calibrate.dark import result_of_levels, source_of_le
 from psd_deflection.studies.calibrate.fit import CLAMP_AT, CLOCK, NAMES, REPORTED, UNITS
 from psd_deflection.studies.calibrate.observation import CHANNEL_NAMES
 from psd_deflection.studies.calibrate.progress import progress_of
-from psd_deflection.studies.study import PageSection, StudyResult, Tell, described, edited_rig_file, named, warn_caller
+from psd_deflection.studies.study import (
+    Notify,
+    PageSection,
+    StudyResult,
+    described,
+    edited_rig_file,
+    named,
+    warn_caller,
+)
 
 
 @dataclass(frozen=True, repr=False)
 class Calibrated(StudyResult):
     """``found``: the fit and what it means. ``rig``: as it was known, with the parameter file it has, if any.
 
-    ``date``: of the calibration, for the provenance. ``tell``: takes warnings.
+    ``date``: of the calibration, for the provenance. ``notify``: takes warnings.
     """
 
     study, json_name = 'calibrate', 'calibration.json'
@@ -41,7 +49,7 @@ class Calibrated(StudyResult):
     rig: Rig
     params_file: str | Path | None
     date: str
-    tell: Tell = warn_caller
+    notify: Notify = warn_caller
 
     @property
     def sources(self) -> dict[str, str]:
@@ -96,7 +104,9 @@ class Calibrated(StudyResult):
             return with_values(plain, values, f'Calibrated by {source_of(calibration, self.date)}', path)
 
         kept_effects = effects_of_rig(self.rig) if calibration.rejected else effects
-        return edited_rig_file(self.params_file, 'rig.yaml', lambda: described(self.rig, kept_effects), edit, self.tell)
+        return edited_rig_file(
+            self.params_file, 'rig.yaml', lambda: described(self.rig, kept_effects), edit, self.notify
+        )
 
     def files(self) -> dict[str, str]:
         """Return the rig file, the page and the JSON."""

@@ -22,7 +22,7 @@ from psd_deflection.studies.check.judges import (
 )
 from psd_deflection.studies.check.levels import SUM_FACTOR, Levels, levels
 from psd_deflection.studies.check.responses import responses
-from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup, Finding
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, SIGNIFICANT_DRIFT, WRONG, Checkup, Finding
 from psd_deflection.studies.check.wirings import (
     DOTS,
     LIMIT,
@@ -247,7 +247,7 @@ def _notes(problem: CheckProblem, wiring: Wiring, sizes: Sequence[float]) -> lis
         )
     per_minute = np.abs(drift) * 60e6
     far = (per_minute > 5.0) & (np.abs(drift) > 5.0 * drift_sd)
-    if far.any() and drift_sd.max() <= TELLING_DRIFT:
+    if far.any() and drift_sd.max() <= SIGNIFICANT_DRIFT:
         worst = int(np.argmax(np.where(far, per_minute, 0.0)))
         out.append(f'drift: {drift[worst] * 60e6:+.1f} µm a minute on {DOTS[worst]}; let lasers and amplifier warm up')
     return out

@@ -24,7 +24,7 @@ from psd_deflection.studies.study import PageSection, StudyResult
 
 RIGHT, WRONG, CANNOT_TELL = 'right', 'wrong', 'cannot_tell'
 
-TELLING_DRIFT = 5e-6 / 60.0
+SIGNIFICANT_DRIFT = 5e-6 / 60.0
 """m/s: a drift whose standard deviation is larger is not shown; the recording is too short."""
 
 NAMES = {
@@ -192,10 +192,10 @@ def push_rows(checkup: Checkup) -> list[list[str]]:
     rows = [['push', *(f'{c} µm' for c in DOTS), '', *DOTS, 'size']]
     for push, size in zip(checkup.pushes, checkup.sizes, strict=True):
         expected = on_channels(Wiring.from_rig(checkup.rig), push.expected)
-        told_size = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
+        size_text = f'{abs(size):.2f}' if push.sized and math.isfinite(size) else ''
         words = [arrow(v, float(np.linalg.norm(expected))) for v in expected.tolist()]
         rows.append(
-            [push.name, *(f'{v * 1e6:+z.1f}' for v in push.channels.tolist()), '  rig file:', *words, told_size]
+            [push.name, *(f'{v * 1e6:+z.1f}' for v in push.channels.tolist()), '  rig file:', *words, size_text]
         )
     if not any(row[-1] for row in rows[1:]):
         rows = [row[:-1] for row in rows]
@@ -275,7 +275,7 @@ def level_rows(checkup: Checkup) -> list[tuple[str, str]]:
         for c, v, sd in zip(DOTS, checkup.drift.tolist(), checkup.drift_sd.tolist(), strict=True)
     )
     drift += '  µm a minute'
-    if checkup.drift_sd.max() > TELLING_DRIFT:
+    if checkup.drift_sd.max() > SIGNIFICANT_DRIFT:
         drift = 'cannot be told: the recording is too short'
     hum = 'none at 50 or 60 Hz'
     if measured.hum.max() > 0.0:

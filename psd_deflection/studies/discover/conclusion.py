@@ -47,7 +47,7 @@ from psd_deflection.studies.discover.trees import (
     parameters_of,
     size_of,
 )
-from psd_deflection.studies.study import GIVEN_RIG, StudyResult, Tell, described, edited_rig_file, named, warn_caller
+from psd_deflection.studies.study import GIVEN_RIG, Notify, StudyResult, described, edited_rig_file, named, warn_caller
 
 SHOWN = 1e-3
 """µm and µrad: a smaller change of an estimate is none."""
@@ -241,7 +241,7 @@ class RigConclusion(Conclusion):
     the set-up; ``unsettled``: names of what explains the recordings as well as something in ``fit``.
     ``moves``: by how much at most an estimate is wrong that is not corrected for the effects: dX m, dY m, theta rad.
     ``rig``: as it was known, with the parameter file it has, if any. ``adopted``: name of the effect that the law
-    became, '' if it is none. ``tell``: takes warnings.
+    became, '' if it is none. ``notify``: takes warnings.
     """
 
     workspace: Workspace
@@ -255,7 +255,7 @@ class RigConclusion(Conclusion):
     rig: Rig
     params_file: str | Path | None = None
     adopted: str = ''
-    tell: Tell = warn_caller
+    notify: Notify = warn_caller
     rig_source: str = GIVEN_RIG
 
     @property
@@ -336,7 +336,7 @@ class RigConclusion(Conclusion):
             law = self.model_of_law
             laws = [] if law is None else [ActiveEffect(effect_of(law), values_of(law))]
             effects = [*self.known, *beside, *laws]
-        return model_yaml(self.params_file, self.rig, effects, self.values, self.tell)
+        return model_yaml(self.params_file, self.rig, effects, self.values, self.notify)
 
     def files(self) -> dict[str, str]:
         """Return the rig file with the effects, the page, the JSON, and the law as an effect that can be adopted."""
@@ -372,11 +372,11 @@ def model_yaml(
     rig: Rig,
     effects: Iterable[ActiveEffect],
     values: Mapping[str, object],
-    tell: Tell = warn_caller,
+    notify: Notify = warn_caller,
 ) -> str:
     """Return the user's parameter file with ``effects``, comments kept; without one what describes ``rig``.
 
-    ``values``: what was wrong in the rig file, put right. ``tell`` gets a warning if the file cannot be edited.
+    ``values``: what was wrong in the rig file, put right. ``notify`` gets a warning if the file cannot be edited.
     """
     given = list(effects)
 
@@ -386,7 +386,7 @@ def model_yaml(
             return text
         return with_values(text, values, f'Put right by psd-deflection {__version__}', path)
 
-    return edited_rig_file(params_file, 'model.yaml', lambda: described(rig, given), edit, tell)
+    return edited_rig_file(params_file, 'model.yaml', lambda: described(rig, given), edit, notify)
 
 
 def _residual_words(discovery: Conclusion) -> str:

@@ -37,7 +37,7 @@ from psd_deflection.studies.discover.plant_search import PlantDiscovery, discove
 from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
 from psd_deflection.studies.discover.reference_readings import Resting, resting_in, resting_rows
 from psd_deflection.studies.discover.result import Discovery
-from psd_deflection.studies.study import GIVEN_RIG, Tell, warn_caller
+from psd_deflection.studies.study import GIVEN_RIG, Notify, warn_caller
 
 
 def read_observation(
@@ -265,7 +265,7 @@ def _readings_of(path: Path, rig: Rig, rest: Resting) -> Readings:
 
 
 def _references_of(
-    recording: Recording, rig: Rig | None, overrides: Mapping[str, object] | None, where: str, warn: Tell
+    recording: Recording, rig: Rig | None, overrides: Mapping[str, object] | None, where: str, warn: Notify
 ) -> Readings:
     """The references of a recording without samples, with its rig (by default its own), changed by ``overrides``."""
     if rig is None:
@@ -288,7 +288,7 @@ def _without_samples(source: Recording | str | Path, namespace: str | None) -> R
 def read_tables(
     sources: Sequence[Recording | str | Path],
     rig: Rig | None = None,
-    warn: Tell = lambda _: None,
+    warn: Notify = lambda _: None,
     namespace: str | None = None,
 ) -> list[Readings]:
     """Return the tables among ``sources``, which may be ``.yaml`` lists; none if all are recordings of samples.
@@ -338,32 +338,32 @@ class DiscoverOptions:
         """Return the rig as it is known, if it is. Raises ConfigError."""
         return self.known if self.known is None or isinstance(self.known, Rig) else load_rig(self.known)
 
-    def read(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Observation]:
-        """Return the recordings; ``tell`` gets what is odd."""
+    def read(self, sources: Sequence[Recording | str | Path], notify: Notify = warn_caller) -> list[Observation]:
+        """Return the recordings; ``notify`` gets what is odd."""
         return read_observations(
-            sources, self.rig(), namespace=self.namespace, span=self.span, warn=tell, any_rate=True
+            sources, self.rig(), namespace=self.namespace, span=self.span, warn=notify, any_rate=True
         )
 
-    def tables(self, sources: Sequence[Recording | str | Path], tell: Tell = warn_caller) -> list[Readings]:
+    def tables(self, sources: Sequence[Recording | str | Path], notify: Notify = warn_caller) -> list[Readings]:
         """Return the tables of readings; none if ``sources`` are recordings."""
-        return read_tables(sources, self.rig(), tell, self.namespace)
+        return read_tables(sources, self.rig(), notify, self.namespace)
 
     def discovered(
         self,
         observations: Sequence[Observation],
         progress: Callable[[str], None] = lambda _: None,
-        tell: Tell = warn_caller,
+        notify: Notify = warn_caller,
     ) -> Discovery:
-        """Return the answer; ``tell`` gets a warning if the rig file cannot be edited."""
+        """Return the answer; ``notify`` gets a warning if the rig file cannot be edited."""
         discovery = discover(observations, self.rig(), seed=self.seed, without=self.without, progress=progress)
         source = GIVEN_RIG if self.known else 'the parameters in each recording, the nominal rig if it has none'
-        return replace(discovery, params_file=self.params_file, tell=tell, rig_source=source)
+        return replace(discovery, params_file=self.params_file, notify=notify, rig_source=source)
 
-    def discovered_in_tables(self, tables: Sequence[Readings], tell: Tell = warn_caller) -> PlantDiscovery:
-        """Return the answer of tables of readings; ``tell`` gets a warning if the rig file cannot be edited.
+    def discovered_in_tables(self, tables: Sequence[Readings], notify: Notify = warn_caller) -> PlantDiscovery:
+        """Return the answer of tables of readings; ``notify`` gets a warning if the rig file cannot be edited.
 
         Raises RecordingError if a part of a table is asked for.
         """
         if self.span != WHOLE:
             raise RecordingError(f'{tables[0].name}: holds readings of a link at rest: take all of it')
-        return discover_in(ReadingsPlant(tables, self.without, self.params_file, tell), seed=self.seed)
+        return discover_in(ReadingsPlant(tables, self.without, self.params_file, notify), seed=self.seed)

@@ -4,7 +4,7 @@
 
 The signature of each effect is simulated under loads that are planned, beside the noise of the rig. The chi-square of
 a signature grows with the square of the effect's size. An effect is seen from the size at which a search would accept
-it. It is named from the size at which the part that no other single effect can imitate reaches ``TELLS_APART``; that
+it. It is named from the size at which the part that no other single effect can imitate reaches ``SEPARATES``; that
 part is sin² of the angle between the two signatures. As in a search, an effect with more free parameters is no rival
 of one that does with fewer. All of it is to first order.
 """
@@ -29,7 +29,7 @@ from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.planning import TELLS_APART
+from psd_deflection.studies.discover.planning import SEPARATES
 from psd_deflection.studies.discover.problem import Problem, Progress
 from psd_deflection.studies.discover.recorded_rig import RecordedRig
 from psd_deflection.studies.discover.search.screen import Screen, solve_observable
@@ -241,7 +241,7 @@ def _isolable(
         parameter=p.name,
         unit=p.unit,
         seen=_size(candidate, length, accepted),
-        named=None if apart == 0.0 else _size(candidate, length, max(accepted, TELLS_APART / apart)),
+        named=None if apart == 0.0 else _size(candidate, length, max(accepted, SEPARATES / apart)),
         alike=alike,
         apart=apart,
     )
@@ -279,5 +279,5 @@ def _of_probes(screen: Screen, effect: Isolable, probes: Sequence[Candidate], ac
         enough = [c for c in probes if lengths[c] >= wanted]
         return min(enough, key=lambda c: lengths[c]).start[p.name] if enough else None
 
-    named = None if effect.apart == 0.0 else weakest(max(accepted, TELLS_APART / effect.apart))
+    named = None if effect.apart == 0.0 else weakest(max(accepted, SEPARATES / effect.apart))
     return replace(effect, seen=weakest(accepted), named=named)

@@ -33,10 +33,10 @@ from psd_deflection.studies.discover.experiment import (
 from psd_deflection.studies.discover.search.fit import Fit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
-TELLS_APART = 21.6
+SEPARATES = 21.6
 """lambda sin^2(theta) from which two effects are told apart: lambda sin^2(theta/2) >= 5.4, small angles."""
 SURE = 60.0
-"""Expected chi-square beyond which more is worth nothing: its scatter of 2 sqrt(60) leaves ``TELLS_APART``."""
+"""Expected chi-square beyond which more is worth nothing: its scatter of 2 sqrt(60) leaves ``SEPARATES``."""
 WORTH = 0.02
 """Least value that a further piece must add."""
 EFFORT_OF_A_MINUTE = 0.03
@@ -45,7 +45,7 @@ EFFORT_OF_A_MINUTE = 0.03
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """``separation``: smallest chi-square between the alternatives; below ``TELLS_APART`` the experiment is not
+    """``separation``: smallest chi-square between the alternatives; below ``SEPARATES`` the experiment is not
     enough.
     """
 
@@ -55,10 +55,10 @@ class Suggestion:
     @property
     def text(self) -> str:
         """The suggestion as text, for people and result.json."""
-        if self.separation < TELLS_APART:
+        if self.separation < SEPARATES:
             return (
                 f'none of the experiments tried tells them apart; the best, {self.words}, separates by chi-square '
-                f'{self.separation:.1f} (needed: {TELLS_APART})'
+                f'{self.separation:.1f} (needed: {SEPARATES})'
             )
         return f'{self.words}: in simulation this separates them by chi-square {self.separation:.0f}'
 
@@ -79,7 +79,7 @@ class Discrimination:
     @property
     def separable(self) -> bool:
         """Whether any recording within the limits tells the two apart."""
-        return self.possible >= TELLS_APART
+        return self.possible >= SEPARATES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +133,7 @@ class Plan:
         others = ', '.join(dict.fromkeys(t.alternative for t in apart))
         out = (
             f'Record next, {self.seconds:.0f} s: {self.words}. It tells {apart[0].named} from {others} '
-            f'(chi-square {least:.0f} at least, {TELLS_APART:g} needed)'
+            f'(chi-square {least:.0f} at least, {SEPARATES:g} needed)'
         )
         lasting = [t.alternative for t in self.discriminations if not t.separable]
         return f'{out}; nothing within the limits tells {", ".join(lasting)} apart.' if lasting else f'{out}.'

@@ -29,7 +29,7 @@ from psd_deflection.rig.config import Rig
 from psd_deflection.studies.discover.conclusion import model_yaml
 from psd_deflection.studies.discover.plants import Model, Plant
 from psd_deflection.studies.loads.plate_motion import dots_of
-from psd_deflection.studies.study import Tell, warn_caller
+from psd_deflection.studies.study import Notify, warn_caller
 
 CHANNELS: Mapping[str, tuple[str, ...]] = {
     'dots': dot_names(2),
@@ -89,9 +89,9 @@ class ReadingsPlant(Plant):
         tables: Sequence[Readings],
         without: Sequence[str] = (),
         params_file: str | Path | None = None,
-        tell: Tell = warn_caller,
+        notify: Notify = warn_caller,
     ) -> None:
-        """``params_file``: of the rig, if it has one. ``tell`` gets a warning if that cannot be edited."""
+        """``params_file``: of the rig, if it has one. ``notify`` gets a warning if that cannot be edited."""
         kinds = {t.kind for t in tables}
         if len(kinds) > 1:
             words = ' and '.join(','.join(CHANNELS[k]) for k in sorted(kinds))
@@ -103,7 +103,7 @@ class ReadingsPlant(Plant):
                 'search them one by one'
             )
         self.tables = tuple(tables)
-        self._params_file, self._tell = params_file, tell
+        self._params_file, self._notify = params_file, notify
         self.kind = tables[0].kind
         of_dots = self.kind == 'dots'
         self.channels = dot_names(tables[0].psds) if of_dots else CHANNELS[self.kind]
@@ -153,7 +153,7 @@ class ReadingsPlant(Plant):
     def files(self, effects: Sequence[ActiveEffect]) -> Mapping[str, str]:
         """Return the rig file with the effects."""
         rig = self.tables[0].rig
-        return {'model.yaml': model_yaml(self._params_file, rig, [*self.known, *effects], {}, self._tell)}
+        return {'model.yaml': model_yaml(self._params_file, rig, [*self.known, *effects], {}, self._notify)}
 
     def _rows(self, table: Readings, effects: Sequence[ActiveEffect], order: IntArray) -> FloatArray:
         """Return the readings (channels, n) of the rows, which are simulated in ``order``."""

@@ -225,7 +225,7 @@ class Identified(StudyResult):
 
     def rig_yaml(self) -> str:
         """Return the user's parameter file with the modes, comments kept; without one what describes the rig."""
-        recording, rig, params_file, tell, _ = self.problem.opened
+        recording, rig, params_file, notify, _ = self.problem.opened
         date = datetime.now(UTC).date().isoformat()
         recorded = named(recording.name, recording.digest)
         source = f'Identified by psd-deflection {__version__}, {date}, from {recorded}'
@@ -233,7 +233,7 @@ class Identified(StudyResult):
         def edit(text: str, path: Path) -> str:
             return with_values(text, self.values, source, path)
 
-        return edited_rig_file(params_file, 'rig.yaml', lambda: described(rig, effects_of_rig(rig)), edit, tell)
+        return edited_rig_file(params_file, 'rig.yaml', lambda: described(rig, effects_of_rig(rig)), edit, notify)
 
     def files(self) -> dict[str, str]:
         """Return the page, the JSON, and ``rig.yaml`` with the modes in it."""

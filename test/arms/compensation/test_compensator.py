@@ -41,7 +41,7 @@ def arm() -> Arm:
 class Loop:
     """A compensator that sees a simulated arm through estimates of noise; ``offsets`` are those the controller has.
 
-    ``tells``: the controller tells them, or with commands its command. ``applies``: the share of them that it adds.
+    ``reports``: the controller tells them, or with commands its command. ``applies``: the share of them that it adds.
     ``droop``: how far the joints stand below their command. ``measured``: what encoders make of angles. ``sent``:
     when what was sent. ``whys``: why it held, and ''.
     """
@@ -49,7 +49,7 @@ class Loop:
     def __init__(self, arm: Arm, dry: bool = False, applies: float = 1.0, **chosen: Any) -> None:
         given: dict[str, Any] = {'takeover': False, **chosen}
         self.commands = given.get('output') == 'commands'
-        self.tells = bool(given['takeover']) or self.commands
+        self.reports = bool(given['takeover']) or self.commands
         self.applies, self.droop = applies, 0.0
         self.measured: Callable[[FloatArray], FloatArray] = lambda angles: angles
         self.sent: list[tuple[float, FloatArray]] = []
@@ -61,7 +61,7 @@ class Loop:
         self.t = 0.0
         self.noise = np.random.default_rng(3)
 
-    def run(self, seconds: float, wanted: FloatArray = ELBOW, told_every: int = 1) -> Command:
+    def run(self, seconds: float, wanted: FloatArray = ELBOW, report_every: int = 1) -> Command:
         """Let the arm be moved to ``wanted`` at once, and the compensator act."""
         for n in range(round(seconds / PERIOD)):
             self.t += PERIOD
@@ -71,9 +71,9 @@ class Loop:
             if self.commands:
                 there = wanted + self.applies * (self.has - wanted)
             self.plant.step(there - self.droop, PERIOD)
-            if n % told_every == 0:
+            if n % report_every == 0:
                 self.compensator.joints(self.t, self.measured(self.plant.angles))
-            if self.tells and n % told_every == 0:
+            if self.reports and n % report_every == 0:
                 self.compensator.controller_has(self.t, self.has if self.commands else self.offsets)
             at = self.plant.end().deflection
             noisy = Transform(at.rotation, at.position + self.noise.normal(size=3) * 1e-6)
@@ -167,7 +167,7 @@ def following(arm: Arm, **chosen: Any) -> Loop:
     return loop
 
 
-def telling(arm: Arm) -> Loop:
+def reporting(arm: Arm) -> Loop:
     """The same with a controller that tells the offsets that it applies."""
     loop = Loop(arm, takeover=True)
     loop.plant.force = PAYLOAD
@@ -327,7 +327,7 @@ def test_joints_that_leap_hold_the_offsets(arm: Arm) -> None:
     assert np.array_equal(command.offsets, before)
 
 
-def test_two_nodes_that_tell_different_joints_hold_the_offsets(arm: Arm) -> None:
+def test_two_nodes_that_report_different_joints_hold_the_offsets(arm: Arm) -> None:
     loop = following(arm)
     before = loop.offsets
     for n in range(1, 10):
@@ -427,13 +427,13 @@ def test_an_arm_that_stands_still_is_not_asked_for_more(arm: Arm) -> None:
 
 
 @pytest.mark.parametrize('how', [{}, {'takeover': True}, {'output': 'commands'}], ids=repr)
-def test_an_arm_that_tells_seldom_is_not_taken_for_one_that_does_not_follow(arm: Arm, how: dict[str, Any]) -> None:
+def test_an_arm_that_reports_seldom_is_not_taken_for_one_that_does_not_follow(arm: Arm, how: dict[str, Any]) -> None:
     loop = following(arm, stale=0.5, jump=1.0, **how)
     before = loop.offsets
     loop.plant.force = 4.0 * PAYLOAD
     loop.whys.clear()
     # Between two messages the offsets may move by 0.028; 0.01 from what the arm does is one that does not follow.
-    command = loop.run(3.0, told_every=14)
+    command = loop.run(3.0, report_every=14)
     assert (command.state, loop.whys) == (State.FOLLOWING, {''})
     assert np.abs(command.offsets - before).max() > 0.02
 
@@ -446,7 +446,7 @@ def test_what_the_controller_applies_is_where_it_begins(arm: Arm) -> None:
     again.enable(True)
     assert loop.run(0.6).why == 'the controller does not tell the offsets that it applies'
     again.enable(False)
-    loop.tells, count = True, len(loop.sent)
+    loop.reports, count = True, len(loop.sent)
     assert loop.run(0.6).state is State.OFF
     assert len(loop.sent) == count
     again.enable(True)
@@ -459,7 +459,7 @@ def test_what_the_controller_applies_is_where_it_begins(arm: Arm) -> None:
 
 
 def test_a_controller_that_applies_something_else_is_not_sent_more(arm: Arm) -> None:
-    loop = telling(arm)
+    loop = reporting(arm)
     before = loop.offsets
     for n in range(1, 30):
         loop.compensator.joints(loop.t + PERIOD * n, loop.plant.angles)
@@ -480,14 +480,14 @@ def test_a_controller_that_applies_something_else_is_not_sent_more(arm: Arm) -> 
 
 def test_a_controller_that_starts_again_without_offsets_is_sent_no_step(arm: Arm) -> None:
     """It ends, so nothing is sent. It comes back with none, and is led from there to those that are needed."""
-    loop = telling(arm)
+    loop = reporting(arm)
     needed = loop.offsets
-    loop.tells = False
+    loop.reports = False
     assert loop.run(0.1).why == 'the controller does not tell the offsets that it applies'
     count = len(loop.sent)
     loop.run(0.2)
     assert len(loop.sent) == count
-    loop.tells, loop.offsets = True, np.zeros(2)
+    loop.reports, loop.offsets = True, np.zeros(2)
     loop.run(2.0)
     assert not loop.sent[count][1].any()
     assert loop.offsets == pytest.approx(needed, abs=1e-3)
@@ -502,9 +502,9 @@ def test_a_stop_that_is_over_is_no_reason_any_more(arm: Arm) -> None:
     assert loop.send(loop.t + 1.0).why == 'no deflection for 0.08 s'
 
 
-def test_switched_off_while_nothing_is_told_the_offsets_go_back_once_it_is(arm: Arm) -> None:
-    loop = telling(arm)
-    loop.tells = False
+def test_switched_off_while_nothing_is_reported_the_offsets_go_back_once_it_is(arm: Arm) -> None:
+    loop = reporting(arm)
+    loop.reports = False
     loop.run(0.1)
     loop.compensator.enable(False)
     left, count = loop.offsets.copy(), len(loop.sent)
@@ -513,7 +513,7 @@ def test_switched_off_while_nothing_is_told_the_offsets_go_back_once_it_is(arm: 
     assert len(loop.sent) == count
     assert np.array_equal(loop.offsets, left)
     # Not while somebody else commands the robot.
-    loop.tells = True
+    loop.reports = True
     loop.compensator.stop(RIVAL, rival=True)
     loop.run(0.2)
     assert len(loop.sent) == count
@@ -528,12 +528,12 @@ def test_switched_off_while_nothing_is_told_the_offsets_go_back_once_it_is(arm: 
 
 
 def test_switched_off_while_the_robot_stands_offsets_that_were_silent_go_back(arm: Arm) -> None:
-    loop = telling(arm)
+    loop = reporting(arm)
     loop.compensator.stop('the robot does not run')
-    loop.tells = False
+    loop.reports = False
     loop.run(0.4)
     loop.compensator.enable(False)
-    loop.tells = True
+    loop.reports = True
     assert np.any(loop.offsets)
     assert loop.run(float(np.abs(loop.offsets).max()) / 0.1 + 0.1).state is State.OFF
     assert not loop.offsets.any()
@@ -601,7 +601,7 @@ def test_until_offsets_move_the_joints_nothing_is_verified(arm: Arm, applies: fl
 
 
 def test_a_controller_that_changes_its_scale_holds(arm: Arm) -> None:
-    loop = telling(arm)
+    loop = reporting(arm)
     assert loop.run(1.0).why == ''
     loop.applies = 1.5
     loop.run(1.0)
@@ -616,7 +616,7 @@ def test_a_controller_that_changes_its_scale_holds(arm: Arm) -> None:
 @pytest.mark.parametrize('delayed', [0.0, 0.02, 0.3])
 def test_an_arm_that_moves_by_itself_is_not_blamed(arm: Arm, delayed: float) -> None:
     """Motions begin with the loads that they cause, of all sizes; then the slope is as it was."""
-    loop = telling(arm)
+    loop = reporting(arm)
     rng, at = np.random.default_rng(7), ELBOW
     for n in range(20):
         to = at + rng.normal(size=2) * rng.choice([0.03, 0.1, 0.5])
@@ -686,12 +686,12 @@ def test_a_report_older_than_the_last_command_begins_nothing(arm: Arm, output: s
 
 
 @pytest.mark.parametrize(
-    ('tells', 'away', 'why'),
+    ('reports', 'away', 'why'),
     [(False, 0.0, 'does not tell the command that it has'), (True, 0.05, 'is 0.05 from the command of the controller')],
 )
-def test_with_commands_an_unknown_or_far_command_is_rejected(arm: Arm, tells: bool, away: float, why: str) -> None:
+def test_with_commands_an_unknown_or_far_command_is_rejected(arm: Arm, reports: bool, away: float, why: str) -> None:
     loop = Loop(arm, output='commands')
-    loop.tells, loop.droop = tells, away
+    loop.reports, loop.droop = reports, away
     loop.compensator.enable(True)
     command = loop.run(1.0)
     assert (command.state, command.sends, loop.sent) == (State.HOLDING, False, [])
@@ -701,7 +701,7 @@ def test_with_commands_an_unknown_or_far_command_is_rejected(arm: Arm, tells: bo
 def test_offsets_of_before_are_reported_and_taken_back_on_request(arm: Arm) -> None:
     loop = following(arm)
     held = loop.offsets.copy()
-    loop.compensator, loop.tells, count = Compensator(arm, CompensatorSettings(axes=('x', 'z'))), True, len(loop.sent)
+    loop.compensator, loop.reports, count = Compensator(arm, CompensatorSettings(axes=('x', 'z'))), True, len(loop.sent)
     command = loop.run(0.6)
     worst = int(np.abs(held).argmax())
     assert (command.state, command.foreign, len(loop.sent)) == (State.OFF, True, count)

@@ -9,7 +9,7 @@ import math
 from psd_deflection.arms.compensation.robot import RobotWatch
 
 
-def test_a_robot_of_which_nothing_is_told_runs() -> None:
+def test_a_robot_of_which_nothing_is_reported_runs() -> None:
     assert RobotWatch().fault(1e9) == ''
 
 

@@ -79,21 +79,21 @@ def test_what_begins_after_the_last_sample_of_a_block_moves_nothing_before() -> 
     one.block(0, 0, SLOTS, np.zeros((N, 3)))
     still = one.predicted(np.array([0.005]))
     # The last sample is 9.5 ms after the middle.
-    one.inertia.tell(BaseAcceleration(14 * MS + MS // 2, (5.0, 0.0, 0.0), NONE), 10 * MS)
-    told = one.predicted(np.array([0.005, 0.006]))
-    assert np.array_equal(told.pose[0], still.pose[0])
+    one.inertia.notify(BaseAcceleration(14 * MS + MS // 2, (5.0, 0.0, 0.0), NONE), 10 * MS)
+    reported = one.predicted(np.array([0.005, 0.006]))
+    assert np.array_equal(reported.pose[0], still.pose[0])
     # From rest: half of the acceleration times the square of the time.
-    assert told.pose[1, 0] == pytest.approx(-0.5 * 5.0 * 0.001**2, rel=0.01)
+    assert reported.pose[1, 0] == pytest.approx(-0.5 * 5.0 * 0.001**2, rel=0.01)
 
 
-def test_a_base_that_is_told_is_no_load_that_nobody_foresaw() -> None:
+def test_a_base_that_is_reported_is_no_load_that_nobody_foresaw() -> None:
     one = of()
     mode = Oscillator(14.0, 0.02)
     base = Inertia((mode, mode, Oscillator(21.0, 0.02)), 0.585)
     for k in range(40):
-        told = BaseAcceleration(10 * MS * k + 200 * MS, (2.0 * np.sin(0.7 * k), 0.0, 0.0), NONE)
-        base.tell(told, 10 * MS * k + 200 * MS)
-        one.inertia.tell(told, 10 * MS * k + 200 * MS)
+        reported = BaseAcceleration(10 * MS * k + 200 * MS, (2.0 * np.sin(0.7 * k), 0.0, 0.0), NONE)
+        base.notify(reported, 10 * MS * k + 200 * MS)
+        one.inertia.notify(reported, 10 * MS * k + 200 * MS)
     moved = base.forced(-10 * MS - MS // 2, 1e-3 * np.arange(1.0, 601.0)).at[:, :, 0].T
     for k in range(30):
         one.block(k, 20 * MS * k, SLOTS, moved[N * k : N * (k + 1)])

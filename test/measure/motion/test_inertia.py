@@ -62,7 +62,7 @@ def integrated(changes: Sequence[tuple[float, Sequence[float]]], t: FloatArray) 
 
 
 def test_it_is_the_solution_of_the_equation_of_motion() -> None:
-    told = [
+    reported = [
         BaseAcceleration(-5 * MS, (0.3, -1.0, 9.0), (2.0, 0.5, -4.0)),
         BaseAcceleration(7 * MS + 300_000, (0.0, 2.0, 0.0), (-1.0, 3.0, 8.0)),
         BaseAcceleration(12 * MS, NONE, NONE),
@@ -70,10 +70,10 @@ def test_it_is_the_solution_of_the_equation_of_motion() -> None:
     known = Inertia(MODES, L)
     # In any order, and twice.
     for i in (2, 0, 1, 1):
-        known.tell(told[i], 0)
+        known.notify(reported[i], 0)
     seconds = 1e-3 * np.arange(1.0, 21.0)
     found = known.forced(0, seconds)
-    changes = [(0.0, rigid_tip(told[0])), (0.0073, rigid_tip(told[1])), (0.012, rigid_tip(told[2]))]
+    changes = [(0.0, rigid_tip(reported[0])), (0.0073, rigid_tip(reported[1])), (0.012, rigid_tip(reported[2]))]
     np.testing.assert_allclose(found.at[..., :2], integrated(changes, seconds), rtol=1e-7, atol=1e-13)
     assert not found.at[..., 2:].any()
     # Of two changes that other messages led to, the twentieth part may be wrong.
@@ -85,7 +85,7 @@ def test_it_is_the_solution_of_the_equation_of_motion() -> None:
 def test_it_holds_for_a_tenth_of_a_second_and_the_first_one_is_doubted() -> None:
     known = Inertia(MODES, L)
     first = BaseAcceleration(10 * MS, (1.0, 0.0, 0.0), NONE)
-    known.tell(first, 0)
+    known.notify(first, 0)
     seconds = 1e-3 * np.arange(1.0, 201.0)
     found = known.forced(0, seconds)
     changes = [(0.0, NONE), (0.010, (1.0, 0.0, 0.0)), (0.110, NONE)]
@@ -93,12 +93,12 @@ def test_it_holds_for_a_tenth_of_a_second_and_the_first_one_is_doubted() -> None
     # It may have begun before it was told, and nobody knows how it ended.
     assert found.doubt[0] == pytest.approx(2.0 / MODES[0].w ** 2)
     # One that comes too late to be the next is a first one again.
-    known.tell(BaseAcceleration(111 * MS, (1.0, 0.0, 0.0), NONE), 100 * MS)
+    known.notify(BaseAcceleration(111 * MS, (1.0, 0.0, 0.0), NONE), 100 * MS)
     assert known.forced(0, seconds[:150]).doubt[0] == pytest.approx(3.0 / MODES[0].w ** 2)
     known.forget_before(10 * MS + HOLD_NS)
-    assert (known.ended, len(known.told)) == (0, 2)
+    assert (known.ended, len(known.reported)) == (0, 2)
     known.forget_before(111 * MS)
-    assert (known.ended, len(known.told)) == (1, 1)
+    assert (known.ended, len(known.reported)) == (1, 1)
     known.forget_before(111 * MS + HOLD_NS)
     assert (known.ended, known.known) == (2, False)
 
@@ -115,11 +115,11 @@ def test_it_holds_for_a_tenth_of_a_second_and_the_first_one_is_doubted() -> None
 def test_what_cannot_be_used_is_rejected(base: BaseAcceleration, why: str) -> None:
     known = Inertia(MODES, L)
     with pytest.raises(ValueError, match=why):
-        known.tell(base, 1000 * MS)
+        known.notify(base, 1000 * MS)
     assert not known.known
-    known.tell(BaseAcceleration(900 * MS, NONE, NONE), 1000 * MS)
-    known.tell(BaseAcceleration(11_000 * MS, (1e4, 0.0, 0.0), NONE), 1000 * MS)
-    assert len(known.told) == 2
+    known.notify(BaseAcceleration(900 * MS, NONE, NONE), 1000 * MS)
+    known.notify(BaseAcceleration(11_000 * MS, (1e4, 0.0, 0.0), NONE), 1000 * MS)
+    assert len(known.reported) == 2
 
 
 def turned(seconds: float) -> motion.Run:
@@ -134,11 +134,11 @@ def turned(seconds: float) -> motion.Run:
     found = integrated(changes, t)
     pose = found[..., 0].T
     velocity = (found[..., 1] * np.array([[mode.w] for mode in MODES])).T
-    told = []
+    reported = []
     for ms in range(25, len(t), 5):
         now = int(np.searchsorted(begins, ms / 1000.0 + 1e-6)) - 1
-        told.append(BaseAcceleration(ms * MS, NONE, angular[now] if now >= 0 else NONE))
-    return motion.Run(pose, pose, velocity, motion.volts_of(pose, np.random.default_rng(3)), tuple(told))
+        reported.append(BaseAcceleration(ms * MS, NONE, angular[now] if now >= 0 else NONE))
+    return motion.Run(pose, pose, velocity, motion.volts_of(pose, np.random.default_rng(3)), tuple(reported))
 
 
 @pytest.fixture(scope='module')
@@ -147,14 +147,14 @@ def run() -> motion.Run:
 
 
 def through(
-    pipeline: Pipeline, run: motion.Run, blocks: range, told: list[BaseAcceleration] | None = None, late: int = 0
+    pipeline: Pipeline, run: motion.Run, blocks: range, reported: list[BaseAcceleration] | None = None, late: int = 0
 ) -> list[Record]:
     """What is told comes ``late`` samples after its stamp."""
-    told = list(run.told) if told is None else told
+    reported = list(run.reported) if reported is None else reported
     out: list[Record] = []
     for b in blocks:
-        while told and told[0].t_ns < ((b + 1) * motion.BLOCK - late) * MS:
-            pipeline.accelerate(told.pop(0))
+        while reported and reported[0].t_ns < ((b + 1) * motion.BLOCK - late) * MS:
+            pipeline.accelerate(reported.pop(0))
         out += pipeline.process(motion.chunk(run, b))
     return out
 
@@ -171,21 +171,21 @@ def off(run: motion.Run, motions: list[TipMotion]) -> tuple[float, float]:
 
 
 def test_the_filter_foretells_what_a_turning_joint_does(run: motion.Run) -> None:
-    told, untold = Pipeline(motion.rig_of()), Pipeline(motion.rig_of())
-    with_it, own = off(run, moved(through(told, run, range(100))))
-    without, _ = off(run, moved(through(untold, run, range(100), told=[])))
+    reported, untold = Pipeline(motion.rig_of()), Pipeline(motion.rig_of())
+    with_it, own = off(run, moved(through(reported, run, range(100))))
+    without, _ = off(run, moved(through(untold, run, range(100), reported=[])))
     assert with_it < 0.4 * without
     assert with_it < 1.1 * own
     # To now: the acceleration goes on.
-    assert told.motion_filter is not None
-    assert told.motion_filter.inertia.late == 0
-    before = told.motion_filter.predicted(np.array([0.0, 0.020]))
-    step = before.velocity[1, 1] - np.array(MODES[1].step(0.020)[1] @ told.motion_filter._x[1]) * MODES[1].w
+    assert reported.motion_filter is not None
+    assert reported.motion_filter.inertia.late == 0
+    before = reported.motion_filter.predicted(np.array([0.0, 0.020]))
+    step = before.velocity[1, 1] - np.array(MODES[1].step(0.020)[1] @ reported.motion_filter._x[1]) * MODES[1].w
     assert abs(step) == pytest.approx(4.0 * L / MODES[1].w * MODES[1].pushed(np.array([0.02]))[0, 0, 1], rel=1e-9)
 
 
-def test_lost_lasers_are_coasted_through_with_what_is_told(run: motion.Run) -> None:
-    dark = motion.Run(run.loads, run.pose, run.velocity, run.volts.copy(), run.told)
+def test_lost_lasers_are_coasted_through_with_what_is_reported(run: motion.Run) -> None:
+    dark = motion.Run(run.loads, run.pose, run.velocity, run.volts.copy(), run.reported)
     # A turn of the acceleration is in it.
     dark.volts[940:1040, 2] = 0.0
     last = moved(through(Pipeline(motion.rig_of()), dark, range(52)))[-1]
@@ -202,11 +202,11 @@ def test_what_comes_late_is_put_right(run: motion.Run, monkeypatch: pytest.Monke
     in_time, late = Pipeline(rig), Pipeline(rig)
     expected = moved(through(in_time, run, range(39)))
     # At 0.75 s, in the middle of block 37, the acceleration turns.
-    early = [message for message in run.told if message.t_ns < 750 * MS]
-    seen = moved(through(late, run, range(38), told=early))
+    early = [message for message in run.reported if message.t_ns < 750 * MS]
+    seen = moved(through(late, run, range(38), reported=early))
     assert seen[36] == expected[36]
     assert abs(seen[37].vy - expected[37].vy) > 0.01
-    for message in run.told[145:]:
+    for message in run.reported[145:]:
         late.accelerate(message)
     after = moved(list(late.process(motion.chunk(run, 38))))[-1]
     assert late.motion_filter is not None
@@ -217,7 +217,7 @@ def test_what_comes_late_is_put_right(run: motion.Run, monkeypatch: pytest.Monke
     assert after.velocity_covariance[4] > 4.0 * expected[38].velocity_covariance[4]
 
 
-def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> None:
+def test_diagnostics_say_what_is_wrong_with_what_is_reported(run: motion.Run) -> None:
     pipeline = Pipeline(motion.rig_of())
     session: Any = SimpleNamespace(pipeline=pipeline, rejected=Counter(), why_rejected={})
     health = HealthReporter(session)
@@ -231,14 +231,14 @@ def test_diagnostics_say_what_is_wrong_with_what_is_told(run: motion.Run) -> Non
         one = entry()
         return one.level, one.message
 
-    told = list(run.told)
-    through(pipeline, run, range(25), told)
+    reported = list(run.reported)
+    through(pipeline, run, range(25), reported)
     assert said() == (0, 'the modes foretell the samples')
     session.rejected[ACCELERATION], session.why_rejected[ACCELERATION] = 3, 'no frame'
-    through(pipeline, run, range(25, 30), told)
+    through(pipeline, run, range(25, 30), reported)
     assert said() == (1, '3 base accelerations refused: no frame')
     # Of four messages in a block two come late.
-    through(pipeline, run, range(30, 35), told, late=10)
+    through(pipeline, run, range(30, 35), reported, late=10)
     assert said() == (1, '8 of 18 base accelerations came after the samples on which they acted')
     through(pipeline, run, range(35, 42), [])
     assert said() == (1, 'no base acceleration came for 0.1 s, and the last one was not 0: taken as 0')
@@ -253,21 +253,21 @@ def test_a_memory_that_is_none_is_rejected() -> None:
         with pytest.raises(ValueError, match=r'state.inertia: .* in blocks of 20 samples'):
             filtered.load_state_dict({INERTIA: values})
     filtered.load_state_dict({INERTIA: (*one, *one)})
-    assert filtered.inertia.told == [(1_000_000_000, (0.0, 0.0, 0.0))]
+    assert filtered.inertia.reported == [(1_000_000_000, (0.0, 0.0, 0.0))]
 
 
 @pytest.mark.parametrize('start', [20, 38, 50])
 def test_a_recording_begun_at_any_block_replays_to_the_bit(start: int, run: motion.Run, tmp_path: Path) -> None:
     """It is recorded as the session does it, also with lost samples and messages that come late."""
-    dark = motion.Run(run.loads, run.pose, run.velocity, run.volts.copy(), run.told)
+    dark = motion.Run(run.loads, run.pose, run.velocity, run.volts.copy(), run.reported)
     dark.volts[940:1000, 2] = 0.0
     rig = motion.rig_of({'filter_ahead': 0.005})
     live = Pipeline(rig)
-    told = list(run.told)
-    through(live, dark, range(start), told, late=10)
+    reported = list(run.reported)
+    through(live, dark, range(start), reported, late=10)
     # Two that the filter has not used yet. In block 37 the acceleration turned.
-    assert start != 38 or told[0].t_ns == 750 * MS
-    for message in (told.pop(0), told.pop(0)):
+    assert start != 38 or reported[0].t_ns == 750 * MS
+    for message in (reported.pop(0), reported.pop(0)):
         live.accelerate(message)
     with BagWriter(tmp_path / 'bag', rig_values=rig.flat()) as bag:
         memory = live.memory(rig)
@@ -276,8 +276,8 @@ def test_a_recording_begun_at_any_block_replays_to_the_bit(start: int, run: moti
         bag.put(memory)
         expected = []
         for b in range(start, 70):
-            while told and told[0].t_ns < ((b + 1) * motion.BLOCK - 5) * MS:
-                message = told.pop(0)
+            while reported and reported[0].t_ns < ((b + 1) * motion.BLOCK - 5) * MS:
+                message = reported.pop(0)
                 known_ns = live.accelerate(message)
                 assert known_ns is not None
                 (m,) = to_messages(message)

@@ -161,12 +161,12 @@ def test_ahead_is_the_prediction(operation: motion.Run) -> None:
 
 def test_a_known_load_is_foretold() -> None:
     run = motion.make('steps', 6.0, 11)
-    told, untold = Pipeline(RIG), Pipeline(RIG)
+    reported, untold = Pipeline(RIG), Pipeline(RIG)
     changes = np.flatnonzero(np.any(np.diff(run.loads, axis=0), axis=1)) + 1
-    told.load(AppliedLoad(0, 0.0, 0.0, 0.0))
+    reported.load(AppliedLoad(0, 0.0, 0.0, 0.0))
     for i in changes.tolist():
-        assert told.load(AppliedLoad(i * 1_000_000, *run.loads[i].tolist())) is not None
-    with_load, without = (through(p, run, range(300))[150:] for p in (told, untold))
+        assert reported.load(AppliedLoad(i * 1_000_000, *run.loads[i].tolist())) is not None
+    with_load, without = (through(p, run, range(300))[150:] for p in (reported, untold))
     off, blind = (
         motion.rms(np.array([velocity(m) - run.velocity[round(m.t_ns / 1e6)] for m in moved])[:, :2])
         for moved in (with_load, without)

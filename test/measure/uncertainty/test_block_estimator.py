@@ -76,10 +76,10 @@ def test_of_a_flat_plate_the_residual_is_computed_anew() -> None:
     rig = rig_of(3)
     pose = np.array([2e-3, -3e-3, 0.05])
     dots = flat_points(pose, rig.centers + rig.zeros).ravel() - rig.centers.ravel()
-    told = (1e-5,) * 6
-    assert np.abs(PlateModel(rig, range(3), 'none').residual(tuple(dots.tolist()), told)).max() < 1e-15
+    reported = (1e-5,) * 6
+    assert np.abs(PlateModel(rig, range(3), 'none').residual(tuple(dots.tolist()), reported)).max() < 1e-15
     for tilts in ('tied', 'bounded', 'free'):
-        assert PlateModel(rig, range(3), tilts).residual(tuple(dots.tolist()), told) == told
+        assert PlateModel(rig, range(3), tilts).residual(tuple(dots.tolist()), reported) == reported
 
 
 def test_words_say_the_noise_of_each_reading_beside_the_rig_files() -> None:

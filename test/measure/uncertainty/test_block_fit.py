@@ -127,9 +127,9 @@ class Dense:
         self.squares, self.weight = np.zeros((4, orders)), np.ones((4, orders))
         self.long, self.blocks = np.zeros((4, orders)), np.full((4, orders), 12.0)
 
-    def information(self, a: int, slots: IntArray, told: int) -> FloatArray:
+    def information(self, a: int, slots: IntArray, reported: int) -> FloatArray:
         """Covariance (told, told) of the coefficients by generalised least squares."""
-        q = self.q[slots, :told]
+        q = self.q[slots, :reported]
         return np.asarray(np.linalg.inv(q.T @ np.linalg.inv(self.spread[a, a][np.ix_(slots, slots)]) @ q))
 
     def usual(self) -> FloatArray:
@@ -141,47 +141,47 @@ class Dense:
 
     def last(self, a: int, excess: FloatArray, sure: FloatArray) -> None:
         """The mean of what goes on alike; where that is over, it begins anew."""
-        told, v = slice(len(excess)), self.usual_v[a, : len(excess)]
-        self.blocks[a, told] = np.minimum(self.blocks[a, told] + sure, 250.0)
-        self.long[a, told] += sure * (excess - self.long[a, told]) / self.blocks[a, told]
-        late = self.late()[a, told]
-        least = (0.35 + self.blocks[a, told] * 0.65 / 250.0) * (v + np.maximum(late, 0.0))
-        over = self.long[a, told] - late > least
-        self.long[a, told] = np.where(over, late, self.long[a, told])
-        self.blocks[a, told] = np.where(over, 12.0, self.blocks[a, told])
+        reported, v = slice(len(excess)), self.usual_v[a, : len(excess)]
+        self.blocks[a, reported] = np.minimum(self.blocks[a, reported] + sure, 250.0)
+        self.long[a, reported] += sure * (excess - self.long[a, reported]) / self.blocks[a, reported]
+        late = self.late()[a, reported]
+        least = (0.35 + self.blocks[a, reported] * 0.65 / 250.0) * (v + np.maximum(late, 0.0))
+        over = self.long[a, reported] - late > least
+        self.long[a, reported] = np.where(over, late, self.long[a, reported])
+        self.blocks[a, reported] = np.where(over, 12.0, self.blocks[a, reported])
 
     def fit(self, slots: IntArray, dots: FloatArray) -> tuple[tuple[float, ...], FloatArray, bool]:
         z, n = self.of.of(dots), len(slots)
-        told = min(self.orders, (n + 1) // 2)
+        reported = min(self.orders, (n + 1) // 2)
         before, q = self.usual(), self.q[slots]
         weights, more, value, misfit = np.zeros((4, self.size)), np.zeros(4), np.zeros(4), False
         for a in range(4):
             precision = np.linalg.inv(self.spread[a, a][np.ix_(slots, slots)])
-            spread = self.information(a, slots, told)
-            c = spread @ q[:, :told].T @ precision @ (z[a] - z[a].mean())
+            spread = self.information(a, slots, reported)
+            c = spread @ q[:, :reported].T @ precision @ (z[a] - z[a].mean())
             excess = c * c - np.diag(spread)
-            sure = np.minimum(self.usual_v[a, :told] / np.diag(spread), 1.0) ** 2
-            self.squares[a, :told] += (sure * excess - self.squares[a, :told]) / 12.0
-            self.weight[a, :told] += (sure - self.weight[a, :told]) / 12.0
+            sure = np.minimum(self.usual_v[a, :reported] / np.diag(spread), 1.0) ** 2
+            self.squares[a, :reported] += (sure * excess - self.squares[a, :reported]) / 12.0
+            self.weight[a, :reported] += (sure - self.weight[a, :reported]) / 12.0
             self.last(a, excess, sure)
             tau = self.usual()[a]
-            sudden = c * c > 16.0 * (np.diag(spread) + before[a, :told])
-            tau[:told] = np.where(sudden, np.maximum(excess, tau[:told]), tau[:told])
-            if told > 1 and n < self.size:
-                expected = spread[1:, 1:] + np.diag(tau[1:told])
-                if c[1:] @ np.linalg.inv(expected) @ c[1:] > told - 1 + 3.0 * (2.0 * (told - 1)) ** 0.5:
-                    tau[1:told] = np.maximum(tau[1:told], (c * c + np.diag(spread))[1:])
+            sudden = c * c > 16.0 * (np.diag(spread) + before[a, :reported])
+            tau[:reported] = np.where(sudden, np.maximum(excess, tau[:reported]), tau[:reported])
+            if reported > 1 and n < self.size:
+                expected = spread[1:, 1:] + np.diag(tau[1:reported])
+                if c[1:] @ np.linalg.inv(expected) @ c[1:] > reported - 1 + 3.0 * (2.0 * (reported - 1)) ** 0.5:
+                    tau[1:reported] = np.maximum(tau[1:reported], (c * c + np.diag(spread))[1:])
             if a == 3:
                 # The length of the base line: what it does in one block is noise.
                 tau = before[a]
-            prior = np.diag(np.r_[0.0, 1.0 / tau[1:told]])
-            inverted = np.linalg.inv(q[:, :told].T @ precision @ q[:, :told] + prior)
-            w = precision @ q[:, :told] @ inverted @ self.middle[:told]
+            prior = np.diag(np.r_[0.0, 1.0 / tau[1:reported]])
+            inverted = np.linalg.inv(q[:, :reported].T @ precision @ q[:, :reported] + prior)
+            w = precision @ q[:, :reported] @ inverted @ self.middle[:reported]
             weights[a, slots] = w
             value[a] = w @ z[a]
             more[a] = float((self.middle - w @ q)[1:] ** 2 @ tau[1:])
-            left = z[a] - z[a].mean() - q[:, :told] @ c
-            free = n - told
+            left = z[a] - z[a].mean() - q[:, :reported] @ c
+            free = n - reported
             if free > 0 and left @ precision @ left > free + 5.0 * (2.0 * free) ** 0.5:
                 misfit = True
                 more[a] += float(left @ left) / free
@@ -357,7 +357,7 @@ def test_small_blocks_follow_motion_and_say_how_well(size: int) -> None:
     assert np.mean(z < 3.0) > 0.99
 
 
-def test_blocks_that_always_lose_their_end_say_how_little_they_tell() -> None:
+def test_blocks_that_always_lose_their_end_say_how_little_they_report() -> None:
     """Weights of some 1e-5 a block are weights: 0.93 were within three deviations, and the rms error was 6 um."""
     assert np.mean(np.abs(swaying(20, tuple(range(12, 20)))) < 3.0) > 0.99
 

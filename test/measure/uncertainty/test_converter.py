@@ -40,7 +40,7 @@ def test_coarse_steps_are_found_on_every_channel(bits: int, offset: float, noise
     np.testing.assert_allclose(fed(samples).steps, step, rtol=1e-5)
 
 
-def test_channels_that_never_change_tell_by_their_levels() -> None:
+def test_channels_that_never_change_report_by_their_levels() -> None:
     np.testing.assert_allclose(fed(volts(TEN, 0.0)).steps, TEN, rtol=1e-5)
     # A dead channel has no steps, and one level that is far off is none either.
     samples = volts(TEN, 0.0)
@@ -99,7 +99,7 @@ def test_a_step_is_not_believed_before_thirty_samples_and_one_finer_value_ends_i
 
 def test_ten_bits_untold_are_in_the_intervals() -> None:
     """The finding: 0.77 of the intervals of one axis held the truth."""
-    s = coarse(24, told=False)
+    s = coarse(24, reported=False)
     assert min(s.axes) > 0.93
     assert s.joint > 0.93
 

@@ -290,9 +290,9 @@ def test_a_segment_need_not_be_whole_to_be_of_its_place() -> None:
     """Segments are of 50 blocks by their numbers: what begins in the middle of one ends with it."""
     of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
     rng = np.random.default_rng(8)
-    told = [b for b in range(20, 130) if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
-    assert told == [49, 99]
+    reported = [b for b in range(20, 130) if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
+    assert reported == [49, 99]
     # A block of a later segment closes one whose end was lost; too little of one changes nothing.
     of = StreamNoise(SIZE, PLACES, PLACES, SIGMA**2, 0.0)
-    told = [b for b in [*range(40), 51, *range(52, 60), 130] if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
-    assert told == [51]
+    reported = [b for b in [*range(40), 51, *range(52, 60), 130] if of.add(b, ALL, SIGMA * rng.normal(size=(SIZE, 4)))]
+    assert reported == [51]

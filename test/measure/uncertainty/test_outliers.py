@@ -53,7 +53,7 @@ def named(said: FloatArray, should: FloatArray, noise: float) -> str:
 def test_a_reading_is_named_by_the_moments_of_what_was_seen() -> None:
     """Readings around each limit of the rules, a reading or two at a time; axes exchanged more or less exactly."""
     rng = np.random.default_rng(12)
-    told: dict[str, int] = {}
+    reported: dict[str, int] = {}
     for case in range(500):
         n = int(rng.choice([9, 10, 11, 40]))
         should = rng.normal(size=(n, 4)) * NOISE * 10.0 ** rng.uniform(1.7, 3.0, 4)
@@ -76,5 +76,5 @@ def test_a_reading_is_named_by_the_moments_of_what_was_seen() -> None:
             search.add(tuple(said[block].tolist()), tuple((said[block] - should[block]).tolist()))
         want = named(said, should, NOISE)
         assert search.most_likely(NOISE) == want, case
-        told[want] = told.get(want, 0) + 1
-    assert len(told) == 11
+        reported[want] = reported.get(want, 0) + 1
+    assert len(reported) == 11

@@ -20,7 +20,7 @@ def moves(um: list[float], noise_um: float = 0.01) -> str:
     return why_moving(dots, ((1e-6 * noise_um) ** 2,) * 4)
 
 
-def test_two_blocks_tell_nothing_three_do() -> None:
+def test_two_blocks_report_nothing_three_do() -> None:
     assert moves([0.0, 50.0]) == ''
     # From the first block to the mean of the others.
     assert moves([0.0, 2.01, 2.01]).startswith('the link moves: y1 varied by 1.2 µm rms in the last 3 blocks, noise')

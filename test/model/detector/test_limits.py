@@ -82,8 +82,8 @@ def test_a_channel_is_saturated_from_the_converters_last_step_on(channel: int, s
 
 
 def test_the_devices_flag_blames_no_detector_unless_a_cause_is_seen() -> None:
-    told = judge(flag=FLAG_OVER_RANGE)
-    assert (told.status, told.faulty) == (BlockStatus.SATURATED, 0)
+    reported = judge(flag=FLAG_OVER_RANGE)
+    assert (reported.status, reported.faulty) == (BlockStatus.SATURATED, 0)
     assert judge(changed(2, 0.0), flag=FLAG_OVER_RANGE).status is BlockStatus.LASER_LOST
 
 
@@ -127,7 +127,7 @@ def test_too_few_samples_leave_no_detector_to_go_on_with() -> None:
     assert (dark.status, dark.faulty, dark.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1}))
 
 
-def test_the_worst_cause_is_told_first_and_two_faults_leave_nothing() -> None:
+def test_the_worst_cause_is_reported_first_and_two_faults_leave_nothing() -> None:
     far = (1.0, 0.0, 1.25e-4, -1.25e-4)
     both = judge(changed(5, 0.0), far)
     assert (both.status, both.faulty, both.faults) == (BlockStatus.LASER_LOST, 0, frozenset({1, 2}))
@@ -137,18 +137,18 @@ def test_the_worst_cause_is_told_first_and_two_faults_leave_nothing() -> None:
     assert judge(changed(3, 10.0), (*DOTS[:2], 1.0, 0.0)).status is BlockStatus.SATURATED
 
 
-@pytest.mark.parametrize(('share', 'told'), [(0.34, False), (0.36, True), (0.64, True), (0.66, False)])
-def test_half_the_light_on_both_is_one_laser_of_two(share: float, told: bool) -> None:
+@pytest.mark.parametrize(('share', 'reported'), [(0.34, False), (0.36, True), (0.64, True), (0.66, False)])
+def test_half_the_light_on_both_is_one_laser_of_two(share: float, reported: bool) -> None:
     nominal = load_rig().amplifier.sum_nominal
     volts = (*GOOD[:2], share * nominal, *GOOD[3:5], share * nominal)
     got = judge(volts, splitter=True)
-    assert got.half_light == told
-    assert any('half the light' in f for f in got.findings) == told
+    assert got.half_light == reported
+    assert any('half the light' in f for f in got.findings) == reported
     assert not judge((*volts[:5], nominal), splitter=True).half_light
     assert not judge(volts).half_light
 
 
-def test_other_light_and_a_clipped_spot_are_told_of_the_detector() -> None:
+def test_other_light_and_a_clipped_spot_are_reported_of_the_detector() -> None:
     most = load_rig().estimator.sum_max
     for psd, channel in ((1, 2), (2, 5)):
         assert judge(one=changed(channel, most + 0.01)).findings == (
@@ -158,9 +158,9 @@ def test_other_light_and_a_clipped_spot_are_told_of_the_detector() -> None:
     area, radius = load_rig().psds[0].active_area, load_rig().psds[0].spot_radius
     for axis in range(4):
         edge = area[axis % 2] / 2.0 - radius
-        for off, told in ((1e-6, True), (-1e-6, False)):
+        for off, reported in ((1e-6, True), (-1e-6, False)):
             dots = (*DOTS[:axis], -edge - off, *DOTS[axis + 1 :])
-            said = (f'psd_{1 + axis // 2}: the spot is clipped at the edge',) if told else ()
+            said = (f'psd_{1 + axis // 2}: the spot is clipped at the edge',) if reported else ()
             assert judge(dots=dots).findings == said
 
 
@@ -218,21 +218,21 @@ def test_a_detector_is_still_if_x_y_and_sum_are(channel: int) -> None:
 
 @pytest.mark.parametrize('channel', range(6))
 @pytest.mark.parametrize('size', [10, 20])
-def test_noise_is_told_from_five_times_what_amplifier_and_converter_have(channel: int, size: int) -> None:
+def test_noise_is_separated_from_five_times_what_amplifier_and_converter_have(channel: int, size: int) -> None:
     """The third difference of a, -a, a ... is 8 a, that of white noise of s has the rms s sqrt(20)."""
     sigma = 1e-4
     rig = load_rig(overrides={'amplifier.noise': sigma, 'block_size': size, 'min_samples': size // 2})
     limit = 5.0 * np.sqrt(sigma**2 + STEP**2 / 12.0)
-    for share, told in ((0.99, 0), (1.01, 1)):
+    for share, reported in ((0.99, 0), (1.01, 1)):
         volts = np.zeros((size, 6))
         volts[:, channel] = share * limit * np.sqrt(20.0) / 8.0 * (-1.0) ** np.arange(size)
         found = OpticsHealth(rig).late_findings(
             of(volts.astype(np.float32)), Verdict(BlockStatus.OK, '', 0), (0, 0), Loudness()
         )
-        assert found == (f'psd_{1 + channel // 3} is noisy: {share * limit * 1e3:.1f} mV a sample',) * told
+        assert found == (f'psd_{1 + channel // 3} is noisy: {share * limit * 1e3:.1f} mV a sample',) * reported
 
 
-def test_blocks_of_nine_samples_and_blocks_with_gaps_tell_no_noise() -> None:
+def test_blocks_of_nine_samples_and_blocks_with_gaps_report_no_noise() -> None:
     volts = np.tile((-1.0) ** np.arange(20, dtype=np.float32)[:, None], (1, 6)).astype(np.float32)
     for size, present in ((9, 9), (20, 19)):
         rig = load_rig(overrides={'block_size': size, 'min_samples': 4})
@@ -269,7 +269,7 @@ def test_other_light_counts_over_each_detectors_own_area() -> None:
     assert OpticsHealth(rig).background_variance((8.0,) * 3) == pytest.approx(want)
 
 
-def test_a_spot_at_a_corner_is_told_once_and_the_faulty_psd_hides_no_other() -> None:
+def test_a_spot_at_a_corner_is_reported_once_and_the_faulty_psd_hides_no_other() -> None:
     corner = (*DOTS[:2], 4.9e-3, -4.9e-3)
     assert judge(dots=corner).findings == ('psd_2: the spot is clipped at the edge',)
     dark = judge(changed(2, 0.0), corner)

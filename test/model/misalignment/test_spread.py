@@ -56,13 +56,13 @@ def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
     dots = np.concatenate([readings(q, pose, rig.link.length) for q in drawn], axis=1).T
     pipeline = Pipeline(rig)
     solved: dict[str, list[tuple[float, ...]]] = {}
-    told: dict[str, DeflectionEstimate] = {}
+    reported: dict[str, DeflectionEstimate] = {}
     for i, row in enumerate(dots):
         for name, e in estimates([*pipeline.process(chunk_of(np.repeat(row[None], 20, axis=0), 20 * i))]).items():
             solved.setdefault(name, []).append(e.pose)
-            told.setdefault(name, e)
+            reported.setdefault(name, e)
     for name, poses in solved.items():
-        seen, said = np.cov(np.array(poses).T), np.array(told[name].covariance).reshape(3, 3)
+        seen, said = np.cov(np.array(poses).T), np.array(reported[name].covariance).reshape(3, 3)
         sd = np.sqrt(np.diag(seen))
         assert np.sqrt(np.diag(said)) == pytest.approx(sd, rel=0.17), name
         assert said / np.outer(sd, sd) == pytest.approx(seen / np.outer(sd, sd), abs=0.25), name
@@ -100,9 +100,9 @@ def test_a_zero_taken_now_replaces_what_the_file_left_open() -> None:
     assert before.covariance[0] ** 0.5 > 0.9e-6
     assert after.covariance[0] ** 0.5 < 0.5e-6
     # As it was recorded, bit for bit; and a recording that starts now tells the same.
-    for told in (change, pipeline.memory(rig)):
-        assert isinstance(told, ParameterChange)
-        assert ZERO_VARIANCES in dict(told.values)
+    for reported in (change, pipeline.memory(rig)):
+        assert isinstance(reported, ParameterChange)
+        assert ZERO_VARIANCES in dict(reported.values)
     other = Pipeline(rig)
     list(other.process(chunk_of(dots[:600])))
     other.apply(change)
@@ -144,9 +144,9 @@ def test_what_the_filters_covariance_holds_besides_noise_is_remembered() -> None
     list(live.process(chunk_of(still(rig, POSE, 200))))
     memory = live.memory(rig)
     assert memory is not None
-    told = dict(memory.values)[SYSTEMATIC]
+    reported = dict(memory.values)[SYSTEMATIC]
     assert live.estimation.systematic is not None
-    assert told == tuple(live.estimation.systematic.ravel().tolist())
+    assert reported == tuple(live.estimation.systematic.ravel().tolist())
     replay.apply(memory)
     without.apply(streams.without(memory, SYSTEMATIC))
     dark = chunk_of(still(rig, POSE, 20), 200)
@@ -154,4 +154,4 @@ def test_what_the_filters_covariance_holds_besides_noise_is_remembered() -> None
     moved = [[r for r in pipeline.process(dark) if isinstance(r, TipMotion)] for pipeline in (live, replay, without)]
     assert moved[0] == moved[1]
     more = np.array(moved[0][0].covariance) - moved[2][0].covariance
-    np.testing.assert_allclose(more, told, rtol=1e-6)
+    np.testing.assert_allclose(more, reported, rtol=1e-6)

@@ -191,10 +191,10 @@ def test_two_effects_of_one_name_are_rejected(folder: Path) -> None:
 
 
 def test_a_package_offers_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = tmp_path / 'some_package-1.0.dist-info'
-    told.mkdir()
-    (told / 'METADATA').write_text('Metadata-Version: 2.1\nName: some-package\nVersion: 1.0\n')
-    (told / 'entry_points.txt').write_text(f'[{GROUP}]\n{NAME} = some_package_with_an_effect:EFFECT\n')
+    reported = tmp_path / 'some_package-1.0.dist-info'
+    reported.mkdir()
+    (reported / 'METADATA').write_text('Metadata-Version: 2.1\nName: some-package\nVersion: 1.0\n')
+    (reported / 'entry_points.txt').write_text(f'[{GROUP}]\n{NAME} = some_package_with_an_effect:EFFECT\n')
     (tmp_path / 'some_package_with_an_effect.py').write_text(CODE)
     monkeypatch.syspath_prepend(str(tmp_path))
     monkeypatch.setenv(FOLDERS, '')

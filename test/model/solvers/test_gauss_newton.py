@@ -21,8 +21,8 @@ def curve(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
 
 def line(x: Sequence[float]) -> tuple[list[float], list[Sequence[float]]]:
     """Sees the sum of its unknowns only, except where the first is 1."""
-    tells = 1.0 if x[0] == 1.0 else 0.0
-    return [x[0] + x[1], 0.0], [(1.0, 1.0), (tells, 0.0)]
+    reports = 1.0 if x[0] == 1.0 else 0.0
+    return [x[0] + x[1], 0.0], [(1.0, 1.0), (reports, 0.0)]
 
 
 def test_a_curve_is_fitted_with_its_covariance() -> None:

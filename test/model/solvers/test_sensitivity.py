@@ -426,7 +426,7 @@ def test_three_psds_at_the_base_in_two_planes_give_five_unknowns(rays: Any) -> N
     assert got[:5] == pytest.approx(five, abs=1e-12)
 
 
-def test_without_tilts_in_the_dots_beam_is_a_flat_plate_that_tells_its_tilts() -> None:
+def test_without_tilts_in_the_dots_beam_is_a_flat_plate_that_reports_its_tilts() -> None:
     """Dots whose tilts a correction has taken off, on surfaces at heights."""
     dots = (1e-3, -2e-3, 5e-4, 1e-3)
     flat = make_solver('exact', RAISED).solve(dots, VARIANCES[:4])

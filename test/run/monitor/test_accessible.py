@@ -47,7 +47,7 @@ def shown(serve: Callable[..., Serving]) -> Serving:
     serving.give(0, 100)
     serving.give(100, 5, lost=3)
     for number in range(50):
-        serving.server.tell(f'message {number}')
+        serving.server.notify(f'message {number}')
     return serving
 
 

@@ -526,12 +526,12 @@ def test_half_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[...,
             # Some are short, so that losses are drawn too.
             serving.give(given, 1790)
             serving.give(given + 1790, 10, lost=1)
-            serving.server.tell(f'{given} blocks')
+            serving.server.notify(f'{given} blocks')
             given += 1800
             page.quietly_until_rows(given)
 
     for number in range(100):
-        serving.server.tell(f'message {number}')
+        serving.server.notify(f'message {number}')
     give_until(WARM_BLOCKS)
     nodes = page.nodes()
     heap = page.heap_bytes()

@@ -102,12 +102,12 @@ def test_calibrate_records_and_ends_with_the_recording(
     serving = serve()
     serving.shown.folder = str(bag)
     # It asks whether something is recorded, asks for a recording, and where it is; then somebody ends it.
-    asked, told = itertools.count(1), client.recording_of
+    asked, reported = itertools.count(1), client.recording_of
 
     def recording_of(daemon: client.Daemon) -> str | None:
         if next(asked) == 3:
             serving.shown.recordings.append(None)
-        return told(daemon)
+        return reported(daemon)
 
     monkeypatch.setattr(client, 'recording_of', recording_of)
     monkeypatch.setattr('os.nice', lambda more: more)
@@ -129,7 +129,7 @@ def test_a_stop_of_the_calibration_is_never_lost(
     convert(made, bag, made.parameters, Beside.of(made), made.blocks())
     serving = serve()
     serving.shown.folder = str(bag)
-    asked, told = itertools.count(1), client.recording_of
+    asked, reported = itertools.count(1), client.recording_of
 
     class Leaving:
         def __del__(self) -> None:
@@ -140,7 +140,7 @@ def test_a_stop_of_the_calibration_is_never_lost(
     def recording_of(daemon: client.Daemon) -> str | None:
         if next(asked) == 3:
             Leaving()
-        return told(daemon)
+        return reported(daemon)
 
     monkeypatch.setattr(client, 'recording_of', recording_of)
     monkeypatch.setattr('os.nice', lambda more: more)
@@ -167,10 +167,10 @@ def test_echo_prints_new_blocks(serve: Serve, capsys: pytest.CaptureFixture[str]
     serving.give(0, 3)
     listen(serving.url, lambda m: 'rows' in m)
     connected = threading.Event()
-    told = client.messages
+    reported = client.messages
 
     async def noticed(daemon: client.Daemon) -> object:
-        async for message in told(daemon):
+        async for message in reported(daemon):
             connected.set()
             yield message
 

@@ -102,7 +102,7 @@ def test_words_of_a_device_cannot_break_the_text() -> None:
     assert found[('psd_deflection_samples_lost_total', '?')] == 1.0
 
 
-def test_a_number_that_is_none_is_told_as_one() -> None:
+def test_a_number_that_is_none_is_reported_as_one() -> None:
     text = text_of([Family('sum_volts', 'gauge', 'Sum', (({}, math.nan), ({'psd': '1'}, math.inf)), 'volts')])
     values = list(numbers(text).values())
     assert math.isnan(values[1])

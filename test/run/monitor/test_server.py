@@ -72,7 +72,7 @@ def rows_in(messages: list[Any]) -> list[Any]:
 def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     serving = serve()
     serving.give(0, 5)
-    serving.server.tell('a message')
+    serving.server.notify('a message')
     seen: list[Any] = []
 
     def more(message: dict[str, Any]) -> bool:
@@ -94,8 +94,8 @@ def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     assert [r[1] for r in rows] == list(range(8))
     assert {len(r) for r in rows} == {len(hello['columns'])}
     assert rows[6][8:14] == [None] * 6
-    told = [text for m in messages for _, text in m.get('messages', [])]
-    assert told == ['a message']
+    reported = [text for m in messages for _, text in m.get('messages', [])]
+    assert reported == ['a message']
     health = next(m['health'] for m in messages if 'health' in m)
     assert health['entries'][0]['name'] == 'acquisition'
     # A level that is changed while it runs reaches the page.
@@ -439,10 +439,10 @@ def test_one_browser_too_many_gets_the_reason(serve: Serve) -> None:
             for one in lookers:
                 await one.receive()
             late = await session.ws_connect(serving.url + 'ws')
-            told = await late.receive()
+            reported = await late.receive()
             for one in lookers:
                 await one.close()
-            return told.data, told.extra or ''
+            return reported.data, reported.extra or ''
 
     assert asyncio.run(asyncio.wait_for(go(), WAIT_S)) == (1013, '16 viewers look on already')
 

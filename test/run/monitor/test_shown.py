@@ -91,10 +91,10 @@ def test_a_zero_does_not_wait_for_the_next_block_of_a_slow_recording() -> None:
     source = source_of('clean', feed, stated, threading.Event(), speed=1e-3)
     source.start()
     assert feed.estimated.wait(60.0)
-    told = source.zero()
+    reported = source.zero()
     source.close()
-    assert told.startswith('unloaded dots (mm): psd_1 (')
-    assert stated == [told]
+    assert reported.startswith('unloaded dots (mm): psd_1 (')
+    assert stated == [reported]
 
 
 class Played(Feed):
@@ -171,7 +171,7 @@ def test_a_recording_can_be_paused_and_sought() -> None:
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'status', 'told'),
+    ('arguments', 'status', 'reported'),
     [
         (['no_such_bag'], 4, 'no such recording'),
         ([str(BAGS / 'clean'), '--speed', '0'], 2, '--speed 0: must be above 0'),
@@ -182,11 +182,11 @@ def test_a_recording_can_be_paused_and_sought() -> None:
     ],
 )
 def test_what_cannot_be_is_one_line(
-    arguments: list[str], status: int, told: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], status: int, reported: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(['monitor', *arguments]) == status
     err = capsys.readouterr().err
-    assert told in err
+    assert reported in err
     assert err.strip().count('\n') == 0
 
 

@@ -75,7 +75,7 @@ def test_outliers_do_not_move_it(nominal: Rig, pose: FloatArray) -> None:
     assert off[: AT['psd_1.zero_x']].max() < 3.0
 
 
-def test_the_noise_of_reference_and_channels_is_told(nominal: Rig, pose: FloatArray) -> None:
+def test_the_noise_of_reference_and_channels_is_reported(nominal: Rig, pose: FloatArray) -> None:
     found = calibrated(nominal, only(), pose, spread=(5e-6, 20e-6, 1e-3))
     assert found.fit.noise.reference == pytest.approx((5e-6, 20e-6, 1e-3), rel=0.12)
     assert found.noise == pytest.approx(np.full(4, 2e-3), rel=0.03)
@@ -184,7 +184,7 @@ def test_a_recording_without_reference_and_loads_is_rejected(nominal: Rig, pose:
 
 
 @pytest.mark.statistics
-def test_the_redundant_reading_alone_tells_a_relative_gain(nominal: Rig, pose: FloatArray) -> None:
+def test_the_redundant_reading_alone_reports_a_relative_gain(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(psd_1__gain_x=0.02), pose, np.random.default_rng(2)))
     found = calibrate(
         [CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal, alone=True

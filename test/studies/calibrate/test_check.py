@@ -49,7 +49,7 @@ def test_a_group_has_moved_by_what_its_rows_and_its_prior_say(seed: int) -> None
 
 
 def test_a_group_is_fitted_as_if_it_may_have_moved_by_three_tolerances(monkeypatch: pytest.MonkeyPatch) -> None:
-    told = prior_of_rig(rig_from_values({}))
+    reported = prior_of_rig(rig_from_values({}))
     names = [p.name for p in PARAMETERS if p.group == 'psd_1.gain']
     given: list[Prior] = []
 
@@ -60,15 +60,15 @@ def test_a_group_is_fitted_as_if_it_may_have_moved_by_three_tolerances(monkeypat
     monkeypatch.setattr(checking, 'explained', explained)
     group = MovedGroup('psd_1.gain', 0.01, 1.0, 2, dict.fromkeys(names, (0.0, 0.1)))
     nothing = cast(Any, None)
-    found = fitted_group(group, nothing, nothing, told, 'reference', nothing, nothing, 3.0)
-    wider = np.zeros(len(told.mean))
+    found = fitted_group(group, nothing, nothing, reported, 'reference', nothing, nothing, 3.0)
+    wider = np.zeros(len(reported.mean))
     for p in PARAMETERS:
         if p.name in names:
             wider[INDEX[p.name]] = 9.0 * p.tolerance**2
     (prior,) = given
     assert np.all(wider[[INDEX[n] for n in names]] > 0.0)
-    np.testing.assert_allclose(prior.covariance, told.covariance + np.diag(wider), rtol=1e-12)
-    assert np.array_equal(prior.mean, told.mean)
+    np.testing.assert_allclose(prior.covariance, reported.covariance + np.diag(wider), rtol=1e-12)
+    assert np.array_equal(prior.mean, reported.mean)
     # Against nothing moved; and what it moved by.
     assert found.evidence == pytest.approx(4.0)
     assert [v for v, _ in found.shifts.values()] == pytest.approx([0.5] * len(names))
@@ -86,7 +86,7 @@ def test_at_most_five_per_cent_of_rigs_are_said_to_have_moved(shared: float, lea
     assert (LEVEL, overall_p([]), overall_p([0.4, 0.9])) == (0.05, 1.0, 0.8)
 
 
-def test_what_no_row_tells_is_undetermined_alone_or_as_a_combination() -> None:
+def test_what_no_row_reports_is_undetermined_alone_or_as_a_combination() -> None:
     prior = prior_of_rig(rig_from_values({}))
     size = len(prior.mean)
     free = np.ones(size, dtype=bool)

@@ -137,7 +137,7 @@ def test_lost_samples_are_left_out(nominal: Rig) -> None:
         (slice(700, 702), 1, 9.95, r'^off\.csv: y1 is saturated with the laser off: 9\.950 V, .*is 10 V'),
     ],
 )
-def test_a_recording_that_tells_no_dark_level_is_rejected(
+def test_a_recording_that_reports_no_dark_level_is_rejected(
     nominal: Rig, rows: slice, column: int, value: float, words: str
 ) -> None:
     volts = darkness()
@@ -182,7 +182,7 @@ def test_light_is_not_taken_off_twice(nominal: Rig) -> None:
     dark_levels(runs, replace_values(old, {'psd_1.dark': [0.0, 0.0, 0.1], 'psd_2.dark': [0.0, 0.0, 0.1]}))
 
 
-def test_a_recording_with_lasers_on_does_not_tell_light_from_gains() -> None:
+def test_a_recording_with_lasers_on_does_not_report_light_from_gains() -> None:
     """What a level does to the readings is what both gains and the zero of that PSD do: no motion tells them apart."""
     p = np.zeros(COUNT)
     p[INDEX['psd_1.center_y']], p[INDEX['psd_2.center_x']], p[INDEX['link.slope_ratio']] = 0.07, -0.1, 1.5

@@ -74,8 +74,8 @@ def test_rows_that_are_worth_fewer_weigh_less() -> None:
 
 
 @pytest.mark.parametrize('kind', ['reference', 'loads', 'self'])
-@pytest.mark.parametrize(('share', 'told'), [(0.0, 0.3), (0.2, 0.3), (0.4, 0.4), (2.0, 2.0)])
-def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: float, told: float) -> None:
+@pytest.mark.parametrize(('share', 'reported'), [(0.0, 0.3), (0.2, 0.3), (0.4, 0.4), (2.0, 2.0)])
+def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: float, reported: float) -> None:
     """The redundant reading has ``share`` of the noise that is stated, of either sign; nothing was fitted."""
     rng = np.random.default_rng(6)
     n, sd = 200, 3e-6
@@ -92,4 +92,4 @@ def test_dots_are_believed_up_to_three_tenths_of_their_noise(kind: Kind, share: 
     linear = Linear(residual, np.zeros((n, 4, SIZE)), by_pose)
     prior = prior_of_rig(rig_from_values({}))
     found = variance_components(linear, rows, np.ones(n), kind, 1, np.zeros((SIZE, SIZE)), prior)
-    assert found.dots == pytest.approx(told)
+    assert found.dots == pytest.approx(reported)

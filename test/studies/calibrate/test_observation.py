@@ -169,7 +169,7 @@ def test_references_count_by_their_proportions_if_all_state_them() -> None:
     assert np.all(joined([rows(1e-6), rows(np.nan)]).sd == 1.0)
 
 
-def test_half_of_the_deviations_tell_that_of_all() -> None:
+def test_half_of_the_deviations_report_that_of_all() -> None:
     values = np.random.default_rng(3).normal(0.0, 2.0, 20_000)
     assert deviation_of(values, False) == pytest.approx(2.0, rel=0.02)
     assert deviation_of(values, True) == pytest.approx(2.0, rel=0.03)

@@ -186,9 +186,9 @@ def test_a_dead_channel_is_named_and_no_wiring(channel: str, stuck: bool) -> Non
     assert [(f.name, f.where) for f in found.findings] == [('stuck_channel', channel)]
     assert not found.values
     # On the page each is a sentence, on the terminal a row.
-    (told,) = [text for text in found.sentences() if text.startswith(channel)]
-    assert re.fullmatch(rf'{channel}: [^:]+: .+', told)
-    assert '  ' not in told
+    (reported,) = [text for text in found.sentences() if text.startswith(channel)]
+    assert re.fullmatch(rf'{channel}: [^:]+: .+', reported)
+    assert '  ' not in reported
     assert any(line.startswith(f'  {channel}: ') for line in found.lines())
 
 
@@ -238,7 +238,7 @@ def test_a_wrong_wiring_is_named_whatever_the_sensitivities_are(name: str) -> No
     assert dict(found.values) == lines_of(turn)
 
 
-def test_drift_is_told_with_its_sign() -> None:
+def test_drift_is_reported_with_its_sign() -> None:
     loads = pushes(50.0)
     drifting = {'name': 'laser_pointing_drift', 'psd': 2, 'rate_x': 1e-6, 'rate_y': 0.0}
     found = checked(recorded(loads, 6, effects=[drifting]), loads)

@@ -17,7 +17,7 @@ from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check import checkup
 from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.levels import Levels
-from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, TELLING_DRIFT, WRONG, Checkup
+from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, SIGNIFICANT_DRIFT, WRONG, Checkup
 from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFit, on_channels
 from psd_deflection.studies.loads.noted_times import CorrectedNote
 
@@ -89,7 +89,7 @@ def test_a_channel_is_dead_that_moves_less_than_a_tenth_of_every_push() -> None:
     assert ('stuck_channel', 'x1') not in of(checked([dead, turned]))
 
 
-def test_a_channel_that_is_stuck_is_told_once_and_no_wiring_then() -> None:
+def test_a_channel_that_is_stuck_is_reported_once_and_no_wiring_then() -> None:
     dead = replace(push('fx'), channels=np.array([0.0, 0.0, -1e-4, 0.0]))
     found = checked([dead, push('fy')], of_levels(stuck=('x1', 'sum2')))
     assert of(found) == [('stuck_channel', 'x1'), ('stuck_channel', 'sum2')]
@@ -162,7 +162,7 @@ def test_all_signs_turned_may_be_the_loads_as_well() -> None:
     assert not any('load_sign' in text for f in found.findings for text in f.equivalent)
 
 
-def test_a_load_of_the_other_sign_is_told() -> None:
+def test_a_load_of_the_other_sign_is_reported() -> None:
     found = checked([push('fx'), push('fy'), push('tz', -1.0)])
     assert [(f.name, f.where, f.value, f.fix) for f in found.findings] == [
         ('load_sign', 'tz', -1.0, 'load_tz in the recording has the wrong sign')
@@ -174,7 +174,7 @@ def test_a_load_of_the_other_sign_is_told() -> None:
 
 
 @pytest.mark.parametrize(
-    ('size', 'told'),
+    ('size', 'reported'),
     [
         (1.09, ''),
         (1.11, '1.11'),
@@ -186,18 +186,18 @@ def test_a_load_of_the_other_sign_is_told() -> None:
         (-1.05, ''),
     ],
 )
-def test_a_push_a_tenth_too_large_is_noted(size: float, told: str) -> None:
+def test_a_push_a_tenth_too_large_is_noted(size: float, reported: str) -> None:
     found = checked([push('fx'), push('fy'), push('tz', size)])
     words = (
-        f'+θ: the dots move {told} times what the rig file expects; see its link and amplifier.sensitivity '
+        f'+θ: the dots move {reported} times what the rig file expects; see its link and amplifier.sensitivity '
         '(`psd-deflection discover` names the cause)'
     )
-    assert found.notes == ((words,) if told else ())
+    assert found.notes == ((words,) if reported else ())
     # By hand nobody knows how far.
     assert checked([push('fx'), push('fy'), push('tz', size, sized=False)]).notes == ()
 
 
-def test_a_unit_is_told_by_the_sizes_of_pushes_that_have_one() -> None:
+def test_a_unit_is_reported_by_the_sizes_of_pushes_that_have_one() -> None:
     kilograms = [push('fx', 9.80665), push('fy', 9.80665), push('tz')]
     found = checked(kilograms)
     assert [(f.name, f.where, f.value) for f in found.findings] == [('load_unit', 'fx fy', 9.80665)]
@@ -306,22 +306,22 @@ def test_a_sum_between_its_limits_is_light_enough(sums: tuple[float, float], lig
 
 
 @pytest.mark.parametrize(
-    ('level', 'told'),
+    ('level', 'reported'),
     [(5.74, False), (5.76, True), (4.35, False), (4.34, True), (7.5, True), (7.6, False)],
 )
-def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, told: bool) -> None:
+def test_a_sum_that_is_off_by_fifteen_per_cent_is_worth_a_look(level: float, reported: bool) -> None:
     found = checked(levels=of_levels(sums=(5.0, level)))
     words = f'psd_2: sum {level:.2f} V, the rig file says 5 V; see amplifier.sum_nominal'
-    assert found.notes == ((words,) if told else ())
+    assert found.notes == ((words,) if reported else ())
 
 
 def test_hum_is_worth_a_look_where_it_is_largest() -> None:
     hum = (0.0, 1e-3, 0.0, 4e-3, 0.0, 2e-3)
     words = 'hum: 4.0 mV at 60 Hz on x2; look at shielding and ground'
     assert checked(levels=of_levels(hum=hum, hum_hz=60.0)).notes == (words,)
-    for volt, told in ((4.9495e-3, '4.9'), (4.9505e-3, '5.0')):
+    for volt, reported in ((4.9495e-3, '4.9'), (4.9505e-3, '5.0')):
         hum = (0.0, volt, 0.0, 0.0, 0.0, 0.0)
-        assert checked(levels=of_levels(hum=hum)).notes[0].startswith(f'hum: {told} mV at 50 Hz on y1')
+        assert checked(levels=of_levels(hum=hum)).notes[0].startswith(f'hum: {reported} mV at 50 Hz on y1')
     for channel, name in enumerate(('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')):
         small = [1e-9 * (i == channel) for i in range(6)]
         assert checked(levels=of_levels(hum=small)).notes[0].endswith(f'on {name}; look at shielding and ground')
@@ -330,7 +330,7 @@ def test_hum_is_worth_a_look_where_it_is_largest() -> None:
 def test_drift_beyond_5_um_a_minute_and_5_sd_is_noted() -> None:
     minute = 1e-6 / 60.0
     sd = 2.0**-24
-    for drift, deviation, told in (
+    for drift, deviation, reported in (
         ((0.0, 5.1 * minute, 0.0, 0.0), 1e-9, '+5.1 µm a minute on y1'),
         ((0.0, 4.9 * minute, 0.0, 0.0), 1e-9, ''),
         ((-5.1 * minute, 0.0, 0.0, 0.0), 1e-9, '-5.1 µm a minute on x1'),
@@ -343,10 +343,10 @@ def test_drift_beyond_5_um_a_minute_and_5_sd_is_noted() -> None:
         ((6.0 * minute, 0.0, -7.0 * minute, 0.0), 1e-9, '-7.0 µm a minute on x2'),
         ((0.0, 0.0, 0.0, 5.0 * sd), sd, ''),
         ((0.0, 0.0, 0.0, 5.001 * sd), sd, '+17.9 µm a minute on y2'),
-        ((0.0, 0.0, 0.0, 1e-5), TELLING_DRIFT, '+600.0 µm a minute on y2'),
+        ((0.0, 0.0, 0.0, 1e-5), SIGNIFICANT_DRIFT, '+600.0 µm a minute on y2'),
         # Of a short recording nothing is told.
-        ((0.0, 0.0, 0.0, 1e-5), 1.001 * TELLING_DRIFT, ''),
+        ((0.0, 0.0, 0.0, 1e-5), 1.001 * SIGNIFICANT_DRIFT, ''),
     ):
-        words = f'drift: {told}; let lasers and amplifier warm up'
-        assert checked(drift=drift, drift_sd=deviation).notes == ((words,) if told else ())
-    assert pytest.approx(5e-6 / 60.0) == TELLING_DRIFT
+        words = f'drift: {reported}; let lasers and amplifier warm up'
+        assert checked(drift=drift, drift_sd=deviation).notes == ((words,) if reported else ())
+    assert pytest.approx(5e-6 / 60.0) == SIGNIFICANT_DRIFT

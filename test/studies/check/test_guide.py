@@ -82,7 +82,7 @@ def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
         assert found.findings[0].equivalent == ('load_sign of tz',)
 
 
-def test_a_turn_the_other_way_is_told_beside_exchanged_psds() -> None:
+def test_a_turn_the_other_way_is_reported_beside_exchanged_psds() -> None:
     known = load_rig()
     x, y, turn = hand_of(known, 0.2e-3, 0.1)
     guide, _ = led(known, Bench(known, 1), (x, y, -turn))
@@ -286,7 +286,7 @@ def test_a_dot_at_the_end_of_its_range_is_said_though_it_is_held() -> None:
         assert any(text.startswith('Got it') for text in said) is not ends
 
 
-def test_how_far_the_dots_were_pushed_is_told_in_whole_micrometres() -> None:
+def test_how_far_the_dots_were_pushed_is_reported_in_whole_micrometres() -> None:
     fed = Fed().rested()
     assert fed.feed((1234.5006 * MICRO, -0.6 * MICRO, -999.4998 * MICRO, 0.0), 30)[-1] == (
         'Got it: x1 +1235, y1 -1, x2 -999, y2 +0 µm.'

@@ -22,9 +22,9 @@ from psd_deflection.studies.check.levels import levels
 RIG = load_rig()
 
 
-@pytest.mark.parametrize(('noise', 'told'), [(0.0034, False), (0.006, True), (0.0007, True)])
+@pytest.mark.parametrize(('noise', 'reported'), [(0.0034, False), (0.006, True), (0.0007, True)])
 def test_check_and_discover_say_the_same_of_the_noise(
-    noise: float, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    noise: float, reported: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run, found = tmp_path / 'run.csv', tmp_path / 'found'
     world = ['--world', f'amplifier.noise={noise}']
@@ -35,12 +35,12 @@ def test_check_and_discover_say_the_same_of_the_noise(
     checked = json.loads(capsys.readouterr().out)['setup']
     searched = json.loads((found / 'result.json').read_text())['setup']
     levels = [[f for f in said if f['name'] == 'noise_level'] for said in (checked, searched)]
-    assert [len(one) for one in levels] == [told, told]
-    if told:
+    assert [len(one) for one in levels] == [reported, reported]
+    if reported:
         (of_check,), (of_search,) = levels
         assert of_check['value'] == pytest.approx(of_search['value'], rel=0.03)
-        levels_told = [float(f['fix'].removeprefix('amplifier.noise: ')) for f in (of_check, of_search)]
-        assert levels_told == pytest.approx([noise, noise], rel=0.05)
+        levels_reported = [float(f['fix'].removeprefix('amplifier.noise: ')) for f in (of_check, of_search)]
+        assert levels_reported == pytest.approx([noise, noise], rel=0.05)
 
 
 def test_each_unit_has_its_factor() -> None:
@@ -49,7 +49,7 @@ def test_each_unit_has_its_factor() -> None:
     force = {'kg': g, 'g': g / 1000, 'lbf': g * pound, 'kN': 1000, 'mN': 1 / 1000, 'ozf': g * pound / 16}
     torque = {'kg m': g, 'kg cm': g / 100, 'kg mm': g / 1000, 'kN m': 1000, 'N mm': 1 / 1000, 'N cm': 1 / 100}
     for units, own, wanted in ((judges.FORCE_UNITS, 'N', force), (judges.TORQUE_UNITS, 'N m', torque)):
-        told = {words: factor for factor, words in judges.both_ways(units, own)}
+        reported = {words: factor for factor, words in judges.both_ways(units, own)}
         there = {f'{unit} instead of {own}': factor for unit, factor in wanted.items()}
         # What is a thousand times one way is it the other way too.
         back = {
@@ -57,7 +57,7 @@ def test_each_unit_has_its_factor() -> None:
             for unit, factor in wanted.items()
             if factor not in (1000, 1 / 1000)
         }
-        assert told == pytest.approx({**there, **back}, rel=2e-7)
+        assert reported == pytest.approx({**there, **back}, rel=2e-7)
 
 
 NAN = math.nan
@@ -93,8 +93,8 @@ NAN = math.nan
 def test_a_size_is_a_unit_within_three_per_cent(sizes: tuple[float, float, float], units: dict[int, str]) -> None:
     findings, _ = judges.unit_findings(np.array(sizes))
     places = {'fx': 0, 'fy': 1, 'tz': 2}
-    told = {places[load]: f.fix.partition('it is noted in ')[2] for f in findings for load in f.where.split()}
-    assert told == units
+    reported = {places[load]: f.fix.partition('it is noted in ')[2] for f in findings for load in f.where.split()}
+    assert reported == units
 
 
 def test_check_and_discover_name_a_converter_that_is_coarser_than_the_file_says(
@@ -182,16 +182,16 @@ def test_each_doubling_of_the_step_is_a_bit_less(bits: int, step: float, right: 
     assert lines == ({} if right is None else {'converter.bits': right})
     assert (found.where, found.value) == ('sum1', step)
     assert found.evidence == pytest.approx(math.log(step / (20.0 / 2**bits)))
-    told = f'sum1 steps by {words}'
+    reported = f'sum1 steps by {words}'
     if words:
-        assert found.fix == (told if right is None else f'converter.bits: {right} ({told})')
+        assert found.fix == (reported if right is None else f'converter.bits: {right} ({reported})')
     # If other channels are finer, no number of bits is right for all.
     (found,), lines = judges.step_findings(rig, np.array([0.0, 0.0, step, 0.0, 0.0, 0.0]), finer=True)
     assert lines == {}
     assert not found.fix.startswith('converter.bits')
 
 
-def test_a_unit_has_the_evidence_that_is_told_or_none() -> None:
+def test_a_unit_has_the_evidence_that_is_reported_or_none() -> None:
     sizes = np.array([9.80665, math.nan, math.nan])
     assert judges.unit_findings(sizes)[0][0].evidence == 0.0
     (found,), factors = judges.unit_findings(sizes, 7.0)

@@ -98,9 +98,9 @@ def test_slopes_are_least_squares_and_memory_widens_them() -> None:
 
 @pytest.mark.parametrize('other', [1, 2, 3])
 @pytest.mark.parametrize('unit', [1e4, 1.0, 1e-4, 1e-8])
-@pytest.mark.parametrize(('share', 'told'), [(1e-5, True), (1e-7, False)])
+@pytest.mark.parametrize(('share', 'reported'), [(1e-5, True), (1e-7, False)])
 def test_combinations_that_hardly_move_say_nothing_in_whatever_unit(
-    other: int, unit: float, share: float, told: bool
+    other: int, unit: float, share: float, reported: bool
 ) -> None:
     chance = np.random.default_rng(2)
     along, beside = chance.normal(size=100), share * chance.normal(size=100)
@@ -109,7 +109,7 @@ def test_combinations_that_hardly_move_say_nothing_in_whatever_unit(
     design[:, other] = unit * (along + beside)
     slopes, _, _ = module.least_squares_fit(design, unit * (3.0 * along + beside + 7.0)[:, None])
     # Of the difference alone that is 1; if it says nothing both have the same share.
-    assert bool(abs(slopes[other, 0] - slopes[0, 0]) > 0.5) is told
+    assert bool(abs(slopes[other, 0] - slopes[0, 0]) > 0.5) is reported
     assert slopes[4, 0] == pytest.approx(7.0 * unit, rel=1e-3)
     # Where only one dot moves a lot, the others are small beside it.
     for small, large in ((0, other), (other, 0)):
@@ -162,7 +162,7 @@ def test_each_push_moves_the_channels_by_what_its_load_moves_at_rest(rig: Rig) -
     assert (found.drift_sd < 2e-8).all()
 
 
-def test_loads_that_came_together_are_told_at_their_largest() -> None:
+def test_loads_that_came_together_are_reported_at_their_largest() -> None:
     for most, more, way in (((0, -4, -2), (0, -3.9, -2.2), -1.0), ((0, -4, 2), (0, -3.9, 2.2), -1.0)):
         loads = held((0, 0, 0), more, most, (0, -2, 0.5 * most[2]), (0, 0, 0))
         (push,) = responses(RIG, of_loads(RIG, loads), loads).pushes

@@ -17,7 +17,7 @@ from psd_deflection.studies.check.levels import Levels
 from psd_deflection.studies.check.result import (
     CANNOT_TELL,
     RIGHT,
-    TELLING_DRIFT,
+    SIGNIFICANT_DRIFT,
     WRONG,
     Checkup,
     Finding,
@@ -226,12 +226,12 @@ def test_levels_are_in_millivolts_and_drift_in_micrometres_a_minute() -> None:
         drift_sd=minute * np.array([2.24999998, 2.25000002, 0.0, 0.0]),
         levels=replace(LEVELS, hum=np.array([1.0495e-3, 1.0505e-3, 0.0, 0.0, 0.0, 0.0]), stated=2.2245e-3),
     )
-    told = dict(level_rows(near))
-    assert told['drift'].startswith('x1 +1.0 ± 2.2  y1 +1.1 ± 2.3  ')
-    assert told['hum'].startswith('x1 1.0  y1 1.1  ')
-    assert told['noise'].endswith('(rig file 2.22)')
+    reported = dict(level_rows(near))
+    assert reported['drift'].startswith('x1 +1.0 ± 2.2  y1 +1.1 ± 2.3  ')
+    assert reported['hum'].startswith('x1 1.0  y1 1.1  ')
+    assert reported['noise'].endswith('(rig file 2.22)')
     assert level_rows(replace(CHECKUP, levels=replace(LEVELS, stated=2.2255e-3)))[0][1].endswith('(rig file 2.23)')
-    for sd, known in ((TELLING_DRIFT, True), (1.001 * TELLING_DRIFT, False)):
+    for sd, known in ((SIGNIFICANT_DRIFT, True), (1.001 * SIGNIFICANT_DRIFT, False)):
         short = replace(CHECKUP, drift_sd=np.array([0.0, 0.0, sd, 0.0]))
         assert (level_rows(short)[3][1] != 'cannot be told: the recording is too short') is known
 

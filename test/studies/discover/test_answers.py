@@ -421,16 +421,20 @@ def test_the_best_of_each_variant_is_tried() -> None:
 # Plans.
 
 
-def told_of(rival: str, separation: float, reverse: float, possible: float) -> Discrimination:
+def reported_of(rival: str, separation: float, reverse: float, possible: float) -> Discrimination:
     return Discrimination(rival, 'creep', separation, reverse, possible)
 
 
-def test_a_plan_says_what_it_tells_apart() -> None:
+def test_a_plan_says_what_it_separates() -> None:
     piece, other = Piece('push', ('constant:0,-5,0:3',)), Piece('wait', ('constant:0,0,0:1', 'constant:0,0,0:2'))
     limits = Limits(seconds=30.0)
     warm = Setting('while it is warm', {'link.length': 0.4}, 5.0)
-    tells = (told_of('damping', 30.0, 40.0, 50.0), told_of('tip_mass', 90.0, 22.0, 99.0), told_of('x', 1.0, 2.0, 21.5))
-    plan = Plan(warm, (piece, piece, other), tells, limits, 500.0)
+    reports = (
+        reported_of('damping', 30.0, 40.0, 50.0),
+        reported_of('tip_mass', 90.0, 22.0, 99.0),
+        reported_of('x', 1.0, 2.0, 21.5),
+    )
+    plan = Plan(warm, (piece, piece, other), reports, limits, 500.0)
     assert plan.words == 'push, 2 times; then wait, while it is warm'
     assert plan.seconds == 9.0
     assert plan.loads[:1500].tolist() == plan.loads[1500:3000].tolist() == [[0.0, -5.0, 0.0]] * 1500
@@ -440,11 +444,11 @@ def test_a_plan_says_what_it_tells_apart() -> None:
         'Record next, 9 s: push, 2 times; then wait, while it is warm. It tells creep from damping, tip_mass '
         '(chi-square 40 at least, 21.6 needed); nothing within the limits tells x apart.'
     )
-    assert dataclasses.replace(plan, discriminations=tells[:1]).sentence.endswith(
+    assert dataclasses.replace(plan, discriminations=reports[:1]).sentence.endswith(
         'from damping (chi-square 40 at least, 21.6 needed).'
     )
     idle = dataclasses.replace(
-        plan, setting=Setting(), discriminations=(tells[2], dataclasses.replace(tells[2], alternative='y'))
+        plan, setting=Setting(), discriminations=(reports[2], dataclasses.replace(reports[2], alternative='y'))
     )
     assert not idle.useful
     assert idle.words == 'push, 2 times; then wait'
@@ -462,7 +466,7 @@ def test_a_plan_says_what_it_tells_apart() -> None:
         'separable': True,
     }
     assert (tree['useful'], tree['loads'], tree['limits']['seconds']) == (True, plan.script, 30.0)
-    assert [told_of('x', 0.0, 0.0, p).separable for p in (21.5, 21.6)] == [False, True]
+    assert [reported_of('x', 0.0, 0.0, p).separable for p in (21.5, 21.6)] == [False, True]
     assert Suggestion('do', 21.7).text == 'do: in simulation this separates them by chi-square 22'
     assert planning.rate_of(RIG, Setting('', {'converter.sample_rate_hz': 250.0})) == 250.0
     assert planning.rate_of(RIG, Setting()) == 1000.0
@@ -503,7 +507,7 @@ def left_with(**given: Any) -> Localisation:
     return Localisation(**{**whole, **given})
 
 
-def test_what_remains_is_told_in_words() -> None:
+def test_what_remains_is_reported_in_words() -> None:
     cells = (
         Cell('y2', 0, (1.0, 2.5), (9.0, 17.0), (), 9.0, 0.009, 50.0),
         Cell('x1', 0, (0.0, 1.0), (0.0, 2.0), (), 5.0, 0.011, 20.0),
@@ -597,7 +601,7 @@ def named_effect(active: ActiveEffect, **given: Any) -> NamedEffect:
         (-1.23456789, 1e-9, 'angle -1.23457 ± 1e-09 rad'),
     ],
 )
-def test_a_size_is_told_to_the_digits_that_its_deviation_leaves(value: float, sd: float, words: str) -> None:
+def test_a_size_is_reported_to_the_digits_that_its_deviation_leaves(value: float, sd: float, words: str) -> None:
     """Two digits more than the deviation's first, six at most; within two deviations of nothing it is none."""
     effect = named_effect(make_active('sensor_rotation', {'psd': 2, 'angle': value}, 't'), sd={'angle': sd})
     assert trees.size_of(effect) == words
@@ -755,7 +759,7 @@ def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery
     assert said_of(turned, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
 
 
-def test_places_are_told_if_one_in_twenty_by_chance(found: Discovery) -> None:
+def test_places_are_reported_if_one_in_twenty_by_chance(found: Discovery) -> None:
     first = found.where.cells[0]
     cells = tuple(dataclasses.replace(first, p=p) for p in (0.0, 0.0499, 0.05, 1.0))
     changed = dataclasses.replace(found, where=dataclasses.replace(found.where, cells=cells))

@@ -179,7 +179,7 @@ def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
 
 
 @pytest.mark.statistics
-def test_what_one_length_cannot_tell_two_can() -> None:
+def test_what_one_length_cannot_report_two_can() -> None:
     one = discover([observe(with_effect('clamp_bending_compliance', compliance=2e-7))], RIG, bank=BANK)
     (effect,) = one.effects
     names = {effect.active.effect.name, *effect.equivalent}
@@ -323,7 +323,7 @@ def test_what_an_estimate_is_wrong_by_is_what_the_model_changes_in_a_replay(
     assert ('An estimate is not corrected for amplifier_lag.' in found.sentence) is not wrong
 
 
-def test_a_bag_tells_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bag_reports_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = tmp_path / 'short.yaml'
     short.write_text(described(replace_values(RIG, {'link.length': 0.4}), ()))
     words = ['--params-file', str(short), '--loads', 'thesis:1', '--effect', 'sensor_rotation,psd=1,angle=0.003']

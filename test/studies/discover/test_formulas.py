@@ -465,10 +465,10 @@ def test_a_channel_is_stuck_from_three_hundredths_of_a_second_on(count: int, is_
     assert stuck(slow, 1.0, np.full(1, 0.01), 1e-3).any()
 
 
-def test_what_is_known_of_a_recording_is_told() -> None:
+def test_what_is_known_of_a_recording_is_reported() -> None:
     o = observed()
-    told = dataclasses.replace(o, unknown_load=(100, 50), stated_rate_hz=500.0)
-    cleaned, (rate, coverage) = clean(told, ())
+    reported = dataclasses.replace(o, unknown_load=(100, 50), stated_rate_hz=500.0)
+    cleaned, (rate, coverage) = clean(reported, ())
     assert (rate.name, rate.where, rate.value) == ('sample_rate', 'converter.sample_rate_hz', 2.0)
     assert rate.fix == 'converter.sample_rate_hz: 1000.0'
     assert rate.evidence == pytest.approx(math.log(2.0))
@@ -476,7 +476,7 @@ def test_what_is_known_of_a_recording_is_told() -> None:
     assert 'its first 0.10 s and its last 0.05 s' in coverage.fix
     gone = np.isnan(cleaned.volts).all(axis=1)
     assert np.flatnonzero(gone).tolist() == [*range(100), *range(1150, 1200)]
-    assert cleaned.digest == told.hashed()
+    assert cleaned.digest == reported.hashed()
     for unknown, gone_samples in (((100, 0), range(100)), ((0, 100), range(1100, 1200))):
         half, (one,) = clean(dataclasses.replace(o, unknown_load=unknown), ())
         assert one.value == pytest.approx(100 / 1200)

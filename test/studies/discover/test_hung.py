@@ -44,7 +44,7 @@ def searched(volts: FloatArray, noted: FloatArray) -> Discovery:
 
 
 @pytest.mark.statistics
-def test_a_weight_that_was_hung_and_never_noted_is_told_with_what_hung() -> None:
+def test_a_weight_that_was_hung_and_never_noted_is_reported_with_what_hung() -> None:
     found = searched(read(HELD, **TURNED), noted_as(2, (0, -20, 0)))
     assert [(f.name, f.where) for f in found.setup] == [('missing_load', '8.000 s')]
     assert found.setup[0].value == pytest.approx((0.0, -50.0, 0.0), abs=0.2)
@@ -56,7 +56,7 @@ def test_a_weight_that_was_hung_and_never_noted_is_told_with_what_hung() -> None
 
 
 @pytest.mark.statistics
-def test_a_load_that_was_noted_twice_is_told() -> None:
+def test_a_load_that_was_noted_twice_is_reported() -> None:
     found = searched(read(HELD), noted_as(5, (80, -80, 40)))
     assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 5')]
     assert 'the 5th load of x was noted wrong' in found.setup[0].fix
@@ -65,7 +65,7 @@ def test_a_load_that_was_noted_twice_is_told() -> None:
 
 
 @pytest.mark.statistics
-def test_rounded_loads_are_told_one_by_one_and_the_effect_beside_them() -> None:
+def test_rounded_loads_are_reported_one_by_one_and_the_effect_beside_them() -> None:
     odd = LEVELS + np.array(
         [(0, 0, 0), (0, 1.3, 0), (0, -2.1, 0), (0, 1.7, 0.9), (2.2, 0, 0), (-1.1, 2.4, 0), (0, 1.9, 0), (0, 0, 0)]
     )
@@ -123,7 +123,7 @@ def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search
 
 @pytest.mark.statistics
 @pytest.mark.parametrize(('force', 'frequency'), [(1.0, 1.3), (2.0, 1.6)])
-def test_a_weight_that_sways_is_told_and_its_time_left_out(force: float, frequency: float) -> None:
+def test_a_weight_that_sways_is_reported_and_its_time_left_out(force: float, frequency: float) -> None:
     """So much that its swings are taken for steps of a load that nobody noted, too."""
     acting = HELD.copy()
     at = (NUMBER - 3 * DWELL) / 1000.0
@@ -219,7 +219,7 @@ def test_a_lower_frequency_of_the_bending_alone_may_be_a_mass_at_the_tip() -> No
 
 
 @pytest.mark.statistics
-def test_other_frequencies_are_told_beside_an_effect() -> None:
+def test_other_frequencies_are_reported_beside_an_effect() -> None:
     true = {'dynamics__bending_frequency': 14.0 * 1.05, 'dynamics__torsion_frequency': 21.0 * 0.97}
     found = searched(read(HELD, **true, **TURNED), HELD)
     sizes = {e.name: e.values for e in found.effects}
@@ -293,7 +293,7 @@ def test_small_delays_beside_a_second_mode_are_found() -> None:
 
 
 @pytest.mark.statistics
-def test_the_first_load_noted_twice_is_told_if_no_other_pulls_that_way() -> None:
+def test_the_first_load_noted_twice_is_reported_if_no_other_pulls_that_way() -> None:
     down = [(0, -20, 0), (0, -40, -23.4), (0, -10, 0), (0, -30, 17.55)]
     acting = np.repeat(np.array([(0, 0, 0), (15, 0, 0), *down, (0, 0, 0)]), DWELL, axis=0)
     noted = acting.copy()
@@ -307,7 +307,7 @@ def test_the_first_load_noted_twice_is_told_if_no_other_pulls_that_way() -> None
 
 
 @pytest.mark.statistics
-def test_no_noise_is_told_of_what_rings_and_is_unknown() -> None:
+def test_no_noise_is_reported_of_what_rings_and_is_unknown() -> None:
     ringing = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
     volts = read(HELD, **{f'effects__e__{k}': v for k, v in ringing.items()})
     found = discover([Observation('x', RIG, volts, HELD)], without=('second_bending_mode',))
@@ -316,7 +316,7 @@ def test_no_noise_is_told_of_what_rings_and_is_unknown() -> None:
 
 
 @pytest.mark.statistics
-def test_loads_that_are_one_sample_late_are_told() -> None:
+def test_loads_that_are_one_sample_late_are_reported() -> None:
     found = searched(read(HELD), np.vstack((np.zeros((1, 3)), HELD[:-1])))
     assert [f.name for f in found.setup] == ['load_delay']
     assert found.setup[0].value == pytest.approx(0.001, abs=1e-5)
@@ -349,7 +349,7 @@ def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
 
 
 @pytest.mark.statistics
-def test_the_only_torque_noted_twice_is_told_with_the_clamp_that_twists() -> None:
+def test_the_only_torque_noted_twice_is_reported_with_the_clamp_that_twists() -> None:
     """If the load were free, nothing would tell it from what the clamp does."""
     levels = np.array(
         [(0, 0, 0), (0, -20, 0), (15, 0, 0), (24, -40, 0), (20, -30, 17.5), (-15, 0, 0), (0, -35, 0), (0, 0, 0)]

@@ -51,7 +51,7 @@ def test_it_says_from_which_size_a_search_names_an_effect() -> None:
     assert not found.unsettled
 
 
-def test_it_says_what_a_search_cannot_tell_apart() -> None:
+def test_it_says_what_a_search_cannot_separate() -> None:
     one = of('bending_stiffness (moves_frequency 0)')
     assert one.seen is not None
     assert (one.named, one.alike) == (None, 'clamp_bending_compliance')

@@ -174,7 +174,7 @@ def test_the_likeliest_states_are_those_of_all_that_gain_most(seed: int) -> None
     assert law_features.likeliest_states(gain).tolist() == list(best)
 
 
-def test_two_levels_are_told_apart_from_a_stated_gain_on() -> None:
+def test_two_levels_are_separated_from_a_stated_gain_on() -> None:
     """A box of the height A and n blocks of weight w gains n w A^2 in chi-square, for two changes of 24."""
     rng = np.random.default_rng(2)
     n = 200
@@ -290,10 +290,10 @@ def test_a_fitted_law_has_the_numbers_of_the_fit_and_their_deviations() -> None:
     assert second.sd == pytest.approx({'coefficient': sd[4]})
     assert dataclasses.replace(got, terms=()) == dataclasses.replace(law, terms=())
     # A hundred times its value is no deviation: the recording does not determine the number.
-    for factor, told in ((99.0, True), (101.0, False)):
+    for factor, reported in ((99.0, True), (101.0, False)):
         wide = np.array(covariance, dtype=np.float64)
         wide[4, 4] = (factor * 3.0) ** 2
-        assert ('coefficient' in laws.fitted_law(law, fit, wide, 1).terms[1].sd) == told
+        assert ('coefficient' in laws.fitted_law(law, fit, wide, 1).terms[1].sd) == reported
     # Two pictures that are one: what cannot be told apart has a large deviation, and stays finite.
     same = dataclasses.replace(fit, jacobian=np.column_stack((jacobian[:, :4], jacobian[:, 3])))
     assert laws.term_covariance(same)[3, 3] > 1e6 * covariance[3, 3]
@@ -319,7 +319,7 @@ def trial(law: Law, cost: float, chi2: float, *beside: ActiveEffect) -> laws.Law
     return laws.LawTrial((law,), cast(Fit, fit), cost)
 
 
-def test_of_laws_that_cannot_be_told_apart_the_simplest_is_taken() -> None:
+def test_of_laws_that_cannot_be_separated_the_simplest_is_taken() -> None:
     two = trial(Law('a', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fy')),)), 10.0, 5.0)
     one = Law('b', 'psd', 'y2', (LawTerm('product', ('x2',)),))
     assert laws.simplest(two, [trial(one, 19.9, 26.5)]).laws == (one,)
@@ -369,7 +369,7 @@ def test_variances_are_the_likeliest() -> None:
     assert variance.variance(np.full(10, 1e-6), np.linspace(0.0, 1.0, 10)) == pytest.approx((0.05, 0.0), abs=1e-9)
 
 
-def test_noise_that_grows_with_a_load_is_told_with_its_size_and_evidence() -> None:
+def test_noise_that_grows_with_a_load_is_reported_with_its_size_and_evidence() -> None:
     """Against the likelihoods of the same squares, counted here."""
     rng = np.random.default_rng(5)
     o = observed(6)

@@ -88,7 +88,9 @@ def test_noise_that_follows_a_variable_is_a_law_of_its_variance() -> None:
 
 
 @pytest.mark.statistics
-def test_a_law_is_told_adopted_and_then_explains_the_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_law_is_reported_adopted_and_then_explains_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     theirs, ours = tmp_path / 'theirs', tmp_path / 'ours'
     theirs.mkdir()
     ours.mkdir()
@@ -103,17 +105,17 @@ def test_a_law_is_told_adopted_and_then_explains_the_recording(tmp_path: Path, m
     few = [name for name in effect_names() if name not in ('sensor_gain', 'sensor_rotation', 'bending_stiffness')]
     without = [word for name in few for word in ('--without', name)]
     assert main(['discover', run, '--out', str(out), '--adopt', 'yielding', '--quiet', *without]) == 0
-    told = json.loads((out / 'result.json').read_text())
-    jsonschema.validate(told, SCHEMA)
-    law = told['unknown'][0]['law']
-    assert (told['verdict'], law['stage'], law['variables'], law['kind']) == (
+    reported = json.loads((out / 'result.json').read_text())
+    jsonschema.validate(reported, SCHEMA)
+    law = reported['unknown'][0]['law']
+    assert (reported['verdict'], law['stage'], law['variables'], law['kind']) == (
         'unknown_effect',
         'psd',
         ['load_fx'],
         'static',
     )
     assert law['channels'] == ['y2']
-    assert law['heldout_after'] < 1.05 * told['gap']['floor']
+    assert law['heldout_after'] < 1.05 * reported['gap']['floor']
     assert 'A law for it' in (out / 'report.html').read_text()
     # It is an effect of the user's now, and the model has it.
     assert 'yielding' in effect_names()
@@ -145,16 +147,16 @@ def test_noise_beside_a_movement_is_no_law() -> None:
 def test_what_switches_with_the_loads_is_no_law_of_times() -> None:
     # Without the sweep, in which the load changes all the time.
     changes = np.flatnonzero(np.any(np.diff(HISTORY[:STEPS], axis=0) != 0.0, axis=1)) * 1e-3
-    for times, told in ((changes[1:4] + 0.1, False), (changes[1:4] + 0.7, True)):
+    for times, reported in ((changes[1:4] + 0.1, False), (changes[1:4] + 0.7, True)):
         term = LawTerm('switched', (), 3e-6, times=tuple(times.tolist()))
         ws = workspace(Law('bump', 'psd', 'x1', (term,)), count=STEPS)
         null = refit(ws, ())
         found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)
         switched = found is not None and any(t.times for law in found.laws for t in law.terms)
-        assert switched is told
+        assert switched is reported
 
 
-def test_a_law_that_leaves_much_on_unseen_cases_is_told_and_not_written() -> None:
+def test_a_law_that_leaves_much_on_unseen_cases_is_reported_and_not_written() -> None:
     ws = workspace(Law('odd', 'psd', 'y2', (LawTerm('product', ('load_fx', 'load_fx'), 3e-9),)))
     null = refit(ws, ())
     found = find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print)

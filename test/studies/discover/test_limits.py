@@ -103,7 +103,7 @@ def test_a_size_that_shows_nothing_stays_where_it_is() -> None:
 # Plans.
 
 
-def test_two_models_are_told_apart_by_what_no_sizes_of_one_explain() -> None:
+def test_two_models_are_separated_by_what_no_sizes_of_one_explain() -> None:
     """Of two parameters that go nearly the same way too."""
     rng = np.random.default_rng(1)
     slopes = rng.standard_normal((30, 2))
@@ -218,7 +218,7 @@ def test_a_candidate_counts_from_a_thousandth_of_sigma() -> None:
 # Wiring, jumps and places.
 
 
-def test_other_wirings_that_are_as_good_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_wirings_that_are_as_good_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     o = observed(warm=None)
     file = Wiring.from_rig(o.rig)
     good = [w for w in WIRINGS if len(differences(w, file)) == 1][:4]
@@ -244,7 +244,7 @@ def test_a_jump_is_a_step_that_gains_fifty(n: int, height: float, seen: bool) ->
 # The words of the answer.
 
 
-def test_what_a_law_leaves_is_told_in_micrometres() -> None:
+def test_what_a_law_leaves_is_reported_in_micrometres() -> None:
     law = SimpleNamespace(expression='y2 += 1', stage='psd', kind='straight')
     found = SimpleNamespace(law=law, laws=[law], beside=[], heldout_gap=1.0)
     answer = SimpleNamespace(law=found, effects=())

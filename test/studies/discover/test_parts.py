@@ -68,7 +68,7 @@ def test_of_eight_samples_one_may_be_an_outlier(there: int) -> None:
     assert not cleaning.outliers(x, 1e-3)[there:].any()
 
 
-def test_what_is_stuck_is_told_with_its_place_and_share() -> None:
+def test_what_is_stuck_is_reported_with_its_place_and_share() -> None:
     o = observed(warm=None)
     volts = o.volts.copy()
     volts[400:440, 4] = volts[400, 4]
@@ -521,7 +521,7 @@ def test_standard_deviations_are_those_of_the_noise_unless_more_remains(monkeypa
     assert weighing.sd_of(plant, fit, -1) == {'x': pytest.approx(2.0 * sd[0])}
 
 
-def test_what_is_tied_is_told_in_words() -> None:
+def test_what_is_tied_is_reported_in_words() -> None:
     effects = (active('a', x=0.5), active('b', x=0.5), active('c', y=0.5))
     fit = cast(Fit, SimpleNamespace(effects=effects, chi2=100.0))
     result = cast(SearchResult, SimpleNamespace(delta_chi2=[50.0, 999.0, 30.0], null=SimpleNamespace(chi2=300.0)))

@@ -29,7 +29,7 @@ from psd_deflection.studies.discover import loop
 from psd_deflection.studies.discover.experiment import Limits, Setting, expected_sums, pieces, proposals, settings
 from psd_deflection.studies.discover.from_recordings import read_observations
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.discover.planning import TELLS_APART, Plan, plan_next
+from psd_deflection.studies.discover.planning import SEPARATES, Plan, plan_next
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.workspace import Workspace
@@ -58,13 +58,13 @@ def plan(models: tuple[Workspace, Fit, Fit]) -> Plan:
     return planned
 
 
-def test_another_length_is_planned_where_only_that_tells(plan: Plan) -> None:
+def test_another_length_is_planned_where_only_that_reports(plan: Plan) -> None:
     assert plan.setting.changes == {'link.length': pytest.approx(0.7 * RIG.link.length, abs=1e-3)}
-    (told,) = plan.discriminations
-    assert told.alternative == 'clamp_bending_compliance'
-    assert told.named.startswith('bending_stiffness')
-    assert min(told.separation, told.reverse) > TELLS_APART
-    assert told.possible >= max(told.separation, told.reverse)
+    (reported,) = plan.discriminations
+    assert reported.alternative == 'clamp_bending_compliance'
+    assert reported.named.startswith('bending_stiffness')
+    assert min(reported.separation, reported.reverse) > SEPARATES
+    assert reported.possible >= max(reported.separation, reported.reverse)
     assert plan.useful
     assert plan.seconds <= 12.0
     assert 'on a link of 0.41 m' in plan.sentence
@@ -76,13 +76,13 @@ def test_another_length_is_planned_where_only_that_tells(plan: Plan) -> None:
     assert tree['rivals'][0]['separable']
 
 
-def test_it_is_said_if_nothing_within_the_limits_tells(models: tuple[Workspace, Fit, Fit]) -> None:
+def test_it_is_said_if_nothing_within_the_limits_reports(models: tuple[Workspace, Fit, Fit]) -> None:
     workspace, named, rival = models
     plan = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0, lengths=(), seconds=12.0))
     assert plan is not None
     assert not plan.useful
     assert plan.sentence.startswith('No recording within the limits would tell bending_stiffness')
-    assert plan.discriminations[0].possible < TELLS_APART
+    assert plan.discriminations[0].possible < SEPARATES
     assert plan_next(workspace, named, []) is None
 
 
@@ -296,7 +296,7 @@ def test_options_that_would_be_ignored_are_rejected(
     assert part in capsys.readouterr().err
 
 
-def test_a_plan_is_told_in_words() -> None:
+def test_a_plan_is_reported_in_words() -> None:
     limits = Limits()
     (push, *_) = pieces(RIG, limits)
     plan = Plan(settings(RIG, limits)[1], (push, push), (), limits, 1000.0)

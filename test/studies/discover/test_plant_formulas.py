@@ -187,14 +187,14 @@ def sd_of_size(values: Sequence[FloatArray], picture: Sequence[FloatArray], **gi
 
 def test_few_values_make_the_interval_of_student() -> None:
     # Of one channel: the textbook's line through the origin. Of two: Welch (1947).
-    values, told = tables(3), [np.linspace(1.0, 2.0, n) for n in LENGTHS]
-    x, y = np.concatenate(told), np.concatenate([rows[0] for rows in values])
-    picture = [np.stack([part, 0.0 * part]) for part in told]
+    values, reported = tables(3), [np.linspace(1.0, 2.0, n) for n in LENGTHS]
+    x, y = np.concatenate(reported), np.concatenate([rows[0] for rows in values])
+    picture = [np.stack([part, 0.0 * part]) for part in reported]
     size = float(x @ y / (x @ x))
     left = float(np.sum((y - size * x) ** 2)) / (len(x) - 1)
     wanted = math.sqrt(left / float(x @ x)) * student.ppf(0.975, len(x) - 1) / norm.ppf(0.975)
     assert sd_of_size(values, picture) == pytest.approx(wanted, rel=1e-3)
-    both = [np.stack([part, 0.1 * part]) for part in told]
+    both = [np.stack([part, 0.1 * part]) for part in reported]
     parts, freedom = [], []
     for scale, row in ((1.0, 0), (0.1, 1)):
         y = np.concatenate([rows[row] for rows in values])

@@ -136,8 +136,8 @@ def test_the_covariance_of_the_sizes_is_that_of_least_squares() -> None:
     scale = float(matrix[0, 0] / expected[0, 0])
     assert 1.0 < scale < 3.0
     np.testing.assert_allclose(matrix, scale * expected, rtol=0.02)
-    told = [e['parameters'][p]['sd'] for e in tree['effects'] for p in e['parameters']]
-    assert np.sqrt(np.diag(matrix)).tolist() == pytest.approx(told)
+    reported = [e['parameters'][p]['sd'] for e in tree['effects'] for p in e['parameters']]
+    assert np.sqrt(np.diag(matrix)).tolist() == pytest.approx(reported)
 
 
 def test_a_stated_noise_is_the_floor() -> None:

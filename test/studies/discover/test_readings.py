@@ -73,7 +73,7 @@ def test_a_table_names_what_the_rig_lacks_and_model_yaml_repairs_it(
     assert discover_in(ReadingsPlant(read_tables([table], repaired))).verdict == 'nothing_missing'
 
 
-def test_tables_of_two_lengths_tell_stiffness_from_the_clamp() -> None:
+def test_tables_of_two_lengths_report_stiffness_from_the_clamp() -> None:
     found = discover_in(ReadingsPlant([read([SOFT]), read([SOFT], length=0.4, seed=1)]))
     (effect,) = found.effects
     assert (effect.active.effect.name, effect.equivalent) == ('bending_stiffness', ())
@@ -202,7 +202,7 @@ def test_options_for_recordings_are_rejected_for_tables(tmp_path: Path, capsys: 
     assert 'discover and info take a table of readings without times' in capsys.readouterr().err
 
 
-def test_info_tells_of_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_reports_of_a_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     readings = 1e3 * read([]).values
     table = written(tmp_path / 'hung.csv', readings)
     assert main(['info', str(table)]) == 0

@@ -721,9 +721,9 @@ def test_nothing_is_unknown_that_noise_alone_would_leave(gap: float, unknown: bo
     # Of a machine whose noise nobody knows.
     assert unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 1e-6 * gap, math.inf)
     # Hum is in no mean of a block, and no gap has it.
-    for low, p, told in ((25.0, 0.009, True), (25.0, 0.011, unknown), (17.0, 0.009, unknown)):
+    for low, p, reported in ((25.0, 0.009, True), (25.0, 0.011, unknown), (17.0, 0.009, unknown)):
         hum = Cell('x1', 0, (0.0, 1.0), (low, 60.0), (), 9.0, p, 50.0)
-        assert bool(unknown_of(nowhere(p=0.0, excess=100.0, cells=(hum,)), 0.0, 1e-6 * gap, 2e-6)) is told
+        assert bool(unknown_of(nowhere(p=0.0, excess=100.0, cells=(hum,)), 0.0, 1e-6 * gap, 2e-6)) is reported
     # The noise of one recording may be a little more than that of most.
     assert not unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 1e-6 * gap, 2e-6, 2.01e-6)
     assert unknown_of(nowhere(p=0.0, excess=100.0), 0.0, 2.02e-6, 2e-6, 2.01e-6)
@@ -905,7 +905,7 @@ def test_an_experiment_separates_by_what_no_size_of_the_other_explains(monkeypat
     # A parabola, to first order.
     curve = np.polynomial.Polynomial.fit(trials, [apart(float(c)) for c in trials], 2)
     low = float(curve(curve.deriv().roots()[0].real))
-    (told,) = plan.discriminations
-    assert told.separation == pytest.approx(low, rel=0.05)
-    assert found.separation == pytest.approx(max(told.separation, told.reverse), rel=1e-9)
+    (reported,) = plan.discriminations
+    assert reported.separation == pytest.approx(low, rel=0.05)
+    assert found.separation == pytest.approx(max(reported.separation, reported.reverse), rel=1e-9)
     assert planning.suggest(workspace, named, []) is None

@@ -173,10 +173,10 @@ def test_corners_within_a_fifth_are_alike() -> None:
     assert model(np.zeros(6)).slow is None
 
 
-def test_a_workspace_has_the_slow_noise_of_its_recording_and_tells_it() -> None:
+def test_a_workspace_has_the_slow_noise_of_its_recording_and_reports_it() -> None:
     ws = Workspace([seen(5.0, 1)])
-    (told,) = ws.provenance()
-    assert told['corners_hz'] == ws.noise[0].corners.tolist()
+    (reported,) = ws.provenance()
+    assert reported['corners_hz'] == ws.noise[0].corners.tolist()
     assert ws.noise[0].corners == pytest.approx(np.full(6, 5.0), rel=0.4)
     plain = Workspace([seen(0.0, 1)])
     assert ws.floor() > 1.2 * plain.floor()

@@ -122,14 +122,14 @@ def test_predictions_with_all_shapes_agree_with_a_closed_form() -> None:
     np.testing.assert_allclose(left, (p @ values) / np.diag(p), rtol=1e-6, atol=1e-9)
 
 
-def test_the_gap_with_given_shapes_is_told_beside_the_other() -> None:
+def test_the_gap_with_given_shapes_is_reported_beside_the_other() -> None:
     """It is smaller, for the shapes have seen the readings, and not below the noise."""
     found = smooth(Table(1, 1.0))
     assert found is not None
     assert 0.8 * NOISE < found.heldout_as_shaped < found.heldout
 
 
-def test_few_readings_tell_no_function() -> None:
+def test_few_readings_report_no_function() -> None:
     plant = Table(1, 1.0)
     plant.seen[19:] = np.nan
     assert smooth(plant) is None

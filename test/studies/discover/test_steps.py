@@ -576,10 +576,10 @@ def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
     m, file = movement_sums([turned], ()), Wiring.from_rig(RIG)
     right = dataclasses.replace(file, axes=(('x', '-y'), file.axes[1]))
     energy = noise_energy([turned])
-    told, sizes = load_sizes(m, file)
+    reported, sizes = load_sizes(m, file)
     # With the file's wiring a load seems to pull the wrong way: then it explains nothing.
     assert (sizes < 0.0).any()
-    assert told < m.squared
+    assert reported < m.squared
     assert sign.evidence == pytest.approx((m.squared + energy) / (load_sizes(m, right)[0] + energy))
 
 
@@ -602,6 +602,12 @@ def test_of_recordings_of_the_same_value_the_easier_one_is_planned(
     plan = planning.plan_next(ws, fits[0], fits[1:], Limits(seconds=6.0))
     assert plan is not None
     assert plan.setting.words == taken
-    (told,) = plan.discriminations
+    (reported,) = plan.discriminations
     # The same for as long as a recording may be shows twice as much.
-    assert (told.alternative, told.named, told.separation, told.reverse, told.possible) == ('b', 'a', 40.0, 30.0, 80.0)
+    assert (reported.alternative, reported.named, reported.separation, reported.reverse, reported.possible) == (
+        'b',
+        'a',
+        40.0,
+        30.0,
+        80.0,
+    )

@@ -137,17 +137,17 @@ def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
 
 
 @pytest.mark.parametrize(
-    ('world', 'told'),
+    ('world', 'reported'),
     [
         ({'psd_3.axes': ['-x', 'y']}, [('channel_sign', 'x3')]),
         ({'psd_3.axes': ['y', 'x']}, [('axis_swap', 'psd_3')]),
         ({'psds_exchanged': True, 'psd_3.axes': ['x', '-y']}, [('psd_swap', 'psd_1 psd_2'), ('channel_sign', 'y3')]),
     ],
 )
-def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], told: list[tuple[str, str]]) -> None:
+def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], reported: list[tuple[str, str]]) -> None:
     given = observed(RIG, world=world)
     (right,), findings, lines = wire([given], ())
-    assert [(f.name, f.where) for f in findings] == told
+    assert [(f.name, f.where) for f in findings] == reported
     assert lines == world
     assert right.volts == pytest.approx(Wiring.from_rig(replace_values(RIG, world)).to_psds(given.volts))
 

@@ -76,7 +76,7 @@ def test_a_tie_of_known_cause_is_not_called_unknown(second: str, count: int) -> 
     assert len(coincidences(fit, None)) == count
 
 
-def test_the_deviation_of_a_tie_is_told_in_per_cent() -> None:
+def test_the_deviation_of_a_tie_is_reported_in_per_cent() -> None:
     cause = CommonCause('link_radius', 1.0, 1e-3)
     assert '(2 ± 1 %)' in Tie(0.02, 0.0149, True, (cause,)).sentence
 

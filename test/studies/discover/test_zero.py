@@ -54,7 +54,7 @@ def test_what_the_noise_of_a_taken_zero_leaves_is_nothing_unknown(faultless: Dis
 
 
 @pytest.mark.statistics
-def test_the_same_constants_are_told_if_no_zero_was_taken() -> None:
+def test_the_same_constants_are_reported_if_no_zero_was_taken() -> None:
     found = discover([recorded(taken=False)])
     assert found.effects or found.unknown
 
@@ -107,12 +107,12 @@ def test_a_recording_says_how_well_its_zero_is_known(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     recording = open_recording(BAG)
-    told = [ParameterChange(0, i, tuple(c.items())) for i, c in enumerate(changes)]
-    monkeypatch.setattr(recording, 'changes', told)
+    reported = [ParameterChange(0, i, tuple(c.items())) for i, c in enumerate(changes)]
+    monkeypatch.setattr(recording, 'changes', reported)
     assert zero_variances_at_end(recording, RIG) == variances
 
 
-def test_a_zero_that_tells_nothing_is_the_mean_of_half_a_second() -> None:
+def test_a_zero_that_gives_nothing_is_the_mean_of_half_a_second() -> None:
     per_sample = [s**2 * (n**2 + RIG.converter.volts_per_count**2 / 12) for s, n in _channels()]
     samples = ZERO_BLOCKS * RIG.estimator.block_size
     assert samples == 500

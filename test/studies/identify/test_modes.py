@@ -89,7 +89,7 @@ def test_a_step_response_of_scipy() -> None:
     assert any(3.0 <= s < 3.1 for s in starts)
 
 
-def test_a_second_mode_is_found_and_told_apart() -> None:
+def test_a_second_mode_is_found_and_separated() -> None:
     link = Link(((14.0, 0.02, 0.9), (46.0, 0.01, 0.1)))
     found = modes_of(rung(link, np.random.default_rng(1)), RATE)
     first, second = found.modes
@@ -115,7 +115,7 @@ def test_lost_samples_and_creep_do_not_move_it() -> None:
     assert mode.damping == pytest.approx(0.01, rel=0.03)
 
 
-def test_in_operation_the_spectrum_tells_it() -> None:
+def test_in_operation_the_spectrum_reports_it() -> None:
     found = modes_of(driven(Link(((14.0, 0.02, 1.0),)), np.random.default_rng(3)), RATE)
     assert found.how == 'operation'
     (mode,) = found.modes

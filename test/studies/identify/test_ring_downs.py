@@ -176,7 +176,7 @@ def test_a_pair_beside_a_mode_is_hinted_at(apart: float, seen: bool, damping: fl
     assert not hints_at_pair(both, fit, 1.0001 * squares)
 
 
-def test_how_loud_the_ringing_is_is_told_by_dense_least_squares() -> None:
+def test_how_loud_the_ringing_is_is_reported_by_dense_least_squares() -> None:
     """Three damping ratios of each mode, and each of these times t, beside a line."""
     rng = np.random.default_rng(3)
     samples = 1e-3 + ring(times(900) - 0.3) + 1e-4 * rng.normal(size=900)
@@ -381,9 +381,9 @@ def test_the_search_finds_the_ring_downs_and_their_mode() -> None:
     assert find_stretches(noise, noise, RATE, [(15.5, 0.01)], 1e-6) == ([], [(15.5, 0.01)])
 
 
-@pytest.mark.parametrize(('level', 'told'), [(1e-6, 3e-6), (4e-6, 4e-6)])
-def test_of_three_windows_that_grow_the_longest_tells_the_modes(
-    level: float, told: float, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(('level', 'reported'), [(1e-6, 3e-6), (4e-6, 4e-6)])
+def test_of_three_windows_that_grow_the_longest_gives_the_modes(
+    level: float, reported: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And what it leaves is noise, if it is more than was thought."""
     samples = blows(6000, [100, 2000, 4000])
@@ -410,7 +410,7 @@ def test_of_three_windows_that_grow_the_longest_tells_the_modes(
     # Six periods, and half a one.
     ((modes, noise, *sizes),) = scanned
     assert modes == [(900.0, 0.02)]
-    assert noise == pytest.approx(told)
+    assert noise == pytest.approx(reported)
     assert sizes == [384, 32]
 
 

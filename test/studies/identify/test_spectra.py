@@ -128,7 +128,7 @@ def test_noise_that_remembers_has_the_density_of_its_autoregression() -> None:
     np.testing.assert_allclose(coloured_noise(samples, RATE, [14.0]).density(f, RATE), expected, rtol=0.15)
 
 
-def test_above_a_fast_mode_there_is_too_little_to_tell_what_remembers() -> None:
+def test_above_a_fast_mode_there_is_too_little_to_report_what_remembers() -> None:
     """The whole spectrum then stands for the noise."""
     samples = np.random.default_rng(9).normal(0.0, 2e-6, 20_000)
     found = coloured_noise(samples, RATE, [185.0])

@@ -63,13 +63,15 @@ def test_noise_correlation_is_below_four_over_root_n(count: int, memory: float, 
     assert len(without_cell_noise(both)[1]) == noise
 
 
-@pytest.mark.parametrize(('changes', 'samples', 'told'), [(49, 400, 0), (50, 400, 1), (99, 5000, 0), (100, 5000, 1)])
-def test_loads_that_change_at_a_fiftieth_are_measured(changes: int, samples: int, told: int) -> None:
+@pytest.mark.parametrize(
+    ('changes', 'samples', 'reported'), [(49, 400, 0), (50, 400, 1), (99, 5000, 0), (100, 5000, 1)]
+)
+def test_loads_that_change_at_a_fiftieth_are_measured(changes: int, samples: int, reported: int) -> None:
     loads = np.zeros((samples, 3))
     at = np.arange(changes + 1) * (samples // (changes + 1))
     for first, value in zip(at.tolist(), np.random.default_rng(4).normal(size=changes + 1).tolist(), strict=True):
         loads[first:, 0] = value
-    assert len(without_cell_noise(loads)[1]) == told
+    assert len(without_cell_noise(loads)[1]) == reported
 
 
 @pytest.mark.parametrize(('times', 'parts'), [(7.9, 1), (8.1, 2), (-7.9, 1), (-8.1, 2)])

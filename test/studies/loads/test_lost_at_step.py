@@ -29,7 +29,7 @@ def noted() -> FloatArray:
     return out
 
 
-def told(dots: FloatArray) -> list[float]:
+def reported(dots: FloatArray) -> list[float]:
     mended = correct_loads(RIG, dots, noted())
     assert mended is not None
     return [note.delay for note in mended.timed]
@@ -40,14 +40,14 @@ def test_a_time_is_found_among_lost_samples_by_the_ringing_after_them(lost: int,
     dots = DOTS.copy()
     first = 2 * DWELL - round(share * lost)
     dots[first : first + lost] = np.nan
-    assert told(dots) == pytest.approx(LATE, abs=2e-3)
+    assert reported(dots) == pytest.approx(LATE, abs=2e-3)
 
 
 def test_samples_lost_between_the_steps_change_no_time() -> None:
     dots = DOTS.copy()
     for at in range(2000, 27_000, 5000):
         dots[at : at + 1200] = np.nan
-    assert told(dots) == pytest.approx(LATE, abs=1e-3)
+    assert reported(dots) == pytest.approx(LATE, abs=1e-3)
 
 
 def test_equal_delays_after_lost_samples_are_corrected() -> None:

@@ -299,7 +299,7 @@ def test_last_step_is_the_last_of_them(monkeypatch: pytest.MonkeyPatch) -> None:
     assert last_step(RIG, np.zeros((1000, 4)), 0.02) == pytest.approx(18.01)
 
 
-def test_steps_without_a_note_near_them_are_told_by_their_fitted_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_without_a_note_near_them_are_reported_by_their_fitted_time(monkeypatch: pytest.MonkeyPatch) -> None:
     steps = [steps_module.DotStep(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0, 15000.0)]
     fitted = {3000.0: (3.01, 0.5), 8000.0: (8.02, 0.7), 15000.0: (15.03, 0.9)}
     between = with_pieces(monkeypatch, steps, fitted)
@@ -308,8 +308,8 @@ def test_steps_without_a_note_near_them_are_told_by_their_fitted_time(monkeypatc
     assert between == [(0.0, 8000.0), (3000.0, 15000.0), (8000.0, 20000.0)]
     # Near: two widths of 286 before the step's first sample, or after its last.
     for at, near in ((7228, True), (7227, False), (8772, True), (8773, False)):
-        told = unnoted_steps(RIG, dots, noted_at(3000, at, 15000))
-        assert told == ([] if near else [8.02])
+        reported = unnoted_steps(RIG, dots, noted_at(3000, at, 15000))
+        assert reported == ([] if near else [8.02])
     # One axis is enough for a note, and two samples may be one change after the other.
     for axis in range(3):
         loads = np.zeros((20_000, 3))
@@ -323,9 +323,9 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     steps = [steps_module.DotStep(at, 1.0, int(at) - 200, int(at) + 200) for at in (3000.0, 8000.0)]
     with_pieces(monkeypatch, steps, {3000.0: (3.01, 0.0), 8000.0: (8.0, 0.0)})
     dots = np.zeros((20_000, 4))
-    for apart, told in ((249, []), (250, [3.01])):
-        assert unnoted_steps(RIG, dots, noted_at(8000, 8000 + apart)) == told
-        assert (correct_loads(RIG, dots, noted_at(3000, 9000, 9000 + apart)) is None) == (not told)
+    for apart, reported in ((249, []), (250, [3.01])):
+        assert unnoted_steps(RIG, dots, noted_at(8000, 8000 + apart)) == reported
+        assert (correct_loads(RIG, dots, noted_at(3000, 9000, 9000 + apart)) is None) == (not reported)
     # A ramp is one change, which ends once; one that comes two samples later is another.
     ramp = noted_at(*range(8000, 8100))
     assert unnoted_steps(RIG, dots, ramp) == [3.01]
@@ -367,10 +367,10 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
         assert correct_loads(RIG, dots, noted_at(3000, 8000, 15000)) is None
         assert len(between) == looks
     # Applied over a tenth of a second is a step.
-    for took, told in ((0.1, None), (0.101, [0.101])):
+    for took, reported in ((0.1, None), (0.101, [0.101])):
         fitted[8000.0] = (8.0, took)
         ramp = correct_loads(RIG, dots, noted_at(3000, 8000, 15000))
-        assert (None if ramp is None else [n.took for n in ramp.notes]) == told
+        assert (None if ramp is None else [n.took for n in ramp.notes]) == reported
     fitted[8000.0] = (8.0, 0.0)
     monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
@@ -378,9 +378,9 @@ def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(mon
     fitted.update({3000.0: (2.999, 0.0), 8000.0: (9.498, 0.0), 15000.0: (15.0, 0.0)})
     assert correct_loads(RIG, dots, late) is None
     fitted.update({3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0)})
-    for left, told_late in (((1.0, 3.9), False), ((1.0, 4.0), True), ((1.0, 4.1), True), ((0.1, 0.41), True)):
+    for left, reported_late in (((1.0, 3.9), False), ((1.0, 4.0), True), ((1.0, 4.1), True), ((0.1, 0.41), True)):
         with_pieces(monkeypatch, steps, fitted, left)
-        assert (correct_loads(RIG, dots, late) is not None) == told_late
+        assert (correct_loads(RIG, dots, late) is not None) == reported_late
 
 
 def test_loads_of_a_cell_lose_their_noise_whether_times_are_mended_or_not(monkeypatch: pytest.MonkeyPatch) -> None:

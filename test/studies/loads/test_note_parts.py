@@ -68,7 +68,7 @@ def test_a_late_note_is_late_by_2_ms_and_the_ramp_time(
         ),
     ],
 )
-def test_a_wrong_time_is_told_in_words_and_so_is_what_to_do(one: CorrectedNote, words: str) -> None:
+def test_a_wrong_time_is_reported_in_words_and_so_is_what_to_do(one: CorrectedNote, words: str) -> None:
     assert one.words('x') == f'the 3rd load of x (1.5 N, -2 N, 0.25 N m) {words}'
 
 
@@ -154,10 +154,10 @@ def test_a_step_is_where_the_mean_after_differs_from_the_mean_before() -> None:
     assert (shifted.at, shifted.size) == pytest.approx((first.at, first.size))
     assert (shifted.first, shifted.last) == (first.first, first.last) == (10, 24)
     # Four widths are the least, even if most of them is lost: more than two of ten must be there.
-    for n, told in ((40, 1), (39, 0)):
+    for n, reported in ((40, 1), (39, 0)):
         short = stepped(n, {20: 1.0})
         short[:15] = short[26:] = np.nan
-        assert len(steps_module.steps_among_samples(short, 10)) == told
+        assert len(steps_module.steps_among_samples(short, 10)) == reported
     assert steps_module.steps_among_samples(np.zeros((200, 4)), 10) == []
 
 

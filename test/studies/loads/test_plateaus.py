@@ -153,7 +153,7 @@ def test_nobody_is_accused_if_another_load_may_be_the_wrong_one() -> None:
     assert wrong_notes(RIG, reading, HELD) == []
 
 
-def test_beside_an_effect_what_hung_is_told_as_if_there_were_none() -> None:
+def test_beside_an_effect_what_hung_is_reported_as_if_there_were_none() -> None:
     soft = read(np.repeat(LONG, DWELL, axis=0), link__youngs_modulus=0.95 * RIG.link.youngs_modulus)
     (note,) = wrong_notes(RIG, soft, long_as(p5=(40, -80, 20)))
     assert note.where == 'load 5'
@@ -209,7 +209,7 @@ def test_a_step_without_a_note_has_its_time() -> None:
 # ---- the pieces, by hand
 
 
-def told(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
+def reported(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
     return [(p.first, p.last, p.number, p.unnoted) for p in listed]
 
 
@@ -222,7 +222,12 @@ def test_holds_of_a_second_have_the_number_of_their_note() -> None:
     loads[5000:5049] = np.linspace((1.0, 2.0, 3.0), (1.0, 2.0, 0.0), 51)[1:-1][:49]
     loads[5049:] = (1.0, 2.0, 0.0)
     listed = plateaus.plateaus(RIG, np.zeros((9000, 6)), loads, 7)
-    assert told(listed) == [(0, 1500, 0, False), (1500, 2500, 1, False), (3499, 5000, 3, False), (5049, 9000, 4, False)]
+    assert reported(listed) == [
+        (0, 1500, 0, False),
+        (1500, 2500, 1, False),
+        (3499, 5000, 3, False),
+        (5049, 9000, 4, False),
+    ]
     assert [tuple(p.annotated) for p in listed] == [(0, 0, 0), (1, 0, 0), (1, 2, 3), (1, 2, 0)]
     assert {p.recording for p in listed} == {7}
     # From the second sample on, and two that follow each other in two samples.
@@ -230,11 +235,11 @@ def test_holds_of_a_second_have_the_number_of_their_note() -> None:
     loads[6000:6002] = (0.0, 0.0, 1.0)
     loads[6002:] = (0.0, 0.0, 2.0)
     again = plateaus.plateaus(RIG, np.zeros((9000, 6)), loads)
-    assert told(again)[0] == (1, 1500, 1, False)
-    assert told(again)[-1] == (6002, 9000, 7, False)
+    assert reported(again)[0] == (1, 1500, 1, False)
+    assert reported(again)[-1] == (6002, 9000, 7, False)
     assert {p.recording for p in again} == {0}
-    assert told(plateaus.plateaus(RIG, np.zeros((9000, 6)), np.ones((9000, 3)))) == [(0, 9000, 0, False)]
-    assert told(plateaus.plateaus(RIG, np.zeros((999, 6)), np.ones((999, 3)))) == []
+    assert reported(plateaus.plateaus(RIG, np.zeros((9000, 6)), np.ones((9000, 3)))) == [(0, 9000, 0, False)]
+    assert reported(plateaus.plateaus(RIG, np.zeros((999, 6)), np.ones((999, 3)))) == []
     # Its load is the one in its middle.
     assert Plateau(0, 10, 21, 1, False, np.zeros(3)).of(np.arange(90.0).reshape(30, 3)).tolist() == [45.0, 46.0, 47.0]
 
@@ -260,7 +265,12 @@ def test_steps_without_a_note_are_looked_for_in_the_dots_in_metres(monkeypatch: 
     volts, loads = np.random.default_rng(1).normal(size=(9000, 6)), np.zeros((9000, 3))
     loads[4000:] = 1.0
     listed = plateaus.plateaus(GIVEN, volts, loads)
-    assert told(listed) == [(0, 2000, 0, False), (2000, 4000, 0, True), (4000, 5500, 1, False), (5500, 9000, 1, True)]
+    assert reported(listed) == [
+        (0, 2000, 0, False),
+        (2000, 4000, 0, True),
+        (4000, 5500, 1, False),
+        (5500, 9000, 1, True),
+    ]
     assert looked[0] == pytest.approx(volts[:, [0, 1, 3, 4]] * (4e-4, 6e-4, 5e-4, 8e-4))
 
 

@@ -37,17 +37,17 @@ def test_check_calibrate_and_discover_say_the_same() -> None:
     words = f'x: from 8.000 s to the end the load changed 8 times, and {WORDS}'
     checked, known, log, found = answers(VOLTS, STOPPED)
     # The loads that are left move all readings, but none of them along Y alone.
-    told, pushes = checked.findings
-    assert (told.name, told.where, told.fix) == ('load_coverage', 'load_fx load_fy load_tz', words)
+    reported, pushes = checked.findings
+    assert (reported.name, reported.where, reported.fix) == ('load_coverage', 'load_fx load_fy load_tz', words)
     assert (pushes.name, pushes.where) == ('load_coverage', 'fy tz')
     assert checked.verdict == 'wrong'
     assert f'load_fx load_fy load_tz: not seen: {words}' in checked.sentences()
     assert log == [words]
     assert np.isnan(known.volts[8_000:]).all()
     assert np.isfinite(known.volts[:8_000]).all()
-    (told,) = found.setup
-    assert (told.name, told.fix) == ('load_coverage', words)
-    assert told.value == pytest.approx(16 / 24)
+    (reported,) = found.setup
+    assert (reported.name, reported.fix) == ('load_coverage', words)
+    assert reported.value == pytest.approx(16 / 24)
     assert found.verdict == 'nothing_missing'
     assert found.simulations <= 300
 
@@ -71,7 +71,7 @@ def test_loads_missing_in_the_middle_are_left_out_until_the_next_note() -> None:
     np.testing.assert_array_equal(acted.loads, noted)
 
 
-def test_two_loads_that_were_not_noted_are_told_one_by_one() -> None:
+def test_two_loads_that_were_not_noted_are_reported_one_by_one() -> None:
     noted = HELD.copy()
     noted[2 * DWELL : 4 * DWELL] = LEVELS[1]
     acted = loads_that_acted(RIG, VOLTS, noted)

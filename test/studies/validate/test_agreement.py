@@ -13,7 +13,7 @@ from scipy.stats import linregress
 from psd_deflection.studies.validate.agreement import agreement
 
 
-def test_bias_scale_and_noise_are_told_apart() -> None:
+def test_bias_scale_and_noise_are_separated() -> None:
     rng = np.random.default_rng(0)
     true = 2e-3 * np.sin(np.linspace(0.0, 40.0, 3000))
     reference = true + rng.normal(0.0, 10e-6, 3000)

@@ -23,7 +23,7 @@ def motion_of(run: ClockRecording, kept: Array | None = None) -> Motion:
 def test_intervals_hold_the_truth() -> None:
     """`python -m blind.clock` has the figures of 200 runs. At 95 %, fewer than 35 of 40 are one case in 2000."""
     score = scored(range(40))
-    assert score.told == 40
+    assert score.reported == 40
     assert score.inside >= 35
     assert max(map(abs, score.errors)) < 0.5e-3
 
@@ -60,7 +60,7 @@ def test_clocks_that_count_from_different_days() -> None:
     assert found.determined
 
 
-def test_a_link_at_rest_tells_nothing() -> None:
+def test_a_link_at_rest_gives_nothing() -> None:
     run = simulated(8, steps=())
     found = clock_offset(motion_of(run), run.stamps, run.poses)
     assert not found.determined

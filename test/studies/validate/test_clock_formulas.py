@@ -151,19 +151,19 @@ def found_of(
     monkeypatch: pytest.MonkeyPatch, fits: Sequence[OffsetFit | None], poses: Array, largest: float = 0.5
 ) -> tuple[Offset, list[float | None]]:
     """The offset if the refinement gives ``fits``, and the best fit that each was told of. 256 samples a second."""
-    told: list[float | None] = []
+    reported: list[float | None] = []
     left = iter(fits)
 
     def refined(
         motion: Motion, t: FloatArray, poses: FloatArray, start: float, exposure: float, best: OffsetFit | None
     ) -> OffsetFit | None:
-        told.append(None if best is None else best.value)
+        reported.append(None if best is None else best.value)
         return next(left)
 
     monkeypatch.setattr(clock, 'coarse_offsets', lambda *_: [0.0] * len(fits))
     monkeypatch.setattr(clock, 'refined_offset', refined)
     motion = of(np.arange(512.0) / 256.0, np.zeros((512, 3)), 1.0 / 256.0)
-    return clock.offset_near(motion, np.arange(50.0) / 50.0, poses, largest, 0.0), told
+    return clock.offset_near(motion, np.arange(50.0) / 50.0, poses, largest, 0.0), reported
 
 
 def test_the_best_fit_is_taken_and_what_fits_as_well_is_a_rival(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -184,12 +184,12 @@ def test_the_best_fit_is_taken_and_what_fits_as_well_is_a_rival(monkeypatch: pyt
         fit_with(0.5 + 4.9 / 256.0, 0.3),
         fit_with(-0.5 - 4.9 / 256.0, 0.3),
     ]
-    found, told = found_of(monkeypatch, fits, np.zeros((50, 3)))
+    found, reported = found_of(monkeypatch, fits, np.zeros((50, 3)))
     assert (found.value, found.sd, found.drift, found.drift_sd) == (0.1, 0.101, 2e-6, 3e-6)
     assert found.used == 50
     places = (0.3, 0.1 + 5.1 / 256.0, 0.1 - 5.1 / 256.0, 0.5 + 4.9 / 256.0, -0.5 - 4.9 / 256.0)
     assert found.rivals == pytest.approx(places)
-    assert told == [None, 0.3, 0.3, *[0.1] * 9]
+    assert reported == [None, 0.3, 0.3, *[0.1] * 9]
 
 
 def test_five_samples_apart_is_near_still(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,7 +346,7 @@ def test_step_and_deviations_are_those_of_dense_least_squares(outliers: int, sti
     assert fit.drift_sd == pytest.approx(np.sqrt(expected), rel=1e-6)
 
 
-def test_a_motion_at_rest_tells_no_step() -> None:
+def test_a_motion_at_rest_reports_no_step() -> None:
     rng = np.random.default_rng(0)
     poses = rng.normal(0.0, 1.0, (60, 3))
     step, fit, weights = UsedReferences(np.arange(60.0), poses, np.full((60, 3), 0.1), poses).solved(np.ones((60, 3)))
@@ -355,7 +355,7 @@ def test_a_motion_at_rest_tells_no_step() -> None:
     assert weights.max() <= 1.0
 
 
-def test_references_at_one_time_tell_no_drift() -> None:
+def test_references_at_one_time_report_no_drift() -> None:
     rng = np.random.default_rng(0)
     seen, rates = rng.normal(0.0, 1.0, (60, 3)), rng.normal(0.0, 1.0, (60, 3))
     _, fit, _ = UsedReferences(np.zeros(60), seen + rng.normal(0.0, 0.1, (60, 3)), seen, rates).solved(np.ones((60, 3)))

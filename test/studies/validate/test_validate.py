@@ -64,7 +64,7 @@ def test_the_offset_is_removed_if_asked(problem: ValidateProblem) -> None:
     assert found.problem is problem
 
 
-def test_an_offset_that_is_not_told_is_not_removed(problem: ValidateProblem) -> None:
+def test_an_offset_that_is_not_reported_is_not_removed(problem: ValidateProblem) -> None:
     noise = np.random.default_rng(1).normal(0.0, 1.0, (90, 3))
     found = validate(replace(problem, reference=noise))
     assert not found.offset.determined

@@ -46,7 +46,7 @@ def test_a_sound_rig_has_no_alarm() -> None:
 
 
 @pytest.mark.filterwarnings('ignore:.*lacks its parameters')
-def test_a_bump_is_told_as_by_the_command(bumped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bump_is_reported_as_by_the_command(bumped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with np.errstate(all='raise'):
         found = psd_deflection.watch(bumped, psd_deflection.load_rig())
     assert main(['replay', str(bumped), '--watch']) == 0

@@ -39,9 +39,9 @@ PULSE = 1000.0
 LONGER = 0.5
 """A mode rings longer than the rig file says if it decays at less than this share of that rate."""
 RINGING = 'ringing after what is left out'
-TELLING = 4.0
+SIGNIFICANT = 4.0
 """Standard deviations by which a load that is told differs from the noted one."""
-LEAST_TOLD = (0.02, 0.02, 0.01)
+LEAST_REPORTED = (0.02, 0.02, 0.01)
 """N, N, N m: a smaller difference is not told."""
 
 BoolArray = npt.NDArray[np.bool_]
@@ -148,7 +148,7 @@ def wrong_load_findings(ws: Workspace, wrong: Sequence[Plateau]) -> list[Finding
         o = ws.observations[p.recording]
         note = WrongNote(_timed(ws, p), p.of(o.loads), o.period)
         sd = np.array([sds.get((id(p), axis), 0.0) for axis in range(3)])
-        if np.any(note.off > np.maximum(TELLING * sd, LEAST_TOLD)):
+        if np.any(note.off > np.maximum(SIGNIFICANT * sd, LEAST_REPORTED)):
             out.append(note_finding(note, o.name))
     return out
 

@@ -172,9 +172,9 @@ def wire(
     ]
     _, residual, chosen = min(as_good)
     _, wiring, sizes = tried[chosen]
-    stated, told_sizes = next((x, s) for x, w, s in tried if w == file)
+    stated, stated_sizes = next((x, s) for x, w, s in tried if w == file)
     # With the wiring and the signs of the rig file: a load that pulled the wrong way explains nothing.
-    plain = stated if not np.any(told_sizes < 0.0) else m.squared + noise
+    plain = stated if not np.any(stated_sizes < 0.0) else m.squared + noise
     findings: list[Finding] = []
     lines: dict[str, object] = {}
     crossed: tuple[int, ...] = ()
