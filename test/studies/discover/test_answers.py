@@ -44,7 +44,7 @@ from psd_deflection.studies.discover.setup.setup import (
     likely_jumps,
 )
 
-from .test_formulas import RIG, observed
+from .test_formulas import RIG, make_observation
 
 EVERY = catalogue()
 
@@ -52,7 +52,7 @@ EVERY = catalogue()
 @pytest.fixture(scope='module')
 def workspace() -> Workspace:
     """Two recordings, the second without temperature."""
-    return Workspace([observed(), observed(1, name='second', warm=None)])
+    return Workspace([make_observation(), make_observation(1, name='second', warm=None)])
 
 
 # Mistakes of the set-up.
@@ -200,7 +200,7 @@ def test_a_mistake_is_said_with_its_line(workspace: Workspace) -> None:
 
 def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
     """The shift at which the readings follow the loads best, and its neighbours; the step that gains most."""
-    o = observed(history=np.repeat(np.random.default_rng(3).uniform(-20, 20, (12, 3)), 400, axis=0), warm=None)
+    o = make_observation(history=np.repeat(np.random.default_rng(3).uniform(-20, 20, (12, 3)), 400, axis=0), warm=None)
     for shift in (40, -40):
         late = Workspace([dataclasses.replace(o, loads=np.roll(o.loads, shift, axis=0))])
         assert likely_delays(late) == pytest.approx(sorted(s / 1000.0 + shift / 1000.0 for s in (-4, 0, 4)))
@@ -213,7 +213,7 @@ def test_delays_and_jumps_are_looked_for_where_they_show() -> None:
         assert min(abs(delay - shift / 1000.0) for delay in likely_delays(late)) < 0.0025
     # The link follows its loads as simulated: nothing is late.
     assert likely_delays(Workspace([o])) == []
-    short = Workspace([observed()])
+    short = Workspace([make_observation()])
     assert likely_delays(short) == []
     part = 0.01 * np.random.default_rng(0).standard_normal((6, 300))
     part[4, 120:] += 2.0
@@ -358,7 +358,7 @@ def test_a_step_is_coarse_from_three_counts_on(counts: int, seen: bool) -> None:
     lsb = RIG.converter.volts_per_count
     rng = np.random.default_rng(2)
     k = np.rint(rng.uniform(-300, 300, (2000, 6)))
-    o = dataclasses.replace(observed(), volts=k * counts * lsb, loads=np.zeros((2000, 3)), temperature=None)
+    o = dataclasses.replace(make_observation(), volts=k * counts * lsb, loads=np.zeros((2000, 3)), temperature=None)
     found = proposals.coarse_step(o)
     assert (found is not None) == seen
     if found is not None:
@@ -627,7 +627,7 @@ HIDDEN = {'psd': 2, 'angle': 0.03}
 @pytest.fixture(scope='module')
 def found() -> Discovery:
     """A turned sensor in 1.2 s, looked for among three effects."""
-    o = observed(9, (make_active('sensor_rotation', HIDDEN, 'test'),))
+    o = make_observation(9, (make_active('sensor_rotation', HIDDEN, 'test'),))
     return discover([o], RIG, without=[name for name in EVERY if name not in FEW])
 
 

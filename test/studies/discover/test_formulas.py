@@ -35,7 +35,9 @@ HISTORY = loads.steps(PUSHES, 0.3).loads
 WARM = 21.0 + np.linspace(0.0, 2.0, len(HISTORY)) ** 2
 
 
-def observed(seed: int = 0, effects: tuple[ActiveEffect, ...] = (), name: str = 'seen', **given: Any) -> Observation:
+def make_observation(
+    seed: int = 0, effects: tuple[ActiveEffect, ...] = (), name: str = 'seen', **given: Any
+) -> Observation:
     """1.2 s of the rig with white noise of its own level."""
     history = given.pop('history', HISTORY)
     warm = given.pop('warm', WARM)
@@ -47,7 +49,7 @@ def observed(seed: int = 0, effects: tuple[ActiveEffect, ...] = (), name: str = 
 @pytest.fixture(scope='module')
 def workspace() -> Workspace:
     """Two recordings, the second without temperature."""
-    return Workspace([observed(), observed(1, name='second', warm=None)])
+    return Workspace([make_observation(), make_observation(1, name='second', warm=None)])
 
 
 # What a rig can be asked to do.
@@ -312,7 +314,7 @@ def test_folds_are_dealt_out_in_turn(workspace: Workspace) -> None:
     assert workspace.folds().tolist() == [i % 4 for i in range(cases)]
     # The second recording's cases are others than the first one's.
     assert workspace.case[1].min() == workspace.case[0].max() + 1
-    one = Workspace([observed(history=np.zeros((400, 3)), warm=None)])
+    one = Workspace([make_observation(history=np.zeros((400, 3)), warm=None)])
     assert one.folds().tolist() == [0, 1, 2, 3]
 
 
@@ -340,11 +342,11 @@ def test_a_load_case_begins_after_a_quarter_of_a_second_of_rest() -> None:
 )
 def test_what_is_no_recording_is_rejected(change: dict[str, Any], said_of_it: str) -> None:
     with pytest.raises(RecordingError, match=said_of_it):
-        dataclasses.replace(observed(), **change)
+        dataclasses.replace(make_observation(), **change)
 
 
 def test_a_recording_knows_its_length_and_its_digest() -> None:
-    o = observed()
+    o = make_observation()
     assert o.period == 1e-3
     assert o.duration == pytest.approx(1.2)
     Observation('least', RIG, np.zeros((80, 6)), np.zeros((80, 3)))
@@ -389,14 +391,16 @@ def test_rest_needs_three_tenths_of_a_second_after_the_ringing(dwell: float, see
     assert 7.0 / (2.0 * math.pi * slow) == pytest.approx(3.979, abs=1e-3)
     history = loads.steps([(0, 0, 0), (0, -10, 0)], dwell).loads
     windows = rest_windows(
-        dataclasses.replace(observed(), volts=np.zeros((len(history), 6)), loads=history, temperature=None)
+        dataclasses.replace(make_observation(), volts=np.zeros((len(history), 6)), loads=history, temperature=None)
     )
     assert len(windows) == seen
     first = round(1000 * dwell)
     assert windows[0] == slice(0, first)
     if seen == 2:
         assert windows[1] == slice(first + 3978, 2 * first)
-    loaded = dataclasses.replace(observed(), volts=np.zeros((5000, 6)), loads=np.ones((5000, 3)), temperature=None)
+    loaded = dataclasses.replace(
+        make_observation(), volts=np.zeros((5000, 6)), loads=np.ones((5000, 3)), temperature=None
+    )
     assert rest_windows(loaded) == [slice(3978, 5000)]
 
 
@@ -466,7 +470,7 @@ def test_a_channel_is_stuck_from_three_hundredths_of_a_second_on(count: int, is_
 
 
 def test_what_is_known_of_a_recording_is_reported() -> None:
-    o = observed()
+    o = make_observation()
     reported = dataclasses.replace(o, unknown_load=(100, 50), stated_rate_hz=500.0)
     cleaned, (rate, coverage) = clean(reported, ())
     assert (rate.name, rate.where, rate.value) == ('sample_rate', 'converter.sample_rate_hz', 2.0)

@@ -23,13 +23,13 @@ from psd_deflection.studies.discover.search.fit import Fit, refit
 from psd_deflection.studies.discover.search.hold_out import heldout_gap
 from psd_deflection.studies.discover.search.workspace import Workspace
 
-from .test_formulas import RIG, observed
+from .test_formulas import RIG, make_observation
 
 
 @pytest.fixture(scope='module')
 def seen() -> tuple[Workspace, Fit]:
     """1.2 s of noise, and a fit of one effect to it."""
-    workspace = Workspace([observed(3)])
+    workspace = Workspace([make_observation(3)])
     return workspace, refit(workspace, [make_active('sensor_rotation', {'psd': 2, 'angle': 0.0}, 'test')], 2)
 
 
@@ -203,7 +203,7 @@ def test_two_levels_are_separated_from_a_stated_gain_on() -> None:
 def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]) -> None:
     workspace = Workspace(
         [
-            observed(
+            make_observation(
                 4,
                 (
                     ActiveEffect(
@@ -227,10 +227,10 @@ def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]
 
 @pytest.mark.parametrize('form', ['over', 'under'])
 def test_a_level_at_which_a_dot_jumps_becomes_better(form: str) -> None:
-    (ringing,) = law_features.known_fine(Workspace([observed(4)]), (), 'y1')
+    (ringing,) = law_features.known_fine(Workspace([make_observation(4)]), (), 'y1')
     level = float(np.quantile(ringing[np.abs(ringing) > 1e-6], 0.6))
     law = Law('bump', 'psd', 'x1', (LawTerm(form, ('y1',), 3e-5, {'threshold': level}),))
-    workspace = Workspace([observed(4, (ActiveEffect(effect_of(law), values_of(law)),))])
+    workspace = Workspace([make_observation(4, (ActiveEffect(effect_of(law), values_of(law)),))])
     found = responses(workspace, refit(workspace, ()))
     pitch = float(np.ptp(ringing)) / 24
     for start in (level - 0.9 * pitch, level + 0.9 * pitch):
@@ -372,7 +372,7 @@ def test_variances_are_the_likeliest() -> None:
 def test_noise_that_grows_with_a_load_is_reported_with_its_size_and_evidence() -> None:
     """Against the likelihoods of the same squares, counted here."""
     rng = np.random.default_rng(5)
-    o = observed(6)
+    o = make_observation(6)
     volts = o.volts.copy()
     full = np.abs(o.loads[:, 1]).max()
     volts[:, 4] += 4e-3 * (o.loads[:, 1] / full) * rng.standard_normal(len(volts))
@@ -437,7 +437,9 @@ class Given(laws.LawSearch):
 
     def __init__(self, costs: dict[tuple[str, str], float], chi2: float = 1e9) -> None:
         self.costs, self.chi2, self.asked = costs, chi2, list[tuple[str, str, int]]()
-        self.ws = cast(Workspace, SimpleNamespace(size=200, simulations=0, physics=Workspace([observed()]).physics))
+        self.ws = cast(
+            Workspace, SimpleNamespace(size=200, simulations=0, physics=Workspace([make_observation()]).physics)
+        )
         self.start = cast(Fit, SimpleNamespace(effects=()))
         self.penalty, self.last, self.found, self.listed = 3.0, 600, [], []
 

@@ -28,7 +28,7 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
-from .test_formulas import observed
+from .test_formulas import make_observation
 
 RIG = load_rig()
 HISTORY = loads.identification().loads
@@ -73,7 +73,7 @@ def test_times_of_switching_are_found_to_a_sample_or_two() -> None:
 
 
 def test_there_is_no_law_in_noise() -> None:
-    ws = Workspace([observed(3)])
+    ws = Workspace([make_observation(3)])
     null = refit(ws, ())
     assert find_law(ws, null, null, float(np.log(ws.effective_size())), 0.0, np.random.default_rng(0), print) is None
     assert find_jitter(ws, null, float(np.log(ws.effective_size()))) is None

@@ -33,7 +33,7 @@ from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup import cleaning, setup
 
-from .test_formulas import RIG, observed
+from .test_formulas import RIG, make_observation
 from .test_rules import FINE, SIGMA, A, N, Plant, active, candidate, noise, pictures
 
 # Wiring and units.
@@ -41,7 +41,7 @@ from .test_rules import FINE, SIGMA, A, N, Plant, active, candidate, noise, pict
 
 def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """It pulled the other way, half as much as noted: that is no unit, but the sign is wrong."""
-    o = observed(warm=None)
+    o = make_observation(warm=None)
     seen = dataclasses.replace(o, loads=o.loads * [1.0, -2.0, 1.0])
     mended, findings, lines = setup.wire([seen], ())
     assert [(f.name, f.where) for f in findings] == [('load_sign', 'fy')]
@@ -56,7 +56,7 @@ def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch
 def test_a_simulation_is_rougher_if_it_has_more_than_twice_the_outliers(
     monkeypatch: pytest.MonkeyPatch, of_simulation: int, taken: int
 ) -> None:
-    o = observed(warm=None)
+    o = make_observation(warm=None)
 
     def outliers(residual: FloatArray, least: float) -> cleaning.BoolArray:
         out = np.zeros(residual.shape, dtype=bool)
@@ -121,7 +121,7 @@ def test_two_models_are_separated_by_what_no_sizes_of_one_explain() -> None:
 def test_noise_of_a_sum_is_no_gap() -> None:
     """What grows with a load in the light of a PSD: the gap of the dots is as it was."""
     rng = np.random.default_rng(5)
-    o = observed(6)
+    o = make_observation(6)
     volts = o.volts.copy()
     volts[:, 5] += 4e-3 * (o.loads[:, 1] / np.abs(o.loads[:, 1]).max()) * rng.standard_normal(len(volts))
     workspace = Workspace([dataclasses.replace(o, volts=volts)])
@@ -140,7 +140,7 @@ def test_noise_of_a_sum_is_no_gap() -> None:
 
 
 def test_where_a_block_is_lost_a_law_is_not_looked_for() -> None:
-    o = observed(warm=None)
+    o = make_observation(warm=None)
     volts = o.volts.copy()
     volts[200:240] = np.nan
     workspace = Workspace([dataclasses.replace(o, volts=volts)])
@@ -219,7 +219,7 @@ def test_a_candidate_counts_from_a_thousandth_of_sigma() -> None:
 
 
 def test_other_wirings_that_are_as_good_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    o = observed(warm=None)
+    o = make_observation(warm=None)
     file = Wiring.from_rig(o.rig)
     good = [w for w in WIRINGS if len(differences(w, file)) == 1][:4]
     monkeypatch.setattr(setup, 'load_sizes', lambda m, w: (0.0 if w in good else m.squared, np.ones(3)))
@@ -273,7 +273,7 @@ def test_a_table_is_tried_with_a_small_size_and_the_first_shape() -> None:
 
 
 def test_where_something_is_left_does_not_depend_on_the_units_of_what_is_fitted() -> None:
-    workspace = Workspace([observed(warm=None)])
+    workspace = Workspace([make_observation(warm=None)])
     known = np.random.default_rng(3).standard_normal((len(workspace.whiten(workspace.measured)), 2))
     residual = workspace.residual([])[0]
     one, other = (
@@ -302,7 +302,7 @@ def test_a_time_moves_by_up_to_168_ms(monkeypatch: pytest.MonkeyPatch, sign: flo
 
 def test_a_law_of_the_noise_passes_at_the_p_of_its_limit_and_not_at_the_bic(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
-    o = observed(6)
+    o = make_observation(6)
     volts = o.volts.copy()
     volts[:, 4] += 2e-3 * (o.loads[:, 1] / np.abs(o.loads[:, 1]).max()) * rng.standard_normal(len(volts))
     workspace = Workspace([dataclasses.replace(o, volts=volts)])
@@ -331,7 +331,7 @@ def test_tied_effects_explain_none_to_all_of_the_gap(gains: tuple[float, float],
 
 @pytest.mark.parametrize('channel', range(6))
 def test_a_limit_is_looked_for_on_every_channel(channel: int) -> None:
-    o = observed(warm=None)
+    o = make_observation(warm=None)
     volts = np.zeros_like(o.volts)
     volts[7, channel] = -3.0
     seen = dataclasses.replace(o, volts=volts)
@@ -380,7 +380,7 @@ def test_of_two_that_are_one_the_sum_is_known() -> None:
 
 
 def test_a_variable_is_known_as_means_of_the_blocks_of_an_estimate() -> None:
-    workspace = Workspace([observed(warm=None), observed(1, name='second', warm=None)])
+    workspace = Workspace([make_observation(warm=None), make_observation(1, name='second', warm=None)])
     for o, got in zip(workspace.observations, law_features.known_values(workspace, (), 'load_fy'), strict=True):
         np.testing.assert_allclose(got, o.loads[:, 1].reshape(-1, 20).mean(axis=1), atol=1e-12)
 

@@ -35,7 +35,7 @@ from psd_deflection.studies.discover.setup import cleaning
 from psd_deflection.studies.discover.setup.hidden import beginning, mistakes
 from psd_deflection.studies.discover.setup.noise import estimate_noise
 
-from .test_formulas import HISTORY, RIG, observed
+from .test_formulas import HISTORY, RIG, make_observation
 from .test_rules import CASES, FINE, SIGMA, Plant, active, columns, noise, nowhere, pictures
 
 A, B = ('a', 'x'), ('b', 'x')
@@ -69,7 +69,7 @@ def test_of_eight_samples_one_may_be_an_outlier(there: int) -> None:
 
 
 def test_what_is_stuck_is_reported_with_its_place_and_share() -> None:
-    o = observed(warm=None)
+    o = make_observation(warm=None)
     volts = o.volts.copy()
     volts[400:440, 4] = volts[400, 4]
     volts[500:560, 4] = volts[500, 4]
@@ -95,11 +95,11 @@ def test_what_is_stuck_is_reported_with_its_place_and_share() -> None:
 def gappy() -> Workspace:
     """Two recordings of different lengths and sample rates, with lost samples, on temperature and not."""
     slow = replace_values(RIG, {'converter.sample_rate_hz': 500.0})
-    first = observed(1, warm=None)
+    first = make_observation(1, warm=None)
     volts = first.volts.copy()
     volts[np.random.default_rng(4).random(1200) < 0.3] = np.nan
     volts[400:440] = np.nan
-    second = observed(2, name='second')
+    second = make_observation(2, name='second')
     return Workspace(
         [
             dataclasses.replace(first, volts=volts),
@@ -148,7 +148,7 @@ def test_long_recordings_have_longer_fine_blocks(monkeypatch: pytest.MonkeyPatch
     """As many in all as a stated number."""
     assert whitened.MAX_FINE == 60_000
     monkeypatch.setattr(whitened, 'MAX_FINE', 120)
-    o = observed(warm=None)
+    o = make_observation(warm=None)
     # 1.2 s in 120 blocks: 10 ms; two of these recordings: 20 ms.
     assert Workspace([o]).fine == [10]
     assert Workspace([o, o]).fine == [20, 20]
@@ -157,7 +157,7 @@ def test_long_recordings_have_longer_fine_blocks(monkeypatch: pytest.MonkeyPatch
 def test_noise_has_a_floor_of_its_file() -> None:
     """A twentieth of the file's; a quarter where coarse steps hide it."""
     loud = replace_values(RIG, {'amplifier.noise': 0.1})
-    ws = Workspace([dataclasses.replace(observed(warm=None), rig=loud)])
+    ws = Workspace([dataclasses.replace(make_observation(warm=None), rig=loud)])
     np.testing.assert_allclose(ws.noise[0].sigma, 0.05 * loud.noises.ravel())
     coarse = ws.renoised([make_active('quantisation', {'step': 0.01}, 't')])
     np.testing.assert_allclose(coarse.noise[0].sigma, 0.25 * loud.noises.ravel())
@@ -176,7 +176,7 @@ def test_pieces_of_a_recording_are_half_seconds(gappy: Workspace) -> None:
 
 
 def test_a_slow_change_is_unwhitened_by_what_is_left_of_a_constant() -> None:
-    ws = Workspace([observed(warm=None)])
+    ws = Workspace([make_observation(warm=None)])
     ar = np.array([[0.5, -0.2], [0.3, 0.0], [0.97, 0.0], [0.0, 0.0], [-0.6, 0.1], [0.2, 0.2]])
     ws = ws.replaced(noise=(dataclasses.replace(ws.noise[0], ar=ar),))
     constant = np.ones((6, 300)) * np.arange(1.0, 7.0)[:, None]
@@ -566,7 +566,7 @@ def test_gaps_of_channels_are_before_and_after() -> None:
 
 def test_a_recording_shows_the_distance_of_its_models_in_units_of_the_noise() -> None:
     """At another rate, in a swinging temperature, and without the effects of one recording alone."""
-    ws = Workspace([observed(warm=None)])
+    ws = Workspace([make_observation(warm=None)])
     other = next(e for e in mistakes(2, [], []) if e.name == 'zero')
     base = make_active('sensor_gain', {'psd': 1, 'x': 0.01}, 't')
     ws.base = (
@@ -620,7 +620,7 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
     fits = [
         cast(Fit, SimpleNamespace(jacobian=np.zeros((5, 0)), free=(), effects=(active(name, x=0.1),))) for name in 'abc'
     ]
-    ws = cast(Workspace, SimpleNamespace(observations=[observed(warm=None)]))
+    ws = cast(Workspace, SimpleNamespace(observations=[make_observation(warm=None)]))
     plan = planning.plan_next(ws, fits[0], fits[1:], Limits(seconds=seconds))
     assert plan is not None
     times = int(seconds // 3.0)
@@ -647,7 +647,7 @@ def test_four_values_lie_on_a_step_by_chance_unless_it_is_very_coarse(gap: int, 
     """Each with the chance of 2 counts in a step: their logarithms must add up to 20."""
     lsb = RIG.converter.volts_per_count
     volts = np.resize(np.arange(4.0) * gap * lsb, (1200, 6))
-    assert (proposals.coarse_step(dataclasses.replace(observed(warm=None), volts=volts)) is not None) == seen
+    assert (proposals.coarse_step(dataclasses.replace(make_observation(warm=None), volts=volts)) is not None) == seen
 
 
 def test_half_a_per_cent_of_readings_may_be_off_the_steps() -> None:
@@ -657,7 +657,7 @@ def test_half_a_per_cent_of_readings_may_be_off_the_steps() -> None:
         counts = np.arange(1000.0) * 50.0
         counts[100 : 100 + 10 * off : 10] += 20.0
         volts = np.tile(counts[:, None] * lsb, (2, 6))
-        o = dataclasses.replace(observed(warm=None), volts=volts, loads=np.zeros((2000, 3)), temperature=None)
+        o = dataclasses.replace(make_observation(warm=None), volts=volts, loads=np.zeros((2000, 3)), temperature=None)
         assert (proposals.coarse_step(o) is not None) == seen
 
 

@@ -36,7 +36,7 @@ from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.setup import load_sizes, movement_sums, noise_energy, wire
 from psd_deflection.studies.discover.steps import alternatives
 
-from .test_formulas import RIG, observed
+from .test_formulas import RIG, make_observation
 from .test_rules import (
     CASES,
     FINE,
@@ -382,7 +382,7 @@ def test_what_a_channel_follows_is_named_where_it_is_slow(monkeypatch: pytest.Mo
 
 def test_what_the_simulation_may_be_wrong_by_is_no_dependence() -> None:
     """A five-hundredth of the length of what is explained on that channel is taken off each product."""
-    workspace = Workspace([observed()])
+    workspace = Workspace([make_observation()])
     rng = np.random.default_rng(2)
     residual, explained = (
         rng.standard_normal(sum(m.size for m in workspace.measured)),
@@ -497,7 +497,7 @@ def test_an_alternative_that_comes_close_is_refitted_in_full(
 
 
 def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> None:
-    whole = observed(warm=None)
+    whole = make_observation(warm=None)
     volts = whole.volts.copy()
     volts[60:] = np.nan
     poor = dataclasses.replace(whole, volts=volts)
@@ -534,7 +534,7 @@ def test_of_so_coarse_steps_four_values_are_enough(values: int, seen: bool) -> N
     """Each lies on them by a chance of a thousandth; three are too few however coarse they are."""
     lsb = RIG.converter.volts_per_count
     k = np.resize(np.arange(values) - 1.0, (2000, 6))
-    o = dataclasses.replace(observed(warm=None), volts=k * 2000.0 * lsb, loads=np.zeros((2000, 3)))
+    o = dataclasses.replace(make_observation(warm=None), volts=k * 2000.0 * lsb, loads=np.zeros((2000, 3)))
     assert (coarse_step(o) is not None) == seen
 
 
@@ -566,7 +566,7 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None
 
 
 def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
-    o = observed(warm=None)
+    o = make_observation(warm=None)
     _, (unit,), _ = wire([dataclasses.replace(o, loads=o.loads / [9.80665, 9.80665, 1.0])], ())
     # The wiring is right: a unit leaves no more of the movement than another size does.
     assert (unit.name, unit.where) == ('load_unit', 'fx fy')
@@ -598,7 +598,7 @@ def test_of_recordings_of_the_same_value_the_easier_one_is_planned(
     fits = [
         cast(Fit, SimpleNamespace(jacobian=np.zeros((5, 0)), free=(), effects=(active(name, x=0.1),))) for name in 'ab'
     ]
-    ws = cast(Workspace, SimpleNamespace(observations=[observed(warm=None)]))
+    ws = cast(Workspace, SimpleNamespace(observations=[make_observation(warm=None)]))
     plan = planning.plan_next(ws, fits[0], fits[1:], Limits(seconds=6.0))
     assert plan is not None
     assert plan.setting.words == taken

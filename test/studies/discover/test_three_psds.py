@@ -43,7 +43,7 @@ LEVELS = np.array([(0, 0, 0), (0, -20, 0), (0, 0, 0), (15, -10, 4), (0, 0, 0), (
 LOADS = np.repeat(LEVELS, 1000, axis=0)
 
 
-def observed(rig: Rig, *words: str, seed: int = 0, world: Mapping[str, object] | None = None) -> Observation:
+def make_observation(rig: Rig, *words: str, seed: int = 0, world: Mapping[str, object] | None = None) -> Observation:
     """What the device shows under ``LOADS`` of a rig with the effects of ``words``, which ``world`` has otherwise."""
     true = with_effects(replace_values(rig, world or {}), words, 'test')
     volts = RigSimulator(true, seed).step(LOADS).counts * rig.converter.volts_per_count
@@ -60,7 +60,7 @@ def observed(rig: Rig, *words: str, seed: int = 0, world: Mapping[str, object] |
     ],
 )
 def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: float) -> None:
-    (effect,) = (found := discover([observed(RIG, word)])).effects
+    (effect,) = (found := discover([make_observation(RIG, word)])).effects
     wanted = dict(pair.split('=') for pair in word.split(',')[1:])
     assert effect.active.effect.name == word.split(',', maxsplit=1)[0]
     assert effect.active.values.get('psd', 0.0) == float(wanted.get('psd', 0.0))
@@ -71,20 +71,20 @@ def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: floa
 
 @pytest.mark.parametrize('seed', [1, 2])
 def test_nothing_is_missing_where_nothing_is_hidden(seed: int) -> None:
-    found = discover([observed(RIG, seed=seed)])
+    found = discover([make_observation(RIG, seed=seed)])
     assert (found.verdict, found.effects, found.setup) == ('nothing_missing', (), ())
     assert 0.95 < found.floors < 1.05
 
 
 def test_of_six_psds_a_wrong_wiring_and_an_effect_are_named_together() -> None:
-    found = discover([observed(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
+    found = discover([make_observation(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
     assert [(f.name, f.where) for f in found.setup] == [('channel_sign', 'x6')]
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 5)']
 
 
 def test_a_law_may_act_on_the_third_psd(tmp_path: Path) -> None:
     """Beyond 12 N downwards the third detector lifts."""
-    plain = observed(RIG)
+    plain = make_observation(RIG)
     volts = plain.volts.copy()
     volts[:, 7] += 0.004 * np.maximum(-LOADS[:, 1] - 12.0, 0.0)
     found = discover([dataclasses.replace(plain, volts=volts)])
@@ -105,7 +105,7 @@ def test_a_rig_without_the_psd_of_a_law_rejects_it(tmp_path: Path, monkeypatch: 
     with pytest.raises(ConfigError, match='lifts is of a rig of 4 PSDs, this one has 3'):
         RigSimulator(with_effects(RIG, ['lifts,c1=100'], 'test'))
     # A search on a rig without that PSD does not look for it.
-    assert discover([observed(RIG)]).verdict == 'nothing_missing'
+    assert discover([make_observation(RIG)]).verdict == 'nothing_missing'
     lit = RigSimulator(with_effects(SIX, ['lifts,c1=1e4'], 'test')).step(LOADS).counts
     dark = RigSimulator(SIX).step(LOADS).counts
     assert np.flatnonzero(np.any(lit != dark, axis=0)).tolist() == [8]
@@ -115,7 +115,7 @@ def test_a_rig_without_the_psd_of_a_law_rejects_it(tmp_path: Path, monkeypatch: 
 @pytest.mark.statistics
 def test_hum_is_named_on_the_channels_of_the_third_psd() -> None:
     hidden = 'mains_interference,frequency=50,amplitude_y3=0.004,amplitude_sum3=0.003,phase_sum3=1.0'
-    (effect,) = discover([observed(RIG, hidden)]).effects
+    (effect,) = discover([make_observation(RIG, hidden)]).effects
     assert effect.active.effect.name == 'mains_interference'
     for name, size in (('amplitude_y3', 0.004), ('amplitude_sum3', 0.003), ('phase_sum3', 1.0), ('amplitude_x1', 0.0)):
         assert effect.active.values[name] == pytest.approx(size, abs=4.0 * max(effect.sd[name], 1e-5))
@@ -145,7 +145,7 @@ def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
     ],
 )
 def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], reported: list[tuple[str, str]]) -> None:
-    given = observed(RIG, world=world)
+    given = make_observation(RIG, world=world)
     (right,), findings, lines = wire([given], ())
     assert [(f.name, f.where) for f in findings] == reported
     assert lines == world
@@ -154,7 +154,7 @@ def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], reporte
 
 def test_two_others_that_are_exchanged_are_named_and_put_right() -> None:
     """No parameter says it, so there is no line for it."""
-    right = observed(RIG, world={'psd_1.axes': ['x', '-y']})
+    right = make_observation(RIG, world={'psd_1.axes': ['x', '-y']})
     exchanged = dataclasses.replace(right, volts=right.volts[:, [6, 7, 8, 3, 4, 5, 0, 1, 2]])
     (mended,), findings, lines = wire([exchanged], ())
     assert [(f.name, f.where) for f in findings] == [('psd_swap', 'psd_1 psd_3'), ('channel_sign', 'y3')]
@@ -176,7 +176,7 @@ def test_a_crossed_wiring_goes_to_the_device_and_back() -> None:
 
 def test_a_wiring_as_the_rig_file_says_it_is_no_finding() -> None:
     file = replace_values(RIG, {'psd_1.axes': ['y', '-x'], 'psd_3.axes': ['-x', 'y']})
-    right = observed(file)
+    right = make_observation(file)
     read = dataclasses.replace(right, volts=Wiring.from_rig(file).to_psds(right.volts))
     assert wire([read], ())[1:] == ([], {})
 
@@ -235,7 +235,7 @@ def test_what_no_movement_makes_is_as_many_numbers_as_there_are_readings_too_man
 def test_the_readings_too_many_of_pure_noise_have_unit_covariance(rig: Rig) -> None:
     """Also if the noise of the detectors and their sensitivities differ."""
     other = {'psd_2.noise': [3e-3, 1e-3], 'psd_2.sensitivity': [1e-3, 2e-3], 'psd_1.sensitivity': [4e-4, 7e-4]}
-    ws = Workspace([observed(replace_values(rig, other))])
+    ws = Workspace([make_observation(replace_values(rig, other))])
     readings, blocks = 2 * len(rig.psds), ws.measured[0].shape[1]
     # The combinations themselves: every reading alone, one after the other.
     each = np.zeros((readings, ws.measured[0].size))
@@ -264,7 +264,7 @@ def test_the_readings_too_many_of_pure_noise_have_unit_covariance(rig: Rig) -> N
     ],
 )
 def test_the_readings_too_many_acquit_the_detectors_of_what_the_link_does(word: str, acquitted: bool) -> None:
-    ws = Workspace([observed(RIG, word)])
+    ws = Workspace([make_observation(RIG, word)])
     residual, _ = ws.residual([])
     reading = fourth_reading(ws, residual)
     assert reading.values == 3 * ws.measured[0].shape[1]
@@ -293,7 +293,7 @@ def test_slow_noise_is_seen_if_all_lights_and_all_dots_but_one_have_it() -> None
 
 
 def test_recordings_of_one_search_are_of_as_many_psds() -> None:
-    both = [observed(RIG), dataclasses.replace(observed(TWO), name='other')]
+    both = [make_observation(RIG), dataclasses.replace(make_observation(TWO), name='other')]
     with pytest.raises(RecordingError, match='other: is of 2 PSDs, the rig of the search has 3'):
         discover(both)
     with pytest.raises(RecordingError, match='x: is of 3 PSDs, the rig of the search has 2'):
@@ -302,7 +302,7 @@ def test_recordings_of_one_search_are_of_as_many_psds() -> None:
 
 def test_volts_of_another_number_of_psds_than_the_rig_has_are_rejected() -> None:
     with pytest.raises(RecordingError, match=r'volts \(7000, 9\)'):
-        Observation('x', SIX, observed(RIG).volts, LOADS)
+        Observation('x', SIX, make_observation(RIG).volts, LOADS)
 
 
 def test_the_command_searches_a_recording_of_three_and_writes_what_it_found(
