@@ -81,17 +81,17 @@ def run(compensated: bool, end: float = END) -> Ran:
         plant.force = PAYLOAD if TAKEN <= t < PUT_DOWN else np.zeros(3)
         plant.step(wanted(t) + offsets, PERIOD)
         compensator.joints(t, plant.angles)
-        seen = plant.end()
-        at = seen.deflection.position + noise.normal(size=3) * NOISE
+        observed = plant.end()
+        at = observed.deflection.position + noise.normal(size=3) * NOISE
         if not LOST <= t < BACK:
-            late.append((t, Transform(seen.deflection.rotation, at)))
+            late.append((t, Transform(observed.deflection.rotation, at)))
         while late and late[0][0] <= t - LATE:
             stamp, deflection = late.popleft()
             covariance = np.eye(6) * NOISE**2
             compensator.observe(t, Observed(stamp, deflection, covariance, t - stamp))
         command = compensator.watch(t)
         offsets = command.offsets
-        error = np.linalg.norm(seen.deflected.position - arm.pose(wanted(t)).position)
+        error = np.linalg.norm(observed.deflected.position - arm.pose(wanted(t)).position)
         rows.append((t, error, *offsets, command.state is State.HOLDING))
     out = np.array(rows, dtype=np.float64)
     return Ran(out[:, 0], out[:, 1], out[:, 2:4], out[:, 4])

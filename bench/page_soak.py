@@ -60,10 +60,10 @@ def soak(minutes: int, rate: float, out: TextIO) -> list[dict[str, int]]:
             for minute in range(1, minutes + 1):
                 time.sleep(max(began + 60.0 * minute - time.monotonic(), 0.0))
                 heap = heap_bytes(driver)
-                nodes, seen = driver.execute_script(
+                nodes, observed = driver.execute_script(
                     'return [document.querySelectorAll("*").length, Number(document.body.dataset.rows ?? 0)]'
                 )
-                rows.append(dict(zip(HEAD, (minute, heap, nodes, seen), strict=True)))
+                rows.append(dict(zip(HEAD, (minute, heap, nodes, observed), strict=True)))
                 table.writerow(rows[-1])
                 out.flush()
         finally:

@@ -54,14 +54,14 @@ class AuxTel(Plant):
             rows = np.radians(np.loadtxt(stream))
         self.azimuth, self.elevation = rows[:, 0], rows[:, 1]
         turned = np.mod(rows[:, 2] - rows[:, 0] + np.pi, 2.0 * np.pi) - np.pi
-        self._seen = ARCSECONDS * np.stack([turned * np.cos(self.elevation), rows[:, 3] - self.elevation])
+        self._observed = ARCSECONDS * np.stack([turned * np.cos(self.elevation), rows[:, 3] - self.elevation])
         self.nuisance = tuple(_term(name) for name in ('IA', 'IE', *known))
         names = [*PHYSICAL, *_harmonics()]
         self.library = tuple(_term(name) for name in names if name not in {*known, *without})
 
     def measured(self) -> list[FloatArray]:
         """How far across and up, arcsec on the sky, each star was from where it was commanded."""
-        return [self._seen]
+        return [self._observed]
 
     def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
         """Azimuth and elevation, rad."""
@@ -79,7 +79,7 @@ class AuxTel(Plant):
 
     def simulate(self, model: Model) -> list[FloatArray]:
         """Return the sum of the terms."""
-        out = np.zeros_like(self._seen)
+        out = np.zeros_like(self._observed)
         for name, values in model.items():
             out += values['size'] * self._picture(name)
         return [out]

@@ -223,12 +223,12 @@ def _linear(plant: Plant, y: FloatArray) -> Left:
         e.name: _vector(plant.simulate(_model([e], np.ones(1)))) - nothing for e in (*plant.nuisance, *plant.library)
     }
 
-    def left(effects: Sequence[Effect], seen: BoolArray) -> FloatArray:
+    def left(effects: Sequence[Effect], observed: BoolArray) -> FloatArray:
         names = [e.name for e in (*plant.nuisance, *effects)]
         if not names:
             return y - nothing
         table = np.column_stack([pictures[n] for n in names])
-        sizes = np.linalg.lstsq(table[seen], (y - nothing)[seen], rcond=None)[0]
+        sizes = np.linalg.lstsq(table[observed], (y - nothing)[observed], rcond=None)[0]
         return np.asarray(y - nothing - table @ sizes)
 
     return left
@@ -237,7 +237,7 @@ def _linear(plant: Plant, y: FloatArray) -> Left:
 def _bent(plant: Plant, y: FloatArray) -> Left:
     """By least squares within the bounds, from where the effects are off."""
 
-    def left(effects: Sequence[Effect], seen: BoolArray) -> FloatArray:
+    def left(effects: Sequence[Effect], observed: BoolArray) -> FloatArray:
         used = [*plant.nuisance, *effects]
         if not used:
             return y - _vector(plant.simulate({}))
@@ -250,7 +250,7 @@ def _bent(plant: Plant, y: FloatArray) -> Left:
             return y - _vector(plant.simulate(_model(used, x)))
 
         def some(x: FloatArray) -> FloatArray:
-            return apart(x)[seen]
+            return apart(x)[observed]
 
         return apart(np.asarray(least_squares(some, start, bounds=(low, high), x_scale=size).x))
 

@@ -136,5 +136,5 @@ class Emps(Plant):
             after = np.sign(free) * np.maximum(np.abs(free) - gain * coulomb, 0.0)
             q = q + 0.5 * h * (v + after)
             v = after
-        seen = out[:: KEPT // self._step].T * (1.0 + of('position_gain', 'scale')) + of('position_offset', 'shift')
-        return [row[None, :] for row in seen]
+        observed = out[:: KEPT // self._step].T * (1.0 + of('position_gain', 'scale')) + of('position_offset', 'shift')
+        return [row[None, :] for row in observed]

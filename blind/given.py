@@ -26,17 +26,17 @@ from psd_deflection.studies.discover.observation import Observation
 LOADS = ('load_fx', 'load_fy', 'load_tz')
 
 
-def written(seen: Observation, stem: Path) -> None:
+def written(observed: Observation, stem: Path) -> None:
     """``stem.csv``: a row for each sample that is there; ``stem.yaml``: what of the rig is not as usual."""
-    there = np.isfinite(seen.volts).all(axis=1)
-    columns = [np.arange(len(seen.volts)) * seen.period, *seen.volts.T, *seen.loads.T]
+    there = np.isfinite(observed.volts).all(axis=1)
+    columns = [np.arange(len(observed.volts)) * observed.period, *observed.volts.T, *observed.loads.T]
     names = ['t', *CHANNELS, *LOADS]
-    if seen.temperature is not None:
-        columns, names = [*columns, seen.temperature], [*names, 'temperature']
+    if observed.temperature is not None:
+        columns, names = [*columns, observed.temperature], [*names, 'temperature']
     rows = np.column_stack(columns)[there]
     np.savetxt(stem.with_suffix('.csv'), rows, '%.10g', ',', header=','.join(names), comments='')
     usual = load_rig().values
-    values = {name: value for name, value in seen.rig.values.items() if value != usual[name]}
+    values = {name: value for name, value in observed.rig.values.items() if value != usual[name]}
     stem.with_suffix('.yaml').write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
 
 
@@ -46,9 +46,9 @@ def given(job: tuple[Case, str, str]) -> str:
     out = Path(folder) / case.key
     out.mkdir(parents=True, exist_ok=True)
     names = []
-    for i, seen in enumerate(observe(case, json.loads(Path(sealed).read_text())['truth']), start=1):
+    for i, observed in enumerate(observe(case, json.loads(Path(sealed).read_text())['truth']), start=1):
         names.append(f'recording_{i}')
-        written(seen, out / names[-1])
+        written(observed, out / names[-1])
     (out / 'case.json').write_text(json.dumps({'recordings': names, 'without': list(case.without)}, indent=1))
     return case.key
 

@@ -57,19 +57,19 @@ def ours(make: Callable[[], Plant], tables: Sequence[FloatArray], hidden: Sequen
     return _vector([t - s for t, s in zip(tables, said, strict=True)])
 
 
-def forward_backward(plant: Plant, left: Left, seen: BoolArray) -> FloatArray:
-    """What is left of all values by terms chosen and fitted with those that are ``seen``."""
-    count = int(seen.sum())
+def forward_backward(plant: Plant, left: Left, observed: BoolArray) -> FloatArray:
+    """What is left of all values by terms chosen and fitted with those that are ``observed``."""
+    count = int(observed.sum())
     terms = range(len(plant.library))
     kept: dict[frozenset[int], FloatArray] = {}
 
     def of(chosen: frozenset[int]) -> FloatArray:
         if chosen not in kept:
-            kept[chosen] = left([plant.library[j] for j in sorted(chosen)], seen)
+            kept[chosen] = left([plant.library[j] for j in sorted(chosen)], observed)
         return kept[chosen]
 
     def bic(chosen: frozenset[int]) -> float:
-        return float(count * np.log(np.sum(of(chosen)[seen] ** 2)) + len(chosen) * np.log(count))
+        return float(count * np.log(np.sum(of(chosen)[observed] ** 2)) + len(chosen) * np.log(count))
 
     chosen: frozenset[int] = frozenset()
     while True:
@@ -79,26 +79,26 @@ def forward_backward(plant: Plant, left: Left, seen: BoolArray) -> FloatArray:
         chosen = best
 
 
-def stlsq(plant: Plant, y: FloatArray, seen: BoolArray) -> FloatArray:
+def stlsq(plant: Plant, y: FloatArray, observed: BoolArray) -> FloatArray:
     """Return the same by least squares over all terms, again without those whose contribution is below a threshold."""
     nothing = _vector(plant.simulate({}))
     effects = [*plant.nuisance, *plant.library]
     table = np.column_stack([_vector(plant.simulate({e.name: {e.parameters[0].name: 1.0}})) - nothing for e in effects])
-    table /= np.sqrt(np.mean(table[seen] ** 2, axis=0))
-    always, count, best = len(plant.nuisance), int(seen.sum()), (np.inf, y)
+    table /= np.sqrt(np.mean(table[observed] ** 2, axis=0))
+    always, count, best = len(plant.nuisance), int(observed.sum()), (np.inf, y)
     for threshold in THRESHOLDS:
         keep = np.ones(table.shape[1], dtype=bool)
         sizes = np.zeros(table.shape[1])
         for _ in range(20):
             sizes[:] = 0.0
-            sizes[keep] = np.linalg.lstsq(table[seen][:, keep], (y - nothing)[seen], rcond=1e-8)[0]
+            sizes[keep] = np.linalg.lstsq(table[observed][:, keep], (y - nothing)[observed], rcond=1e-8)[0]
             less = np.abs(sizes) >= threshold * np.abs(sizes).max()
             less[:always] = True
             if np.array_equal(less & keep, keep):
                 break
             keep &= less
         out = y - nothing - table @ sizes
-        bic = count * np.log(np.sum(out[seen] ** 2)) + keep.sum() * np.log(count)
+        bic = count * np.log(np.sum(out[observed] ** 2)) + keep.sum() * np.log(count)
         # As many terms as readings fit anything.
         if keep.sum() < count // 2 and bic < best[0]:
             best = (float(bic), out)

@@ -174,7 +174,7 @@ def record(made: Bench, hung: HeldLoad) -> None:
     at = CubicSpline(t, pose)
     k = made.truth['link.slope_ratio'] / misaligned.LENGTH
 
-    def seen(instant: float) -> render.Pose:
+    def observed(instant: float) -> render.Pose:
         dx, dy, theta = (float(v) for v in at(instant))
         return render.Pose(dx, dy, theta, -k * dy, k * dx)
 
@@ -185,7 +185,7 @@ def record(made: Bench, hung: HeldLoad) -> None:
     listed, true = [], []
     still = render.clean(made.scene, [render.Pose()])
     for number, start in enumerate(starts.tolist()):
-        poses = render.over_exposure(seen, start, plan.exposure, plan.instants)
+        poses = render.over_exposure(observed, start, plan.exposure, plan.instants)
         rests = start + plan.exposure < plan.rest
         image = render.developed(made.scene, still if rests else render.clean(made.scene, poses), rng)
         name = f'{number:04}.png'

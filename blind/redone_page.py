@@ -159,8 +159,8 @@ def _on_the_link(forces: Sequence[float], summary: Mapping[str, Any], answers: M
 def relative_errors(curves: Curves, camera: Mapping[str, Array]) -> dict[str, Array]:
     """By method (3,): the mean at the end of a recording over that of the camera, less one."""
     late = curves.t > curves.t[-1] - CALM
-    seen = camera['t'] > camera['t'][-1] - CALM
-    reference = np.array([np.nanmean(camera[axis][seen]) for axis in ('dx', 'dy', 'theta')])
+    observed = camera['t'] > camera['t'][-1] - CALM
+    reference = np.array([np.nanmean(camera[axis][observed]) for axis in ('dx', 'dy', 'theta')])
     return {method: poses[late].mean(axis=0) / reference - 1.0 for method, poses in curves.poses.items()}
 
 

@@ -58,14 +58,14 @@ def answer(case: Case, truth: Sequence[dict[str, Any]]) -> tuple[dict[str, Any],
     """discover's result.json for a case."""
     # A mistake may change the rig, the loads or the length of the recording.
     bank = None if case.mistake[0] else _BANKS.setdefault(case.design, SignatureBank())
-    seen = observe(case, truth)
-    found = discover(seen, _rig(case, seen), seed=0, without=case.without, bank=bank)
+    observed = observe(case, truth)
+    found = discover(observed, _rig(case, observed), seed=0, without=case.without, bank=bank)
     return found.tree(), found
 
 
-def _rig(case: Case, seen: Sequence[Observation]) -> Rig:
+def _rig(case: Case, observed: Sequence[Observation]) -> Rig:
     """As its file says."""
-    return seen[0].rig if case.mistake[0] else load_rig()
+    return observed[0].rig if case.mistake[0] else load_rig()
 
 
 def _answer_case(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | None]) -> str:
@@ -80,8 +80,8 @@ def _answer_case(job: tuple[dict[str, Any], list[dict[str, Any]], str, str | Non
     )
     start = time.perf_counter()
     if peer:
-        seen = observe(case, truth)
-        got = suite_peers.answer(peer, seen, _rig(case, seen), case.without)
+        observed = observe(case, truth)
+        got = suite_peers.answer(peer, observed, _rig(case, observed), case.without)
     else:
         got, _ = answer(case, truth)
     got['seconds'] = time.perf_counter() - start

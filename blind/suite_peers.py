@@ -105,9 +105,9 @@ def lacking(peer: str) -> str:
 PEERS: dict[str, Callable[[Pictures], list[int]]] = {'stlsq': stlsq, 'subsets': subsets}
 
 
-def answer(peer: str, seen: Sequence[Observation], rig: Rig, without: Sequence[str]) -> dict[str, Any]:
+def answer(peer: str, observed: Sequence[Observation], rig: Rig, without: Sequence[str]) -> dict[str, Any]:
     """What ``peer`` says of recordings, as docs/blind.md has it: something is unknown if 1.5 floors remain."""
-    machine = RecordedRig.of(seen, rig, without, None, lambda _: None)
+    machine = RecordedRig.of(observed, rig, without, None, lambda _: None)
     pictures = Pictures(machine)
     chosen = PEERS[peer](pictures)
     named = [pictures.screen.candidates[i].effect.name for i in chosen]

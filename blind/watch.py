@@ -123,9 +123,9 @@ def watch_run(job: tuple[str, int]) -> Run:
     chain.load(load)
     for start in range(held, len(volts), CHUNK):
         chain.feed(volts[start : start + CHUNK])
-    early = any(a.seen_ns < 1e9 * event for a in chain.raised)
-    alarm = next((a for a in chain.raised if a.seen_ns >= 1e9 * event), None)
-    after = math.nan if alarm is None else alarm.seen_ns / 1e9 - event
+    early = any(a.observed_ns < 1e9 * event for a in chain.raised)
+    alarm = next((a for a in chain.raised if a.observed_ns >= 1e9 * event), None)
+    after = math.nan if alarm is None else alarm.observed_ns / 1e9 - event
     return Run(kind, after, early, '' if alarm is None else alarm.channel)
 
 
@@ -187,12 +187,12 @@ def table(runs: Sequence[Run], hours: float, alarms: int, said: Sequence[str], c
     lines, met = [], alarms == 0
     for kind in dict.fromkeys(r.kind for r in runs):
         of = [r for r in runs if r.kind == kind]
-        seen = [r for r in of if r.after <= WITHIN_S]
+        observed = [r for r in of if r.after <= WITHIN_S]
         early = sum(r.early for r in of)
-        met = met and len(seen) >= WANTED * len(of) and not early
-        after = np.array([r.after for r in seen] or [math.nan])
+        met = met and len(observed) >= WANTED * len(of) and not early
+        after = np.array([r.after for r in observed] or [math.nan])
         lines.append(
-            f'{kind} of {SIZES[kind]}: seen within {WITHIN_S:g} s in {len(seen)} of {len(of)}, after '
+            f'{kind} of {SIZES[kind]}: seen within {WITHIN_S:g} s in {len(observed)} of {len(of)}, after '
             f'{np.median(after):.1f} s in the middle, {after.max():.1f} s at most; {early} alarms before it'
         )
     if hours:

@@ -53,14 +53,14 @@ class MessageType:
     @cached_property
     def definition(self) -> str:
         """The text, followed by the texts of all parts that it is made of."""
-        seen: list[str] = []
+        observed: list[str] = []
 
         def visit(kind: str) -> None:
-            if kind in self._texts and kind not in seen:
-                seen.append(kind)
+            if kind in self._texts and kind not in observed:
+                observed.append(kind)
                 for line in self._texts[kind].splitlines():
                     visit(line.split()[0].partition('[')[0])
 
         visit(self._short)
-        parts = ''.join(f'{_SEPARATOR}MSG: {kind}\n{self._texts[kind]}' for kind in seen[1:])
+        parts = ''.join(f'{_SEPARATOR}MSG: {kind}\n{self._texts[kind]}' for kind in observed[1:])
         return self._texts[self._short] + parts

@@ -246,9 +246,9 @@ def check(recording: Recording | str | Path, rig: Rig | str | Path | None = None
     from psd_deflection.studies.study import opened
 
     given = opened(recording, rig)
-    seen = read_observation(given.recording, given.rig)
-    volts = Wiring.from_rig(given.rig).to_device(seen.volts)
-    return of_problem(of_recording(given.rig, volts, seen.loads, str(given.recording.path)))
+    observed = read_observation(given.recording, given.rig)
+    volts = Wiring.from_rig(given.rig).to_device(observed.volts)
+    return of_problem(of_recording(given.rig, volts, observed.loads, str(given.recording.path)))
 
 
 def identify(recording: Recording | str | Path, rig: Rig | str | Path | None = None) -> Identified:

@@ -108,7 +108,7 @@ def check_dots(written: Written, recording: Recording, rig: Rig) -> None:
     present = np.diff([*first, len(samples)])
     for n in (1, 2):
         light = np.add.reduceat(samples[f'sum{n}'].astype(np.float64), first) / present
-        seen = light >= rig.estimator.sum_min
+        observed = light >= rig.estimator.sum_min
         low, high = (
             1e3
             * np.stack(
@@ -117,14 +117,16 @@ def check_dots(written: Written, recording: Recording, rig: Rig) -> None:
                     for axis, sensitivity in zip('xy', rig.sensitivities[n - 1], strict=True)
                 ],
                 axis=-1,
-            )[seen]
+            )[observed]
             for extreme in (np.minimum, np.maximum)
         )
         _, _, found = written.rows(f'psd_{n}/plane/dot', 'Points2D:positions')
-        need(len(found) == int(seen.sum()), f'PSD {n}: {len(found)} dots, {seen.sum()} blocks with light')
+        need(len(found) == int(observed.sum()), f'PSD {n}: {len(found)} dots, {observed.sum()} blocks with light')
         # The dot in the middle of a whole block lies among its samples, or next to them; float32 in the file.
         slack = high - low + 1e-5
-        apart = ((found < low - slack) | (found > high + slack)).any(axis=1) & (present[seen] == recording.block_size)
+        apart = ((found < low - slack) | (found > high + slack)).any(axis=1) & (
+            present[observed] == recording.block_size
+        )
         need(not apart.any(), f'PSD {n}: {int(apart.sum())} dots lie apart from their samples')
         _, _, sums = written.rows(f'sums/psd_{n}', 'Scalars:scalars')
         need(np.allclose(sums, light, rtol=1e-6), f'sum{n} differs')

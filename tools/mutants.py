@@ -202,16 +202,16 @@ def tried(
                     words = mutant.words(text)
                     line = mutant.line if isinstance(mutant, Mutant) else mutant.line_of(text)
                     key = hashlib.sha256(f'{mutant.file}\n{code}'.encode()).hexdigest()
-                    seen = noticed.get(key, '')
-                    if not seen and not (stage == 'slow' and words in known):
+                    observed = noticed.get(key, '')
+                    if not observed and not (stage == 'slow' and words in known):
                         file.write_text(code)
                         if not passed(mutant.file, function_at(text, line)):
-                            seen = stage
+                            observed = stage
                             with NOTICED.open('a') as stream:
                                 stream.write(f'{key} {stage}\n')
                         file.write_text(text)
-                    if seen or stage == stages[-1][0]:
-                        yield f'{words}  (line {line})', seen
+                    if observed or stage == stages[-1][0]:
+                        yield f'{words}  (line {line})', observed
                     else:
                         left.append(mutant)
 
@@ -248,10 +248,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     for name in arguments.rooms:
         same, left, noticed = 0, 0, dict.fromkeys(STAGES, 0)
         seed = None if arguments.by_hand else arguments.seed
-        for words, seen in tried(name, arguments.python, arguments.count, seed, known, not arguments.quick):
-            print(f'{seen or "NOT noticed"}: {words}', file=sys.stderr, flush=True)
-            if seen:
-                noticed[seen] += 1
+        for words, observed in tried(name, arguments.python, arguments.count, seed, known, not arguments.quick):
+            print(f'{observed or "NOT noticed"}: {words}', file=sys.stderr, flush=True)
+            if observed:
+                noticed[observed] += 1
             elif words.rpartition('  (')[0] in known:
                 same += 1
             else:

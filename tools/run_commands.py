@@ -240,7 +240,7 @@ def is_campaign(line: str) -> bool:
 def blocks_to_run() -> list[list[Command]]:
     """What is run here, in the documents' order; blocks that are quick throughout are left to the tests."""
     blocks: dict[int, list[Command]] = {}
-    seen: set[str] = set()
+    observed: set[str] = set()
     for command in commands():
         blocks.setdefault(command.block, []).append(command)
     out = []
@@ -250,10 +250,10 @@ def blocks_to_run() -> list[list[Command]]:
             continue
         if all(is_quick(c.line) or run_by_ci(c.line) for c in block):
             continue
-        left = [c for c in block if run_by_ci(c.line) is None and typed_as(c.line) not in seen]
+        left = [c for c in block if run_by_ci(c.line) is None and typed_as(c.line) not in observed]
         # The lines below it may need what a simulation writes, and nothing else that is quick.
         left = [c for c in left if not is_quick(c.line) or ' simulate ' in c.line]
-        seen.update(typed_as(c.line) for c in left)
+        observed.update(typed_as(c.line) for c in left)
         if left:
             out.append(left)
     return out

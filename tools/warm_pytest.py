@@ -86,7 +86,7 @@ class Watch:
         finally:
             self._seconds[item.nodeid] = time.monotonic() - begun
 
-    def seen(self) -> str:
+    def observed(self) -> str:
         """The tests as JSON."""
         sys.settrace(None)
         here = str(Path.cwd()) + os.sep
@@ -138,7 +138,7 @@ def watched(tier: str, tests: Sequence[str], answer: Path) -> int:
     """Run ``tests`` and write what they enter into ``answer``; the exit code of pytest."""
     watch = Watch()
     code = pytest.main([*OPTIONS, '--tier', tier, *tests], plugins=[watch])
-    answer.write_text(watch.seen())
+    answer.write_text(watch.observed())
     return int(code)
 
 

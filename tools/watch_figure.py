@@ -37,7 +37,7 @@ def main() -> int:
         shown = (t > event - 5.0) & (t < event + 8.0)
         axis.plot(t[shown] - event, 1e6 * (means[shown] - means[before].mean()), '.', ms=2, color='tab:blue')
         axis.axvline(alarm.since_ns / 1e9 - event, color='black', ls=':', label='since')
-        axis.axvline(alarm.seen_ns / 1e9 - event, color='tab:red', label='alarm')
+        axis.axvline(alarm.observed_ns / 1e9 - event, color='tab:red', label='alarm')
         axis.set_title(f'{kind} of {size}', fontsize=10)
         axis.set_xlabel('time since the event / s')
         axis.set_ylabel(f'{channel} / µm')

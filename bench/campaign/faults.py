@@ -94,8 +94,8 @@ class Witness:
 
     def next_report(self) -> dict[str, float]:
         """The counters of the next report."""
-        seen = self.reports
-        self.spin_until(lambda: self.reports > seen, 5.0)
+        observed = self.reports
+        self.spin_until(lambda: self.reports > observed, 5.0)
         return self.counters
 
 
@@ -119,7 +119,7 @@ def inject(row: Row, line: Line, witness: Witness, pid: int) -> None:
     row.times.append(took)
     row.windows.append((first, line.next_identity()))
     after = witness.next_report()
-    row.detected += not fault.seen or any(after.get(k, 0.0) > before.get(k, 0.0) for k in fault.seen)
+    row.detected += not fault.observed or any(after.get(k, 0.0) > before.get(k, 0.0) for k in fault.observed)
 
 
 def lost_samples(rows: list[Row], line: Line, recording: Path, start: int, end: int) -> dict[str, tuple[int, int]]:
@@ -154,7 +154,7 @@ def report(rows: list[Row], lost: dict[str, tuple[int, int]]) -> bool:
     for row in rows:
         missing, taken = lost[row.fault.name]
         worst = max(row.times)
-        detected = str(row.detected) if row.fault.seen else '-'
+        detected = str(row.detected) if row.fault.observed else '-'
         fine = row.recovered == row.injected == row.detected and missing == 0
         fine = fine and (not row.fault.back or worst <= BACK_S)
         good = good and fine

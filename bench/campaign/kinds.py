@@ -26,7 +26,7 @@ Act = Callable[[Line, int], None]
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """``act(line, pid)`` returns when the fault is over. ``seen``: diagnostics of which one must have risen.
+    """``act(line, pid)`` returns when the fault is over. ``observed``: diagnostics of which one must have risen.
 
     ``estimates``: what must come back is the estimate, not the sample. ``back``: the port was away,
     so the time to recover counts against the second that is allowed.
@@ -34,7 +34,7 @@ class Fault:
 
     name: str
     act: Act
-    seen: tuple[str, ...]
+    observed: tuple[str, ...]
     estimates: bool = False
     back: bool = False
 

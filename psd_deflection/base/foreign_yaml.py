@@ -173,13 +173,13 @@ def _count(text: str) -> None:
 
 def _reject_doubles(root: yaml.Node) -> None:
     """Refuse a key that is in one map twice: one of its values would be lost without a word. Merge keys may repeat."""
-    seen: set[int] = set()
+    observed: set[int] = set()
     waiting = [root]
     while waiting:
         node = waiting.pop()
-        if id(node) in seen or isinstance(node, yaml.ScalarNode):
+        if id(node) in observed or isinstance(node, yaml.ScalarNode):
             continue
-        seen.add(id(node))
+        observed.add(id(node))
         if not isinstance(node, yaml.MappingNode):
             waiting += node.value
             continue

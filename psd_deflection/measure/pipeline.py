@@ -333,7 +333,7 @@ class Pipeline:
 
     def dots(self, block: SampleBlock) -> FloatArray:
         """Dots (n, 2P), m, of the samples of ``block``, calibrated and corrected as for the estimate."""
-        return self._dots(block, self._calibration.seen(block.volts))
+        return self._dots(block, self._calibration.observed(block.volts))
 
     def _dots(self, block: SampleBlock, volts: npt.NDArray[np.float32]) -> FloatArray:
         samples = self._calibration.dots(volts)
@@ -348,13 +348,13 @@ class Pipeline:
             if self._correction.uses_time and START not in self._surroundings.known:
                 yield self._environment_change(first.index, {START: float(first.t_ns[0])})
             changes = self._changes
-            volts = [self._calibration.seen(block.volts) for block in blocks]
+            volts = [self._calibration.observed(block.volts) for block in blocks]
             samples = [self._dots(block, own) for block, own in zip(blocks, volts, strict=True)]
             measures = measured(volts, samples)
-            seen = list(self._judged(blocks, measures))
-            fits = self.estimation.fits(seen)
+            observed = list(self._judged(blocks, measures))
+            fits = self.estimation.fits(observed)
             done = 0
-            for own in zip(blocks, measures, seen, strict=True):
+            for own in zip(blocks, measures, observed, strict=True):
                 yield from self._block(*own, fits)
                 done += 1
                 if self._changes != changes:
@@ -362,34 +362,34 @@ class Pipeline:
             blocks = blocks[done:]
 
     def _block(
-        self, block: SampleBlock, measures: BlockMeasures, seen: SeenBlock, fits: Iterator[Fitted]
+        self, block: SampleBlock, measures: BlockMeasures, observed: SeenBlock, fits: Iterator[Fitted]
     ) -> Iterator[Record]:
         self.counters.samples += len(block.seq)
         self._end_ns = int(block.t_ns[-1])
-        self._stillness.blocks = seen.frozen
-        verdict = seen.verdict
+        self._stillness.blocks = observed.frozen
+        verdict = observed.verdict
         solvable = verdict.status is BlockStatus.OK or verdict.sound
-        answer = self.estimation.solve(seen, fits) if solvable else BlockSolution(seen.means)
+        answer = self.estimation.solve(observed, fits) if solvable else BlockSolution(observed.means)
         self.last_estimate = answer.estimate
         self.estimator.excluded = self.estimation.excluded(answer.used)
         status, reason = answer.failure or (verdict.status, verdict.reason)
         self._count(status, verdict, answer)
-        yield from self._estimates(seen, answer, status)
+        yield from self._estimates(observed, answer, status)
         # The estimates are out: the rest is not urgent.
-        findings = self._findings(measures, seen, answer, status)
+        findings = self._findings(measures, observed, answer, status)
         self.last_spots = SpotMeans(
-            t_ns=seen.t_ns,
-            index=seen.index,
+            t_ns=observed.t_ns,
+            index=observed.index,
             dots=answer.dots,
             sums=measures.mean_sums,
             covariance=measures.covariance,
-            present=len(seen.slots),
-            lost=self._cutter.block_size - len(seen.slots),
+            present=len(observed.slots),
+            lost=self._cutter.block_size - len(observed.slots),
             status=status,
             reason=reason,
             findings=findings,
             left_out=self.estimator.excluded,
-            published=seen.due,
+            published=observed.due,
         )
         yield self.last_spots
         yield block
@@ -421,49 +421,49 @@ class Pipeline:
         counters.estimates += 1
         counters.degraded += verdict.status is not BlockStatus.OK or not answer.complete
 
-    def _estimates(self, seen: SeenBlock, answer: BlockSolution, status: BlockStatus) -> Iterator[Record]:
+    def _estimates(self, observed: SeenBlock, answer: BlockSolution, status: BlockStatus) -> Iterator[Record]:
         """The primary estimate first, then its load, the motion and the other solvers' estimates."""
         best, used = answer.estimate, answer.used
         if best is not None:
             yield best
             if used is not None:
-                load = self.tip_loads.tip_load(seen.index, best.dx, best.dy, best.theta)
-                if seen.due:
-                    yield TipLoad(seen.t_ns, *load)
+                load = self.tip_loads.tip_load(observed.index, best.dx, best.dy, best.theta)
+                if observed.due:
+                    yield TipLoad(observed.t_ns, *load)
         if self.motion_filter is not None:
             # Poses of some PSDs have another noise than the filter knows: it coasts.
             usable = status is BlockStatus.TOO_FEW_SAMPLES or (status is BlockStatus.OK and answer.complete)
-            moved = self._moved(self.motion_filter, seen, usable)
+            moved = self._moved(self.motion_filter, observed, usable)
             if moved is not None:
                 yield moved
-        self._keep_for_zero(seen, answer)
-        if seen.due and best is not None and used is not None:
-            yield from self.estimation.other_estimates(seen, used)
+        self._keep_for_zero(observed, answer)
+        if observed.due and best is not None and used is not None:
+            yield from self.estimation.other_estimates(observed, used)
 
-    def _keep_for_zero(self, seen: SeenBlock, answer: BlockSolution) -> None:
+    def _keep_for_zero(self, observed: SeenBlock, answer: BlockSolution) -> None:
         """Keep the dots of the last good blocks; a zero must not be a mean across an outage."""
         if answer.estimate is None or answer.used is None or not answer.complete:
             self._recent = []
             return
         last = self.last_spots
-        if last is not None and seen.t_ns - last.t_ns > ZERO_BLOCKS * self._cutter.block_size * self._period_ns:
+        if last is not None and observed.t_ns - last.t_ns > ZERO_BLOCKS * self._cutter.block_size * self._period_ns:
             self._recent = []
         self._recent = [*self._recent[1 - ZERO_BLOCKS :], answer.used.readings.dots]
 
     def _findings(
-        self, measures: BlockMeasures, seen: SeenBlock, answer: BlockSolution, status: BlockStatus
+        self, measures: BlockMeasures, observed: SeenBlock, answer: BlockSolution, status: BlockStatus
     ) -> tuple[str, ...]:
         """What is odd about a block; of one that is not, the noise is learnt."""
-        findings, used = seen.verdict.findings, answer.used
+        findings, used = observed.verdict.findings, answer.used
         if used is not None and used.excluded:
             findings = (*findings, f'psd_{used.excluded} contradicts the others and is left out')
         # Of this block: what it has to say counts from the next one on.
         vibrates = self.estimator.vibrates
         if status is BlockStatus.OK and not findings:
-            self._learn(seen, measures)
+            self._learn(observed, measures)
         if answer.complete and used is not None and used.checked is not None:
-            self.estimator.search_outliers(seen.index, used.readings.dots, used.checked)
-        findings += self._optics.late_findings(measures, seen.verdict, seen.frozen, self._loudness)
+            self.estimator.search_outliers(observed.index, used.readings.dots, used.checked)
+        findings += self._optics.late_findings(measures, observed.verdict, observed.frozen, self._loudness)
         if vibrates:
             findings += (f'vibrates: {vibrates}',)
         if answer.estimate is not None:
@@ -471,21 +471,21 @@ class Pipeline:
         self.counters.count_findings(findings)
         return findings
 
-    def _learn(self, seen: SeenBlock, measures: BlockMeasures) -> None:
+    def _learn(self, observed: SeenBlock, measures: BlockMeasures) -> None:
         """Take a good block into the noise."""
-        changed = self.estimator.learn(seen.index, seen.slots, seen.samples, measures.volts)
+        changed = self.estimator.learn(observed.index, observed.slots, observed.samples, measures.volts)
         if changed and self.motion_filter is not None:
             self.motion_filter.set_noise(self.estimator.noise.gamma)
 
-    def _moved(self, motion: ModalFilter, seen: SeenBlock, usable: bool) -> TipMotion | None:
+    def _moved(self, motion: ModalFilter, observed: SeenBlock, usable: bool) -> TipMotion | None:
         """The motion by the filter; ``usable``: whether samples of the block can be used."""
-        slots, poses = seen.slots, None
+        slots, poses = observed.slots, None
         if usable:
-            solved = self.estimation.primary.solve_many(seen.samples, np.array(self.estimation.variances[0]))
+            solved = self.estimation.primary.solve_many(observed.samples, np.array(self.estimation.variances[0]))
             sound = solved.status == SolverStatus.OK
             if sound.any():
                 slots, poses = slots[sound], solved.pose[sound]
-        moved = motion.block(seen.index, seen.t_ns, slots if poses is not None else None, poses)
+        moved = motion.block(observed.index, observed.t_ns, slots if poses is not None else None, poses)
         if moved is None:
             return None
         systematic = self.estimation.systematic
@@ -498,7 +498,7 @@ class Pipeline:
         vx, vy, vtheta = moved.velocity.tolist()
         return TipMotion(
             t_ns=moved.t_ns,
-            block=seen.index,
+            block=observed.index,
             dx=dx,
             dy=dy,
             theta=theta,

@@ -68,13 +68,13 @@ BACK = 20
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """``since_ns``: when it began; ``seen_ns``: when it was sure. ``channel``: of the readings, the base line of two
-    PSDs, or an axis of the pose. ``shift`` and ``sd``, m or rad. ``sigmas``: how many standard deviations it is.
+    """``since_ns``: when it began; ``observed_ns``: when it was sure. ``channel``: of the readings, the base line of
+    two PSDs, or an axis of the pose. ``shift`` and ``sd``, m or rad. ``sigmas``: how many standard deviations it is.
     ``also``: other channels that shifted.
     """
 
     since_ns: int
-    seen_ns: int
+    observed_ns: int
     channel: str
     shift: float
     sd: float

@@ -49,7 +49,7 @@ class RecordedVibration:
         if segment != self._segment:
             self._close()
             self._segment = segment
-        volts = self._calibration.seen(block.volts)
+        volts = self._calibration.observed(block.volts)
         sums = volts[:, 2::3].astype(np.float64)
         if volts.shape[1] == self._channels and sums.min() >= self._light:
             places = block.seq - segment * SEGMENT_BLOCKS * self._size

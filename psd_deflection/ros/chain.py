@@ -64,7 +64,7 @@ class ChainNode(BaseNode[ChainSettings]):
         self._inputs: list[InputRecorder] = []
         self._reported: list[RigPublisher] = []
         self._health: list[HealthReporter] = []
-        self._seen = (0, 0)
+        self._observed = (0, 0)
         self._frames: FramePublisher | None = None
         super().__init__(NODE_NAME, log)
 
@@ -113,7 +113,7 @@ class ChainNode(BaseNode[ChainSettings]):
                 session.processing.sinks.append(reported)
                 self._reported.append(reported)
                 inputs.session = session
-            self._seen = (0, 0)
+            self._observed = (0, 0)
             chain.listeners.append(self._composed)
             chain.start()
         except BaseException:
@@ -196,8 +196,8 @@ class ChainNode(BaseNode[ChainSettings]):
         if chain is None:
             return (Health('end effector', STALE, 'not configured'),)
         missing = chain.missing
-        before, self._seen = self._seen, (chain.composed, sum(missing.values()))
-        new, lacking = (now - then for now, then in zip(self._seen, before, strict=True))
+        before, self._observed = self._observed, (chain.composed, sum(missing.values()))
+        new, lacking = (now - then for now, then in zip(self._observed, before, strict=True))
         silent = chain.silent()
         if silent or not new:
             level, text = ERROR, f'no end effector: {silent or "no common time"}'

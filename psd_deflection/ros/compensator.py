@@ -156,7 +156,7 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
 
     def _listen(self) -> None:
         listen = self.gate.listen
-        listen(END_EFFECTOR, self._deflection_fault, self._seen)
+        listen(END_EFFECTOR, self._deflection_fault, self._observed)
         listen(JOINT_STATES, self._joints_fault, self._joints)
         if not self._drive:
             return
@@ -269,15 +269,15 @@ class CompensatorNode(BaseNode[CompensatorSettings]):
             or quaternion_fault([turned.x, turned.y, turned.z, turned.w])
         )
 
-    def _seen(self, message: Any) -> None:
+    def _observed(self, message: Any) -> None:
         at, turned = message.pose.pose.position, message.pose.pose.orientation
         rotation = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w]).as_matrix()
         t_ns = _ns(message.header.stamp)
         deflection = Transform(rotation, np.array([at.x, at.y, at.z]))
         covariance = np.array(message.pose.covariance).reshape(6, 6)
-        seen = Observed(t_ns / 1e9, deflection, covariance, self._age(t_ns))
+        observed = Observed(t_ns / 1e9, deflection, covariance, self._age(t_ns))
         with self._lock:
-            self.compensator.observe(time.monotonic(), seen)
+            self.compensator.observe(time.monotonic(), observed)
 
     def _age(self, t_ns: int) -> float:
         """s, by the node's clock: that of the simulation with ``use_sim_time``."""

@@ -127,7 +127,7 @@ class RigMarkers:
         self.session: Session | None = None
         self._node = node
         self._magnify = rig.monitor.markers_magnify
-        self._seen = 0
+        self._observed = 0
         self._at_rest, self._moving = publisher_of(node, MARKERS_AT_REST), publisher_of(node, MARKERS)
         self._at_rest.publish(at_rest(rig))
         self._rest_of = rig
@@ -138,9 +138,9 @@ class RigMarkers:
         if session is None:
             return
         estimate, spots = session.pipeline.last_estimate, session.pipeline.last_spots
-        if spots is None or spots.t_ns == self._seen:
+        if spots is None or spots.t_ns == self._observed:
             return
-        self._seen = spots.t_ns
+        self._observed = spots.t_ns
         if session.rig is not self._rest_of:
             self._rest_of = session.rig
             self._at_rest.publish(at_rest(session.rig))

@@ -51,7 +51,7 @@ def finding(alarm: Alarm, about: Mapping[str, object]) -> dict[str, object]:
     return {
         'text': f'since {_utc(alarm.since_ns)}: {alarm.words}',
         'since': _utc(alarm.since_ns),
-        'sure_since': _utc(alarm.seen_ns),
+        'sure_since': _utc(alarm.observed_ns),
         'channel': alarm.channel,
         'shift': alarm.shift,
         'sd': alarm.sd,

@@ -58,7 +58,7 @@ class HealthReporter:
 
     def __init__(self, session: Session) -> None:
         self._session = session
-        self._seen: CounterSnapshot | None = None
+        self._observed: CounterSnapshot | None = None
         self._foretold = Innovations()
         self._base = (0, 0, 0, 0)
 
@@ -82,8 +82,8 @@ class HealthReporter:
             s.rejected.total(),
         )
         # The first report counts from the start. The time that it covers is unknown, so it gives no rates.
-        before = self._seen
-        self._seen = now
+        before = self._observed
+        self._observed = now
         seconds = (now.t_ns - before.t_ns) / 1e9 if before is not None else 0.0
         new = (
             CounterSnapshot(0, *(b - a for a, b in zip(before[1:], now[1:], strict=True)))

@@ -304,7 +304,7 @@ def _reported(alarm: Alarm) -> list[tuple[str, str]]:
     unit = '(urad)' if alarm.channel == 'theta' else '(um)'
     return [
         ('since', _clock(alarm.since_ns)),
-        ('sure since', _clock(alarm.seen_ns)),
+        ('sure since', _clock(alarm.observed_ns)),
         ('channel', alarm.channel),
         (f'shift {unit}', f'{1e6 * alarm.shift:.3f}'),
         (f'its standard deviation {unit}', f'{1e6 * alarm.sd:.3f}'),

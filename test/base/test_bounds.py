@@ -86,16 +86,16 @@ def test_a_key_that_is_set_again_is_never_gone_for_another_thread() -> None:
         """Its hash is asked for whenever a map is changed: there another thread may read."""
 
         def __hash__(self) -> int:
-            seen.append(not held or 'a' in held[0])
+            observed.append(not held or 'a' in held[0])
             return super().__hash__()
 
         __eq__ = str.__eq__
 
-    seen: list[bool] = []
+    observed: list[bool] = []
     held: list[BoundedMap[str, int]] = []
     kept: BoundedMap[str, int] = BoundedMap()
     kept['a'] = 1
     held.append(kept)
     kept[Word('a')] = 2
-    assert seen
-    assert all(seen)
+    assert observed
+    assert all(observed)

@@ -49,7 +49,7 @@ def test_logarithmic_axes_levels_and_spreads() -> None:
     assert stream.getvalue()[:4] == b'\x89PNG'
 
 
-def test_of_a_long_curve_what_can_be_seen_is_drawn() -> None:
+def test_of_a_long_curve_what_can_be_observed_is_drawn() -> None:
     x = np.arange(100_000.0)
     y = np.sin(x)
     y[70_001] = 9.0

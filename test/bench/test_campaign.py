@@ -70,27 +70,27 @@ def test_the_line_keeps_its_ledger(line: Line, recording_rig: Rig) -> None:
     acquisition = Acquisition(recording_rig, null_log)
     acquisition.open()
     acquisition.start()
-    seen: set[int] = set()
+    observed: set[int] = set()
     line.inject(b'\x00rubbish\x00')
     first = line.next_identity()
     fault = FAULTS[[f.name for f in FAULTS].index('frame truncated')]
     while not line.taken_by_fault & set(range(first, line.next_identity())):
         fault.act(line, 0)
     last = line.next_identity()
-    while max(seen, default=0) < last:
+    while max(observed, default=0) < last:
         item = acquisition.queue.get(timeout=WAIT_S)
         raw = getattr(item, 'raw', None)
         if raw is not None:
-            seen.update(identities(raw.readings.astype(np.float32) * np.float32(VOLTS_PER_COUNT)).tolist())
+            observed.update(identities(raw.readings.astype(np.float32) * np.float32(VOLTS_PER_COUNT)).tolist())
     acquisition.stop()
-    expected = set(range(min(seen), max(seen) + 1)) - line.taken_by_fault
-    assert expected <= seen
+    expected = set(range(min(observed), max(observed) + 1)) - line.taken_by_fault
+    assert expected <= observed
     assert len(line.taken_by_fault & set(range(first, last))) == 1
 
 
 def test_a_cable_is_pulled_only_when_the_host_has_read(line: Line) -> None:
     """However late it reads: what a cable takes with it would look like a loss of the daemon's."""
-    seen: set[int] = set()
+    observed: set[int] = set()
     decoder, unread = FrameDecoder(), threading.Event()
     with serial.Serial(line.device_name, timeout=0, exclusive=True) as host:
         host.write(encode(HelloRequestFrame()))
@@ -108,9 +108,9 @@ def test_a_cable_is_pulled_only_when_the_host_has_read(line: Line) -> None:
             while True:
                 for frame in decoder.feed(host.read(4096)):
                     if isinstance(frame, SampleFrame):
-                        seen.add(frame.seq)
+                        observed.add(frame.seq)
         pulled.join()
-    assert set(range(min(seen), line.next_identity())) - line.taken_by_fault <= seen
+    assert set(range(min(observed), line.next_identity())) - line.taken_by_fault <= observed
 
 
 def test_there_are_enough_kinds_and_a_bad_row_fails_the_campaign(capsys: pytest.CaptureFixture[str]) -> None:

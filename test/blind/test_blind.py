@@ -145,10 +145,10 @@ def test_every_mistake_has_five_sizes_and_changes_the_recording() -> None:
     sound = Observation('recording 1', rig, g.record([], 'white', 1), g.loads, g.temperature)
     for name, sizes in MISTAKES.items():
         assert len(sizes) == 5
-        seen = observed((name, sizes[0]), g, rig, 'white', 1)
+        visited = observed((name, sizes[0]), g, rig, 'white', 1)
         same = [
             o.rig.values == rig.values and np.array_equal(o.volts, sound.volts) and np.array_equal(o.loads, sound.loads)
-            for o in seen
+            for o in visited
         ]
         assert not all(same), name
 

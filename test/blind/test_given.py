@@ -27,18 +27,18 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_case_as_files_is_what_discover_was_given(folder: Path) -> None:
-    (seen,) = observe(CASE, [])
+    (observed,) = observe(CASE, [])
     at = folder / 'cases' / CASE.key
     assert json.loads((at / 'case.json').read_text()) == {'recordings': ['recording_1'], 'without': []}
     rows = np.genfromtxt(at / 'recording_1.csv', delimiter=',', names=True)
-    there = np.isfinite(seen.volts).all(axis=1)
+    there = np.isfinite(observed.volts).all(axis=1)
     assert len(rows) == there.sum()
     read = np.column_stack([rows[name] for name in ('x1', 'y1', 'sum1', 'x2', 'y2', 'sum2')])
-    np.testing.assert_allclose(read, seen.volts[there], atol=1e-9)
+    np.testing.assert_allclose(read, observed.volts[there], atol=1e-9)
     held = np.column_stack([rows[name] for name in ('load_fx', 'load_fy', 'load_tz')])
-    np.testing.assert_allclose(held, seen.loads[there], atol=1e-8)
+    np.testing.assert_allclose(held, observed.loads[there], atol=1e-8)
     rig = load_rig(at / 'recording_1.yaml')
-    assert rig.values == seen.rig.values
+    assert rig.values == observed.rig.values
     assert rig.values != load_rig().values
 
 

@@ -69,8 +69,8 @@ def test_the_noise_of_a_board_is_what_its_pose_leaves_of_the_corners() -> None:
     apart = BOARD.square * (np.arange(4) - 1.5)
     corners = np.array([[x, y, 0.0] for x in apart for y in apart])
     turn, _ = cv2.Rodrigues(found.rotation)
-    seen, _ = cv2.projectPoints(corners, turn, found.place, matrix, distortion)
-    away = np.linalg.norm(seen - found.points, axis=2)
+    observed, _ = cv2.projectPoints(corners, turn, found.place, matrix, distortion)
+    away = np.linalg.norm(observed - found.points, axis=2)
     # Each corner has its own, much nearer than the next.
     assert sorted(away.argmin(axis=0).tolist()) == list(range(16))
     left = float(np.sum(away.min(axis=0) ** 2))

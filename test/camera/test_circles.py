@@ -71,7 +71,7 @@ def test_theta_has_four_quadrants() -> None:
     assert_within(measured(Scene(), poses), poses)
 
 
-def test_a_tilt_of_the_plate_is_seen_and_does_not_turn_theta() -> None:
+def test_a_tilt_of_the_plate_is_observed_and_does_not_turn_theta() -> None:
     poses = [*STILL, Pose(theta=0.1, phi=0.12, omega=-0.1)]
     answer = measured(Scene(tilt=(0.2, 0.1)), poses)[-1]
     assert answer.theta == pytest.approx(0.1, abs=5e-4)
@@ -123,7 +123,7 @@ def test_the_mean_over_the_exposure_is_what_counts() -> None:
     assert math.sqrt(answer.covariance[0, 0]) > 2 * still
 
 
-def test_a_lens_that_loses_its_focus_moves_no_plate_seen_from_the_side() -> None:
+def test_a_lens_that_loses_its_focus_moves_no_plate_observed_from_the_side() -> None:
     """The blur along a bent rim moves it, more at the ends of an ellipse than at its sides."""
     scene, rng = Scene(tilt=(0.29, 0.15), blur=0.5, read_noise=0.5), np.random.default_rng(4)
     reference = CameraReference(replace(settings_of(scene), rest_frames=2), target_of)

@@ -157,14 +157,14 @@ def test_exact_corners_give_the_pose_of_a_board_at_once(view: str) -> None:
     facing = np.diag([1.0, -1.0, -1.0]) if view == 'outside' else np.eye(3)
     true = facing @ turned(np.array([0.2, -0.3, 0.4]))
     at = np.array([0.01, -0.02, 0.5])
-    seen = np.column_stack([plane, np.zeros(len(plane))]) @ true.T + at
-    rotation, place = board.first_pose(plane, seen[:, :2] / seen[:, 2:])
+    observed = np.column_stack([plane, np.zeros(len(plane))]) @ true.T + at
+    rotation, place = board.first_pose(plane, observed[:, :2] / observed[:, 2:])
     assert rotation == pytest.approx(true, abs=1e-9)
     assert place == pytest.approx(at, abs=1e-9)
 
 
 @pytest.mark.parametrize(('thick', 'why'), [(1, Status.MISSING), (2, Status.OBLIQUE)])
-def test_three_scratches_a_pixel_wide_are_no_target_seen_obliquely(thick: int, why: Status) -> None:
+def test_three_scratches_a_pixel_wide_are_no_target_observed_obliquely(thick: int, why: Status) -> None:
     """They have its spacing: 36 px, of half-widths of 10 to 12 px."""
     grey = np.full((40, 130), 20, dtype=np.uint8)
     for middle in (24, 60, 96):

@@ -63,8 +63,8 @@ def test_the_preview_shows_where_the_discs_were_found(filmed: Path, tmp_path: Pa
         shown = cv2.imread(str(tmp_path / 'now.png'))
         assert shown is not None
         green = (shown[..., 1].astype(int) - shown[..., 2]) > 100
-        seen = [pixel_of(Scene(turn=0.1), POSES[-1], 0.0, 0.025 * i) for i in (1, 0, -1)]
-        assert [bool(green[round(v), round(u)]) for u, v in seen] == [crosses] * 3
+        observed = [pixel_of(Scene(turn=0.1), POSES[-1], 0.0, 0.025 * i) for i in (1, 0, -1)]
+        assert [bool(green[round(v), round(u)]) for u, v in observed] == [crosses] * 3
 
 
 @pytest.mark.parametrize('name', ['reference.mcap', 'reference'])

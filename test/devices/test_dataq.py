@@ -89,7 +89,7 @@ def test_scans_come_out_however_the_stream_was_cut(cuts: list[int]) -> None:
 
 
 @given(st.integers(1, 13), st.lists(st.integers(0, 10_000), max_size=20))
-def test_lost_bytes_are_seen_and_the_step_is_found_again(lost: int, cuts: list[int]) -> None:
+def test_lost_bytes_are_observed_and_the_step_is_found_again(lost: int, cuts: list[int]) -> None:
     stream = SCAN * 5 + SCAN[lost:] + SCAN * 10
     got = fed(stream, cuts)
     assert got == fed(stream, [])

@@ -120,13 +120,13 @@ def test_it_works_unchanged_with_the_daemon(port: str) -> None:
 def test_it_answers_what_the_page_asks_of_it(port: str) -> None:
     line = SerialPort(port, 921_600)
     decoder = FrameDecoder()
-    seen: list[Frame] = []
+    observed: list[Frame] = []
 
     def until(kind: type[object]) -> Frame:
-        seen.clear()
-        while not any(isinstance(f, kind) for f in seen):
-            seen.extend(decoder.feed(line.read(10.0)))
-        return next(f for f in seen if isinstance(f, kind))
+        observed.clear()
+        while not any(isinstance(f, kind) for f in observed):
+            observed.extend(decoder.feed(line.read(10.0)))
+        return next(f for f in observed if isinstance(f, kind))
 
     line.write(b'\x07junk\x00\x00' + encode(PingFrame(COOKIE)))
     pong = until(PongFrame)
@@ -136,11 +136,11 @@ def test_it_answers_what_the_page_asks_of_it(port: str) -> None:
     until(PongFrame)
     line.write(encode(PingFrame(2)))
     until(PongFrame)
-    assert not any(isinstance(f, SampleFrame) for f in seen)
+    assert not any(isinstance(f, SampleFrame) for f in observed)
     line.write(encode(StartFrame()))
     sample = until(SampleFrame)
     assert isinstance(sample, SampleFrame)
-    assert not any(isinstance(f, BadFrame) for f in seen)
+    assert not any(isinstance(f, BadFrame) for f in observed)
     status = until(StatusFrame)
     assert isinstance(status, StatusFrame)
     assert status.temperature_centi is None

@@ -214,11 +214,11 @@ def test_a_change_of_the_rule_while_it_runs_holds_from_the_next_block() -> None:
 
 def test_outside_the_calibrated_range_the_block_says_so() -> None:
     dx, dy, theta = POSE
-    seen = (-1e-3, -1e-3, -0.01, 1e-3, 1e-3, 0.01)
-    inside = spots(records_of(Pipeline(load_rig(overrides={'calibration.range': list(seen)})), moving(10)))
+    observed = (-1e-3, -1e-3, -0.01, 1e-3, 1e-3, 0.01)
+    inside = spots(records_of(Pipeline(load_rig(overrides={'calibration.range': list(observed)})), moving(10)))
     assert not [f for s in inside for f in s.findings]
     for axis, (name, shown) in enumerate((('dX', dx * 1e3), ('dY', dy * 1e3), ('theta', np.degrees(theta)))):
-        narrow = list(seen)
+        narrow = list(observed)
         # Its largest, or its least, just short of the pose.
         narrow[axis + 3 if shown > 0.0 else axis] = 0.9 * POSE[axis]
         pipeline = Pipeline(load_rig(overrides={'calibration.range': narrow}))

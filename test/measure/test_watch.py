@@ -131,7 +131,7 @@ def test_a_bump_is_reported_with_its_time_channel_and_size() -> None:
     assert alarm.channel == 'x1'
     assert alarm.shift == pytest.approx(5e-6, abs=0.3e-6)
     assert alarm.since_ns / 1e9 == pytest.approx(10.0, abs=0.6)
-    assert alarm.seen_ns / 1e9 - 10.0 < 6.0
+    assert alarm.observed_ns / 1e9 - 10.0 < 6.0
     # Of two means of four windows, which are means of 25 blocks.
     assert alarm.sd == pytest.approx(NOISE / 5.0 * 0.5**0.5, rel=0.4)
     assert alarm.sigmas > 20.0
@@ -178,7 +178,7 @@ def test_three_seconds_pass_from_what_is_sure_to_the_alarm() -> None:
     fed.run(10.0, REST)
     fed.run(6.0, REST + 10.0 * X1)
     assert fed.watch.alarm is not None
-    assert fed.watch.alarm.seen_ns / 1e9 == pytest.approx(14.0, abs=0.3)
+    assert fed.watch.alarm.observed_ns / 1e9 == pytest.approx(14.0, abs=0.3)
 
 
 def test_the_readings_under_a_load_are_learnt_in_two_seconds() -> None:
@@ -322,7 +322,7 @@ def test_drift_ringing_and_gaps_are_no_alarm() -> None:
 
 @pytest.mark.statistics
 @pytest.mark.parametrize('kind', SIZES)
-def test_events_of_the_second_generator_are_seen(kind: str) -> None:
+def test_events_of_the_second_generator_are_observed(kind: str) -> None:
     run = watch_run((kind, 1000))
     assert run.after < WITHIN_S
     assert not run.early

@@ -268,7 +268,7 @@ def test_an_estimated_load_is_no_input() -> None:
 
 
 def test_an_independent_decoder_reads_every_message_as_the_fields_say() -> None:
-    seen = set()
+    observed = set()
     for record in run(60):
         for m in to_messages(record):
             raw = cdr.encode(m.type, m.fields)
@@ -279,9 +279,9 @@ def test_an_independent_decoder_reads_every_message_as_the_fields_say() -> None:
                 stamp = decoded.header.stamp
                 assert stamp.sec * 10**9 + stamp.nanosec == m.t_ns
             assert cdr.decode(m.type, raw) == m.fields
-            seen.add(m.topic)
+            observed.add(m.topic)
     of_two = {*TOPIC_TYPES} - {*spot_topics(MOST_PSDS)[2:]}
-    assert seen | {RIG} == {*of_two, solver_topic('exact'), solver_topic('wls')}
+    assert observed | {RIG} == {*of_two, solver_topic('exact'), solver_topic('wls')}
 
 
 @pytest.mark.parametrize('flags', [0, 1])
@@ -340,8 +340,8 @@ def test_a_block_is_cut_only_if_its_times_do_not_fit(span: int, pieces: int) -> 
     messages = to_messages(given_block)
     assert len(messages) == pieces
     assert (next(point_cloud2.parts(given_block)) is given_block) == (pieces == 1)
-    seen = [point_cloud2.to_points(m.fields) for m in messages]
-    times = np.concatenate([t + points['dt'].astype(np.int64) for t, points in seen])
+    observed = [point_cloud2.to_points(m.fields) for m in messages]
+    times = np.concatenate([t + points['dt'].astype(np.int64) for t, points in observed])
     np.testing.assert_array_equal(times, t_ns)
 
 
@@ -400,9 +400,9 @@ def test_points_that_contradict_themselves_are_rejected() -> None:
 
 
 @pytest.mark.parametrize('status', BlockStatus)
-def test_a_dot_that_was_not_seen_is_not_published(status: BlockStatus) -> None:
-    seen = status in (BlockStatus.OK, BlockStatus.OUTSIDE_ACTIVE_AREA, BlockStatus.NOT_SOLVED)
-    assert [m.topic for m in to_messages(spots(1, status))] == (list(SPOTS) if seen else [])
+def test_a_dot_that_was_not_observed_is_not_published(status: BlockStatus) -> None:
+    observed = status in (BlockStatus.OK, BlockStatus.OUTSIDE_ACTIVE_AREA, BlockStatus.NOT_SOLVED)
+    assert [m.topic for m in to_messages(spots(1, status))] == (list(SPOTS) if observed else [])
 
 
 def test_of_a_block_without_one_psd_the_others_are_published() -> None:
@@ -418,8 +418,8 @@ def test_dots_that_are_no_numbers_are_not_published() -> None:
 
 
 def test_each_dot_is_published_in_its_own_frame_and_axes() -> None:
-    seen = [(m.topic, m.fields['header']['frame_id'], m.fields['point']) for m in to_messages(spots(3))]
-    assert seen == [
+    observed = [(m.topic, m.fields['header']['frame_id'], m.fields['point']) for m in to_messages(spots(3))]
+    assert observed == [
         ('/psd_1/spot', 'psd_1', {'x': 1e-3, 'y': -2e-3, 'z': 0.0}),
         ('/psd_2/spot', 'psd_2', {'x': 1e-4 * 3, 'y': 0.0, 'z': 0.0}),
     ]

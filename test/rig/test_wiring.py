@@ -40,13 +40,13 @@ def test_there_are_128_wirings_of_two_detectors_and_each_is_undone() -> None:
     assert len(set(WIRINGS)) == 128
     assert [w for w in WIRINGS if w.nominal] == [Wiring()]
     volts = np.arange(1, 13, dtype=np.float32).reshape(2, 6)
-    seen = set()
+    observed = set()
     for wiring in WIRINGS:
         out = wiring.to_psds(volts)
         assert out.dtype == np.float32
         np.testing.assert_array_equal(wiring.to_device(out), volts)
-        seen.add(tuple(out[0].tolist()))
-    assert len(seen) == 128
+        observed.add(tuple(out[0].tolist()))
+    assert len(observed) == 128
 
 
 @pytest.mark.parametrize('wiring', [WIRINGS[1], WIRINGS[22], WIRINGS[77], WIRINGS[127]], ids=str)

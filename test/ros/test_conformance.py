@@ -532,7 +532,7 @@ def test_simulated_time_acts_or_is_rejected(running: Running) -> None:
         return
     assert answer.successful, answer.reason
     clock = running.peer.node.create_publisher(Clock, '/clock', 5)
-    seen, rejected = len(running.reports), running.rejections()
+    observed, rejected = len(running.reports), running.rejections()
 
     def reported(sec: int) -> None:
         message = Clock()
@@ -540,7 +540,7 @@ def test_simulated_time_acts_or_is_rejected(running: Running) -> None:
         clock.publish(message)
 
     def of_that_time() -> bool:
-        return any(report.header.stamp.sec == 1234 for report in running.reports[seen:])
+        return any(report.header.stamp.sec == 1234 for report in running.reports[observed:])
 
     try:
         running.peer.until_sent(lambda: reported(1234), of_that_time, 'diagnostics in simulated time')

@@ -143,15 +143,15 @@ def test_another_vendors_dds_sees_the_same_values(start: Callable[..., Any], pee
     peer.until(lambda: other.poll() is not None, 'the other vendor to have 50 messages')
     stdout, stderr = other.communicate()
     assert other.returncode == 0, (other.returncode, stderr, len(poses))
-    seen = {row[0]: row[1:] for row in json.loads(stdout)}
-    assert len(seen) == 50
+    observed = {row[0]: row[1:] for row in json.loads(stdout)}
+    assert len(observed) == 50
     ours = {stamp(p): p for p in poses}
-    common = sorted(set(seen) & set(ours))
+    common = sorted(set(observed) & set(ours))
     assert len(common) >= 45
     for t in common:
         p = ours[t]
         o = p.pose.orientation
-        assert seen[t] == [
+        assert observed[t] == [
             p.header.frame_id,
             p.pose.position.x,
             p.pose.position.y,

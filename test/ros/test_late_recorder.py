@@ -50,8 +50,8 @@ def recorded_late(peer: Any, poses: list[Any], folder: Path) -> Path:
     peer.until(lambda: any(m.topic == f'/arm{SAMPLES}' for m in heard), 'the first samples')
     before = max(memories(), 1)
     peer.until(lambda: memories() > before, 'the next memory')
-    seen = len(poses)
-    peer.until(lambda: len(poses) >= seen + 100, 'two seconds after it')
+    observed = len(poses)
+    peer.until(lambda: len(poses) >= observed + 100, 'two seconds after it')
     for one in listening:
         peer.node.destroy_subscription(one)
     return written(folder / f'late_{len(list(folder.iterdir()))}', heard)

@@ -78,8 +78,8 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert state(peer) == State.PRIMARY_STATE_INACTIVE
     with pytest.raises(DeviceError, match='another program has the port open'):
         SerialPort(simulated_port, 921_600)
-    seen = len(health)
-    peer.until(lambda: len(health) > seen + 1, 'diagnostics while inactive')
+    observed = len(health)
+    peer.until(lambda: len(health) > observed + 1, 'diagnostics while inactive')
     assert not poses
     assert not markers
     assert change(peer, Transition.TRANSITION_ACTIVATE)
@@ -93,11 +93,11 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert [(r.successful, '42' in r.reason) for r in answer.results] == [(False, True)]
     peer.until(lambda: len(poses) >= 10 and len(markers) > 0, 'estimates')
     assert change(peer, Transition.TRANSITION_DEACTIVATE)
-    seen = len(health)
-    peer.until(lambda: len(health) > seen + 1, 'diagnostics while inactive')
+    observed = len(health)
+    peer.until(lambda: len(health) > observed + 1, 'diagnostics while inactive')
     stopped, drawn = len(poses), len(markers)
-    seen = len(health)
-    peer.until(lambda: len(health) > seen, 'more diagnostics')
+    observed = len(health)
+    peer.until(lambda: len(health) > observed, 'more diagnostics')
     assert (len(poses), len(markers)) == (stopped, drawn)
     assert change(peer, Transition.TRANSITION_CLEANUP)
     SerialPort(simulated_port, 921_600).close()

@@ -71,8 +71,8 @@ class Arm:
         self.peer.until(self._ready, 'the controller and the joints')
 
     def _ready(self) -> bool:
-        seen = {s.name: s for r in self.reports for s in r.status if s.name.startswith('shaper: ')}
-        return len(seen) == 2 and all(s.level == DiagnosticStatus.OK for s in seen.values())
+        observed = {s.name: s for r in self.reports for s in r.status if s.name.startswith('shaper: ')}
+        return len(observed) == 2 and all(s.level == DiagnosticStatus.OK for s in observed.values())
 
     def goal(self, end: tuple[float, ...] = (0.5, 0.1), seconds: float = 0.3, names: tuple[str, ...] = NAMES) -> Any:
         at = Duration(nanoseconds=round(1e9 * seconds)).to_msg()

@@ -61,7 +61,7 @@ def test_a_repeated_sample_and_one_whose_time_does_not_fit_its_number_are_not_sh
     assert watched.state() == before
 
 
-def test_a_jump_is_seen_sample_by_sample() -> None:
+def test_a_jump_is_observed_sample_by_sample() -> None:
     watched = watch()
     for k in range(5):
         assert not watched.torn(k, k * 1000)

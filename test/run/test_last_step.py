@@ -17,7 +17,7 @@ from psd_deflection.run.last_step import REACH_S, RecentDots
 RIG = load_rig()
 
 
-def seen(loads: list[tuple[float, float, float]], seconds: float, lost: range = range(0)) -> RecentDots:
+def observed(loads: list[tuple[float, float, float]], seconds: float, lost: range = range(0)) -> RecentDots:
     """The dots under ``loads``, each held for so many s; some blocks ``lost``."""
     recent = RecentDots(RIG)
     for records in replayed(psd_deflection.simulate(RIG, loads, seconds=seconds), Pipeline(RIG)):
@@ -29,13 +29,13 @@ def seen(loads: list[tuple[float, float, float]], seconds: float, lost: range = 
 
 @pytest.mark.parametrize('lost', [range(0), range(60, 80)])
 def test_the_last_step_is_found_to_a_tenth_of_a_block(lost: range) -> None:
-    found = seen([(0, 0, 0), (0, -10, 0), (5, -10, 0)], 4.0, lost).step_ns()
+    found = observed([(0, 0, 0), (0, -10, 0), (5, -10, 0)], 4.0, lost).step_ns()
     assert found is not None
     assert found * 1e-9 == pytest.approx(8.0, abs=0.002)
 
 
 def test_a_link_at_rest_has_no_step() -> None:
-    assert seen([(0, -10, 0)], 5.0).step_ns() is None
+    assert observed([(0, -10, 0)], 5.0).step_ns() is None
     assert RecentDots(RIG).step_ns() is None
 
 

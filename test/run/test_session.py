@@ -155,7 +155,7 @@ def test_the_start_says_what_another_rig_has_as_in_the_thesis(device: ScriptedDe
     assert len(line) <= 160
 
 
-class Seen:
+class Observed:
     """A sink that keeps what it gets."""
 
     def __init__(self) -> None:
@@ -168,8 +168,8 @@ class Seen:
 def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
     running: Running, device: ScriptedDevice, sample: Sample
 ) -> None:
-    session, seen = running.session, Seen()
-    session.input_sinks.append(seen)
+    session, observed = running.session, Observed()
+    session.input_sinks.append(observed)
     first = session.note_load(0.0, -10.0, 0.5)
     running.heard('load noted: Fx 0 N, Fy -10 N, Tz 0.5 N·m')
     before = session.acquisition.now_ns()
@@ -183,7 +183,7 @@ def test_a_noted_load_is_recorded_and_holds_for_the_next_recording(
     assert [load[1:] for load in loads] == [(0.0, -10.0, 0.5), (1.0, -20.0, 0.5)]
     assert first.t_ns < before <= loads[0].t_ns <= loads[1].t_ns
     assert loads[1] == more == session.load
-    assert [r for r in seen.records if isinstance(r, AppliedLoad)] == [first, *loads]
+    assert [r for r in observed.records if isinstance(r, AppliedLoad)] == [first, *loads]
 
 
 def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_reported_now(
@@ -217,15 +217,15 @@ def test_a_load_that_has_hung_for_a_while_is_stamped_with_that_and_reported_now(
 def test_a_request_that_came_late_is_of_the_time_it_was_made(running: Running) -> None:
     session = running.session
     shown = ShownSession(session)
-    seen = Seen()
-    session.input_sinks.append(seen)
+    observed = Observed()
+    session.input_sinks.append(observed)
     before = session.acquisition.now_ns()
     shown.mark('bumped it', 8.0)
     shown.load(0.0, -10.0, 0.0, False, 0.0, 6.0)
     # Made before the load above and heard after it: it comes after it all the same.
     shown.load(0.0, 0.0, 0.0, False, 0.0, 7.0)
     passed = session.acquisition.now_ns() - before
-    mark, load, later = seen.records
+    mark, load, later = observed.records
     assert isinstance(mark, Mark)
     assert isinstance(load, AppliedLoad)
     assert isinstance(later, AppliedLoad)
@@ -258,8 +258,8 @@ def test_the_hours_of_a_device_are_kept_by_its_serial_number(
 
 
 def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDevice, sample: Sample) -> None:
-    session, seen = running.session, Seen()
-    session.input_sinks.append(seen)
+    session, observed = running.session, Observed()
+    session.input_sinks.append(observed)
     folder = session.record(True).result(WAIT_S)
     assert folder is not None
     device.send_frames(*(sample(seq) for seq in range(200, 300)))
@@ -269,14 +269,14 @@ def test_a_mark_is_recorded_when_it_arrives(running: Running, device: ScriptedDe
     last = session.take_input(MARK, cdr.encode(message.type, message.fields))
     assert session.record(False).result(WAIT_S) == folder
     assert [mark.text for mark in open_recording(folder).marks()] == ['bumped it', 'at rest']
-    assert open_recording(folder).marks() == [first, last] == seen.records
+    assert open_recording(folder).marks() == [first, last] == observed.records
 
 
 def test_a_mark_that_is_none_or_comes_too_often_is_rejected_and_counted(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    session, seen = running.session, Seen()
-    session.input_sinks.append(seen)
+    session, observed = running.session, Observed()
+    session.input_sinks.append(observed)
     for text in ('', 'x' * 201, 'a\x1b[31m', '\ud800'):
         with pytest.raises(ValueError, match='a mark'):
             session.note_mark(text)
@@ -288,12 +288,12 @@ def test_a_mark_that_is_none_or_comes_too_often_is_rejected_and_counted(
         session.note_mark('one more')
     session.processing.request(lambda: None)
     assert session.rejected[MARK] >= 6
-    assert [mark.text for mark in seen.records if isinstance(mark, Mark)] == ['good']
+    assert [mark.text for mark in observed.records if isinstance(mark, Mark)] == ['good']
 
 
 def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) -> None:
-    seen = Seen()
-    running.session.input_sinks.append(seen)
+    observed = Observed()
+    running.session.input_sinks.append(observed)
 
     def give(pose: ReferencePose) -> Record | None:
         (message,) = to_messages(pose)
@@ -307,7 +307,7 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
     now = give(good._replace(t_ns=0))
     assert isinstance(now, ReferencePose)
     assert now.t_ns > good.t_ns
-    assert seen.records == [good, now]
+    assert observed.records == [good, now]
     # Both are counted, and the last reason is told.
     running.session.processing.request(lambda: None)
     assert running.session.rejected == {REFERENCE: 2}

@@ -20,7 +20,7 @@ from test.heard import WAIT_S
 BLOCKS = 20
 
 
-class Seen:
+class Observed:
     """A sink; ``until`` waits for the last ``BLOCKS`` values of dY, m, to be as wanted."""
 
     def __init__(self) -> None:
@@ -38,29 +38,32 @@ class Seen:
             assert self._changed.wait_for(lambda: len(self._last) == BLOCKS and wanted(list(self._last)), WAIT_S)
 
 
-def running(**parameters: object) -> tuple[Session, Seen]:
-    session, seen = Session(load_rig(overrides={'keep_zero': False, 'realtime': False, **parameters}), null_log), Seen()
-    session.processing.sinks.append(seen)
+def running(**parameters: object) -> tuple[Session, Observed]:
+    session, observed = (
+        Session(load_rig(overrides={'keep_zero': False, 'realtime': False, **parameters}), null_log),
+        Observed(),
+    )
+    session.processing.sinks.append(observed)
     session.start()
-    return session, seen
+    return session, observed
 
 
 def test_it_hangs_what_is_noted() -> None:
-    session, seen = running()
+    session, observed = running()
     try:
         assert session.hangs
-        seen.until(lambda dy: max(map(abs, dy)) < 2e-6)
+        observed.until(lambda dy: max(map(abs, dy)) < 2e-6)
         # Zero gives zero: no weight hangs there when it is taken.
         assert session.zero() is not None
         assert all(abs(value) < 1e-6 for psd in session.rig.psds for value in psd.zero)
         _, sag, _ = LinkStatics.from_rig(session.rig).compliance @ [0.0, -10.0, 0.0]
         assert sag == pytest.approx(-445.43e-6, abs=0.01e-6)
         session.note_load(0.0, -10.0, 0.0)
-        seen.until(lambda dy: max(abs(value - sag) for value in dy) < 3e-6)
+        observed.until(lambda dy: max(abs(value - sag) for value in dy) < 3e-6)
         with pytest.raises(ValueError, match='the simulated rig hangs a load when it is noted'):
             session.note_load(0.0, -20.0, 0.0, ago_s=1.0)
         session.note_load(0.0, 0.0, 0.0)
-        seen.until(lambda dy: max(map(abs, dy)) < 3e-6)
+        observed.until(lambda dy: max(map(abs, dy)) < 3e-6)
     finally:
         session.close()
     # What comes at the end, or after it, is hung nowhere.
@@ -68,9 +71,9 @@ def test_it_hangs_what_is_noted() -> None:
 
 
 def test_on_the_demo_weights_hang_in_turn() -> None:
-    session, seen = running(demo=True)
+    session, observed = running(demo=True)
     try:
         assert not session.hangs
-        seen.until(lambda dy: min(dy) < -200e-6)
+        observed.until(lambda dy: min(dy) < -200e-6)
     finally:
         session.close()

@@ -73,7 +73,8 @@ def certificate(folder: Path) -> StudyResult:
 def watched(folder: Path) -> StudyResult:
     shifts = (('x1', 3_000_000_000, 2e-5), ('theta', 5_000_000_000, 1e-4))
     alarms = tuple(
-        Alarm(since_ns=t, seen_ns=t + 1, channel=name, shift=shift, sd=shift / 10, also=()) for name, t, shift in shifts
+        Alarm(since_ns=t, observed_ns=t + 1, channel=name, shift=shift, sd=shift / 10, also=())
+        for name, t, shift in shifts
     )
     return WatchedRun(alarms, 'all', 0, {'recording': 'a'})
 

@@ -213,16 +213,16 @@ class Compensator:
         """
         if not np.all(np.abs(positions) <= LARGEST_POSITION):
             return
-        seen = np.array(positions, dtype=np.float64)
+        observed = np.array(positions, dtype=np.float64)
         before, then = self._joints, self._joints_t
-        self._joints, self._joints_t = seen, now - max(age, 0.0)
+        self._joints, self._joints_t = observed, now - max(age, 0.0)
         self._at_joints = self._offsets
-        wrong = self.response.add(now, seen, self._offsets, self.settings.follow_error)
+        wrong = self.response.add(now, observed, self._offsets, self.settings.follow_error)
         if wrong is not None and self._speaks and not self._dry:
             self._broken = self._broken or self.response.wrong(self.arm.names, wrong)
         if before is None:
             return
-        move, settings = seen - before, self.settings
+        move, settings = observed - before, self.settings
         leap = float(np.abs(move).max())
         if leap > settings.max_joint_speed * min(max(self._joints_t - then, 0.02), 1.0):
             self._hold(f'the positions of the joints leap by {leap:.3g}')
@@ -233,21 +233,21 @@ class Compensator:
             self._hold(f'the positions of the joints go to and fro by {turned.max():.3g}')
         self._last_move = move
 
-    def observe(self, now: float, seen: Observed) -> Command:
+    def observe(self, now: float, observed: Observed) -> Command:
         """Take a deflection at the time ``now``; return what :meth:`watch` gave last, with the state of now."""
-        before, fault = self._last, self._rejection(now, seen)
+        before, fault = self._last, self._rejection(now, observed)
         if fault:
             self._hold(fault)
             return self.command()
-        back = before.t - seen.t if before is not None else -1.0
+        back = before.t - observed.t if before is not None else -1.0
         if 0.0 <= back <= self.settings.stale:
             # Twice the same, or late on the way.
             return self.command()
-        self._last, self._last_now = seen, now - max(seen.age, 0.0)
+        self._last, self._last_now = observed, now - max(observed.age, 0.0)
         if back > 0.0:
             self._hold(f'the stamps of the deflections go back by {back:.3g} s')
         elif before is not None:
-            moved = _vector(before.deflection.inverse() @ seen.deflection)[self._rows]
+            moved = _vector(before.deflection.inverse() @ observed.deflection)[self._rows]
             if np.abs(moved).max() > self.settings.jump:
                 self._hold(f'the deflection jumps by {np.abs(moved).max():.3g}')
         if self._fault:
@@ -257,8 +257,8 @@ class Compensator:
             self._fault = ''
         nominal = self._nominal() if self.enabled and self._speaks else None
         if nominal is not None:
-            elapsed = seen.t - before.t if before is not None else 0.0
-            self._follow(nominal, seen.deflection, min(max(elapsed, 0.0), LONGEST_S))
+            elapsed = observed.t - before.t if before is not None else 0.0
+            self._follow(nominal, observed.deflection, min(max(elapsed, 0.0), LONGEST_S))
         return self.command()
 
     def watch(self, now: float) -> Command:
@@ -430,21 +430,21 @@ class Compensator:
             return self._pose
         return self._joints - self._at_joints
 
-    def _rejection(self, now: float, seen: Observed) -> str:
+    def _rejection(self, now: float, observed: Observed) -> str:
         settings = self.settings
-        finite = all(np.all(np.isfinite(part)) for part in (*seen.deflection, seen.covariance))
-        if not finite or not math.isfinite(seen.t):
+        finite = all(np.all(np.isfinite(part)) for part in (*observed.deflection, observed.covariance))
+        if not finite or not math.isfinite(observed.t):
             return 'the deflection is not finite'
-        size = float(np.abs(_vector(seen.deflection)).max())
+        size = float(np.abs(_vector(observed.deflection)).max())
         if size > settings.max_deflection:
             return f'a deflection of {size:.3g} is more than the links can have'
-        variances = np.diag(seen.covariance)[self._rows]
+        variances = np.diag(observed.covariance)[self._rows]
         if variances.min() < LEAST_SD**2:
             return 'the deflection does not say how certain it is'
         if math.sqrt(variances.max()) > settings.max_sd:
             return f'the deflection is uncertain by more than {settings.max_sd:g}'
-        if abs(seen.age) > settings.stale:
-            what = 'is older than' if seen.age > 0.0 else 'has a stamp ahead of our clock by more than'
+        if abs(observed.age) > settings.stale:
+            what = 'is older than' if observed.age > 0.0 else 'has a stamp ahead of our clock by more than'
             return f'the deflection {what} {settings.stale:g} s'
         if self._joints is None:
             return 'the positions of the joints are not known'
@@ -463,7 +463,7 @@ class Compensator:
         error = _vector(wanted.inverse() @ self.arm.pose(nominal + self._offsets) @ deflection)[rows]
         jacobian = self.arm.jacobian(nominal + self._offsets)
         in_wanted = np.vstack([wanted.rotation.T @ jacobian[:3], wanted.rotation.T @ jacobian[3:]])[rows]
-        self._verified = (self._verified and not self.response.suspects) or self._seen_to_follow(in_wanted)
+        self._verified = (self._verified and not self.response.suspects) or self._observed_to_follow(in_wanted)
         self._residual = float(np.linalg.norm(self._measured_error(deflection, error)))
         square = in_wanted.T @ in_wanted + settings.damping**2 * np.eye(len(self._offsets))
         step = -np.linalg.solve(square, in_wanted.T @ error) * -math.expm1(-elapsed / settings.time_constant)
@@ -474,7 +474,7 @@ class Compensator:
         beyond = np.abs(self._offsets + step - self._wanted).max() > 1e-12
         self._limited = bool(beyond or np.abs(step).max() > settings.max_rate * elapsed * (1.0 + 1e-9))
 
-    def _seen_to_follow(self, jacobian: FloatArray) -> bool:
+    def _observed_to_follow(self, jacobian: FloatArray) -> bool:
         """Whether the joints whose offsets count were seen to move with them."""
         known = self.response.known()
         doubtful = np.linalg.norm(jacobian @ np.where(known, 0.0, self._offsets))

@@ -140,14 +140,14 @@ class Fitter:
         flat[1] += np.repeat((u[:, 0] * size).astype(np.float32), np.diff(begin))
         np.take((v.ravel() * size).astype(np.float32), line, out=flat[2], mode='clip')
         # The rise lies between: its pixels would make the contrast too small and the first step too long.
-        some, seen = away.ravel()[near[::THINNED]], level[::THINNED]
+        some, observed = away.ravel()[near[::THINNED]], level[::THINNED]
         first = -(-begin // THINNED)
         light = np.zeros((3, LIGHTS))
         for k, (a, b, band) in enumerate(zip(first[:-1].tolist(), first[1:].tolist(), bands.tolist(), strict=True)):
             inner = some[a:b] < max(self._radius - band / 2, self._radius / 2) ** 2
             outer = some[a:b] > (self._radius + band / 2) ** 2
-            light[k, 0] = float(seen[a:b] @ outer) / max(int(np.count_nonzero(outer)), 1)
-            light[k, 3] = float(seen[a:b] @ inner) / max(int(np.count_nonzero(inner)), 1)
+            light[k, 0] = float(observed[a:b] @ outer) / max(int(np.count_nonzero(outer)), 1)
+            light[k, 3] = float(observed[a:b] @ inner) / max(int(np.count_nonzero(inner)), 1)
         return Rims(begin, level, rays, flat, bends, chosen), light
 
     def _bends(self, pixels: FloatArray) -> FloatArray:

@@ -200,7 +200,7 @@ def _doubled(normal: Normal, raw: Pixels, blur: FloatArray) -> bool:
     along = np.linalg.eigh(blur)[1][:, 1]
     across = normal.side[0] * float(along[0]) + normal.side[1] * float(along[1])
     level = normal.rows[3] if normal.root is None else normal.rows[3] / normal.root
-    seen = level + raw
+    observed = level + raw
     dwell = np.zeros(_DWELL)
     for end in (1.0, -1.0):
         of = across * end > 0.9
@@ -208,7 +208,7 @@ def _doubled(normal: Normal, raw: Pixels, blur: FloatArray) -> bool:
         count = np.bincount(place, minlength=_DWELL + 1)
         if count[:-1].min() < 4:
             return False
-        mean = np.bincount(place, seen[of], _DWELL + 1) / np.maximum(count, 1)
+        mean = np.bincount(place, observed[of], _DWELL + 1) / np.maximum(count, 1)
         dwell[1:] += end * np.diff(mean[:-1])
     # The two highest places with the lowest between them.
     left = np.maximum.accumulate(dwell)

@@ -439,8 +439,8 @@ def _detector(axes: Any, table: dict[str, FloatArray], rig: Rig, number: int, ra
     width, height = (1e3 * side for side in rig.psds[number - 1].active_area)
     axes.add_patch(Rectangle((-width / 2, -height / 2), width, height, fill=False, color=COLORS['quiet']))
     x, y = table[f'x{number}'] * 1e3, table[f'y{number}'] * 1e3
-    seen = np.isfinite(table['dx'])
-    axes.plot(x[seen], y[seen], '.', ms=2.5, color=COLORS['lost'], alpha=0.5, rasterized=raster)
+    observed = np.isfinite(table['dx'])
+    axes.plot(x[observed], y[observed], '.', ms=2.5, color=COLORS['lost'], alpha=0.5, rasterized=raster)
     axes.set(
         aspect='equal',
         xlim=(-0.54 * width, 0.54 * width),

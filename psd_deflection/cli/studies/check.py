@@ -77,11 +77,11 @@ def run(args: argparse.Namespace) -> int:
         recording = open_recording(args.recording, span=args.span)
         rig = load_rig(args.params_file) if args.params_file else rig_at_end(recording)
         with stage('reading', quiet=args.json):
-            seen = read_observation(recording, rig)
-        volts = Wiring.from_rig(rig).to_device(seen.volts)
-        found = check(of_recording(rig, volts, seen.loads, args.recording))
+            observed = read_observation(recording, rig)
+        volts = Wiring.from_rig(rig).to_device(observed.volts)
+        found = check(of_recording(rig, volts, observed.loads, args.recording))
         if not args.json:
-            show(f'{args.recording}: {seen.duration:.1f} s')
+            show(f'{args.recording}: {observed.duration:.1f} s')
     else:
         if args.span != WHOLE:
             raise UsageError('--from, --to: are for a recording: give REC')

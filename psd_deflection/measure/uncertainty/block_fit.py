@@ -270,11 +270,11 @@ class BlockFit:
         whole = samples == self._size
         terms = self._whole if whole else self._terms_without(slots)
         orders, reported = self._orders, len(terms.v)
-        seen = by.einsum('sja,sza->jza', terms.all, z)
-        c = seen[orders : orders + reported]
+        observed = by.einsum('sja,sza->jza', terms.all, z)
+        c = observed[orders : orders + reported]
         memories, motion = self._motion(c, terms)
         x, missed = _weights(terms, motion, self._middle, by)
-        value = by.sum(x * seen[:orders], 0) + offset
+        value = by.sum(x * observed[:orders], 0) + offset
         weights: FloatArray | None = None
         if whole:
             covariance = by.einsum('kza,kjab,jzb->zab', x, self._of_whole, x)
@@ -286,7 +286,7 @@ class BlockFit:
         if orders > 1:
             left = samples - reported
             # In units of the noise: a chi-square of n - K degrees of freedom.
-            squares = by.sum(z * seen[orders + reported :], 0) - by.sum(seen[:reported] * c, 0)
+            squares = by.sum(z * observed[orders + reported :], 0) - by.sum(observed[:reported] * c, 0)
             over = squares > (left + _MISFIT * by.root(2.0 * left) if left else np.inf)
             if np.count_nonzero(over):
                 misfit = [any(row) for row in over.tolist()]

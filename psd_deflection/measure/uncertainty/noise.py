@@ -116,7 +116,7 @@ class StreamNoise:
         self._average: FloatArray | None = None
         self._sure = np.ones(size)
         self._count = 0
-        self._seen = 0
+        self._observed = 0
         self._louder = 0
         self.at_rest = False
         self._segment = -1
@@ -144,7 +144,7 @@ class StreamNoise:
     @property
     def measured(self) -> bool:
         """Whether ``gamma`` comes from the stream."""
-        return self._seen >= STATED_SEGMENTS
+        return self._observed >= STATED_SEGMENTS
 
     def sample_sd(self) -> FloatArray:
         """Standard deviation (C,), m, of one sample."""
@@ -228,7 +228,7 @@ class StreamNoise:
 
     def state(self) -> tuple[float, ...]:
         """What :meth:`set_state` needs to go on from here."""
-        head = (float(self._seen), float(self._count), float(self._louder), float(self.at_rest))
+        head = (float(self._observed), float(self._count), float(self._louder), float(self.at_rest))
         return head if self._average is None else (*head, *self._average.ravel().tolist(), *self._sure.tolist())
 
     def set_state(self, values: tuple[float, ...]) -> None:
@@ -236,7 +236,7 @@ class StreamNoise:
         wanted = self._wanted + self._size
         if len(values) not in (4, wanted):
             raise ValueError(f'noise of {self._size} samples a block has {wanted} values, not {len(values)}')
-        self._seen, self._count, self._louder = (int(v) for v in values[:3])
+        self._observed, self._count, self._louder = (int(v) for v in values[:3])
         self.at_rest = bool(values[3])
         average = np.array(values[4 : self._wanted])
         self._average = average.reshape(self._readings, self._readings, -1) if len(values) > 4 else None
@@ -278,7 +278,7 @@ class StreamNoise:
         dots = np.concatenate([d for _, _, d in blocks])
         series = np.column_stack((dots, self._combinations.fixed(dots)))
         lags, sure = _autocovariance(places, series, SEGMENT_BLOCKS * size, size, self._by)
-        self._seen += 1
+        self._observed += 1
         moved = self._by.einsum('sc,ac->sa', dots, self._moving)
         rough = _roughness(places, np.column_stack((moved, series)), self._q, self._by)
         count = self._readings

@@ -106,14 +106,14 @@ class ToneSearch:
             band = slice(max(peak - wide, self._first), min(peak + wide, self._last) + 1)
             free[band] = False
             strength = self._by.sum(power[band], 0)
-            seen = above[band].max(axis=0) > _SEEN
-            moved = strength[:count] * seen[:count]
-            if bool((seen[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
+            observed = above[band].max(axis=0) > _SEEN
+            moved = strength[:count] * observed[:count]
+            if bool((observed[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
                 continue
-            own = spectrum[band, :count] * seen[:count]
+            own = spectrum[band, :count] * observed[:count]
             cross = self._by.times_conjugate(own[:, :, None], own[:, None, :]).real
             covariance = scale * self._by.sum(np.ascontiguousarray(cross), 0)
-            weight = self._by.sum(power[band, :count] * seen[:count], 1)
+            weight = self._by.sum(power[band, :count] * observed[:count], 1)
             at = self._by.product(weight, np.arange(band.start, band.stop, dtype=np.float64))
             frequency = float(at) / float(self._by.sum(weight, 0)) / self._length
             out.append(Tone(frequency, self._by.einsum('ac,ab,bd->cd', turn, covariance, turn)))

@@ -59,12 +59,13 @@ class VoltsToDots:
             dark=tuple((i, psd.dark) for i, psd in enumerate(rig.psds) if psd.dark[2] > 0.0),
         )
 
-    def seen(self, volts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
+    def observed(self, volts: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
         """Volts (n, 3P) of the PSDs, x y sum of each, from those of the device's channels."""
         return self.wiring.to_psds(volts)
 
     def dots(self, volts: npt.NDArray[np.float32]) -> FloatArray:
-        """Places (n, 2P), m: x1, y1, x2, y2 ..., each from its PSD's centre; ``volts`` (n, 3P) float32 as :meth:`seen`.
+        """Places (n, 2P), m: x1, y1, x2, y2 ..., each from its PSD's centre; ``volts`` (n, 3P) float32 as
+        :meth:`observed`.
 
         The amplifier divides by the sum, so a voltage is the place over the sensitivity. Photocurrents add: with other
         light of sum b a reading is v = ((W - b) v_laser + b v_dark)/W, W the sum, and v_laser is what counts. The

@@ -65,7 +65,7 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
     v = np.zeros(len(ALL))
     clamp = dict.fromkeys(CLAMP, 0.0)
     others: list[ActiveEffect] = []
-    seen: dict[str, str] = {}
+    observed: dict[str, str] = {}
     listed: set[str] = set()
     tilts = False
     v[SLOPE] = rig.link.slope_ratio
@@ -84,7 +84,7 @@ def vector_of_rig(rig: Rig, effects: Sequence[ActiveEffect] | None = None) -> Ri
             # Of one PSD an effect counts once, whatever its other choices are.
             whole = f'psd_{active.values[PSD.name]:.0f}.{name}' if PSD in active.effect.parameters else name
             if active.values[own] != active.effect.parameter(own).nominal or name == _AIMED:
-                _claim(seen, whole, active)
+                _claim(observed, whole, active)
             if name in clamp:
                 clamp[name] = active.values[own]
             elif name == _SLOPE:

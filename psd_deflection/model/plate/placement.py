@@ -101,10 +101,10 @@ def _deviations(jacobian: FloatArray, sigma: float) -> FloatArray:
     _, values, rows = np.linalg.svd(jacobian / scale, full_matrices=True)
     count = jacobian.shape[1]
     values = np.concatenate([values, np.zeros(count - len(values))])
-    seen = values > 1e-12
-    out = sigma / scale * np.sqrt(np.sum((rows[seen] / values[seen, None]) ** 2, axis=0))
+    observed = values > 1e-12
+    out = sigma / scale * np.sqrt(np.sum((rows[observed] / values[observed, None]) ** 2, axis=0))
     # Every unknown with a component along an unseen direction is undetermined.
-    out[np.any(np.abs(rows[~seen]) > 1e-9, axis=0)] = math.inf
+    out[np.any(np.abs(rows[~observed]) > 1e-9, axis=0)] = math.inf
     return np.asarray(out)
 
 

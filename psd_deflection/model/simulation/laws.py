@@ -367,9 +367,9 @@ def _correct(law: Law, first: int, reading: Reading, values: Values) -> None:
 
 
 def _correctable(law: Law) -> bool:
-    seen = {*DOTS, 'temperature', 'time'}
+    observed = {*DOTS, 'temperature', 'time'}
     apart = all(t.form == 'switched' or FORMS[t.form].apart is not None for t in law.terms)
-    return TARGETS[law.acts_on].point == 'dots' and apart and set(law.variables) <= seen
+    return TARGETS[law.acts_on].point == 'dots' and apart and set(law.variables) <= observed
 
 
 def _parameters(law: Law, first: int) -> list[EffectParameter]:

@@ -110,9 +110,9 @@ class BasePairSolver(Solver):
                     'dot back by what the deflection moved it (Fig. 5.9): the deflection cannot be seen; '
                     'put the PSDs in another plane'
                 )
-        seen = jacobian @ self._matrix
-        seen /= np.linalg.norm(seen, axis=0)
-        if np.linalg.svd(seen, compute_uv=False)[-1] < _SMALLEST_GAIN:
+        observed = jacobian @ self._matrix
+        observed /= np.linalg.norm(observed, axis=0)
+        if np.linalg.svd(observed, compute_uv=False)[-1] < _SMALLEST_GAIN:
             raise SolverError(
                 f'base_pair, assuming {assume}: some motion of the tip moves no dot with this geometry '
                 '(PSDs on one line in space, or in one plane); move one PSD'

@@ -131,13 +131,13 @@ class RerunFile:
             self._add(f'load/{name}', t_ns, None if load is None else (getattr(load, name),))
         for i, psd in enumerate(self._rig.psds):
             x, y = s.dots[2 * i : 2 * i + 2]
-            seen = s.sums[i] >= self._rig.estimator.sum_min and math.isfinite(x) and math.isfinite(y)
+            observed = s.sums[i] >= self._rig.estimator.sum_min and math.isfinite(x) and math.isfinite(y)
             self._add(f'sums/psd_{i + 1}', t_ns, (s.sums[i],))
             for path in ('dot', 'trail'):
-                self._add(f'psd_{i + 1}/plane/{path}', t_ns, (1e3 * x, 1e3 * y) if seen else None)
+                self._add(f'psd_{i + 1}/plane/{path}', t_ns, (1e3 * x, 1e3 * y) if observed else None)
             zx, zy = psd.center[0] + psd.zero[0], psd.center[1] + psd.zero[1]
             at = (zx + self._magnify * (x - psd.zero[0]), zy + self._magnify * (y - psd.zero[1]), psd.height)
-            self._add(f'rig/tip/dot_{i + 1}', t_ns, at if seen and e is not None else None)
+            self._add(f'rig/tip/dot_{i + 1}', t_ns, at if observed and e is not None else None)
         moved = None if pose is None else tuple(self._magnify * v for v in pose)
         self._add('rig/link', t_ns, moved)
         self._add('rig/tip', t_ns, moved)

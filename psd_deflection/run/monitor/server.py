@@ -221,7 +221,7 @@ class MonitorServer(GatedServer):
     async def _once_a_second(self) -> None:
         while True:
             last, self._alarm = self._alarm, self._shown.alarm()
-            if self._alarm is not None and (last is None or last.seen_ns != self._alarm.seen_ns):
+            if self._alarm is not None and (last is None or last.observed_ns != self._alarm.observed_ns):
                 self._take_mark(self._alarm)
             if self.viewers:
                 self._take_health()

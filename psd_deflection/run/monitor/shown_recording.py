@@ -98,8 +98,8 @@ class ShownRecording:
         self._load: AppliedLoad | None = None
         self._start_ns: int | None = None
         self._last: SpotMeans | None = None
-        self._seen = (0, 0, 0)
-        self._seen_ns = time.time_ns()
+        self._observed = (0, 0, 0)
+        self._observed_ns = time.time_ns()
         self._thread = threading.Thread(target=self._run, name='replay', daemon=True)
 
     @property
@@ -142,11 +142,11 @@ class ShownRecording:
         """Counts of the part played so far, rates since the last report, why blocks have no estimate; ``t_ns``: now."""
         counters = self._pipeline.counters
         samples, estimates, lost = counters.samples, counters.estimates, self._lost
-        new_samples = max(samples - self._seen[0], 0)
-        new_estimates = max(estimates - self._seen[1], 0)
-        new_lost = max(lost - self._seen[2], 0)
-        seconds = (t_ns - self._seen_ns) / 1e9
-        self._seen, self._seen_ns = (samples, estimates, lost), t_ns
+        new_samples = max(samples - self._observed[0], 0)
+        new_estimates = max(estimates - self._observed[1], 0)
+        new_lost = max(lost - self._observed[2], 0)
+        seconds = (t_ns - self._observed_ns) / 1e9
+        self._observed, self._observed_ns = (samples, estimates, lost), t_ns
         rates = [round(new / seconds) if seconds > 0.0 else 0 for new in (new_samples, new_estimates)]
         spots = self._last
         pace = 'as fast as recorded' if self._speed == 1.0 else f'{self._speed:g} times as fast as recorded'

@@ -73,7 +73,7 @@ class Spectrum:
         if not self._blocks:
             return None
         seq = np.concatenate([b.seq for b in self._blocks])
-        volts = self._calibration.seen(np.concatenate([b.volts for b in self._blocks]))
+        volts = self._calibration.observed(np.concatenate([b.volts for b in self._blocks]))
         dots = self._calibration.dots(volts).astype(np.float64)
         psds = volts.shape[1] // 3
         for psd in range(psds):
@@ -83,13 +83,13 @@ class Spectrum:
         for run in np.split(dots, np.flatnonzero(np.diff(seq) != 1) + 1):
             for start in range(0, len(run) - SEGMENT + 1, SEGMENT // 2):
                 part = run[start : start + SEGMENT]
-                seen = np.repeat(np.isfinite(part).all(axis=0).reshape(-1, 2).all(axis=1), 2)
-                if not seen.any():
+                observed = np.repeat(np.isfinite(part).all(axis=0).reshape(-1, 2).all(axis=1), 2)
+                if not observed.any():
                     continue
-                part = part[:, seen]
+                part = part[:, observed]
                 transform = np.fft.rfft((part - part.mean(axis=0)) * self._window[:, None], axis=0)
-                total[:, seen] += np.abs(transform) ** 2
-                count += seen
+                total[:, observed] += np.abs(transform) ** 2
+                count += observed
         if not count.any():
             return None
         count[count == 0] = np.nan

@@ -49,7 +49,7 @@ SHIFT = 3.0
 """Size of the shifts that are looked for, in tolerances."""
 FITTED = 7
 """Groups, the likeliest, that are fitted in full if something moved."""
-_SEEN = 1e-4
+_OBSERVED = 1e-4
 """A direction that the rows show by less than this share of a tolerance's inverse variance counts as unseen."""
 
 
@@ -146,7 +146,7 @@ def moved_group(name: str, at: IntArray, left: FloatArray, m: FloatArray, scale:
     members = [i for i, index in enumerate(at) if index < ZERO and PARAMETERS[int(index)].group == name]
     block, score = m[np.ix_(members, members)], left[members]
     size, vectors = np.linalg.eigh(0.5 * (block + block.T))
-    shown = size > _SEEN
+    shown = size > _OBSERVED
     along = vectors.T @ score
     statistic = float(np.sum(along[shown] ** 2 / size[shown]))
     freedom = int(shown.sum())

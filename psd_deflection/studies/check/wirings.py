@@ -60,7 +60,7 @@ MARGIN = 0.35
 LIMIT = 0.35
 """A wiring with a larger misfit to any one push does not explain it."""
 
-SEEN = 6.0
+OBSERVED = 6.0
 """A movement below so many of its standard deviations says nothing."""
 
 DOTS = tuple(CHANNELS[i] for i in DOT_CHANNELS)
@@ -110,7 +110,7 @@ class PushResponse:
         """Whether it stands out of the noise. What a turn moves both dots alike does not count."""
         moved = _pattern(self.channels, self.only_twist)
         variance = float(np.mean(self.sd**2)) * (2.0 if self.only_twist else 1.0)
-        return bool(moved @ moved > SEEN**2 * variance)
+        return bool(moved @ moved > OBSERVED**2 * variance)
 
     def misfit(self, wiring: Wiring) -> tuple[float, float]:
         """Share of the movement that ``wiring`` leaves unexplained, and the size of the movement over the expected one.

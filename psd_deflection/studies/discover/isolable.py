@@ -48,14 +48,14 @@ FROM_READINGS = ('spectral', 'line', 'lattice')
 class Isolable:
     """One effect, with its choices, under the loads. ``parameter``: that of the sizes, in ``unit``.
 
-    ``seen``, ``named``: the least sizes, None if no size that the parameter may have is enough. ``alike``: the effect
-    that imitates it best; ``apart``: sin² of the angle between the two, 0 to 1.
+    ``observed``, ``named``: the least sizes, None if no size that the parameter may have is enough. ``alike``: the
+    effect that imitates it best; ``apart``: sin² of the angle between the two, 0 to 1.
     """
 
     label: str
     parameter: str
     unit: str
-    seen: float | None
+    observed: float | None
     named: float | None
     alike: str
     apart: float
@@ -68,7 +68,9 @@ class Isolable:
     @property
     def row(self) -> tuple[str, ...]:
         """For a table."""
-        sizes = [f'{size:.2g} {self.unit}'.strip() if size is not None else 'never' for size in (self.seen, self.named)]
+        sizes = [
+            f'{size:.2g} {self.unit}'.strip() if size is not None else 'never' for size in (self.observed, self.named)
+        ]
         return (self.label, self.parameter, *sizes, self.alike)
 
 
@@ -126,9 +128,11 @@ class Isolability(StudyResult):
         }
 
     def table(self) -> Table:
-        """One row an effect: the least sizes at which it is ``seen`` and ``named``, NaN: never, and its ``unit``."""
+        """One row an effect: the least sizes at which it is ``observed`` and ``named``, NaN: never, and its
+        ``unit``.
+        """
         effects = self.effects
-        sizes = np.array([(f.seen, f.named) for f in effects], dtype=np.float64)
+        sizes = np.array([(f.observed, f.named) for f in effects], dtype=np.float64)
         sizes = sizes.reshape(-1, 2)
         return Table(
             text_column('effect', [f.label for f in effects], 'that may be there'),
@@ -240,7 +244,7 @@ def _isolable(
         label=label,
         parameter=p.name,
         unit=p.unit,
-        seen=_size(candidate, length, accepted),
+        observed=_size(candidate, length, accepted),
         named=None if apart == 0.0 else _size(candidate, length, max(accepted, SEPARATES / apart)),
         alike=alike,
         apart=apart,
@@ -280,4 +284,4 @@ def _of_probes(screen: Screen, effect: Isolable, probes: Sequence[Candidate], ac
         return min(enough, key=lambda c: lengths[c]).start[p.name] if enough else None
 
     named = None if effect.apart == 0.0 else weakest(max(accepted, SEPARATES / effect.apart))
-    return replace(effect, seen=weakest(accepted), named=named)
+    return replace(effect, observed=weakest(accepted), named=named)

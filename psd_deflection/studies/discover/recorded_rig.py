@@ -101,7 +101,9 @@ class RecordedRig(Machine):
         if fit is not None and fit.effects:
             # A large effect hides the spectral lines of a small one.
             beside = proposals_of(ws, fit.effects)
-            values = {name: [*seen, *(v for v in beside[name] if v not in seen)] for name, seen in values.items()}
+            values = {
+                name: [*observed, *(v for v in beside[name] if v not in observed)] for name, observed in values.items()
+            }
         listed = candidates([*library, *more], self.recorded.physics, values)
         if fit is None or not far(fit):
             signatures = [(c, self.bank.get(c, ws)) for c in listed]

@@ -55,7 +55,7 @@ class WatchedRun(StudyResult):
             'alarms': [
                 {
                     'since_s': self.since_s(a),
-                    'seen_s': (a.seen_ns - self.start_ns) / 1e9,
+                    'seen_s': (a.observed_ns - self.start_ns) / 1e9,
                     'channel': a.channel,
                     'shift': a.shift,
                     'sd': a.sd,
@@ -101,7 +101,9 @@ class WatchedRun(StudyResult):
         return Table(
             Column('since', np.array([self.since_s(a) for a in alarms], dtype=np.float64), 's', 'when it began'),
             [
-                Column('seen', np.array([(a.seen_ns - self.start_ns) / 1e9 for a in alarms]), 's', 'when it was sure'),
+                Column(
+                    'seen', np.array([(a.observed_ns - self.start_ns) / 1e9 for a in alarms]), 's', 'when it was sure'
+                ),
                 text_column('channel', [a.channel for a in alarms], 'what shifted'),
                 Column('shift', np.array([a.shift for a in alarms], dtype=np.float64), 'm, rad', 'by how much'),
                 Column('sd', np.array([a.sd for a in alarms], dtype=np.float64), 'm, rad', 'its standard deviation'),

@@ -196,8 +196,8 @@ def test_covariance_is_that_of_chance(slopes: str) -> None:
         at = chain.compose([TipDeflection(p, CERTAIN) for p in drawn], angles).deflection
         row[:3] = at.position - mean.position
         row[3:] = Transform(at.rotation @ mean.rotation.T, at.position).rotation_vector
-    seen = errors.T @ errors / len(draws)
-    whitened = np.linalg.solve(np.linalg.cholesky(text), np.linalg.cholesky(seen))
+    observed = errors.T @ errors / len(draws)
+    whitened = np.linalg.solve(np.linalg.cholesky(text), np.linalg.cholesky(observed))
     assert np.linalg.svd(whitened, compute_uv=False) == pytest.approx(np.ones(6), abs=0.025)
 
 

@@ -176,7 +176,7 @@ def reporting(arm: Arm) -> Loop:
     return loop
 
 
-def seen(loop: Loop, **changed: object) -> Observed:
+def observed(loop: Loop, **changed: object) -> Observed:
     return Observed(loop.t, loop.plant.end().deflection, CERTAIN)._replace(**changed)  # type: ignore[arg-type]
 
 
@@ -206,7 +206,7 @@ def test_a_bad_deflection_is_not_followed_and_good_ones_are_again(
     before = loop.offsets
     loop.t += PERIOD
     loop.compensator.joints(loop.t, loop.plant.angles)
-    command = loop.compensator.observe(loop.t, seen(loop, **{'t': loop.t, **changed}))
+    command = loop.compensator.observe(loop.t, observed(loop, **{'t': loop.t, **changed}))
     assert command.state is State.HOLDING
     assert why in command.why
     assert np.array_equal(command.offsets, before)
@@ -224,7 +224,7 @@ def test_a_deflection_is_followed_up_to_the_deviation_that_is_allowed(arm: Arm) 
         loop.t += PERIOD
         loop.compensator.joints(loop.t, loop.plant.angles)
         covariance = np.eye(6) * sd**2
-        assert loop.compensator.observe(loop.t, seen(loop, t=loop.t, covariance=covariance)).state is state
+        assert loop.compensator.observe(loop.t, observed(loop, t=loop.t, covariance=covariance)).state is state
 
 
 @pytest.mark.parametrize('lost', ['deflection', 'joints'])
@@ -234,7 +234,7 @@ def test_it_holds_within_a_tenth_of_a_second_of_the_last_word(arm: Arm, lost: st
     for n in range(1, 11):
         now = loop.t + 0.01 * n
         if lost == 'joints':
-            command = loop.compensator.observe(now, seen(loop, t=now))
+            command = loop.compensator.observe(now, observed(loop, t=now))
         else:
             loop.compensator.joints(now, loop.plant.angles)
             command = loop.compensator.watch(now)
@@ -333,7 +333,7 @@ def test_two_nodes_that_report_different_joints_hold_the_offsets(arm: Arm) -> No
     for n in range(1, 10):
         now = loop.t + PERIOD * n
         loop.compensator.joints(now, loop.plant.angles + (0.05 if n % 2 else 0.0))
-        loop.compensator.observe(now, seen(loop, t=now))
+        loop.compensator.observe(now, observed(loop, t=now))
         command = loop.send(now)
     assert 'go to and fro by 0.05' in command.why
     assert np.array_equal(command.offsets[1:], before[1:]) or loop.step() <= 1.0
@@ -348,7 +348,7 @@ def test_a_clock_that_is_set_holds_the_offsets_for_some_estimates_only(arm: Arm,
     for n in range(1, 60):
         now = loop.t + PERIOD * n
         loop.compensator.joints(now, loop.plant.angles)
-        loop.compensator.observe(now, seen(loop, t=now + step))
+        loop.compensator.observe(now, observed(loop, t=now + step))
         command = loop.send(now)
         states.add(command.state)
         assert n > 20 or step > 0.0 or np.array_equal(command.offsets, before)
@@ -360,14 +360,14 @@ def test_a_clock_that_is_set_holds_the_offsets_for_some_estimates_only(arm: Arm,
 def test_positions_that_were_old_when_they_came_are_not_new(arm: Arm) -> None:
     loop = following(arm)
     loop.compensator.joints(loop.t, loop.plant.angles, age=0.07)
-    loop.compensator.observe(loop.t + PERIOD, seen(loop, t=loop.t + PERIOD))
+    loop.compensator.observe(loop.t + PERIOD, observed(loop, t=loop.t + PERIOD))
     assert loop.send(loop.t + PERIOD).why == 'no positions of the joints for 0.08 s'
 
 
 def test_a_deflection_that_was_old_when_it_came_is_not_new(arm: Arm) -> None:
     loop = following(arm)
     now = loop.t + PERIOD
-    loop.compensator.observe(now, seen(loop, t=now, age=0.07))
+    loop.compensator.observe(now, observed(loop, t=now, age=0.07))
     loop.compensator.joints(now + PERIOD, loop.plant.angles)
     assert loop.send(now + PERIOD).why == 'no deflection for 0.08 s'
 
@@ -464,7 +464,7 @@ def test_a_controller_that_applies_something_else_is_not_sent_more(arm: Arm) -> 
     for n in range(1, 30):
         loop.compensator.joints(loop.t + PERIOD * n, loop.plant.angles)
         loop.compensator.controller_has(loop.t + PERIOD * n, before + 0.02)
-        loop.compensator.observe(loop.t + PERIOD * n, seen(loop, t=loop.t + PERIOD * n))
+        loop.compensator.observe(loop.t + PERIOD * n, observed(loop, t=loop.t + PERIOD * n))
         command = loop.send(loop.t + PERIOD * n)
         assert command.state is State.HOLDING
     assert 'is 0.02 from what it was sent' in command.why
@@ -725,7 +725,7 @@ def test_with_commands_an_arm_that_stops_holds_and_one_that_was_moved_is_left_al
         loop.t = start + PERIOD * n
         loop.compensator.joints(loop.t, stopped)
         loop.compensator.controller_has(loop.t, loop.has)
-        loop.compensator.observe(loop.t, seen(loop, t=loop.t))
+        loop.compensator.observe(loop.t, observed(loop, t=loop.t))
         command = loop.send(loop.t)
         # At once, and not when it has asked for much more.
         assert np.array_equal(command.offsets, before) or not command.sends

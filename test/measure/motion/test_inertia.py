@@ -203,9 +203,9 @@ def test_what_comes_late_is_put_right(run: motion.Run, monkeypatch: pytest.Monke
     expected = moved(through(in_time, run, range(39)))
     # At 0.75 s, in the middle of block 37, the acceleration turns.
     early = [message for message in run.reported if message.t_ns < 750 * MS]
-    seen = moved(through(late, run, range(38), reported=early))
-    assert seen[36] == expected[36]
-    assert abs(seen[37].vy - expected[37].vy) > 0.01
+    observed = moved(through(late, run, range(38), reported=early))
+    assert observed[36] == expected[36]
+    assert abs(observed[37].vy - expected[37].vy) > 0.01
     for message in run.reported[145:]:
         late.accelerate(message)
     after = moved(list(late.process(motion.chunk(run, 38))))[-1]

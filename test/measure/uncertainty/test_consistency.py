@@ -62,9 +62,9 @@ def test_excess_of_the_base_line_is_that_of_least_squares(seed: int) -> None:
 
 def test_readings_with_next_to_no_part_in_the_base_line_have_no_error() -> None:
     """Along a base line in x a wrong y changes its length to second order only."""
-    for y, seen in ((0.0, False), (0.0028 * 2**0.5 * 1.05, True), (0.0028 * 2**0.5 * 0.95, False)):
+    for y, observed in ((0.0, False), (0.0028 * 2**0.5 * 1.05, True), (0.0028 * 2**0.5 * 0.95, False)):
         got = two().update(BaseLineExcess((0.14, y), (1e-5, 0.0, -1e-5, 0.0), COVARIANCE), 1.0, None)
-        assert [e != 0.0 for e in got.errors] == [True, seen, True, seen]
+        assert [e != 0.0 for e in got.errors] == [True, observed, True, observed]
     assert two().update(None, 1.0, None) == (0.0, False, (0.0,) * 4, (0.0,) * 4, 0, 1)
     assert BaseLineExcess(REST, (1e-5, 0.0, 0.0, 0.0), np.zeros((4, 4))).chi_square == 0.0
 
@@ -75,7 +75,7 @@ def test_the_state_follows_its_laws_through_any_blocks() -> None:
     along = np.array([*REST, *(-c for c in REST)]) / math.hypot(*REST) / 2**0.5
     variance = float(along @ COVARIANCE @ along)
     of, held, mean, lasting = two(), 0.0, 0.0, 0.0
-    seen = set()
+    observed = set()
     for block in range(1500):
         limit = 400.0 if block % 300 > 250 else 25.0
         chi_square = rng.choice([0.0, 1.5, 2.4, 3.0, 6.0, 7.0, 24.0, 26.0, 390.0, 410.0])
@@ -95,8 +95,8 @@ def test_the_state_follows_its_laws_through_any_blocks() -> None:
         np.testing.assert_allclose(got.errors, r / along, rtol=1e-9)
         np.testing.assert_allclose(got.possible, root / along, rtol=1e-9)
         np.testing.assert_allclose(of.state(), (0.0, 0.0, held, mean, lasting), rtol=1e-9, atol=1e-18)
-        seen.add((held > 0.0, lasting > 0.0, doubtful))
-    assert len(seen) > 5
+        observed.add((held > 0.0, lasting > 0.0, doubtful))
+    assert len(observed) > 5
 
 
 def test_limits_of_one_degree_are_those_of_the_shares() -> None:

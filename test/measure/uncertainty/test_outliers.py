@@ -50,7 +50,7 @@ def named(said: FloatArray, should: FloatArray, noise: float) -> str:
     return found[0] if len(found) == 1 else ''
 
 
-def test_a_reading_is_named_by_the_moments_of_what_was_seen() -> None:
+def test_a_reading_is_named_by_the_moments_of_what_was_observed() -> None:
     """Readings around each limit of the rules, a reading or two at a time; axes exchanged more or less exactly."""
     rng = np.random.default_rng(12)
     reported: dict[str, int] = {}

@@ -81,7 +81,7 @@ def test_a_channel_is_saturated_from_the_converters_last_step_on(channel: int, s
     assert judge(one=changed(channel, sign * 32765 * STEP)).status is BlockStatus.OK
 
 
-def test_the_devices_flag_blames_no_detector_unless_a_cause_is_seen() -> None:
+def test_the_devices_flag_blames_no_detector_unless_a_cause_is_observed() -> None:
     reported = judge(flag=FLAG_OVER_RANGE)
     assert (reported.status, reported.faulty) == (BlockStatus.SATURATED, 0)
     assert judge(changed(2, 0.0), flag=FLAG_OVER_RANGE).status is BlockStatus.LASER_LOST

@@ -125,7 +125,7 @@ def test_electrodes_go_through_the_wiring_once() -> None:
     calibration = VoltsToDots.from_rig(rig_from_values(wired))
     # The second input is that of PSD 1: its own x is 1/2 of the way and its own y 1/4 back.
     electrodes = np.array([[1.0, 1.0, 1.0, 1.0, 3.0, 1.0, 3.0, 5.0]])
-    dots = calibration.dots(calibration.seen(calibration.volts_of_electrodes(electrodes).astype(np.float32)))
+    dots = calibration.dots(calibration.observed(calibration.volts_of_electrodes(electrodes).astype(np.float32)))
     np.testing.assert_allclose(dots, [[1.25e-3, 2.5e-3, 0.0, 0.0]], atol=1e-9)
 
 

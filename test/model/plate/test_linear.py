@@ -27,8 +27,8 @@ def test_no_error_exceeds_the_bound(golden: Any, scaling: Any, lacking: float) -
     for _ in range(400):
         pose = rng.uniform(-1, 1, 3) * (3e-3, 3e-3, 0.05)
         true = used + rng.choice([-1.0, 1.0], (4, 3)) * design_error
-        seen = true @ pose + rng.choice([-1.0, 1.0], 4) * reading_error
-        got = np.linalg.lstsq(po[:, None] * used, po * seen, rcond=None)[0]
+        observed = true @ pose + rng.choice([-1.0, 1.0], 4) * reading_error
+        got = np.linalg.lstsq(po[:, None] * used, po * observed, rcond=None)[0]
         share.append(np.abs(got - pose) / error_bound(used, got, design_error, reading_error, po))
     assert np.max(share) <= 1.0
     # It says something: some trial comes near it in each component.

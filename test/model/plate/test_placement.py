@@ -57,7 +57,7 @@ def test_two_sensors_leave_a_direction_unseen() -> None:
     assert not np.any(np.isfinite(placement.pose_spread(tilted, THESIS, np.array([0.05, -0.05]), SIGMA)))
 
 
-def test_the_slope_ratio_is_seen_by_the_height_between_opposite_sensors() -> None:
+def test_the_slope_ratio_is_observed_by_the_height_between_opposite_sensors() -> None:
     # Along the bending direction y1 - y2 = (h1 - h2) k dY/L, so sigma(k) = sqrt(2) sigma L/(0.1 m |dY|).
     pose = np.array([0.0, -2.2271675e-3, 0.016418222])
     got = placement.slope_ratio_spread(pose, 1.5, 0.585, placement.opposite(0.1), np.array([0.05, -0.05]), SIGMA)
@@ -158,7 +158,7 @@ def _at(*angles: float) -> list[tuple[float, float]]:
     return [(math.cos(a), math.sin(a)) for a in angles]
 
 
-def test_spreads_of_what_is_seen_are_those_of_dense_least_squares() -> None:
+def test_spreads_of_what_is_observed_are_those_of_dense_least_squares() -> None:
     centers, heights = placement.ring(3, 0.1), np.array([0.1, -0.05, -0.05])
     pose = np.array([1e-3, -2e-3, 0.02, 0.03, -0.04])
     step = 1e-6

@@ -150,12 +150,14 @@ CORRECTABLE = [
 @pytest.mark.parametrize(('name', 'values'), CORRECTABLE)
 def test_the_correction_gives_back_what_the_nominal_rig_shows(name: str, values: dict[str, object]) -> None:
     rig = rig_from_values({'effects.a.name': name, **{f'effects.a.{k}': v for k, v in values.items()}})
-    seen = ForwardModel(rig).run(HISTORY, WARM)
+    observed = ForwardModel(rig).run(HISTORY, WARM)
     nominal = ForwardModel(RIG).run(HISTORY, WARM)
     correction = Correction.from_rig(rig)
     assert correction.active
-    before = np.abs(seen.dots - nominal.dots).max()
-    after = np.abs(correction.apply(seen.dots.T, seen.sums.T, seen.warmer, seen.t).T - nominal.dots).max()
+    before = np.abs(observed.dots - nominal.dots).max()
+    after = np.abs(
+        correction.apply(observed.dots.T, observed.sums.T, observed.warmer, observed.t).T - nominal.dots
+    ).max()
     assert after < 1e-3 * before
 
 
@@ -167,10 +169,10 @@ def test_all_corrections_together() -> None:
         values[f'effects.e{i}.name'] = name
         values.update({f'effects.e{i}.{k}': v for k, v in parameters.items()})
     rig = rig_from_values(values)
-    seen, nominal = ForwardModel(rig).run(HISTORY, WARM), ForwardModel(RIG).run(HISTORY, WARM)
-    after = Correction.from_rig(rig).apply(seen.dots.T, seen.sums.T, seen.warmer, seen.t).T
+    observed, nominal = ForwardModel(rig).run(HISTORY, WARM), ForwardModel(RIG).run(HISTORY, WARM)
+    after = Correction.from_rig(rig).apply(observed.dots.T, observed.sums.T, observed.warmer, observed.t).T
     assert np.abs(after - nominal.dots).max() < 1e-7
-    assert np.abs(seen.dots - nominal.dots).max() > 1e-5
+    assert np.abs(observed.dots - nominal.dots).max() > 1e-5
 
 
 LOADS = ((10.0, -25.0, -12.0), (20.0, -40.0, -20.0), (-5.0, 10.0, 8.0))

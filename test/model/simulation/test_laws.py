@@ -113,10 +113,10 @@ def test_a_lag_and_a_rate_are_those_of_their_equations() -> None:
 def test_a_law_of_what_a_reading_knows_is_corrected() -> None:
     terms = (LawTerm('product', ('y1', 'temperature'), 2e-3), LawTerm('beyond', ('y1',), 0.05, {'threshold': 5e-5}))
     law = Law('odd', 'psd', 'y1', terms)
-    seen = ForwardModel(RIG, active(law)).run(LOADS, WARM)
+    observed = ForwardModel(RIG, active(law)).run(LOADS, WARM)
     true = ForwardModel(RIG, []).run(LOADS, WARM)
-    assert np.abs(seen.dots - true.dots).max() > 5e-6
-    fixed = Correction(RIG, active(law)).apply(seen.dots.T, seen.sums.T, WARM - WARM[0])
+    assert np.abs(observed.dots - true.dots).max() > 5e-6
+    fixed = Correction(RIG, active(law)).apply(observed.dots.T, observed.sums.T, WARM - WARM[0])
     np.testing.assert_allclose(fixed, true.dots.T, atol=1e-11)
 
 
@@ -154,7 +154,7 @@ def test_a_law_travels_with_the_recording_and_the_rig_file(
     words = ['simulate', '--params-file', str(by_hand), '--loads', 'steps:0,0,0;9,-20,5:0.5']
     for name in ('a', 'a.mcap'):
         assert main([*words, '--out', str(tmp_path / name)]) == 0
-    seen = psd_deflection.replay(tmp_path / 'a')
+    observed = psd_deflection.replay(tmp_path / 'a')
     # What discover writes for others.
     (active,) = effects_of_rig(load_rig(by_hand))
     model = tmp_path / 'model.yaml'
@@ -164,9 +164,9 @@ def test_a_law_travels_with_the_recording_and_the_rig_file(
     assert 'no bit differs' in capsys.readouterr().out
     for rig in (None, model):
         again = psd_deflection.replay(tmp_path / 'a', rig)
-        np.testing.assert_array_equal(again.dy, seen.dy)
-    assert len(psd_deflection.replay(tmp_path / 'a.mcap').dy) == len(seen.dy)
-    assert np.any(psd_deflection.replay(tmp_path / 'a', RIG).dy != seen.dy)
+        np.testing.assert_array_equal(again.dy, observed.dy)
+    assert len(psd_deflection.replay(tmp_path / 'a.mcap').dy) == len(observed.dy)
+    assert np.any(psd_deflection.replay(tmp_path / 'a', RIG).dy != observed.dy)
     (carried,) = effects_of_rig(load_rig(model))
     assert carried.values == {'c1': 4.0}
     assert carried.effect.law == active.effect.law

@@ -36,7 +36,7 @@ def test_a_curve_is_fitted_with_its_covariance() -> None:
     np.testing.assert_allclose(one.covariance, want, rtol=1e-9)
 
 
-def test_what_cannot_be_seen_is_not_converged() -> None:
+def test_what_cannot_be_observed_is_not_converged() -> None:
     one = fit(line, (0.0, 0.0), (1.0, 0.0), (1.0, 1.0))
     assert not one.converged
     assert np.isnan(one.covariance).all()

@@ -69,11 +69,11 @@ def test_covariance_and_coverage(
     found = solver.solve_many(clean + np.sqrt(variances) * rng.standard_normal((draws, len(clean))), variances)
     assert not found.status.any()
     off = found.pose - center
-    seen = off.T @ off / draws
+    observed = off.T @ off / draws
     claimed = found.covariance.mean(axis=0)
     scale = np.sqrt(np.diag(claimed))
-    np.testing.assert_allclose(np.diag(seen) / np.diag(claimed), 1.0, atol=0.05)
-    np.testing.assert_allclose(seen / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.05)
+    np.testing.assert_allclose(np.diag(observed) / np.diag(claimed), 1.0, atol=0.05)
+    np.testing.assert_allclose(observed / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.05)
     inside = np.abs(off) <= 1.959964 * np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
     coverage = inside.mean(axis=0)
     assert (coverage >= 0.94).all(), coverage

@@ -65,11 +65,11 @@ class Page:
         html = next(node for node in document['children'] if node['nodeName'] == 'HTML')
         body = next(node for node in html['children'] if node['nodeName'] == 'BODY')['nodeId']
 
-        def seen(_: object) -> bool:
+        def observed(_: object) -> bool:
             words = self.driver.execute_cdp_cmd('DOM.getAttributes', {'nodeId': body})['attributes']
             return int(dict(zip(words[::2], words[1::2], strict=True)).get('data-rows', 0)) >= count
 
-        WebDriverWait(self.driver, WAIT_S, poll_frequency=0.02).until(seen, f'{count} rows on the page')
+        WebDriverWait(self.driver, WAIT_S, poll_frequency=0.02).until(observed, f'{count} rows on the page')
 
     def complaints(self) -> list[str]:
         """What the page told the console, but for the connections that the test cut itself."""

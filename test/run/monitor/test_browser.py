@@ -272,7 +272,7 @@ def test_the_page_reconnects_to_a_restarted_daemon(page: Page, start: Start) -> 
     assert [c for c in page.complaints() if 'ERR_CONNECTION_REFUSED' not in c] == []
 
 
-def test_a_lost_laser_is_seen(page: Page, start: Start) -> None:
+def test_a_lost_laser_is_observed(page: Page, start: Start) -> None:
     page.open(address_of(start('monitor', str(BAGS / 'laser_off'), '--loop', '--http-port', '0')))
     page.until('document.getElementById("state").textContent === "laser lost"')
     page.until('document.getElementById("detector_2").classList.contains("low")')

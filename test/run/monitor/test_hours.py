@@ -34,7 +34,7 @@ CELL = 'document.getElementById("cell").textContent'
 OPEN = 'document.body.dataset.cells'
 PRESSED = '[...document.querySelectorAll(".windows [aria-pressed=true]")].map((b) => b.textContent).join()'
 
-SEEN = """((plot, from, to, is) => {
+OBSERVED = """((plot, from, to, is) => {
   const canvas = document.querySelector(plot + ' canvas');
   const over = document.querySelector(plot + ' .u-over').getBoundingClientRect();
   const whole = canvas.getBoundingClientRect();
@@ -73,14 +73,14 @@ def hour(serve: Callable[..., Serving]) -> Serving:
 
 def see(start: float, end: float, color: str, plot: str = '#plot_shift') -> str:
     """How many pixels of a colour are on a part of a plot."""
-    return f'{SEEN}("{plot}", {start}, {end}, {color})'
+    return f'{OBSERVED}("{plot}", {start}, {end}, {color})'
 
 
 def choose(page: Page, name: str) -> None:
     page.js(f'[...document.querySelectorAll("[data-span]")].find((b) => b.textContent === "{name}").click()')
 
 
-def test_a_mark_a_gap_and_an_alarm_are_seen_in_the_hour(page: Page, hour: Serving) -> None:
+def test_a_mark_a_gap_and_an_alarm_are_observed_in_the_hour(page: Page, hour: Serving) -> None:
     page.open(hour.url)
     page.until('document.body.dataset.rows > 0')
     choose(page, '1 h')

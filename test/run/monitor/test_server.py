@@ -73,14 +73,14 @@ def test_a_browser_gets_the_last_minute_then_new_rows(serve: Serve) -> None:
     serving = serve()
     serving.give(0, 5)
     serving.server.notify('a message')
-    seen: list[Any] = []
+    observed: list[Any] = []
 
     def more(message: dict[str, Any]) -> bool:
-        seen.extend(message.get('rows', []))
+        observed.extend(message.get('rows', []))
         # A message without rows may come while there are five.
-        if len(seen) == 5 and 'rows' in message:
+        if len(observed) == 5 and 'rows' in message:
             serving.give(5, 3, status=BlockStatus.LASER_LOST)
-        return len(seen) >= 8 and any('health' in m for m in (message, *got))
+        return len(observed) >= 8 and any('health' in m for m in (message, *got))
 
     got: list[Any] = []
     messages = listen(serving.url, lambda m: (got.append(m), more(m))[1])  # type: ignore[func-returns-value]

@@ -198,7 +198,7 @@ def test_a_shift_of_a_reading_moves_each_pose_as_least_squares_has_it(certificat
 # ---- The sums ----
 
 
-def test_without_poses_they_are_rest_and_the_ends_of_what_was_seen() -> None:
+def test_without_poses_they_are_rest_and_the_ends_of_what_was_observed() -> None:
     expected = [
         (0.0, 0.0, 0.0),
         (-2e-3, 0.0, 0.0),

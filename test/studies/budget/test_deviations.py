@@ -349,9 +349,9 @@ def test_any_guess_makes_a_deviation_a_guess() -> None:
 def test_draws_are_of_all_causes_together() -> None:
     at = _at()
     both = [_term('amplifier_noise'), _term('pointing_drift')]
-    seen: list[int] = []
-    errors = draws(at, 25_000, 5, both, seen.append)
-    assert seen == [10_000, 10_000, 5_000]
+    observed: list[int] = []
+    errors = draws(at, 25_000, 5, both, observed.append)
+    assert observed == [10_000, 10_000, 5_000]
     assert errors.shape == (25_000, 3)
     total = np.sqrt(sum(np.diag(c.contribution(at).covariance) for c in both))
     assert errors.std(axis=0) == pytest.approx(total, rel=0.02)

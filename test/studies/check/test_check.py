@@ -387,8 +387,8 @@ def test_a_weight_that_is_taken_off_moves_the_dots_by_what_it_held(
     before, after = ForwardModel(rig, settled=True).run(np.array([[0.0, 0.0, 0.0], [0.0, -50.0, -29.25]])).true_dots.T
     made = str(tmp_path / 'made')
     assert main(['simulate', '--out', made, '--loads', HUNG[2]]) == 0
-    seen = read_observation(made, rig)
-    (push,) = responses(rig, seen.volts, seen.loads).pushes
+    observed = read_observation(made, rig)
+    (push,) = responses(rig, observed.volts, observed.loads).pushes
     # Named by the load upwards; what hung there pulled down.
     assert push.channels == pytest.approx(before - after, abs=1e-6)
     assert push.expected == pytest.approx(before - after, abs=1e-9)

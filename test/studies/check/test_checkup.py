@@ -126,7 +126,7 @@ def test_a_wrong_wiring_has_its_lines_only_if_it_is_the_only_one() -> None:
 @pytest.mark.parametrize(('count', 'words'), [(2, '1 other wiring,'), (3, '2 other wirings,'), (4, '3 other wirings,')])
 def test_other_wirings_are_counted(count: int, words: str, monkeypatch: pytest.MonkeyPatch) -> None:
     some = [WiringFit(wiring, 0.0) for wiring in WIRINGS[7 : 7 + count]]
-    monkeypatch.setattr(checkup, 'fitting_wirings', lambda seen: some)
+    monkeypatch.setattr(checkup, 'fitting_wirings', lambda observed: some)
     assert {f.equivalent[-1] for f in checked().findings if f.equivalent} == {
         f'{words} which these pushes cannot tell apart'
     }

@@ -125,7 +125,7 @@ def test_hum_stands_out_of_its_neighbours_five_times() -> None:
     assert ratio > 5.0
     t = np.arange(1000) / 500.0
     # Taken down to just above, then just below.
-    for wanted, seen in ((5.01, True), (4.99, False)):
+    for wanted, observed in ((5.01, True), (4.99, False)):
         less = volts.copy()
         low, high = -2e-3, 2e-3
         for _ in range(40):
@@ -137,20 +137,20 @@ def test_hum_stands_out_of_its_neighbours_five_times() -> None:
                 high = middle
             if high - low < 1e-9:
                 break
-        assert bool(module.mains_hum(less, 500.0, np.zeros(6))[1][1] > 0.0) is seen
+        assert bool(module.mains_hum(less, 500.0, np.zeros(6))[1][1] > 0.0) is observed
 
 
-@pytest.mark.parametrize(('noise', 'seen'), [(0.0195, True), (0.0205, False)])
-def test_hum_below_a_quarter_of_the_noise_is_none(noise: float, seen: bool) -> None:
+@pytest.mark.parametrize(('noise', 'observed'), [(0.0195, True), (0.0205, False)])
+def test_hum_below_a_quarter_of_the_noise_is_none(noise: float, observed: bool) -> None:
     volts = waves(4000, 1000.0, {50.0: 5e-3})
-    assert bool(module.mains_hum(volts, 1000.0, np.full(6, noise))[1].any()) is seen
+    assert bool(module.mains_hum(volts, 1000.0, np.full(6, noise))[1].any()) is observed
 
 
 @pytest.mark.parametrize(
-    ('n', 'rate', 'seen'), [(1000, 1000.0, True), (999, 1000.0, False), (600, 150.0, True), (600, 149.0, False)]
+    ('n', 'rate', 'observed'), [(1000, 1000.0, True), (999, 1000.0, False), (600, 150.0, True), (600, 149.0, False)]
 )
-def test_hum_needs_a_second_and_2_5_samples_a_period(n: int, rate: float, seen: bool) -> None:
+def test_hum_needs_a_second_and_2_5_samples_a_period(n: int, rate: float, observed: bool) -> None:
     hz, hum = module.mains_hum(waves(n, rate, {50.0: 0.1}), rate, np.full(6, 1e-3))
     assert hz == 50.0
-    assert bool(hum[1] > 0.0) is seen
+    assert bool(hum[1] > 0.0) is observed
     assert len(hum) == 6

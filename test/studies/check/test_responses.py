@@ -149,9 +149,9 @@ def test_each_push_moves_the_channels_by_what_its_load_moves_at_rest(rig: Rig) -
     for push, load in zip(found.pushes, ((5.0, 0.0, 0.0), (0.0, -10.0, 0.0), (0.0, 0.0, 3.0)), strict=True):
         moved = np.sign(sum(load)) * at_rest(rig, load)
         assert push.expected == pytest.approx(moved, abs=1e-9)
-        seen = push.channels * np.array(push.scales)
-        assert seen == pytest.approx(moved, abs=1e-7)
-        assert (np.abs(seen - moved) < 5.0 * push.sd).all()
+        observed = push.channels * np.array(push.scales)
+        assert observed == pytest.approx(moved, abs=1e-7)
+        assert (np.abs(observed - moved) < 5.0 * push.sd).all()
         # 1e-4 V of noise are 50 nm a sample, of some hundred samples a few.
         assert (push.sd < 2e-8).all()
         assert (push.sd > 5e-10).all()

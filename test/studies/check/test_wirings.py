@@ -60,7 +60,7 @@ def test_a_pattern_is_unknown_for_psds_at_the_base() -> None:
 
 
 @pytest.mark.parametrize(
-    ('channels', 'sd', 'only_twist', 'seen'),
+    ('channels', 'sd', 'only_twist', 'observed'),
     [
         # Six deviations; exactly six are not beyond. Of four channels their mean square counts: 4/4 = 1.
         ([6.0, 0.0, 0.0, 0.0], [2.0, 0.0, 0.0, 0.0], False, False),
@@ -74,10 +74,10 @@ def test_a_pattern_is_unknown_for_psds_at_the_base() -> None:
         ([100.0, 50.0, 100.0, 50.0], [1.0, 1.0, 1.0, 1.0], True, False),
     ],
 )
-def test_a_push_is_seen_beyond_six_deviations(
-    channels: list[float], sd: list[float], only_twist: bool, seen: bool
+def test_a_push_is_observed_beyond_six_deviations(
+    channels: list[float], sd: list[float], only_twist: bool, observed: bool
 ) -> None:
-    assert push(channels, sd=sd, only_twist=only_twist).observed is seen
+    assert push(channels, sd=sd, only_twist=only_twist).observed is observed
 
 
 def test_the_misfit_is_the_share_of_the_square_that_the_pattern_leaves() -> None:

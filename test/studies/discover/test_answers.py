@@ -352,15 +352,15 @@ def test_lines_come_strongest_first_each_once() -> None:
         assert proposals.persistent([50.0], [rows_of[:3072]], [np.ones(6)], [1e-3]) == [50.0]
 
 
-@pytest.mark.parametrize(('counts', 'seen'), [(1, False), (2, False), (3, True), (40, True)])
-def test_a_step_is_coarse_from_three_counts_on(counts: int, seen: bool) -> None:
+@pytest.mark.parametrize(('counts', 'observed'), [(1, False), (2, False), (3, True), (40, True)])
+def test_a_step_is_coarse_from_three_counts_on(counts: int, observed: bool) -> None:
     """All readings are whole multiples of it; its deviation is that of rounding to counts, 1/sqrt(12)."""
     lsb = RIG.converter.volts_per_count
     rng = np.random.default_rng(2)
     k = np.rint(rng.uniform(-300, 300, (2000, 6)))
     o = dataclasses.replace(make_observation(), volts=k * counts * lsb, loads=np.zeros((2000, 3)), temperature=None)
     found = proposals.coarse_step(o)
-    assert (found is not None) == seen
+    assert (found is not None) == observed
     if found is not None:
         values = np.unique(k)
         assert found[0] == pytest.approx(counts * lsb, rel=1e-9)
@@ -478,10 +478,10 @@ def test_pieces_are_put_together_as_long_as_each_is_worth_it() -> None:
     def shows(gain: float, seconds: float) -> ModelSums:
         return ModelSums(np.array([[gain]]), [], [], seconds)
 
-    seen = [(Piece(n, ()), shows(g, s)) for n, g, s in (('a', 30.0, 10.0), ('b', 25.0, 1.0), ('c', 1.0, 1.0))]
+    observed = [(Piece(n, ()), shows(g, s)) for n, g, s in (('a', 30.0, 10.0), ('b', 25.0, 1.0), ('c', 1.0, 1.0))]
 
     def together(seconds: float) -> Any:
-        value, chosen = planning.best_combination(seen, shows(0.0, 0.0), lambda s: s.apart[0], seconds)
+        value, chosen = planning.best_combination(observed, shows(0.0, 0.0), lambda s: s.apart[0], seconds)
         return value, ''.join(p.words for p in chosen)
 
     # 30/60 - 0.005 against 25/60 - 0.0005; then the same again; then nothing is left to gain.

@@ -162,8 +162,8 @@ def test_the_model_closes_the_gap_on_new_data(rotated: Discovery, tmp_path: Path
     model = load_rig(path)
     assert model.values == RIG.values
     assert [a.effect.name for a in effects_of_rig(model)] == ['sensor_rotation']
-    seen = observe(with_effect('sensor_rotation', psd=2, angle=0.002), seed=9, known=model)
-    again = discover([seen], model, without=[n for n in effect_names() if n not in NEAR])
+    observed = observe(with_effect('sensor_rotation', psd=2, angle=0.002), seed=9, known=model)
+    again = discover([observed], model, without=[n for n in effect_names() if n not in NEAR])
     assert again.verdict == 'nothing_missing'
 
 
@@ -200,11 +200,11 @@ def test_what_one_length_cannot_report_two_can() -> None:
 def test_a_load_cell_with_a_wrong_zero_is_named_from_two_lengths() -> None:
     history = loads.steps([(0, 0, 0), (5, -20, -9), (0, 0, 0)], 0.5).loads
     zero = {'effects.e.name': 'tip_force', 'effects.e.x': 0.05, 'effects.e.y': -0.1}
-    seen = []
+    observed = []
     for i, length in enumerate((0.585, 0.4)):
         own = replace_values(RIG, {'link.length': length})
-        seen.append(observe(replace_values(own, zero), seed=i, known=own, history=history))
-    found = discover(seen, RIG)
+        observed.append(observe(replace_values(own, zero), seed=i, known=own, history=history))
+    found = discover(observed, RIG)
     (effect,) = found.effects
     assert effect.active.effect.name == 'tip_force'
     for name, force in (('x', 0.05), ('y', -0.1)):
@@ -217,11 +217,11 @@ def test_a_load_cell_with_a_wrong_zero_is_named_from_two_lengths() -> None:
 
 @pytest.mark.statistics
 def test_what_is_not_in_the_library_is_unknown_and_not_merged() -> None:
-    seen = observe(RIG, seed=3)
-    volts = seen.volts.copy()
+    observed = observe(RIG, seed=3)
+    volts = observed.volts.copy()
     # The square of y2 leaks into x2: in no catalogue.
     volts[:, 3] += 0.004 * volts[:, 4] ** 2
-    found = discover([Observation('alien', RIG, volts, seen.loads, seen.temperature)], RIG, bank=BANK)
+    found = discover([Observation('alien', RIG, volts, observed.loads, observed.temperature)], RIG, bank=BANK)
     assert found.verdict == 'unknown_effect'
     assert 'x2' in found.unknown[0].signature
     check_schema(found.tree())
@@ -265,7 +265,7 @@ def test_a_parameter_stays_where_the_rig_lets_it() -> None:
 # Pieces.
 
 
-def test_directions_that_cannot_be_seen_are_left_alone() -> None:
+def test_directions_that_cannot_be_observed_are_left_alone() -> None:
     fisher = np.array([[1.0, 1.0], [1.0, 1.0]])
     gain, rank, c = solve_observable(fisher, np.array([2.0, 2.0]), np.diag(fisher))
     assert rank == 1

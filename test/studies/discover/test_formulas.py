@@ -199,24 +199,24 @@ def some_shown(rng: np.random.Generator, seconds: float = 2.0) -> tuple[ModelSum
 def test_a_separation_is_what_least_squares_leaves_of_both_recordings() -> None:
     """The other model adapts to the new data and to the old, whose curvature is known."""
     rng = np.random.default_rng(3)
-    seen, rows, slopes = some_shown(rng)
+    observed, rows, slopes = some_shown(rng)
     old = rng.standard_normal((15, 3))
     both = np.vstack((slopes[1], old))
     target = np.concatenate((rows[0] - rows[1], np.zeros(15)))
     left = target - both @ np.linalg.lstsq(both, target, rcond=None)[0]
-    assert seen.separation(0, 1, old.T @ old) == pytest.approx(float(left @ left), rel=1e-9)
+    assert observed.separation(0, 1, old.T @ old) == pytest.approx(float(left @ left), rel=1e-9)
     # One without parameters cannot adapt.
-    assert seen.separation(1, 0, np.zeros((0, 0))) == pytest.approx(seen.apart[0, 1])
+    assert observed.separation(1, 0, np.zeros((0, 0))) == pytest.approx(observed.apart[0, 1])
     again, _, _ = some_shown(rng, 3.0)
-    total = seen + again * 2.0
+    total = observed + again * 2.0
     assert total.seconds == 8.0
-    np.testing.assert_allclose(total.apart, seen.apart + 2.0 * again.apart)
-    np.testing.assert_allclose(total.fisher[1], seen.fisher[1] + 2.0 * again.fisher[1])
-    np.testing.assert_allclose(total.pull[0][1], seen.pull[0][1] + 2.0 * again.pull[0][1])
+    np.testing.assert_allclose(total.apart, observed.apart + 2.0 * again.apart)
+    np.testing.assert_allclose(total.fisher[1], observed.fisher[1] + 2.0 * again.fisher[1])
+    np.testing.assert_allclose(total.pull[0][1], observed.pull[0][1] + 2.0 * again.pull[0][1])
     models = cast(list[Fit], [SimpleNamespace(free=()), SimpleNamespace(free=((0, 'a'), (0, 'b'), (1, 'c')))])
     nothing = nothing_of(models)
     assert nothing.seconds == 0.0
-    for a, b in ((nothing + seen, seen), (seen + nothing, seen)):
+    for a, b in ((nothing + observed, observed), (observed + nothing, observed)):
         np.testing.assert_array_equal(a.apart, b.apart)
         np.testing.assert_array_equal(a.fisher[1], b.fisher[1])
         np.testing.assert_array_equal(a.pull[0][1], b.pull[0][1])
@@ -381,8 +381,8 @@ def test_whitening_predicts_each_block_from_those_before_it() -> None:
     np.testing.assert_allclose(model.whiten(fine, count), want, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize(('dwell', 'seen'), [(4.29, 2), (4.27, 1)])
-def test_rest_needs_three_tenths_of_a_second_after_the_ringing(dwell: float, seen: int) -> None:
+@pytest.mark.parametrize(('dwell', 'observed'), [(4.29, 2), (4.27, 1)])
+def test_rest_needs_three_tenths_of_a_second_after_the_ringing(dwell: float, observed: int) -> None:
     """7/(2 pi 14 Hz 0.02) = 3.979 s after a change; nothing before it if the recording begins under load."""
     slow = min(
         RIG.dynamics.bending_frequency * RIG.dynamics.bending_damping_ratio,
@@ -393,10 +393,10 @@ def test_rest_needs_three_tenths_of_a_second_after_the_ringing(dwell: float, see
     windows = rest_windows(
         dataclasses.replace(make_observation(), volts=np.zeros((len(history), 6)), loads=history, temperature=None)
     )
-    assert len(windows) == seen
+    assert len(windows) == observed
     first = round(1000 * dwell)
     assert windows[0] == slice(0, first)
-    if seen == 2:
+    if observed == 2:
         assert windows[1] == slice(first + 3978, 2 * first)
     loaded = dataclasses.replace(
         make_observation(), volts=np.zeros((5000, 6)), loads=np.ones((5000, 3)), temperature=None

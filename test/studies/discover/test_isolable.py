@@ -43,9 +43,9 @@ def searched(name: str, **values: float) -> Discovery:
 def test_it_says_from_which_size_a_search_names_an_effect() -> None:
     one = of('sensor_rotation (psd 2)')
     assert one.parameter == 'angle'
-    assert one.seen is not None
+    assert one.observed is not None
     assert one.named is not None
-    assert not searched('sensor_rotation', psd=2, angle=0.5 * one.seen).effects
+    assert not searched('sensor_rotation', psd=2, angle=0.5 * one.observed).effects
     found = searched('sensor_rotation', psd=2, angle=2.0 * one.named)
     assert [e.active.label for e in found.effects] == [one.label]
     assert not found.unsettled
@@ -53,10 +53,10 @@ def test_it_says_from_which_size_a_search_names_an_effect() -> None:
 
 def test_it_says_what_a_search_cannot_separate() -> None:
     one = of('bending_stiffness (moves_frequency 0)')
-    assert one.seen is not None
+    assert one.observed is not None
     assert (one.named, one.alike) == (None, 'clamp_bending_compliance')
     # A softer link: a clamp cannot make it stiffer.
-    found = searched('bending_stiffness', scale=-100.0 * one.seen, moves_frequency=0)
+    found = searched('bending_stiffness', scale=-100.0 * one.observed, moves_frequency=0)
     names = {e.active.effect.name for e in found.effects} | set(found.unsettled)
     assert {'bending_stiffness', 'clamp_bending_compliance'} <= names
 

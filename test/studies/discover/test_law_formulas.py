@@ -27,7 +27,7 @@ from .test_formulas import RIG, make_observation
 
 
 @pytest.fixture(scope='module')
-def seen() -> tuple[Workspace, Fit]:
+def observed() -> tuple[Workspace, Fit]:
     """1.2 s of noise, and a fit of one effect to it."""
     workspace = Workspace([make_observation(3)])
     return workspace, refit(workspace, [make_active('sensor_rotation', {'psd': 2, 'angle': 0.0}, 'test')], 2)
@@ -40,8 +40,8 @@ def term_names(found: list[LawTerm]) -> dict[tuple[str, tuple[str, ...]], list[d
     return out
 
 
-def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit]) -> None:
-    (r,) = responses(*seen)
+def test_the_terms_that_are_tried_are_those_of_a_grid(observed: tuple[Workspace, Fit]) -> None:
+    (r,) = responses(*observed)
     assert set(r.known) == set(variables_of(2))
     # load_fx takes a few values, load_tz never changes, x1 many.
     few = np.repeat([0.0, 5.0, -10.0, 1.0], 300)
@@ -92,8 +92,8 @@ def test_the_terms_that_are_tried_are_those_of_a_grid(seen: tuple[Workspace, Fit
     }
 
 
-def test_two_dozen_values_are_few_and_one_more_is_many(seen: tuple[Workspace, Fit]) -> None:
-    (r,) = responses(*seen)
+def test_two_dozen_values_are_few_and_one_more_is_many(observed: tuple[Workspace, Fit]) -> None:
+    (r,) = responses(*observed)
     for count in (24, 25):
         values = np.arange(count) ** 2.0
         known = {n: np.zeros(1200) for n in variables_of(2)} | {'load_fy': np.resize(values, 1200)}
@@ -115,9 +115,9 @@ def test_two_dozen_values_are_few_and_one_more_is_many(seen: tuple[Workspace, Fi
         ('static_theta', 'load_fx'),
     ],
 )
-def test_a_gain_is_that_of_the_simulated_picture(seen: tuple[Workspace, Fit], target: str, of: str) -> None:
+def test_a_gain_is_that_of_the_simulated_picture(observed: tuple[Workspace, Fit], target: str, of: str) -> None:
     """The term is put into the simulation, and its picture, freed of what the fit explains, held to the residual."""
-    workspace, fit = seen
+    workspace, fit = observed
     law = Law('one', TARGETS[target].stage, target, (LawTerm('product', (of,), 1.0),))
     size = {'load_fy': 1e-9, 'load_tz': 1e-9, 'dx': 1e-5, 'dy': 1e-5, 'load_fx': 1e-9, 'temperature': 1e-9}[of]
     size *= 1e3 if target.startswith('sum') else 1.0
@@ -136,9 +136,9 @@ def test_a_gain_is_that_of_the_simulated_picture(seen: tuple[Workspace, Fit], ta
     assert score(found, [LawTerm('product', ('dx',))], ('static_dx', 'load_fx')) == []
 
 
-def test_what_a_target_lacks_is_estimated_with_its_weight(seen: tuple[Workspace, Fit]) -> None:
+def test_what_a_target_lacks_is_estimated_with_its_weight(observed: tuple[Workspace, Fit]) -> None:
     """Of a dot: the residual in volts times the sensitivity, weighted by the noise. It costs one simulation."""
-    workspace, fit = seen
+    workspace, fit = observed
     before = workspace.simulations
     (r,) = responses(workspace, fit)
     assert workspace.simulations == before + 1
@@ -200,7 +200,7 @@ def test_two_levels_are_separated_from_a_stated_gain_on() -> None:
     assert law_features.two_levels(late, ones, ones) == [150]
 
 
-def test_times_that_show_are_terms_and_become_better(seen: tuple[Workspace, Fit]) -> None:
+def test_times_that_show_are_terms_and_become_better(observed: tuple[Workspace, Fit]) -> None:
     workspace = Workspace(
         [
             make_observation(
@@ -244,9 +244,9 @@ def test_a_level_at_which_a_dot_jumps_becomes_better(form: str) -> None:
     assert law_features.with_better_level(found, kept) is kept
 
 
-def test_between_two_loads_any_level_is_as_good(seen: tuple[Workspace, Fit]) -> None:
+def test_between_two_loads_any_level_is_as_good(observed: tuple[Workspace, Fit]) -> None:
     """Its middle is told, and the width of what is between, as a standard deviation; the fit keeps both."""
-    workspace, fit = seen
+    workspace, fit = observed
     found = responses(workspace, fit)
     levels = np.unique(found[0].known['load_fx'])
     low, high = levels[-2:].tolist()
@@ -416,8 +416,8 @@ def test_noise_that_grows_with_a_load_is_reported_with_its_size_and_evidence() -
     assert laws.find_jitter(workspace, fit, gain) is None
 
 
-def test_a_law_shows_where_a_twentieth_of_its_energy_is(seen: tuple[Workspace, Fit]) -> None:
-    workspace, _ = seen
+def test_a_law_shows_where_a_twentieth_of_its_energy_is(observed: tuple[Workspace, Fit]) -> None:
+    workspace, _ = observed
     big = Law('big', 'psd', 'y2', (LawTerm('product', ('load_fy',), 1e-5),))
     for share, shown in ((0.06, ('x1', 'y2')), (0.04, ('y2',))):
         # The residuals' energies per volt are those of the channels' noise.
@@ -550,8 +550,8 @@ def test_a_law_shows_alike_at_other_stages() -> None:
     assert seeker.same_elsewhere(seeker.trial([law_of('load_fx', on='dx')], (), 1)) == []
 
 
-def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit]) -> None:
-    workspace, fit = seen
+def test_a_shape_at_its_bound_is_not_the_right_form(observed: tuple[Workspace, Fit]) -> None:
+    workspace, fit = observed
     before = workspace.simulations
     seeker = laws.LawSearch(workspace, fit, 3.0)
     assert seeker.tried == len(seeker.listed) * len(law_features.SOUGHT)
@@ -570,8 +570,8 @@ def test_a_shape_at_its_bound_is_not_the_right_form(seen: tuple[Workspace, Fit])
 
 
 @pytest.mark.parametrize('form', ['over', 'under'])
-def test_a_threshold_that_no_refit_moves_is_not_at_its_bound(seen: tuple[Workspace, Fit], form: str) -> None:
-    workspace, fit = seen
+def test_a_threshold_that_no_refit_moves_is_not_at_its_bound(observed: tuple[Workspace, Fit], form: str) -> None:
+    workspace, fit = observed
     seeker = laws.LawSearch(workspace, fit, 3.0)
     level = Law('b', 'psd', 'y2', (LawTerm(form, ('x1',), shapes={'threshold': 1e-4}),))
     got = seeker.trial([law_of('load_fy'), level], fit.effects, 2)

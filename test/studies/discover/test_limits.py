@@ -42,8 +42,8 @@ from .test_rules import FINE, SIGMA, A, N, Plant, active, candidate, noise, pict
 def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch) -> None:
     """It pulled the other way, half as much as noted: that is no unit, but the sign is wrong."""
     o = make_observation(warm=None)
-    seen = dataclasses.replace(o, loads=o.loads * [1.0, -2.0, 1.0])
-    mended, findings, lines = setup.wire([seen], ())
+    observed = dataclasses.replace(o, loads=o.loads * [1.0, -2.0, 1.0])
+    mended, findings, lines = setup.wire([observed], ())
     assert [(f.name, f.where) for f in findings] == [('load_sign', 'fy')]
     np.testing.assert_allclose(mended[0].loads, o.loads * [1.0, 2.0, 1.0])
     assert lines == {}
@@ -206,10 +206,10 @@ def test_a_candidate_counts_from_a_thousandth_of_sigma() -> None:
     shown = pictures(A)
     unit = shown[A] / np.linalg.norm(shown[A]) * SIGMA
     plant = Plant(shown, 5.0 * unit)
-    for size, seen in ((0.5, True), (1.01e-3, True), (0.99e-3, False)):
+    for size, observed in ((0.5, True), (1.01e-3, True), (0.99e-3, False)):
         screen = Screen(plant, [(candidate('a', 'x'), [[size * unit]])])
         got = screen.score(plant.whiten(plant.measured))
-        assert [s.gain for s in got] == ([pytest.approx(25.0, rel=1e-4)] if seen else [])
+        assert [s.gain for s in got] == ([pytest.approx(25.0, rel=1e-4)] if observed else [])
     for size, least, gain in ((1.0, 0.0, 25.0), (10.0, 0.0, 25.0), (-1.0, 0.0, 0.0), (-1.0, -1.0, 25.0)):
         screen = Screen(plant, [(candidate('a', 'x', least=least), [[size * unit]])])
         assert screen.score(plant.whiten(plant.measured))[0].gain == pytest.approx(gain, rel=1e-4)
@@ -228,17 +228,17 @@ def test_other_wirings_that_are_as_good_are_reported(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize(
-    ('n', 'height', 'seen'), [(100, 2.03**0.5, True), (100, 1.97**0.5, False), (50, 9.0, True), (49, 9.0, False)]
+    ('n', 'height', 'observed'), [(100, 2.03**0.5, True), (100, 1.97**0.5, False), (50, 9.0, True), (49, 9.0, False)]
 )
-def test_a_jump_is_a_step_that_gains_fifty(n: int, height: float, seen: bool) -> None:
+def test_a_jump_is_a_step_that_gains_fifty(n: int, height: float, observed: bool) -> None:
     """In the middle of n values it gains h^2 n/4."""
     for psd in (1, 2):
         part = np.zeros((6, n))
         part[3 * psd - 2, n // 2 :] = height
         ws = SimpleNamespace(split=lambda _, part=part: [part], fine=[4], observations=[SimpleNamespace(period=1e-3)])
         found = setup.likely_jumps(cast(Workspace, ws), np.empty(0))
-        assert [(r, p) for r, p, _ in found] == [(1, psd)] * seen
-        assert [t for *_, t in found] == pytest.approx([n // 2 * 4e-3] * seen)
+        assert [(r, p) for r, p, _ in found] == [(1, psd)] * observed
+        assert [t for *_, t in found] == pytest.approx([n // 2 * 4e-3] * observed)
 
 
 # The words of the answer.
@@ -334,10 +334,10 @@ def test_a_limit_is_looked_for_on_every_channel(channel: int) -> None:
     o = make_observation(warm=None)
     volts = np.zeros_like(o.volts)
     volts[7, channel] = -3.0
-    seen = dataclasses.replace(o, volts=volts)
+    observed = dataclasses.replace(o, volts=volts)
     limits = pytest.approx([2.8, 2.6, 1.8, 2.94])
-    assert proposals.highest_voltages([seen], True, 0.1) == limits
-    assert proposals.highest_voltages([seen], False, 0.1) == ([] if channel in (2, 5) else limits)
+    assert proposals.highest_voltages([observed], True, 0.1) == limits
+    assert proposals.highest_voltages([observed], False, 0.1) == ([] if channel in (2, 5) else limits)
 
 
 @pytest.mark.parametrize('together', [0.9, -0.9])

@@ -271,7 +271,7 @@ def test_noise_without_a_memory_is_its_level() -> None:
 
 
 @pytest.mark.parametrize(('n', 'known'), [(400, False), (420, True)])
-def test_a_memory_is_seen_in_more_than_400_samples_at_rest(n: int, known: bool) -> None:
+def test_a_memory_is_observed_in_more_than_400_samples_at_rest(n: int, known: bool) -> None:
     o = Observation('x', RIG, np.zeros((n, 6)), np.zeros((n, 3)))
     model = estimate_noise(o, resting(n, 1e-3, 0.8), 4, np.full(6, 1e-6))
     assert all(model.coloured) == any(model.coloured) == known
@@ -334,7 +334,7 @@ def test_a_line_is_refined_to_a_thousandth_of_its_bin() -> None:
 
 
 @pytest.mark.parametrize(
-    ('n', 'f', 'size', 'seen'),
+    ('n', 'f', 'size', 'observed'),
     [
         (8192, 1.5, 1.0, False),
         (8192, 2.3, 1.0, True),
@@ -343,17 +343,17 @@ def test_a_line_is_refined_to_a_thousandth_of_its_bin() -> None:
         (256, 4.0 / 0.256, 3.0, True),
     ],
 )
-def test_below_two_hertz_is_no_line(n: int, f: float, size: float, seen: bool) -> None:
+def test_below_two_hertz_is_no_line(n: int, f: float, size: float, observed: bool) -> None:
     rows = np.random.default_rng(0).standard_normal((n, 6))
     rows[:, 1] += size * np.sin(2 * np.pi * f * np.arange(n) * 1e-3)
     found = proposals.spectral_peaks([rows], [np.ones(6)], [1e-3])
-    assert any(abs(p - f) < 1.0 / (n * 1e-3) for p in found) == seen
+    assert any(abs(p - f) < 1.0 / (n * 1e-3) for p in found) == observed
 
 
 def test_a_line_stands_forty_times_above_the_median() -> None:
     """White noise of one level in all bins but one: so many times their power."""
     n = 1024
-    for times, seen in ((41.0, 1), (39.0, 0)):
+    for times, observed in ((41.0, 1), (39.0, 0)):
         phases = np.exp(2j * np.pi * np.random.default_rng(0).random(n // 2 + 1))
         spectrum = phases.copy()
         rows = np.fft.irfft(spectrum, n)
@@ -365,7 +365,7 @@ def test_a_line_stands_forty_times_above_the_median() -> None:
         need = math.sqrt(times * float(np.median(power[4:]))) - math.sqrt(power[200])
         whole = (rows + need / own * tone)[:, None]
         found = proposals.spectral_peaks([whole], [np.ones(1)], [1e-3])
-        assert len(found) == seen
+        assert len(found) == observed
 
 
 def test_a_line_persists_if_its_quarters_are_alike() -> None:
@@ -642,23 +642,25 @@ def test_what_is_possible_is_what_the_longest_recording_shows(monkeypatch: pytes
 # Coarse steps.
 
 
-@pytest.mark.parametrize(('gap', 'seen'), [(255, False), (300, True)])
-def test_four_values_lie_on_a_step_by_chance_unless_it_is_very_coarse(gap: int, seen: bool) -> None:
+@pytest.mark.parametrize(('gap', 'observed'), [(255, False), (300, True)])
+def test_four_values_lie_on_a_step_by_chance_unless_it_is_very_coarse(gap: int, observed: bool) -> None:
     """Each with the chance of 2 counts in a step: their logarithms must add up to 20."""
     lsb = RIG.converter.volts_per_count
     volts = np.resize(np.arange(4.0) * gap * lsb, (1200, 6))
-    assert (proposals.coarse_step(dataclasses.replace(make_observation(warm=None), volts=volts)) is not None) == seen
+    assert (
+        proposals.coarse_step(dataclasses.replace(make_observation(warm=None), volts=volts)) is not None
+    ) == observed
 
 
 def test_half_a_per_cent_of_readings_may_be_off_the_steps() -> None:
     lsb = RIG.converter.volts_per_count
-    for off, seen in ((4, True), (6, False)):
+    for off, observed in ((4, True), (6, False)):
         # Of a thousand values.
         counts = np.arange(1000.0) * 50.0
         counts[100 : 100 + 10 * off : 10] += 20.0
         volts = np.tile(counts[:, None] * lsb, (2, 6))
         o = dataclasses.replace(make_observation(warm=None), volts=volts, loads=np.zeros((2000, 3)), temperature=None)
-        assert (proposals.coarse_step(o) is not None) == seen
+        assert (proposals.coarse_step(o) is not None) == observed
 
 
 # Noise that grows.
@@ -683,11 +685,11 @@ def test_long_recordings_are_looked_at_in_part() -> None:
     """For coarse steps, 20 000 readings: of 40 000 every second one."""
     lsb = RIG.converter.volts_per_count
     counts = np.resize(np.arange(-50.0, 50.0) * 40.0, 40_000)
-    for off, seen in ((1, True), (0, False)):
+    for off, observed in ((1, True), (0, False)):
         wrong = counts.copy()
         wrong[off::2] += np.resize(np.arange(1.0, 40.0), 20_000)
         o = Observation('long', RIG, np.tile(wrong[:, None] * lsb, (1, 6)), np.zeros((40_000, 3)))
-        assert (proposals.coarse_step(o) is not None) == seen
+        assert (proposals.coarse_step(o) is not None) == observed
 
 
 def test_a_candidate_that_is_in_the_model_already_has_nothing_to_explain() -> None:

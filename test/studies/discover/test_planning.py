@@ -174,7 +174,7 @@ class Searches:
     """Stands for discover: each search leaves one fewer rival of ``free`` parameters; plans are of ``useful``."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, equivalents: int, useful: bool = True, free: int = 1) -> None:
-        self.seen: list[int] = []
+        self.observed: list[int] = []
         self.equivalents, self.free = equivalents, free
         monkeypatch.setattr(
             loop,
@@ -183,7 +183,7 @@ class Searches:
         )
 
     def search(self, known: Sequence[Observation]) -> Discovery:
-        self.seen.append(len(known))
+        self.observed.append(len(known))
         left = ('other',) * max(self.equivalents - len(known) + 1, 0)
         rivals = [SimpleNamespace(parameters=self.free)] * len(left)
         return cast(
@@ -201,7 +201,7 @@ def test_the_loop_ends_when_the_answer_is_unique(monkeypatch: pytest.MonkeyPatch
     searches = Searches(monkeypatch, 2)
     done = searches.settle()
     assert (done.outcome, len(done.plans), done.open) == ('unique', 2, None)
-    assert searches.seen == [1, 2, 3]
+    assert searches.observed == [1, 2, 3]
     assert done.sentence == 'The answer is unique after 2 more recordings.'
     assert Searches(monkeypatch, 0).settle().sentence == 'The answer is unique without a further recording.'
 
@@ -243,8 +243,8 @@ def test_the_command_settles_what_one_length_leaves_open(
     assert [e['name'] for e in tree['effects']] == ['clamp_bending_compliance']
     (made,) = tree['run']['recordings']
     assert made['overrides'] == {'link.length': 0.409}
-    (seen,) = read_observations([tmp_path / 'next.yaml'])
-    assert (seen.name, seen.rig.link.length) == (made['file'], 0.409)
+    (observed,) = read_observations([tmp_path / 'next.yaml'])
+    assert (observed.name, observed.rig.link.length) == (made['file'], 0.409)
 
 
 class Nothing:
@@ -270,11 +270,11 @@ def test_a_plan_is_written_as_files_that_the_commands_take(
     command = shlex.split(lines[1])
     assert command[:2] == ['psd-deflection', 'simulate']
     assert main(command[1:]) == 0
-    (seen,) = read_observations([tmp_path / 'next.yaml'])
-    assert seen.rig.link.length == 0.409
-    assert np.array_equal(seen.loads, plan.loads)
-    assert seen.temperature is not None
-    assert np.ptp(seen.temperature) == pytest.approx(4.0, abs=0.01)
+    (observed,) = read_observations([tmp_path / 'next.yaml'])
+    assert observed.rig.link.length == 0.409
+    assert np.array_equal(observed.loads, plan.loads)
+    assert observed.temperature is not None
+    assert np.ptp(observed.temperature) == pytest.approx(4.0, abs=0.01)
     shown_table = plan.table
     assert 'hold' in shown_table
     assert 'clamp_bending_compliance' in shown_table

@@ -43,22 +43,22 @@ class Pictures(Plant):
     units: tuple[str, ...] = ('N', 'rad')
     cases: tuple[str, ...] = ('a', 'b', 'c')
 
-    def __init__(self, seen: Sequence[FloatArray], shown: Mapping[str, Sequence[FloatArray]], **given: Any) -> None:
-        self.seen, self.shown, self.asked = list(seen), shown, list[dict[str, dict[str, float]]]()
+    def __init__(self, observed: Sequence[FloatArray], shown: Mapping[str, Sequence[FloatArray]], **given: Any) -> None:
+        self.observed, self.shown, self.asked = list(observed), shown, list[dict[str, dict[str, float]]]()
         self.library = tuple(size_of(name) for name in shown)
         self.done: dict[str, list[FloatArray]] = {}
         for name, value in given.items():
             setattr(self, name, value)
 
     def measured(self) -> Sequence[FloatArray]:
-        return self.seen
+        return self.observed
 
     def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
         return self.done
 
     def simulate(self, model: Model) -> Sequence[FloatArray]:
         self.asked.append({name: dict(values) for name, values in model.items()})
-        out = [np.zeros(np.shape(rows)) for rows in self.seen]
+        out = [np.zeros(np.shape(rows)) for rows in self.observed]
         for name, values in model.items():
             for total, picture in zip(out, self.shown[name], strict=True):
                 total += values['size'] * picture
@@ -90,52 +90,52 @@ def rms(values: FloatArray) -> float:
 
 
 def test_a_plant_is_measured_by_its_own_level() -> None:
-    seen = holed()
-    ws = PlantComparison(Pictures(seen, {}))
+    observed = holed()
+    ws = PlantComparison(Pictures(observed, {}))
     counts = [28, 22]
     assert ws.total.tolist() == counts
     assert (ws.size, ws.effective_size(), ws.simulations) == (50, 50.0, 1)
     assert (ws.names, ws.channels, ws.periods) == (('a', 'b', 'c'), ('force', 'turn'), [1.0] * 3)
     assert (ws.base, ws.nuisance, ws.open_level, ws.budget, ws.physics) == ((), (), True, 4000, None)
-    levels = [rms(whole(seen, c)) for c in range(2)]
+    levels = [rms(whole(observed, c)) for c in range(2)]
     assert ws.level == pytest.approx(levels)
-    vector = ws.whiten(seen)
-    want = [np.nan_to_num(rows / np.array(levels)[:, None]).ravel() for rows in seen]
+    vector = ws.whiten(observed)
+    want = [np.nan_to_num(rows / np.array(levels)[:, None]).ravel() for rows in observed]
     np.testing.assert_allclose(vector, np.concatenate(want), rtol=1e-12)
     assert float(vector @ vector) == pytest.approx(50.0)
-    for part, rows in zip(ws.unwhitened(vector), seen, strict=True):
+    for part, rows in zip(ws.unwhitened(vector), observed, strict=True):
         np.testing.assert_allclose(part, np.nan_to_num(rows), rtol=1e-12)
-    for part, rows in zip(ws.displayed(seen), seen, strict=True):
+    for part, rows in zip(ws.displayed(observed), observed, strict=True):
         np.testing.assert_array_equal(part, rows)
     # What is simulated where nothing was measured is not shown.
-    assert np.isnan(ws.displayed([np.zeros_like(rows) for rows in seen])[1][1]).all()
+    assert np.isnan(ws.displayed([np.zeros_like(rows) for rows in observed])[1][1]).all()
     assert ws.provenance() == [
         {'name': 'a', 'values': 18, 'lost': 2},
         {'name': 'b', 'values': 7, 'lost': 7},
         {'name': 'c', 'values': 25, 'lost': 1},
     ]
     own = [np.arange(n, dtype=np.float64) for n in LENGTHS]
-    there = [np.isfinite(rows[1]) for rows in seen]
+    there = [np.isfinite(rows[1]) for rows in observed]
     np.testing.assert_allclose(
         ws.row(1, own), np.concatenate([np.where(t, v, 0.0) for t, v in zip(there, own, strict=True)]) / levels[1]
     )
     residual, difference = ws.residual([])
     np.testing.assert_allclose(residual, vector)
-    assert all(np.array_equal(d, rows, equal_nan=True) for d, rows in zip(difference, seen, strict=True))
+    assert all(np.array_equal(d, rows, equal_nan=True) for d, rows in zip(difference, observed, strict=True))
 
 
 def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
-    seen = holed()
-    left = [0.5 * rows for rows in seen]
-    forces, turns = whole(seen, 0), whole(seen, 1)
-    ws = PlantComparison(Pictures(seen, {}))
+    observed = holed()
+    left = [0.5 * rows for rows in observed]
+    forces, turns = whole(observed, 0), whole(observed, 1)
+    ws = PlantComparison(Pictures(observed, {}))
     assert ws.gap_per_channel(left) == pytest.approx([0.5 * rms(forces), 0.5 * rms(turns)])
     assert math.isnan(ws.floor())
     ws = ws.begun(refit(ws, ()))
     # Newtons and radians have no sum: each is a share of its gap before.
-    assert ws.gap(seen) == pytest.approx(1.0)
+    assert ws.gap(observed) == pytest.approx(1.0)
     assert ws.gap(left) == pytest.approx(0.5)
-    mixed = [rows * [[1.0], [0.5]] for rows in seen]
+    mixed = [rows * [[1.0], [0.5]] for rows in observed]
     assert ws.gap(mixed) == pytest.approx(math.sqrt((1.0 + 0.25) / 2.0))
     assert (ws.unit, ws.display_scale, ws.display_units) == (
         'share of the gap before',
@@ -146,25 +146,25 @@ def test_the_gap_of_a_plant_is_in_its_unit_or_a_share() -> None:
     assert ws.worded(0.1234, '.1f') == '12.3 % of the gap before'
     assert ws.worded(math.nan) == 'not known'
     # A radian that moves something by 0.1 of the first unit.
-    with_lever = Pictures(seen, {})
+    with_lever = Pictures(observed, {})
     with_lever.levers = (1.0, 0.1)
     ws = PlantComparison(with_lever)
     ws = ws.begun(refit(ws, ()))
-    count = [np.isfinite(whole(seen, k)).sum() for k in (0, 1)]
+    count = [np.isfinite(whole(observed, k)).sum() for k in (0, 1)]
     squares = count[0] * rms(forces) ** 2 + count[1] * (0.1 * rms(turns)) ** 2
-    assert ws.gap(seen) == pytest.approx(math.sqrt(squares / sum(count)))
-    assert ws.gap_per_channel(seen) == pytest.approx([rms(forces), rms(turns)])
+    assert ws.gap(observed) == pytest.approx(math.sqrt(squares / sum(count)))
+    assert ws.gap_per_channel(observed) == pytest.approx([rms(forces), rms(turns)])
     assert (ws.unit, ws.worded(0.1234)) == ('N', '0.123 N')
     with_lever.levers = (1.0,)
     with pytest.raises(ConfigError, match=r'levers = \(1\.0,\): must be one number above 0 for each channel'):
         PlantComparison(with_lever)
-    same = PlantComparison(Pictures(seen, {}, units=('N', 'N'), noise=(0.3, 0.1)))
+    same = PlantComparison(Pictures(observed, {}, units=('N', 'N'), noise=(0.3, 0.1)))
     both = np.concatenate((forces, turns))
-    assert same.gap(seen) == pytest.approx(rms(both))
+    assert same.gap(observed) == pytest.approx(rms(both))
     assert same.floor() == pytest.approx(math.sqrt((28 * 0.3**2 + 22 * 0.1**2) / 50))
     assert (same.unit, same.display_scale, same.worded(0.1234)) == ('N', (1.0, 'N'), '0.123 N')
     # A number without a unit has none behind it.
-    assert PlantComparison(Pictures(seen, {}, units=('', ''))).worded(0.5) == '0.5'
+    assert PlantComparison(Pictures(observed, {}, units=('', ''))).worded(0.5) == '0.5'
 
 
 def fitted(values: Sequence[FloatArray], picture: Sequence[FloatArray], **given: Any) -> tuple[PlantComparison, Any]:
@@ -212,20 +212,20 @@ def test_few_values_make_the_interval_of_student() -> None:
 
 def test_the_likelihood_of_a_plant_has_the_level_that_fits_best() -> None:
     """n ln s^2 + n for each channel, s its rms over the level before; never below a stated noise."""
-    seen = holed()
-    other = [rows * [[0.4], [2.5]] for rows in seen]
+    observed = holed()
+    other = [rows * [[0.4], [2.5]] for rows in observed]
     for noise in ((), (2.0, 1e-3)):
-        ws = PlantComparison(Pictures(seen, {}, noise=noise))
+        ws = PlantComparison(Pictures(observed, {}, noise=noise))
         want = 0.0
         for c in range(2):
-            level = max(rms(whole(seen, c)), noise[c] if noise else 0.0)
+            level = max(rms(whole(observed, c)), noise[c] if noise else 0.0)
             square = (rms(whole(other, c)) / level) ** 2
             least = (noise[c] / level) ** 2 if noise else 0.0
-            want += len(whole(seen, c)) * (math.log(max(square, least)) + square / max(square, least))
+            want += len(whole(observed, c)) * (math.log(max(square, least)) + square / max(square, least))
         assert ws.loss(ws.whiten(other)) == pytest.approx(want)
     assert ws.loss(ws.whiten(other)) != pytest.approx(28 * (math.log(0.16) + 1.0) + 22 * (math.log(6.25) + 1.0))
     # A level below the noise is the noise.
-    loud = PlantComparison(Pictures(seen, {}, noise=(9.0, 9.0)))
+    loud = PlantComparison(Pictures(observed, {}, noise=(9.0, 9.0)))
     assert loud.level.tolist() == [9.0, 9.0]
 
 
@@ -233,8 +233,8 @@ def test_the_likelihood_of_a_plant_has_the_level_that_fits_best() -> None:
 @pytest.mark.parametrize('period', [0.0, 0.01])
 def test_what_is_gained_on_a_fold_has_a_level_of_its_own(period: float, stated: float) -> None:
     """Half of what the likelihood of each fold and channel differs by, its values weighed as independent ones."""
-    seen, first, second = holed(), holed(1), [0.7 * rows for rows in holed(2)]
-    ws = PlantComparison(Pictures(seen, {}, period=period, noise=(stated, 1e-3)))
+    observed, first, second = holed(), holed(1), [0.7 * rows for rows in holed(2)]
+    ws = PlantComparison(Pictures(observed, {}, period=period, noise=(stated, 1e-3)))
     # Two pieces of each of three cases, four being wanted.
     cases = [i * 2 + np.arange(n) * 2 // n for i, n in enumerate(LENGTHS)]
     assert [c.tolist() for c in ws.case] == [c.tolist() for c in cases]
@@ -250,7 +250,7 @@ def test_what_is_gained_on_a_fold_has_a_level_of_its_own(period: float, stated: 
             if x:
                 square = sum(v * v for v in x) / len(x)
                 level = max(square, float(least[channel]))
-                weight = len(x) * float(ws.independent[channel]) / len(whole(seen, channel))
+                weight = len(x) * float(ws.independent[channel]) / len(whole(observed, channel))
                 sides.append(0.5 * weight * (math.log(level) + square / level))
         want[fold] += sides[0] - sides[1] if sides else 0.0
     np.testing.assert_allclose(ws.pieces(ws.whiten(first), ws.whiten(second)), want, rtol=1e-9)
@@ -313,37 +313,37 @@ def test_a_level_is_the_same_within_two_per_cent(scale: float) -> None:
     given = {'channels': ('force',), 'units': ('N',), 'period': 0.1}
     for change, again in ((0.019, False), (0.021, True), (-0.019, False), (-0.021, True)):
         ws = PlantComparison(Pictures(shown, {'a': shown, 'b': other}, **given))
-        again_seen = ws.renoised([on('a', change)])
-        assert (again_seen is not ws) == again
+        again_observed = ws.renoised([on('a', change)])
+        assert (again_observed is not ws) == again
         if again:
-            assert again_seen.level == pytest.approx(abs(1.0 - change) * ws.level)
+            assert again_observed.level == pytest.approx(abs(1.0 - change) * ws.level)
     followed = ws.renoised([on('b', 1.0)])
     assert followed.level == pytest.approx(ws.level)
     assert followed.independent[0] < 0.7 * ws.independent[0]
 
 
 def test_what_a_plant_simulates_is_what_the_model_says() -> None:
-    seen = holed()
-    plant = Pictures(seen, {'a': tables(4), 'b': tables(5)}, nuisance=(size_of('b', nominal=2.0),))
+    observed = holed()
+    plant = Pictures(observed, {'a': tables(4), 'b': tables(5)}, nuisance=(size_of('b', nominal=2.0),))
     plant.library = (size_of('a'),)
     ws = PlantComparison(plant)
     assert [(a.effect.name, dict(a.values)) for a in ws.nuisance] == [('b', {'size': 2.0})]
     # The first level is that beside the nuisance as it is declared.
     assert plant.asked == [{'b': {'size': 2.0}}]
     assert ws.level == pytest.approx(
-        [rms(whole([m - 2.0 * b for m, b in zip(seen, tables(5), strict=True)], c)) for c in range(2)]
+        [rms(whole([m - 2.0 * b for m, b in zip(observed, tables(5), strict=True)], c)) for c in range(2)]
     )
     got = ws.simulate([on('a', 3.0), *ws.nuisance])
     for rows, a, b in zip(got, tables(4), tables(5), strict=True):
         np.testing.assert_allclose(rows, 3.0 * a + 2.0 * b)
     assert ws.simulations == len(plant.asked) == 2
     # Where nothing was measured it may be anything.
-    plant.shown = {'a': [np.where(np.isfinite(rows), 1.0, math.inf) for rows in seen], 'b': tables(5)}
+    plant.shown = {'a': [np.where(np.isfinite(rows), 1.0, math.inf) for rows in observed], 'b': tables(5)}
     ws.simulate([on('a', 1.0)])
-    plant.shown = {'a': [np.where(np.isfinite(rows), math.inf, 1.0) for rows in seen], 'b': tables(5)}
+    plant.shown = {'a': [np.where(np.isfinite(rows), math.inf, 1.0) for rows in observed], 'b': tables(5)}
     with pytest.raises(ConfigError, match=r'simulate, a: not finite with .*narrow the bounds'):
         ws.simulate([on('a', 1.0)])
-    plant.seen = seen[:2]
+    plant.observed = observed[:2]
     plant.shown = {'a': tables(4)[:2]}
     with pytest.raises(ConfigError, match='simulate: 2 tables for 3 cases'):
         ws.simulate([on('a', 1.0)])
@@ -400,9 +400,9 @@ def test_an_effect_of_a_plant_is_declared_without_a_rig() -> None:
 
 @pytest.mark.parametrize('period', [0.0, 0.25])
 def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> None:
-    seen = holed()
+    observed = holed()
     given = [np.arange(n, dtype=np.float64) for n in LENGTHS]
-    plant = Pictures(seen, {'a': tables(4)}, period=period)
+    plant = Pictures(observed, {'a': tables(4)}, period=period)
     plant.done = {'u': given}
     ws = PlantComparison(plant)
     axis, alongs = ws.along()
@@ -413,7 +413,7 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
     for got, along in zip(alongs, times, strict=True):
         np.testing.assert_allclose(got, along)
     assert all(np.array_equal(a, b) for a, b in zip(beside['u'], given, strict=True))
-    assert all(np.array_equal(a, b[1], equal_nan=True) for a, b in zip(beside['turn / rad'], seen, strict=True))
+    assert all(np.array_equal(a, b[1], equal_nan=True) for a, b in zip(beside['turn / rad'], observed, strict=True))
     plant.units = ('', '')
     assert list(ws.against())[1:] == ['force', 'turn']
     fit = refit(ws, [on('a', 0.5)], iterations=0)
@@ -421,7 +421,7 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
     assert [channel for channel, _ in named] == ['force', 'turn']
     for c, (channel, of) in enumerate(named):
         for i, n in enumerate(LENGTHS):
-            own = 0.5 * tables(4)[i][c] * np.isfinite(seen[i][c])
+            own = 0.5 * tables(4)[i][c] * np.isfinite(observed[i][c])
             want = {'constant': np.ones(n), 'u': given[i], 'u^2': given[i] ** 2, 'u^3': given[i] ** 3}
             want.update({channel: own, f'{channel}^2': own**2, f'{channel}^3': own**3, f'|{channel}|': abs(own)})
             if period:
@@ -440,10 +440,10 @@ def test_what_remains_of_a_plant_is_held_against_its_inputs(period: float) -> No
 @pytest.mark.parametrize('period', [0.0, 0.25])
 def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     """Energy beyond its share of independent values, as a normal deviate; by the chi-square law itself."""
-    seen = holed()
-    seen[1][0] *= 3.0
-    seen[2][1] += 0.3 * np.arange(13) / 13
-    plant = Pictures(seen, {}, period=period)
+    observed = holed()
+    observed[1][0] *= 3.0
+    observed[2][1] += 0.3 * np.arange(13) / 13
+    plant = Pictures(observed, {}, period=period)
     plant.done = {'u': [np.arange(n) / n for n in LENGTHS]}
     ws = PlantComparison(plant)
     fit = refit(ws, ())
@@ -452,9 +452,9 @@ def test_a_case_is_a_cell_of_each_channel(period: float) -> None:
     assert set(cells) == {('force', 0), ('force', 1), ('force', 2), ('turn', 0), ('turn', 2)}
     for (channel, case), cell in cells.items():
         c = ws.channels.index(channel)
-        there = int(np.isfinite(seen[case][c]).sum())
+        there = int(np.isfinite(observed[case][c]).sum())
         dof = float(ws.independent[c]) * there / float(ws.total[c])
-        energy = float(np.nansum((seen[case][c] / ws.scale[c]) ** 2))
+        energy = float(np.nansum((observed[case][c] / ws.scale[c]) ** 2))
         assert cell.energy == pytest.approx(energy - dof)
         p = float(chi2_law.sf(energy, dof))
         # Six cells were tried, one of which is empty.
@@ -483,8 +483,8 @@ def steel(size: float, seed: int = 0, **given: Any) -> Pictures:
     rng = np.random.default_rng(seed)
     shown = {name: [rng.standard_normal((2, 30)) for _ in range(4)] for name in 'abc'}
     noise = [0.02 * rng.standard_normal((2, 30)) for _ in range(4)]
-    seen = [size * b + 1.5 * c + e for b, c, e in zip(shown['b'], shown['c'], noise, strict=True)]
-    plant = Pictures(seen, shown, cases=tuple('abcd'), units=('N', 'N'), nuisance=(size_of('c'),), **given)
+    observed = [size * b + 1.5 * c + e for b, c, e in zip(shown['b'], shown['c'], noise, strict=True)]
+    plant = Pictures(observed, shown, cases=tuple('abcd'), units=('N', 'N'), nuisance=(size_of('c'),), **given)
     plant.library = (size_of('a'), size_of('b'))
     return plant
 
@@ -492,7 +492,7 @@ def steel(size: float, seed: int = 0, **given: Any) -> Pictures:
 def least_squares(plant: Pictures, *names: str) -> tuple[FloatArray, list[FloatArray], FloatArray]:
     """Sizes of the pictures, what they leave, and the inverse of their products."""
     matrix = np.stack([np.concatenate([p.ravel() for p in plant.shown[n]]) for n in names], axis=1)
-    data = np.concatenate([s.ravel() for s in plant.seen])
+    data = np.concatenate([s.ravel() for s in plant.observed])
     sizes = np.linalg.lstsq(matrix, data, rcond=None)[0]
     left = (data - matrix @ sizes).reshape(4, 2, 30)
     return sizes, list(left), np.linalg.inv(matrix.T @ matrix)

@@ -37,10 +37,10 @@ class Spring(Plant):
     def __init__(self, c: float, k: float = 1.0, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
         self.u = [np.linspace(-1, 1, 50) * (1 + 0.2 * i) for i in range(6)]
-        self.seen = [(k * u + c * u**3 + NOISE * rng.standard_normal(50))[None, :] for u in self.u]
+        self.observed = [(k * u + c * u**3 + NOISE * rng.standard_normal(50))[None, :] for u in self.u]
 
     def measured(self) -> list[FloatArray]:
-        return self.seen
+        return self.observed
 
     def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
         return {'u': self.u}
@@ -73,7 +73,7 @@ def test_nothing_is_named_where_nothing_is_missing(seed: int) -> None:
 
 def test_a_limit_that_is_not_reached_at_first_is_found() -> None:
     plant = Spring(0.0)
-    plant.seen = [np.clip(rows, -1.3, 1.3) for rows in plant.seen]
+    plant.observed = [np.clip(rows, -1.3, 1.3) for rows in plant.observed]
     (limit,) = psd_deflection.discover_in(plant).effects
     assert limit.active.values['force'] == pytest.approx(1.3, abs=0.01)
 
@@ -94,7 +94,7 @@ def test_nuisance_is_fitted_and_never_named() -> None:
 def test_lost_values_cost_precision_and_nothing_else() -> None:
     plant = Spring(0.3)
     lost = np.random.default_rng(1)
-    plant.seen = [np.where(lost.random(rows.shape) < 0.3, math.nan, rows) for rows in plant.seen]
+    plant.observed = [np.where(lost.random(rows.shape) < 0.3, math.nan, rows) for rows in plant.observed]
     found = psd_deflection.discover_in(plant)
     (cubic,) = found.effects
     assert abs(cubic.active.values['c'] - 0.3) < 4.0 * cubic.sd['c']
@@ -159,7 +159,9 @@ class Warm(Spring):
     def __init__(self, c: float) -> None:
         super().__init__(c)
         rng = np.random.default_rng(9)
-        self.seen = [np.vstack([rows, 1e3 * np.abs(rows) + rng.standard_normal(rows.shape)]) for rows in self.seen]
+        self.observed = [
+            np.vstack([rows, 1e3 * np.abs(rows) + rng.standard_normal(rows.shape)]) for rows in self.observed
+        ]
 
     def simulate(self, model: Model) -> list[FloatArray]:
         return [np.vstack([rows, 1e3 * np.abs(rows)]) for rows in super().simulate(model)]
@@ -204,7 +206,7 @@ def test_a_plant_that_contradicts_itself_is_rejected(change: Mapping[str, object
     for name, value in change.items():
         setattr(plant, name, value)
     if change.get('cases') == ():
-        plant.seen = []
+        plant.observed = []
     with pytest.raises(ConfigError, match=words):
         psd_deflection.discover_in(plant)
 
@@ -214,7 +216,7 @@ def test_what_swings_on_is_no_noise_though_none_is_stated() -> None:
     plant = Spring(0.0)
     plant.period = 0.01
     plant.library = (LIMIT,)
-    plant.seen = [rows + 0.05 * np.sin(np.linspace(0.0, 9.0, 50)) for rows in plant.seen]
+    plant.observed = [rows + 0.05 * np.sin(np.linspace(0.0, 9.0, 50)) for rows in plant.observed]
     found = psd_deflection.discover_in(plant)
     assert (found.verdict, found.effects) == ('unknown_effect', ())
     assert 'remain, which is no noise' in found.unknown[0].signature or 'follows' in found.unknown[0].signature
@@ -229,6 +231,6 @@ def test_sizes_of_unlike_units_do_not_tie() -> None:
     plant.simulate = lambda model: simulate(  # type: ignore[method-assign]
         {**model, 'square': {'c': model.get('angle', {'turn': 0.0})['turn']}}
     )
-    plant.seen = [r + 0.1 * (u + u**2) - 0.1 * u**3 for r, u in zip(plant.seen, plant.u, strict=True)]
+    plant.observed = [r + 0.1 * (u + u**2) - 0.1 * u**3 for r, u in zip(plant.observed, plant.u, strict=True)]
     found = psd_deflection.discover_in(plant)
     assert (found.verdict, sorted(e.name for e in found.effects)) == ('effects_found', ['angle', 'stiffness'])

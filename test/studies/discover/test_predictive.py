@@ -33,27 +33,27 @@ class Small(Plant):
         raw = rng.standard_normal((len(sizes), 2, points))
         self.pictures = raw + 0.7 * np.roll(raw, 1, axis=0)
         self.truth = np.tensordot(sizes, self.pictures, 1)
-        self.seen = self.truth + rng.standard_normal(self.truth.shape)
+        self.observed = self.truth + rng.standard_normal(self.truth.shape)
 
     def measured(self) -> list[FloatArray]:
-        return [self.seen]
+        return [self.observed]
 
     def simulate(self, model: Model) -> list[FloatArray]:
         terms = [v['size'] * self.pictures[int(name[1:])] for name, v in model.items()]
-        return [np.sum([np.zeros_like(self.seen), *terms], axis=0)]
+        return [np.sum([np.zeros_like(self.observed), *terms], axis=0)]
 
     def parts(self) -> Sequence[IntArray]:
-        return [np.arange(self.seen.shape[1])]
+        return [np.arange(self.observed.shape[1])]
 
     def cut(self, at: slice) -> Small:
         out = Small(np.zeros(len(self.pictures)), 1)
-        out.pictures, out.truth, out.seen = self.pictures[..., at], self.truth[:, at], self.seen[:, at]
+        out.pictures, out.truth, out.observed = self.pictures[..., at], self.truth[:, at], self.observed[:, at]
         return out
 
 
 def forward_backward(plant: Small) -> Model:
     """Terms by the smallest N log RSS + k log N, one added or dropped at a time."""
-    table, y = plant.pictures.reshape(TERMS, -1).T, plant.seen.ravel()
+    table, y = plant.pictures.reshape(TERMS, -1).T, plant.observed.ravel()
     chosen: frozenset[int] = frozenset()
 
     def sizes(terms: frozenset[int]) -> FloatArray:
@@ -74,13 +74,13 @@ def test_twelve_small_terms_are_predicted_as_by_bic_or_better(seed: int) -> None
     sizes = np.zeros(TERMS)
     sizes[rng.permutation(TERMS)[:12]] = rng.uniform(1.5, 3.0, 12) * rng.choice([-1, 1], 12) / np.sqrt(80 * 1.5)
     whole = Small(sizes, 440, seed)
-    seen, new = whole.cut(slice(0, 40)), whole.cut(slice(40, 440))
-    found = psd_deflection.discover_in(seen)
+    observed, new = whole.cut(slice(0, 40)), whole.cut(slice(40, 440))
+    found = psd_deflection.discover_in(observed)
 
     def wrong(model: Model) -> float:
         return float(np.sqrt(np.mean((new.simulate(model)[0] - new.truth) ** 2)))
 
-    assert np.hypot(1.0, wrong(found.predictive)) <= 1.1 * np.hypot(1.0, wrong(forward_backward(seen)))
+    assert np.hypot(1.0, wrong(found.predictive)) <= 1.1 * np.hypot(1.0, wrong(forward_backward(observed)))
     assert wrong(found.predictive) < wrong({e.name: e.values for e in found.effects})
     np.testing.assert_array_equal(found.predict(new)[0], new.simulate(found.predictive)[0])
 

@@ -58,13 +58,13 @@ def test_each_step_adds_what_it_finds_and_changes_nothing_before_it() -> None:
     first = begun(Library(plant))
     assert first.fit is first.null
     assert first.comparison is plant
-    seen = [first]
+    observed = [first]
     for step in STEPS:
-        kept = {f.name: getattr(seen[-1], f.name) for f in dataclasses.fields(Problem)}
-        seen.append(step(seen[-1]))
-        assert all(getattr(seen[-2], name) is value for name, value in kept.items())
+        kept = {f.name: getattr(observed[-1], f.name) for f in dataclasses.fields(Problem)}
+        observed.append(step(observed[-1]))
+        assert all(getattr(observed[-2], name) is value for name, value in kept.items())
     assert first.comparison is plant
-    _, searched, weighed, named, last = seen
+    _, searched, weighed, named, last = observed
     assert names(searched.fit) == names(searched.result.fit) == ['a', 'b']
     assert not searched.heldout
     assert len(weighed.heldout) == 2

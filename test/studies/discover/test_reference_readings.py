@@ -36,9 +36,9 @@ def measured(effects: Sequence[ActiveEffect]) -> tuple[FloatArray, FloatArray]:
     each = round(HELD * RIG.converter.sample_rate_hz)
     pose = ForwardModel(RIG, effects).expect(np.repeat(LOADS.astype(np.float64), each, axis=0)).pose.T
     step = round(EVERY * RIG.converter.sample_rate_hz)
-    seen = pose[::step]
-    noise = np.random.default_rng(1).normal(size=seen.shape) * NOISE
-    return np.linspace(0.0, EVERY * (len(seen) - 1), len(seen)), np.asarray(seen + noise, dtype=np.float64)
+    observed = pose[::step]
+    noise = np.random.default_rng(1).normal(size=observed.shape) * NOISE
+    return np.linspace(0.0, EVERY * (len(observed) - 1), len(observed)), np.asarray(observed + noise, dtype=np.float64)
 
 
 def recorded(path: Path, effects: Sequence[ActiveEffect], loads: bool = True) -> Path:

@@ -784,8 +784,8 @@ def test_a_dependence_is_the_chi_square_that_a_regressor_explains() -> None:
     history = loads.steps([(0, 0, 0), (5, -20, -9), (-10, 10, 12)], 0.6).loads
     volts = ForwardModel(RIG, []).expect(history, None).volts.T + noise(8)[0, 0]
     rng = np.random.default_rng(4)
-    seen = Observation('seen', RIG, volts + 2e-3 * rng.standard_normal(volts.shape), history)
-    workspace = Workspace([seen])
+    observed = Observation('seen', RIG, volts + 2e-3 * rng.standard_normal(volts.shape), history)
+    workspace = Workspace([observed])
     residual = rng.standard_normal(sum(m.size for m in workspace.measured))
     chunk = ForwardModel(RIG, []).run(history, None)
     size = workspace.fine[0]

@@ -51,7 +51,7 @@ def clean(angle: float) -> FloatArray:
     return np.asarray(ForwardModel(rig, effects_of_rig(rig)).expect(LOADS).volts.T)
 
 
-def seen(corner: float, seed: int, angle: float = 0.0) -> Observation:
+def observed(corner: float, seed: int, angle: float = 0.0) -> Observation:
     step = RIG.converter.volts_per_count
     noise = RIG.noises.ravel() * flicker(len(LOADS), 1.0 / RIG.converter.sample_rate_hz, corner, seed)
     return Observation('x', RIG, np.rint((clean(angle) + noise) / step) * step, LOADS)
@@ -174,11 +174,11 @@ def test_corners_within_a_fifth_are_alike() -> None:
 
 
 def test_a_workspace_has_the_slow_noise_of_its_recording_and_reports_it() -> None:
-    ws = Workspace([seen(5.0, 1)])
+    ws = Workspace([observed(5.0, 1)])
     (reported,) = ws.provenance()
     assert reported['corners_hz'] == ws.noise[0].corners.tolist()
     assert ws.noise[0].corners == pytest.approx(np.full(6, 5.0), rel=0.4)
-    plain = Workspace([seen(0.0, 1)])
+    plain = Workspace([observed(0.0, 1)])
     assert ws.floor() > 1.2 * plain.floor()
     residual, _ = ws.residual(())
     assert float(residual @ residual) / ws.size == pytest.approx(1.0, abs=0.05)
@@ -187,7 +187,7 @@ def test_a_workspace_has_the_slow_noise_of_its_recording_and_reports_it() -> Non
 @pytest.mark.statistics
 @pytest.mark.parametrize('corner', [0.3, 1.0, 5.0, 30.0])
 def test_nothing_is_missing_from_slow_noise(corner: float) -> None:
-    found = discover([seen(corner, 1)])
+    found = discover([observed(corner, 1)])
     assert found.verdict == 'nothing_missing'
     assert not found.setup
 
@@ -196,7 +196,7 @@ def test_nothing_is_missing_from_slow_noise(corner: float) -> None:
 def test_an_effect_beside_slow_noise_is_named_and_its_sd_covers() -> None:
     off = []
     for seed in range(6):
-        found = discover([seen(5.0, seed, angle=0.002)])
+        found = discover([observed(5.0, seed, angle=0.002)])
         assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
         assert found.verdict == 'effects_found'
         off.append((found.effects[0].active.values['angle'] - 0.002) / found.effects[0].sd['angle'])

@@ -35,10 +35,10 @@ class Table(Plant):
         rng = np.random.default_rng(seed)
         self.along, self.across = rng.uniform(0.0, 1.0, (2, 30))
         self.error = noise * rng.standard_normal(30)
-        self.seen = 2.0 * self.along + waves * np.sin(9.0 * self.along) + self.error
+        self.observed = 2.0 * self.along + waves * np.sin(9.0 * self.along) + self.error
 
     def measured(self) -> list[FloatArray]:
-        return [self.seen[None, :]]
+        return [self.observed[None, :]]
 
     def inputs(self) -> Mapping[str, Sequence[FloatArray]]:
         return {'along': [self.along], 'across': [self.across]}
@@ -131,7 +131,7 @@ def test_the_gap_with_given_shapes_is_reported_beside_the_other() -> None:
 
 def test_few_readings_report_no_function() -> None:
     plant = Table(1, 1.0)
-    plant.seen[19:] = np.nan
+    plant.observed[19:] = np.nan
     assert smooth(plant) is None
     assert smooth(Table(1, 1.0), {}) is None
 

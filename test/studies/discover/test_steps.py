@@ -529,13 +529,13 @@ def test_a_recording_with_too_little_of_it_is_left_out_and_the_next_is_not() -> 
     assert noise_energy([whole, whole]) == pytest.approx(2 * noise_of_dots * 4 * 1200 / 400)
 
 
-@pytest.mark.parametrize(('values', 'seen'), [(4, True), (3, False)])
-def test_of_so_coarse_steps_four_values_are_enough(values: int, seen: bool) -> None:
+@pytest.mark.parametrize(('values', 'observed'), [(4, True), (3, False)])
+def test_of_so_coarse_steps_four_values_are_enough(values: int, observed: bool) -> None:
     """Each lies on them by a chance of a thousandth; three are too few however coarse they are."""
     lsb = RIG.converter.volts_per_count
     k = np.resize(np.arange(values) - 1.0, (2000, 6))
     o = dataclasses.replace(make_observation(warm=None), volts=k * 2000.0 * lsb, loads=np.zeros((2000, 3)))
-    assert (coarse_step(o) is not None) == seen
+    assert (coarse_step(o) is not None) == observed
 
 
 @pytest.mark.parametrize(('loss', 'is_rival'), [(6.9, True), (7.1, False)])

@@ -246,8 +246,8 @@ def test_the_readings_too_many_of_pure_noise_have_unit_covariance(rig: Rig) -> N
     assert basis.T @ basis == pytest.approx(np.eye(readings - 3), abs=1e-9)
     # And what noise makes of them.
     white = np.random.default_rng(0).standard_normal((1, ws.measured[0].size))
-    seen = fourth(ws, white)[0].reshape(readings - 3, blocks)
-    assert seen @ seen.T / blocks == pytest.approx(np.eye(readings - 3), abs=5.0 * (2.0 / blocks) ** 0.5)
+    observed = fourth(ws, white)[0].reshape(readings - 3, blocks)
+    assert observed @ observed.T / blocks == pytest.approx(np.eye(readings - 3), abs=5.0 * (2.0 / blocks) ** 0.5)
     # A movement of the plate is none of them.
     moved = ws.simulate([make_active('load_offset', {'x': 0.01}, 'test')])
     change = ws.whiten([a - b for a, b in zip(moved, ws.simulate([]), strict=True)])
@@ -271,7 +271,7 @@ def test_the_readings_too_many_acquit_the_detectors_of_what_the_link_does(word: 
     assert reading.acquits == acquitted
 
 
-def test_slow_noise_is_seen_if_all_lights_and_all_dots_but_one_have_it() -> None:
+def test_slow_noise_is_observed_if_all_lights_and_all_dots_but_one_have_it() -> None:
     """1/f noise of a corner of 4 Hz, of nine channels."""
     rng, n, period = np.random.default_rng(3), 4000, 0.004
     f = np.fft.rfftfreq(n, period)
@@ -314,8 +314,8 @@ def test_the_command_searches_a_recording_of_three_and_writes_what_it_found(
     words = ['--params-file', str(rig), '--loads', steps, '--effect', 'sensor_rotation,psd=3,angle=0.01']
     assert main(['simulate', *words, '--out', str(tmp_path / 'three.csv')]) == 0
     assert main(['simulate', '--loads', steps, '--out', str(tmp_path / 'two.csv')]) == 0
-    seen = read_observation(tmp_path / 'three.csv', RIG)
-    assert (seen.psds, seen.volts.shape) == (3, (7000, 9))
+    observed = read_observation(tmp_path / 'three.csv', RIG)
+    assert (observed.psds, observed.volts.shape) == (3, (7000, 9))
     out = tmp_path / 'out'
     assert main(['discover', str(tmp_path / 'three.csv'), '--params-file', str(rig), '--out', str(out)]) == 0
     assert 'sensor_rotation (psd 3) is missing' in capsys.readouterr().out

@@ -82,9 +82,9 @@ def test_a_constant_is_whitened_by_what_the_zero_allows() -> None:
     constant = [np.zeros_like(t) for t in ws.measured]
     axis = 3
     constant[0][DOT_CHANNELS[axis]] = np.sqrt(ZERO[axis]) / RIG.sensitivities.ravel()[axis]
-    seen = float(np.linalg.norm(ws.whiten(constant)))
-    assert seen > 5.0
-    assert np.linalg.norm(own.whiten(constant)) == pytest.approx(seen / np.hypot(1.0, seen), rel=1e-9)
+    observed = float(np.linalg.norm(ws.whiten(constant)))
+    assert observed > 5.0
+    assert np.linalg.norm(own.whiten(constant)) == pytest.approx(observed / np.hypot(1.0, observed), rel=1e-9)
     assert not own.free_loads
     assert own.refitted(ws.measured) is own
 

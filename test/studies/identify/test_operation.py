@@ -102,18 +102,20 @@ def test_it_is_the_likeliest_mode_with_the_scatter_of_its_likelihood(
     assert found.amplitude == pytest.approx(math.sqrt(1e-6 * peak * f0 * area), rel=1e-3)
 
 
-@pytest.mark.parametrize(('guess', 'seen'), [(14.0 / 0.72, True), (14.0 / 0.68, False), (10.15, True), (9.7, False)])
-def test_a_mode_far_from_the_peak_is_not_the_one_that_was_asked_for(guess: float, seen: bool) -> None:
+@pytest.mark.parametrize(
+    ('guess', 'observed'), [(14.0 / 0.72, True), (14.0 / 0.68, False), (10.15, True), (9.7, False)]
+)
+def test_a_mode_far_from_the_peak_is_not_the_one_that_was_asked_for(guess: float, observed: bool) -> None:
     """Below 0.7 of it or above 1.4."""
-    assert (mode_in_operation(driven(noise=3e-5), RATE, guess) is not None) is seen
+    assert (mode_in_operation(driven(noise=3e-5), RATE, guess) is not None) is observed
 
 
-@pytest.mark.parametrize(('seconds', 'seen'), [(4.6, False), (4.8, True)])
-def test_a_spectrum_of_thirty_lines_is_enough(seconds: float, seen: bool) -> None:
+@pytest.mark.parametrize(('seconds', 'observed'), [(4.6, False), (4.8, True)])
+def test_a_spectrum_of_thirty_lines_is_enough(seconds: float, observed: bool) -> None:
     samples = driven(seconds=seconds, zeta=0.05, noise=3e-5)
-    assert (len(lines(samples, 14.0)[0]) == 30) is seen
+    assert (len(lines(samples, 14.0)[0]) == 30) is observed
     assert len(lines(samples, 14.0)[0]) in (29, 30)
-    assert (mode_in_operation(samples, RATE, 14.0) is not None) is seen
+    assert (mode_in_operation(samples, RATE, 14.0) is not None) is observed
 
 
 def test_the_search_begins_at_the_peak_with_narrow_and_wide_modes(monkeypatch: pytest.MonkeyPatch) -> None:

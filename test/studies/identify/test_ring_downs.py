@@ -160,9 +160,9 @@ def test_one_mode_is_split_into_two(apart: float) -> None:
     np.testing.assert_allclose(sorted(fit.modes), [*pair, (50.0, 0.01)], rtol=1e-5)
 
 
-@pytest.mark.parametrize(('apart', 'seen'), [(0.01, True), (0.025, True), (0.06, True), (0.04, False)])
+@pytest.mark.parametrize(('apart', 'observed'), [(0.01, True), (0.025, True), (0.06, True), (0.04, False)])
 @pytest.mark.parametrize(('damping', 'of_pair'), [(0.002, 0.01), (0.03, 0.03)])
-def test_a_pair_beside_a_mode_is_hinted_at(apart: float, seen: bool, damping: float, of_pair: float) -> None:
+def test_a_pair_beside_a_mode_is_hinted_at(apart: float, observed: bool, damping: float, of_pair: float) -> None:
     """Whether it takes off all that is left but a millionth."""
     t = times(1500)
     places = (16.0 * (1.0 - apart), 16.0 * (1.0 + apart))
@@ -172,7 +172,7 @@ def test_a_pair_beside_a_mode_is_hinted_at(apart: float, seen: bool, damping: fl
     left = np.concatenate([s.solved(modes)[0] for s in both])
     fit = RingFit(modes, left, np.eye(4))
     squares = float(np.sum(left**2))
-    assert hints_at_pair(both, fit, 0.99999999 * squares) is seen
+    assert hints_at_pair(both, fit, 0.99999999 * squares) is observed
     assert not hints_at_pair(both, fit, 1.0001 * squares)
 
 
@@ -360,10 +360,10 @@ def test_of_a_window_half_is_there_and_twelve_samples() -> None:
     assert len(scan_windows(samples, RATE, [(16.0, 0.001)], 1e-6, 384, 32)) == 1
     samples[0] = math.nan
     assert scan_windows(samples, RATE, [(16.0, 0.001)], 1e-6, 384, 32) == []
-    for there, seen in ((12, True), (11, False)):
+    for there, observed in ((12, True), (11, False)):
         few = ring(times(17), 200.0, damping=0.001)
         few[[3, 6, 8, 10, 13][: 16 - there]] = math.nan
-        assert bool(scan_windows(few, RATE, [(200.0, 0.001)], 1e-6, 16, 2)) is seen
+        assert bool(scan_windows(few, RATE, [(200.0, 0.001)], 1e-6, 16, 2)) is observed
 
 
 def test_the_search_finds_the_ring_downs_and_their_mode() -> None:
@@ -388,12 +388,12 @@ def test_of_three_windows_that_grow_the_longest_gives_the_modes(
     """And what it leaves is noise, if it is more than was thought."""
     samples = blows(6000, [100, 2000, 4000])
     lengths = [500, 900, 700, 5000]
-    seen: list[Modes] = []
+    observed: list[Modes] = []
     scanned: list[tuple[Modes, float, int, int]] = []
 
     def grown(samples: FloatArray, seed: Stretch, start: RingFit, window: int, level: float) -> tuple[Stretch, RingFit]:
-        length, first = lengths[len(seen)], (100, 200, 4000)[len(seen)]
-        seen.append(start.modes)
+        length, first = lengths[len(observed)], (100, 200, 4000)[len(observed)]
+        observed.append(start.modes)
         return Stretch(samples, first, first + length, RATE), RingFit(
             [(float(length), 0.02)], np.full(4, 3e-6), np.eye(2)
         )
@@ -405,8 +405,8 @@ def test_of_three_windows_that_grow_the_longest_gives_the_modes(
     monkeypatch.setattr(module, 'grow_stretch', grown)
     monkeypatch.setattr(module, 'scan_windows', scan)
     assert find_stretches(samples, samples, RATE, [(16.0, 0.01)], level) == ([], [(900.0, 0.02)])
-    assert len(seen) == 3
-    np.testing.assert_allclose(np.reshape(seen, (3, 2)), [(16.0, 0.02)] * 3, rtol=0.02)
+    assert len(observed) == 3
+    np.testing.assert_allclose(np.reshape(observed, (3, 2)), [(16.0, 0.02)] * 3, rtol=0.02)
     # Six periods, and half a one.
     ((modes, noise, *sizes),) = scanned
     assert modes == [(900.0, 0.02)]

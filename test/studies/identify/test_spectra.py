@@ -150,17 +150,17 @@ def test_a_mode_exceeds_the_noise_at_its_frequency_25_times(frequency: float) ->
 
 def fitted_bands(samples: FloatArray, peaks: list[float], monkeypatch: pytest.MonkeyPatch) -> list[FloatArray]:
     """What is given to the fit of the noise, if there is a fit: shapes over the power of each band."""
-    seen: list[FloatArray] = []
+    observed: list[FloatArray] = []
 
     def watched(matrix: FloatArray, ones: FloatArray) -> Any:
         np.testing.assert_array_equal(ones, 1.0)
-        seen.append(matrix)
+        observed.append(matrix)
         return nnls(matrix, ones)
 
     monkeypatch.setattr('scipy.optimize.nnls', watched)
     found = coloured_noise(samples, RATE, peaks)
     assert found.white > 0.0 or not samples.any()
-    return seen
+    return observed
 
 
 @pytest.mark.parametrize('peaks', [[14.0], [46.0, 14.0], [60.0]])
@@ -183,9 +183,9 @@ def test_the_noise_is_fitted_in_24_bands_above_the_loudest_mode(
     band = np.floor(24.0 * np.log(np.maximum(f, 1e-9) / lowest) / math.log(highest / lowest))
     band[np.any([np.abs(f / k - 1.0) <= 0.4 for k in peaks], axis=0)] = -1
     rows = [[shape[band == b].mean() / p[band == b].mean() for shape in shapes] for b in range(24) if (band == b).any()]
-    (seen,) = fitted_bands(samples, peaks, monkeypatch)
+    (observed,) = fitted_bands(samples, peaks, monkeypatch)
     expected = np.array(rows) / np.linalg.norm(rows, axis=0)
-    np.testing.assert_allclose(seen, expected, rtol=1e-9)
+    np.testing.assert_allclose(observed, expected, rtol=1e-9)
 
 
 def test_a_fit_of_the_noise_needs_four_bands(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -218,16 +218,16 @@ def cheapest(
     changes: IntArray, sizes: FloatArray, steps: list[steps_module.DotStep], period: float
 ) -> list[tuple[int, int]]:
     """Of all ways to pair notes and steps in their order that of the least cost, one by one."""
-    seen = [i for i in range(len(changes)) if sizes[i] > 0.03 * max(sizes)]
-    factor = sum(s.size for s in steps) / sum(sizes[i] for i in seen)
-    near = [any(abs(step.at - changes[i]) * period <= 0.03 for step in steps) for i in seen]
-    own = 9.0 if sum(near) >= len(seen) / 2 else 0.0
+    observed = [i for i in range(len(changes)) if sizes[i] > 0.03 * max(sizes)]
+    factor = sum(s.size for s in steps) / sum(sizes[i] for i in observed)
+    near = [any(abs(step.at - changes[i]) * period <= 0.03 for step in steps) for i in observed]
+    own = 9.0 if sum(near) >= len(observed) / 2 else 0.0
     best: tuple[float, list[tuple[int, int]]] = (math.inf, [])
-    for count in range(min(len(seen), len(steps)) + 1):
-        for some in itertools.combinations(seen, count):
+    for count in range(min(len(observed), len(steps)) + 1):
+        for some in itertools.combinations(observed, count):
             for others in itertools.combinations(range(len(steps)), count):
                 pairs = list(zip(some, others, strict=True))
-                cost = 9.0 * (len(seen) - count) + 4.0 * (len(steps) - count)
+                cost = 9.0 * (len(observed) - count) + 4.0 * (len(steps) - count)
                 for i, j in pairs:
                     away = abs(steps[j].at - changes[i]) * period
                     unlike = 2.0 * math.log(max(steps[j].size, 1e-12) / factor / sizes[i])

@@ -290,7 +290,7 @@ SPREAD = np.array(
 """Noted loads; each is like the others."""
 
 
-def seen(
+def observed(
     more: dict[int, tuple[float, float, float]],
     noted: FloatArray = SPREAD,
     *,
@@ -311,7 +311,7 @@ def seen(
 
 
 def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> None:
-    found = seen({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
+    found = observed({1: (3.0, 4.0, 0.0), 2: (0.0, 0.0, 5.0), 3: (6.0, 0.0, 8.0)})
     assert found.sizes[:4] == pytest.approx([0.0, 5e-5, 5e-5, 1e-4])
     assert found.annotated.tolist() == SPREAD.tolist()
 
@@ -335,7 +335,7 @@ def test_a_load_counts_by_how_far_it_moves_the_plate_at_a_tenth_of_a_metre() -> 
 def test_loads_that_are_off_beside_exact_ones_are_wrong_if_five_are_right(
     count: int, more: dict[int, tuple[float, float, float]], gone: tuple[int, ...]
 ) -> None:
-    found = plateaus.outliers(seen(more, SPREAD[:count]))
+    found = plateaus.outliers(observed(more, SPREAD[:count]))
     assert (found.gone, found.softer) == (gone, 0.0)
 
 
@@ -343,15 +343,15 @@ def test_a_faulty_detector_is_no_wrong_note() -> None:
     wrong = {6: (0.0, 1.0, 0.0)}
     # A load of 1 N moves the plate by 10 um: a twentieth of that and 0.2 um are 0.7 um.
     for far, gone in ((6.9e-7, (6,)), (-6.9e-7, (6,)), (7.1e-7, ()), (-7.1e-7, ())):
-        assert plateaus.outliers(seen(wrong, across={6: far})).gone == gone
-    assert plateaus.outliers(seen(wrong, across={1: 1e-3})).gone == (6,)
+        assert plateaus.outliers(observed(wrong, across={6: far})).gone == gone
+    assert plateaus.outliers(observed(wrong, across={1: 1e-3})).gone == (6,)
     # Far beyond the tolerance no plate is asked for.
-    far_off = plateaus.outliers(seen({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
+    far_off = plateaus.outliers(observed({6: (0.0, 10.0, 0.0)}, across={6: 1e-3}))
     assert (far_off.gone, far_off.softer) == ((6,), 0.0)
     # Nothing that moves is nothing to explain.
-    assert not plateaus.closes(seen({}))
+    assert not plateaus.closes(observed({}))
     for left, bent, gone in ((0.19, 0.0, (6,)), (0.21, 0.0, ()), (0.21, 0.02, (6,))):
-        assert plateaus.outliers(seen(wrong, left=left), bent).gone == gone
+        assert plateaus.outliers(observed(wrong, left=left), bent).gone == gone
 
 
 @pytest.mark.parametrize(
@@ -371,7 +371,7 @@ def test_two_of_eight_notes_beside_small_errors_are_wrong(
 ) -> None:
     twelve = np.vstack((SPREAD, SPREAD[1:5]))
     slightly = np.where(np.arange(count)[:, None] % 2, 0.1, -0.1) * (1.0, 0.0, 0.0)
-    assert plateaus.outliers(seen(more, twelve[:count], everywhere=slightly)).gone == gone
+    assert plateaus.outliers(observed(more, twelve[:count], everywhere=slightly)).gone == gone
 
 
 def test_a_note_beside_effects_is_wrong_only_if_no_other_fits() -> None:
@@ -381,11 +381,11 @@ def test_a_note_beside_effects_is_wrong_only_if_no_other_fits() -> None:
         return float(np.delete(plateaus.deviation_in_tolerances(found, (without,), 0.1), without).max())
 
     # Without any other one, the worst that is left is one and a half times the tolerance.
-    found = seen({2: (0.0, 2.5, 0.0)}, everywhere=softened)
+    found = observed({2: (0.0, 2.5, 0.0)}, everywhere=softened)
     assert all(1.3 < left(found, k) < 1.8 for k in (1, 3, 4, 5, 6, 7))
     assert plateaus.outliers(found).gone == (2,)
     # Without the fourth it is 1.13 times, which may come from that one if a tenth of its 3.9 is allowed.
-    found = seen({3: (0.0, 6.0, 0.0)}, everywhere=softened)
+    found = observed({3: (0.0, 6.0, 0.0)}, everywhere=softened)
     assert left(found, 4) == pytest.approx(1.13, abs=0.01)
     assert plateaus.deviation_in_tolerances(found, (4,), 0.1)[4] == pytest.approx(3.9, abs=0.05)
     assert plateaus.outliers(found).gone == (3,)
@@ -399,7 +399,7 @@ def test_a_wrong_load_is_known_if_the_others_span_it() -> None:
     def known(k: list[int], more: tuple[float, float, float] = (0.0, 0.0, 1.0), largest: float = 1e9) -> bool:
         rows = [i for i in range(5) if i < 3 or i in k]
         here = [rows.index(i) for i in k]
-        return plateaus.is_known(seen(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
+        return plateaus.is_known(observed(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
 
     # A torque of 5 % of (3, 4) is as good as none.
     assert known([3])
@@ -415,17 +415,17 @@ def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> No
     off = {4: (9.0, 0.0, 0.0), 5: (-9.0, 9.0, 4.0), 6: (7.0, -8.0, 0.0)}
     loads = np.repeat(SPREAD, DWELL, axis=0)
     for left, free in ((0.19, True), (0.21, False)):
-        assert plateaus.all_free(seen(off, left=left), loads) is free
-    assert plateaus.all_free(seen({2: (9.0, 5.0, 0.0), 3: (-9.0, 9.0, 4.0)}, SPREAD[:4]), loads)
-    assert not plateaus.all_free(seen({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, SPREAD[:3]), loads)
+        assert plateaus.all_free(observed(off, left=left), loads) is free
+    assert plateaus.all_free(observed({2: (9.0, 5.0, 0.0), 3: (-9.0, 9.0, 4.0)}, SPREAD[:4]), loads)
+    assert not plateaus.all_free(observed({1: (9.0, 5.0, 0.0), 2: (-9.0, 9.0, 4.0)}, SPREAD[:3]), loads)
     # Two that are off by more than the tolerance are enough.
-    two = seen({5: (0.0, 0.0, 0.9), 1: (0.0, 0.0, -0.9)})
+    two = observed({5: (0.0, 0.0, 0.9), 1: (0.0, 0.0, -0.9)})
     apart = plateaus.deviation_in_tolerances(two, (), 0.1)
     assert sorted(apart)[-3] < 1.0 < sorted(apart)[-2]
     assert max(apart) < 2.0
     assert plateaus.all_free(two, loads)
     # One alone is a wrong note, and others are needed to say so.
-    found = seen({0: (0.0, 0.0, 0.6)})
+    found = observed({0: (0.0, 0.0, 0.6)})
     assert int((plateaus.deviation_in_tolerances(found, (), 0.1) > 1.0).sum()) == 1
     assert not plateaus.all_free(found, loads)
 
@@ -437,7 +437,7 @@ def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
     def rounded(*off: tuple[float, float, float], count: int = 5) -> bool:
         more = np.zeros((5, 3))
         more[: len(off)] = off
-        return plateaus.are_rounded(seen({}, noted[:count], everywhere=more[:count]), loads)
+        return plateaus.are_rounded(observed({}, noted[:count], everywhere=more[:count]), loads)
 
     # Forces in steps of 5 N, torques in steps of 2 N m.
     assert rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0, 0.0, 1.0))
@@ -470,7 +470,7 @@ def test_loads_off_by_less_than_a_step_may_be_rounded() -> None:
     def may_be(*off: tuple[float, float, float], loads: FloatArray = noted) -> bool:
         more = np.zeros((len(loads), 3))
         more[: len(off)] = off
-        return plateaus.may_be_rounded(seen({}, loads, everywhere=more))
+        return plateaus.may_be_rounded(observed({}, loads, everywhere=more))
 
     assert may_be((4.9, 0.0, 0.0), (0.0, -4.9, 99.0))
     assert not may_be((5.1, 0.0, 0.0))
@@ -517,7 +517,7 @@ def world(
     def asked(acting: FloatArray) -> PlateauLoads:
         off = acted - acting[DWELL // 2 :: DWELL]
         off -= bend * np.sign(off) * np.maximum(np.abs(off) - 5.0, 0.0)
-        return seen({}, noted, everywhere=off)
+        return observed({}, noted, everywhere=off)
 
     return asked
 
@@ -574,7 +574,7 @@ def test_readings_are_compared_in_fine_means(
         rig: Rig, difference: FloatArray, count: FloatArray, samples: int, size: int, listed: list[Plateau]
     ) -> PlateauLoads:
         held.append((difference, count, samples, size))
-        return seen({}, SPREAD[:0])
+        return observed({}, SPREAD[:0])
 
     monkeypatch.setattr(plateaus, 'implied_loads', asked_for)
     loads = np.tile((1.0, -5.0, 2.0), (400, 1))
@@ -617,7 +617,7 @@ def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -
     def of_size(size: float) -> Callable[[FloatArray], PlateauLoads]:
         def asked(acting: FloatArray) -> PlateauLoads:
             asked_with.append(acting)
-            return seen({6: (0.0, size, 0.0)})
+            return observed({6: (0.0, size, 0.0)})
 
         return asked
 
@@ -626,7 +626,7 @@ def test_nothing_is_wrong_below_the_least_that_could_be_and_without_any_load() -
         asked_with.clear()
         assert plateaus.wrong_notes_against(loads, 1e-3, of_size(size)) == []
         assert len(asked_with) == asks
-    assert plateaus.wrong_notes_against(loads, 1e-3, lambda acting: seen({}, SPREAD[:0])) == []
+    assert plateaus.wrong_notes_against(loads, 1e-3, lambda acting: observed({}, SPREAD[:0])) == []
 
 
 ONE_TORQUE = np.array(
@@ -640,19 +640,19 @@ def test_the_only_torque_is_accused_if_its_change_was_noted_twice() -> None:
     more = HUNG_ONCE - ONE_TORQUE[4]
     for allowed in ((0.0, 0.0, 0.0), (1.0, -1.5, 1.5)):
         off = tuple((more + allowed).tolist())
-        assert plateaus.outliers(seen({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
+        assert plateaus.outliers(observed({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
     # Another torque, and half of the torque alone: another unit or stiffness may make that.
-    assert plateaus.outliers(seen({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
-    assert plateaus.outliers(seen({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
+    assert plateaus.outliers(observed({4: (4.0, -10.0, -10.0)}, ONE_TORQUE)).gone == ()
+    assert plateaus.outliers(observed({4: (0.0, 0.0, -17.5)}, ONE_TORQUE)).gone == ()
     # The first load that was hung: half of it may be another unit, too.
     first = ONE_TORQUE.copy()
     first[3] = 0.0
-    assert plateaus.outliers(seen({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
+    assert plateaus.outliers(observed({4: (-8.0, 10.0, -17.5)}, first)).gone == ()
 
 
 def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> None:
     more = HUNG_ONCE - ONE_TORQUE[4] + (0.2, -0.01, 0.4)
-    listed = seen({4: (float(more[0]), float(more[1]), float(more[2]))}, ONE_TORQUE)
+    listed = observed({4: (float(more[0]), float(more[1]), float(more[2]))}, ONE_TORQUE)
     noted = np.repeat(ONE_TORQUE, DWELL, axis=0)
 
     def asked(acting: FloatArray) -> PlateauLoads:
@@ -665,7 +665,7 @@ def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> No
     assert note.applied.tolist() == HUNG_ONCE.tolist()
     assert note.where == 'load 4'
     # One that others are like is what the readings say.
-    other = seen({3: (0.0, 5.0, 0.0)}, ONE_TORQUE)
+    other = observed({3: (0.0, 5.0, 0.0)}, ONE_TORQUE)
     (free,) = plateaus.wrong_notes_against(
         noted, 1e-3, lambda acting: replace(other, more=ONE_TORQUE + other.more - acting[DWELL // 2 :: DWELL])
     )

@@ -294,24 +294,24 @@ def test_step_and_deviations_are_those_of_dense_least_squares(outliers: int, sti
     rng = np.random.default_rng(3)
     k = 90
     t = np.sort(rng.uniform(-2.0, 3.0, k))
-    seen = np.stack([np.sin(7.0 * t), np.cos(5.0 * t), t**2], axis=1)
+    observed = np.stack([np.sin(7.0 * t), np.cos(5.0 * t), t**2], axis=1)
     rates = np.stack([7.0 * np.cos(7.0 * t), -5.0 * np.sin(5.0 * t), 2.0 * t], axis=1)
     moving = [0, 1, 2]
     if still:
         # An axis at rest has rates of noise alone, which tell nothing.
-        seen[:, 1] = 0.1
+        observed[:, 1] = 0.1
         rates[:, 1] = rng.normal(0.0, 50.0, k)
         moving = [0, 2]
     matrix = np.array([[1.1, 0.2, -0.3], [0.1, 0.9, 0.4], [-0.2, 0.3, 1.3]])
-    poses = (seen + 0.004 * rates * (not still)) @ matrix + [0.1, -0.2, 5.0]
+    poses = (observed + 0.004 * rates * (not still)) @ matrix + [0.1, -0.2, 5.0]
     poses += rng.normal(0.0, [0.01, 0.02, 0.03], (k, 3))
     poses[:outliers] += 4.0
-    used, weights = UsedReferences(t, poses, seen, rates), np.ones((k, 3))
+    used, weights = UsedReferences(t, poses, observed, rates), np.ones((k, 3))
     for _ in range(300):
         _, _, weights = used.solved(weights)
     step, fit, again = used.solved(weights)
     np.testing.assert_allclose(again, weights, atol=1e-9)
-    causes = np.column_stack([np.ones(k), seen[:, moving]])
+    causes = np.column_stack([np.ones(k), observed[:, moving]])
     # One bias and one row of scales an axis; the offset moves all three at once.
     columns, left, sizes = np.zeros((3 * k, 3 * causes.shape[1])), np.empty((k, 3)), np.empty(3)
     does = np.empty(3 * k)
@@ -357,8 +357,10 @@ def test_a_motion_at_rest_reports_no_step() -> None:
 
 def test_references_at_one_time_report_no_drift() -> None:
     rng = np.random.default_rng(0)
-    seen, rates = rng.normal(0.0, 1.0, (60, 3)), rng.normal(0.0, 1.0, (60, 3))
-    _, fit, _ = UsedReferences(np.zeros(60), seen + rng.normal(0.0, 0.1, (60, 3)), seen, rates).solved(np.ones((60, 3)))
+    observed, rates = rng.normal(0.0, 1.0, (60, 3)), rng.normal(0.0, 1.0, (60, 3))
+    _, fit, _ = UsedReferences(np.zeros(60), observed + rng.normal(0.0, 0.1, (60, 3)), observed, rates).solved(
+        np.ones((60, 3))
+    )
     assert fit.sd < math.inf
     assert (fit.drift, fit.drift_sd) == (0.0, math.inf)
 

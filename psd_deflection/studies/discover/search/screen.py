@@ -21,7 +21,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.search.comparison import Comparison
 from psd_deflection.studies.discover.search.signatures import Candidate, Columns
 
-SEEN = 1e-6
+OBSERVED = 1e-6
 """Columns that keep less than this fraction of their squared length after projection are skipped as
 already explained.
 """
@@ -62,7 +62,7 @@ def solve_observable(fisher: FloatArray, score: FloatArray, original: FloatArray
     f = fisher / np.outer(scale, scale)
     g = score / scale
     values, vectors = np.linalg.eigh(f)
-    keep = values > SEEN
+    keep = values > OBSERVED
     if not np.any(keep):
         return 0.0, 0, np.zeros_like(score)
     along = vectors[:, keep].T @ g

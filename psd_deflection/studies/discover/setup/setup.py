@@ -40,7 +40,7 @@ BETTER = 10.0
 AS_GOOD = 2.0
 """Wirings that leave up to this much more than the best one count as equally good; the one with the fewest changes is
 taken."""
-SEEN = 100.0
+OBSERVED = 100.0
 """A load is ignored if its movement has less than this factor of the energy of one block's noise."""
 SMALL = 1e-4
 """m and rad; movements up to this size are in proportion to the load."""
@@ -127,7 +127,7 @@ def load_sizes(m: _Movement, wiring: Wiring) -> tuple[float, FloatArray]:
     residual = max(m.squared - float(along[at] @ sizes[at]), 0.0)
     # A load that moved nothing that stands out has no size.
     with np.errstate(invalid='ignore'):
-        sizes[sizes**2 * np.diag(m.own) < SEEN * m.noise + 1e-3 * residual] = np.nan
+        sizes[sizes**2 * np.diag(m.own) < OBSERVED * m.noise + 1e-3 * residual] = np.nan
     return residual, sizes
 
 
