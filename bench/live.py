@@ -114,12 +114,12 @@ def looker(url: str) -> None:
     stop = until_stdin_closes()
 
     async def look() -> int:
-        said: list[str] = []
+        message: list[str] = []
         async with aiohttp.ClientSession() as session, session.ws_connect(f'{url}ws') as socket:
             print('ready', flush=True)
             while not stop.is_set():
-                said.append(await socket.receive_str())
-        return sum(len(json.loads(text).get('rows', ())) for text in said)
+                message.append(await socket.receive_str())
+        return sum(len(json.loads(text).get('rows', ())) for text in message)
 
     print(asyncio.run(look()))
 
@@ -208,8 +208,8 @@ def parts(seconds: float, times: int) -> list[float]:
                 ('publishers', str(recording)),
                 ('writer', str(recording)),
             ):
-                said, _ = child(role, what, seconds).communicate()
-                total += float(said)
+                message, _ = child(role, what, seconds).communicate()
+                total += float(message)
             sums.append(total)
             device.stop.set()
             device.thread.join()

@@ -98,11 +98,11 @@ def drawn(name: str) -> Hand:
     acted = _held(levels, times, n)
     noted, wrong = acted.copy(), list[dict[str, Any]]()
     if kind in ('late', 'mixed', 'one'):
-        said = _moved(kind, times, n / RATE, rng)
-        noted = _held(levels, said, n)
+        message = _moved(kind, times, n / RATE, rng)
+        noted = _held(levels, message, n)
         wrong = [
             {'name': 'load_time', 'where': f'load {i + 1}', 'value': float(b - a)}
-            for i, (a, b) in enumerate(zip(times, said, strict=True))
+            for i, (a, b) in enumerate(zip(times, message, strict=True))
             if abs(b - a) > LEAST_S
         ]
     elif kind == 'slow':
@@ -113,19 +113,19 @@ def drawn(name: str) -> Hand:
             acted += share[:, None] * (levels[i + 1] - levels[i])
             wrong.append({'name': 'load_ramp', 'where': f'load {i + 1}', 'value': took})
     elif kind == 'rounded':
-        said_levels = np.round(levels / np.array([5.0, 5.0, 2.0])) * np.array([5.0, 5.0, 2.0])
-        noted = _held(said_levels, times, n)
+        reported_levels = np.round(levels / np.array([5.0, 5.0, 2.0])) * np.array([5.0, 5.0, 2.0])
+        noted = _held(reported_levels, times, n)
         wrong = [
             {'name': 'load_value', 'where': f'load {i + 1}', 'load': levels[i + 1].tolist()}
             for i in range(len(times) - 1)
-            if np.any(np.abs(levels[i + 1] - said_levels[i + 1]) > (0.2, 0.2, 0.1))
+            if np.any(np.abs(levels[i + 1] - reported_levels[i + 1]) > (0.2, 0.2, 0.1))
         ]
     elif kind in ('forgotten', 'twice'):
         i = int(rng.integers(0, len(times) - 1))
-        said_levels = levels.copy()
+        reported_levels = levels.copy()
         # Never noted: the load before is held on. Noted twice: what was added is added once more.
-        said_levels[i + 1] = levels[i] if kind == 'forgotten' else 2.0 * levels[i + 1] - levels[i]
-        noted = _held(said_levels, times, n)
+        reported_levels[i + 1] = levels[i] if kind == 'forgotten' else 2.0 * levels[i + 1] - levels[i]
+        noted = _held(reported_levels, times, n)
         where = {'name': 'missing_load', 'from': float(times[i])}
         if kind == 'twice':
             where = {'name': 'load_value', 'where': f'load {i + 1}'}

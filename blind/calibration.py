@@ -74,7 +74,7 @@ class Score(NamedTuple):
     ``z``: by parameter, error over its standard deviation. ``inside``: share of published poses within their 95 %
     ellipsoid; ``axes`` (3,): within 1.96 standard deviations; ``noise_only``: within the ellipsoid of the noise.
     ``before``, ``after`` (3,): rms errors of the pose. ``gap``: held out, before and after, m. ``unreported``:
-    parameters that the Fisher information leaves open and calibrate does not report; ``said``: the reverse.
+    parameters that the Fisher information leaves open and calibrate does not report; ``message``: the reverse.
     ``moved``: the group that was moved, or ''; ``named``: what --check says, '' if it holds; ``like``: what it
     cannot tell that from.
     """
@@ -87,7 +87,7 @@ class Score(NamedTuple):
     after: Array
     gap: tuple[float, float]
     unreported: list[str]
-    said: list[str]
+    message: list[str]
     moved: str
     named: str
     like: list[str]
@@ -215,7 +215,7 @@ def score(seed: int, lit: bool = False) -> Score:
     reported = alone | {max(d.parts, key=lambda n: abs(d.parts[n])) for d in found.undetermined}
     every = {n for d in found.undetermined for n in d.parts}
     unreported = [n for n, s in own.items() if s > OPEN + BORDER and n not in every]
-    said = [n for n in reported & alone if own.get(n, 1.0) < OPEN - BORDER]
+    message = [n for n in reported & alone if own.get(n, 1.0) < OPEN - BORDER]
     group = GROUPS[seed // 2 % len(GROUPS)] if seed % 2 else ''
     again = misaligned.record(
         shifted(truth, group, rng) if group else truth, later_motion(rng), rng, outliers=0.01, light=light
@@ -231,7 +231,7 @@ def score(seed: int, lit: bool = False) -> Score:
         np.sqrt(np.mean(error**2, axis=0)),
         (found.gap.heldout_before, found.gap.heldout_after),
         unreported,
-        said,
+        message,
         group,
         '' if checked.unchanged else checked.groups[0].group,
         checked.like,
@@ -337,7 +337,7 @@ class Summary(NamedTuple):
     poses: float
     worse: int
     unreported: int
-    said: int
+    message: int
     named: float
     alarms: float
 
@@ -356,7 +356,7 @@ def summary(scores: Sequence[Score]) -> Summary:
             for s in scores
         ),
         sum(len(s.unreported) for s in scores),
-        sum(len(s.said) for s in scores),
+        sum(len(s.message) for s in scores),
         float(np.mean([s.named == s.moved for s in moved])) if moved else 1.0,
         float(np.mean([bool(s.named) for s in still])) if still else 0.0,
     )
@@ -382,7 +382,7 @@ def table(scores: Sequence[Score]) -> Iterator[str]:
     yield f'- rigs that came out worse: {total.worse} of {len(scores)}'
     every = len(scores) * len(scores[0].z)
     yield f'- parameters that the Fisher information leaves open and nothing reports: {total.unreported} of {every}'
-    yield f'- parameters reported as open that it does not leave open: {total.said}'
+    yield f'- parameters reported as open that it does not leave open: {total.message}'
     moved = [s for s in scores if s.moved]
     like = sum(s.moved in (s.named, *s.like) for s in moved) / max(len(moved), 1)
     yield f'- --check: the moved group is named in {total.named:.1%} of {len(moved)}, or among the like: {like:.1%}'
@@ -409,9 +409,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     scores = list(over(partial(score, lit=args.light), range(args.rigs), args.jobs, 'rigs'))
     print('\n'.join(table(scores)))
     for number, s in enumerate(scores):
-        if s.moved != s.named or s.unreported or s.said:
+        if s.moved != s.named or s.unreported or s.message:
             reported = f'moved {s.moved or "nothing"}, named {s.named or "nothing"} {s.like}'
-            print(f'rig {number}: {reported}; {s.unreported} {s.said}')
+            print(f'rig {number}: {reported}; {s.unreported} {s.message}')
     return 0
 
 

@@ -66,14 +66,14 @@ class Device:
         self._thread.start()
 
     def _run(self) -> None:
-        sent, said, asked = 0, -1.0, b''
+        sent, message, asked = 0, -1.0, b''
         while sent < len(self._counts):
             time.sleep(0.004)
             now = time.monotonic() - self.began
             out = []
-            if now - said >= 1.0:
+            if now - message >= 1.0:
                 out.append(hello())
-                said = now
+                message = now
             with contextlib.suppress(OSError):
                 asked += os.read(self._master, 4096)
             *whole, asked = asked.split(b'\0')
@@ -156,18 +156,18 @@ def recorded(turn: float, seed: int, folder: Path) -> tuple[Path, list[tuple[flo
 
 def judged(out: Path, turn: float, late: list[tuple[float, float]]) -> list[str]:
     """What is wrong with the answer in ``out``; nothing if it is right."""
-    said = json.loads((out / 'result.json').read_text())
+    message = json.loads((out / 'result.json').read_text())
     wrong = []
-    sizes = [e['parameters'] for e in said['effects'] if e['name'] == 'sensor_rotation']
-    if len(said['effects']) != 1 or not sizes or sizes[0]['psd'] != 1:
-        wrong.append(f'effects: {[e["name"] for e in said["effects"]]}')
+    sizes = [e['parameters'] for e in message['effects'] if e['name'] == 'sensor_rotation']
+    if len(message['effects']) != 1 or not sizes or sizes[0]['psd'] != 1:
+        wrong.append(f'effects: {[e["name"] for e in message["effects"]]}')
     elif abs(sizes[0]['angle']['value'] - turn) > 3.0 * sizes[0]['angle']['sd'] + 1e-3 * abs(turn):
         wrong.append(f'angle {sizes[0]["angle"]}, true {turn}')
-    reported = {int(re.sub(r'\D', '', s['where'])): s['value'] for s in said['setup'] if s['name'] == 'load_time'}
+    reported = {int(re.sub(r'\D', '', s['where'])): s['value'] for s in message['setup'] if s['name'] == 'load_time'}
     for i, (least, most) in enumerate(late, start=1):
         if not least - NEAR_S < reported.get(i, 0.0) < most + NEAR_S:
             wrong.append(f'load {i}: said {reported.get(i)} s late, was {least:.2f} to {most:.2f} s')
-    return wrong + [f'{said["verdict"]}, unknown: {u["signature"]}' for u in said['unknown']]
+    return wrong + [f'{message["verdict"]}, unknown: {u["signature"]}' for u in message['unknown']]
 
 
 def main() -> int:

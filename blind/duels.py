@@ -62,9 +62,9 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What was ``said``, and the figures."""
+    """What was ``message``, and the figures."""
 
-    said: str
+    message: str
     figures: Sequence[Figure]
 
 
@@ -325,7 +325,7 @@ def rows(name: str, duel: Duel, folder: Path, progress: Progress) -> tuple[str, 
         why = 'not run: there is no model of it here'
         return line(name, duel.source, known, duel.lacks, duel.left_out, why), [line(name, why, '', '', '', '')]
     answer = duel.run(folder, progress)
-    first = line(name, duel.source, known, duel.lacks, duel.left_out, answer.said)
+    first = line(name, duel.source, known, duel.lacks, duel.left_out, answer.message)
     return first, [figure_row(name, f) for f in answer.figures]
 
 

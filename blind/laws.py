@@ -101,13 +101,13 @@ def answer(law: dict[str, Any] | None, seed: int) -> tuple[dict[str, Any], Disco
 
 def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
     """How the answer compares with the truth."""
-    said = next((u['law'] for u in got['unknown'] if u['law']), None)
-    row: dict[str, Any] = {'verdict': got['verdict'], 'law': None if said is None else said['expression']}
+    message = next((u['law'] for u in got['unknown'] if u['law']), None)
+    row: dict[str, Any] = {'verdict': got['verdict'], 'law': None if message is None else message['expression']}
     row['effects'] = [e['name'] for e in got['effects']]
     if law is None:
-        return {**row, 'alarm': said is not None}
+        return {**row, 'alarm': message is not None}
     truth = law_forms.truth_of(law)
-    listed = [] if said is None else [said, *said['equivalent']]
+    listed = [] if message is None else [message, *message['equivalent']]
     if _reported_as_jumps(law, got):
         # Of a PSD that jumps, a beam that jumps and a voltage that jumps no reading tells one from the other.
         listed = [{'stage': truth['stage'], 'variables': ['time']}]
@@ -119,33 +119,35 @@ def judged(law: dict[str, Any] | None, got: dict[str, Any]) -> dict[str, Any]:
         'truth': truth,
         'gap': law['gap'],
         'stage': any(e['stage'] == truth['stage'] for e in listed),
-        'stage_alone': said is not None and said['stage'] == truth['stage'],
+        'stage_alone': message is not None and message['stage'] == truth['stage'],
         'variables': any(sorted(e['variables']) == truth['variables'] for e in listed),
-        'variables_alone': said is not None and sorted(said['variables']) == truth['variables'],
-        'kind': said is not None and said['kind'] == truth['kind'],
+        'variables_alone': message is not None and sorted(message['variables']) == truth['variables'],
+        'kind': message is not None and message['kind'] == truth['kind'],
         'jumps': _reported_as_jumps(law, got),
         'note': _reported_as_note(law, got),
         'set': len(listed),
-        'floors': (got['gap']['heldout_after'] if said is None else said['heldout_after']) / floor,
+        'floors': (got['gap']['heldout_after'] if message is None else message['heldout_after']) / floor,
     }
 
 
 def _reported_as_jumps(law: dict[str, Any], got: dict[str, Any]) -> bool:
     """Return whether the check of the recording names each time of a dot's law, as a jump of its PSD."""
-    said = sorted(f['value'] for f in got['setup'] if f['name'] == 'jump' and f['where'] == f'psd_{law["where"][-1]}')
-    jumps = law['form'] == 'events' and law['where'] in law_forms.DOTS and len(said) == len(law['times'])
-    return jumps and bool(np.allclose(said, law['times'], atol=0.01))
+    message = sorted(
+        f['value'] for f in got['setup'] if f['name'] == 'jump' and f['where'] == f'psd_{law["where"][-1]}'
+    )
+    jumps = law['form'] == 'events' and law['where'] in law_forms.DOTS and len(message) == len(law['times'])
+    return jumps and bool(np.allclose(message, law['times'], atol=0.01))
 
 
 def _reported_as_note(law: dict[str, Any], got: dict[str, Any]) -> bool:
     """Whether the law acts under one load only, and the answer is that another load hung there: no reading tells one
     from the other.
     """
-    said = [f for f in got['setup'] if f['name'] == 'load_value']
-    if len(said) != 1 or len(got['setup']) > 1 or got['effects'] or got['unknown']:
+    message = [f for f in got['setup'] if f['name'] == 'load_value']
+    if len(message) != 1 or len(got['setup']) > 1 or got['effects'] or got['unknown']:
         return False
     (g,) = designs('one')
-    number = int(said[0]['where'].removeprefix('load '))
+    number = int(message[0]['where'].removeprefix('load '))
     changes = np.flatnonzero(np.any(np.diff(g.loads, axis=0) != 0.0, axis=1)) + 1
     acts = np.sum((g.clean([law]) - g.clean([])) ** 2, axis=1)
     # The link rings on when that load is gone.

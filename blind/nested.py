@@ -53,8 +53,8 @@ def ours(make: Callable[[], Plant], tables: Sequence[FloatArray], hidden: Sequen
     plant = make()
     _without(plant, tables, hidden)
     found = discover_in(plant)
-    said = found.predict(plant)
-    return _vector([t - s for t, s in zip(tables, said, strict=True)])
+    message = found.predict(plant)
+    return _vector([t - s for t, s in zip(tables, message, strict=True)])
 
 
 def forward_backward(plant: Plant, left: Left, observed: BoolArray) -> FloatArray:

@@ -261,7 +261,7 @@ def judged(made: Bench, hung: HeldLoad, stem: str, by: str) -> Any:
 def calibrated(made: Bench, runs: Sequence[HeldLoad], stem: str) -> str:
     """``calibrate`` on some recordings: ``STEM.yaml``; what it says."""
     references = itertools.chain.from_iterable(('--reference', f'{h.name}_camera.csv') for h in runs)
-    said = made.run(
+    message = made.run(
         'calibrate',
         *(f'{h.name}.csv' for h in runs),
         *references,
@@ -269,7 +269,7 @@ def calibrated(made: Bench, runs: Sequence[HeldLoad], stem: str) -> str:
     )
     shutil.copy(made.folder / f'{stem}_found' / 'rig.yaml', made.folder / f'{stem}.yaml')
     rig_files(made, stem, {})
-    return said
+    return message
 
 
 def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
@@ -293,7 +293,7 @@ def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
     bar.set_description('calibrate')
     shutil.copy(made.folder / 'nominal.yaml', made.folder / 'before.yaml')
     rig_files(made, 'before', zeroed(made, sidebar[0].name))
-    said = calibrated(made, sidebar, 'after')
+    message = calibrated(made, sidebar, 'after')
     bar.update()
     calibrated(made, [h for h in sidebar if h.side > 0], 'one_side')
     bar.update()
@@ -309,7 +309,7 @@ def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
         bar.update()
     bar.close()
     summary = _summary(made, link, answers)
-    summary['calibrate'] = said.strip().splitlines()
+    summary['calibrate'] = message.strip().splitlines()
     (folder / 'summary.json').write_text(json.dumps(summary, indent=1) + '\n')
     page = page_of(made.folder, plan.forces, summary, drawn, cameras, answers, made.truth, made.typed)
     (folder / 'page.html').write_text(page)

@@ -70,10 +70,10 @@ def complete(answer: dict[str, Any]) -> dict[str, Any]:
     """Return an answer of any tool with all that is counted: what it leaves out is nothing, or not a number."""
     effects = [{'equivalent': [], 'parameters': {}, **e} for e in answer.get('effects', ())]
     unknown = [{'law': None, **u} for u in answer.get('unknown', ())]
-    said = 'unknown_effect' if unknown else 'effects_found' if effects else 'nothing_missing'
+    message = 'unknown_effect' if unknown else 'effects_found' if effects else 'nothing_missing'
     nan = math.nan
     return {
-        'verdict': said,
+        'verdict': message,
         'setup': [],
         'remaining': {'floors': nan},
         'gap': {'before': nan, 'after': nan, 'floor': nan, 'heldout_after': nan},
@@ -259,9 +259,9 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
     sheet.rate('mistake of the set-up named, and nothing else', of, hits, THRESHOLDS['mistake_named'], 1.0, True)
     sound = [r for r in rows if r.kind in ('faultless', 'null', 'single', 'pair', 'spread', 'four', 'six')]
     # Coarse steps are both: an effect, and a line of the rig file that is wrong.
-    said = [[s['name'] for s in r.answer['setup'] if s['name'] != 'converter_step'] for r in sound]
-    sheet.failures += [f'{r.key}: set-up {", ".join(s)}' for r, s in zip(sound, said, strict=True) if s]
-    sheet.rate('mistake named where there is none', sound, [bool(s) for s in said], 0.0, 0.0, False)
+    message = [[s['name'] for s in r.answer['setup'] if s['name'] != 'converter_step'] for r in sound]
+    sheet.failures += [f'{r.key}: set-up {", ".join(s)}' for r, s in zip(sound, message, strict=True) if s]
+    sheet.rate('mistake named where there is none', sound, [bool(s) for s in message], 0.0, 0.0, False)
     odd = [r for r in rows if r.kind == 'faultless']
     alarm = [r.answer['verdict'] != 'nothing_missing' for r in odd]
     sheet.failures += [f'{r.key}: {_row_words(r)}' for r, wrong in zip(odd, alarm, strict=True) if wrong]
@@ -365,8 +365,8 @@ def _curve(rows: Sequence[Row]) -> list[str]:
 def _confusion(rows: Sequence[Row]) -> list[str]:
     table: dict[str, Counter[str]] = {}
     for r in rows:
-        said = r.named[0] if r.named else r.answer['verdict']
-        table.setdefault(r.truth[0]['name'], Counter())[said] += 1
+        message = r.named[0] if r.named else r.answer['verdict']
+        table.setdefault(r.truth[0]['name'], Counter())[message] += 1
     return [f'  {name:28s}' + ', '.join(f'{s} {n}' for s, n in table[name].most_common()) for name in sorted(table)]
 
 
@@ -384,7 +384,7 @@ def _both(row: Row) -> bool:
 
 def _row_words(row: Row) -> str:
     truth = ', '.join(t['name'] for t in row.truth) or 'nothing'
-    said = '; '.join('/'.join(sorted(s)) for s in row.sets) or 'no effect'
+    message = '; '.join('/'.join(sorted(s)) for s in row.sets) or 'no effect'
     gap = row.answer['gap']
     before, after = gap['before'] / gap['floor'], gap['after'] / gap['floor']
-    return f'truth {truth}; {row.answer["verdict"]}: {said}; gap {before:.2f} -> {after:.2f}'
+    return f'truth {truth}; {row.answer["verdict"]}: {message}; gap {before:.2f} -> {after:.2f}'

@@ -151,7 +151,7 @@ def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
     covariance = tuple((noise**2 * np.eye(3)).ravel().tolist())
     turns = rng.uniform(0.0, 2.0 * math.pi, 4)
     hold = HOLD_S * RATE // BLOCK
-    said: list[str] = []
+    message: list[str] = []
     at, seconds = 0, 0.0
     step_ns = BLOCK * 1_000_000
     while at * BLOCK < hours * 3600 * RATE:
@@ -177,12 +177,12 @@ def quiet(job: tuple[float, int]) -> tuple[float, int, list[str], float]:
                 watch.put(record)
             seconds += time.thread_time() - began
             if watch.alarms > before and watch.alarm is not None:
-                said.append(watch.alarm.words)
+                message.append(watch.alarm.words)
         at += len(clean)
-    return at * BLOCK / 3600.0 / RATE, watch.alarms, said, seconds / at
+    return at * BLOCK / 3600.0 / RATE, watch.alarms, message, seconds / at
 
 
-def table(runs: Sequence[Run], hours: float, alarms: int, said: Sequence[str], cost: float) -> tuple[str, bool]:
+def table(runs: Sequence[Run], hours: float, alarms: int, message: Sequence[str], cost: float) -> tuple[str, bool]:
     """What came out, as text, and whether it is what is wanted."""
     lines, met = [], alarms == 0
     for kind in dict.fromkeys(r.kind for r in runs):
@@ -197,7 +197,7 @@ def table(runs: Sequence[Run], hours: float, alarms: int, said: Sequence[str], c
         )
     if hours:
         lines.append(f'{hours:.2f} quiet hours: {alarms} alarms; {1e6 * cost:.1f} us a block')
-        lines += [f'    {words}' for words in said[:20]]
+        lines += [f'    {words}' for words in message[:20]]
     return '\n'.join(lines), met
 
 
@@ -212,12 +212,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parts = [(args.hours / args.jobs, args.first + i) for i in range(args.jobs)] if args.hours else []
     runs = list(over(watch_run, jobs, args.jobs, 'events'))
     hours, alarms, costs = 0.0, 0, list[float]()
-    said: list[str] = []
+    message: list[str] = []
     for done, count, words, cost in over(quiet, parts, args.jobs, 'quiet hours'):
         hours, alarms = hours + done, alarms + count
-        said += words
+        message += words
         costs.append(cost)
-    return conclude(*table(runs, hours, alarms, said, float(np.mean(costs)) if costs else 0.0))
+    return conclude(*table(runs, hours, alarms, message, float(np.mean(costs)) if costs else 0.0))
 
 
 if __name__ == '__main__':

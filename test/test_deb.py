@@ -65,9 +65,9 @@ def test_the_answers_of_rosdep_are_by_key_and_system(tmp_path: Path) -> None:
     }
 
 
-def test_what_bloom_warns_of_is_said_and_a_rejection_is_an_error(tmp_path: Path) -> None:
-    said = 'mkdir debian; touch debian/control; echo "No CHANGELOG.rst found"; echo fine'
-    path = program(tmp_path, 'bloom-generate', said)
+def test_what_bloom_warns_of_is_reported_and_a_rejection_is_an_error(tmp_path: Path) -> None:
+    message = 'mkdir debian; touch debian/control; echo "No CHANGELOG.rst found"; echo fine'
+    path = program(tmp_path, 'bloom-generate', message)
     env = {'PATH': f'{path / "bin"}:/usr/bin:/bin'}
     assert templates(tmp_path, env, 'ubuntu', 'noble') == ['No CHANGELOG.rst found']
     program(tmp_path, 'bloom-generate', "echo Could not resolve rosdep key \\'x\\' >&2; exit 1")

@@ -73,7 +73,7 @@ BOUNDED_BY = {
     'ros/node.py:_published': 'our own topics',
     'ros/wires.py:_publishers': 'our own topics',
     'ros/wires.py:_subscriptions': 'our own topics',
-    'run/alarm_out.py:_said': 'two ways, and alarms that wait',
+    'run/alarm_out.py:_logged': 'two ways, and alarms that wait',
     'run/alarm_out.py:_waiting': 'MOST_WAITING',
     'run/alarm_out.py:_ways': 'a command and an address',
     'run/chain.py:sessions': 'the links of the chain',

@@ -487,5 +487,5 @@ def test_every_study_takes_a_rig_of_three_psds_or_says_why_not(
         out = [] if name in ('budget', 'design', 'check', 'validate') else ['--out', str(tmp_path / name)]
         capsys.readouterr()
         code = main([name, *(a.format(three=three) for a in given), *out])
-        said = capsys.readouterr().err
-        assert code == 0 or (code in (3, 4) and ('PSDs' in said or 'reference' in said)), (name, code, said)
+        message = capsys.readouterr().err
+        assert code == 0 or (code in (3, 4) and ('PSDs' in message or 'reference' in message)), (name, code, message)

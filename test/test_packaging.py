@@ -183,8 +183,8 @@ def test_a_command_whose_extra_is_missing_says_so(capsys: pytest.CaptureFixture[
         for module in hidden:
             patch.setitem(sys.modules, module, None)
         assert main(['plot', str(ROOT / 'bags/clean'), '--out', str(tmp_path / 'plot.png')]) == 3
-    said = capsys.readouterr().err
-    assert "psd-deflection plot: matplotlib is not installed: `pip install 'psd_deflection[plot]'`" in said
+    message = capsys.readouterr().err
+    assert "psd-deflection plot: matplotlib is not installed: `pip install 'psd_deflection[plot]'`" in message
     assert not list(tmp_path.iterdir())
 
 

@@ -82,7 +82,7 @@ def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None
 
 
 @pytest.mark.parametrize(
-    ('sabotage', 'said'),
+    ('sabotage', 'message'),
     [
         (
             lambda root: change(root / 'package.xml', '<exec_depend>python3-yaml<', '<exec_depend>python-cobs-pip<'),
@@ -123,10 +123,10 @@ def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None
         'no entry', 'a key without a row', 'no key',
     ],
 )  # fmt: skip
-def test_what_a_release_must_not_have_is_said(
+def test_what_a_release_must_not_have_is_reported(
     tree: Path,
     sabotage: Callable[[Path], object],
-    said: str,
+    message: str,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -136,7 +136,7 @@ def test_what_a_release_must_not_have_is_said(
     sabotage(tree)
     assert main(['check'], tree) == 1
     found = [line for line in capsys.readouterr().out.splitlines() if line.startswith('PROBLEM: ')]
-    assert any(said in line for line in found), found
+    assert any(message in line for line in found), found
 
 
 def packed(wheel: Path, without: str = '\0') -> Path:
@@ -153,9 +153,9 @@ def packed(wheel: Path, without: str = '\0') -> Path:
 
 def test_a_wheel_without_the_page_is_noticed(tmp_path: Path) -> None:
     assert list(check_wheel(ROOT, packed(tmp_path / 'whole.whl'))) == []
-    said = list(check_wheel(ROOT, packed(tmp_path / 'bare.whl', '/page/vendor/')))
-    assert said
-    assert all('lacks psd_deflection/base/page/vendor/' in line for line in said)
+    message = list(check_wheel(ROOT, packed(tmp_path / 'bare.whl', '/page/vendor/')))
+    assert message
+    assert all('lacks psd_deflection/base/page/vendor/' in line for line in message)
 
 
 def test_a_check_of_a_wheel_without_the_page_fails(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -188,12 +188,12 @@ def test_a_copyleft_licence_among_what_is_installed_is_noticed(tmp_path: Path) -
     assert check_licences_of(python) == (['strict 1: GPL-3.0'], [])
 
 
-def test_what_was_not_tried_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_was_not_tried_is_reported(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(['check']) == 0
-    said = capsys.readouterr().out
-    assert 'not tried: what is built' in said
-    assert 'not tried: what only a release must have' in said
-    assert 'not tried: publishing' in said
+    message = capsys.readouterr().out
+    assert 'not tried: what is built' in message
+    assert 'not tried: what only a release must have' in message
+    assert 'not tried: publishing' in message
 
 
 def test_the_changelog_of_bloom_has_the_text_of_the_other(tree: Path) -> None:

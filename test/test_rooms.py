@@ -34,7 +34,7 @@ AS_IT_IS = {
 
 
 @pytest.mark.parametrize(
-    ('module', 'libraries', 'said'),
+    ('module', 'libraries', 'message'),
     [
         *(('measure.averaging', {name}, f'imports {name}, which no line') for name in FOREIGN),
         ('attic', set(), NO_ROOM),
@@ -44,9 +44,9 @@ AS_IT_IS = {
         ('run.session', {'math'}, 'run: threading is allowed, and nobody imports it'),
     ],
 )
-def test_what_no_line_allows_is_broken(module: str, libraries: set[str], said: str) -> None:
+def test_what_no_line_allows_is_broken(module: str, libraries: set[str], message: str) -> None:
     (line,) = broken_by(AS_IT_IS | {f'psd_deflection.{module}': libraries}, PURE, LINES)
-    assert said in line
+    assert message in line
 
 
 def test_what_the_lines_allow_is_kept() -> None:
@@ -68,15 +68,15 @@ def test_circles_are_found() -> None:
 
 
 def test_the_house_is_one_that_a_person_keeps_in_mind() -> None:
-    said = subprocess.run(
+    message = subprocess.run(
         [sys.executable, '-m', 'tools.rooms'], cwd=ROOT, capture_output=True, text=True, check=True
     ).stdout.splitlines()
-    rooms, files, lines, arrows = map(int, re.findall(r'\d+', said[-2]))
+    rooms, files, lines, arrows = map(int, re.findall(r'\d+', message[-2]))
     assert rooms <= 22
     assert arrows <= 150
     assert (files, lines) > (100, 10_000)
-    assert re.fullmatch(r'make targets: \d+; private names in test: \d+', said[-4])
-    assert said[-1] == 'circles of rooms: none; circles of modules: none'
+    assert re.fullmatch(r'make targets: \d+; private names in test: \d+', message[-4])
+    assert message[-1] == 'circles of rooms: none; circles of modules: none'
 
 
 def test_the_tests_lie_where_the_code_lies() -> None:

@@ -89,10 +89,10 @@ def templates(folder: Path, env: dict[str, str], system: str, version: str) -> l
     done = subprocess.run(
         words.split(), cwd=folder, env=env, stdin=none, stdout=pipe, stderr=pipe, text=True, check=False
     )
-    said = re.sub(r'\x1b\[\d*m', '', done.stdout + done.stderr)
+    message = re.sub(r'\x1b\[\d*m', '', done.stdout + done.stderr)
     if done.returncode or not (folder / 'debian/control').is_file():
-        raise RuntimeError(f'bloom refuses the package for {version}:\n{said}')
-    return [line for line in said.splitlines() if 'warn' in line.lower() or line.startswith('No CHANGELOG')]
+        raise RuntimeError(f'bloom refuses the package for {version}:\n{message}')
+    return [line for line in message.splitlines() if 'warn' in line.lower() or line.startswith('No CHANGELOG')]
 
 
 def inside(chroot: Path, script: str) -> list[str]:

@@ -67,7 +67,7 @@ def record(case: Case, folder: Path) -> Path:
     return path
 
 
-def said_live(path: Path) -> str:
+def reported_live(path: Path) -> str:
     """What the live page and ``/diagnostics`` say at the end of the recording, from a report that covers it all."""
     recording, rig = open_for_replay(path)
     pipeline, spectrum = Pipeline(rig), Spectrum(rig)
@@ -103,11 +103,11 @@ def answered(case: Case, folder: Path) -> str:
     """What the product says of the case."""
     path = record(case, folder)
     if case.study == 'live':
-        return said_live(path)
+        return reported_live(path)
     study = STUDIES[case.study]
     names = {'REC': str(path), 'OUT': str(folder / 'out')}
     answer = run([names.get(word, word) for word in study.command.split()])
-    lines = [line.strip() for found in re.findall(study.said, answer, re.M) for line in found.splitlines()]
+    lines = [line.strip() for found in re.findall(study.message, answer, re.M) for line in found.splitlines()]
     return '\n'.join(without_repeats(lines)).replace(f'{folder}/', '')
 
 
@@ -138,22 +138,22 @@ def picture(case: Case, folder: Path) -> bytes:
     return stream.getvalue()
 
 
-def section(case: Case, said: str) -> str:
+def section(case: Case, message: str) -> str:
     """The part of the page about one case."""
-    quoted = '\n'.join(f'    {line}' for line in said.splitlines())
+    quoted = '\n'.join(f'    {line}' for line in message.splitlines())
     parts = (f'### {case.title}', f'![Recording](figures/gallery/{case.name}.png)', quoted, case.do)
     return '\n\n'.join(filter(None, parts)) + '\n'
 
 
-def page(said: dict[str, str]) -> str:
-    """The whole page; ``said``: by the name of the case."""
+def page(message: dict[str, str]) -> str:
+    """The whole page; ``message``: by the name of the case."""
     parts = [
         '# Gallery\n\nA good rig and typical faults: the recording, the first lines of the output (… marks a cut), and '
         'the remedy. `make docs STEP=gallery` makes this page; the tests compare it.\n'
     ]
     for name, study in STUDIES.items():
         parts.append(f'## {study.title}\n\n{study.about}\n')
-        parts += [section(case, said[case.name]) for case in CASES if case.study == name and case.name in said]
+        parts += [section(case, message[case.name]) for case in CASES if case.study == name and case.name in message]
     parts.append('Where next: [troubleshooting](troubleshooting.md).\n')
     return '\n'.join(parts)
 
@@ -191,10 +191,10 @@ def _last_digit(found: re.Match[str]) -> float:
 def shown(case: Case, renew: bool) -> str:
     """What the product says of the case; ``renew``: its picture is drawn too."""
     with tempfile.TemporaryDirectory() as temporary:
-        said = answered(case, Path(temporary))
+        message = answered(case, Path(temporary))
         if renew:
             (FIGURES / f'{case.name}.png').write_bytes(picture(case, Path(temporary)))
-    return said
+    return message
 
 
 def main() -> int:
@@ -205,16 +205,16 @@ def main() -> int:
     args = parser.parse_args()
     cases = [case for case in CASES if args.only is None or args.only in case.name]
     FIGURES.mkdir(exist_ok=True)
-    said, before = {}, kept()
+    message, before = {}, kept()
     answers = over(partial(shown, renew=not args.check), cases, args.jobs, 'cases')
     for case, answer in zip(cases, answers, strict=True):
-        said[case.name] = answer
-    differ = [name for name, answer in said.items() if not same(answer, before.get(name, ''))]
+        message[case.name] = answer
+    differ = [name for name, answer in message.items() if not same(answer, before.get(name, ''))]
     if not args.check:
-        PAGE.write_text(page(kept() | said))
+        PAGE.write_text(page(kept() | message))
         for left in set(FIGURES.glob('*.png')) - {FIGURES / f'{case.name}.png' for case in CASES}:
             left.unlink()
-    text = '\n\n'.join(f'{name}\n{said[name]}' for name in differ)
+    text = '\n\n'.join(f'{name}\n{message[name]}' for name in differ)
     return conclude(text or 'every case says what the page has', met=not (args.check and differ))
 
 

@@ -23,13 +23,13 @@ DOTS = ('x1', 'y1', 'x2', 'y2')
 class Study(NamedTuple):
     """One part of the page. ``command``: REC and OUT stand for the recording and a folder; '' for the live page.
 
-    ``said``: what of its answer a person reads first: a pattern of lines, all of which are taken.
+    ``message``: what of its answer a person reads first: a pattern of lines, all of which are taken.
     """
 
     title: str
     about: str
     command: str
-    said: str = '.+'
+    message: str = '.+'
 
 
 class Case(NamedTuple):

@@ -150,10 +150,10 @@ def warm(python: str, folder: Path, tier: str, tests: Sequence[str]) -> Iterator
         into, answers = process.stdin, process.stdout
 
         def answer() -> bool:
-            said = answers.readline()
-            if not said:
+            message = answers.readline()
+            if not message:
                 raise RuntimeError('the process that runs the tests ended')
-            return said == '1\n'
+            return message == '1\n'
 
         def passed(file: str, first: int) -> bool:
             into.write(f'{file} {first}\n')

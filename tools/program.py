@@ -54,7 +54,7 @@ class Program:
             env={**os.environ, 'PYTHONUNBUFFERED': '1', **(env or {})},
         )
         os.close(theirs)
-        self._said = b''
+        self._output = b''
         self._ended = False
         self._new = threading.Condition()
         self._thread = threading.Thread(target=self._read, daemon=True)
@@ -68,7 +68,7 @@ class Program:
                 # A terminal whose last program has ended reads as an error, a pipe as nothing.
                 new = b''
             with self._new:
-                self._said += new
+                self._output += new
                 self._ended = not new
                 self._new.notify_all()
             if not new:
@@ -78,7 +78,7 @@ class Program:
     @property
     def text(self) -> str:
         """All output so far."""
-        return self._said.decode(errors='replace')
+        return self._output.decode(errors='replace')
 
     @property
     def lines(self) -> list[str]:

@@ -258,9 +258,9 @@ print(json.dumps(rows))
 
 def check_licences_of(python: Path) -> tuple[list[str], list[str]]:
     """(problems, notes) of all distributions of an environment: copyleft of the strong kind is a problem."""
-    said = subprocess.run([python, '-c', LIST_LICENCES], capture_output=True, text=True, check=True).stdout
+    message = subprocess.run([python, '-c', LIST_LICENCES], capture_output=True, text=True, check=True).stdout
     problems, silent = [], []
-    for name, version, words, has_file in json.loads(said):
+    for name, version, words, has_file in json.loads(message):
         if COPYLEFT.search(words) and 'LGPL' not in words and 'Lesser' not in words and ' OR ' not in words:
             problems.append(f'{name} {version}: {words}')
         elif not words and not has_file:
@@ -290,27 +290,27 @@ def check_built(root: Path, dist: Path, installed: Path, tools: Path) -> tuple[l
         ('python', ['-c', RENDER]),
     )
     for judge, words in judges:
-        status, said = _tool([tools / 'bin' / judge, *words], root)
+        status, message = _tool([tools / 'bin' / judge, *words], root)
         if status:
-            problems.append(f'{judge}: {said}')
+            problems.append(f'{judge}: {message}')
     python = installed / 'bin/python'
     found, silent = check_licences_of(python)
     problems += found
     if silent:
         left.append('licences that no metadata states: ' + ', '.join(silent))
     bom = dist.parent / 'build/release/sbom.cdx.json'
-    status, said = _tool(
+    status, message = _tool(
         [tools / 'bin/cyclonedx-py', 'environment', python, '--of', 'JSON', '-o', bom],
         root,
     )
     if status or not json.loads(bom.read_text()).get('components'):
-        problems.append(f'cyclonedx-py: {said or "an empty SBOM"}')
-    status, said = _tool([tools / 'bin/pip-audit', '--path', _site(python), '--progress-spinner', 'off'], root)
+        problems.append(f'cyclonedx-py: {message or "an empty SBOM"}')
+    status, message = _tool([tools / 'bin/pip-audit', '--path', _site(python), '--progress-spinner', 'off'], root)
     # It ends with 1 for what it finds, and also if it reaches no database.
-    if 'Found' in said and 'vulnerabilit' in said:
-        problems.append(f'pip-audit: {said}')
-    elif status or 'Skip Reason' in said:
-        left.append('pip-audit: not every package was found in its database: ' + said.splitlines()[-1])
+    if 'Found' in message and 'vulnerabilit' in message:
+        problems.append(f'pip-audit: {message}')
+    elif status or 'Skip Reason' in message:
+        left.append('pip-audit: not every package was found in its database: ' + message.splitlines()[-1])
     return problems, left
 
 

@@ -98,8 +98,8 @@ def resolved(env: dict[str, str], tools: Path, keys: list[str]) -> dict[str, dic
     for version, (system, ros) in SYSTEMS.items():
         command = [str(tools / 'bin/python'), '-c', LOOK_UP, system, version, *keys]
         here = {**env, 'ROS_DISTRO': ros}
-        said = subprocess.run(command, env=here, check=True, capture_output=True, text=True).stdout
-        for key, how in json.loads(said.splitlines()[-1]).items():
+        message = subprocess.run(command, env=here, check=True, capture_output=True, text=True).stdout
+        for key, how in json.loads(message.splitlines()[-1]).items():
             rows[key][version] = how
     return rows
 
@@ -107,10 +107,10 @@ def resolved(env: dict[str, str], tools: Path, keys: list[str]) -> dict[str, dic
 def differences(table: dict[str, dict[str, str]], found: dict[str, dict[str, str]]) -> list[str]:
     """Where the table says otherwise than rosdep."""
     return [
-        f'packaging/rosdep_keys.csv: {key} on {version} is {said}, rosdep says {found[key][version]}'
+        f'packaging/rosdep_keys.csv: {key} on {version} is {message}, rosdep says {found[key][version]}'
         for key, row in table.items()
-        for version, said in row.items()
-        if found[key][version] != said
+        for version, message in row.items()
+        if found[key][version] != message
     ]
 
 

@@ -96,9 +96,11 @@ def main() -> int:
                 raise SystemExit(f'the page: {text(driver, "state")}')
             for choice in HIDDEN:
                 hidden = answered(driver, choice)
-                said = text(driver, 'answer')
-                failures += wrong(hidden, said)
-                print(f'{hidden}: {said.splitlines()[0]}\n{text(driver, "steps")}\n{text(driver, "state")}', flush=True)
+                message = text(driver, 'answer')
+                failures += wrong(hidden, message)
+                print(
+                    f'{hidden}: {message.splitlines()[0]}\n{text(driver, "steps")}\n{text(driver, "state")}', flush=True
+                )
                 if choice != HIDDEN[0]:
                     continue
                 if args.picture is not None:

@@ -39,7 +39,7 @@ class Found(NamedTuple):
     """One run: seconds, what was printed, the bytes of the Parquet file."""
 
     seconds: float
-    said: str
+    message: str
     rows: bytes
 
 
@@ -60,14 +60,14 @@ def make(folder: Path, recordings: int, seconds: float) -> None:
 
 def replayed(folder: Path, out: Path, executor: str) -> Found:
     """All of them, by the command."""
-    said = io.StringIO()
+    message = io.StringIO()
     began = time.perf_counter()
     words = ['replay', f'{folder}/**/*.mcap', '--compare', '--json', '--executor', executor, '--out', str(out)]
-    with contextlib.redirect_stdout(said):
+    with contextlib.redirect_stdout(message):
         status = psd_deflection(words)
     if status != 0:
         raise SystemExit(f'replay on {executor}: status {status}')
-    return Found(time.perf_counter() - began, said.getvalue(), out.read_bytes())
+    return Found(time.perf_counter() - began, message.getvalue(), out.read_bytes())
 
 
 @contextlib.contextmanager
@@ -139,7 +139,9 @@ def campaign(folder: Path, recordings: int, seconds: float, kills: int, one: boo
         finally:
             killer.end()
     wrong = [f'{what}: the rows differ from the serial ones' for what, run in runs.items() if run.rows != serial.rows]
-    wrong += [f'{what}: other lines than in the serial run' for what, run in runs.items() if run.said != serial.said]
+    wrong += [
+        f'{what}: other lines than in the serial run' for what, run in runs.items() if run.message != serial.message
+    ]
     if len(killer.killed) != kills:
         wrong.append(f'{len(killer.killed)} workers were killed, not {kills}')
     lines = [f'{recordings} recordings of {seconds:g} s, {len(serial.rows) / 1e6:.1f} MB of estimates']
@@ -164,8 +166,8 @@ def main() -> int:
     parser.add_argument('--only-killed', action='store_true', help='only the run whose workers are killed')
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        said, wrong = campaign(Path(folder), args.recordings, args.seconds, args.kills, not args.only_killed)
-    return conclude('\n'.join([said, *wrong]), not wrong)
+        message, wrong = campaign(Path(folder), args.recordings, args.seconds, args.kills, not args.only_killed)
+    return conclude('\n'.join([message, *wrong]), not wrong)
 
 
 if __name__ == '__main__':

@@ -169,9 +169,9 @@ def parameters_target() -> tuple[Target, list[bytes]]:
     nominal = load_rig()
 
     def load_zero(path: Path) -> None:
-        _, said, _ = ZeroStore(load_rig(None, {'zero_file': str(path)}), 'A').load(nominal)
-        if '\n' in said:
-            raise AssertionError(f'more than one line: {said!r}')
+        _, message, _ = ZeroStore(load_rig(None, {'zero_file': str(path)}), 'A').load(nominal)
+        if '\n' in message:
+            raise AssertionError(f'more than one line: {message!r}')
 
     return _file_target('.yaml', load_rig, load_zero), [
         (ROOT / 'config' / 'thesis_rig.yaml').read_bytes(),
@@ -339,7 +339,7 @@ def yaml_target() -> tuple[Target, list[bytes]]:
     names = [*BY_NAME]
     tags = ('', '!!int ', '!!float ', '!!bool ', '!!timestamp ', '!!binary ', '!!set ', '!!python/name:os.system ')
 
-    def said(choices: Choices, depth: int, anchors: list[str]) -> str:
+    def message(choices: Choices, depth: int, anchors: list[str]) -> str:
         kind = choices.below(10)
         if anchors and kind == 0:
             return '*' + anchors[choices.below(len(anchors))]
@@ -348,17 +348,17 @@ def yaml_target() -> tuple[Target, list[bytes]]:
             anchors.append(f'a{len(anchors)}')
             anchor = f'&{anchors[-1]} '
         if depth < 8 and kind in (2, 3):
-            return anchor + '[' + ', '.join(said(choices, depth + 1, anchors) for _ in range(choices.below(8))) + ']'
+            return anchor + '[' + ', '.join(message(choices, depth + 1, anchors) for _ in range(choices.below(8))) + ']'
         if depth < 8 and kind in (4, 5):
             keys = (names[choices.below(len(names))] if choices.below(3) else '<<' for _ in range(choices.below(8)))
-            return anchor + '{' + ', '.join(f'{k}: {said(choices, depth + 1, anchors)}' for k in keys) + '}'
+            return anchor + '{' + ', '.join(f'{k}: {message(choices, depth + 1, anchors)}' for k in keys) + '}'
         return anchor + tags[choices.below(len(tags))] + json.dumps(choices.value(4))
 
     folder = Path(tempfile.mkdtemp(dir='/dev/shm' if Path('/dev/shm').is_dir() else None))
 
     @timed()
     def target(content: bytes) -> list[str]:
-        text = said(Choices(content), 0, [])
+        text = message(Choices(content), 0, [])
         rejected = []
         for head, read in (('/**: {ros__parameters: ', load_rig), ('rosbag2_bagfile_information: ', read_information)):
             path = folder / 'input.yaml'

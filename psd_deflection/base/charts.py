@@ -159,8 +159,8 @@ def drawn(chart: Chart) -> str:
     notes: dict[str, None] = {}
     panels = []
     for panel, rules in zip(chart.panels, chart.rules(), strict=True):
-        series, said = thinned(panel.curves)
-        notes |= dict.fromkeys(said)
+        series, message = thinned(panel.curves)
+        notes |= dict.fromkeys(message)
         panels.append(
             {
                 'series': [_reported(one, columns) for one in series],
@@ -212,18 +212,18 @@ def _reported(series: Series, columns: dict[str, int]) -> dict[str, Any]:
 def thinned(series: Sequence[Series]) -> tuple[list[Series], Iterable[str]]:
     """What of ``series`` can be seen, and what was done, in words. Curves over the same x stay so."""
     kept: dict[bytes, npt.NDArray[np.intp]] = {}
-    said: dict[str, None] = {}
+    message: dict[str, None] = {}
     for key, group in _by_x(series).items():
         x, rows = group[0].x, [one.y for one in group]
         if len(x) <= 2 * BUCKETS:
             kept[key] = np.arange(len(x))
         elif np.all(np.diff(x) >= 0.0) and len(np.unique(x)) > len(x) // 2:
             kept[key] = _extremes(rows)
-            said[f'of every {len(x) / BUCKETS:.3g} points the least and the largest are drawn'] = None
+            message[f'of every {len(x) / BUCKETS:.3g} points the least and the largest are drawn'] = None
         else:
             kept[key] = _apart(x, rows)
-            said[f'{len(kept[key])} of {len(x)} points are drawn'] = None
-    return [_of(one, kept[_key(one)]) for one in series], said
+            message[f'{len(kept[key])} of {len(x)} points are drawn'] = None
+    return [_of(one, kept[_key(one)]) for one in series], message
 
 
 def _key(one: Series) -> bytes:

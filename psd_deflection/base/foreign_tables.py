@@ -320,9 +320,9 @@ def why_rate(path: PurePath, column: int, rate: float, first_s: float) -> str:
     begin = ''
     if 'days' in fits and EXCEL_DAYS[0] < first_s < EXCEL_DAYS[1]:
         fits, begin = {"Excel's days": fits['days']}, f' - {int(first_s)}'
-    said = ' or '.join(
+    message = ' or '.join(
         f'{unit}: {rate * scale:.1f}/s if {"divided" if scale > 1 else "multiplied"} by {max(scale, 1 / scale):.0f}: '
         f'`{awk_line(path, column, f"({{}}{begin})" + (f" / {scale:.0f}" if scale > 1 else f" * {1 / scale:.0f}"))}`'
         for unit, scale in fits.items()
     )
-    return f't looks like {said}; {seconds}'
+    return f't looks like {message}; {seconds}'

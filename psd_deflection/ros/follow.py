@@ -170,7 +170,7 @@ class Follower:
         while self._waiting and self._asked is None:
             goal = self._waiting.popleft()
             if goal.stopped is not None:
-                self._end(goal, GoalStatus.STATUS_CANCELED, self._said('cancelled before it was sent', 'SUCCESSFUL'))
+                self._end(goal, GoalStatus.STATUS_CANCELED, self._reply('cancelled before it was sent', 'SUCCESSFUL'))
             elif not goal.ended and not self._send(goal):
                 self._waiting.appendleft(goal)
                 return
@@ -296,14 +296,14 @@ class Follower:
         self._cancel(goal)
         self._abort(goal, why)
 
-    def _said(self, why: str, code: str) -> Any:
+    def _reply(self, why: str, code: str) -> Any:
         return self._result(error_code=getattr(self._result, code), error_string=why)
 
     def _abort(self, goal: _Goal, why: str, code: str = INVALID) -> None:
         if not goal.ended:
             gate = self._owner.gate
             gate.reject(FOLLOW, why)
-            self._end(goal, GoalStatus.STATUS_ABORTED, self._said(gate.why[FOLLOW], code))
+            self._end(goal, GoalStatus.STATUS_ABORTED, self._reply(gate.why[FOLLOW], code))
 
     def _end(self, goal: _Goal, status: int, result: Any) -> None:
         if goal.ended:

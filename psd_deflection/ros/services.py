@@ -59,9 +59,9 @@ def add_rig_services(
                 response.message = str(error)
                 return response
             verb = 'recording to' if request.data else 'recording ended:'
-            said = ', '.join(str(folder) for folder in folders if folder is not None)
+            message = ', '.join(str(folder) for folder in folders if folder is not None)
             response.success = True
-            response.message = f'{verb} {said}' if said else 'no recording runs'
+            response.message = f'{verb} {message}' if message else 'no recording runs'
         return response
 
     node.create_service(Trigger, ZERO, answer_zero)

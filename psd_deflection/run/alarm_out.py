@@ -75,7 +75,7 @@ class AlarmOut:
         self.failure = ''
         self._log, self._about = log, dict(about or {})
         self._ways: list[tuple[str, Callable[[bytes], None]]] = []
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
         if command:
             argv = _argv(command)
             self._ways.append((f'command {argv[0]}', lambda text: _run(argv, text)))
@@ -124,13 +124,13 @@ class AlarmOut:
                     self._fail(name, str(error))
                 else:
                     self.sent += 1
-                    self._said.discard(name)
+                    self._logged.discard(name)
 
     def _fail(self, name: str, why: str) -> None:
         self.failed += 1
         self.failure = f'{name}: {why}'
-        if name not in self._said:
-            self._said.add(name)
+        if name not in self._logged:
+            self._logged.add(name)
             self._log(f'watch: {name}: {why}; an alarm was not handed on, and further ones are counted', WARNING)
 
 

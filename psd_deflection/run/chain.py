@@ -106,7 +106,7 @@ class ChainSession:
                 for name, rig in zip(file.names, file.rigs, strict=True):
                     # Nobody notes loads to a chain.
                     moving = replace_values(rig, {'demo': True}) if simulates(rig.values) else rig
-                    self.sessions.append(open_session(name, moving, partial(self._said, name)))
+                    self.sessions.append(open_session(name, moving, partial(self._log_of, name)))
         except BaseException:
             self.close()
             raise
@@ -115,7 +115,7 @@ class ChainSession:
             session.acquisition.to_ros_ns = self.sessions[0].acquisition.to_ros_ns
             session.processing.sinks.append(_LinkSink(self, link))
 
-    def _said(self, name: str, line: str, level: int = INFO, /) -> None:
+    def _log_of(self, name: str, line: str, level: int = INFO, /) -> None:
         self._log(f'{name}: {line}', level)
 
     @property

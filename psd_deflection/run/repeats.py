@@ -23,7 +23,7 @@ class _Reason:
     line: str = ''
     level: int = INFO
     since: int = 0
-    said_s: float = 0.0
+    reported_s: float = 0.0
     next_s: float = 0.0
     wait_s: float = FIRST_WAIT_S
 
@@ -69,19 +69,19 @@ class RateLimitedLog:
         if news:
             # Those that are said at once make none wait longer.
             reason.wait_s = FIRST_WAIT_S
-        self._said(reason, line + more, now_s)
+        self._write(reason, line + more, now_s)
 
     def settle(self, now_s: float) -> None:
         """Say what was counted and is due: it was so, and may not be so any more."""
         for known in self._kinds.values():
             for reason in known.reasons.values():
                 if reason.since and now_s >= reason.next_s:
-                    ago = f'in the last {now_s - reason.said_s:.0f} s'
-                    self._said(reason, f'{reason.since} more {ago}: {reason.line}', now_s)
+                    ago = f'in the last {now_s - reason.reported_s:.0f} s'
+                    self._write(reason, f'{reason.since} more {ago}: {reason.line}', now_s)
 
-    def _said(self, reason: _Reason, line: str, now_s: float) -> None:
+    def _write(self, reason: _Reason, line: str, now_s: float) -> None:
         self._log(line, reason.level)
-        reason.since, reason.said_s = 0, now_s
+        reason.since, reason.reported_s = 0, now_s
         reason.next_s = now_s + reason.wait_s
         reason.wait_s = min(2.0 * reason.wait_s, LONGEST_WAIT_S)
 

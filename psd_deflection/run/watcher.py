@@ -83,7 +83,7 @@ class Watcher:
         self._segments: deque[_Segment] = deque()
         self._last_ns = 0
         self._due_ns: int | None = None
-        self._said = 0
+        self._logged = 0
         self._writing: threading.Thread | None = None
 
     @property
@@ -101,8 +101,8 @@ class Watcher:
         if not isinstance(record, SampleBlock):
             return
         t_ns = int(record.t_ns[-1])
-        if self.watch.alarms > self._said and self.watch.alarm is not None:
-            self._said = self.watch.alarms
+        if self.watch.alarms > self._logged and self.watch.alarm is not None:
+            self._logged = self.watch.alarms
             self._log(f'watch: since {_clock(self.watch.alarm.since_ns)}: {self.watch.alarm.words}', WARNING)
             self._out.put(self.watch.alarm)
             if self._parent is not None and self._due_ns is None:

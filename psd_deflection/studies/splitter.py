@@ -88,7 +88,7 @@ class LightPhase(NamedTuple):
 
     ``estimates``: share of blocks with one; ``status`` of most blocks; ``deviations`` (3,): stated, m, m, rad;
     ``off``, ``scatter`` (3,): mean and standard deviation of the errors, m, m, rad; ``largest``: largest error about
-    their mean, in stated deviations (0 without estimates); ``said``: the finding, or ''.
+    their mean, in stated deviations (0 without estimates); ``message``: the finding, or ''.
     """
 
     name: str
@@ -98,7 +98,7 @@ class LightPhase(NamedTuple):
     off: FloatArray
     scatter: FloatArray
     largest: float
-    said: str
+    message: str
 
 
 def rules(rig: Rig, lasers: Lasers) -> list[SplitterRule]:

@@ -102,7 +102,7 @@ def test_a_bomb_is_rejected_before_it_is_built(tmp_path: Path, text: str) -> Non
 
 
 @pytest.mark.parametrize(
-    ('body', 'said'),
+    ('body', 'message'),
     [
         ('    baud: 9600\n    port: x\n    baud: 115200\n', r'mine\.yaml:5:5: baud is there twice, in lines 3 and 5'),
         ('    link: {length: 1.0, length: 2.0}\n', r'mine\.yaml:3:25: length is there twice, in lines 3 and 3'),
@@ -112,10 +112,10 @@ def test_a_bomb_is_rejected_before_it_is_built(tmp_path: Path, text: str) -> Non
         ),
     ],
 )
-def test_a_key_that_is_there_twice_is_rejected_with_its_lines(tmp_path: Path, body: str, said: str) -> None:
+def test_a_key_that_is_there_twice_is_rejected_with_its_lines(tmp_path: Path, body: str, message: str) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text('/**:\n  ros__parameters:\n' + body)
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         load_rig(path)
 
 

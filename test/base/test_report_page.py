@@ -82,15 +82,15 @@ def values(page: Page) -> dict[str, str]:
 def test_every_plot_says_its_values_under_one_cursor(page: Page) -> None:
     move(page, 'c0p0', 0.252)
     page.until(f'{KEYS}[0].querySelector("output").textContent !== ""')
-    said = values(page)
+    message = values(page)
     at = float(page.js('document.querySelector("output.at[data-plot=c0p0]").textContent').removesuffix(' s'))
     assert 22 <= at <= 28
-    assert float(said['c0p0 before']) == 2 * at
-    assert float(said['c0p0 after']) == -at
-    assert float(said['c0p1 before']) == at**2
-    assert float(said['c0p1 after']) == at
+    assert float(message['c0p0 before']) == 2 * at
+    assert float(message['c0p0 after']) == -at
+    assert float(message['c0p1 before']) == at**2
+    assert float(message['c0p1 after']) == at
     # Another axis has a cursor of its own.
-    assert said['c1p0 missing'] == ''
+    assert message['c1p0 missing'] == ''
 
 
 def test_in_a_gap_there_is_no_value(page: Page) -> None:

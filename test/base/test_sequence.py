@@ -117,9 +117,11 @@ class Recorded:
     """Numbers of a recording in blocks of 20; times in ms."""
 
     def __init__(self, seq: list[int], ms: list[float]) -> None:
-        self.said: list[str] = []
+        self.message: list[str] = []
         self.restarts: list[tuple[int, int]] = []
-        self._sequence = RecordedSequence(20, self.said.append, lambda last, first: self.restarts.append((last, first)))
+        self._sequence = RecordedSequence(
+            20, self.message.append, lambda last, first: self.restarts.append((last, first))
+        )
         assert self.extended(seq, ms) == seq
 
     def extended(self, seq: list[int], ms: list[float], whole: bool = False) -> list[int]:
@@ -148,7 +150,7 @@ def test_a_recording_goes_on_if_neither_number_nor_time_goes_back() -> None:
 def test_a_time_that_goes_back_is_reported_and_the_last_time_counts() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     assert of.extended([8, 9, 10], [6.5, 8.0, 9.0]) == [8, 9, 10]
-    assert of.said == ['time goes back to 6500000 ns']
+    assert of.message == ['time goes back to 6500000 ns']
     assert not of.follows([11], [8.5])
     assert of.follows([11], [9.5])
 
@@ -167,28 +169,28 @@ def test_a_recorded_number_has_wrapped_if_20_khz_gives_as_many_samples() -> None
     last, most = 4_000_000_000, 1_000_001_000
     of = Recorded([last], [0.0])
     assert of.extended([(last + most) % WRAP], [5e7]) == [last + most]
-    assert (of.said, of.restarts) == ([], [])
+    assert (of.message, of.restarts) == ([], [])
     of = Recorded([last], [0.0])
     number = (last + most + 1) % WRAP
     # 4 10^9 is the first of a block: the next block begins 20 later.
     first = last + 20 + number % 20
     assert of.extended([number], [5e7]) == [first]
-    assert (of.said, of.restarts) == (['sample numbers start again after 4000000000'], [(last, first)])
+    assert (of.message, of.restarts) == (['sample numbers start again after 4000000000'], [(last, first)])
 
 
 def test_the_last_number_once_more_is_a_restart_of_a_recording() -> None:
     of = Recorded([5, 6, 7], [5.0, 6.0, 7.0])
     assert of.extended([7, 8], [8.0, 9.0]) == [27, 28]
-    assert (of.said, of.restarts) == (['sample numbers start again after 7'], [(7, 27)])
+    assert (of.message, of.restarts) == (['sample numbers start again after 7'], [(7, 27)])
 
 
 def test_the_number_after_the_last_of_32_bits_is_0_and_goes_on() -> None:
     of = Recorded([WRAP - 1], [0.0])
-    assert of.said == []
+    assert of.message == []
     assert of.extended([0], [1.0]) == [WRAP]
     assert of.follows([1], [2.0])
     assert of.extended([1, 2], [2.0, 3.0]) == [WRAP + 1, WRAP + 2]
-    assert (of.said, of.restarts) == ([], [])
+    assert (of.message, of.restarts) == ([], [])
 
 
 def test_whole_numbers_that_go_back_within_a_message_are_rejected() -> None:

@@ -29,12 +29,12 @@ def test_ratios_and_bounds_are_those_of_peers_and_limits() -> None:
 
 def test_a_row_in_which_outside_load_shows_is_not_judged() -> None:
     steady, torn = figure('mine', 'ours', [1.0, 1.1, 0.9]), figure('least', 'limit', [1.0, 1.0, 1.6], 0.5)
-    said = 'not judged: quartiles 30 % apart, load from outside'
-    assert Row('work', 's', [steady, torn]).verdict(torn) == said
-    assert page.lines_of(Row('work', 's', [steady, torn]))[0].endswith(f': {said}) |')
+    message = 'not judged: quartiles 30 % apart, load from outside'
+    assert Row('work', 's', [steady, torn]).verdict(torn) == message
+    assert page.lines_of(Row('work', 's', [steady, torn]))[0].endswith(f': {message}) |')
     once = figure('least', 'limit', [1.0], 0.5)
     assert Row('work', 's', [steady, once]).verdict(once) == 'not met'
-    assert Row('work', 's', [figure('mine', 'ours', [1.0, 1.0, 1.6]), once]).verdict(once) == said
+    assert Row('work', 's', [figure('mine', 'ours', [1.0, 1.0, 1.6]), once]).verdict(once) == message
     assert Row('work', 's', [steady, figure('least', 'limit', [1.0])]).verdict(figure('least', 'limit', [1.0])) == ''
 
 

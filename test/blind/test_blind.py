@@ -195,7 +195,7 @@ def test_right_loads_beside_a_sticking_clamp_stay() -> None:
     assert (found['setup'], found['unknown']) == ([], [])
 
 
-def test_what_is_left_unsaid_fails_the_suite() -> None:
+def test_what_is_left_unreported_fails_the_suite() -> None:
     gap = {'before': 4.0, 'after': 2.0, 'floor': 1.0, 'heldout_after': 1.0}
     answer = {'verdict': 'effects_found', 'effects': [], 'unknown': [], 'setup': [], 'gap': gap}
     for floors, failures in ((1.4, 0), (1.6, 1)):
@@ -233,8 +233,8 @@ def test_a_peer_answers_the_same_cases(peer: str) -> None:
 def test_no_answer_is_taken_for_that_of_another_tool(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / 'answers').mkdir()
     (tmp_path / 'answers' / 'null-s0.json').write_text(json.dumps({'effects': [{'name': 'creep'}]}))
-    said = {'effects': [], 'remaining': {'floors': 1.0}}
-    monkeypatch.setattr(suite_peers, 'answer', lambda *given: said if given[0] == 'subsets' else {})
+    message = {'effects': [], 'remaining': {'floors': 1.0}}
+    monkeypatch.setattr(suite_peers, 'answer', lambda *given: message if given[0] == 'subsets' else {})
     run.main(['--short', '--only', 'null-s0', '--peer', 'subsets', '--out', str(tmp_path)])
     assert json.loads((tmp_path / 'answers-subsets' / 'null-s0.json').read_text())['effects'] == []
     assert 'false alarm, right noise: 0.0 % (0/1' in (tmp_path / 'summary-subsets.txt').read_text()

@@ -55,7 +55,7 @@ RIGHT = {
 
 
 @pytest.mark.parametrize(
-    ('changed', 'said'),
+    ('changed', 'message'),
     [
         ({}, []),
         ({'effects': []}, ['effects: []']),
@@ -66,9 +66,11 @@ RIGHT = {
         ),
     ],
 )
-def test_an_answer_is_right_if_angle_and_times_are(tmp_path: Path, changed: dict[str, object], said: list[str]) -> None:
+def test_an_answer_is_right_if_angle_and_times_are(
+    tmp_path: Path, changed: dict[str, object], message: list[str]
+) -> None:
     (tmp_path / 'result.json').write_text(json.dumps({**RIGHT, **changed}))
-    assert day.judged(tmp_path, 0.02, LATE) == said
+    assert day.judged(tmp_path, 0.02, LATE) == message
     if not changed:
         (wrong,) = day.judged(tmp_path, 0.021, LATE)
         assert wrong.startswith('angle')

@@ -45,11 +45,11 @@ def test_a_case_as_files_is_what_discover_was_given(folder: Path) -> None:
 def test_the_score_takes_an_answer_of_any_tool(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     answers = folder / 'answers'
     answers.mkdir()
-    said = {'setup': [{'name': 'sensitivity', 'where': 'amplifier.sensitivity', 'value': 0.5}]}
-    (answers / f'{CASE.key}.json').write_text(json.dumps(said))
+    message = {'setup': [{'name': 'sensitivity', 'where': 'amplifier.sensitivity', 'value': 0.5}]}
+    (answers / f'{CASE.key}.json').write_text(json.dumps(message))
     assert run.main(['--score', '--out', str(folder)]) == 0
     assert 'ok    mistake of the set-up named, and nothing else: 100.0 % (1/1;' in capsys.readouterr().out
-    (answers / f'{CASE.key}.json').write_text(json.dumps({**said, 'effects': [{'name': 'sensor_gain'}]}))
+    (answers / f'{CASE.key}.json').write_text(json.dumps({**message, 'effects': [{'name': 'sensor_gain'}]}))
     assert run.main(['--score', '--out', str(folder)]) == 1
     shown = capsys.readouterr().out
     assert 'MISS  mistake of the set-up named, and nothing else: 0.0 % (0/1;' in shown

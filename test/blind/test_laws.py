@@ -47,9 +47,9 @@ def test_a_law_has_the_gap_it_says() -> None:
 
 def reported(**law: Any) -> dict[str, Any]:
     whole = {'stage': 'psd', 'variables': ['x1'], 'kind': 'static', 'expression': '', 'heldout_after': 2.2e-7}
-    said = {**whole, 'equivalent': [], **law}
+    message = {**whole, 'equivalent': [], **law}
     gap = {'floor': 2e-7, 'heldout_after': 1e-6}
-    return {'verdict': 'unknown_effect', 'effects': [], 'setup': [], 'unknown': [{'law': said}], 'gap': gap}
+    return {'verdict': 'unknown_effect', 'effects': [], 'setup': [], 'unknown': [{'law': message}], 'gap': gap}
 
 
 def test_an_answer_is_right_if_the_law_or_one_that_ties_is() -> None:
@@ -84,8 +84,8 @@ def test_a_dot_that_jumps_may_be_reported_as_jumps_of_its_detector() -> None:
         [found[0], {**found[1], 'where': 'psd_1'}],
         [found[0], {**found[1], 'value': 5.3}],
     ]
-    for said in wrong:
-        row = judged(truth, {**nothing, 'setup': said})
+    for message in wrong:
+        row = judged(truth, {**nothing, 'setup': message})
         assert (row['stage'], row['variables'], row['jumps']) == (False, False, False)
     for other in ({'where': 'load_fx'}, {'form': 'gain_events'}):
         assert not judged({**truth, **other}, {**nothing, 'setup': found})['jumps']
@@ -100,18 +100,18 @@ def test_a_law_that_acts_under_one_load_only_may_be_reported_as_another_load() -
     assert (row['stage'], row['variables'], row['stage_alone'], row['note']) == (True, True, False, True)
     # Under forces along y it acts at five of the noted loads.
     several = {**truth, 'of': ['load_fy'], 'where': 'load_fx', 'at': 0.1, 'sign': -1.0}
-    for law, said in (
+    for law, message in (
         (truth, []),
         (truth, found * 2),
         (truth, [{**found[0], 'where': 'load 7'}]),
         (several, found),
     ):
-        row = judged(law, {**nothing, 'setup': said})
+        row = judged(law, {**nothing, 'setup': message})
         assert (row['stage'], row['note']) == (False, False)
     assert not judged(truth, {**reported(stage='psd'), 'setup': found})['note']
 
 
-def test_a_threshold_that_is_missed_is_said() -> None:
+def test_a_threshold_that_is_missed_is_reported() -> None:
     truth = {**law_forms.draw(1, 'psd', 'cube'), 'of': ['x1'], 'gap': 9.0}
     good = {**judged(truth, reported()), 'seconds': 1.0}
     assert summary([good] * 10) == (summary([good] * 10)[0], True)

@@ -79,7 +79,7 @@ def test_a_tilt_of_the_plate_is_observed_and_does_not_turn_theta() -> None:
 
 
 @pytest.mark.parametrize('tilt', [(0.0, 0.0), (0.1, -0.08)], ids=['frontal', 'from the side'])
-def test_without_a_lens_what_is_said_of_the_error_is_its_size(tilt: tuple[float, float]) -> None:
+def test_without_a_lens_what_is_reported_of_the_error_is_its_size(tilt: tuple[float, float]) -> None:
     """The mirrored tilt is no error of dX, dY or theta, and perspective is seen without knowing the focal length."""
     rng = np.random.default_rng(8)
     shifts = rng.uniform(-3e-3, 3e-3, (10, 2)).tolist()
@@ -134,7 +134,7 @@ def test_a_lens_that_loses_its_focus_moves_no_plate_observed_from_the_side() -> 
     assert math.hypot(answer.dx - 1e-3, answer.dy - 1e-3) < 30e-6
 
 
-def test_a_disc_that_just_saturates_tilts_the_plate_by_no_more_than_is_said() -> None:
+def test_a_disc_that_just_saturates_tilts_the_plate_by_no_more_than_is_reported() -> None:
     scene = Scene(focal=1500.0, white=240.0, slope=(0.0, 0.45), tilt=(0.15, 0.06), blur=1.0, read_noise=0.9)
     rng = np.random.default_rng(6)
     reference = CameraReference(replace(settings_of(scene), rest_frames=1), target_of)

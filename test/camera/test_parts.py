@@ -89,7 +89,7 @@ def test_a_mosaic_has_its_colours_where_its_name_says(encoding: str, first: str,
     assert np.abs(found[2:4, 2:6].astype(int) - 60).max() <= 2
 
 
-def test_sixteen_bits_are_in_the_order_that_is_said() -> None:
+def test_sixteen_bits_are_in_the_order_that_is_reported() -> None:
     image = np.array([[1, 2], [256, 65535]], dtype=np.uint16)
     assert np.array_equal(of_ros_image(2, 2, 'mono16', False, 4, image.astype('<u2').tobytes()), image)
     assert np.array_equal(of_ros_image(2, 2, '16UC1', True, 4, image.astype('>u2').tobytes()), image)
@@ -135,9 +135,9 @@ def test_each_image_that_does_not_show_the_board_is_reported_with_the_reason() -
     images = [('a', np.zeros((48, 64), np.uint8)), ('b', np.zeros((50, 60), np.uint8)), ('c', None)]
     with pytest.raises(ConfigError, match=r'0 images show the board') as caught:
         calibrated(CameraSettings(target='charuco'), images)
-    said = str(caught.value)
-    assert '; a: ' in said
-    assert '; b: has 60 x 50 pixels, the first has 64 x 48; c: ' in said
+    message = str(caught.value)
+    assert '; a: ' in message
+    assert '; b: has 60 x 50 pixels, the first has 64 x 48; c: ' in message
 
 
 @pytest.mark.parametrize(('columns', 'right'), [(0, True), (1000, True), (1001, False), (-1, False)])

@@ -47,7 +47,7 @@ def test_programs_get_the_declaration(capsys: pytest.CaptureFixture[str]) -> Non
     assert found['parameters']['psd']['choices'] == [1, 2, 3, 4, 5, 6]
 
 
-def test_what_is_corrected_is_said() -> None:
+def test_what_is_corrected_is_reported() -> None:
 
     corrected = {
         name: catalogue()[name].corrected for name in ('plane_tilt', 'refraction', 'creep', 'bending_stiffness')

@@ -130,7 +130,7 @@ def test_a_port_in_use_or_missing_is_named_and_left_alone(
     assert busy.source == missing.source == ''
 
 
-def test_something_else_is_said_to_be_something_else(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_something_else_is_reported_to_be_something_else(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(port_survey, 'BOOT_S', 20.0)
     monkeypatch.setattr(port_survey, 'ANSWER_S', 0.1)
     monkeypatch.setattr(port_survey, 'ONCE_A_SECOND_S', 0.1)

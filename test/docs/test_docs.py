@@ -99,7 +99,7 @@ def test_make_has_few_targets_and_help_names_each() -> None:
     assert [target for target in make_targets() if not re.search(rf'\b{target}\b', head)] == []
 
 
-def test_ci_runs_what_it_is_said_to_run() -> None:
+def test_ci_runs_what_it_is_reported_to_run() -> None:
     for _, file, text in run_commands.CI_RUNS:
         assert text in (ROOT / file).read_text(), (file, text)
     targets = make_targets()
@@ -319,11 +319,11 @@ def test_python_sessions_answer_as_printed(
         for fence in fences
         for e in doctest.DocTestParser().get_examples(fence['text'])
     ]
-    said: list[str] = []
+    message: list[str] = []
     flags = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
     session = doctest.DocTest(examples, {}, page.name, str(page), 0, text)
-    failed, tried = doctest.DocTestRunner(optionflags=flags).run(session, out=said.append)
-    assert failed == 0, ''.join(said)
+    failed, tried = doctest.DocTestRunner(optionflags=flags).run(session, out=message.append)
+    assert failed == 0, ''.join(message)
     assert tried > 5
 
 

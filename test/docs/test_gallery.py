@@ -13,17 +13,17 @@ from tools.gallery_cases import CASES, STUDIES, Case
 
 
 def test_every_case_is_on_the_page_with_its_picture() -> None:
-    said = gallery.kept()
-    assert list(said) == [case.name for study in STUDIES for case in CASES if case.study == study]
+    message = gallery.kept()
+    assert list(message) == [case.name for study in STUDIES for case in CASES if case.study == study]
     # Nothing on the page was written by hand.
-    assert gallery.PAGE.read_text() == gallery.page(said)
-    assert {path.stem for path in gallery.FIGURES.glob('*.png')} == set(said)
+    assert gallery.PAGE.read_text() == gallery.page(message)
+    assert {path.stem for path in gallery.FIGURES.glob('*.png')} == set(message)
 
 
 @pytest.mark.parametrize('case', CASES, ids=lambda case: str(case.name))
 def test_the_program_says_what_the_page_has(case: Case, tmp_path: Path) -> None:
-    said = gallery.answered(case, tmp_path)
-    assert gallery.same(said, gallery.kept()[case.name]), said
+    message = gallery.answered(case, tmp_path)
+    assert gallery.same(message, gallery.kept()[case.name]), message
 
 
 def test_answers_are_the_same_if_words_agree_and_numbers_nearly_do() -> None:

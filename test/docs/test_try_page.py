@@ -68,7 +68,7 @@ def test_every_choice_is_tried() -> None:
 
 
 @pytest.mark.parametrize(
-    ('hidden', 'said'),
+    ('hidden', 'message'),
     [
         ('creep,amplitude=0.03', 'load_direction is missing from the model'),
         ('creep,amplitude=0.03', 'Nothing is missing: the gap is 1 µm'),
@@ -76,8 +76,8 @@ def test_every_choice_is_tried() -> None:
         ('creep,amplitude=0.03', ''),
     ],
 )
-def test_another_answer_than_what_was_hidden_is_wrong(hidden: str, said: str) -> None:
-    assert try_page.wrong(hidden, said)
+def test_another_answer_than_what_was_hidden_is_wrong(hidden: str, message: str) -> None:
+    assert try_page.wrong(hidden, message)
 
 
 @pytest.fixture

@@ -118,7 +118,7 @@ def test_a_block_of_one_sample_is_complete_with_it() -> None:
     assert cutter.flush() == []
 
 
-def test_the_middle_is_the_mean_of_what_the_clock_said() -> None:
+def test_the_middle_is_the_mean_of_what_the_clock_reported() -> None:
     """Jitter of ns on some samples, of a block of four of which one is lost: 1.5 periods after its first place."""
     seq = np.array([8, 9, 11])
     t_ns = np.array([8_000_000, 9_000_003, 11_000_009])

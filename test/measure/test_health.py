@@ -101,7 +101,7 @@ def test_with_one_laser_lost_the_translation_goes_on_by_the_rule_and_returns(psd
     assert pipeline.zero() is None
 
 
-def test_what_is_saturated_is_said_with_the_parameter_of_the_range() -> None:
+def test_what_is_saturated_is_reported_with_the_parameter_of_the_range() -> None:
     counts = moving(1)
     counts[3, 2] = 32767
     (spot, *_) = [r for r in records_of(Pipeline(load_rig()), counts) if isinstance(r, SpotMeans)]
@@ -222,9 +222,9 @@ def test_outside_the_calibrated_range_the_block_says_so() -> None:
         # Its largest, or its least, just short of the pose.
         narrow[axis + 3 if shown > 0.0 else axis] = 0.9 * POSE[axis]
         pipeline = Pipeline(load_rig(overrides={'calibration.range': narrow}))
-        said = [f for s in spots(records_of(pipeline, moving(10))) for f in s.findings]
-        assert len(said) == 10
-        assert all(f.startswith(f'outside the calibrated range: {name} {shown:.1g}') for f in said)
+        message = [f for s in spots(records_of(pipeline, moving(10))) for f in s.findings]
+        assert len(message) == 10
+        assert all(f.startswith(f'outside the calibrated range: {name} {shown:.1g}') for f in message)
         assert pipeline.counters.findings == {'outside the calibrated range': 10}
 
 

@@ -121,7 +121,7 @@ REST = (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
-    ('label', 'change', 'status', 'said'),
+    ('label', 'change', 'status', 'message'),
     [
         ('laser 1 off', lambda c: c.__setitem__((slice(3, 9), slice(0, 3)), 0), BlockStatus.LASER_LOST, 'laser 1'),
         ('laser 2 off', lambda c: c.__setitem__((slice(None), slice(3, 6)), 0), BlockStatus.LASER_LOST, 'laser 2'),
@@ -130,14 +130,14 @@ REST = (0.0, 0.0, 0.0)
     ],
 )
 def test_a_block_that_cannot_be_trusted_has_no_estimate_and_says_why(
-    rig: Rig, label: str, change: object, status: BlockStatus, said: str
+    rig: Rig, label: str, change: object, status: BlockStatus, message: str
 ) -> None:
     counts = still(REST, 20, 0)
     change(counts)  # type: ignore[operator]
     records = run(Pipeline(rig).process, chunk_of(counts))
     spots = spots_of(records)
     assert spots.status is status
-    assert said in spots.reason
+    assert message in spots.reason
     assert not any(isinstance(r, DeflectionEstimate | TipLoad) for r in records)
     # The samples themselves are kept.
     assert any(isinstance(r, SampleBlock) and len(r.seq) == 20 for r in records)

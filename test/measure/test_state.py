@@ -75,16 +75,16 @@ def test_a_value_that_does_not_fit_is_named_with_its_part(name: str, value: floa
     wrong = {**dict(memory.values), name: value}
     pipeline = Pipeline(rig)
     pipeline.apply(ParameterChange(memory.t_ns, memory.block, tuple(wrong.items())))
-    (said,) = pipeline.misfits
-    assert 'does not go on from what was recorded' in said
+    (message,) = pipeline.misfits
+    assert 'does not go on from what was recorded' in message
     assert list(pipeline.process(chunk(rig, 2)))
 
 
 def test_a_value_of_no_part_is_named() -> None:
     pipeline = Pipeline(load_rig())
     pipeline.apply(ParameterChange(0, 0, (('state.motion', (1.0,)), ('state.psds.0_2', (1.0,)))))
-    assert any('state.motion: no part of this rig remembers such a value' in said for said in pipeline.misfits)
-    assert any('two or more of 2 PSDs' in said for said in pipeline.misfits)
+    assert any('state.motion: no part of this rig remembers such a value' in message for message in pipeline.misfits)
+    assert any('two or more of 2 PSDs' in message for message in pipeline.misfits)
     pipeline.apply(ParameterChange(0, 0, ((ENVIRONMENT[0], 'noon'),)))
     assert 'expected a number' in pipeline.misfits[0]
     assert load_states((), {}) == []

@@ -333,9 +333,9 @@ def test_events_of_the_second_generator_are_observed(kind: str) -> None:
 
 def test_quiet_minutes_are_quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr('blind.watch.HOLDS', 3)
-    hours, alarms, said, _ = quiet((0.05, 1))
+    hours, alarms, message, _ = quiet((0.05, 1))
     assert hours >= 0.05
-    assert (alarms, said) == (0, [])
+    assert (alarms, message) == (0, [])
     assert not table([], hours, 1, ['x1'], 0.0)[1]
 
 

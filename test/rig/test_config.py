@@ -19,7 +19,7 @@ def test_the_shipped_rig_file_is_the_default() -> None:
 
 
 @pytest.mark.parametrize(
-    ('key', 'value', 'said'),
+    ('key', 'value', 'notice'),
     [
         ('amplifier.noise', -1.0, 'above 0'),
         ('amplifier.noise', 'loud', 'must be a number'),
@@ -35,13 +35,13 @@ def test_the_shipped_rig_file_is_the_default() -> None:
         ('record', 'yes', 'true or false'),
     ],
 )
-def test_a_bad_value_is_rejected_by_name(key: str, value: object, said: str) -> None:
+def test_a_bad_value_is_rejected_by_name(key: str, value: object, notice: str) -> None:
     with pytest.raises(ConfigError) as error:
         rig_from_values({key: value}, 'rig.yaml')
     message = str(error.value)
     assert 'rig.yaml' in message
     assert key in message
-    assert said in message
+    assert notice in message
 
 
 def test_a_dump_of_a_node_is_a_parameter_file() -> None:
@@ -94,13 +94,13 @@ def test_one_message_for_a_file_and_for_an_override(tmp_path: Path) -> None:
         load_rig(RIG, {'converter.full_scale': -1})
 
 
-def test_what_another_rig_leaves_as_in_the_thesis_is_said() -> None:
+def test_what_another_rig_leaves_as_in_the_thesis_is_reported() -> None:
     assert left_as_in_the_thesis(load_rig().values) == ()
     # A parameter that measures nothing of the rig makes it no other one.
     assert left_as_in_the_thesis(load_rig(overrides={'block_size': 30}).values) == ()
-    said = left_as_in_the_thesis(load_rig(overrides={'link.length': 0.4}).values)
-    assert 'dynamics.bending_frequency = 14.0 Hz' in said
-    assert not [text for text in said if text.startswith(('link.length', 'psd_1.zero', 'port'))]
+    notice = left_as_in_the_thesis(load_rig(overrides={'link.length': 0.4}).values)
+    assert 'dynamics.bending_frequency = 14.0 Hz' in notice
+    assert not [text for text in notice if text.startswith(('link.length', 'psd_1.zero', 'port'))]
 
 
 @pytest.mark.parametrize('word', ['none', 'off', False])

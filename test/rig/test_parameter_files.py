@@ -14,7 +14,7 @@ from psd_deflection.rig.parameter_files import flat_parameters, read_parameter_f
 
 
 @pytest.mark.parametrize(
-    ('text', 'said'),
+    ('text', 'message'),
     [
         ('a: [1', ':'),
         ('[]', 'not a ROS 2 parameter file'),
@@ -23,13 +23,13 @@ from psd_deflection.rig.parameter_files import flat_parameters, read_parameter_f
         ('!!python/object/apply:os.system ["true"]', 'malformed'),
     ],
 )
-def test_a_malformed_file_is_rejected_by_name(tmp_path: Path, text: str, said: str) -> None:
+def test_a_malformed_file_is_rejected_by_name(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / 'mine.yaml'
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
         read_parameter_file(path)
     assert 'mine.yaml' in str(error.value)
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 @pytest.mark.parametrize(('content', 'why'), [(None, r'Is a directory'), (b'\xd0\xff', 'it is no text')])

@@ -70,7 +70,7 @@ def test_a_dark_detector_is_dark_on_the_input_that_it_is_wired_to() -> None:
 
 
 @pytest.mark.parametrize(
-    ('values', 'said'),
+    ('values', 'message'),
     [
         ({'psd_1.axes': ['x', 'z']}, r"psd_1.axes = \['x', 'z'\]: each must be one of x, -x, y, -y"),
         ({'psd_2.axes': ['x', '-x']}, r'psd_2.axes = .*: must name x once and y once'),
@@ -78,8 +78,8 @@ def test_a_dark_detector_is_dark_on_the_input_that_it_is_wired_to() -> None:
         ({'psd_1.axes': [True, 'x']}, r'list of names'),
     ],
 )
-def test_a_wiring_that_cannot_be_is_rejected(values: dict[str, object], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+def test_a_wiring_that_cannot_be_is_rejected(values: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         rig_from_values(values, 'rig.yaml')
 
 

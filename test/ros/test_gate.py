@@ -70,7 +70,7 @@ def sender(peer: Any, delivery: Any = 50) -> Any:
     return publisher
 
 
-def test_good_ones_are_taken_and_others_counted_and_said(
+def test_good_ones_are_taken_and_others_counted_and_reported(
     peer: Any, gated: Gated, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     heard_as(monkeypatch, most_bytes=1000)

@@ -51,7 +51,7 @@ def test_what_our_own_nodes_send_is_taken(topic: str) -> None:
 
 
 @pytest.mark.parametrize('topic', [LOAD, REFERENCE, REFERENCE_WITH_COVARIANCE])
-def test_the_frame_is_that_of_this_rig_at_rest_or_not_said(topic: str) -> None:
+def test_the_frame_is_that_of_this_rig_at_rest_or_not_reported(topic: str) -> None:
     assert fault(topic, {'header.frame_id': ''}) == ''
     assert fault(topic, {'header.frame_id': 'left_link_tip_rest'}, frame_prefix='left_') == ''
     assert fault(topic, {'header.frame_id': 'link_tip_rest'}, frame_prefix='left_') != ''

@@ -113,7 +113,7 @@ def test_no_shell_reads_the_command(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ['kept']
 
 
-def test_a_command_that_fails_is_said_once_and_counted() -> None:
+def test_a_command_that_fails_is_reported_once_and_counted() -> None:
     out, stated = handed_on(python('import sys; sys.exit(3)'), times=3)
     assert (out.sent, out.failed) == (0, 3)
     assert stated == [
@@ -163,7 +163,7 @@ def test_what_no_repetition_mends_is_tried_once_and_no_redirection_is_followed(s
     assert (out.failed, out.failure) == (1, f'webhook at 127.0.0.1: answers {answer}')
 
 
-def test_a_server_that_is_away_is_said() -> None:
+def test_a_server_that_is_away_is_reported() -> None:
     with socket.create_server(('127.0.0.1', 0)) as taken:
         port = taken.getsockname()[1]
     out, stated = handed_on('', f'http://127.0.0.1:{port}/')

@@ -22,7 +22,7 @@ def test_a_line_a_second_for_a_day_is_few_lines_and_none_is_forgotten() -> None:
     assert counted + len(logged) + int(last.split(' more in')[0]) == 86_400
 
 
-def test_what_was_counted_is_said_when_it_is_due() -> None:
+def test_what_was_counted_is_reported_when_it_is_due() -> None:
     logged: list[str] = []
     repeats = RateLimitedLog(texts(logged.append))
     for _ in range(3):
@@ -37,7 +37,7 @@ def test_what_was_counted_is_said_when_it_is_due() -> None:
     assert len(logged) == 2
 
 
-def test_the_first_few_are_said_one_by_one_and_so_is_what_comes_after_a_quiet_time() -> None:
+def test_the_first_few_are_reported_one_by_one_and_so_is_what_comes_after_a_quiet_time() -> None:
     logged: list[str] = []
     repeats = RateLimitedLog(texts(logged.append))
     for k in range(5):
@@ -48,7 +48,7 @@ def test_the_first_few_are_said_one_by_one_and_so_is_what_comes_after_a_quiet_ti
     assert logged[3:] == ['2 more in the last 99998 s: gone 4', 'gone again']
 
 
-def test_lines_that_are_said_at_once_make_the_next_wait_no_longer() -> None:
+def test_lines_that_are_reported_at_once_make_the_next_wait_no_longer() -> None:
     logged: list[str] = []
     repeats = RateLimitedLog(texts(logged.append))
     for k in range(6):
@@ -67,7 +67,7 @@ def test_one_kind_does_not_hold_up_another() -> None:
     assert logged == ['one', 'two']
 
 
-def test_a_new_reason_is_said_at_once_and_takes_no_count_of_another() -> None:
+def test_a_new_reason_is_reported_at_once_and_takes_no_count_of_another() -> None:
     logged: list[str] = []
     repeats = RateLimitedLog(texts(logged.append))
     for k in range(5):

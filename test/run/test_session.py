@@ -112,17 +112,17 @@ def test_metrics_count_what_came_was_lost_and_was_rejected(running: Running) -> 
 
 
 def test_diagnostics_report_no_dots_while_the_device_is_away(running: Running, device: ScriptedDevice) -> None:
-    def said_of_dots() -> list[tuple[int, str]]:
+    def description_of_dots() -> list[tuple[int, str]]:
         report = health.report(time.time_ns())
         return [(e.level, e.message) for e in report.entries if e.name.startswith('psd_deflection: psd_')]
 
     health = HealthReporter(running.session)
-    assert STALE not in dict(said_of_dots())
+    assert STALE not in dict(description_of_dots())
     device.unplug()
     running.heard('waiting for it to come back')
     # What came before the unplugging is told once more.
-    said_of_dots()
-    assert said_of_dots() == [(STALE, 'no samples')] * 2
+    description_of_dots()
+    assert description_of_dots() == [(STALE, 'no samples')] * 2
 
 
 def test_a_step_of_the_system_clock_moves_no_stamp_of_the_run(
@@ -136,7 +136,7 @@ def test_a_step_of_the_system_clock_moves_no_stamp_of_the_run(
     assert acquisition.system_clock_step_ns() == pytest.approx(-3600e9, abs=1e9)
 
 
-def test_no_zero_is_taken_of_a_device_that_has_said_nothing_for_long(
+def test_no_zero_is_taken_of_a_device_that_has_reported_nothing_for_long(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, 'SILENT_S', -1e3)
@@ -317,7 +317,7 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
     assert entry.message.startswith(f'{REFERENCE}: refused: ')
 
 
-def test_what_was_counted_of_rejected_messages_is_said_though_no_more_come(
+def test_what_was_counted_of_rejected_messages_is_reported_though_no_more_come(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The health is asked once a second, whatever the run publishes."""

@@ -160,7 +160,7 @@ def test_nothing_is_written_unasked(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert len(chain.logged) == 1
 
 
-def test_a_disk_without_room_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_without_room_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = SimpleNamespace(free=1_000_000)
     monkeypatch.setattr('psd_deflection.run.recorder.shutil', cast(Any, SimpleNamespace(disk_usage=lambda _: usage)))
     chain = Chain(tmp_path)

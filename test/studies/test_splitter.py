@@ -59,8 +59,8 @@ def test_one_that_fails_costs_certainty_and_a_cold_spare_its_warm_up() -> None:
     both, out, alone, cold, spare = simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.5))
     assert [p.estimates for p in (both, out, alone, cold, spare)] == [1.0, 1.0, 1.0, 0.0, 1.0]
     assert cold.status is BlockStatus.LASER_LOST
-    assert out.said == 'one of the two lasers is out: half the light on both detectors'
-    assert 'laser 1 lost' in cold.said
+    assert out.message == 'one of the two lasers is out: half the light on both detectors'
+    assert 'laser 1 lost' in cold.message
     # Half the light has twice the noise, at least; the spare has what the first one had.
     assert np.all(out.deviations > 1.9 * both.deviations)
     assert spare.deviations == pytest.approx(alone.deviations, rel=0.3)

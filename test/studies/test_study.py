@@ -131,8 +131,8 @@ def test_a_result_draws_itself_and_is_a_table(kind: str, tmp_path: Path) -> None
 
 def test_only_an_axis_of_time_has_its_words() -> None:
     files = Path(psd_deflection.__file__).parent.rglob('*.py')
-    said = [path.name for path in files if 'time / s' in path.read_text(encoding='utf-8')]
-    assert said == ['charts.py'], 'a chart over time takes a TimeAxis, which has the marks'
+    message = [path.name for path in files if 'time / s' in path.read_text(encoding='utf-8')]
+    assert message == ['charts.py'], 'a chart over time takes a TimeAxis, which has the marks'
 
 
 @pytest.mark.parametrize('kind', ['Calibrated', 'Discovery', 'Identified', 'LoopResult', 'Validated'])

@@ -108,7 +108,7 @@ class LiveDisplay:
         self._json = as_json
         self._live = not as_json and sys.stdout.isatty()
         self._drawn = 0
-        self._said: set[str] = set()
+        self._logged: set[str] = set()
 
     def update(self, step: BenchStep) -> None:
         """Show one look at the recording."""
@@ -125,15 +125,15 @@ class LiveDisplay:
             self._notify(step.progress)
 
     def _once(self, words: str, say: Callable[[str], None]) -> None:
-        if words not in self._said:
-            self._said.add(words)
+        if words not in self._logged:
+            self._logged.add(words)
             self.end()
             say(words)
 
     def _notify(self, progress: CalibrationProgress) -> None:
         for parameter in progress.parameters:
-            if parameter.determined and parameter.name not in self._said:
-                self._said.add(parameter.name)
+            if parameter.determined and parameter.name not in self._logged:
+                self._logged.add(parameter.name)
                 show(f'{progress.seconds:6.1f} s  {line(parameter)}')
         for need in progress.needs[:1]:
             self._once(next_words(need), show)

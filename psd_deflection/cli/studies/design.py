@@ -173,8 +173,8 @@ def phases_text(phases: Sequence[splitter.LightPhase]) -> str:
         sds = (p.deviations * np.array([1e6, 1e6, MDEG])).tolist()
         numbers = [*(f'{v:.3f}' for v in sds), f'{1e6 * p.off[0]:.1f}', f'{p.largest:.1f}']
         rows.append([p.name, f'{p.estimates:.0%}', *(numbers if p.estimates else ['–'] * 5)])
-    said = [f'{p.name}: {p.said}' for p in phases if p.said]
-    return '\n'.join([columns(rows), *(['', *said] if said else [])])
+    message = [f'{p.name}: {p.message}' for p in phases if p.message]
+    return '\n'.join([columns(rows), *(['', *message] if message else [])])
 
 
 # ---- Appendix B ----

@@ -218,12 +218,12 @@ class CsvRecording(Recording):
     def _loads(self) -> tuple[list[AppliedLoad], int, int]:
         """The loads that differ from the one before; number of rows with a load; time of the last, ns."""
         loads: list[AppliedLoad] = []
-        said: tuple[float, ...] | None = None
+        message: tuple[float, ...] | None = None
         count = last = 0
         for t_ns, values in self._optional(LOAD_COLUMNS):
-            if values != said:
+            if values != message:
                 loads.append(AppliedLoad(t_ns, *values))
-                said = values
+                message = values
             count, last = count + 1, t_ns
         return loads, count, last
 

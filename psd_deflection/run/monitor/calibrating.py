@@ -29,7 +29,7 @@ class PageCalibration:
         self._process: asyncio.subprocess.Process | None = None
         self._listener: asyncio.Task[None] | None = None
         self._out = Path()
-        self._said: dict[str, Any] = {}
+        self._shown: dict[str, Any] = {}
         self._last = ''
 
     @property
@@ -38,14 +38,14 @@ class PageCalibration:
         if self._process is None:
             return None
         running = self._listener is not None and not self._listener.done()
-        return {'running': running, 'out': str(self._out), 'last': self._last, **self._said}
+        return {'running': running, 'out': str(self._out), 'last': self._last, **self._shown}
 
     async def start(self, url: str, token_variable: str, token: str, out: Path) -> str:
         """Begin one that speaks to the page at ``url`` and writes into ``out``. Raises RefusedError."""
         if self._listener is not None and not self._listener.done():
             raise RejectedError('a calibration runs already')
         command = [sys.executable, '-m', 'psd_deflection', 'calibrate', '--live', '--json']
-        self._out, self._said, self._last = out, {}, ''
+        self._out, self._shown, self._last = out, {}, ''
         try:
             self._process = await asyncio.create_subprocess_exec(
                 *command,
@@ -104,10 +104,10 @@ class PageCalibration:
         if not isinstance(look, dict):
             return
         if isinstance(look.get('waiting'), str):
-            self._said = {'waiting': look['waiting']}
+            self._shown = {'waiting': look['waiting']}
         elif isinstance(look.get('needs'), list) and isinstance(look.get('parameters'), list):
             shown = {key: look.get(key) for key in ('kind', 'seconds', 'determined', 'refused', 'parameters')}
-            self._said = {**shown, 'needs': look['needs'][:MOST_NEEDS]}
+            self._shown = {**shown, 'needs': look['needs'][:MOST_NEEDS]}
 
 
 async def _lines(stream: asyncio.StreamReader | None) -> Any:

@@ -227,21 +227,21 @@ def test_diagnostics_say_what_is_wrong_with_what_is_reported(run: motion.Run) ->
         (one,) = health._motion()
         return one
 
-    def said() -> tuple[int, str]:
+    def message() -> tuple[int, str]:
         one = entry()
         return one.level, one.message
 
     reported = list(run.reported)
     through(pipeline, run, range(25), reported)
-    assert said() == (0, 'the modes foretell the samples')
+    assert message() == (0, 'the modes foretell the samples')
     session.rejected[ACCELERATION], session.why_rejected[ACCELERATION] = 3, 'no frame'
     through(pipeline, run, range(25, 30), reported)
-    assert said() == (1, '3 base accelerations refused: no frame')
+    assert message() == (1, '3 base accelerations refused: no frame')
     # Of four messages in a block two come late.
     through(pipeline, run, range(30, 35), reported, late=10)
-    assert said() == (1, '8 of 18 base accelerations came after the samples on which they acted')
+    assert message() == (1, '8 of 18 base accelerations came after the samples on which they acted')
     through(pipeline, run, range(35, 42), [])
-    assert said() == (1, 'no base acceleration came for 0.1 s, and the last one was not 0: taken as 0')
+    assert message() == (1, 'no base acceleration came for 0.1 s, and the last one was not 0: taken as 0')
     assert dict(entry().values)['base accelerations, not ended by another'] == '1'
 
 

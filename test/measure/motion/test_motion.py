@@ -123,7 +123,7 @@ def test_what_loads_did_is_recorded_and_goes_on_from_there() -> None:
     assert np.all(np.array(found[262].covariance[::4]) > 4.0 * np.array(found[255].covariance[::4]))
 
 
-def test_a_lost_laser_is_coasted_through_and_said(operation: motion.Run) -> None:
+def test_a_lost_laser_is_coasted_through_and_reported(operation: motion.Run) -> None:
     dark = motion.Run(operation.loads, operation.pose, operation.velocity, operation.volts.copy())
     dark.volts[4000:4100, 2] = 0.0
     pipeline = Pipeline(RIG)

@@ -89,8 +89,8 @@ def test_words_say_the_noise_of_each_reading_beside_the_rig_files() -> None:
     assert list(words) == [f'noise of {name} (um)' for name in ('x1', 'y1', 'x2', 'y2')]
     for name, um in (('x1', 2.0), ('y1', 1.0), ('x2', 2.0), ('y2', 1.0)):
         mean = um / 20.0**0.5
-        said = f'{um:.3f} a sample (rig file {um:.3f}), {mean:.3f} a block ({mean:.3f})'
-        assert words[f'noise of {name} (um)'] == said
+        message = f'{um:.3f} a sample (rig file {um:.3f}), {mean:.3f} a block ({mean:.3f})'
+        assert words[f'noise of {name} (um)'] == message
 
 
 def checked(of: BlockEstimator, dots: FloatArray, residual: FloatArray, covariance: FloatArray) -> ConsistencyResult:

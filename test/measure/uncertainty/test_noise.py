@@ -117,7 +117,7 @@ def test_one_spike_is_not_noise() -> None:
 
 
 @pytest.mark.parametrize(('sigma', 'seeds'), [(0.0, 1), (0.3, 1), (0.6, 1)])
-def test_the_error_of_a_mean_of_coarse_readings_is_inside_what_is_said(sigma: float, seeds: int) -> None:
+def test_the_error_of_a_mean_of_coarse_readings_is_inside_what_is_reported(sigma: float, seeds: int) -> None:
     """Steps of 10 um: over all places between two steps, the rms error of the mean is what is stated, or less."""
     step = 10e-6
     rng = np.random.default_rng(16)
@@ -128,9 +128,9 @@ def test_the_error_of_a_mean_of_coarse_readings_is_inside_what_is_said(sigma: fl
         feed(noise, dots)
         errors.append(dots.reshape(-1, SIZE, 4).mean(axis=1) - step * place)
         stated.append(noise.mean_sd() ** 2)
-    rms, said = float(np.mean(np.square(errors)) ** 0.5), float(np.mean(stated) ** 0.5)
-    assert rms <= 1.05 * said
-    assert said < 2.5 * rms
+    rms, message = float(np.mean(np.square(errors)) ** 0.5), float(np.mean(stated) ** 0.5)
+    assert rms <= 1.05 * message
+    assert message < 2.5 * rms
 
 
 def test_a_dead_reading_is_no_better_than_a_converters_step() -> None:

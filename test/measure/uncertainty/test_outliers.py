@@ -24,23 +24,23 @@ def dots_of(pose: FloatArray) -> FloatArray:
     return np.asarray(np.column_stack((c * u + s * v, c * v - s * u)) - CENTERS).ravel()
 
 
-def named(said: FloatArray, should: FloatArray, noise: float) -> str:
+def named(message: FloatArray, should: FloatArray, noise: float) -> str:
     """Of readings (n, 4) and what they should be: the words, from weighted moments by numpy."""
-    n = len(said)
+    n = len(message)
     weights = (1.0 - 1.0 / 500.0) ** np.arange(n - 1, -1, -1)
     if n < 10:
         return ''
     orders = ([0, 1, 2, 3], [1, 0, 2, 3], [0, 1, 3, 2])
     off = []
     for order in orders:
-        apart = CENTERS[0] - CENTERS[1] + said[:, order][:, :2] - said[:, order][:, 2:]
+        apart = CENTERS[0] - CENTERS[1] + message[:, order][:, :2] - message[:, order][:, 2:]
         off.append(float(weights @ (np.hypot(*apart.T) - math.hypot(*REST)) ** 2))
     for psd in (1, 2):
         if off[psd] < 0.01 * off[0] and off[psd] < weights.sum() * (10.0 * noise) ** 2:
             return f'the axes of psd_{psd} are exchanged'
     found = []
     for c, name in enumerate(('x1', 'y1', 'x2', 'y2')):
-        own, shared, wanted = np.cov(said[:, c], should[:, c], aweights=weights, ddof=0)[[0, 0, 1], [0, 1, 1]]
+        own, shared, wanted = np.cov(message[:, c], should[:, c], aweights=weights, ddof=0)[[0, 0, 1], [0, 1, 1]]
         if wanted < (100.0 * noise) ** 2:
             continue
         if own < (5.0 * noise) ** 2:
@@ -58,23 +58,23 @@ def test_a_reading_is_named_by_the_moments_of_what_was_observed() -> None:
         n = int(rng.choice([9, 10, 11, 40]))
         should = rng.normal(size=(n, 4)) * NOISE * 10.0 ** rng.uniform(1.7, 3.0, 4)
         should[:, rng.random(4) < 0.5] *= 1e-3
-        said = should.copy()
+        message = should.copy()
         for i in rng.choice(4, 1 + case % 2, replace=False):
             slope = rng.choice([0.0, -1.0, -1.0, -1.018, -0.982, -1.022, -0.978, 1.0])
             scatter = NOISE * rng.choice([0.0, 3.0, 4.5, 5.5, 9.0, 11.0]) + rng.choice([0.0, 0.9e-2]) * np.std(
                 should[:, i]
             )
-            said[:, i] = slope * should[:, i] + scatter * rng.choice([-1.0, 1.0], n) + 1e-4
+            message[:, i] = slope * should[:, i] + scatter * rng.choice([-1.0, 1.0], n) + 1e-4
         search = OutlierSearch(CENTERS, CENTERS)
         if case % 3 == 0:
             # Poses of some millimetres whose base line is right but for noise once the axes are put right.
             right = np.array([dots_of(rng.normal(size=3) * (2e-3, 2e-3, 0.02)) for _ in range(n)])
             right[:, 0] += rng.choice([0.0, 5.0, 12.0, 17.0, 30.0]) * NOISE * rng.choice([-1.0, 1.0], n)
-            said = right[:, [[0, 1, 2, 3], [1, 0, 2, 3], [0, 1, 3, 2]][int(rng.integers(3))]]
-            should = said - 1e-5
+            message = right[:, [[0, 1, 2, 3], [1, 0, 2, 3], [0, 1, 3, 2]][int(rng.integers(3))]]
+            should = message - 1e-5
         for block in range(n):
-            search.add(tuple(said[block].tolist()), tuple((said[block] - should[block]).tolist()))
-        want = named(said, should, NOISE)
+            search.add(tuple(message[block].tolist()), tuple((message[block] - should[block]).tolist()))
+        want = named(message, should, NOISE)
         assert search.most_likely(NOISE) == want, case
         reported[want] = reported.get(want, 0) + 1
     assert len(reported) == 11

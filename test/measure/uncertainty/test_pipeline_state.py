@@ -121,12 +121,12 @@ def test_what_was_changed_is_remembered() -> None:
         (KNOWN_LOAD, (0.0, 0.0, 1.0, 0.0)),
     ],
 )
-def test_a_memory_of_another_length_is_left_out_and_said(name: str, value: tuple[float, ...]) -> None:
+def test_a_memory_of_another_length_is_left_out_and_reported(name: str, value: tuple[float, ...]) -> None:
     rig = load_rig(overrides={'filter': 'modal', 'degraded': 'hold'})
     pipeline, fresh = Pipeline(rig), Pipeline(rig)
     pipeline.apply(ParameterChange(0, 0, ((name, value),)))
-    (said,) = pipeline.misfits
-    assert f'{name}: {len(value)} numbers; expected ' in said
+    (message,) = pipeline.misfits
+    assert f'{name}: {len(value)} numbers; expected ' in message
     assert pipeline.memory(rig) == fresh.memory(rig)
     assert pipeline.estimation.zero_variances == ()
     samples = chunk(volts(1, 1)[:200])

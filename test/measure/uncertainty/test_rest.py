@@ -26,17 +26,17 @@ def test_two_blocks_report_nothing_three_do() -> None:
     assert moves([0.0, 2.01, 2.01]).startswith('the link moves: y1 varied by 1.2 µm rms in the last 3 blocks, noise')
     assert moves([0.0, 1.99, 1.99]) == ''
     # Of two at 0 and two at 1 m: 1/sqrt 3 m.
-    said = moves([0.0, 0.0, 1e6, 1e6], noise_um=1e5)
-    assert ' varied by 577350.3 µm rms in the last 4 blocks, noise explains 100000.0 µm; ' in said
+    message = moves([0.0, 0.0, 1e6, 1e6], noise_um=1e5)
+    assert ' varied by 577350.3 µm rms in the last 4 blocks, noise explains 100000.0 µm; ' in message
 
 
 @pytest.mark.parametrize(('noise_um', 'drifts', 'scatters'), [(0.01, 2.0, 10.0), (3.0, 15.0, 15.0)])
 def test_moving_is_five_times_the_noise_and_micrometres(noise_um: float, drifts: float, scatters: float) -> None:
-    for share, said in ((0.99, False), (1.01, True)):
-        assert bool(moves([0.0, 0.0, share * drifts, share * drifts], noise_um)) == said
+    for share, message in ((0.99, False), (1.01, True)):
+        assert bool(moves([0.0, 0.0, share * drifts, share * drifts], noise_um)) == message
         # Of a, -a, a, -a the standard deviation is 2 a / sqrt 3.
         a = share * scatters * 3.0**0.5 / 2.0
-        assert bool(moves([a, -a, a, -a], noise_um)) == said
+        assert bool(moves([a, -a, a, -a], noise_um)) == message
 
 
 @pytest.mark.parametrize(

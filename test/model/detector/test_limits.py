@@ -160,8 +160,8 @@ def test_other_light_and_a_clipped_spot_are_reported_of_the_detector() -> None:
         edge = area[axis % 2] / 2.0 - radius
         for off, reported in ((1e-6, True), (-1e-6, False)):
             dots = (*DOTS[:axis], -edge - off, *DOTS[axis + 1 :])
-            said = (f'psd_{1 + axis // 2}: the spot is clipped at the edge',) if reported else ()
-            assert judge(dots=dots).findings == said
+            message = (f'psd_{1 + axis // 2}: the spot is clipped at the edge',) if reported else ()
+            assert judge(dots=dots).findings == message
 
 
 def test_other_light_moves_a_dot_toward_its_own_centre_wherever_that_is() -> None:
@@ -246,10 +246,10 @@ def test_a_frozen_detector_is_a_finding_unless_it_is_a_fault() -> None:
     volts = np.tile(np.array(GOOD, np.float32), (20, 1))
     health, ok = OpticsHealth(load_rig()), Verdict(BlockStatus.OK, '', 0)
     blamed = Verdict(BlockStatus.LASER_LOST, '', 2, faults=frozenset({2}))
-    said = ('psd_1 stands still: no bit has moved for 5 blocks', 'psd_2 stands still: no bit has moved for 7 blocks')
-    assert health.late_findings(of(volts), ok, (5, 7), Loudness()) == said
-    assert health.late_findings(of(volts), ok, (4, 7), Loudness()) == said[1:]
-    assert health.late_findings(of(volts), blamed, (5, 7), Loudness()) == said[:1]
+    message = ('psd_1 stands still: no bit has moved for 5 blocks', 'psd_2 stands still: no bit has moved for 7 blocks')
+    assert health.late_findings(of(volts), ok, (5, 7), Loudness()) == message
+    assert health.late_findings(of(volts), ok, (4, 7), Loudness()) == message[1:]
+    assert health.late_findings(of(volts), blamed, (5, 7), Loudness()) == message[:1]
     rejects = OpticsHealth(load_rig(overrides={'frozen': 'refuse'}))
     assert rejects.late_findings(of(volts), ok, (5, 7), Loudness()) == ()
 

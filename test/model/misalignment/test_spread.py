@@ -62,10 +62,10 @@ def test_every_solver_spreads_as_rigs_that_differ_by_that_much() -> None:
             solved.setdefault(name, []).append(e.pose)
             reported.setdefault(name, e)
     for name, poses in solved.items():
-        observed, said = np.cov(np.array(poses).T), np.array(reported[name].covariance).reshape(3, 3)
+        observed, message = np.cov(np.array(poses).T), np.array(reported[name].covariance).reshape(3, 3)
         sd = np.sqrt(np.diag(observed))
-        assert np.sqrt(np.diag(said)) == pytest.approx(sd, rel=0.17), name
-        assert said / np.outer(sd, sd) == pytest.approx(observed / np.outer(sd, sd), abs=0.25), name
+        assert np.sqrt(np.diag(message)) == pytest.approx(sd, rel=0.17), name
+        assert message / np.outer(sd, sd) == pytest.approx(observed / np.outer(sd, sd), abs=0.25), name
 
 
 def test_the_polynomial_is_what_it_stands_for() -> None:

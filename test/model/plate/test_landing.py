@@ -49,7 +49,7 @@ def test_a_beam_that_leans_meets_the_plate_where_its_ray_does(height: float) -> 
 
 
 @pytest.mark.parametrize(
-    ('centers', 'heights', 'said'),
+    ('centers', 'heights', 'message'),
     [
         (np.zeros((2, 3)), 2, r'centers has shape \(2, 3\)'),
         (np.zeros(4), 2, r'centers has shape \(4,\)'),
@@ -58,8 +58,8 @@ def test_a_beam_that_leans_meets_the_plate_where_its_ray_does(height: float) -> 
         (np.full((2, 2), np.nan), 2, 'centers must be finite'),
     ],
 )
-def test_arrays_that_are_no_geometry_are_rejected(centers: np.ndarray, heights: int, said: str) -> None:
-    with pytest.raises(SolverError, match=said):
+def test_arrays_that_are_no_geometry_are_rejected(centers: np.ndarray, heights: int, message: str) -> None:
+    with pytest.raises(SolverError, match=message):
         check_shapes(Geometry(centers, np.zeros(centers.shape), np.zeros(heights), 0.585))
 
 
@@ -71,10 +71,10 @@ def test_a_geometry_is_of_so_many_psds(count: int) -> None:
 def test_the_beams_are_apart_by_more_than_a_micrometre_in_any_direction() -> None:
     """The refusal says where they are: at the first one's place."""
     for along in ((1.0, 0.0), (0.0, 1.0), (-0.6, 0.8)):
-        for apart, said in ((0.9e-6, True), (1.1e-6, False)):
+        for apart, message in ((0.9e-6, True), (1.1e-6, False)):
             centers = np.array([[0.01, 0.07], [0.01, 0.07]]) + np.array([[0.0, 0.0], along]) * apart
             geometry = Geometry(centers, np.zeros((2, 2)), np.zeros(2), 0.585)
-            if said:
+            if message:
                 with pytest.raises(SolverError, match=r'psd_1 and psd_2 coincide at \(0\.01, 0\.07\) m'):
                     check_twist(geometry)
             else:

@@ -107,7 +107,7 @@ def test_the_search_finds_what_lies_between_its_candidates() -> None:
 
 
 @pytest.mark.parametrize(
-    ('radius', 'keep_out', 'box', 'said'),
+    ('radius', 'keep_out', 'box', 'message'),
     [
         (0.0, 0.0, None, '^radius = '),
         (math.nan, 0.0, None, '^radius = '),
@@ -121,9 +121,9 @@ def test_the_search_finds_what_lies_between_its_candidates() -> None:
     ],
 )
 def test_an_impossible_room_is_rejected(
-    radius: float, keep_out: float, box: tuple[float, float, float, float] | None, said: str
+    radius: float, keep_out: float, box: tuple[float, float, float, float] | None, message: str
 ) -> None:
-    with pytest.raises(ConfigError, match=said):
+    with pytest.raises(ConfigError, match=message):
         Room(radius, keep_out, box)
 
 

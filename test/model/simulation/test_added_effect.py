@@ -156,15 +156,15 @@ BROKEN = [
 ]
 
 
-@pytest.mark.parametrize(('code', 'said'), BROKEN, ids=[said for _, said in BROKEN])
-def test_a_broken_file_is_named_with_the_cause(folder: Path, code: str, said: str) -> None:
+@pytest.mark.parametrize(('code', 'message'), BROKEN, ids=[message for _, message in BROKEN])
+def test_a_broken_file_is_named_with_the_cause(folder: Path, code: str, message: str) -> None:
     file = folder / f'{NAME}.py'
     file.write_text(code)
     for load in (lambda: Pipeline(load_rig(overrides=EFFECT)), catalogue):
         with pytest.raises(ConfigError) as error:
             load()
         assert str(file) in str(error.value)
-        assert said in str(error.value)
+        assert message in str(error.value)
     # Whoever does not use it is not disturbed.
     Pipeline(load_rig())
     Pipeline(load_rig(overrides={'effects.one.name': 'sensor_gain', 'effects.one.psd': 1, 'effects.one.x': 0.01}))

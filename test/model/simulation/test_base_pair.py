@@ -35,7 +35,7 @@ def test_the_simulated_dots_are_those_of_the_rays(rays: RayPlane) -> None:
 
 
 @pytest.mark.parametrize(
-    ('assume', 'load', 'said'),
+    ('assume', 'load', 'message'),
     [('beam', (3.0, -20.0, 4.0), {}), ('no_twist', (3.0, -20.0, 0.0), {'arrangement': 'base'})],
 )
 def test_it_is_simulated_recorded_replayed_and_solved(
@@ -43,10 +43,10 @@ def test_it_is_simulated_recorded_replayed_and_solved(
     capsys: pytest.CaptureFixture[str],
     assume: str,
     load: tuple[float, float, float],
-    said: dict[str, str],
+    message: dict[str, str],
 ) -> None:
     file, bag = tmp_path / 'rig.yaml', tmp_path / 'run'
-    body = {**BASE, **said, 'base_pair.assume': assume}
+    body = {**BASE, **message, 'base_pair.assume': assume}
     file.write_text(yaml.safe_dump({'/**': {'ros__parameters': body}}))
     words = ','.join(map(str, load))
     assert main(['simulate', '--params-file', str(file), '--loads', f'constant:{words}:12', '--out', str(bag)]) == 0
@@ -65,9 +65,9 @@ CONTRADICTIONS = [
 ]
 
 
-@pytest.mark.parametrize(('more', 'said'), CONTRADICTIONS)
-def test_a_contradiction_is_rejected_and_not_simulated(more: dict[str, object], said: str) -> None:
-    with pytest.raises(ConfigError, match=said):
+@pytest.mark.parametrize(('more', 'message'), CONTRADICTIONS)
+def test_a_contradiction_is_rejected_and_not_simulated(more: dict[str, object], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
         RigSimulator(load_rig(overrides={**BASE, **more}))
 
 

@@ -104,7 +104,7 @@ def test_a_rig_file_carries_it_there_and_back(active: ActiveEffect, tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ('values', 'said'),
+    ('values', 'message'),
     [
         ({'effects.a': 3}, 'effects.a = 3'),
         ({'effects.a.name': 'sensor_rotatoin', 'effects.a.psd': 1}, 'did you mean sensor_rotation'),
@@ -117,10 +117,10 @@ def test_a_rig_file_carries_it_there_and_back(active: ActiveEffect, tmp_path: Pa
         ({'effects.a.name': 'sensor_rotation', 'effects.a.psd': 1, 'effects.a.turn': 4.0}, 'turn'),
     ],
 )
-def test_a_bad_effect_is_rejected_by_name(values: dict[str, object], said: str) -> None:
+def test_a_bad_effect_is_rejected_by_name(values: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError) as error:
         effects_of_rig(rig_from_values(values))
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 def test_play_is_the_sequential_operator() -> None:

@@ -176,7 +176,7 @@ def test_a_law_travels_with_the_recording_and_the_rig_file(
 
 
 @pytest.mark.parametrize(
-    ('text', 'said'),
+    ('text', 'message'),
     [
         (
             '{name: other, acts_on: y2, terms: [{form: product, of: [x2], coefficient: 1}]}',
@@ -187,11 +187,11 @@ def test_a_law_travels_with_the_recording_and_the_rig_file(
         ('7', 'law: must be a map'),
     ],
 )
-def test_a_malformed_law_in_a_rig_file_is_rejected_with_its_key(text: str, said: str) -> None:
+def test_a_malformed_law_in_a_rig_file_is_rejected_with_its_key(text: str, message: str) -> None:
     rig = load_rig(overrides={'effects.e.name': 'e', 'effects.e.c1': 1.0, 'effects.e.law': text})
     with pytest.raises(ConfigError) as error:
         effects_of_rig(rig)
-    assert str(error.value).startswith(f'effects.e.{said}')
+    assert str(error.value).startswith(f'effects.e.{message}')
 
 
 def test_units_and_words_are_those_of_the_variables() -> None:
@@ -203,7 +203,7 @@ def test_units_and_words_are_those_of_the_variables() -> None:
 
 
 @pytest.mark.parametrize(
-    ('change', 'said'),
+    ('change', 'message'),
     [
         ({'acts_on: y2': 'acts_on: y7'}, "acts_on = 'y7': unknown"),
         ({'form: above': 'form: abov'}, "terms[0].form = 'abov': unknown; did you mean above?"),
@@ -215,7 +215,7 @@ def test_units_and_words_are_those_of_the_variables() -> None:
         ({'acts_on: y2': 'acts_on: load_fx', '- load_fx': '- y1'}, "terms[0].of = 'y1': unknown"),
     ],
 )
-def test_a_malformed_law_is_rejected_with_file_and_key(tmp_path: Path, change: dict[str, str], said: str) -> None:
+def test_a_malformed_law_is_rejected_with_file_and_key(tmp_path: Path, change: dict[str, str], message: str) -> None:
     text = law_text(Law('yielding', 'psd', 'y2', (LawTerm('above', ('load_fx',), 2.5e-7, {'threshold': 10.0}),)))
     for old, new in change.items():
         assert old in text
@@ -224,7 +224,7 @@ def test_a_malformed_law_is_rejected_with_file_and_key(tmp_path: Path, change: d
     file.write_text(text)
     with pytest.raises(ConfigError) as error:
         read_law(file)
-    assert str(error.value).startswith(f'{file}: {said}')
+    assert str(error.value).startswith(f'{file}: {message}')
 
 
 def test_every_form_has_a_sound_unit() -> None:

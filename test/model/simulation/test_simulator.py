@@ -101,7 +101,7 @@ def test_load_file_is_held_between_rows(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ('text', 'said'),
+    ('text', 'message'),
     [
         ('', 'is empty'),
         ('t,load_fx,load_fy\n0,1,2\n', 'the header lacks load_tz'),
@@ -111,13 +111,13 @@ def test_load_file_is_held_between_rows(tmp_path: Path) -> None:
         ('t,load_fx,load_fy,load_tz\n0,1,2,3\n0,1,2,3\n', ':3: column t does not rise'),
     ],
 )
-def test_bad_load_file_is_rejected_by_line(tmp_path: Path, text: str, said: str) -> None:
+def test_bad_load_file_is_rejected_by_line(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / 'loads.csv'
     path.write_text(text)
     with pytest.raises(RecordingError) as error:
         loads.from_csv(path)
     assert 'loads.csv' in str(error.value)
-    assert said in str(error.value)
+    assert message in str(error.value)
 
 
 OWN = {

@@ -56,7 +56,7 @@ def test_one_of_the_two_rank_conditions_is_enough(rays: Any, method: str, center
 
 
 @pytest.mark.parametrize(
-    ('method', 'geometry', 'options', 'said'),
+    ('method', 'geometry', 'options', 'message'),
     [
         ('beam', rig(CORNER, [-0.39, 0.0]), {}, r'psd_1\.height = -0\.39 m: .*the deflection cannot be seen'),
         ('beam', rig(CORNER, length=0.0), {}, r'link\.length = 0\.0 m: must be above 0'),
@@ -77,8 +77,8 @@ def test_one_of_the_two_rank_conditions_is_enough(rays: Any, method: str, center
         ('appendix_d_ols', rig(THREE), {}, r'takes two PSDs'),
     ],
 )
-def test_rejected_by_name(method: str, geometry: Geometry, options: dict[str, Any], said: str) -> None:
-    with pytest.raises(SolverError, match=said):
+def test_rejected_by_name(method: str, geometry: Geometry, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(SolverError, match=message):
         make_solver(method, geometry, **options)
 
 

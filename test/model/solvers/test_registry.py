@@ -113,15 +113,17 @@ COMPARISON_ONLY = [name for name, entry in SOLVERS.items() if entry.instead]
 
 @pytest.mark.parametrize('name', COMPARISON_ONLY)
 def test_a_printed_method_is_no_live_runs_answer(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    said = f"solver = '{name}': a method as printed, for comparison only: for a live run take '{SOLVERS[name].instead}'"
-    with pytest.raises(ConfigError, match=said):
+    message = (
+        f"solver = '{name}': a method as printed, for comparison only: for a live run take '{SOLVERS[name].instead}'"
+    )
+    with pytest.raises(ConfigError, match=message):
         Session(rig_from_values({'solver': name, 'port': '/dev/nothing_here'}), texts(print))
     file = rig_file(tmp_path, f'solver: {name}; port: /dev/nothing_here')
     for command in (['estimator', '--no-ros'], ['monitor', '--http-port', '0']):
         assert main([*command, '--params-file', file]) == 3
-        assert said in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     assert main(['estimator', '--no-ros', '--solver', name, '--port', '/dev/nothing_here']) == 2
-    assert '--' + said in capsys.readouterr().err
+    assert '--' + message in capsys.readouterr().err
 
 
 def test_a_printed_method_may_be_listed_live_and_may_replay(tmp_path: Path) -> None:

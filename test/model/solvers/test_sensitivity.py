@@ -273,7 +273,7 @@ def test_who_can_do_with_fewer_psds() -> None:
     assert three.tilts == 'free'
 
 
-def test_where_the_psds_are_is_said_once() -> None:
+def test_where_the_psds_are_is_reported_once() -> None:
     """PSDs nearer to the base than to the tip are at the base; halfway they may still be at the tip."""
     check_arrangement(rig_from_values({'link.length': 0.5, 'psd_1.height': -0.25}))
     with pytest.raises(ConfigError, match=r'psd_2\.height = -0\.251 m: that is nearer to the base'):
@@ -290,7 +290,7 @@ def test_where_the_psds_are_is_said_once() -> None:
             check_arrangement(rig_from_values({**values, 'degraded': 'none'}))
 
 
-def test_the_arrangement_is_said_by_the_rig_or_by_the_name_of_the_solver_alone() -> None:
+def test_the_arrangement_is_reported_by_the_rig_or_by_the_name_of_the_solver_alone() -> None:
     """Said by the rig, it is not changed by the name of a solver: that is refused with the lines to write."""
     base = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
     for more, at_base in (({}, True), ({'arrangement': 'base'}, True), ({'arrangement': 'tip'}, False)):
@@ -345,19 +345,19 @@ def test_options_come_from_the_rig_file() -> None:
     base = {'solver': 'base_pair', 'solvers': ['base_pair'], 'degraded': 'none'}
     rig = rig_from_values({**base, 'psd_1.height': -0.585, 'psd_2.height': -0.485, 'base_pair.assume': 'no_twist'})
     dots = (1e-3, -2e-3, 5e-4, 1e-3)
-    said = solver_from_rig('base_pair', rig).solve(dots, VARIANCES[:4])
-    assert said == make_solver('base_pair', Geometry.from_rig(rig), assume='no_twist').solve(dots, VARIANCES[:4])
-    assert said != make_solver('base_pair', Geometry.from_rig(rig)).solve(dots, VARIANCES[:4])
+    message = solver_from_rig('base_pair', rig).solve(dots, VARIANCES[:4])
+    assert message == make_solver('base_pair', Geometry.from_rig(rig), assume='no_twist').solve(dots, VARIANCES[:4])
+    assert message != make_solver('base_pair', Geometry.from_rig(rig)).solve(dots, VARIANCES[:4])
     rig = rig_from_values({'minimum_tilt.angles': 'azimuth'})
     far = (1e-3, 2e-3, -1e-3, -3e-3)
-    said = solver_from_rig('minimum_tilt', rig).solve(far, VARIANCES[:4])
-    assert said == make_solver('minimum_tilt', Geometry.from_rig(rig), angles='azimuth').solve(far, VARIANCES[:4])
-    assert said.theta != make_solver('minimum_tilt', Geometry.from_rig(rig)).solve(far, VARIANCES[:4]).theta
+    message = solver_from_rig('minimum_tilt', rig).solve(far, VARIANCES[:4])
+    assert message == make_solver('minimum_tilt', Geometry.from_rig(rig), angles='azimuth').solve(far, VARIANCES[:4])
+    assert message.theta != make_solver('minimum_tilt', Geometry.from_rig(rig)).solve(far, VARIANCES[:4]).theta
     two = {'psd_1.height': 0.02, 'psd_2.height': -0.03}
     for effect, in_dots in (({}, True), ({'effects.t.name': 'plane_tilt', 'effects.t.slope_ratio': 1.5}, False)):
         rig = rig_from_values({**two, **effect})
-        said = solver_from_rig('beam', rig).solve(dots, VARIANCES[:4])
-        assert said == make_solver('beam', Geometry.from_rig(rig), tilt_in_dots=in_dots).solve(dots, VARIANCES[:4])
+        message = solver_from_rig('beam', rig).solve(dots, VARIANCES[:4])
+        assert message == make_solver('beam', Geometry.from_rig(rig), tilt_in_dots=in_dots).solve(dots, VARIANCES[:4])
     # An effect that does not say how the plate leans leaves the tilts in, and so does one that says it does not.
     for effect in (
         {'effects.g.name': 'sensor_gain', 'effects.g.psd': 1, 'effects.g.x': 0.01},
@@ -442,7 +442,7 @@ def test_a_sine_is_inadmissible_from_one_on_in_either_direction() -> None:
     """Readings that turn more and more: an angle, and beyond a quarter turn none."""
     solver = make_solver('wls_exact', TWO)
     for way in (1.0, -1.0):
-        said = [solver.solve((0.0, 0.0, 0.0, way * y), VARIANCES[:4]).status for y in np.linspace(0.01, 0.6, 60)]
-        ends = said.index(SolverStatus.INADMISSIBLE)
+        message = [solver.solve((0.0, 0.0, 0.0, way * y), VARIANCES[:4]).status for y in np.linspace(0.01, 0.6, 60)]
+        ends = message.index(SolverStatus.INADMISSIBLE)
         assert 3 < ends < 30
-        assert said == [SolverStatus.OK] * ends + [SolverStatus.INADMISSIBLE] * (60 - ends)
+        assert message == [SolverStatus.OK] * ends + [SolverStatus.INADMISSIBLE] * (60 - ends)

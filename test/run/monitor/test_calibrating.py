@@ -66,7 +66,7 @@ def test_it_shows_what_is_determined_and_ends_with_its_files(serve: Serve, bag: 
     assert asked(serving.url, False) == (409, 'no calibration runs')
 
 
-def test_why_it_could_not_is_said(serve: Serve, tmp_path: Path) -> None:
+def test_why_it_could_not_is_reported(serve: Serve, tmp_path: Path) -> None:
     serving = serve(bag_dir=str(tmp_path))
     assert asked(serving.url, True)[0] == 200
     ended = calibrations(serving.url, lambda c: not c['running'])

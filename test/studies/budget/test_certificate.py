@@ -273,15 +273,15 @@ def test_the_rows_of_the_results_are_the_numbers(certificate: Certificate) -> No
     assert len(head) == 1 + 6 * 3 + 2
     assert head[1:4] == ['ΔX µm', 'ΔY µm', 'θ mdeg']
     verdicts = _certified(certificate, limits=LIMITS).verdicts
-    for n, (row, said) in enumerate(zip(others, certificate.stated, strict=True)):
+    for n, (row, message) in enumerate(zip(others, certificate.stated, strict=True)):
         assert row[0] == str(n + 1)
         assert len(row) == len(head)
-        parts = (certificate.poses[n], certificate.found[n], said.standard)
+        parts = (certificate.poses[n], certificate.found[n], message.standard)
         numbers = [scale * v for part in parts for scale, v in zip(SCALES, part.tolist(), strict=True)]
         assert [float(v) for v in row[1:10]] == pytest.approx(numbers, abs=6e-4)
-        assert row[10:13] == [f'{v:.0f}' for v in said.freedom.tolist()]
-        assert [float(v) for v in row[13:16]] == pytest.approx(said.factor.tolist(), abs=6e-4)
-        expanded = [scale * v for scale, v in zip(SCALES, said.uncertainty.tolist(), strict=True)]
+        assert row[10:13] == [f'{v:.0f}' for v in message.freedom.tolist()]
+        assert [float(v) for v in row[13:16]] == pytest.approx(message.factor.tolist(), abs=6e-4)
+        expanded = [scale * v for scale, v in zip(SCALES, message.uncertainty.tolist(), strict=True)]
         assert [float(v) for v in row[16:19]] == pytest.approx(expanded, abs=6e-4)
         assert tuple(row[19:]) == tuple(verdicts[n])
     # Nothing is judged without limits.
@@ -307,10 +307,10 @@ def test_the_sentences_say_the_largest(certificate: Certificate) -> None:
 def test_mixed_verdicts_are_all_named(certificate: Certificate) -> None:
     # One pose was a metre off, the others not at all.
     wrong = replace(certificate, found=np.diag([1.0, 0.0, 0.0]))
-    said = _certified(wrong, limits=(0.5, 0.5, 0.5)).sentences()[2]
-    assert said == 'As found: conforms, does not conform; as left: every pose conforms.'
-    said = _certified(certificate, limits=(1e-12, 1.0, 1.0)).sentences()[2]
-    assert said.endswith('as left: every pose not decided.')
+    message = _certified(wrong, limits=(0.5, 0.5, 0.5)).sentences()[2]
+    assert message == 'As found: conforms, does not conform; as left: every pose conforms.'
+    message = _certified(certificate, limits=(1e-12, 1.0, 1.0)).sentences()[2]
+    assert message.endswith('as left: every pose not decided.')
 
 
 def test_the_chart_has_every_error_and_both_limits(certificate: Certificate) -> None:
@@ -321,7 +321,7 @@ def test_the_chart_has_every_error_and_both_limits(certificate: Certificate) -> 
         assert panel.y_label == axis
         assert curve.x.tolist() == [1.0, 2.0, 3.0]
         assert curve.y == pytest.approx(SCALES[i] * certificate.found[:, i])
-        assert curve.spread == pytest.approx([SCALES[i] * said.uncertainty[i] for said in certificate.stated])
+        assert curve.spread == pytest.approx([SCALES[i] * message.uncertainty[i] for message in certificate.stated])
         assert [rule.at for rule in panel.rules] == pytest.approx([-SCALES[i] * LIMITS[i], SCALES[i] * LIMITS[i]])
         assert all(rule.across for rule in panel.rules)
     assert all(not panel.rules for panel in _certified(certificate).chart().panels)
@@ -344,14 +344,14 @@ def test_the_files_have_all_digits(certificate: Certificate) -> None:
         assert [float(row[name]) for name in names] == own
     assert [row['pose'] for row in read['results.csv']] == ['1', '2', '3']
     for n, row in enumerate(read['results.csv']):
-        said = certificate.stated[n]
+        message = certificate.stated[n]
         parts: Mapping[str, FloatArray] = {
             '': certificate.poses[n],
             'as_found_': certificate.found[n],
-            'u_c_': said.standard,
-            'nu_eff_': said.freedom,
-            'k_': said.factor,
-            'U_': said.uncertainty,
+            'u_c_': message.standard,
+            'nu_eff_': message.freedom,
+            'k_': message.factor,
+            'U_': message.uncertainty,
         }
         for kind, values in parts.items():
             assert [float(row[f'{kind}{axis}']) for axis in AXES] == values.tolist()

@@ -44,11 +44,11 @@ def test_effective_freedom_is_that_of_the_gum() -> None:
 
 
 def test_a_bias_that_is_not_corrected_is_added_with_its_size() -> None:
-    said = expanded(np.array([[9.0, 4.0, 1.0], [16.0, 0.0, 0.0]]), [math.inf, 8.0], np.array([0.0, -2.0, 3.0]))
-    assert said.standard.tolist() == [5.0, 2.0, 1.0]
+    message = expanded(np.array([[9.0, 4.0, 1.0], [16.0, 0.0, 0.0]]), [math.inf, 8.0], np.array([0.0, -2.0, 3.0]))
+    assert message.standard.tolist() == [5.0, 2.0, 1.0]
     # 25^2/(16^2/8) = 19.5.
-    assert said.freedom.tolist() == [19.0, math.inf, math.inf]
-    assert said.uncertainty == pytest.approx([2.093 * 5.0, 2.0 + 1.96 * 2.0, 3.0 + 1.96], abs=2e-3)
+    assert message.freedom.tolist() == [19.0, math.inf, math.inf]
+    assert message.uncertainty == pytest.approx([2.093 * 5.0, 2.0 + 1.96 * 2.0, 3.0 + 1.96], abs=2e-3)
 
 
 def test_the_sensitivity_to_a_shift_of_one_reading() -> None:
@@ -90,8 +90,8 @@ def test_a_deviation_that_is_hardly_known_is_drawn_wider() -> None:
 def test_u_is_half_of_the_drawn_interval() -> None:
     answer = budget(BudgetProblem(RIG, draws=20_000))
     assert answer.interval is not None
-    said = answer.budget.expanded()
-    assert np.abs(difference(said, answer.interval)).max() < 0.06
+    message = answer.budget.expanded()
+    assert np.abs(difference(message, answer.interval)).max() < 0.06
     # And the interval has 95 % of the draws, counted.
     errors = draws(answer.budget.at, 20_000, 1, shaped=True)
     inside = np.abs(errors - answer.interval.middle) <= answer.interval.half

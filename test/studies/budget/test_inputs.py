@@ -14,7 +14,7 @@ EVERY = (*INPUTS, *REFERENCE_INPUTS)
 NANO, MICRO, MILLI = 1e-9, 1e-6, 1e-3
 
 # By what the sources say: data sheets, the thesis, a rule. Default, unit, least (more than it: True), greatest.
-SAID: dict[str, tuple[float, str, float, bool, float]] = {
+MESSAGE: dict[str, tuple[float, str, float, bool, float]] = {
     'laser_wavelength': (650 * NANO, 'm', 10 * NANO, True, 10 * MICRO),
     'laser_diameter': (1 * MILLI, 'm', 1 * MICRO, True, 50 * MILLI),
     'laser_power': (1 * MILLI / 2, 'W', 0.0, True, 1.0),
@@ -54,8 +54,8 @@ ROUNDED = {'beam_tolerance': 0.03, 'rotation_tolerance': 0.01, 'tilt_tolerance':
 
 
 def test_every_input_is_what_its_source_says() -> None:
-    assert [i.parameter.name for i in EVERY] == list(SAID)
+    assert [i.parameter.name for i in EVERY] == list(MESSAGE)
     for i in EVERY:
-        default, unit, *_ = SAID[i.parameter.name]
+        default, unit, *_ = MESSAGE[i.parameter.name]
         assert i.parameter.default == pytest.approx(default, rel=ROUNDED.get(i.parameter.name, 1e-6))
         assert i.parameter.unit == unit

@@ -85,7 +85,7 @@ def test_the_index_of_any_air(pascal: float, celsius: float, percent: float, co2
     assert saturation_pressure(273.15 + celsius) == pytest.approx(_magnus(celsius), rel=1e-12)
 
 
-def test_what_is_not_said_of_the_air() -> None:
+def test_what_is_not_reported_of_the_air() -> None:
     """Half saturated, with 450 ppm of carbon dioxide, for the light of a helium-neon laser."""
     got = air_index(95_000.0, 300.0) - 1.0
     assert got == pytest.approx(_birch_and_downs(95_000.0, 26.85, 50.0, 450.0, 0.633), abs=1e-15)

@@ -90,19 +90,19 @@ def test_the_rows_of_the_causes_are_their_numbers(plain: Budgeted) -> None:
 def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain: Budgeted) -> None:
     variances = np.array([np.diag(line.covariance) for _, line in plain.budget.lines])
     bias = np.sum([line.bias for _, line in plain.budget.lines], axis=0)
-    said = expanded(variances, [cause.freedom(plain.budget.at) for cause in CAUSES], bias)
+    message = expanded(variances, [cause.freedom(plain.budget.at) for cause in CAUSES], bias)
     _, *rows = plain.expanded_rows()
     assert len(rows) == 5
-    assert [float(v) for v in rows[0][1:]] == pytest.approx((said.standard * SCALES).tolist(), abs=6e-4)
-    assert rows[1][1:] == [f'{v:.0f}' for v in said.freedom.tolist()]
-    assert rows[2][1:] == [f'{v:.3f}' for v in said.factor.tolist()]
+    assert [float(v) for v in rows[0][1:]] == pytest.approx((message.standard * SCALES).tolist(), abs=6e-4)
+    assert rows[1][1:] == [f'{v:.0f}' for v in message.freedom.tolist()]
+    assert rows[2][1:] == [f'{v:.3f}' for v in message.factor.tolist()]
     assert [float(v) for v in rows[3][1:]] == pytest.approx((bias * SCALES).tolist(), abs=6e-4)
-    by_hand = said.factor * said.standard + np.abs(bias)
+    by_hand = message.factor * message.standard + np.abs(bias)
     assert [float(v) for v in rows[4][1:]] == pytest.approx((by_hand * SCALES).tolist(), abs=6e-4)
     assert answer.interval is not None
     drawn = answer.expanded_rows()[6:]
     assert [float(v) for v in drawn[0][1:]] == pytest.approx((answer.interval.half * SCALES).tolist(), abs=6e-4)
-    off = 100.0 * (said.factor * said.standard / answer.interval.half - 1.0)
+    off = 100.0 * (message.factor * message.standard / answer.interval.half - 1.0)
     assert drawn[1][1:] == [f'{v:+.1f}' for v in off.tolist()]
     sentence = answer.sentences()[-1]
     assert f'ΔX {off[0]:+.1f} %, ΔY {off[1]:+.1f} %, θ {off[2]:+.1f} %.' in sentence
@@ -111,11 +111,13 @@ def test_the_expanded_uncertainty_is_shown_in_its_parts(answer: Budgeted, plain:
 
 
 def test_without_a_spread_there_is_no_difference() -> None:
-    said = expanded(np.array([[4.0, 4.0, 0.0]]), [math.inf], np.zeros(3))
-    got = difference(said, Interval(np.array([2.0 * 1.959964, 0.0, 0.0]), np.zeros(3)))
+    message = expanded(np.array([[4.0, 4.0, 0.0]]), [math.inf], np.zeros(3))
+    got = difference(message, Interval(np.array([2.0 * 1.959964, 0.0, 0.0]), np.zeros(3)))
     # The first is what was drawn; of the others nothing was drawn.
     assert got == pytest.approx([0.0, 0.0, 0.0], abs=1e-6)
-    assert difference(said, Interval(np.array([1.959964] * 3), np.zeros(3)))[:2] == pytest.approx([1.0, 1.0], abs=1e-6)
+    assert difference(message, Interval(np.array([1.959964] * 3), np.zeros(3)))[:2] == pytest.approx(
+        [1.0, 1.0], abs=1e-6
+    )
 
 
 def test_the_sentences_name_the_largest_cause(answer: Budgeted, plain: Budgeted) -> None:

@@ -192,7 +192,7 @@ def test_shares_add_to_one_where_one_bias_stands_alone() -> None:
 
 
 @pytest.mark.parametrize(
-    ('settings', 'said'),
+    ('settings', 'message'),
     [
         ({'rotation': 0.1}, 'did you mean rotation_tolerance'),
         ({'laser_power': 0.0}, 'above 0'),
@@ -200,20 +200,22 @@ def test_shares_add_to_one_where_one_bias_stands_alone() -> None:
         ({'temperature': 20.0}, 'above 223.15'),
     ],
 )
-def test_a_bad_input_is_rejected_by_name(settings: dict[str, object], said: str) -> None:
+def test_a_bad_input_is_rejected_by_name(settings: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError) as error:
         read_inputs(None, settings)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert next(iter(settings)) in str(error.value)
 
 
-@pytest.mark.parametrize(('text', 'said'), [('- 1', 'name: value'), ('{', 'malformed YAML'), ('x: 1', 'no such input')])
-def test_a_bad_file_of_inputs_is_rejected_by_name(tmp_path: Path, text: str, said: str) -> None:
+@pytest.mark.parametrize(
+    ('text', 'message'), [('- 1', 'name: value'), ('{', 'malformed YAML'), ('x: 1', 'no such input')]
+)
+def test_a_bad_file_of_inputs_is_rejected_by_name(tmp_path: Path, text: str, message: str) -> None:
     path = tmp_path / 'inputs.yaml'
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
         read_inputs(path)
-    assert said in str(error.value)
+    assert message in str(error.value)
     assert 'inputs.yaml' in str(error.value)
 
 

@@ -54,7 +54,7 @@ def test_a_turned_psd_is_found_with_its_sign(nominal: Rig, pose: FloatArray) -> 
     assert turned > 0.015
 
 
-def test_errors_are_those_that_are_said(nominal: Rig, pose: FloatArray) -> None:
+def test_errors_are_those_that_are_reported(nominal: Rig, pose: FloatArray) -> None:
     """All tolerances at once, two rigs; the campaign has many."""
     rng = np.random.default_rng(5)
     errors: list[float] = []

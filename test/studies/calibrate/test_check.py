@@ -75,7 +75,7 @@ def test_a_group_is_fitted_as_if_it_may_have_moved_by_three_tolerances(monkeypat
 
 
 @pytest.mark.parametrize(('shared', 'least', 'most'), [(0.0, 0.042, 0.055), (0.9, 0.005, 0.055)])
-def test_at_most_five_per_cent_of_rigs_are_said_to_have_moved(shared: float, least: float, most: float) -> None:
+def test_at_most_five_per_cent_of_rigs_are_reported_to_have_moved(shared: float, least: float, most: float) -> None:
     """20,000 rigs in which nothing moved, of as many groups as there are, independent or with a common part."""
     groups = len({p.group for p in PARAMETERS[:ZERO]})
     rng = np.random.default_rng(8)

@@ -52,7 +52,7 @@ def white(levels: tuple[float, ...], n: int = 5000, sigma: float = 2e-3) -> Floa
     return np.array(levels) + np.random.default_rng(2).normal(0.0, sigma, (n, 6))
 
 
-def test_levels_are_within_what_is_said_of_them_in_95_of_100(nominal: Rig) -> None:
+def test_levels_are_within_what_is_reported_of_them_in_95_of_100(nominal: Rig) -> None:
     """Coloured noise and flicker: the error of white noise would be a third of that."""
     rng = np.random.default_rng(12)
     far: list[FloatArray] = []
@@ -79,7 +79,7 @@ def test_steps_that_noise_does_not_dither_are_an_uncertainty(nominal: Rig) -> No
     assert one.sd == pytest.approx(np.full(3, 20.0 / 65536.0 / 12.0**0.5), rel=0.01)
 
 
-def test_what_is_said_of_one_psd(nominal: Rig) -> None:
+def test_what_is_reported_of_one_psd(nominal: Rig) -> None:
     lit = run_of(white((0.0, 0.0, 5.12, 0.0, 0.0, 5.06), 500, 0.0))
     (one, two) = dark_levels([run_of(darkness())], nominal, [lit])
     assert one.lit_sum == 5.12

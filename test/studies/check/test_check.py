@@ -279,9 +279,9 @@ def test_the_printed_lines_put_the_rig_file_right(tmp_path: Path, capsys: pytest
     loads = pushes(10.0)
     recording = str(written(tmp_path / 'pushes.csv', recorded(loads, 7, every_turn()[100]), loads))
     assert main(['check', recording]) == 0
-    said = capsys.readouterr().out
-    assert 'WRONG: one wiring of 128 fits' in said
-    pasted = [text for text in said.splitlines() if text.startswith('    ')]
+    message = capsys.readouterr().out
+    assert 'WRONG: one wiring of 128 fits' in message
+    pasted = [text for text in message.splitlines() if text.startswith('    ')]
     rig = tmp_path / 'rig.yaml'
     rig.write_text('\n'.join(['/**:', '  ros__parameters:', *pasted]) + '\n')
     assert read_parameter_file(rig) == lines_of(every_turn()[100])
@@ -322,7 +322,7 @@ def test_a_simulated_recording_can_be_wired_otherwise_than_its_rig_file_says(
 
 
 @pytest.mark.parametrize(
-    ('args', 'status', 'said'),
+    ('args', 'status', 'message'),
     [
         (['check', 'x.csv', '--port', '/dev/null'], 2, '--port is for the guide'),
         (['check', 'bags/clean'], 4, 'holds no loads'),
@@ -332,10 +332,10 @@ def test_a_simulated_recording_can_be_wired_otherwise_than_its_rig_file_says(
     ],
 )
 def test_what_cannot_be_checked_is_rejected(
-    args: list[str], status: int, said: str, capsys: pytest.CaptureFixture[str]
+    args: list[str], status: int, message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(args) == status
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 # A perfect rig: nothing drifts, whatever hangs on it.

@@ -41,7 +41,7 @@ class Bench:
 def led(known: Rig, bench: Bench, hand: tuple[FloatArray, ...], most: float = 60.0) -> tuple[Guide, list[str]]:
     """The guide after all pushes; the hand takes a third of a second to do what it reads."""
     guide = Guide(known)
-    said: list[str] = []
+    message: list[str] = []
     now, wanted = np.zeros(3), np.zeros(3)
     late: list[FloatArray] = [np.zeros(3)] * 16
     for _ in range(round(most * 50)):
@@ -50,8 +50,8 @@ def led(known: Rig, bench: Bench, hand: tuple[FloatArray, ...], most: float = 60
         wanted = hand[guide.number] if guide.phase is Phase.PUSH else np.zeros(3)
         late.append(wanted)
         now = late.pop(0)
-        said.append(guide.feed(bench.block(now)))
-    return guide, [text for text in said if text]
+        message.append(guide.feed(bench.block(now)))
+    return guide, [text for text in message if text]
 
 
 def hand_of(rig: Rig, size: float, clumsy: float = 0.0) -> tuple[FloatArray, ...]:
@@ -71,9 +71,9 @@ def verdict(known: Rig, guide: Guide) -> Checkup:
 def test_a_wiring_is_named_by_hand(number: int, clumsy: float) -> None:
     wiring, known = WIRINGS[number], load_rig()
     world = rig_from_values(parameters(wiring, Wiring()))
-    guide, said = led(known, Bench(world, number), hand_of(known, 0.2e-3, clumsy))
+    guide, message = led(known, Bench(world, number), hand_of(known, 0.2e-3, clumsy))
     assert guide.phase is Phase.DONE
-    assert sum(text.startswith('Got it: ') for text in said) == 3
+    assert sum(text.startswith('Got it: ') for text in message) == 3
     found = verdict(known, guide)
     assert found.verdict == (WRONG if number else RIGHT)
     assert dict(found.values) == parameters(wiring, Wiring())
@@ -91,24 +91,24 @@ def test_a_turn_the_other_way_is_reported_beside_exchanged_psds() -> None:
     assert found.findings[0].equivalent == ('load_sign of tz',)
 
 
-def test_a_push_that_is_too_small_or_too_shaky_is_not_taken_and_said() -> None:
+def test_a_push_that_is_too_small_or_too_shaky_is_not_taken_and_reported() -> None:
     known = load_rig()
-    guide, said = led(known, Bench(known, 2), hand_of(known, 2e-6), most=30.0)
+    guide, message = led(known, Bench(known, 2), hand_of(known, 2e-6), most=30.0)
     assert (guide.phase, guide.number) == (Phase.PUSH, 0)
-    assert any(text.startswith('No push yet: the dots have moved by') for text in said)
-    guide, said = led(known, Bench(known, 3, tremor=1.0), hand_of(known, 0.2e-3), most=30.0)
+    assert any(text.startswith('No push yet: the dots have moved by') for text in message)
+    guide, message = led(known, Bench(known, 3, tremor=1.0), hand_of(known, 0.2e-3), most=30.0)
     assert not guide.pushes
-    assert 'Hold it steadier.' in said
+    assert 'Hold it steadier.' in message
 
 
 def test_a_link_that_is_not_let_go_is_waited_for() -> None:
     known = load_rig()
     bench, guide = Bench(known, 4), Guide(known)
     push, _, _ = hand_of(known, 0.2e-3)
-    said = [guide.feed(bench.block(np.zeros(3))) for _ in range(150)]
-    said += [guide.feed(bench.block(push)) for _ in range(900)]
+    message = [guide.feed(bench.block(np.zeros(3))) for _ in range(150)]
+    message += [guide.feed(bench.block(push)) for _ in range(900)]
     assert guide.phase is Phase.RELEASE
-    assert 'Let go of the link.' in said
+    assert 'Let go of the link.' in message
     assert guide.prompt() == 'Let go.'
 
 
@@ -116,9 +116,9 @@ def test_a_link_that_moves_is_not_at_rest() -> None:
     known = load_rig()
     bench, guide = Bench(known, 5, tremor=1.0), Guide(known)
     push, _, _ = hand_of(known, 0.2e-3)
-    said = [guide.feed(bench.block(push)) for _ in range(800)]
+    message = [guide.feed(bench.block(push)) for _ in range(800)]
     assert guide.phase is Phase.REST
-    assert any('leave it alone' in text for text in said)
+    assert any('leave it alone' in text for text in message)
 
 
 # ---- the phases, sample by sample
@@ -129,23 +129,23 @@ WAIT = 500
 
 
 class Fed:
-    """A guide that gets blocks whose dots are told, m; ``said``: what it answered to each."""
+    """A guide that gets blocks whose dots are told, m; ``message``: what it answered to each."""
 
     def __init__(self, known: Rig | None = None) -> None:
         self.known = known or load_rig()
         self.guide = Guide(self.known)
-        self.said: list[str] = []
+        self.message: list[str] = []
 
     def feed(self, dots: tuple[float, float, float, float], blocks: int = 1, shaking: float = 0.0) -> list[str]:
         """``blocks`` at these ``dots``; ``shaking``: one after the other to either side of it on y1, m."""
         volts = np.full((BLOCK, 6), 5.0)
         answers = []
         for _ in range(blocks):
-            side = shaking if len(self.said) % 2 else -shaking
+            side = shaking if len(self.message) % 2 else -shaking
             moved = np.add(dots, (0.0, side, 0.0, 0.0))
             volts[:, [0, 1, 3, 4]] = moved / self.known.amplifier.sensitivity
             answers.append(self.guide.feed(volts.copy()))
-            self.said.append(answers[-1])
+            self.message.append(answers[-1])
         return answers
 
     def at(self, phase: Phase, progress: float | None = None) -> bool:
@@ -223,11 +223,11 @@ def test_pieces_of_any_length_count_by_their_samples() -> None:
 def test_rest_wanders_by_no_more_than_five_times_the_noise_of_a_block(shaking: float, rests: bool) -> None:
     # 2 mV are 1 um a sample; of a block of 20 five deviations are 1.118 um.
     fed = Fed()
-    said = fed.feed(NOTHING, WAIT - 1, shaking)
+    message = fed.feed(NOTHING, WAIT - 1, shaking)
     assert fed.at(Phase.REST) is not rests
     if not rests:
         assert fed.guide.progress == 0.0
-        assert not any(said)
+        assert not any(message)
         assert fed.feed(NOTHING, 2, shaking).count('It still moves by 1.1 µm rms: leave it alone.') == 1
         # Once in ten seconds, and after half a minute it is taken as it is.
         assert fed.feed(NOTHING, WAIT - 2, shaking) == [''] * (WAIT - 2)
@@ -260,30 +260,30 @@ def test_rest_of_a_quiet_rig_may_still_wander_by_a_tenth_of_the_least_push() -> 
 def test_a_push_stands_out_of_the_rest(shaking: float, size: float, taken: bool) -> None:
     assert 10.0 * math.sqrt(1.0 + 3.0 * 0.2236**2) == pytest.approx(10.724, abs=1e-3)
     fed = Fed().rested(shaking * MICRO)
-    said = fed.feed((size * MICRO, 0.0, 0.0, 0.0), WAIT + 1)
+    message = fed.feed((size * MICRO, 0.0, 0.0, 0.0), WAIT + 1)
     assert fed.at(Phase.RELEASE) is taken
     if not taken:
         assert fed.guide.progress == 0.0
-        assert [text for text in said if text] == [f'No push yet: the dots have moved by {size:.1f} µm.']
-        assert said[WAIT - 2] == ''
+        assert [text for text in message if text] == [f'No push yet: the dots have moved by {size:.1f} µm.']
+        assert message[WAIT - 2] == ''
 
 
 @pytest.mark.parametrize(('shaking', 'taken'), [(149.0, True), (151.0, False)])
 def test_a_push_is_held_if_it_wanders_by_less_than_three_tenths_of_it(shaking: float, taken: bool) -> None:
     fed = Fed().rested()
-    said = fed.feed(FAR, WAIT + 1, shaking * MICRO)
-    assert any(text.startswith('Got it') for text in said) is taken
-    assert ('Hold it steadier.' in said) is not taken
+    message = fed.feed(FAR, WAIT + 1, shaking * MICRO)
+    assert any(text.startswith('Got it') for text in message) is taken
+    assert ('Hold it steadier.' in message) is not taken
 
 
-def test_a_dot_at_the_end_of_its_range_is_said_though_it_is_held() -> None:
+def test_a_dot_at_the_end_of_its_range_is_reported_though_it_is_held() -> None:
     # Two counts below 10 V are the end; half a millimetre is a volt.
     step = 20.0 / 2**16
     for volt, ends in ((10.0 - 2.0 * step, True), (10.0 - 2.5 * step, False)):
         fed = Fed().rested()
-        said = fed.feed((0.0, 0.0, -volt * 5e-4, 0.0), WAIT + 1)
-        assert ('A dot is at the end of its PSD: push less.' in said) is ends
-        assert any(text.startswith('Got it') for text in said) is not ends
+        message = fed.feed((0.0, 0.0, -volt * 5e-4, 0.0), WAIT + 1)
+        assert ('A dot is at the end of its PSD: push less.' in message) is ends
+        assert any(text.startswith('Got it') for text in message) is not ends
 
 
 def test_how_far_the_dots_were_pushed_is_reported_in_whole_micrometres() -> None:
@@ -300,12 +300,12 @@ def test_a_push_is_let_go_within_a_seventh_of_it(size: float, shaking: float, fr
     # Half a millimetre: 0.15 of it are 75 um.
     fed = Fed().rested()
     fed.feed(FAR, 30)
-    said = fed.feed((0.0, 0.0, size * MICRO, 0.0), 30, shaking * MICRO)
+    message = fed.feed((0.0, 0.0, size * MICRO, 0.0), 30, shaking * MICRO)
     assert len(fed.guide.pushes) == free
     if not free:
         assert fed.guide.progress == 0.0
-        said += fed.feed((0.0, 0.0, size * MICRO, 0.0), WAIT - 28, shaking * MICRO)
-        assert [text for text in said if text] == ['Let go of the link.']
+        message += fed.feed((0.0, 0.0, size * MICRO, 0.0), WAIT - 28, shaking * MICRO)
+        assert [text for text in message if text] == ['Let go of the link.']
 
 
 def test_a_push_is_relative_to_the_rests_around_it() -> None:
@@ -352,13 +352,13 @@ def test_ten_seconds_are_enough_and_thirty_are_all() -> None:
     # 1024 samples a second: each second is one in floating point, too.
     known = load_rig(overrides={'converter.sample_rate_hz': 1024.0})
     guide = Guide(known)
-    said = []
+    message = []
     for second in range(1, 31):
         volts = np.zeros((1024, 6))
         volts[:, 1] = 0.1 * (second % 2)
         assert guide.phase is Phase.REST
-        said += [second] if guide.feed(volts) else []
-    assert said == [10, 20]
+        message += [second] if guide.feed(volts) else []
+    assert message == [10, 20]
     assert guide.phase is Phase.PUSH
 
 

@@ -34,7 +34,7 @@ def test_check_and_discover_say_the_same_of_the_noise(
     assert main(['check', str(run), '--json']) == 0
     checked = json.loads(capsys.readouterr().out)['setup']
     searched = json.loads((found / 'result.json').read_text())['setup']
-    levels = [[f for f in said if f['name'] == 'noise_level'] for said in (checked, searched)]
+    levels = [[f for f in message if f['name'] == 'noise_level'] for message in (checked, searched)]
     assert [len(one) for one in levels] == [reported, reported]
     if reported:
         (of_check,), (of_search,) = levels
@@ -109,8 +109,8 @@ def test_check_and_discover_name_a_converter_that_is_coarser_than_the_file_says(
     # What the steps add to the noise is not said once more.
     assert checked['lines'] == {'converter.bits': 10}
     searched = json.loads((found / 'result.json').read_text())['setup']
-    for said in (checked['setup'], searched):
-        steps = [f for f in said if f['name'] == 'converter_step']
+    for message in (checked['setup'], searched):
+        steps = [f for f in message if f['name'] == 'converter_step']
         assert [f['where'] for f in steps] == ['x1', 'y1', 'sum1', 'x2', 'y2', 'sum2']
         assert [f['value'] for f in steps] == pytest.approx([20.0 / 2**10] * 6, rel=1e-4)
         assert steps[0]['fix'] == 'converter.bits: 10 (x1 steps by 19.5 mV, the rig file says 0.305 mV)'

@@ -95,7 +95,7 @@ def test_the_verdict_is_a_sentence(verdict: str, names: tuple[str, ...], count: 
     assert words in found.lines()
 
 
-def test_what_is_wrong_is_said_with_where_and_what_to_do() -> None:
+def test_what_is_wrong_is_reported_with_where_and_what_to_do() -> None:
     found = replace(
         CHECKUP,
         verdict=WRONG,

@@ -171,7 +171,7 @@ def test_an_effect_of_one_recording_acts_in_that_alone() -> None:
     assert only_in([everywhere, first, second], 1) == [everywhere, second]
 
 
-def test_a_mistake_is_said_with_its_line(workspace: Workspace) -> None:
+def test_a_mistake_is_reported_with_its_line(workspace: Workspace) -> None:
     def words(name: str, **values: float) -> tuple[Any, dict[str, object]]:
         fit = cast(Fit, SimpleNamespace(effects=(None, ActiveEffect(of_setup(name), values))))
         (finding,), lines = finding_of_effect(workspace, fit, 1, 33.0)
@@ -547,7 +547,7 @@ def test_what_remains_is_reported_in_words() -> None:
     assert unknown_of(left_with(excess=101.0), 0.0, steps=5000.0) != ()
 
 
-def test_a_gap_that_remains_is_never_left_unsaid() -> None:
+def test_a_gap_that_remains_is_never_left_unreported() -> None:
     noise = cast(Workspace, SimpleNamespace(floor=lambda: 1e-6, worded=micrometres))
     assert weighing.unnamed_gap(noise, 9e-6, 1.5e-6) == ()
     (u,) = weighing.unnamed_gap(noise, 3e-6, 1.6e-6)
@@ -749,14 +749,14 @@ def test_an_estimate_is_called_wrong_only_for_what_is_corrected(found: Discovery
     not_corrected = 'An estimate is not corrected for amplifier_lag.'
     wrong = 'Without them an estimate is wrong by up to ΔX 1 µm, θ 2 µrad.'
 
-    def said_of(*effects: NamedEffect, moves: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> str:
+    def description_of(*effects: NamedEffect, moves: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> str:
         return dataclasses.replace(found, effects=effects, moves=moves).sentences()[-1]
 
-    assert said_of(soft, moves=(1e-10, 1e-10, 9.9e-10)) == right
-    assert said_of(lag) == not_corrected
-    assert said_of(soft, lag) == not_corrected
-    assert said_of(turned, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
-    assert said_of(turned, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
+    assert description_of(soft, moves=(1e-10, 1e-10, 9.9e-10)) == right
+    assert description_of(lag) == not_corrected
+    assert description_of(soft, lag) == not_corrected
+    assert description_of(turned, soft, moves=(1e-6, 0.0, 2e-6)) == wrong
+    assert description_of(turned, lag, lag, moves=(1e-6, 0.0, 2e-6)) == f'{wrong} {not_corrected}'
 
 
 def test_places_are_reported_if_one_in_twenty_by_chance(found: Discovery) -> None:
@@ -820,8 +820,8 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
     # Without a stated noise nothing says that nothing is missing.
     remains = f'{1e6 * found.gap_after:.3f} µm remains and follows nothing, as noise does.'
     without = sentence(verdict='nothing_missing', effects=(), gap_floor=math.inf)
-    said = 'Nothing is missing as far as these readings show'
-    assert without == f'{said}: {remains} How exact the readings are is not stated.'
+    message = 'Nothing is missing as far as these readings show'
+    assert without == f'{message}: {remains} How exact the readings are is not stated.'
     assert sentence(verdict='unknown_effect', effects=(), unknown=(Unknown('', (), 1.0),)) == (
         f'An effect that is not in the catalogue: the gap is {left}.'
     )
@@ -830,12 +830,12 @@ def test_other_answers_have_other_sentences(found: Discovery) -> None:
         f'the gap goes from {before} µm to {left}. Fitted: sensor_rotation {trees.size_of(named)}.'
     )
     two = (named, dataclasses.replace(named, equivalent=('a', 'b'), sd={}))
-    said_of_two = sentence(effects=two)
-    assert said_of_two.startswith(
+    description_of_two = sentence(effects=two)
+    assert description_of_two.startswith(
         'sensor_rotation (psd 2) and sensor_rotation (psd 2) (or a, b: this data cannot tell) are missing from the '
         f'model; adding them closes the gap from {before} to {left}.'
     )
-    assert said_of_two.count('Fitted') == 1
+    assert description_of_two.count('Fitted') == 1
     assert sentence(effects=two, verdict='unknown_effect', unknown=(Unknown('', (), 1.0, unexplained=False),)).endswith(
         f' close the gap from {before} to {left}, but their sizes are tied: '
         'one effect that is not in the catalogue is likelier.'

@@ -288,8 +288,8 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
     )
     out = tmp_path / 'out'
     assert main(['discover', str(recorded), '--out', str(out), '--quiet']) == 0
-    said = capsys.readouterr().out
-    assert 'sensor_gain (psd 1) is missing' in said
+    message = capsys.readouterr().out
+    assert 'sensor_gain (psd 1) is missing' in message
     tree = json.loads((out / 'result.json').read_text())
     check_schema(tree)
     assert tree['provenance']['forward_simulations'] <= 2000
@@ -359,7 +359,7 @@ def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.parametrize(
-    ('listed', 'said'),
+    ('listed', 'message'),
     [
         ('{}', 'must be a list'),
         ('- {rec: a.csv}', 'must have "recording: FILE"'),
@@ -371,17 +371,17 @@ def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pyte
     ],
 )
 def test_a_bad_list_is_rejected_by_name(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], listed: str, said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], listed: str, message: str
 ) -> None:
     simulate(tmp_path, '--loads', 'constant:0,0,0:1')
     path = tmp_path / 'list.yaml'
     path.write_text(listed)
     assert main(['discover', str(path), '--out', str(tmp_path / 'out'), '--quiet']) in (3, 4)
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ('arguments', 'said'),
+    ('arguments', 'message'),
     [
         (['--loads', 'thesis:0'], 'above 0'),
         (['--loads', 'constant:1,2:3'], 'must be 3 numbers'),
@@ -393,10 +393,10 @@ def test_a_bad_list_is_rejected_by_name(
     ],
 )
 def test_bad_words_of_simulate_are_rejected(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], message: str
 ) -> None:
     assert main(['simulate', '--out', str(tmp_path / 'x.csv'), *arguments]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
 def test_a_recording_without_loads_is_rejected_with_the_way_out(

@@ -331,7 +331,7 @@ def test_a_load_case_begins_after_a_quarter_of_a_second_of_rest() -> None:
 
 
 @pytest.mark.parametrize(
-    ('change', 'said_of_it'),
+    ('change', 'description_of_it'),
     [
         ({'loads': np.zeros((5, 3))}, 'do not match'),
         ({'volts': np.zeros((len(HISTORY), 5))}, 'do not match'),
@@ -340,8 +340,8 @@ def test_a_load_case_begins_after_a_quarter_of_a_second_of_rest() -> None:
         ({'volts': np.zeros((79, 6)), 'loads': np.zeros((79, 3))}, '79 samples: discover needs at least 4 blocks'),
     ],
 )
-def test_what_is_no_recording_is_rejected(change: dict[str, Any], said_of_it: str) -> None:
-    with pytest.raises(RecordingError, match=said_of_it):
+def test_what_is_no_recording_is_rejected(change: dict[str, Any], description_of_it: str) -> None:
+    with pytest.raises(RecordingError, match=description_of_it):
         dataclasses.replace(make_observation(), **change)
 
 

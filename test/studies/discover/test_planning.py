@@ -76,7 +76,7 @@ def test_another_length_is_planned_where_only_that_reports(plan: Plan) -> None:
     assert tree['rivals'][0]['separable']
 
 
-def test_it_is_said_if_nothing_within_the_limits_reports(models: tuple[Workspace, Fit, Fit]) -> None:
+def test_it_is_reported_if_nothing_within_the_limits_reports(models: tuple[Workspace, Fit, Fit]) -> None:
     workspace, named, rival = models
     plan = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0, lengths=(), seconds=12.0))
     assert plan is not None

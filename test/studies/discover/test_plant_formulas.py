@@ -499,9 +499,9 @@ def least_squares(plant: Pictures, *names: str) -> tuple[FloatArray, list[FloatA
 
 
 def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
-    said: list[str] = []
+    message: list[str] = []
     plant = steel(0.4, noise=(0.02, 0.02))
-    found = discover_in(plant, seed=5, progress=said.append)
+    found = discover_in(plant, seed=5, progress=message.append)
     (named,) = found.effects
     (size, other), left, inverse = least_squares(plant, 'b', 'c')
     _, before, _ = least_squares(plant, 'c')
@@ -526,8 +526,8 @@ def test_the_answer_for_a_plant_is_that_of_least_squares() -> None:
         assert found.heldout_per_channel[channel] == pytest.approx(pair[1], rel=0.1)
     assert found.waterfall == (('as described', found.gap_before), ('+ b', found.gap_after), ('noise alone', 0.02))
     assert found.simulations == len(plant.asked)
-    assert said[0] == 'simulating the plant as it is described'
-    assert [s for s in said if s in ('signatures of every effect', 'weighing', 'alternatives', 'where')] == [
+    assert message[0] == 'simulating the plant as it is described'
+    assert [s for s in message if s in ('signatures of every effect', 'weighing', 'alternatives', 'where')] == [
         'signatures of every effect',
         'weighing',
         'alternatives',

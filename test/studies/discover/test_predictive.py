@@ -85,20 +85,20 @@ def test_twelve_small_terms_are_predicted_as_by_bic_or_better(seed: int) -> None
     np.testing.assert_array_equal(found.predict(new)[0], new.simulate(found.predictive)[0])
 
 
-def test_what_small_terms_do_together_is_said_everywhere() -> None:
+def test_what_small_terms_do_together_is_reported_everywhere() -> None:
     rng = np.random.default_rng(5)
     found = psd_deflection.discover_in(Small(0.22 * rng.standard_normal(TERMS), 60, 5))
     tree = json.loads(found.json())
     assert (found.verdict, tree['remains']) == ('unknown_effect', True)
-    said = tree['predictive']
-    assert said['nested']
-    assert said['unseen'] < said['unseen_named']
-    assert f'{len(said["terms"])} small terms together lower the unseen error' in found.sentence
+    message = tree['predictive']
+    assert message['nested']
+    assert message['unseen'] < message['unseen_named']
+    assert f'{len(message["terms"])} small terms together lower the unseen error' in found.sentence
     assert 'small terms together' in found.files()['report.html']
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_nothing_is_said_to_remain_where_nothing_does(seed: int) -> None:
+def test_nothing_is_reported_to_remain_where_nothing_does(seed: int) -> None:
     found = psd_deflection.discover_in(Small(np.zeros(TERMS), 40, seed))
     tree = json.loads(found.json())
     assert (found.verdict, tree['remains'], tree['predictive']) == ('nothing_missing', False, None)

@@ -135,14 +135,14 @@ def test_a_mass_is_a_weight_and_an_arm_its_torque(tmp_path: Path) -> None:
         'mass,arm,x1,y1,x2,y2,temperature,by\n'
         '0,0,0,0,0,0,20,me\n1,0,0.1,,0.3,0.4,21,me\n2,0.5,0,1,0,1,22,me\n3,0.5,0,1,0,1,22,me\n'
     )
-    said: list[str] = []
-    (table,) = read_tables([path], warn=said.append)
+    message: list[str] = []
+    (table,) = read_tables([path], warn=message.append)
     np.testing.assert_allclose(table.loads[2], (0.0, -2.0 * 9.80665, -9.80665))
     sensitivity = RIG.sensitivities.ravel()
     np.testing.assert_allclose(table.values[1], np.array([0.1, np.nan, 0.3, 0.4]) * sensitivity)
     assert table.temperature is not None
     assert table.temperature.tolist() == [20.0, 21.0, 22.0, 22.0]
-    assert 'columns that are not read: by' in said[1]
+    assert 'columns that are not read: by' in message[1]
 
 
 def test_a_table_has_the_wiring_of_the_rig(tmp_path: Path) -> None:

@@ -105,7 +105,7 @@ def test_a_table_with_times_gives_the_same_rows(tmp_path: Path, capsys: pytest.C
     assert '0 to 47.95 s: discover takes what rests under each load' in capsys.readouterr().out
 
 
-def test_what_a_reference_alone_lacks_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_a_reference_alone_lacks_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(RecordingError, match=r'camera\.mcap: holds references, but neither samples nor loads'):
         read_tables([recorded(tmp_path / 'camera.mcap', [], loads=False)])
     path = tmp_path / 'swept.csv'

@@ -500,10 +500,10 @@ def test_a_search_adds_what_passes_and_nothing_else() -> None:
     shown = pictures(A, B, ('c', 'x'))
     plant = Plant(shown, without_noise((shown[A], 4000.0), (shown[B], 500.0)) + noise())
     found = [(candidate(n, 'x'), [[shown[n, 'x']]]) for n in ('a', 'b', 'c')]
-    said: list[str] = []
-    result = ran(Search(plant, lambda workspace, _: Screen(workspace, found), said.append))
+    message: list[str] = []
+    result = ran(Search(plant, lambda workspace, _: Screen(workspace, found), message.append))
     assert sorted(a.effect.name for a in result.fit.effects) == ['a', 'b']
-    assert said[:2] == ['adding a', 'adding b']
+    assert message[:2] == ['adding a', 'adding b']
     lost = {a.effect.name: g for a, g in zip(result.fit.effects, result.delta_chi2, strict=True)}
     # Noise adds some tens: 2 sqrt(gain).
     assert lost['a'] == pytest.approx(4000.0, abs=4 * 2 * math.sqrt(4000.0))

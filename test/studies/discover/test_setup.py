@@ -268,9 +268,9 @@ def test_the_command_prints_the_lines_and_puts_them_into_the_model(
     path = csv_of(Observation('seen', RIG, volts, HISTORY), tmp_path / 'seen.csv', 1.0 / 800.0)
     out = tmp_path / 'out'
     assert main(['discover', str(path), '--out', str(out), '--quiet']) == 0
-    said = capsys.readouterr().out
-    assert 'set-up: channel_sign y1: psd_1.axes: [x, -y]' in said
-    assert 'set-up: sample_rate converter.sample_rate_hz: converter.sample_rate_hz: 800' in said
+    message = capsys.readouterr().out
+    assert 'set-up: channel_sign y1: psd_1.axes: [x, -y]' in message
+    assert 'set-up: sample_rate converter.sample_rate_hz: converter.sample_rate_hz: 800' in message
     model: Rig = load_rig(out / 'model.yaml')
     assert model.psds[0].axes == ('x', '-y')
     assert model.converter.sample_rate_hz == 800.0

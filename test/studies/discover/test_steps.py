@@ -56,12 +56,12 @@ from .test_rules import (
 A, B, C = ('a', 'x'), ('b', 'x'), ('c', 'x')
 
 
-def searching(plant: Plant, shown: Pictures, names: Sequence[str], said: list[str] | None = None) -> Search:
+def searching(plant: Plant, shown: Pictures, names: Sequence[str], message: list[str] | None = None) -> Search:
     """A search among effects of one size each, with the pictures that the plant shows."""
     found: list[tuple[Candidate, list[list[FloatArray]]]] = [
         (candidate(n, 'x'), [[1e-3 * shown[n, 'x']]]) for n in names
     ]
-    return Search(plant, lambda ws, _: Screen(ws, found), (said if said is not None else []).append)
+    return Search(plant, lambda ws, _: Screen(ws, found), (message if message is not None else []).append)
 
 
 def across(picture: FloatArray, *others: FloatArray) -> FloatArray:
@@ -81,9 +81,9 @@ def test_a_stand_in_is_dropped_once_the_causes_are_there() -> None:
     shown[B] = across(shown[B], shown[A])
     shown[C] = shown[A] + shown[B] + 0.6 * across(shown[C], shown[A], shown[B])
     plant = Plant(shown, without_noise((shown[A], 3000.0), (shown[B], 3000.0)) + noise())
-    said: list[str] = []
-    result = ran(searching(plant, shown, 'abc', said))
-    assert said[0] == 'adding c'
+    message: list[str] = []
+    result = ran(searching(plant, shown, 'abc', message))
+    assert message[0] == 'adding c'
     assert named(result.fit) == ['a', 'b']
     assert len(result.p) == len(result.delta_bic) == len(result.delta_chi2) == len(result.alternatives) == 2
     assert result.null.effects == ()
@@ -99,9 +99,9 @@ def test_two_that_hide_each_other_are_found_as_a_pair() -> None:
     d, e = across(shown[C], shown[A], b), across(shown['d', 'x'], shown[A], b, shown[C])
     shown[C], shown['d', 'x'] = 0.5 * b + d, 0.5 * b + e
     plant = Plant(shown, without_noise((b, 5000.0)) + noise())
-    said: list[str] = []
-    result = ran(searching(plant, shown, 'abcd', said))
-    assert 'a better pair: ' in ''.join(said)
+    message: list[str] = []
+    result = ran(searching(plant, shown, 'abcd', message))
+    assert 'a better pair: ' in ''.join(message)
     assert named(result.fit) == ['a', 'b']
 
 
@@ -114,13 +114,13 @@ def test_a_mistake_is_taken_first_if_it_explains_nearly_all(left: float, taken: 
     plant = Plant(
         shown, without_noise((shown['link_length', 'x'], whole * (1 - left)), (shown[B], whole * left)) + noise()
     )
-    said: list[str] = []
-    search = searching(plant, shown, ['link_length', 'b'], said)
+    message: list[str] = []
+    search = searching(plant, shown, ['link_length', 'b'], message)
     null = refit(plant, ())
     scores = search.screen.score(null.residual)
     first = mistake(search, null, scores)
     assert named(first) == (['link_length'] if taken else [])
-    assert said == (['the set-up: link_length'] if taken else [])
+    assert message == (['the set-up: link_length'] if taken else [])
     if taken:
         assert named(ran(searching(plant, shown, ['link_length', 'b'])).fit) == ['b', 'link_length']
     # One that is weaker than the best by more than the third of it is not even tried.
@@ -153,7 +153,7 @@ def test_another_sample_rate_is_tried_from_afar() -> None:
     assert {-0.2, -0.1, -0.04, 0.04, 0.1, 0.25} <= set(tried)
 
 
-def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_said(
+def test_all_effects_with_evidence_are_added_and_a_budget_that_ends_them_is_reported(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     names = 'abcdef'
@@ -189,7 +189,7 @@ def test_a_small_share_counts_beside_many_effects() -> None:
     assert 'beside 4 effects explains less than 20% of what remains' in few.limits[0].limit
 
 
-def test_an_effect_that_may_stand_in_is_not_added_and_that_is_said() -> None:
+def test_an_effect_that_may_stand_in_is_not_added_and_that_is_reported() -> None:
     shown = pictures(A, B, C)
     # The library lacks c, which explains much more than b.
     plant = Plant(shown, without_noise((shown[A], 9e5), (shown[B], 4000.0), (shown[C], 60000.0)) + noise())

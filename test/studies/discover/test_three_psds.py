@@ -194,7 +194,7 @@ def test_the_wirings_of_more_psds_are_those_with_two_wrong_ones_and_those_alike(
     assert wirings_of(Wiring()) is WIRINGS
 
 
-def test_what_is_wired_otherwise_is_said_of_any_psd() -> None:
+def test_what_is_wired_otherwise_is_reported_of_any_psd() -> None:
     file = Wiring(axes=(('x', 'y'),) * 4)
     wired = Wiring(True, (('x', 'y'), ('x', 'y'), ('x', 'y'), ('-y', 'x')))
     wrong = differences(wired, file)

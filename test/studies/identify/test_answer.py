@@ -61,11 +61,11 @@ def found(*axes: tuple[Mode, ...], stretches: int = 1) -> Identified:
 )
 def test_why_the_rig_file_does_not_get_a_mode(x: tuple[Mode, ...], y: tuple[Mode, ...], why: str | None) -> None:
     answer = found(x, y, ())
-    said = answer.withheld_reason('bending')
-    assert (said is None) is (why is None)
-    assert why is None or (said is not None and why in said)
+    message = answer.withheld_reason('bending')
+    assert (message is None) is (why is None)
+    assert why is None or (message is not None and why in message)
     assert bool(answer.values) is bool((x or y) and why is None)
-    assert answer.withheld_sentences() == ([f'Nothing for dynamics.bending_*: {said}.'] if why else [])
+    assert answer.withheld_sentences() == ([f'Nothing for dynamics.bending_*: {message}.'] if why else [])
     assert answer.withheld_reason('torsion') is None
 
 

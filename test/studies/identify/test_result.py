@@ -57,9 +57,9 @@ def test_modes_known_well_reach_the_rig_file(source: Opened) -> None:
 def test_doubtful_modes_do_not(source: Opened, x: tuple[Mode, ...], y: tuple[Mode, ...], why: str) -> None:
     answer = found(source, x, y, (mode(21.0),))
     assert set(answer.values) == {'dynamics.torsion_frequency', 'dynamics.torsion_damping_ratio'}
-    (said,) = [line for line in answer.sentences() if 'Nothing for' in line]
-    assert said.startswith('Nothing for dynamics.bending_*: ')
-    assert why in said
+    (message,) = [line for line in answer.sentences() if 'Nothing for' in line]
+    assert message.startswith('Nothing for dynamics.bending_*: ')
+    assert why in message
     text = answer.rig_yaml()
     assert 'torsion_frequency: 21.0' in text
     assert 'bending_frequency: 14.0' in found(source, (mode(14.0),), (), ()).rig_yaml()

@@ -66,12 +66,12 @@ def test_a_step_among_lost_samples_is_in_their_middle() -> None:
     dots = np.zeros((400, 4))
     dots[200:, 2] = 3.0
     # A quarter of the width is not yet a loss.
-    for lost, said in ((10, 0), (11, 11), (60, 60)):
+    for lost, message in ((10, 0), (11, 11), (60, 60)):
         part = dots.copy()
         part[200 - lost // 2 : 200 - lost // 2 + lost] = np.nan
         (step,) = steps_module.lasting_steps(part, 40)
-        assert step.lost == said
+        assert step.lost == message
         assert step.size == pytest.approx(3.0)
-        assert step.at == pytest.approx(200.0, abs=1.5 if said else 7.0)
+        assert step.at == pytest.approx(200.0, abs=1.5 if message else 7.0)
         assert step.first < 200 - lost // 2
         assert step.last > 200 + lost // 2

@@ -31,13 +31,13 @@ def test_tilt_branches(golden: Any, case: str) -> None:
 
 
 def test_tilt_branches_name_their_degenerate_rigs() -> None:
-    for centers, said in (
+    for centers, message in (
         ([[0.0, 0.05], [-0.1, 0.05]], 'same y: phi'),
         ([[0.1, 0.05], [0.1, -0.05]], 'same x: omega'),
         (THREE, 'two PSDs'),
     ):
         geometry = Geometry(np.array(centers), np.zeros((len(centers), 2)), np.zeros(len(centers)), 0.585)
-        with pytest.raises(SolverError, match=said):
+        with pytest.raises(SolverError, match=message):
             tilt_branches(geometry, (0.0,) * (2 * len(centers)), 0.0)
 
 

@@ -82,19 +82,19 @@ def test_a_plain_answer_has_the_clock_and_one_sentence_an_axis() -> None:
         (replace(BEHIND, rivals=(0.2,)), False, None),
     ],
 )
-def test_whether_the_offset_is_removed_is_said_if_there_is_one(
+def test_whether_the_offset_is_removed_is_reported_if_there_is_one(
     offset: Offset, applied: bool, words: str | None
 ) -> None:
-    said = replace(PLAIN, offset=offset, applied=applied).sentences()
-    assert said[0] == offset.sentence
-    assert len(said) == 4 + (words is not None)
-    assert words is None or said[1] == words
+    message = replace(PLAIN, offset=offset, applied=applied).sentences()
+    assert message[0] == offset.sentence
+    assert len(message) == 4 + (words is not None)
+    assert words is None or message[1] == words
 
 
-def test_cover_is_said_if_the_reference_states_its_deviations() -> None:
-    said = replace(PLAIN, covered=(0.95, 0.5, 1.0)).sentences()
-    assert len(said) == 6
-    assert said[-1] == (
+def test_cover_is_reported_if_the_reference_states_its_deviations() -> None:
+    message = replace(PLAIN, covered=(0.95, 0.5, 1.0)).sentences()
+    assert len(message) == 6
+    assert message[-1] == (
         'Differences within 1.96 standard deviations of both instruments (95 % expected): ΔX 95.0 %, ΔY 50.0 %, '
         'θ 100.0 %.'
     )

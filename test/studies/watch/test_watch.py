@@ -50,8 +50,8 @@ def test_a_bump_is_reported_as_by_the_command(bumped: Path, tmp_path: Path, caps
     with np.errstate(all='raise'):
         found = psd_deflection.watch(bumped, psd_deflection.load_rig())
     assert main(['replay', str(bumped), '--watch']) == 0
-    said = [line for line in capsys.readouterr().out.splitlines() if line.startswith('  watch: ')]
-    assert [f'  watch: {sentence}' for sentence in found.sentences()] == said
+    message = [line for line in capsys.readouterr().out.splitlines() if line.startswith('  watch: ')]
+    assert [f'  watch: {sentence}' for sentence in found.sentences()] == message
     first = found.alarms[0]
     assert found.since_s(first) == pytest.approx(18.0, abs=1.0)
     table = found.to_pandas()
