@@ -276,7 +276,7 @@ NOT_OF_A_BLOCK = {
     ('model/plate/linear.py', 'condition_number'): 'told to people, by design alone',
     ('model/plate/linear.py', 'error_bound'): 'told to people, by design alone',
     ('model/plate/layout.py', 'check_twist'): 'compares with a bound',
-    ('model/solvers/base_pair.py', '_refuse_what_is_unseen'): 'compares with a bound',
+    ('model/solvers/base_pair.py', '_reject_what_is_unseen'): 'compares with a bound',
     ('model/solvers/pose.py', '__init__'): 'compares with a bound',
     ('measure/uncertainty/consistency.py', 'survival'): 'told in /diagnostics alone',
     ('measure/uncertainty/rest.py', 'why_moving'): 'compares with a bound; what it decides is recorded',
