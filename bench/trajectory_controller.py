@@ -4,7 +4,7 @@
 
 Its rules, as of ros2_controllers for Jazzy: a stamp of 0 begins when the trajectory arrives, another at that time.
 Until its first point it goes there from where the command is on arrival. After that it follows it, also from its
-middle. After the last point it stays. The joints are where they are commanded. Times that do not rise are refused.
+middle. After the last point it stays. The joints are where they are commanded. Times that do not rise are rejected.
 
 As an action: a goal that is taken ends the one before it (aborted, INVALID_GOAL). A cancelled one ends at once, and the
 joints are held where they are. A goal has succeeded when its last point is over. Feedback comes 20 times a second.
@@ -43,7 +43,7 @@ class TrajectoryController:
         self._begins = 0.0
 
     def arrive(self, now: float, stamp: float, path: Trajectory) -> None:
-        """A trajectory arrives at the time ``now``, s, with a ``stamp``, s. Raises ValueError if it is refused."""
+        """A trajectory arrives at the time ``now``, s, with a ``stamp``, s. Raises ValueError if it is rejected."""
         if not (np.diff(path.times, prepend=-1e-9) > 0.0).all() or not np.isfinite(path.states).all():
             raise ValueError(f'{path.times}: do not rise, or {path.states} are not finite')
         orders = path.states.shape[1]

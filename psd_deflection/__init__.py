@@ -26,7 +26,7 @@ The answers of these studies are :class:`psd_deflection.studies.study.StudyResul
 ``sentences()`` for a person, ``tree()`` for a program, ``to_pandas()`` as a table, ``plot()`` as a matplotlib figure,
 ``report()`` is the page, ``save(folder)`` writes what the command writes.
 
-SI units everywhere. What is refused raises a subclass of ``psd_deflection.errors.PsdDeflectionError``: one line
+SI units everywhere. What is rejected raises a subclass of ``psd_deflection.errors.PsdDeflectionError``: one line
 with the file or argument, the value and its bound. The command ``psd-deflection`` does the same from a shell, and more.
 """
 
@@ -116,7 +116,7 @@ def solve(dots: npt.ArrayLike, rig: Rig | str | Path | None = None, solver: str 
     ``dots``: (2P,) or (n, 2P) of P PSDs: x1, y1, x2, y2 ... from each PSD's centre, m. ``rig``: the rig or its
     parameter file; by default the thesis rig. ``solver``: by default that of the rig;
     :mod:`psd_deflection.model.solvers` has their names. A dot farther from the centre than the width of its detector
-    is refused.
+    is rejected.
 
     The result has ``pose`` (dX m, dY m, theta rad), ``tilt`` (phi, omega, rad), ``covariance`` of the pose (for means
     of one block, with the rig's noise), ``residual`` (m) and ``status`` (0: solved), each for one block or for n.

@@ -71,7 +71,7 @@ def test_what_bloom_warns_of_is_reported_and_a_rejection_is_an_error(tmp_path: P
     env = {'PATH': f'{path / "bin"}:/usr/bin:/bin'}
     assert templates(tmp_path, env, 'ubuntu', 'noble') == ['No CHANGELOG.rst found']
     program(tmp_path, 'bloom-generate', "echo Could not resolve rosdep key \\'x\\' >&2; exit 1")
-    with pytest.raises(RuntimeError, match="bloom refuses the package for noble:\nCould not resolve rosdep key 'x'"):
+    with pytest.raises(RuntimeError, match="bloom rejects the package for noble:\nCould not resolve rosdep key 'x'"):
         templates(tmp_path, env, 'ubuntu', 'noble')
 
 

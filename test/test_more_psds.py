@@ -296,9 +296,9 @@ def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: 
 
 
 def test_reject_rejects_only_what_cannot_be_reported(three: Rig) -> None:
-    report, _, _ = run(with_solver(three, 'exact', consistency='refuse', **LEVEL), inverted(2))
+    report, _, _ = run(with_solver(three, 'exact', consistency='reject', **LEVEL), inverted(2))
     assert len(primaries(report)) > 110
-    not_reported, _, pipeline = run(replace_values(three, {'consistency': 'refuse'}), inverted(2))
+    not_reported, _, pipeline = run(replace_values(three, {'consistency': 'reject'}), inverted(2))
     assert pipeline.counters.rejected['inconsistent'] > 60
     assert spots_of(not_reported)[-1].status is BlockStatus.INCONSISTENT
     assert spots_of(not_reported)[-1].reason.startswith('the readings contradict each other')

@@ -34,13 +34,13 @@ def test_each_check_has_its_row_and_each_reason_its_note() -> None:
         report('log_is_there', 'chain', 'passed', 'setup'),
         report('log_is_there', 'chain', 'passed'),
         report('log_is_there', 'shaper', 'passed'),
-        report('frame_is_refused', 'chain', 'passed'),
-        report('frame_is_refused', 'shaper', 'skipped', why=('file', 1, 'Skipped: there is no frame')),
+        report('frame_is_rejected', 'chain', 'passed'),
+        report('frame_is_rejected', 'shaper', 'skipped', why=('file', 1, 'Skipped: there is no frame')),
     )
     assert made.lines() == [
         '                   chain   shaper',
         'log is there        yes     yes',
-        'frame is refused    yes     (1)',
+        'frame is rejected    yes     (1)',
         '',
         '(1) there is no frame',
     ]

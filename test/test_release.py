@@ -86,7 +86,7 @@ def test_a_tree_with_addresses_date_and_rows_may_be_released(tree: Path) -> None
     [
         (
             lambda root: change(root / 'package.xml', '<exec_depend>python3-yaml<', '<exec_depend>python-cobs-pip<'),
-            'key python-cobs-pip is resolved by pip on noble; bloom refuses it',
+            'key python-cobs-pip is resolved by pip on noble; bloom rejects it',
         ),
         (
             lambda root: (root / '.github/workflows/more.yml').write_text('      - uses: actions/checkout@v4\n'),

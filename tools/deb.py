@@ -83,7 +83,7 @@ def tree(root: Path, folder: Path) -> Path:
 
 
 def templates(folder: Path, env: dict[str, str], system: str, version: str) -> list[str]:
-    """Fills ``folder/debian`` as bloom does, and returns what it warns of. Raises RuntimeError if it refuses."""
+    """Fills ``folder/debian`` as bloom does, and returns what it warns of. Raises RuntimeError if it rejects."""
     words = f'bloom-generate rosdebian --os-name {system} --os-version {version} --ros-distro jazzy .'
     pipe, none = subprocess.PIPE, subprocess.DEVNULL
     done = subprocess.run(
@@ -91,7 +91,7 @@ def templates(folder: Path, env: dict[str, str], system: str, version: str) -> l
     )
     message = re.sub(r'\x1b\[\d*m', '', done.stdout + done.stderr)
     if done.returncode or not (folder / 'debian/control').is_file():
-        raise RuntimeError(f'bloom refuses the package for {version}:\n{message}')
+        raise RuntimeError(f'bloom rejects the package for {version}:\n{message}')
     return [line for line in message.splitlines() if 'warn' in line.lower() or line.startswith('No CHANGELOG')]
 
 

@@ -154,7 +154,7 @@ def main() -> int:
     except UnreachableError as error:
         print(f'try.html of this site cannot run: {error}. All other pages are whole.', file=sys.stderr)
     except WrongFileError as error:
-        print(f'refused: {error}', file=sys.stderr)
+        print(f'rejected: {error}', file=sys.stderr)
         return 1
     return 0
 

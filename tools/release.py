@@ -184,7 +184,7 @@ def rosdep_table(root: Path) -> dict[str, dict[str, str]]:
 
 
 def check_rosdep(root: Path, release: bool) -> Iterator[str]:
-    """Every key of package.xml is one that apt resolves: bloom refuses keys of pip."""
+    """Every key of package.xml is one that apt resolves: bloom rejects keys of pip."""
     table = rosdep_table(root)
     if release:
         # A package that apt built without it would start, and fail at its first chunk.
@@ -200,7 +200,7 @@ def check_rosdep(root: Path, release: bool) -> Iterator[str]:
             continue
         for system, how in found.items():
             if how == 'pip':
-                yield f'package.xml: key {element.text} is resolved by pip on {system}; bloom refuses it'
+                yield f'package.xml: key {element.text} is resolved by pip on {system}; bloom rejects it'
             elif how != 'apt' and release:
                 yield f'package.xml: key {element.text} has no row for {system} (packaging/rosdistro.md)'
 

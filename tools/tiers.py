@@ -77,9 +77,9 @@ ROOMS: Mapping[str, Room] = {
             'test/measure/uncertainty/test_pipeline_state.py',
             'test/measure/test_health.py',
             'test/measure/test_state.py',
-            'test/model/simulation/test_added_effect.py -k refused',
+            'test/model/simulation/test_added_effect.py -k rejected',
             'test/test_more_psds.py -k psd_left or without_one or contradicts or on_itself or all_psds or the_last',
-            'test/measure/motion/test_motion.py -k anew or begun_at or noted or is_refused',
+            'test/measure/motion/test_motion.py -k anew or begun_at or noted or is_rejected',
             _GOLDEN,
         ),
         slow=(
@@ -328,7 +328,7 @@ SLOW: Mapping[str, tuple[str, ...]] = {
         'test/ros/test_description.py -k a_signal_ends',
         'test/ros/test_compensator_node.py -k with_offsets_that_stay or that_hangs or killed_and or after_an_error or '
         'that_does_not_run or a_signal_ends or lets_the_offsets',
-        'test/ros/test_shaper_action.py -k not (is_shaped or is_refused)',
+        'test/ros/test_shaper_action.py -k not (is_shaped or is_rejected)',
         'test/ros/test_shaper_node.py -k the_limits_come',
     ),
 }

@@ -240,7 +240,7 @@ def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS, *, first
         sigmas[hurt].append(off_by(answer, truth))
         assert answer.covariance is not None
         sds.setdefault(hurt, []).append(1e6 * math.sqrt(max(answer.covariance[0, 0], answer.covariance[1, 1])))
-    print('frame with               frames  refused  worst/sd  rms/sd  sd um  reason')
+    print('frame with               frames  rejected  worst/sd  rms/sd  sd um  reason')
     total = wrong = 0
     for hurt in hurts:
         found = np.array(sigmas.get(hurt, []))
@@ -251,7 +251,7 @@ def adverse_table(frames: int, seed: int, hurts: Sequence[str] = HURTS, *, first
         reason = ', '.join(f'{r} {n}' for r, n in reasons.get(hurt, Counter()).most_common(3))
         print(f'{hurt:24} {count:6} {100 * rejected[hurt] / max(count, 1):7.1f}%  {worst} {sd}  {reason}')
     share = 100 * sum(rejected.values()) / max(total, 1)
-    print(f'{total} adverse frames: {share:.1f} % refused, {wrong} answers beyond {SIGMAS:g} sd of their own')
+    print(f'{total} adverse frames: {share:.1f} % rejected, {wrong} answers beyond {SIGMAS:g} sd of their own')
     return wrong == 0
 
 

@@ -39,7 +39,7 @@ HANG_S = 1.0
 others have the machine, and stays for what never comes back at all. Coverage makes a reading three times as long."""
 
 Target = Callable[[bytes], list[str]]
-"""Reads an input, and returns what the package refuses of it; whatever else it raises is a defect."""
+"""Reads an input, and returns what the package rejects of it; whatever else it raises is a defect."""
 
 
 @contextlib.contextmanager
@@ -53,7 +53,7 @@ def timed() -> Iterator[None]:
 
 
 def judged(target: Target, content: bytes) -> list[str]:
-    """``target(content)``. AssertionError if a refusal is not one line."""
+    """``target(content)``. AssertionError if a rejection is not one line."""
     rejected = target(content)
     for text in rejected:
         if '\n' in text:
@@ -428,7 +428,7 @@ def corrupted(count: int) -> int:
         else:
             lost += 1
     print(
-        f'{count} damaged frames: {rejected} refused, {same} came out as they were sent, '
+        f'{count} damaged frames: {rejected} rejected, {same} came out as they were sent, '
         f'{lost} taken for another kind, {wrong} accepted with a wrong content (chance alone: {count * 2.0**-32:.4f})'
     )
     return 1 if wrong else 0

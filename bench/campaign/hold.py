@@ -12,7 +12,7 @@ commands is larger than ``max_rate`` times the time between them, from the first
 applies something else than it reports, or keeps offsets (:mod:`bench.campaign.controller_faults`).
 
 The shaper drives a stand-in of joint_trajectory_controller by trajectories that replace each other,
-and gets what it must refuse in between; then the same by goals of FollowJointTrajectory.
+and gets what it must reject in between; then the same by goals of FollowJointTrajectory.
 
   python -m bench.campaign.hold --times 20
 """

@@ -299,13 +299,13 @@ FAULTS: tuple[Fault, ...] = (
     Fault('sample of a wrong length, right CRC', _injected(lambda line: _sealed(b'\x01' + b'\x00' * 11)), BAD),
     Fault('HELLO that is no JSON', _injected(lambda line: _sealed(b'\x10\x01{not json')), BAD),
     Fault('HELLO of another rate', lambda line, pid: line.inject(encode(hello_of(rate=500.0))), ()),
-    Fault('laser 1 off', _dark(2, 3), ('refused: laser_lost',), estimates=True),
-    Fault('laser 2 off', _dark(5, -2), ('refused: laser_lost',), estimates=True),
-    Fault('y1 saturated', _while(0.15, optics={1: 32767}), ('refused: saturated',), estimates=True),
+    Fault('laser 1 off', _dark(2, 3), ('rejected: laser_lost',), estimates=True),
+    Fault('laser 2 off', _dark(5, -2), ('rejected: laser_lost',), estimates=True),
+    Fault('y1 saturated', _while(0.15, optics={1: 32767}), ('rejected: saturated',), estimates=True),
     Fault(
         'psd_2 stands still',
         _while(0.25, freeze=True),
-        ('refused: frozen', 'found: psd_2 stands still'),
+        ('rejected: frozen', 'found: psd_2 stands still'),
         estimates=True,
     ),
 )

@@ -12,7 +12,7 @@ that is not in the table of good messages (``bench.campaign.attacked``) ends the
 the types of the fields (``bench.campaign.strange``). Its services are asked the same way: parameters, lifecycle,
 ``enable``, ``zero``, ``record``.
 
-Judged: nothing ends the node; what cannot be decoded is counted as refused; the memory after the first tenth stays; it
+Judged: nothing ends the node; what cannot be decoded is counted as rejected; the memory after the first tenth stays; it
 still does what it is there for; no step between two commands is larger than max_rate times the time between them, and
 no trajectory begins elsewhere than the one under way is.
 """
@@ -226,7 +226,7 @@ class Inside:
         """How far it is."""
         return (
             f'{self.number} messages on {len(self.sent)} inputs and {self.asked} requests, '
-            f'{self.attacked.rejected()} refused of which {self.undecodable} could not be decoded, '
+            f'{self.attacked.rejected()} rejected of which {self.undecodable} could not be decoded, '
             f'{memory() / 1e6:.0f} MB; {self.attacked.summary()}'
         )
 

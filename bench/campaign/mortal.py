@@ -12,8 +12,8 @@ from psd_deflection.base.errors import RecordingError
 
 
 def length(name: str) -> int:
-    """The number of characters of ``name``; ``refused`` and ``defect`` fail."""
-    if 'refused' in name:
+    """The number of characters of ``name``; ``rejected`` and ``defect`` fail."""
+    if 'rejected' in name:
         raise RecordingError(f'{name}: no such recording')
     if 'defect' in name:
         raise ZeroDivisionError('division by zero')

@@ -3,7 +3,7 @@
 """The shaper's part of :mod:`bench.campaign.hold`: what it does when something goes wrong, over real DDS.
 
 The shaper moves a stand-in of joint_trajectory_controller by trajectories that replace each other. A fault comes while
-one is under way: the shaper must refuse it, or go on without a step. Judged is the largest step of the command, sampled
+one is under way: the shaper must reject it, or go on without a step. Judged is the largest step of the command, sampled
 500 times a second, over what the fastest trajectory that was given allows. A trajectory that DDS or a busy machine
 delivers after its begin is joined in its middle: such ones are counted, and the step to them is not the shaper's.
 """
@@ -179,7 +179,7 @@ class Moved:
             self.move(REJECTED[name])
             self.spin(0.2)
             if self.heard != heard:
-                raise RuntimeError(f'{name}: was not refused')
+                raise RuntimeError(f'{name}: was not rejected')
         elif name == 'replaced again and again':
             for _ in range(5):
                 self.move()
@@ -191,7 +191,7 @@ class Moved:
             self.spin(0.3)
             self.reports = True
             if self.heard != heard:
-                raise RuntimeError(f'{name}: was not refused')
+                raise RuntimeError(f'{name}: was not rejected')
         elif name == 'killed and started again':
             self.shaper.process.kill()
             self.shaper.wait()

@@ -20,7 +20,7 @@ EXIT_STATUSES: Mapping[int, str] = {
     4: 'a recording or an output that cannot be read or written',
     5: 'the device: missing, in use, silent, or of another protocol',
     6: 'the geometry of the rig cannot be solved',
-    7: 'a running daemon or a Dask scheduler: none answers, or it refuses',
+    7: 'a running daemon or a Dask scheduler: none answers, or it rejects',
     8: 'of many recordings some failed; the others are done',
     9: 'samples were dropped here: this machine was too slow for them',
     71: 'the machine: too little memory, no further thread, or no room in /dev/shm',
@@ -81,7 +81,7 @@ class SolverError(PsdDeflectionError):
 
 
 class DaemonError(PsdDeflectionError):
-    """No running daemon or Dask scheduler answers, or it refuses what it was asked for.
+    """No running daemon or Dask scheduler answers, or it rejects what it was asked for.
 
     Example: ``http://127.0.0.1:8790/: no daemon answers``.
     """

@@ -17,7 +17,7 @@ from psd_deflection.base.errors import RecordingError
 HOLDS = os.open in os.supports_dir_fd
 """Whether the system makes files in a folder that is held open; Windows does not, and takes their paths instead."""
 _NEW = os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, 'O_CLOEXEC', 0) | getattr(os, 'O_BINARY', 0)
-"""O_EXCL: a link of that name, even one that leads nowhere, is refused."""
+"""O_EXCL: a link of that name, even one that leads nowhere, is rejected."""
 
 
 def replace_file(path: Path, content: bytes) -> None:

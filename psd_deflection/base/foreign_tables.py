@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a table of another program is: its encoding, separator, header and units, and the shell line that converts it.
 
-Nothing is converted by itself: a reader that refuses a table says these words.
+Nothing is converted by itself: a reader that rejects a table says these words.
 """
 
 from __future__ import annotations

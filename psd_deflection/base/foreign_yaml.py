@@ -88,7 +88,7 @@ def read_text(path: Path, most: int) -> str:
 def parse_yaml(text: str, *, unique: bool = False) -> object:
     """The tree of one YAML document, None for an empty one. Raises YamlError.
 
-    ``unique``: a key that is in one map twice is refused; otherwise the last one holds.
+    ``unique``: a key that is in one map twice is rejected; otherwise the last one holds.
     """
     try:
         _count(text)
@@ -114,7 +114,7 @@ def parse_yaml(text: str, *, unique: bool = False) -> object:
 def edited(text: str, edit: Callable[[Any], None]) -> str:
     """``text`` after ``edit`` has changed its tree; comments, order and quotes of the rest are kept.
 
-    Raises YamlError if :func:`parse_yaml` refuses the text, or if it can be read but not written again.
+    Raises YamlError if :func:`parse_yaml` rejects the text, or if it can be read but not written again.
     """
     parse_yaml(text)
     # Imported here: it is slow, and only who writes a file of a user again needs it.
@@ -156,7 +156,7 @@ def _exact() -> Any:
 
 
 def _count(text: str) -> None:
-    """Refuse what is too large or nested too deep before anything of it is built."""
+    """Reject what is too large or nested too deep before anything of it is built."""
     nodes = depth = 0
     for event in yaml.parse(text, Loader=_Loader):
         if isinstance(event, yaml.NodeEvent):
@@ -172,7 +172,7 @@ def _count(text: str) -> None:
 
 
 def _reject_doubles(root: yaml.Node) -> None:
-    """Refuse a key that is in one map twice: one of its values would be lost without a word. Merge keys may repeat."""
+    """Reject a key that is in one map twice: one of its values would be lost without a word. Merge keys may repeat."""
     observed: set[int] = set()
     waiting = [root]
     while waiting:

@@ -240,7 +240,7 @@ def _dictionary(settings: CameraSettings, needed: int) -> Any:
     if not aruco.has_boards():
         raise ConfigError(
             f'OpenCV {opencv().__version__} has no boards; target.kind {settings.target} needs 4.7 or later, or '
-            "Ubuntu's 4.6: `pip install 'psd_deflection[camera]'` in a virtual environment (Ubuntu's own pip refuses "
+            "Ubuntu's 4.6: `pip install 'psd_deflection[camera]'` in a virtual environment (Ubuntu's own pip rejects "
             'it; see docs/camera.md), or use the target circles'
         )
     name = settings.dictionary

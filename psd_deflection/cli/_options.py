@@ -135,7 +135,7 @@ def over_file(params_file: str | None, given: Mapping[str, object]) -> dict[str,
     if params_file is None:
         return dict(given)
     values = {**read_parameter_file(params_file), **given}
-    # Refuse them here, where the file's name is known.
+    # Reject them here, where the file's name is known.
     rig_from_values(values, params_file)
     return values
 

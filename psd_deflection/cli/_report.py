@@ -51,7 +51,7 @@ def save_figure(figure: Any, path: Path, **options: Any) -> None:
 
 
 def save(content: bytes, path: Path) -> None:
-    """Write ``path`` completely or not at all; raises RecordingError if the disk refuses to write."""
+    """Write ``path`` completely or not at all; raises RecordingError if the disk cannot be written."""
     try:
         replace_file(path, content)
     except OSError as error:

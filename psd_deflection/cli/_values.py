@@ -61,7 +61,7 @@ def _within(option: str, kind: Callable[[str], N], words: str, least: float, mos
 
 @contextlib.contextmanager
 def given_as_option(*parameters: str) -> Iterator[None]:
-    """Turn a refused value inside into a UsageError: it came as an option (status 2), not from a file (3).
+    """Turn a rejected value inside into a UsageError: it came as an option (status 2), not from a file (3).
 
     ``parameters``: those with their own option; in the message ``keep_out = ...`` becomes ``--keep-out = ...``.
     """

@@ -4,7 +4,7 @@
 
 With --short only those that a rig of one's own needs. With --params-file the values of that file are
 shown and checked, also against each other: unknown solvers and
-effects, and a geometry that cannot be solved, are refused.
+effects, and a geometry that cannot be solved, are rejected.
 
   psd-deflection params
   psd-deflection params --short
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
     """Print the table."""
     rig = load_rig(args.params_file)
     if args.params_file is not None:
-        # It makes the solvers and the effects, and refuses what cannot be evaluated.
+        # It makes the solvers and the effects, and rejects what cannot be evaluated.
         Pipeline(rig)
     shown = [p for p in PARAMETERS if p.name in NEEDED or not args.short]
     if args.json:

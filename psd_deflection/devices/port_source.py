@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Common base of the sources on one port: open it, give up, close, and refuse use before the port is open."""
+"""Common base of the sources on one port: open it, give up, close, and reject use before the port is open."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ Failure = tuple[BlockStatus, str]
 
 
 @dataclass(frozen=True, slots=True)
-class SeenBlock:
+class ValidBlock:
     """What is solved: the good samples of a block.
 
     ``t_ns``: middle of the block, stream time. ``slots`` (n,): places of the samples in the block. ``samples`` (n, 2P):
@@ -151,7 +151,7 @@ class Estimation:
         self.held: HeldTwist | None = None
         self.systematic: FloatArray | None = None
         self.build(rig, effects)
-        # After the solvers, which refuse a geometry that cannot be solved.
+        # After the solvers, which reject a geometry that cannot be solved.
         self.estimator = BlockEstimator(rig, not rig.psds_at_base, solver_class(config.solver).tilts)
 
     def build(self, rig: Rig, effects: Sequence[ActiveEffect]) -> None:
@@ -217,7 +217,7 @@ class Estimation:
         """Variances (2P,), m^2, of the dots of a whole block of ``size`` samples at rest."""
         return self.estimator.mean_variances(size) if self.estimator.on_plate else self.variances[-1]
 
-    def fits(self, blocks: Sequence[SeenBlock]) -> Iterator[Fitted]:
+    def fits(self, blocks: Sequence[ValidBlock]) -> Iterator[Fitted]:
         """Yield the fit of all readings of each block whose verdict is OK; those with the same places are computed
         together.
         """
@@ -226,7 +226,7 @@ class Estimation:
             run = list(same)
             yield from self.estimator.fits(self.estimator.full, run[0].slots, np.stack([own.samples for own in run]))
 
-    def solve(self, block: SeenBlock, fits: Iterator[Fitted]) -> BlockSolution:
+    def solve(self, block: ValidBlock, fits: Iterator[Fitted]) -> BlockSolution:
         """Return the primary solver's estimate of a block whose verdict is OK or names sound detectors.
 
         ``fits``: as :meth:`fits` has them, from this block on.
@@ -244,7 +244,7 @@ class Estimation:
         estimate = self._from_one(verdict.sound[0], block, variances) if len(verdict.sound) == 1 else None
         return BlockSolution(block.means, None, estimate)
 
-    def other_estimates(self, block: SeenBlock, used: CheckedReadings) -> Iterator[DeflectionEstimate]:
+    def other_estimates(self, block: ValidBlock, used: CheckedReadings) -> Iterator[DeflectionEstimate]:
         """Yield the estimates of the other solvers."""
         answers = [(number, self._solution(number, used.readings)[0]) for number in range(1, len(self._solvers))]
         yield from self._estimates(block, [(number, s) for number, s in answers if s is not None], used)
@@ -256,7 +256,7 @@ class Estimation:
         return tuple(n for n in range(1, len(self._rig.psds) + 1) if n - 1 not in used.readings.psds.psds)
 
     def _solve_consistent(
-        self, block: SeenBlock, dots: Dots, variances: tuple[float, ...], readings: BlockReadings
+        self, block: ValidBlock, dots: Dots, variances: tuple[float, ...], readings: BlockReadings
     ) -> BlockSolution:
         """Solve ``readings``, without the PSD that contradicts the others if it can be told.
 
@@ -293,7 +293,7 @@ class Estimation:
         return readings.psds.unexplained(readings.dots, solution.residual, covariance, solution[:5])
 
     def _solved_without(
-        self, number: int, block: SeenBlock, variances: tuple[float, ...], psds: PsdSet
+        self, number: int, block: ValidBlock, variances: tuple[float, ...], psds: PsdSet
     ) -> SolvedReadings | None:
         """Solve the readings of ``psds`` but PSD ``number`` of them (from 1); None if no method can."""
         rest = psds.psds[: number - 1] + psds.psds[number:]
@@ -315,7 +315,7 @@ class Estimation:
             return None
         return self.estimator.check(solved.readings.psds, solved.unexplained, blamed)
 
-    def _to_exclude(self, block: SeenBlock, psds: PsdSet, checked: ConsistencyResult | None) -> int:
+    def _to_exclude(self, block: ValidBlock, psds: PsdSet, checked: ConsistencyResult | None) -> int:
         """Return the PSD to exclude, from 1 among ``psds``; 0: none."""
         if checked is None or checked.excluded or not checked.contradict:
             return 0 if checked is None else checked.excluded
@@ -325,7 +325,7 @@ class Estimation:
 
     def _finish(
         self,
-        block: SeenBlock,
+        block: ValidBlock,
         dots: Dots,
         solved: SolvedReadings,
         checked: ConsistencyResult | None,
@@ -336,7 +336,7 @@ class Estimation:
         if solved.solution is None:
             return BlockSolution(dots, used, None, (BlockStatus.NOT_SOLVED, solved.failure))
         contradict = checked is not None and checked.contradict and not checked.excluded
-        if checked is not None and contradict and self._rig.estimator.consistency == 'refuse':
+        if checked is not None and contradict and self._rig.estimator.consistency == 'reject':
             words = 'four readings' if len(self._rig.psds) == 2 else 'readings'
             reason = f'the {words} contradict each other: chi-square {checked.chi_square:.0f} of {checked.freedom}'
             return BlockSolution(dots, used, None, (BlockStatus.INCONSISTENT, reason))
@@ -345,12 +345,12 @@ class Estimation:
         self.held = HeldTwist(block.t_ns, estimate.theta, estimate.variances[2])
         return BlockSolution(dots, used, estimate)
 
-    def _readings(self, psds: PsdSet, fitted: Fitted, block: SeenBlock, variances: tuple[float, ...]) -> BlockReadings:
+    def _readings(self, psds: PsdSet, fitted: Fitted, block: ValidBlock, variances: tuple[float, ...]) -> BlockReadings:
         """Return the readings of ``psds`` at the block's timestamp; ``variances`` (2P,) m^2 of all."""
         own = tuple([variances[i] for i in psds.columns])
         return BlockReadings(psds, fitted.dots, own, self._covariance_of(block, fitted.covariance, psds.columns))
 
-    def _subset(self, psds: tuple[int, ...], block: SeenBlock, variances: tuple[float, ...]) -> BlockReadings | None:
+    def _subset(self, psds: tuple[int, ...], block: ValidBlock, variances: tuple[float, ...]) -> BlockReadings | None:
         """Return the readings of ``psds`` (from 0) alone; None if the primary method cannot do with them."""
         solver = self._solver(0, psds)
         if solver is None:
@@ -381,7 +381,7 @@ class Estimation:
         return s, ''
 
     def _estimates(
-        self, block: SeenBlock, answers: Sequence[tuple[int, Solution]], used: CheckedReadings
+        self, block: ValidBlock, answers: Sequence[tuple[int, Solution]], used: CheckedReadings
     ) -> list[DeflectionEstimate]:
         """Return the solutions of some solvers, by their numbers, with their covariances as estimates."""
         readings = used.readings
@@ -400,7 +400,7 @@ class Estimation:
     def _estimate(
         self,
         number: int,
-        block: SeenBlock,
+        block: ValidBlock,
         s: Solution,
         covariance: tuple[float, ...],
         checked: ConsistencyResult | None,
@@ -445,7 +445,7 @@ class Estimation:
             self.systematic = own - noise
         return tuple(own.ravel().tolist())
 
-    def _covariance_of(self, block: SeenBlock, covariance: FloatArray, columns: Sequence[int]) -> FloatArray:
+    def _covariance_of(self, block: ValidBlock, covariance: FloatArray, columns: Sequence[int]) -> FloatArray:
         """Return the fit's covariance (C, C) of the readings ``columns``, widened as in :meth:`_variances_of`."""
         if not block.verdict.findings:
             return covariance
@@ -453,7 +453,7 @@ class Estimation:
         more = 4.0 if block.verdict.half_light else 1.0
         return more * covariance + np.diag(background[list(columns)])
 
-    def _variances_of(self, block: SeenBlock) -> tuple[float, ...]:
+    def _variances_of(self, block: ValidBlock) -> tuple[float, ...]:
         """Variances of the dots' means, m^2: from the noise, and from missing or foreign light."""
         variances = self.variances[len(block.slots) - 1]
         if not block.verdict.findings:
@@ -463,7 +463,7 @@ class Estimation:
         more = 4.0 if block.verdict.half_light else 1.0
         return tuple(more * v + b for v, b in zip(variances, background, strict=True))
 
-    def _from_one(self, psd: int, block: SeenBlock, variances: tuple[float, ...]) -> DeflectionEstimate | None:
+    def _from_one(self, psd: int, block: ValidBlock, variances: tuple[float, ...]) -> DeflectionEstimate | None:
         """The translation from the remaining detector ``psd`` (from 0), by the rule that ``degraded`` names."""
         config = self._rig.estimator
         by = self._by

@@ -153,7 +153,7 @@ class OpticsHealth:
         # If two lasers share all detectors, half the light does not mean a lost laser.
         self._sum_min = config.sum_min * (0.5 if self._splitter else 1.0)
         self._sum_max = config.sum_max
-        self.refuses_frozen = config.frozen == 'refuse'
+        self.rejects_frozen = config.frozen == 'reject'
         step = rig.converter.volts_per_count
         self._full_scale = rig.converter.full_scale
         # The converter's last step on either side: the true value may lie beyond it.
@@ -185,7 +185,7 @@ class OpticsHealth:
         faults = _first_of_each([*self._dark(low), *self._saturated(least, most)])
         if not faults and bool((block.flags & FLAG_OVER_RANGE).any()):
             return Verdict(BlockStatus.SATURATED, 'the device reports a channel over range', 0)
-        if self.refuses_frozen:
+        if self.rejects_frozen:
             faults = _first_of_each((psd, BlockStatus.FROZEN, reason) for psd, reason in _long(frozen)) | faults
         if not enough and not faults:
             reason = f'{present} of {self._size} samples, at least {self._min_samples} are needed'
@@ -269,7 +269,7 @@ class OpticsHealth:
                 usual = loudness.take(psd, own, noisy)
                 if noisy:
                     out.append(f'psd_{psd} is noisy: {max(usual) * 1e3:.1f} mV a sample')
-        if not self.refuses_frozen:
+        if not self.rejects_frozen:
             out += [reason for psd, reason in _long(frozen) if psd not in faulty]
         return tuple(out)
 

@@ -24,7 +24,7 @@ from psd_deflection.base.arithmetic import FIXED
 from psd_deflection.base.errors import ConfigError
 from psd_deflection.measure.averaging import BlockCutter, block_middle_ns
 from psd_deflection.measure.correction import FIRST_TEMPERATURE, START, TEMPERATURE, Correction, Surroundings
-from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, SeenBlock
+from psd_deflection.measure.estimation import ZERO_VARIANCES, BlockSolution, Dots, Estimation, ValidBlock
 from psd_deflection.measure.health import CalibratedRange, Loudness, OpticsHealth, Stillness, Verdict
 from psd_deflection.measure.measures import BlockMeasures, measured, of_one_length
 from psd_deflection.measure.motion.known import joined_ns, split_ns
@@ -362,7 +362,7 @@ class Pipeline:
             blocks = blocks[done:]
 
     def _block(
-        self, block: SampleBlock, measures: BlockMeasures, observed: SeenBlock, fits: Iterator[Fitted]
+        self, block: SampleBlock, measures: BlockMeasures, observed: ValidBlock, fits: Iterator[Fitted]
     ) -> Iterator[Record]:
         self.counters.samples += len(block.seq)
         self._end_ns = int(block.t_ns[-1])
@@ -394,12 +394,12 @@ class Pipeline:
         yield self.last_spots
         yield block
 
-    def _judged(self, blocks: Iterable[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[SeenBlock]:
+    def _judged(self, blocks: Iterable[SampleBlock], measures: Iterable[BlockMeasures]) -> Iterator[ValidBlock]:
         """The dots of each block, and whether lasers and detectors are sound."""
         frozen = self._stillness.blocks
         for block, own in zip(blocks, measures, strict=True):
             frozen = self._optics.frozen(frozen, own)
-            yield SeenBlock(
+            yield ValidBlock(
                 t_ns=block_middle_ns(block, self._cutter.block_size, self._period_ns),
                 index=block.index,
                 slots=block.seq - block.index * self._cutter.block_size,
@@ -421,7 +421,7 @@ class Pipeline:
         counters.estimates += 1
         counters.degraded += verdict.status is not BlockStatus.OK or not answer.complete
 
-    def _estimates(self, observed: SeenBlock, answer: BlockSolution, status: BlockStatus) -> Iterator[Record]:
+    def _estimates(self, observed: ValidBlock, answer: BlockSolution, status: BlockStatus) -> Iterator[Record]:
         """The primary estimate first, then its load, the motion and the other solvers' estimates."""
         best, used = answer.estimate, answer.used
         if best is not None:
@@ -440,7 +440,7 @@ class Pipeline:
         if observed.due and best is not None and used is not None:
             yield from self.estimation.other_estimates(observed, used)
 
-    def _keep_for_zero(self, observed: SeenBlock, answer: BlockSolution) -> None:
+    def _keep_for_zero(self, observed: ValidBlock, answer: BlockSolution) -> None:
         """Keep the dots of the last good blocks; a zero must not be a mean across an outage."""
         if answer.estimate is None or answer.used is None or not answer.complete:
             self._recent = []
@@ -451,7 +451,7 @@ class Pipeline:
         self._recent = [*self._recent[1 - ZERO_BLOCKS :], answer.used.readings.dots]
 
     def _findings(
-        self, measures: BlockMeasures, observed: SeenBlock, answer: BlockSolution, status: BlockStatus
+        self, measures: BlockMeasures, observed: ValidBlock, answer: BlockSolution, status: BlockStatus
     ) -> tuple[str, ...]:
         """What is odd about a block; of one that is not, the noise is learnt."""
         findings, used = observed.verdict.findings, answer.used
@@ -471,13 +471,13 @@ class Pipeline:
         self.counters.count_findings(findings)
         return findings
 
-    def _learn(self, observed: SeenBlock, measures: BlockMeasures) -> None:
+    def _learn(self, observed: ValidBlock, measures: BlockMeasures) -> None:
         """Take a good block into the noise."""
         changed = self.estimator.learn(observed.index, observed.slots, observed.samples, measures.volts)
         if changed and self.motion_filter is not None:
             self.motion_filter.set_noise(self.estimator.noise.gamma)
 
-    def _moved(self, motion: ModalFilter, observed: SeenBlock, usable: bool) -> TipMotion | None:
+    def _moved(self, motion: ModalFilter, observed: ValidBlock, usable: bool) -> TipMotion | None:
         """The motion by the filter; ``usable``: whether samples of the block can be used."""
         slots, poses = observed.slots, None
         if usable:

@@ -186,7 +186,7 @@ def recover(path: str | Path) -> Recovered:
     """Repair ``path``, a bag folder or a single ``.mcap``, in place.
 
     Raises RecordingError if nothing in it can be read, if it is still being recorded, or if the
-    disk refuses to write.
+    disk rejects to write.
     """
     path = Path(path)
     try:

@@ -221,8 +221,8 @@ class EstimatorConfig:
     consistency: str = parameter(
         'widen',
         '',
-        'when the readings contradict each other: widen the covariance, refuse the block, or only report it',
-        choices=('widen', 'refuse', 'report'),
+        'when the readings contradict each other: widen the covariance, reject the block, or only report it',
+        choices=('widen', 'reject', 'report'),
     )
     splitter: bool = parameter(
         False, '', 'both detectors share two lasers over a beam splitter (thesis 5.4): one lost halves both sums'
@@ -240,7 +240,7 @@ class EstimatorConfig:
         'report',
         '',
         'a detector whose values do not change by one bit: report it in /diagnostics, or also reject its blocks',
-        choices=('report', 'refuse'),
+        choices=('report', 'reject'),
         live=True,
     )
     twist_sd: float = parameter(

@@ -174,7 +174,7 @@ def shown(value: object) -> str:
     try:
         return _SHORT.repr(value)
     except ValueError:
-        # Python refuses to print integers of thousands of digits.
+        # Python does not print integers of thousands of digits.
         return 'a number of too many digits'
 
 

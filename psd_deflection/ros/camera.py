@@ -1,6 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The node ``camera``: images in, ``/reference/deflection`` out, with its covariance and the reasons of refused frames.
+"""The node ``camera``: images in, ``/reference/deflection`` out, with its covariance and the reasons of rejected
+frames.
 
 It subscribes to ``image`` (sensor_msgs/Image) and ``image/compressed``
 (sensor_msgs/CompressedImage), and takes the lens from ``camera_info`` beside the image if no
@@ -143,11 +144,11 @@ class CameraNode(BaseNode[CameraSettings]):
             self._out[message.topic].publish(cdr.encode(message.type, message.fields))
 
     def health(self) -> Iterable[Health]:
-        """Frames and answers of the last second, and why the others were refused."""
+        """Frames and answers of the last second, and why the others were rejected."""
         since, self._since = self._since, collections.Counter()
         frames, good = sum(since.values()), since.pop(str(Status.OK), 0)
         values = [('frames/s', str(frames)), ('answers/s', str(good))]
-        values += [(f'refused: {reason}', str(count)) for reason, count in since.most_common()]
+        values += [(f'rejected: {reason}', str(count)) for reason, count in since.most_common()]
         if self._last is not None and self._last.covariance is not None:
             names = (('sd dx (m)', 0), ('sd dy (m)', 1), ('sd theta (rad)', 2))
             values += [(name, f'{math.sqrt(float(self._last.covariance[i, i])):.3g}') for name, i in names]
@@ -158,7 +159,7 @@ class CameraNode(BaseNode[CameraSettings]):
             waits = self._reference is not None and self._reference.rest is None
             level, text = (WARN, 'the rest is not known yet') if waits else (STALE, 'no images')
         elif worst:
-            level, text = (WARN if good else ERROR), f'{frames - good} of {frames} frames refused: {worst[0][0]}'
+            level, text = (WARN if good else ERROR), f'{frames - good} of {frames} frames rejected: {worst[0][0]}'
         else:
             level, text = OK, f'{good} answers/s'
         if not self.active:

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The settings of a node as its ROS parameters: described, bounded, unknown ones refused; live ones may be set.
+"""The settings of a node as its ROS parameters: described, bounded, unknown ones rejected; live ones may be set.
 
 A section of :mod:`psd_deflection.rig.parameters` declares them, once, for the command line, too. A value of
 ``-p NAME:=VALUE`` or ``--params-file`` has the last word.
@@ -74,7 +74,7 @@ class UnknownParameterError(ParameterNotDeclaredException):  # type: ignore[misc
 
 
 def meant(node: Node, changed: list[RosParameter], known: Mapping[str, Parameter]) -> list[RosParameter]:
-    """``changed`` without synonyms, whose type rclpy would refuse: `ros2 param set … degraded off` sends false.
+    """``changed`` without synonyms, whose type rclpy would reject: `ros2 param set … degraded off` sends false.
 
     Raises UnknownParameterError, whose text names the nearest of ``known``.
     """
@@ -91,7 +91,7 @@ class DeclaredParameters(Generic[T]):
     """The parameters of ``node`` that ``section`` declares, at ``values`` unless ROS was given others.
 
     ``node``: has what was given to it as parameters. ``changed``: gets the settings when a live one was set; it may
-    raise ConfigError to refuse them. ``more``: further parameters, at their defaults; ``values`` has all of them.
+    raise ConfigError to reject them. ``more``: further parameters, at their defaults; ``values`` has all of them.
     Raises ConfigError for an unknown parameter, a wrong type or a value out of bounds, or if values contradict.
     """
 

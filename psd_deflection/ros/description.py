@@ -25,7 +25,7 @@ WAIT_S = 30.0
 def listen_to_description(gate: InputGate, take: Callable[[str], None]) -> None:
     """Let ``take`` have each text on ``robot_description``, the one that was published before, too.
 
-    A ConfigError of ``take`` refuses it.
+    A ConfigError of ``take`` rejects it.
     """
     gate.listen(ROBOT_DESCRIPTION, _fault, lambda message: take(message.data))
 

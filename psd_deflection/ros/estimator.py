@@ -45,7 +45,7 @@ NODE_NAME = 'estimator'
 
 
 class EstimatorNode(BaseNode[Rig]):
-    """The node and, while it is configured, its session. Raises ConfigError if the parameters are refused."""
+    """The node and, while it is configured, its session. Raises ConfigError if the parameters are rejected."""
 
     SYSTEM_TIME = True
 

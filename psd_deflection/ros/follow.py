@@ -201,7 +201,7 @@ class Follower:
         return True
 
     def _when(self, future: Any, do: Callable[[Any], None]) -> None:
-        """``do`` with what comes; what fails is refused, and the goal ends when it is due."""
+        """``do`` with what comes; what fails is rejected, and the goal ends when it is due."""
 
         def done(future: Any) -> None:
             try:

@@ -1,11 +1,11 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What other nodes send comes in through one gate: what cannot be used is refused, counted, and said once.
+"""What other nodes send comes in through one gate: what cannot be used is rejected, counted, and said once.
 
 A message is bounded in size before it is unpacked, and a topic in messages a second. A check gives the reason why a
-message is refused, or ''. A message that makes a node's own code fail is refused, too: no message ends a node.
+message is rejected, or ''. A message that makes a node's own code fail is rejected, too: no message ends a node.
 
-Goals of an action come through it, too. rclpy shows a goal only unpacked: one that is too large is refused before
+Goals of an action come through it, too. rclpy shows a goal only unpacked: one that is too large is rejected before
 anything is done with it, but it was in memory.
 """
 
@@ -36,13 +36,13 @@ from psd_deflection.run.repeats import RateLimitedLog
 LONGEST = 200
 """Characters of a reason, in which a stranger's words may be."""
 NEWS = 3
-"""Refusals of a topic that are said one by one, before they are counted and said together."""
+"""Rejections of a topic that are said one by one, before they are counted and said together."""
 MOST_A_SECOND = 2000
 """Messages of one topic that are looked at within a second."""
 
 
 class InputGate:
-    """Subscriptions of ``node``. ``log`` gets the refusals. ``clock``: monotonic, s.
+    """Subscriptions of ``node``. ``log`` gets the rejections. ``clock``: monotonic, s.
 
     ``rejected``: messages by topic; ``why``: the last reason of each.
     """
@@ -64,7 +64,7 @@ class InputGate:
         """Subscribe to ``topic``, by its rows: ``take`` gets each message that ``check`` finds nothing wrong with.
 
         ``name``: on the graph, if it is not the topic's own. ``type_name``: of the message, if a parameter names it.
-        A publisher whose messages cannot come, because they have to be reliable, counts as a refusal. Raises KeyError
+        A publisher whose messages cannot come, because they have to be reliable, counts as a rejection. Raises KeyError
         for a topic without a row, ImportError if its message is not installed, and ConfigError for a QoS override that
         ROS does not take.
         """
@@ -151,10 +151,10 @@ class InputGate:
         return deserialize_message(encoded, kind)
 
     def reject(self, topic: str, why: str) -> None:
-        """Count a message and say why it is refused."""
+        """Count a message and say why it is rejected."""
         self.rejected.add(topic)
         self.why[topic] = sanitize(why, LONGEST)
-        self._limited_log.log(topic, f'{topic}: refused: {self.why[topic]}', WARNING, self._clock(), NEWS)
+        self._limited_log.log(topic, f'{topic}: rejected: {self.why[topic]}', WARNING, self._clock(), NEWS)
 
     def settle(self) -> None:
         """Say what was counted and is due; to be called now and then."""
@@ -164,8 +164,8 @@ class InputGate:
         """For the node's diagnostics."""
         counted = sorted(self.rejected.items())
         return [
-            *((f'messages refused: {topic}', str(count)) for topic, count in counted),
-            *((f'refused last: {topic}', self.why[topic]) for topic, _ in counted),
+            *((f'messages rejected: {topic}', str(count)) for topic, count in counted),
+            *((f'rejected last: {topic}', self.why[topic]) for topic, _ in counted),
         ]
 
     def _let_in(self, size: int, most_bytes: int, rate: RateLimit, what: str = 'messages') -> str:
@@ -196,7 +196,7 @@ class InputGate:
 class GatedNode(LifecycleNode):  # type: ignore[misc]
     """A node, of which a subscription that rclpy itself makes, as that of ``/clock``, cannot end it either.
 
-    ``gate``: where what fails is refused, once there is one.
+    ``gate``: where what fails is rejected, once there is one.
     """
 
     gate: InputGate | None = None

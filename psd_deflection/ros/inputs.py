@@ -24,7 +24,7 @@ STAMP_WITHIN_S = 60.0
 LARGEST_LOAD = 1e6
 """Bound of a force, N, and of a torque, N m."""
 COLDEST, HOTTEST = -100.0, 200.0
-"""Bounds of a temperature, degrees Celsius: one in kelvin is refused."""
+"""Bounds of a temperature, degrees Celsius: one in kelvin is rejected."""
 LARGEST_ACCELERATION = 1e5
 """Bound of a component, m/s^2 or rad/s^2."""
 

@@ -103,14 +103,14 @@ class BaseNode(abc.ABC, Generic[T]):
 
     ``log``: gets each line for the terminal. ``overrides``: parameters that take precedence over those of ROS's
     arguments. Before ``super().__init__`` a node keeps what :meth:`set_up` needs. Raises ConfigError if a parameter is
-    refused; then nothing of the node is left.
+    rejected; then nothing of the node is left.
 
     ``parameters``: the declared ones. ``active``: between activation and deactivation. ``finished``: ended for good by
     ``change_state``.
     """
 
     SYSTEM_TIME: ClassVar[bool] = False
-    """What it measures is stamped by the system clock, so it refuses ``use_sim_time``."""
+    """What it measures is stamped by the system clock, so it rejects ``use_sim_time``."""
 
     def __init__(self, name: str, log: LogCallback, overrides: Mapping[str, object] = MappingProxyType({})) -> None:
         self.error: Exception | None = None
@@ -292,7 +292,7 @@ class BaseNode(abc.ABC, Generic[T]):
         why = 'what is measured is stamped by the system clock'
         if self.node.get_parameter(USE_SIM_TIME).value:
             self.node.set_parameters([RosParameter(USE_SIM_TIME, value=False)])
-            self.log(f'{USE_SIM_TIME} is refused: {why}', WARNING)
+            self.log(f'{USE_SIM_TIME} is rejected: {why}', WARNING)
 
         def check(changed: list[RosParameter]) -> SetParametersResult:
             wanted = any(p.name == USE_SIM_TIME and p.value for p in changed)
@@ -313,7 +313,7 @@ class BaseNode(abc.ABC, Generic[T]):
                     return await await_or_execute(carry_out, request, response)
                 except Exception as error:
                     reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-                    self.log(f'{name}: refused: {reason}', WARNING)
+                    self.log(f'{name}: rejected: {reason}', WARNING)
                     return _rejection(request, response, reason)
 
             return answer
@@ -346,7 +346,7 @@ def _made(name: str, overrides: Mapping[str, object]) -> _ManagedNode:
             f'{SOURCE}: one of them is an empty list, of which ROS cannot tell the type; leave it out for its default'
         ) from None
     except RuntimeError as error:
-        # DDS refuses: it was built without security, or the enclave has no permission.
+        # DDS rejects: it was built without security, or the enclave has no permission.
         raise ConfigError('ROS: ' + ' '.join(str(error).split())) from None
 
 

@@ -3,9 +3,9 @@
 """The rig's parameters as ROS parameters, with types, ranges and units.
 
 Values from the command line, a launch file or a parameter file reach the node as overrides.
-:func:`rig_from_values` validates them as everywhere else: ``0`` for a length is refused by name,
+:func:`rig_from_values` validates them as everywhere else: ``0`` for a length is rejected by name,
 and a whole number is accepted for a ``double``. The descriptors come from the declarations; with
-them rclpy refuses wrong types and values out of range.
+them rclpy rejects wrong types and values out of range.
 
 While the node is unconfigured every parameter may be set; configuring reads them. While it is
 configured only the live ones may; the pipeline validates these, because it knows which values
@@ -91,7 +91,7 @@ def _check_solvers(rig: Rig) -> None:
 
 
 class LiveParameters:
-    """Carries out changes of the node's parameters, or refuses them.
+    """Carries out changes of the node's parameters, or rejects them.
 
     ``settings``: the rig, as the parameters describe it. ``given``: names of those that the user
     has set. ``session``: the one that runs while the node is configured, or None.

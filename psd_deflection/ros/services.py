@@ -36,7 +36,7 @@ def add_rig_services(
 ) -> None:
     """Serve ``~/zero`` and ``~/record``.
 
-    ``present``: what runs, or None while the node is not configured; then both are refused.
+    ``present``: what runs, or None while the node is not configured; then both are rejected.
     ``zero`` takes a zero; ``record`` begins (True) or ends recordings, whose answers come from the
     disk. If they raise an error of the package or TimeoutError, the caller gets its text.
     """

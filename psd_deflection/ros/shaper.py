@@ -3,7 +3,7 @@
 """The node ``shaper``: joint trajectories in, the same out, shaped so that they do not ring the link.
 
 It subscribes to ``~/trajectory`` and publishes ``~/shaped``, one for each. With the parameter
-``action`` it does the same for goals of FollowJointTrajectory. What cannot be followed is refused,
+``action`` it does the same for goals of FollowJointTrajectory. What cannot be followed is rejected,
 with the reason in the log and in ``/diagnostics``. ``joint_states`` tells where the
 joints are; the parameter ``urdf`` says where their limits are: in a file, or on
 ``robot_description``. Everything is done in the main thread.
@@ -37,9 +37,9 @@ from psd_deflection.run.repeats import RateLimitedLog
 
 NODE_NAME = 'shaper'
 NEWS = 6
-"""Refusals that are told one by one, before they are counted and told together."""
+"""Rejections that are told one by one, before they are counted and told together."""
 LONGEST = 200
-"""Characters of a refusal, in which a stranger's words may be."""
+"""Characters of a rejection, in which a stranger's words may be."""
 
 
 class ShaperNode(BaseNode[ShaperSettings]):
@@ -96,8 +96,8 @@ class ShaperNode(BaseNode[ShaperSettings]):
         except ConfigError as error:
             self._rejected += 1
             self._why = sanitize(str(error), LONGEST)
-            kind = 'undescribed' if self._undescribed else 'refused'
-            self._limited_log.log(kind, f'trajectory refused: {self._why}', WARNING, time.monotonic(), NEWS)
+            kind = 'undescribed' if self._undescribed else 'rejected'
+            self._limited_log.log(kind, f'trajectory rejected: {self._why}', WARNING, time.monotonic(), NEWS)
             return
         self._why = ''
         self._out.publish(shaped)
@@ -156,7 +156,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
         if rivals := self.rivals():
             return WARN, f'it shapes nothing: another node publishes {rivals[0]}'
         if self._why:
-            return WARN, f'the last trajectory was refused: {self._why}'
+            return WARN, f'the last trajectory was rejected: {self._why}'
         if self._undescribed:
             return WARN, f'nobody has told the limits of the joints on {DESCRIPTION} yet'
         if not self._known.measured(time.monotonic()):
@@ -164,7 +164,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
         return OK, self._described
 
     def health(self) -> Iterable[Health]:
-        """What was shaped and refused."""
+        """What was shaped and rejected."""
         self._limited_log.settle(time.monotonic())
         level, text = self._state()
         shaper = self._shaper.shaper
@@ -173,7 +173,7 @@ class ShaperNode(BaseNode[ShaperSettings]):
             ('shaper', shaper.name),
             ('delay (s)', f'{shaper.duration:.4f}'),
             ('trajectories shaped', str(self._shaped)),
-            ('trajectories refused', str(self._rejected)),
+            ('trajectories rejected', str(self._rejected)),
         )
         yield Health('trajectories', level, text, values)
         if self._follow is not None:

@@ -84,7 +84,7 @@ class VoltsPublisher:
 class InputRecorder(InputGate):
     """Gives the session what other nodes say, as it arrives and if it can be used.
 
-    ``session``: the one that takes it, or None. It counts and says what is refused. ``below``: as
+    ``session``: the one that takes it, or None. It counts and says what is rejected. ``below``: as
     of :class:`PublisherWire`.
     """
 

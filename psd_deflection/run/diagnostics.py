@@ -121,7 +121,7 @@ class HealthReporter:
             level, message = WARN, f'{new.lost} samples lost, {new.bad} bad frames, {new.dropped} dropped'
         elif new.rejected:
             level = WARN
-            message = '; '.join(f'{topic}: refused: {why}' for topic, why in sorted(s.why_rejected.items()))
+            message = '; '.join(f'{topic}: rejected: {why}' for topic, why in sorted(s.why_rejected.items()))
         values = [
             ('port', s.rig.acquisition.port),
             ('rate (samples/s)', rate),
@@ -136,8 +136,8 @@ class HealthReporter:
             ('device restarts', str(wire.restarts)),
             ('disconnects', str(wire.disconnects)),
             ('silences', str(wire.silences)),
-            ('refused on coming back', str(wire.rejected_reopenings)),
-            *((f'messages refused: {topic}', str(count)) for topic, count in sorted(s.rejected.items())),
+            ('rejected on coming back', str(wire.rejected_reopenings)),
+            *((f'messages rejected: {topic}', str(count)) for topic, count in sorted(s.rejected.items())),
             ('blocks waiting', str(s.acquisition.queue.blocks)),
             ('inputs dropped, because the pipeline was held up', str(s.processing.requests_dropped)),
         ]
@@ -204,7 +204,7 @@ class HealthReporter:
             ('base accelerations', str(motion.inertia.count)),
             ('base accelerations, after their samples', str(motion.inertia.late)),
             ('base accelerations, not ended by another', str(motion.inertia.ended)),
-            ('base accelerations, refused', str(self._session.rejected[ACCELERATION])),
+            ('base accelerations, rejected', str(self._session.rejected[ACCELERATION])),
             *zip(LOAD_WALK, (f'{walk:.3g}' for walk in motion.load_walk()), strict=True),
         ]
         level, message = OK, 'the modes foretell the samples'
@@ -214,7 +214,7 @@ class HealthReporter:
         came, late, ended, rejected = (max(now - then, 0) for now, then in zip(base, self._base, strict=True))
         self._base = base
         if rejected:
-            level, message = WARN, f'{rejected} base accelerations refused: {self._session.why_rejected[ACCELERATION]}'
+            level, message = WARN, f'{rejected} base accelerations rejected: {self._session.why_rejected[ACCELERATION]}'
         elif ended:
             level = WARN
             message = f'no base acceleration came for {HOLD_NS / 1e9:g} s, and the last one was not 0: taken as 0'
@@ -280,7 +280,7 @@ def estimates_entry(
         ('degraded', str(counters.degraded)),
         ('status', spots.status.name if spots is not None else 'none yet'),
         *((f'found: {finding}', str(count)) for finding, count in sorted(counters.findings.items())),
-        *((f'refused: {cause}', str(count)) for cause, count in sorted(counters.rejected.items())),
+        *((f'rejected: {cause}', str(count)) for cause, count in sorted(counters.rejected.items())),
     ]
     values += pipeline.estimator.words()
     if latency is not None:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a daemon requests from the system: locked memory, real-time priority for the reader, a watchdog.
 
-None of it is needed to run. The log says once what the system granted and what it refused, with the reason
+None of it is needed to run. The log says once what the system granted and what it rejected, with the reason
 (``docs/deploy``).
 """
 
@@ -29,7 +29,7 @@ def prefer_reader() -> str:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(READER_PRIORITY))
     except (OSError, AttributeError) as error:
         reason = getattr(error, 'strerror', None) or error
-        return f'reader: ordinary scheduling, SCHED_FIFO {READER_PRIORITY} is refused ({reason}; see docs/deploy)'
+        return f'reader: ordinary scheduling, SCHED_FIFO {READER_PRIORITY} is rejected ({reason}; see docs/deploy)'
     return f'reader: SCHED_FIFO {READER_PRIORITY}'
 
 
@@ -37,7 +37,7 @@ def lock_memory() -> str:
     """Call ``mlockall``, so that none of our memory is swapped out; return the outcome as text.
 
     Pages are locked as they are touched: unused stacks cost nothing. Under a finite limit nothing is
-    locked, because a later allocation would be refused and end the process.
+    locked, because a later allocation would be rejected and end the process.
     """
     try:
         import resource
@@ -53,7 +53,7 @@ def lock_memory() -> str:
         reason = os.strerror(ctypes.get_errno())
     except (OSError, AttributeError) as error:
         reason = str(error)
-    return f'memory: not locked, mlockall is refused ({reason}; see docs/deploy)'
+    return f'memory: not locked, mlockall is rejected ({reason}; see docs/deploy)'
 
 
 def settle() -> None:

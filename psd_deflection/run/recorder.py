@@ -437,7 +437,7 @@ def missing_room(folder: Path, reserve: int) -> str:
     try:
         free = shutil.disk_usage(folder).free
     except OSError:
-        # A disk that does not tell its free space is written to until it refuses.
+        # A disk that does not tell its free space is written to until it rejects.
         return ''
     if free >= reserve:
         return ''

@@ -187,7 +187,7 @@ class Session:
 
         Waits up to ``OPEN_S`` for the disk, so that the recording has the first block. If the disk has not
         answered by then, samples flow, and the recording begins when the disk answers. Raises RecordingError
-        if the disk refuses.
+        if the disk rejects.
         """
         cdr.prepare(TOPIC_TYPES.values())
         if self.rig.acquisition.realtime:
@@ -353,10 +353,10 @@ class Session:
         # The reason first: the main thread asks for it as soon as there is a count.
         self.why_rejected[topic] = why
         self.rejected.add(topic)
-        self._limited_log.log(f'refused {topic}', f'{topic}: refused: {why}', WARNING, time.monotonic())
+        self._limited_log.log(f'rejected {topic}', f'{topic}: rejected: {why}', WARNING, time.monotonic())
 
     def settle(self) -> None:
-        """Let what was counted of refused messages be said when it is due; to be called now and then."""
+        """Let what was counted of rejected messages be said when it is due; to be called now and then."""
         self.processing.later(lambda: self._limited_log.settle(time.monotonic()))
 
     def note_load(

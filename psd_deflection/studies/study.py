@@ -146,7 +146,7 @@ class StudyResult(abc.ABC):
     def save(self, folder: str | Path) -> list[Path]:
         """Write the page, the JSON and whatever else there is into ``folder``; it is made if it is not there.
 
-        Returns the paths. Raises RecordingError if the disk refuses.
+        Returns the paths. Raises RecordingError if the disk rejects.
         """
         into = Path(folder)
         files = self.files()

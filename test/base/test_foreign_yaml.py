@@ -67,7 +67,7 @@ BOMBS = [merge_bomb(), alias_bomb(), '\n'.join(f'k{n}: {n}' for n in range(60_00
 
 
 def readers(path: Path) -> list[type[PsdDeflectionError]]:
-    """Every reader of such a file refuses this one; with what."""
+    """Every reader of such a file rejects this one; with what."""
     found: list[type[PsdDeflectionError]] = []
     for read in (
         lambda: load_rig(path),

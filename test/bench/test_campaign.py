@@ -181,9 +181,9 @@ def test_fuzz_targets_take_what_is_good_and_reject_what_was_found_bad(name: str)
 
 
 def test_a_hang_and_a_rejection_of_two_lines_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert judged(lambda content: ['refused'], b'') == ['refused']
+    assert judged(lambda content: ['rejected'], b'') == ['rejected']
     with pytest.raises(AssertionError, match='more than one line'):
-        judged(lambda content: ['refused\nat length'], b'')
+        judged(lambda content: ['rejected\nat length'], b'')
     monkeypatch.setattr(fuzz, 'HANG_S', -1.0)
     for name in ('frames', 'hello', 'csv', 'yaml'):
         target, seeds = TARGETS[name]()

@@ -52,9 +52,9 @@ def test_a_part_that_raises_is_left() -> None:
         raise ValueError
 
     with pytest.raises(ValueError):
-        clocks.timed('refused', rejects)()
+        clocks.timed('rejected', rejects)()
     clocks.timed('next', lambda: None)()
-    assert clocks.calls[threading.get_native_id()] == {'refused': 1, 'next': 1}
+    assert clocks.calls[threading.get_native_id()] == {'rejected': 1, 'next': 1}
 
 
 def test_what_is_in_no_part_is_the_rest_of_its_thread() -> None:

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``psd-deflection budget``: what it prints, draws and refuses."""
+"""``psd-deflection budget``: what it prints, draws and rejects."""
 
 from __future__ import annotations
 

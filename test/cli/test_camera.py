@@ -43,7 +43,7 @@ def test_the_table_has_each_frame_with_its_answer_or_reason(
     )
     output = capsys.readouterr().out
     assert '4 of 5 frames have an answer' in output
-    assert '1 refused: no target' in output
+    assert '1 rejected: no target' in output
     rows = list(csv.DictReader(out.read_text().splitlines()))
     assert list(rows[0]) == ['t', 'dx', 'dy', 'theta', 'sd_dx', 'sd_dy', 'sd_theta', 'status']
     assert [r['t'] for r in rows[:2]] == ['0.002000000', '0.035333000']
@@ -83,7 +83,7 @@ def test_a_bag_has_the_poses_with_and_without_covariance(
     ]
     assert main(words) == 0
     output = json.loads(capsys.readouterr().out)
-    assert (output['frames'], output['answers'], output['refused']) == (5, 4, {'no target': 1})
+    assert (output['frames'], output['answers'], output['rejected']) == (5, 4, {'no target': 1})
     assert output['turn'] == pytest.approx(0.1, abs=1e-3)
     recording = open_recording(out)
     references = recording.references()

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""A certificate: its tables alone give every U again; what is refused."""
+"""A certificate: its tables alone give every U again; what is rejected."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``chain`` without ROS, and what ``chain`` and ``compensator`` refuse."""
+"""``chain`` without ROS, and what ``chain`` and ``compensator`` reject."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``psd-deflection design``: what it prints and refuses."""
+"""``psd-deflection design``: what it prints and rejects."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``shaper``: where it takes the mode from, and what it refuses."""
+"""``shaper``: where it takes the mode from, and what it rejects."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""``psd-deflection validate``: what it prints, writes and refuses."""
+"""``psd-deflection validate``: what it prints, writes and rejects."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def late(run: Path) -> Path:
-    """The reference in a table of its own, 12.5 ms late, with one refused frame."""
+    """The reference in a table of its own, 12.5 ms late, with one rejected frame."""
     path = run.parent / 'camera.csv'
     with run.open() as stream, path.open('w') as out:
         out.write('t,dx,dy,theta,sd_dx,sd_dy,sd_theta,status\n')
@@ -46,7 +46,7 @@ def test_the_offset_is_reported_and_removed_if_asked(run: Path, late: Path, caps
     assert found['offset']['value'] == pytest.approx(-0.0125, abs=0.6e-3)
     assert found['offset']['told']
     assert not found['offset']['applied']
-    assert found['refused'] == {'blurred': 1}
+    assert found['rejected'] == {'blurred': 1}
     without = found['solvers']['exact']['dy']['rms']
     assert main(['validate', str(run), '--reference', str(late), '--align', '--json']) == 0
     found = json.loads(capsys.readouterr().out)

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The page that tries it in the browser, without a browser: what it computes, what it carries, what it refuses.
+"""The page that tries it in the browser, without a browser: what it computes, what it carries, what it rejects.
 
 ``make docs STEP=try-page`` runs it in Chromium.
 """

@@ -193,7 +193,7 @@ def test_a_reading_that_contradicts_the_others_widens_the_covariance() -> None:
 def test_four_readings_that_contradict_each_other_are_rejected_if_that_is_asked_for() -> None:
     volts = at_rest(1)
     volts[:, 0] = 1e-3 / 5e-4
-    records = list(Pipeline(load_rig(overrides={'consistency': 'refuse'})).process(chunk(volts)))
+    records = list(Pipeline(load_rig(overrides={'consistency': 'reject'})).process(chunk(volts)))
     assert not [r for r in records if isinstance(r, DeflectionEstimate)]
     (spots,) = (r for r in records if isinstance(r, SpotMeans))
     assert spots.status is BlockStatus.INCONSISTENT

@@ -120,7 +120,7 @@ def test_a_detector_that_stands_still_is_reported_and_rejected_where_it_shall_be
     quiet = Pipeline(load_rig())
     assert {s.status for s in spots(records_of(quiet, counts[: 8 * SIZE]))} == {BlockStatus.OK}
     assert quiet.counters.findings['psd_1 stands still'] == 2
-    records = records_of(Pipeline(load_rig(overrides={'frozen': 'refuse'})), counts)
+    records = records_of(Pipeline(load_rig(overrides={'frozen': 'reject'})), counts)
     statuses = [s.status for s in spots(records)]
     assert statuses == [BlockStatus.OK] * 6 + [BlockStatus.FROZEN] * 4 + [BlockStatus.OK] * 2
     assert 'psd_1 stands still: no bit has moved for 5 blocks' in [s.reason for s in spots(records)]

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The pipeline on simulated samples: its accuracy against the bound, and what it refuses."""
+"""The pipeline on simulated samples: its accuracy against the bound, and what it rejects."""
 
 from __future__ import annotations
 

@@ -163,7 +163,7 @@ CASES = {
     'vibrates': Case(VIBRATION, (99, 149, 171), vibrating),
     'ten bits': Case(STEPS, (160,), coarse),
     'PSD 2 dark': Case(HELD, (212, 260), dark, {'degraded': 'hold'}),
-    'PSD 1 stands still': Case(FROZEN, (178,), stuck, {'frozen': 'refuse'}),
+    'PSD 1 stands still': Case(FROZEN, (178,), stuck, {'frozen': 'reject'}),
     'x2 noisy': Case(LOUD, (20,), noisy),
     'effects of the link': Case(TIP_LOADS, (151, 251), rig=LINK),
     'PSD 3 does not follow': Case(PSDS + '0_1_2', (151,), rig=THIRD),

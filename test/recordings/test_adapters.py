@@ -227,7 +227,7 @@ def test_a_prefix_is_before_every_frame_once() -> None:
 
 @given(times, numbers, numbers, numbers)
 def test_inputs_come_back_as_they_went(t_ns: int, a: float, b: float, c: float) -> None:
-    # An acceleration without a stamp is refused.
+    # An acceleration without a stamp is rejected.
     base = BaseAcceleration(max(t_ns, 1), (a, b, c), (c, a, b))
     for record in (AppliedLoad(t_ns, a, b, c), TemperatureReading(t_ns, a), base):
         (m,) = to_messages(record)

@@ -1,6 +1,7 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of other loggers: each is refused with what it is, and the shell line that is offered makes a recording of it.
+"""Tables of other loggers: each is rejected with what it is, and the shell line that is offered makes a recording of
+it.
 
 Made anew in the forms that public reports describe; no row is anybody's.
 """

@@ -260,7 +260,7 @@ def test_what_is_computed_from_a_part_says_which(two_files: tuple[Path, Path]) -
 def test_a_part_of_a_replay_is_what_it_is_in_the_whole(
     bag: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Also where the part begins and ends within a block; what is refused in it is counted, and no more."""
+    """Also where the part begins and ends within a block; what is rejected in it is counted, and no more."""
     whole, part = tmp_path / 'whole.csv', tmp_path / 'part.csv'
     assert main(['replay', str(BAGS / bag), '--out', str(whole), '--json']) == 0
     everything = json.loads(capsys.readouterr().out)
@@ -276,8 +276,8 @@ def test_a_part_of_a_replay_is_what_it_is_in_the_whole(
     start = int(next(psd_deflection.open(BAGS / bag).blocks()).t_ns[0])
     since = [int(row.partition(',')[0].replace('.', '')) - start for row in rows]
     assert others == [row for row, t_ns in zip(rows, since, strict=True) if 1_013_000_000 <= t_ns < 2_505_000_000]
-    assert found['blocks'] == found['estimates'] + sum(found['refused'].values())
-    assert sum(found['refused'].values()) <= sum(everything['refused'].values())
+    assert found['blocks'] == found['estimates'] + sum(found['rejected'].values())
+    assert sum(found['rejected'].values()) <= sum(everything['rejected'].values())
     assert found['samples'] + found['lost'] == pytest.approx(1492, abs=40)
 
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What a crash leaves is made whole, and judged by a reader that refuses what is not."""
+"""What a crash leaves is made whole, and judged by a reader that rejects what is not."""
 
 from __future__ import annotations
 

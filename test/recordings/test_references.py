@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of references: read as they are written, refused with file, line and value."""
+"""Tables of references: read as they are written, rejected with file, line and value."""
 
 from __future__ import annotations
 

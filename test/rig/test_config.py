@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters: every refusal names the file, the key, the value and the bound."""
+"""Parameters: every rejection names the file, the key, the value and the bound."""
 
 from __future__ import annotations
 

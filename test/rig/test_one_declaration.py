@@ -29,7 +29,7 @@ def calls(tree: ast.AST, name: str) -> Iterator[ast.Call]:
 
 
 def checks_a_number(function: ast.FunctionDef) -> bool:
-    """Whether it looks at the type of a value and refuses it as a parameter."""
+    """Whether it looks at the type of a value and rejects it as a parameter."""
     raised = (n.exc for n in ast.walk(function) if isinstance(n, ast.Raise) and n.exc is not None)
     rejects = any('ConfigError' in ast.unparse(error) for error in raised)
     kinds = {n.id for call in calls(function, 'isinstance') for n in ast.walk(call.args[1]) if isinstance(n, ast.Name)}

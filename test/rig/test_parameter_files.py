@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Parameter files: what is none is refused by name, and a file of a user keeps its comments."""
+"""Parameter files: what is none is rejected by name, and a file of a user keeps its comments."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ BLOCK_NS = 20_000_000
 
 ASK_AGAIN_S = 20.0
 SEND_AGAIN_S = 1.0
-"""A message is sent again after it: a node that is late loses some, and one that is flooded refuses them as a flood."""
+"""A message is sent again after it: a node that is late loses some, and one that is flooded rejects them as a flood."""
 """An answer that has not come by then is lost."""
 
 
@@ -122,7 +122,7 @@ class Peer:
         return got
 
     def zero(self) -> Any:
-        """The answer of ``~/zero`` once it is taken: while the simulated rig rings under its load it is refused."""
+        """The answer of ``~/zero`` once it is taken: while the simulated rig rings under its load it is rejected."""
         from std_srvs.srv import Trigger
 
         answers: list[Any] = []

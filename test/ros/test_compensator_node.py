@@ -249,7 +249,7 @@ def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program,
 
     def counted(topic: str) -> int:
         values = {v.key: v.value for s in states[-1].status for v in s.values} if states else {}
-        return int(values.get(f'messages refused: {topic.strip("/")}', '0'))
+        return int(values.get(f'messages rejected: {topic.strip("/")}', '0'))
 
     def rejected(topic: str, why: str) -> Callable[[], bool]:
         wanted, before = compensator.text.count(why), counted(topic)
@@ -257,7 +257,7 @@ def test_what_strangers_send_is_rejected_and_moves_nothing(compensator: Program,
 
     for name, (message, topic, why) in strange_messages().items():
         send = partial(senders[topic].publish, message)
-        peer.until_sent(send, rejected(topic, why), f'the refusal of what is {name}')
+        peer.until_sent(send, rejected(topic, why), f'the rejection of what is {name}')
     peer.until(lambda: counted('/end_effector/deflection') >= 4 and counted('/joint_states') >= 5, 'their counts')
     assert compensator.process.poll() is None
     assert plant.step() <= WITHIN

@@ -159,7 +159,7 @@ class Running:
         """As its diagnostics count them."""
         own = f'{NAMESPACE}/{self.name}'.removeprefix('/')
         last = {s.name: s for report in self.reports for s in report.status if s.name.startswith(own)}
-        counts = (v.value for s in last.values() for v in s.values if 's refused' in v.key)
+        counts = (v.value for s in last.values() for v in s.values if 's rejected' in v.key)
         return sum(int(count) for count in counts)
 
 
@@ -243,7 +243,7 @@ def lead_acts(running: Running) -> bool:
 
 
 def age_acts(running: Running) -> bool:
-    """Joints that are older than they had been allowed to be are taken, still older ones are refused."""
+    """Joints that are older than they had been allowed to be are taken, still older ones are rejected."""
 
     def old(seconds: int) -> JointState:
         message = JointState(name=['shoulder', 'elbow'], position=[0.1, 0.2])
@@ -264,7 +264,7 @@ def age_acts(running: Running) -> bool:
         reported += 1
         return running.rejections() > count
 
-    running.peer.until(rejected, 'a refusal')
+    running.peer.until(rejected, 'a rejection')
     return running.rejections() - count <= reported
 
 
@@ -286,7 +286,7 @@ def frame_of(kind: type, topic: str, frame: str) -> Callable[[Running], bool]:
 
 
 def taken_in_the_prefixed_frame_alone(running: Running) -> bool:
-    """A deflection in the frame without the prefix is refused."""
+    """A deflection in the frame without the prefix is rejected."""
     sent = PoseWithCovarianceStamped, 'end_effector/deflection', deflection()
     return rejects(running, sent, ("'end_effector_rest': must be left_end_effector_rest",))
 
@@ -307,7 +307,7 @@ PROFILES: Mapping[str, Profile] = {
         beyond=('amplifier.noise', -1.0),
         rejected=loads_at('link_tip/load'),
         frames=frame_of(PoseStamped, 'link_tip/deflection', 'left_link_tip_rest'),
-        sim_time='refused',
+        sim_time='rejected',
     ),
     'camera': Profile(
         params={'target.spacing': 0.025, 'rest.frames': 1, 'frame_prefix': PREFIX},
@@ -334,7 +334,7 @@ PROFILES: Mapping[str, Profile] = {
         beyond=('slopes', 'none'),
         rejected=loads_at('upper/link_tip/load'),
         frames=frame_of(PoseWithCovarianceStamped, 'end_effector/deflection', 'left_end_effector_rest'),
-        sim_time='refused',
+        sim_time='rejected',
     ),
     'compensator': Profile(
         words=('--urdf', str(ROOT / 'config' / 'two_links.urdf'), '--tip', 'tool', '--axes', 'x,z'),
@@ -394,20 +394,20 @@ def running(
 
 
 def rejects(running: Running, sent: Sent, words: tuple[str, ...]) -> bool:
-    """Whether the message is counted as refused in the node's diagnostics, for a reason with one of ``words``."""
+    """Whether the message is counted as rejected in the node's diagnostics, for a reason with one of ``words``."""
     before, reports = running.rejections(), len(running.reports)
 
     def send() -> None:
         running.send(sent)
         if running.name == 'shaper':
-            # Without it every trajectory is refused.
+            # Without it every trajectory is rejected.
             running.send((JointState, 'joint_states', JointState(name=['joint_0'], position=[0.5])))
 
     def counted() -> bool:
         why = running.texts(reports)
         return running.rejections() > before and any(word in why for word in words)
 
-    running.peer.until_sent(send, counted, f'the refusal of {sent[1]} for one of {words}')
+    running.peer.until_sent(send, counted, f'the rejection of {sent[1]} for one of {words}')
     return running.program.process.poll() is None
 
 
@@ -526,7 +526,7 @@ def test_frame_prefix_acts(running: Running) -> None:
 
 def test_simulated_time_acts_or_is_rejected(running: Running) -> None:
     answer = running.set('use_sim_time', True)
-    if running.profile.sim_time == 'refused':
+    if running.profile.sim_time == 'rejected':
         assert not answer.successful
         assert 'system clock' in answer.reason
         return
@@ -545,7 +545,7 @@ def test_simulated_time_acts_or_is_rejected(running: Running) -> None:
     try:
         running.peer.until_sent(lambda: reported(1234), of_that_time, 'diagnostics in simulated time')
         running.peer.until_sent(
-            lambda: reported(-5), lambda: running.rejections() > rejected, 'the refusal of a time before 1970'
+            lambda: reported(-5), lambda: running.rejections() > rejected, 'the rejection of a time before 1970'
         )
     finally:
         running.peer.node.destroy_publisher(clock)
@@ -576,8 +576,8 @@ def test_rejections_are_warnings(running: Running) -> None:
     # Each test may run in a process of its own: what the others sent may not have been sent here.
     sent = next(sent for sent in running.profile.rejected.values() if not isinstance(sent, str))
 
-    running.peer.until_sent(lambda: running.send(sent), lambda: running.logged('refused', 30), 'a warning')
-    levels = {line.level for line in running.lines if 'refused: ' in line.msg}
+    running.peer.until_sent(lambda: running.send(sent), lambda: running.logged('rejected', 30), 'a warning')
+    levels = {line.level for line in running.lines if 'rejected: ' in line.msg}
     assert levels == {30}
 
 
@@ -655,7 +655,7 @@ def test_goal_that_cannot_be_used_is_rejected(running: Running) -> None:
             future = client.send_goal_async(sent)
             running.peer.until(future.done, 'the answer to a goal')
             assert not future.result().accepted
-            running.peer.until(counted, f'the refusal of a goal: {why}')
+            running.peer.until(counted, f'the rejection of a goal: {why}')
     finally:
         client.destroy()
 

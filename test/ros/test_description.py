@@ -51,8 +51,8 @@ def test_an_empty_one_is_no_description(signals: Signals, peer: Any) -> None:
     reported: list[str] = []
 
     def clock() -> float:
-        """Its time is over once the refusal was said."""
-        return 10.0 * sum('refused' in line for line in reported)
+        """Its time is over once the rejection was said."""
+        return 10.0 * sum('rejected' in line for line in reported)
 
     with pytest.raises(ConfigError, match='it is empty'):
         robot_description(signals, texts(reported.append), wait_s=5.0, clock=clock)

@@ -455,7 +455,7 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     headers = {'Content-Type': 'application/json'}
 
     def zeroed() -> bool:
-        """While the link rings under the simulated load, the zero is refused with status 409."""
+        """While the link rings under the simulated load, the zero is rejected with status 409."""
         try:
             with urllib.request.urlopen(urllib.request.Request(url + 'api/zero', b'{}', headers), timeout=60.0) as got:
                 return bool(json.load(got)['ok'])

@@ -51,7 +51,7 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
         return int({v.key: v.value for v in status.values}[key]) if status is not None else 0
 
     now, reported = len(speeds), 0
-    while counted('base accelerations') < 10 or counted('base accelerations, refused') < 2 or len(speeds) < now + 50:
+    while counted('base accelerations') < 10 or counted('base accelerations, rejected') < 2 or len(speeds) < now + 50:
         base = AccelStamped()
         base.header.stamp = peer.node.get_clock().now().to_msg()
         base.header.frame_id = 'link_base' if reported % 10 else 'tool0'
@@ -70,7 +70,7 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     assert status.level in (DiagnosticStatus.OK, DiagnosticStatus.WARN)
     assert float({v.key: v.value for v in status.values}['NIS a sample, dX']) > 0.5
     # Best effort: either may have come first.
-    (wanted, *_) = [line for line in estimator.lines if '/link_base/acceleration: refused' in line]
+    (wanted, *_) = [line for line in estimator.lines if '/link_base/acceleration: rejected' in line]
     assert "frame_id 'tool0': must be link_base" in wanted or 'angular x = nan: must be finite' in wanted
     recording = open_recording(folder)
     noted = [name for change in recording.changes for name, _ in change.values]

@@ -85,14 +85,14 @@ def test_good_ones_are_taken_and_others_counted_and_reported(
     peer.until(sent, 'the messages')
     assert set(gated.heard) == {'good'}
     assert set(gated.logged) == {
-        f'{TOPIC}: refused: empty',
-        f'{TOPIC}: refused: 2009 bytes: must be at most 1000',
+        f'{TOPIC}: rejected: empty',
+        f'{TOPIC}: rejected: 2009 bytes: must be at most 1000',
     }
     assert set(gated.levels) == {WARNING}
     count, why = gated.gate.values()
-    assert count == (f'messages refused: {TOPIC}', str(gated.gate.rejected[TOPIC]))
-    assert why[0] == f'refused last: {TOPIC}'
-    assert f'{TOPIC}: refused: {why[1]}' in gated.logged
+    assert count == (f'messages rejected: {TOPIC}', str(gated.gate.rejected[TOPIC]))
+    assert why[0] == f'rejected last: {TOPIC}'
+    assert f'{TOPIC}: rejected: {why[1]}' in gated.logged
 
 
 def test_a_text_that_is_no_text_ends_nothing(peer: Any, gated: Gated) -> None:

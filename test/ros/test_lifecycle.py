@@ -84,10 +84,10 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
     assert not markers
     assert change(peer, Transition.TRANSITION_ACTIVATE)
     daemon.until('publishing on ROS domain')
-    # What this state does not have is refused, and measuring goes on.
+    # What this state does not have is rejected, and measuring goes on.
     for wrong in (Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_CONFIGURE, 77):
         assert not change(peer, wrong)
-    daemon.until('change_state: refused')
+    daemon.until('change_state: rejected')
     strange = ParameterMessage(name='sum_min', value=ParameterValue(type=42))
     answer = peer.call(SetParameters, '/estimator/set_parameters', SetParameters.Request(parameters=[strange]))
     assert [(r.successful, '42' in r.reason) for r in answer.results] == [(False, True)]
@@ -115,7 +115,7 @@ def test_states_one_after_the_other(start: Callable[..., Any], peer: Any, simula
 
 
 def put(peer: Any, **values: object) -> str:
-    """Why the values are refused, '' if they are taken; ``__`` in a name stands for a dot."""
+    """Why the values are rejected, '' if they are taken; ``__`` in a name stands for a dot."""
     changes = [Parameter(n.replace('__', '.'), value=v).to_parameter_msg() for n, v in values.items()]
     request = SetParametersAtomically.Request(parameters=changes)
     answer = peer.call(SetParametersAtomically, '/estimator/set_parameters_atomically', request).result
@@ -146,7 +146,7 @@ def test_parameters_that_are_set_while_unconfigured_are_read_and_kept(
     daemon.until('waiting to be configured')
     assert not change(peer, Transition.TRANSITION_CONFIGURE)
     daemon.until('no such port')
-    # Refused at once, all of them, by the words that refuse a file.
+    # Rejected at once, all of them, by the words that reject a file.
     assert 'must be less than sum_max' in put(peer, sum_min=9.0, solver='ols')
     assert "solver = 'magic': must be one of" in put(peer, solver='magic')
     assert 'comparison only' in put(peer, solver='appendix_d')

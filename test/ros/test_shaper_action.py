@@ -213,7 +213,7 @@ def test_what_cannot_be_followed_is_aborted_with_the_reason(begin: Callable[...,
     aborted(arm.goal(), -1, f'{ACTION} rejects it')
     arm.controller.rejects = False
     assert arm.followed(arm.goal(seconds=1.0))[0] == SUCCEEDED
-    assert arm.shaper.text.count('follow_joint_trajectory: refused: point 0 is not finite') == 1
+    assert arm.shaper.text.count('follow_joint_trajectory: rejected: point 0 is not finite') == 1
 
 
 def test_what_no_goal_may_be_is_rejected_at_the_gate(begin: Callable[..., Arm]) -> None:
@@ -263,7 +263,7 @@ def test_what_no_client_of_ros_sends_ends_nothing(begin: Callable[..., Arm]) -> 
             # Half a goal rmw drops itself; some are sent before those whose text is none, which are unpacked.
             stranger.until('sent 20')
             if kind == 'text':
-                arm.peer.until(lambda: 'refused: joint_names: must be' in arm.shaper.text, 'a refusal')
+                arm.peer.until(lambda: 'rejected: joint_names: must be' in arm.shaper.text, 'a rejection')
         finally:
             print(stranger.text)
             stranger.end(signal.SIGKILL)

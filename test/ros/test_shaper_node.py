@@ -67,17 +67,17 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
 
     unknown = 'nobody tells where the joints are on joint_states'
     peer.until(lambda: any(r.status[0].message == unknown for r in reports), 'diagnostics without joints')
-    # Refused: a joint of which nobody tells anything, too.
+    # Rejected: a joint of which nobody tells anything, too.
     given.publish(message(point(0.0, [0.0]), names=('z',)))
-    node.until('trajectory refused: the position of z is not known')
+    node.until('trajectory rejected: the position of z is not known')
     reported(peer, shoulder=START[0], elbow=START[1])
     given.publish(message(point(0.0, [1.0])))
-    node.until('trajectory refused: point 0 has 1 positions, must be 2')
+    node.until('trajectory rejected: point 0 has 1 positions, must be 2')
     late = message(point(0.0, START.tolist()))
     late.header.stamp.sec = 1
     given.publish(late)
-    node.until('trajectory refused: its stamp is .* s old')
-    peer.until(lambda: any('was refused: its stamp' in r.status[0].message for r in reports), 'diagnostics')
+    node.until('trajectory rejected: its stamp is .* s old')
+    peer.until(lambda: any('was rejected: its stamp' in r.status[0].message for r in reports), 'diagnostics')
 
     good = message(point(0.0, START.tolist()), point(MOVE_S, END.tolist()))
     # Many leave zeros there.
@@ -109,16 +109,16 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
     reports.clear()
     peer.until(lambda: any('ZVD for 12 Hz' in r.status[0].message for r in reports), 'diagnostics')
     values = {v.key: v.value for v in reports[-1].status[0].values}
-    assert (values['shaper'], values['delay (s)'], values['trajectories refused']) == ('zvd', '0.0834', '3')
+    assert (values['shaper'], values['delay (s)'], values['trajectories rejected']) == ('zvd', '0.0834', '3')
 
-    # With another one of its name each motion would come twice: both refuse.
+    # With another one of its name each motion would come twice: both reject.
     twin = peer.node.create_publisher(JointTrajectory, '/shaper/shaped', 5)
     reports.clear()
     held = 'it shapes nothing: another node publishes /shaper/shaped'
     peer.until(lambda: any(held == r.status[0].message for r in reports), 'a second publisher')
     good.header.stamp = peer.node.get_clock().now().to_msg()
     given.publish(good)
-    node.until('trajectory refused: another node publishes /shaper/shaped')
+    node.until('trajectory rejected: another node publishes /shaper/shaped')
     peer.node.destroy_publisher(twin)
 
     # A stop goes through.
@@ -141,14 +141,14 @@ def test_the_limits_come_from_the_robots_description(domain: int, peer: Any) -> 
             good = message(point(0.0, START.tolist()), point(*move_of[kind]))
             peer.until(lambda: given.publish(good) or why in node.text, why)
 
-        rejected('trajectory refused: nobody has told the limits of the joints on robot_description yet', 'slow')
+        rejected('trajectory rejected: nobody has told the limits of the joints on robot_description yet', 'slow')
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         described = peer.node.create_publisher(String, '/robot_description', latched)
         described.publish(String(data='<robot'))
-        peer.until(lambda: 'robot_description: refused' in node.text, 'a refusal of what is no URDF')
+        peer.until(lambda: 'robot_description: rejected' in node.text, 'a rejection of what is no URDF')
         described.publish(String(data=URDF.read_text()))
         peer.until(lambda: 'limits of shoulder, elbow' in node.text, 'the limits')
-        rejected('trajectory refused: shoulder', 'far')
+        rejected('trajectory rejected: shoulder', 'far')
         good = message(point(0.0, START.tolist()), point(*move_of['slow']))
         peer.until(lambda: given.publish(good) or bool(heard), 'the shaped trajectory')
     finally:
@@ -175,7 +175,7 @@ def test_settings_are_parameters(node: Program, peer: Any) -> None:
     peer.until(lambda: given.get_subscription_count() > 0, 'the shaper')
     reported(peer, shoulder=0.0, elbow=0.02)
     peer.until(
-        lambda: given.publish(message(point(0.0, [0.0, 0.0]))) or 'from where elbow is' in node.text, 'a refusal'
+        lambda: given.publish(message(point(0.0, [0.0, 0.0]))) or 'from where elbow is' in node.text, 'a rejection'
     )
     assert 'must be at most 0.01' in node.text
 

@@ -136,7 +136,7 @@ def test_reader_waits_for_an_unplugged_device_and_resumes(device: Any, run: Run,
 def test_a_full_queue_drops_the_newest_and_counts(device: Any, rig: Rig, sample: Any) -> None:
     run = Run(load_rig(overrides={'port': rig.acquisition.port, 'queue_blocks': 2}))
     device.send_frames(*[sample(s) for s in range(100)], HelloFrame(1, {'serial': 'T-1'}))
-    # The odd HELLO is refused with a message: by then all samples before it were handled.
+    # The odd HELLO is rejected with a message: by then all samples before it were handled.
     run.heard('kept to the first HELLO')
     run.acquisition.stop()
     items: list[Item] = []

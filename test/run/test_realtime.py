@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""What is asked of the system, with a system that refuses; systemd's socket with ourselves behind it."""
+"""What is asked of the system, with a system that rejects; systemd's socket with ourselves behind it."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_rejected_system_resources_are_reported(monkeypatch: pytest.MonkeyPatch)
         raise PermissionError(errno.EPERM, 'Operation not permitted')
 
     monkeypatch.setattr(os, 'sched_setscheduler', reject)
-    assert 'SCHED_FIFO 50 is refused (Operation not permitted' in prefer_reader()
+    assert 'SCHED_FIFO 50 is rejected (Operation not permitted' in prefer_reader()
     monkeypatch.setattr(os, 'sched_setscheduler', lambda *args: None)
     assert prefer_reader() == 'reader: SCHED_FIFO 50'
     monkeypatch.setattr(os, 'geteuid', lambda: 1000)

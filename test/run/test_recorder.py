@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The recorder against a disk that fills, refuses, or is slow."""
+"""The recorder against a disk that fills, rejects, or is slow."""
 
 from __future__ import annotations
 

@@ -13,8 +13,8 @@ def test_a_line_a_second_for_a_day_is_few_lines_and_none_is_forgotten() -> None:
     repeats = RateLimitedLog(texts(logged.append))
     for k in range(86_400):
         # The words may differ each time: it is the kind that counts.
-        repeats.log('hello', f'HELLO {k} refused', WARNING, 1000.0 + k)
-    assert logged[:2] == ['HELLO 0 refused', 'HELLO 10 refused (and 9 more like it)']
+        repeats.log('hello', f'HELLO {k} rejected', WARNING, 1000.0 + k)
+    assert logged[:2] == ['HELLO 0 rejected', 'HELLO 10 rejected (and 9 more like it)']
     assert len(logged) < 40
     repeats.settle(1000.0 + 86_400 + LONGEST_WAIT_S)
     last = logged.pop()

@@ -89,7 +89,7 @@ def test_a_zero_that_was_taken_under_a_load_is_reported(running: Running) -> Non
     session.note_load(0.0, -30.0, 0.0)
     session.reject_input(LOAD, 'the end')
     reported = []
-    while 'refused: the end' not in (text := running.logged.get(timeout=WAIT_S)):
+    while 'rejected: the end' not in (text := running.logged.get(timeout=WAIT_S)):
         reported.append(text)
     assert not [text for text in reported if 'anew' in text]
 
@@ -105,7 +105,7 @@ def test_metrics_count_what_came_was_lost_and_was_rejected(running: Running) -> 
     }
     assert found[('psd_deflection_samples_total',)] == running.session.acquisition.counters.samples > 0
     assert found[('psd_deflection_estimates_total',)] >= 5.0
-    assert found[('psd_deflection_messages_refused_total', LOAD)] == 1.0
+    assert found[('psd_deflection_messages_rejected_total', LOAD)] == 1.0
     assert found[('psd_deflection_recording',)] == 0.0
     # The device measures none, and nothing watches.
     assert not any('celsius' in key[0] or 'watch' in key[0] for key in found)
@@ -281,7 +281,7 @@ def test_a_mark_that_is_none_or_comes_too_often_is_rejected_and_counted(
         with pytest.raises(ValueError, match='a mark'):
             session.note_mark(text)
     assert session.take_input(MARK, b'too short') is None
-    running.heard('refused')
+    running.heard('rejected')
     session.note_mark('good')
     monkeypatch.setattr(session, '_mark_rate', RateLimit(0))
     with pytest.raises(ValueError, match='more than 10 marks a second'):
@@ -312,9 +312,9 @@ def test_an_input_that_is_no_number_is_recorded_and_not_shown(running: Running) 
     running.session.processing.request(lambda: None)
     assert running.session.rejected == {REFERENCE: 2}
     entry = HealthReporter(running.session).report(0).entries[0]
-    assert dict(entry.values)[f'messages refused: {REFERENCE}'] == '2'
+    assert dict(entry.values)[f'messages rejected: {REFERENCE}'] == '2'
     assert entry.level == WARN
-    assert entry.message.startswith(f'{REFERENCE}: refused: ')
+    assert entry.message.startswith(f'{REFERENCE}: rejected: ')
 
 
 def test_what_was_counted_of_rejected_messages_is_reported_though_no_more_come(

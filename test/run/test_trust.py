@@ -16,15 +16,15 @@ PAGE = (ROOT / 'docs' / 'trust.md').read_text('utf-8')
 LOGS = {'log', '_log', '_report', 'warn', '_warn'}
 CORRECTS = re.compile(
     r'start(s|ed) (again|anew)|time map|1 ns apart|dropped|deleted,|kept to|not processed|not kept|left with|back$|'
-    r'to come back|not corrected|begins later|cannot be read|taking a|is not waited|stopped: |refused|still '
+    r'to come back|not corrected|begins later|cannot be read|taking a|is not waited|stopped: |rejected|still '
 )
 OTHER = (
     # The name of a kind of line.
-    'refused {}',
+    'rejected {}',
     # It is of a request, which is answered with it.
     '{}: {}: {}: {}',
     'the source hangs; it is not waited for',
-    '{} is refused: {}',
+    '{} is rejected: {}',
 )
 
 

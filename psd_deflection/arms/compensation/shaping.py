@@ -23,7 +23,7 @@ LEAST_FREQUENCY = 0.1
 
 @dataclass(frozen=True, slots=True)
 class ShaperSettings:
-    """What is shaped, how, and what is refused; the node has them as ROS parameters.
+    """What is shaped, how, and what is rejected; the node has them as ROS parameters.
 
     Raises ConfigError for a value out of bounds, or if two contradict each other.
     """
@@ -42,13 +42,13 @@ class ShaperSettings:
     urdf: str = parameter(
         '',
         '',
-        'refuse trajectories beyond the limits of the joints of this URDF file; '
+        'reject trajectories beyond the limits of the joints of this URDF file; '
         f'{DESCRIPTION}: of the robot that this topic describes',
     )
     max_step: float = parameter(
         0.05,
         'rad or m',
-        'a trajectory that begins further from where the joints are is refused',
+        'a trajectory that begins further from where the joints are is rejected',
         minimum=1e-6,
         maximum=10.0,
         live=True,

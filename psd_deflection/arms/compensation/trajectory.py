@@ -45,7 +45,7 @@ default, it goes a tenth of what ``max_step`` allows."""
 PARTS = 8
 """Parts of each piece of a trajectory whose ends are held against the limits."""
 OLDEST_S = 1.0
-"""A trajectory whose start is longer ago than this is refused."""
+"""A trajectory whose start is longer ago than this is rejected."""
 QUANTITIES = ('positions', 'velocities', 'accelerations')
 
 
@@ -183,7 +183,7 @@ class _Piece(NamedTuple):
 class TrajectoryShaper:
     """``max_step``: a trajectory may begin so far from where the joints are, or are commanded, rad or m.
 
-    ``limits``: of joints by name; what is given must be within them, and other joints are refused. ``history``: what
+    ``limits``: of joints by name; what is given must be within them, and other joints are rejected. ``history``: what
     was commanded and is not over. Owns no clock; for one thread.
     """
 

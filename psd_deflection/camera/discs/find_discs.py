@@ -73,7 +73,7 @@ def find_discs(grey: Any, ratio: float) -> list[Region]:
     """Return the three discs in an 8-bit image, from one end of the line to the other; ``ratio``: spacing / radius.
 
     Large discs show in an image made small, which takes less time; what is not found there is sought in all pixels.
-    Raises RefusedError with the reason if there is no target, or more than one.
+    Raises RejectedError with the reason if there is no target, or more than one.
     """
     factor = min(grey.shape) // _COARSE_HEIGHT
     if factor > 1:

@@ -66,7 +66,7 @@ class Fitter:
     ) -> TargetPose:
         """Return the pose, from a first guess that is good to a pixel or two, and from the blur of the last answer.
 
-        ``image`` (rows, columns): grey levels; ``full_scale``: where the camera saturates. Raises RefusedError.
+        ``image`` (rows, columns): grey levels; ``full_scale``: where the camera saturates. Raises RejectedError.
         """
         light = np.zeros((len(self._centres), LIGHTS))
         shape = Shape(rotation, place, 1.0, self._blur, np.zeros(0), light, np.zeros(0))

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Judges a fitted picture: refuses one that is not of the target at rest or in plain motion; else its covariance."""
+"""Judges a fitted picture: rejects one that is not of the target at rest or in plain motion; else its covariance."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class Judge:
         pixel_radius: float,
         full_scale: float,
     ) -> TargetPose:
-        """The pose with the covariance that the residuals show. Raises RefusedError if they show another picture."""
+        """The pose with the covariance that the residuals show. Raises RejectedError if they show another picture."""
         contrast = shape.light[:, 3] - shape.light[:, 0]
         if contrast.min() <= 0.0 or contrast.min() < 0.3 * contrast.max():
             raise NoPoseError(Status.HIDDEN)
@@ -165,7 +165,7 @@ def _misfit(z: Pixels, raw: Pixels, sector: IntArray, rims: Rims, full_scale: fl
     """How far the picture is from the model beyond noise, rms in units of the contrast, as ``raw`` is.
 
     Pixels are taken together by sector and by their distance from the rim. What all sectors have in common is the
-    camera's own profile, which moves no centre. Raises RefusedError.
+    camera's own profile, which moves no centre. Raises RejectedError.
     """
     parts, worst = 3 * _SECTORS, 0.0
     if rims.level.max() >= full_scale - 1.0:

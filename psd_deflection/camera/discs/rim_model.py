@@ -114,7 +114,7 @@ class Normal(NamedTuple):
 
 
 def covariance_of(normal: Normal, variance: float, stiff: FloatArray) -> FloatArray:
-    """Covariance of the parameters, if a residual has ``variance``. Raises RefusedError."""
+    """Covariance of the parameters, if a residual has ``variance``. Raises RejectedError."""
     hessian = normal.hessian / variance
     diagonal = np.einsum('ii->i', hessian)
     diagonal += stiff

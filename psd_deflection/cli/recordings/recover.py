@@ -5,7 +5,7 @@
 For each damaged file a new one is written: all intact messages, an index and a summary. The damaged
 file is kept as NAME.mcap.cut. In a bag folder metadata.yaml is written too, so that `ros2 bag play`
 and other readers accept the bag. Intact files stay as they are. A recording that is still being
-written is refused.
+written is rejected.
 
   psd-deflection recover recordings/psd_20260101_120000
   psd-deflection recover lone.mcap

@@ -67,7 +67,7 @@ from psd_deflection.studies.watch.result import WatchedRun
 DIFFERS = 1
 END_S = 60.0
 """How long the end waits for alarms to be handed on."""
-HEAD = ('state', 'seconds', 'samples', 'lost', 'blocks', 'estimates', 'refused')
+HEAD = ('state', 'seconds', 'samples', 'lost', 'blocks', 'estimates', 'rejected')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -163,7 +163,7 @@ class ReplayTask:
             'lost': self.totals.lost,
             'blocks': self.totals.blocks,
             'estimates': len(self.totals.poses),
-            'refused': dict(self.totals.rejected),
+            'rejected': dict(self.totals.rejected),
             'solver': self.rig.estimator.solver,
             'seconds': self.totals.seconds,
             'compared': None if self.comparison is None else self.comparison.counts(),
@@ -333,7 +333,7 @@ def _line(found: Mapping[str, Any], strict: bool) -> list[str]:
     state = 'replayed'
     if found['compared'] is not None:
         state = 'the same' if _agrees(_counts(found), strict) else 'DIFFERS'
-    rejected = sum(found['refused'].values())
+    rejected = sum(found['rejected'].values())
     return [
         state,
         f'{found["seconds"]:.1f}',

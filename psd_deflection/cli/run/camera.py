@@ -140,7 +140,7 @@ def _intrinsics(args: argparse.Namespace, settings: CameraSettings) -> int:
 
 @contextlib.contextmanager
 def _saved(out: Path, option: str = '--out') -> Iterator[None]:
-    """Turn what the disk refuses into a RecordingError."""
+    """Turn what the disk rejects into a RecordingError."""
     try:
         yield
     except OSError as error:
@@ -241,7 +241,7 @@ def _report(
                 'out': args.out,
                 'frames': frames,
                 'answers': good,
-                'refused': rejected,
+                'rejected': rejected,
                 'sd': dict(zip(('dx', 'dy', 'theta'), median, strict=False)),
                 'turn': None if rest is None else reference.turn,
                 'radius_scale': None if rest is None else rest.scale,
@@ -251,7 +251,7 @@ def _report(
         return
     show(f'{args.out}: {good} of {frames} frames have an answer')
     for reason, count in rejected.items():
-        show(f'  {count} refused: {reason}')
+        show(f'  {count} rejected: {reason}')
     if rest is not None and median:
         dx, dy, theta = median
         sds = f'ΔX {dx * 1e6:.2f} µm, ΔY {dy * 1e6:.2f} µm, θ {math.degrees(theta):.5f}°'

@@ -5,7 +5,7 @@
 It reads trajectories on /shaper/trajectory and publishes them on /shaper/shaped, to which you remap your controller's
 topic. Begin and end are those that were given; the motion takes longer by a fraction of a period of the link. The mode
 comes from the rig file that `identify` wrote, or from --frequency and --damping-ratio. With --urdf a trajectory beyond
-the limits of the joints is refused; `--urdf robot_description` takes them from that topic. Each option is a ROS
+the limits of the joints is rejected; `--urdf robot_description` takes them from that topic. Each option is a ROS
 parameter, too. With --action it does the same for goals of FollowJointTrajectory, as MoveIt sends them.
 
   psd-deflection shaper --params-file modes/rig.yaml

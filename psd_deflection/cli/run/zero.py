@@ -3,7 +3,7 @@
 """Make a running daemon take the present dots as the unloaded ones, without ROS.
 
 The daemon must serve its page (`monitor`, `estimator --monitor`, `make run`). One that you run on this
-machine is found by itself. It refuses if no good block came lately. While the link moves no zero is taken;
+machine is found by itself. It rejects if no good block came lately. While the link moves no zero is taken;
 the command waits until it rests, 10 s at most.
 
   psd-deflection zero
@@ -24,7 +24,7 @@ from psd_deflection.cli._values import number
 
 ASK_AGAIN_S = 0.25
 MOVES = 'the link moves'
-"""In a refusal that is over when the link rests."""
+"""In a rejection that is over when the link rests."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

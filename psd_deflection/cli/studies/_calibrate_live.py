@@ -166,7 +166,7 @@ def picture(progress: CalibrationProgress) -> list[str]:
     head = f'{progress.seconds:.1f} s, by {BY[progress.kind]}: {known}'
     lines = [head, '', *(line(parameter) for parameter in progress.parameters), '']
     if progress.rejected:
-        lines.append(f'refused: {progress.rejected}')
+        lines.append(f'rejected: {progress.rejected}')
     lines += [next_words(need) for need in progress.needs[:MOST_NEEDS]]
     return lines if progress.needs else [*lines, 'nothing is open']
 

@@ -127,7 +127,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _reject_mixed(args: argparse.Namespace) -> None:
-    """Refuse options that contradict each other."""
+    """Reject options that contradict each other."""
     if args.reference and len(args.reference) != len(args.recordings):
         raise UsageError(
             f'--reference is given {len(args.reference)} times for {len(args.recordings)} recordings: '
@@ -225,7 +225,7 @@ def answer_of(path: str, asked: CalibrationOptions) -> TaskResult:
     found, files, tree = answer.found, answer.files(), answer.tree()
     cells: dict[str, object] = {
         'kind': found.kind,
-        'refused': found.rejected or '',
+        'rejected': found.rejected or '',
         'undetermined': len(found.undetermined),
         'heldout_before': found.gap.heldout_before,
         'heldout_after': found.gap.heldout_after,
@@ -242,7 +242,7 @@ def _fields() -> list[Field]:
     return [
         ERROR,
         Field('kind', str),
-        Field('refused', str),
+        Field('rejected', str),
         Field('undetermined', int),
         Field('heldout_before', float, 'm'),
         Field('heldout_after', float, 'm'),
@@ -264,7 +264,7 @@ def _each(args: argparse.Namespace, names: list[str], asked: CalibrationOptions)
 
 
 def _line(cells: Mapping[str, Any]) -> list[str]:
-    state = 'refused' if cells['refused'] else 'calibrated'
+    state = 'rejected' if cells['rejected'] else 'calibrated'
     return [
         state,
         cells['kind'],

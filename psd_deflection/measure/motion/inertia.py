@@ -27,7 +27,7 @@ HOLD_NS = 100_000_000
 """An acceleration holds until the next one, but no longer than this. Then it is 0."""
 AHEAD_NS = 10_000_000_000
 """Longest time that an acceleration may arrive before it acts, ns."""
-MOST_TOLD = 100_000
+MOST_REPORTED = 100_000
 """Accelerations that may wait for their samples."""
 SHARE = 0.05
 """Share by which a change of what accelerations do may differ from this model, one standard deviation."""
@@ -69,7 +69,7 @@ class Inertia:
 
     @property
     def known(self) -> bool:
-        """Whether anything was told that may still act."""
+        """Whether anything was reported that may still act."""
         return bool(self.reported)
 
     def notify(self, new: BaseAcceleration, there_ns: int) -> None:
@@ -92,8 +92,8 @@ class Inertia:
                 f'header.stamp is {away_ns / 1e9:.3f} s after the last sample; one may come {AHEAD_NS / 1e9:g} s '
                 'before it acts'
             )
-        if len(self.reported) >= MOST_TOLD:
-            raise ValueError(f'{MOST_TOLD} accelerations wait already for their samples')
+        if len(self.reported) >= MOST_REPORTED:
+            raise ValueError(f'{MOST_REPORTED} accelerations wait already for their samples')
         self.count += 1
         self.late += new.t_ns < there_ns
         (bx, by, _), (ax, ay, az) = new.linear, new.angular

@@ -9,7 +9,7 @@ import numpy as np
 from psd_deflection.records import FloatArray, dot_names
 
 MOVING, RINGS, STILL = 5.0, 10e-6, 2e-6
-"""A zero is refused if the dots scatter or drift by so many times the noise and by more than so much, m: see
+"""A zero is rejected if the dots scatter or drift by so many times the noise and by more than so much, m: see
 :func:`why_moving`."""
 
 

@@ -32,7 +32,7 @@ from psd_deflection.records import FloatArray, IntArray
 SIGNIFICANT = 40.0
 """Times the floor about it: a peak is a tone."""
 
-_SEEN = 12.0
+_OBSERVED = 12.0
 """Times the floor: a combination, or a sum signal, takes part in a tone that is there."""
 
 _ELECTRIC = 0.01
@@ -106,7 +106,7 @@ class ToneSearch:
             band = slice(max(peak - wide, self._first), min(peak + wide, self._last) + 1)
             free[band] = False
             strength = self._by.sum(power[band], 0)
-            observed = above[band].max(axis=0) > _SEEN
+            observed = above[band].max(axis=0) > _OBSERVED
             moved = strength[:count] * observed[:count]
             if bool((observed[count:] & (strength[count:] > _ELECTRIC * moved.max())).any()):
                 continue

@@ -217,7 +217,7 @@ def _effect(name: str, values: Mapping[str, object], source: str, places: Mappin
 def _called(word: str, places: Mapping[str, Place]) -> str:
     """The name of the effect that people call ``word``; nothing if none is called so."""
     for name, place in sorted(places.items()):
-        # One that cannot be loaded is refused where it is asked for.
+        # One that cannot be loaded is rejected where it is asked for.
         with contextlib.suppress(ConfigError):
             if word in _load(name, place).also:
                 return name

@@ -189,7 +189,7 @@ class Effect:
 
     ``calibrated_as``: what a calibration calls the effect's parameters, each one of ``CALIBRATED_OF_PSD`` or
     ``PLACED_OF_PSD`` (an effect with a PSD) or of ``CALIBRATED_OF_LINK``. The calibration then finds their sizes;
-    without it a calibration refuses rigs that have the effect. ``law``: its text in YAML, if it is a law.
+    without it a calibration rejects rigs that have the effect. ``law``: its text in YAML, if it is a law.
     ``also``: what people call it, for whoever types one of these words. ``least_psds``: the fewest PSDs of a rig that
     may have it. ``further``: what the same cause does at other points; these parts take the values of the whole.
     Raises ValueError if the declaration contradicts itself.

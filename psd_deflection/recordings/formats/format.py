@@ -14,7 +14,7 @@ from psd_deflection.records import Record, ReferenceWithCovariance
 
 
 class Sink(Protocol):
-    """Takes records, one thread at a time. Both calls raise RecordingError if the disk refuses to write."""
+    """Takes records, one thread at a time. Both calls raise RecordingError if the disk cannot be written."""
 
     def put(self, record: Record) -> None:
         """Take one record; a sink ignores the kinds that it cannot store."""
@@ -24,7 +24,7 @@ class Sink(Protocol):
 
 
 class ReferenceFile(Protocol):
-    """Takes the answers of a camera. Both calls raise RecordingError if the disk refuses to write."""
+    """Takes the answers of a camera. Both calls raise RecordingError if the disk cannot be written."""
 
     def put(self, t_ns: int, reference: ReferenceWithCovariance | None, status: str) -> None:
         """Take the answer of one frame: its pose, or None and the reason why there is none."""

@@ -360,7 +360,7 @@ class BagRecording(Recording):
         return self._decoded(LOAD, wrench_stamped.to_applied_load)
 
     def marks(self) -> list[Mark]:
-        """The moments that somebody marked, each at its arrival. A live run refuses what is left out here, too."""
+        """The moments that somebody marked, each at its arrival. A live run rejects what is left out here, too."""
         out = []
         for channel, log_time, message in self.messages([MARK]):
             self._check_type(channel.type, channel.encoding, MARK)
@@ -373,7 +373,7 @@ class BagRecording(Recording):
         return sorted(out, key=lambda mark: mark.t_ns)
 
     def accelerations(self) -> Iterator[tuple[int, BaseAcceleration]]:
-        """Known accelerations of the base, with the time of arrival. A live run refuses what is left out here, too."""
+        """Known accelerations of the base, with the time of arrival. A live run rejects what is left out here, too."""
         for channel, log_time, message in self.messages([ACCELERATION]):
             self._check_type(channel.type, channel.encoding, ACCELERATION)
             with contextlib.suppress(ValueError):

@@ -83,7 +83,7 @@ class CsvRecording(Recording):
         return columns
 
     def _reject_parts(self, columns: Collection[str], number: int) -> None:
-        """Refuse a header with a part of a group."""
+        """Reject a header with a part of a group."""
         for group in (LOAD_COLUMNS, REFERENCE_COLUMNS):
             there = [n for n in group if n in columns]
             if there and len(there) < len(group):

@@ -87,7 +87,7 @@ class McapFile(_RecordSink):
     """One MCAP file being written; common to bags and single files.
 
     ``write`` takes the records of one thread. Raises RecordingError if the file exists, cannot be
-    created, or the disk refuses to write. After such an error the file is closed and holds all
+    created, or the disk cannot be written. After such an error the file is closed and holds all
     complete chunks. While it is being written the file is locked (``flock``), so that no program
     repairs it. ``durable``: each chunk is written to the disk, not only to the operating system,
     before the next begins. ``folder``: where the file is made, if its caller holds that folder.
@@ -409,7 +409,7 @@ class BagWriter(_RecordSink):
             self._held.close()
 
     def discard(self) -> None:
-        """Close and delete a bag into which nothing was written. Raises OSError, RecordingError if the disk refuses."""
+        """Close and delete a bag into which nothing was written. Raises OSError, RecordingError if the disk rejects."""
         ours = self.in_place
         self._file.close()
         self._held.remove(self.path.name)

@@ -41,7 +41,7 @@ def seconds(t_ns: int) -> str:
 
 
 class _CsvFile:
-    """A CSV being written. Raises RecordingError if it exists or the disk refuses to write."""
+    """A CSV being written. Raises RecordingError if it exists or the disk cannot be written."""
 
     def __init__(self, path: str | Path, header: Sequence[str]) -> None:
         self.path = Path(path)

@@ -44,7 +44,7 @@ _U64 = struct.Struct('<Q')
 class McapWriter:
     """Writes to ``stream``, from its present beginning to ``finish``. ``spool``: an empty file for the indexes.
 
-    The calls raise OSError if the disk refuses to write. Nothing is closed.
+    The calls raise OSError if the disk cannot be written. Nothing is closed.
     """
 
     def __init__(self, stream: BinaryIO, spool: BinaryIO, *, library: str) -> None:

@@ -9,7 +9,7 @@ from psd_deflection.records import ReferencePose, ReferenceWithCovariance
 
 
 class ReferenceSink:
-    """Poses into ``file``, which it closes. Raises RecordingError if the disk refuses to write."""
+    """Poses into ``file``, which it closes. Raises RecordingError if the disk cannot be written."""
 
     def __init__(self, file: McapFile | BagWriter) -> None:
         self._file = file

@@ -36,7 +36,7 @@ def is_parquet(path: str | None) -> bool:
 class ParquetFile:
     """A new file of ``fields`` behind the name of the recording; the unit is in each column's metadata.
 
-    The same rows make the same bytes. Raises RecordingError if ``path`` exists or the disk refuses, ConfigError if
+    The same rows make the same bytes. Raises RecordingError if ``path`` exists or the disk rejects, ConfigError if
     pyarrow is not installed.
     """
 

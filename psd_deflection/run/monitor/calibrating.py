@@ -41,7 +41,7 @@ class PageCalibration:
         return {'running': running, 'out': str(self._out), 'last': self._last, **self._shown}
 
     async def start(self, url: str, token_variable: str, token: str, out: Path) -> str:
-        """Begin one that speaks to the page at ``url`` and writes into ``out``. Raises RefusedError."""
+        """Begin one that speaks to the page at ``url`` and writes into ``out``. Raises RejectedError."""
         if self._listener is not None and not self._listener.done():
             raise RejectedError('a calibration runs already')
         command = [sys.executable, '-m', 'psd_deflection', 'calibrate', '--live', '--json']
@@ -64,7 +64,7 @@ class PageCalibration:
         return 'calibrating: zero the unloaded link, then hang known loads and note each'
 
     def stop(self) -> str:
-        """Let it end with what it has. Raises RefusedError if none runs."""
+        """Let it end with what it has. Raises RejectedError if none runs."""
         if self._process is None or self._listener is None or self._listener.done():
             raise RejectedError('no calibration runs')
         with contextlib.suppress(ProcessLookupError):
@@ -106,7 +106,7 @@ class PageCalibration:
         if isinstance(look.get('waiting'), str):
             self._shown = {'waiting': look['waiting']}
         elif isinstance(look.get('needs'), list) and isinstance(look.get('parameters'), list):
-            shown = {key: look.get(key) for key in ('kind', 'seconds', 'determined', 'refused', 'parameters')}
+            shown = {key: look.get(key) for key in ('kind', 'seconds', 'determined', 'rejected', 'parameters')}
             self._shown = {**shown, 'needs': look['needs'][:MOST_NEEDS]}
 
 

@@ -210,9 +210,9 @@ class GatedServer(abc.ABC):
             return web.Response(status=403, text='this is not the name of this machine')
         asks = request.method != 'GET' or request.path == self.websocket_path or request.path.startswith('/api/')
         if asks and not self._may(request):
-            return web.Response(status=403, text='refused: asked for by another site')
+            return web.Response(status=403, text='rejected: asked for by another site')
         if 'Content-Encoding' in request.headers:
-            return web.Response(status=415, text='refused: a body must not be encoded')
+            return web.Response(status=415, text='rejected: a body must not be encoded')
         if len(request.path) > PATH_CHARACTERS:
             return web.Response(status=404, text='not found')
         try:

@@ -58,13 +58,13 @@ def of_pipeline(pipeline: Pipeline) -> list[Family]:
         counter('blocks', 'Blocks of samples that were judged', count.blocks),
         counter('estimates', 'Blocks that have an estimate', count.estimates),
         counter('estimates_degraded', 'Estimates that do not come from all detectors', count.degraded),
-        counters('blocks_refused', 'cause', 'Blocks without an estimate', count.rejected),
+        counters('blocks_rejected', 'cause', 'Blocks without an estimate', count.rejected),
         counter('contradictions', 'Blocks whose readings contradict each other', pipeline.estimator.contradictions),
     ]
 
 
 def of_session(session: Session) -> list[Family]:
-    """What was acquired, lost, refused and recorded, and what was computed."""
+    """What was acquired, lost, rejected and recorded, and what was computed."""
     wire, recorder = session.acquisition.counters, session.recorder
     out = [
         counter('samples', 'Samples that the device sent', wire.samples),
@@ -73,7 +73,7 @@ def of_session(session: Session) -> list[Family]:
         counters('frames_bad', 'reason', 'Frames of the wire that could not be read', wire.bad_frames),
         counter('device_disconnects', 'Times that the port was gone', wire.disconnects),
         counter('device_restarts', 'Times that the device began anew', wire.restarts),
-        counters('messages_refused', 'topic', 'Messages of other nodes that could not be used', session.rejected),
+        counters('messages_rejected', 'topic', 'Messages of other nodes that could not be used', session.rejected),
         counter('record_dropped', 'Messages for which the disk was too slow', recorder.dropped),
         Family('recording', 'gauge', '1 while a recording is written', (({}, float(recorder.folder is not None)),)),
         *of_pipeline(session.pipeline),

@@ -72,7 +72,7 @@ MARKS = 200
 
 MAX_SEEK_S = 1e8
 MAX_FORCE = 1e6
-"""Largest load that is taken down, N and N m: a slip of the hand is refused."""
+"""Largest load that is taken down, N and N m: a slip of the hand is rejected."""
 
 HEADERS = {
     'Content-Security-Policy': "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; "
@@ -284,7 +284,7 @@ class MonitorServer(GatedServer):
         try:
             return web.Response(text=self._history.answer(asked(request.query)), content_type='application/json')
         except AskedError as error:
-            return _answer(400, f'refused: {error}')
+            return _answer(400, f'rejected: {error}')
 
     async def _websocket(self, request: web.Request) -> web.StreamResponse:
         # A browser that does not read for this long is gone.
@@ -441,16 +441,16 @@ class MonitorServer(GatedServer):
     ) -> web.StreamResponse:
         """Carry out ``action`` with the body of ``request``, if it is allowed; ``name`` is said, unless it is ''."""
         if not self._control:
-            return _answer(403, f'refused: {self._why_no_control()}')
+            return _answer(403, f'rejected: {self._why_no_control()}')
         if self.token and not access.is_token(request.headers.get(TOKEN_HEADER), self.token):
-            return _answer(401, 'refused: the token is missing or wrong; the address printed at the start has it')
+            return _answer(401, 'rejected: the token is missing or wrong; the address printed at the start has it')
         # A type that a form of another site cannot send.
         if request.content_type != 'application/json':
-            return _answer(415, 'refused: Content-Type must be application/json')
+            return _answer(415, 'rejected: Content-Type must be application/json')
         try:
             body = json.loads(await request.read() or b'{}')
         except (ValueError, RecursionError):
-            return _answer(400, 'refused: not JSON')
+            return _answer(400, 'rejected: not JSON')
         try:
             _need(isinstance(body, dict), 'a JSON object')
             text = await action(body)
@@ -472,7 +472,7 @@ class _BadBodyError(Exception):
 
 def _need(good: bool, expected: str) -> None:
     if not good:
-        raise _BadBodyError(f'refused: expected {expected}')
+        raise _BadBodyError(f'rejected: expected {expected}')
 
 
 def _late(body: Mapping[str, Any]) -> float:

@@ -43,26 +43,26 @@ class Shown(Protocol):
         """What was counted since the start."""
 
     def zero(self) -> str:
-        """Take the present dots as the unloaded ones; return the result as a line. Raises RefusedError."""
+        """Take the present dots as the unloaded ones; return the result as a line. Raises RejectedError."""
 
     async def record(self, wanted: bool) -> str:
-        """Start or stop a recording; return the result as a line once the disk has answered. Raises RefusedError."""
+        """Start or stop a recording; return the result as a line once the disk has answered. Raises RejectedError."""
 
     def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None, late_s: float) -> str:
-        """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RefusedError.
+        """Note a known load (N, N, N m), beside the held one if ``add``; return it as a line. Raises RejectedError.
 
         ``ago_s``: s for which it has acted already; None: since the last step of the dots. ``late_s``: s for which
         the request was under way.
         """
 
     def step(self) -> str:
-        """How long ago the dots stepped last, s; empty if they did not in the last minute. Raises RefusedError."""
+        """How long ago the dots stepped last, s; empty if they did not in the last minute. Raises RejectedError."""
 
     def mark(self, text: str, late_s: float) -> str:
-        """Mark the moment ``late_s`` s ago; return the mark as a line. Raises RefusedError."""
+        """Mark the moment ``late_s`` s ago; return the mark as a line. Raises RejectedError."""
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
-        """Pause or resume, go to a time from the start; None leaves it. Raises RefusedError."""
+        """Pause or resume, go to a time from the start; None leaves it. Raises RejectedError."""
 
     def alarm(self) -> Alarm | None:
         """What the watch holds against the rig now."""
@@ -155,7 +155,7 @@ class ShownSession:
         return mark_text(mark) + unkept
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:
-        """Refuse: what is measured cannot be paused."""
+        """Reject: what is measured cannot be paused."""
         raise RejectedError('only a recording can be paused')
 
     def alarm(self) -> Alarm | None:

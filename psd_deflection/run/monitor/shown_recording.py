@@ -165,7 +165,7 @@ class ShownRecording:
                 (('rate (samples/s)', str(rates[0])), ('samples', str(samples)), ('lost', str(lost))),
             )
         ]
-        rejected = tuple((f'refused: {cause}', str(count)) for cause, count in sorted(counters.rejected.items()))
+        rejected = tuple((f'rejected: {cause}', str(count)) for cause, count in sorted(counters.rejected.items()))
         level, message = OK, 'end of the recording' if self._ended else 'estimates flow'
         if spots is not None and spots.reason:
             level, message = ERROR, spots.reason
@@ -197,19 +197,19 @@ class ShownRecording:
         return self._between_blocks(self._take_zero, 'not zeroed: no data flows')
 
     async def record(self, wanted: bool) -> str:
-        """Refuse: a recording is not recorded again."""
+        """Reject: a recording is not recorded again."""
         raise RejectedError('a recording is not recorded again; the command replay writes its answers')
 
     def load(self, fx: float, fy: float, tz: float, add: bool, ago_s: float | None, late_s: float) -> str:
-        """Refuse: what is recorded is not changed."""
+        """Reject: what is recorded is not changed."""
         raise RejectedError('a recording is played: its loads are those that were recorded')
 
     def step(self) -> str:
-        """Refuse: nothing is noted here."""
+        """Reject: nothing is noted here."""
         raise RejectedError('a recording is played: its loads are those that were recorded')
 
     def mark(self, text: str, late_s: float) -> str:
-        """Refuse: what is recorded is not changed."""
+        """Reject: what is recorded is not changed."""
         raise RejectedError('a recording is played: its marks are those that were recorded')
 
     def play(self, paused: bool | None, seek_s: float | None) -> str:

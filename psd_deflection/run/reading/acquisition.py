@@ -313,11 +313,11 @@ class Acquisition:
                 return
             self.counters.rejected_reopenings += 1
             rejection = str(error)
-            # Report once why the device is refused; a port that is still missing is not worth a
+            # Report once why the device is rejected; a port that is still missing is not worth a
             # line.
             if 'no such port' not in rejection and rejection != self._rejection:
                 self._rejection = rejection
-                self._limited_log.log('refused', f'{rejection}; still trying', WARNING, time.monotonic(), NEWS)
+                self._limited_log.log('rejected', f'{rejection}; still trying', WARNING, time.monotonic(), NEWS)
             return
         self._connected = True
         self._name = self.source.name

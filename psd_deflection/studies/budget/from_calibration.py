@@ -27,7 +27,7 @@ def read_calibration(folder: Path) -> tuple[Rig, dict[str, Any]]:
     """Return the calibrated rig and the tree of calibration.json in ``folder``.
 
     Raises ConfigError if a file or a key is missing, if a value is none that calibrate writes, or if the calibration
-    was refused.
+    was rejected.
     """
     rig = load_rig(folder / 'rig.yaml')
     path = folder / 'calibration.json'
@@ -46,8 +46,8 @@ def read_calibration(folder: Path) -> tuple[Rig, dict[str, Any]]:
 def _check(tree: Any, path: Path) -> None:
     if not isinstance(tree, dict):
         raise ConfigError(f'{path}: no map; give the folder of a calibration')
-    if tree.get('refused'):
-        raise ConfigError(f'{path}: refused: the calibration was refused, and there is nothing to certify')
+    if tree.get('rejected'):
+        raise ConfigError(f'{path}: rejected: the calibration was rejected, and there is nothing to certify')
     if tree.get('kind') != 'reference':
         raise ConfigError(
             f'{path}: kind = {_words(tree.get("kind"))}: its scale is traceable to nothing; calibrate with a reference'

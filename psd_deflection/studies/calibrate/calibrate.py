@@ -61,7 +61,7 @@ CONTRADICTED = 3.5
 """Standard deviations of the prior beyond which a determined parameter says that its tolerance was too small."""
 WIDER = 10.0
 WORSE = 1.01
-"""Ratio of the gaps on unseen motion above which a calibration is refused; less is chance."""
+"""Ratio of the gaps on unseen motion above which a calibration is rejected; less is chance."""
 FOLDS = 8
 """Pieces of a recording, every second of which is held out in turn."""
 OFTEN = 300
@@ -93,7 +93,7 @@ class Calibration:
     ``vector``, ``prior``: what the rig file says. ``noise`` (4,): of a sample of each reading, V rms. ``clock``: the
     offset of the reference's clock, s, to be added to its times. ``rejected``: why the rig file was left as it is, or
     ''. ``widened``: parameters whose tolerance the recordings contradict. ``dropped``: terms that unseen motion
-    refused. ``rows``, ``fit``: for pictures. ``dark``: what was measured with the lasers off; ``rig`` has it already.
+    rejected. ``rows``, ``fit``: for pictures. ``dark``: what was measured with the lasers off; ``rig`` has it already.
     """
 
     rig: Rig

@@ -50,7 +50,7 @@ def advice(calibration: Calibration) -> list[str]:
             'the file. Look at the mount; if it is right, state the tolerance in the file.'
         )
     for name in calibration.dropped:
-        out.append(f'{name}: unseen motion refuses it, so the file keeps its value.')
+        out.append(f'{name}: unseen motion rejects it, so the file keeps its value.')
     out += [f'To determine {" with ".join(d.parts)}: {d.needs}.' for d in calibration.undetermined[:4]]
     if calibration.kind == 'loads':
         out.append(

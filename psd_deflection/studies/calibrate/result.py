@@ -149,7 +149,7 @@ def result(calibration: Calibration, date: str) -> dict[str, Any]:
         if reference_range is None
         else {'low': reference_range[0].tolist(), 'high': reference_range[1].tolist()},
         'dark': result_of_levels(calibration.dark) or None,
-        'refused': calibration.rejected or None,
+        'rejected': calibration.rejected or None,
         'widened': calibration.widened,
         'dropped': calibration.dropped,
         'provenance': {
@@ -171,7 +171,9 @@ def source_of(calibration: Calibration, date: str) -> str:
 
 
 def values_of(calibration: Calibration, date: str) -> tuple[dict[str, object], list[ActiveEffect]]:
-    """Flat values that a rig file gets, and its effects; noise and dark levels alone if the calibration was refused."""
+    """Flat values that a rig file gets, and its effects; noise and dark levels alone if the calibration was
+    rejected.
+    """
     noise = {f'psd_{n}.noise': [float(f'{v:.4g}') for v in calibration.noise[2 * n - 2 : 2 * n]] for n in (1, 2)}
     measured = {**noise, **values_of_levels(calibration.dark)}
     if calibration.rejected:
@@ -202,7 +204,7 @@ def values_of(calibration: Calibration, date: str) -> tuple[dict[str, object], l
 def sentence(calibration: Calibration) -> str:
     """Return the answer in one sentence."""
     if calibration.rejected:
-        return f'Refused: {calibration.rejected}.'
+        return f'Rejected: {calibration.rejected}.'
     g = calibration.gap
     known = int(sum(calibration.fit.free[i] for i in REPORTED))
     what = {'reference': 'the reference', 'loads': 'the known loads', 'self': 'the redundant reading'}[calibration.kind]

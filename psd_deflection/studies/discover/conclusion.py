@@ -313,7 +313,7 @@ class RigConclusion(Conclusion):
     def adopt(self, name: str) -> Self:
         """Return the answer with its law as the effect ``name``, written to the folder of the user's effects.
 
-        Without a law nothing happens. Raises ConfigError for a name that cannot be, RecordingError if the disk refuses.
+        Without a law nothing happens. Raises ConfigError for a name that cannot be, RecordingError if the disk rejects.
         """
         folder = adopting_folder(name)
         if self.law is None:

@@ -94,7 +94,7 @@ def rejected() -> dict[str, str]:
 
 
 def _other_methods() -> dict[str, str]:
-    """Methods that ``VARIANTS`` does not name: name to the reason of a refusal, '' if there is none."""
+    """Methods that ``VARIANTS`` does not name: name to the reason of a rejection, '' if there is none."""
     reasons = {}
     for name in registry.SOLVERS:
         if any(name == variant.name for variant in VARIANTS):

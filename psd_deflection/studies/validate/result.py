@@ -115,7 +115,7 @@ class Validated(StudyResult):
             'solver': self.solver,
             'references': len(self.t),
             'left_out': self.excluded,
-            'refused': dict(self.problem.rejected),
+            'rejected': dict(self.problem.rejected),
             'offset': {**offset, 'applied': self.applied, 'unit': 's', 'sentence': self.offset.sentence},
             'solvers': {
                 name: {axis: {'unit': unit, **asdict(a)} for axis, unit, a in zip(AXES, UNITS, three, strict=True)}

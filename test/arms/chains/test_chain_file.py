@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The file of a chain: what it says, and how it is refused."""
+"""The file of a chain: what it says, and how it is rejected."""
 
 from __future__ import annotations
 

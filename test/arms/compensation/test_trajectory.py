@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Shaped trajectories: what they are between their points, their limits, and what is refused."""
+"""Shaped trajectories: what they are between their points, their limits, and what is rejected."""
 
 from __future__ import annotations
 

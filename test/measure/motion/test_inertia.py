@@ -236,7 +236,7 @@ def test_diagnostics_say_what_is_wrong_with_what_is_reported(run: motion.Run) ->
     assert message() == (0, 'the modes foretell the samples')
     session.rejected[ACCELERATION], session.why_rejected[ACCELERATION] = 3, 'no frame'
     through(pipeline, run, range(25, 30), reported)
-    assert message() == (1, '3 base accelerations refused: no frame')
+    assert message() == (1, '3 base accelerations rejected: no frame')
     # Of four messages in a block two come late.
     through(pipeline, run, range(30, 35), reported, late=10)
     assert message() == (1, '8 of 18 base accelerations came after the samples on which they acted')

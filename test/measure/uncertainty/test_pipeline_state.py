@@ -102,10 +102,10 @@ def test_what_was_changed_is_remembered() -> None:
     rig = load_rig()
     live, replay = Pipeline(rig), Pipeline(rig)
     live.change({'psd_2.zero': (1e-5, -2e-5), 'sum_min': 0.5, 'degraded': 'hold', 'twist_sd': 0.5})
-    live.change({'twist_sd': rig.values['twist_sd'], 'frozen': 'refuse'})  # type: ignore[dict-item]
+    live.change({'twist_sd': rig.values['twist_sd'], 'frozen': 'reject'})  # type: ignore[dict-item]
     memory = live.memory(rig)
     assert memory is not None
-    wanted = {'psd_2.zero': (1e-5, -2e-5), 'sum_min': 0.5, 'degraded': 'hold', 'frozen': 'refuse'}
+    wanted = {'psd_2.zero': (1e-5, -2e-5), 'sum_min': 0.5, 'degraded': 'hold', 'frozen': 'reject'}
     assert dict(memory.values) == wanted
     replay.apply(memory)
     assert replay.rig == live.rig != rig
@@ -147,7 +147,7 @@ def test_a_dead_reading_is_widened_named_and_rejected_if_asked() -> None:
     assert all(abs(e.dy + 2.2272e-3) < 3.0 * e.covariance[4] ** 0.5 for e in late[-50:])
     assert all(abs(e.dy + 2.2272e-3) > 1e-4 for e in late[-50:])
     assert pipeline.estimator.most_likely_wrong() == 'y1 does not move with the others'
-    _, records = run(load_rig(overrides={'consistency': 'refuse'}), samples)
+    _, records = run(load_rig(overrides={'consistency': 'reject'}), samples)
     spots = [s for s in records if isinstance(s, SpotMeans) and s.index > 200]
     assert {s.status for s in spots} == {BlockStatus.INCONSISTENT}
     assert 'contradict' in spots[0].reason

@@ -98,7 +98,7 @@ def test_a_detector_is_frozen_after_five_blocks_if_that_is_to_be_rejected(blocks
 
 def judge_frozen(frozen: tuple[int, int]) -> Verdict:
     rig = load_rig()
-    rig = dataclasses.replace(rig, estimator=dataclasses.replace(rig.estimator, frozen='refuse'))
+    rig = dataclasses.replace(rig, estimator=dataclasses.replace(rig.estimator, frozen='reject'))
     rows = np.tile(np.array(GOOD, np.float32), (20, 1))
     block = SampleBlock(0, np.arange(20), np.arange(20) * 1_000_000, rows, np.zeros(20, np.uint8))
     return OpticsHealth(rig).judge(block, of(rows, DOTS), frozen)
@@ -250,7 +250,7 @@ def test_a_frozen_detector_is_a_finding_unless_it_is_a_fault() -> None:
     assert health.late_findings(of(volts), ok, (5, 7), Loudness()) == message
     assert health.late_findings(of(volts), ok, (4, 7), Loudness()) == message[1:]
     assert health.late_findings(of(volts), blamed, (5, 7), Loudness()) == message[:1]
-    rejects = OpticsHealth(load_rig(overrides={'frozen': 'refuse'}))
+    rejects = OpticsHealth(load_rig(overrides={'frozen': 'reject'}))
     assert rejects.late_findings(of(volts), ok, (5, 7), Loudness()) == ()
 
 

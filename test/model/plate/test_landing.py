@@ -69,7 +69,7 @@ def test_a_geometry_is_of_so_many_psds(count: int) -> None:
 
 
 def test_the_beams_are_apart_by_more_than_a_micrometre_in_any_direction() -> None:
-    """The refusal says where they are: at the first one's place."""
+    """The rejection says where they are: at the first one's place."""
     for along in ((1.0, 0.0), (0.0, 1.0), (-0.6, 0.8)):
         for apart, message in ((0.9e-6, True), (1.1e-6, False)):
             centers = np.array([[0.01, 0.07], [0.01, 0.07]]) + np.array([[0.0, 0.0], along]) * apart

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""PSDs at the base, lasers on the plate: simulated, recorded, replayed and solved; contradictions are refused."""
+"""PSDs at the base, lasers on the plate: simulated, recorded, replayed and solved; contradictions are rejected."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Laws in YAML: read, written, simulated in pieces, corrected, refused with file and key."""
+"""Laws in YAML: read, written, simulated in pieces, corrected, rejected with file and key."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""Geometry that cannot be solved is refused, and the message names what is wrong with it."""
+"""Geometry that cannot be solved is rejected, and the message names what is wrong with it."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ VARIANCES = {
 }
 THRESHOLD = ('iterative_printed', 'appendix_d')
 ELSEWHERE = ('pose', 'base_pair')
-"""They refuse the thesis rig: three staggered PSDs, and PSDs at the base, are what they are for."""
+"""They reject the thesis rig: three staggered PSDs, and PSDs at the base, are what they are for."""
 
 SMOOTH: list[tuple[str, dict[str, Any]]] = [
     *((name, {}) for name in SOLVERS if name not in THRESHOLD + ELSEWHERE),

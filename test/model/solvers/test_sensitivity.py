@@ -291,7 +291,7 @@ def test_where_the_psds_are_is_reported_once() -> None:
 
 
 def test_the_arrangement_is_reported_by_the_rig_or_by_the_name_of_the_solver_alone() -> None:
-    """Said by the rig, it is not changed by the name of a solver: that is refused with the lines to write."""
+    """Said by the rig, it is not changed by the name of a solver: that is rejected with the lines to write."""
     base = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
     for more, at_base in (({}, True), ({'arrangement': 'base'}, True), ({'arrangement': 'tip'}, False)):
         assert rig_from_values({**base, **more}).psds_at_base is at_base
@@ -341,7 +341,7 @@ def test_a_deflection_that_moves_a_dot_by_less_than_a_thousandth_is_unseen(gain:
 
 
 def test_options_come_from_the_rig_file() -> None:
-    """Each has another answer, or another refusal, than the default."""
+    """Each has another answer, or another rejection, than the default."""
     base = {'solver': 'base_pair', 'solvers': ['base_pair'], 'degraded': 'none'}
     rig = rig_from_values({**base, 'psd_1.height': -0.585, 'psd_2.height': -0.485, 'base_pair.assume': 'no_twist'})
     dots = (1e-3, -2e-3, 5e-4, 1e-3)
@@ -399,7 +399,7 @@ def test_the_thesis_weights_are_of_two_psds() -> None:
 
 
 def test_a_psd_at_the_base_stands_below_the_tip_section() -> None:
-    """Named by its number; the one at the section itself is refused."""
+    """Named by its number; the one at the section itself is rejected."""
     for at in (0, 1):
         for height, taken in ((-0.3, True), (0.0, False), (0.3, False)):
             heights = np.array([-0.5, -0.4])

@@ -19,7 +19,7 @@ from psd_deflection.run.fleet.engines import check_engine, open_engine
 from psd_deflection.run.fleet.tasks import AHEAD, Outcome, attempt, outcomes
 
 T = TypeVar('T')
-NAMES = ['a', 'bbb', 'refused', 'cc', 'defect', 'dddd']
+NAMES = ['a', 'bbb', 'rejected', 'cc', 'defect', 'dddd']
 
 
 class Later:
@@ -63,7 +63,7 @@ def test_outcomes_come_in_order_whatever_ends_first() -> None:
     assert [o.name for o in found] == NAMES
     assert [o.value for o in found] == [1, 3, None, 2, None, 4]
     assert len(ended) == len(NAMES)
-    assert found[2].error == 'refused: no such recording'
+    assert found[2].error == 'rejected: no such recording'
     assert found[4].error.startswith('defect: a defect of psd_deflection, ZeroDivisionError: division by zero; ')
 
 

@@ -163,7 +163,7 @@ def test_zero_and_record_work_on_this_machine(page: Page, start: Start, tmp_path
     page.until(f'{dx} > 400')
     notice = 'document.getElementById("notice").textContent'
     text = ''
-    # While the link rings under the simulated load the zero is refused: once more then.
+    # While the link rings under the simulated load the zero is rejected: once more then.
     while not text.startswith('unloaded dots (mm): psd_1 ('):
         assert text == '' or 'move' in text
         page.driver.execute_script(f'{notice} = ""')
@@ -178,7 +178,7 @@ def test_zero_and_record_work_on_this_machine(page: Page, start: Start, tmp_path
     page.until('document.getElementById("record").getAttribute("aria-pressed") === "false"')
     assert program.end() == 0
     assert [p.name for p in (tmp_path / 'recordings').glob('psd_*/metadata.yaml')] == ['metadata.yaml']
-    # The browser notes the refusals too.
+    # The browser notes the rejections too.
     assert [c for c in page.complaints() if '/api/zero' not in c or '409' not in c] == []
 
 
@@ -249,7 +249,7 @@ def test_the_page_outlives_an_unplugged_device(page: Page, start: Start, tmp_pat
     page.live()
     page.until(f'document.body.dataset.rows > {before + 50}')
     page.until('document.querySelector("#messages").textContent.includes("the device is back")')
-    # A refused zero is a 409.
+    # A rejected zero is a 409.
     assert [c for c in page.complaints() if '409' not in c] == []
 
 

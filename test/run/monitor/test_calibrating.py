@@ -86,7 +86,7 @@ def test_it_ends_with_the_daemon(serve: Serve, bag: Path, tmp_path: Path) -> Non
 
 def test_a_played_recording_and_nonsense_are_rejected(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     serving = serve()
-    assert asked(serving.url, 1) == (400, 'refused: expected {"calibrate": true} or {"calibrate": false}')
+    assert asked(serving.url, 1) == (400, 'rejected: expected {"calibrate": true} or {"calibrate": false}')
     described = {'kind': 'replay', 'name': 'test', 'recording': None}
     monkeypatch.setattr(serving.shown, 'describe', lambda: described)
     assert asked(serving.url, True) == (409, 'a recording is played; psd-deflection calibrate takes it')

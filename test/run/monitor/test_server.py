@@ -256,7 +256,7 @@ def test_a_load_is_noted(serve: Serve) -> None:
 def test_a_body_of_another_kind_is_rejected(serve: Serve, path: str, body: object) -> None:
     serving = serve()
     status, text, _ = ask(f'{serving.url}api/{path}', body=body, headers={'Content-Type': 'application/json'})
-    assert (status, json.loads(text)['message'].startswith('refused: expected')) == (400, True)
+    assert (status, json.loads(text)['message'].startswith('rejected: expected')) == (400, True)
     assert (serving.shown.loads, serving.shown.played, serving.shown.zeros) == ([], [], 0)
 
 
@@ -340,8 +340,8 @@ def test_the_history_has_what_came_with_its_losses_and_marks(serve: Serve) -> No
 @pytest.mark.parametrize(
     ('query', 'headers', 'status', 'words'),
     [
-        ('from=1&to=noon', {}, 400, "refused: to = 'noon': must be a time in s since 1970"),
-        ('', {}, 400, 'refused: from is missing'),
+        ('from=1&to=noon', {}, 400, "rejected: to = 'noon': must be a time in s since 1970"),
+        ('', {}, 400, 'rejected: from is missing'),
         ('from=1&to=2', {'Host': 'evil.example'}, 403, 'not the name of this machine'),
         ('from=1&to=2', {'Origin': 'http://evil.example'}, 403, 'asked for by another site'),
         ('from=1&to=2', {'Sec-Fetch-Site': 'cross-site'}, 403, 'asked for by another site'),

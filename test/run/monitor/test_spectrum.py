@@ -106,7 +106,7 @@ def test_samples_without_light_are_no_dots() -> None:
         assert density is not None
         assert np.isnan(density[:2]).all()
         assert (density[2:] == 0.0).all()
-        # NaN is no JSON: a browser would refuse the whole message.
+        # NaN is no JSON: a browser would reject the whole message.
         assert json.loads(density_json(density)) == [[None] * (SEGMENT // 2)] * 2 + [[0.0] * (SEGMENT // 2)] * 2
     spectrum = Spectrum(RIG)
     for block in dark:

@@ -60,7 +60,7 @@ def _tree() -> dict[str, Any]:
     """As calibrate writes it, the parts that a certificate reads."""
     return {
         'kind': 'reference',
-        'refused': '',
+        'rejected': '',
         'parameters': {
             'psd_1.rotation': {'value': 0.012, 'used': 0.0},
             'psd_2.gain_y': {'value': 1e-3, 'used': 5e-3},
@@ -451,7 +451,7 @@ def _changed(*path: str | int, to: object) -> dict[str, Any]:
         ('{', 'no JSON; give'),
         ('[' * 100_000, 'no JSON; give'),
         ([], 'no map; give'),
-        (_changed('refused', to='worse than before'), 'refused: the calibration was refused'),
+        (_changed('rejected', to='worse than before'), 'rejected: the calibration was rejected'),
         (_changed('kind', to='loads'), 'kind = loads: its scale is traceable to nothing'),
         (_changed('parameters', to=[]), 'parameters: not there'),
         (_changed('parameters', 'psd_2.gain_y', to=3.0), 'parameters.psd_2.gain_y: needs the numbers'),

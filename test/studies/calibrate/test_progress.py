@@ -62,12 +62,12 @@ def test_the_tree_has_each_parameter_with_its_bar_and_each_need() -> None:
             {'name': 'n', 'words': 'a', 'value': 'b', 'left': 0.1, 'determined': True, 'filled': pytest.approx(0.5)}
         ],
         'needs': [{'motion': 'push', 'names': ('n',)}],
-        'refused': 'too short',
+        'rejected': 'too short',
     }
 
 
 def test_a_rejection_is_in_the_file_and_none_is_null() -> None:
     made = psd_deflection.simulate(None, [(0, 0, 0), (40, 0, 0)], seconds=1, seed=3)
     found = psd_deflection.calibrate(made, ROOT / 'config' / 'thesis_rig.yaml').found
-    assert result(replace(found, rejected=''), '2026-11-26')['refused'] is None
-    assert result(replace(found, rejected='worse than before'), '2026-11-26')['refused'] == 'worse than before'
+    assert result(replace(found, rejected=''), '2026-11-26')['rejected'] is None
+    assert result(replace(found, rejected='worse than before'), '2026-11-26')['rejected'] == 'worse than before'

@@ -123,7 +123,7 @@ def test_a_law_is_reported_adopted_and_then_explains_the_recording(
     assert adopted.terms[0].coefficient == pytest.approx(3e-9, rel=0.05)
     (active,) = effects_of_rig(load_rig(out / 'model.yaml'))
     assert active.effect.name == 'yielding'
-    # A name that is taken, and one that is none, are refused before the search.
+    # A name that is taken, and one that is none, are rejected before the search.
     assert main(['discover', run, '--out', str(out), '--adopt', 'yielding', '--quiet']) == 2
     assert main(['discover', run, '--out', str(out), '--adopt', 'a b', '--quiet']) == 2
 

@@ -132,7 +132,7 @@ def test_programs_get_si_units() -> None:
     assert tree['solver'] == 'exact'
     assert tree['references'] == 4
     assert tree['left_out'] == 3
-    assert tree['refused'] == {'blurred': 5}
+    assert tree['rejected'] == {'blurred': 5}
     offset = tree['offset']
     assert offset['value'] == 0.0123
     assert offset['interval'] == pytest.approx((0.0123 - 0.196e-3, 0.0123 + 0.196e-3))

@@ -36,7 +36,7 @@ function words(found) {
   if (found.parameters) parts.push(`${found.seconds.toFixed(0)} s, by ${BY[found.kind]}: ${found.determined} of ${found.parameters.length} determined`);
   else if (found.waiting) parts.push(found.waiting);
   else if (found.running) parts.push('begins: zero the unloaded link, then hang known loads and note each');
-  if (found.refused) parts.push(`refused so far: ${found.refused}`);
+  if (found.rejected) parts.push(`rejected so far: ${found.rejected}`);
   if (!found.running) parts.push(found.last === 'calibrated' ? `calibrated: ${found.out}/rig.yaml, report.html` : found.last);
   return parts.join('; ');
 }

@@ -45,7 +45,7 @@ let fresh = false;
 let density;
 let newDensity = false;
 let attempts = 0;
-let refusal = '';
+let rejection = '';
 let received = 0;
 let lastRowAt = 0;
 let token = takeToken();
@@ -72,7 +72,7 @@ function connect() {
     take(JSON.parse(event.data));
   };
   socket.onclose = (event) => {
-    refusal = event.reason;
+    rejection = event.reason;
     setTimeout(connect, RETRY_MS[Math.min(attempts, RETRY_MS.length - 1)]);
     attempts += 1;
     showState();
@@ -276,7 +276,7 @@ function numbers() {
 function showState() {
   const now = performance.now();
   let [state, text] = ['live', 'live'];
-  if (socket.readyState !== WebSocket.OPEN) [state, text] = hello ? ['offline', 'connection lost, trying again'] : ['connecting', refusal || 'connecting'];
+  if (socket.readyState !== WebSocket.OPEN) [state, text] = hello ? ['offline', 'connection lost, trying again'] : ['connecting', rejection || 'connecting'];
   else if (!hello) [state, text] = ['connecting', 'connecting'];
   else if (now - heard > SILENT_MS) {
     // A connection that says nothing is none, whatever the browser thinks of it.
@@ -288,7 +288,7 @@ function showState() {
   else if (now - lastRowAt > Math.max(STALE_MS, 3000 * hello.block_s)) [state, text] = hello.kind === 'replay' ? ['ended', 'end of recording'] : ['stale', 'no samples'];
   else {
     const status = rows.last('status');
-    if (status > 0) [state, text] = ['refused', hello.statuses[status]];
+    if (status > 0) [state, text] = ['rejected', hello.statuses[status]];
     else if (held()) text = 'live, held';
     else if (hello.kind === 'replay') text = 'playing';
   }
@@ -316,7 +316,7 @@ function showHealth(found) {
 // From the hand.
 
 // Why a button does nothing now; '' if it works.
-function refused(id) {
+function rejected(id) {
   if (!hello || body.dataset.state === 'offline') return 'there is no connection to the daemon';
   if (!hello.control) return hello.why_no_control;
   if (hello.kind === 'replay' && id === 'record') return 'a recording is played; it is not recorded again';
@@ -332,7 +332,7 @@ function buttons() {
   const recording = Boolean(health && health.recording);
   // Not `disabled`: a button that cannot be reached cannot say why.
   for (const [id, title] of TITLES) {
-    const why = refused(id);
+    const why = rejected(id);
     $(id).setAttribute('aria-disabled', String(why !== ''));
     $(id).title = why || title;
   }
@@ -346,7 +346,7 @@ function buttons() {
 
 function press(id, action) {
   $(id).onclick = () => {
-    const why = refused(id);
+    const why = rejected(id);
     if (why) notice(why, true);
     else action();
   };
@@ -484,7 +484,7 @@ $('each').onclick = () => {
 };
 $('hold').onclick = () => hold(!held());
 $('pause').onclick = () => {
-  const why = refused('zero');
+  const why = rejected('zero');
   if (why) notice(why, true);
   else act('/api/play', { paused: !(health.paused || body.dataset.state === 'ended') }, true);
 };
@@ -493,7 +493,7 @@ $('seek').oninput = () => {
   showPosition();
 };
 $('seek').onchange = async () => {
-  const why = refused('zero');
+  const why = rejected('zero');
   if (why) notice(why, true);
   else await act('/api/play', { seek: Number($('seek').value) }, true);
   seeking = false;

@@ -3,7 +3,7 @@
 // The dialog that notes a known load. `press` sets what a button does, `act` asks the daemon.
 
 const $ = (id) => document.getElementById(id);
-// A field takes a decimal comma; `pattern` refuses one before three digits, which may be thousands.
+// A field takes a decimal comma; `pattern` rejects one before three digits, which may be thousands.
 const typed = (id) => Number($(id).value.trim().replace(',', '.'));
 
 export function weighing(press, act) {
