@@ -37,7 +37,7 @@ INSTALL = $(if $(UV),$(UV) pip install --python $(1)/bin/python,$(1)/bin/python 
 PYTEST ?=
 # Tests that run at a time: they wait for ports, discs and DDS, and three keep two cores busy.
 WORKERS ?= 3
-# Which of the tests of tools/tiers.py: quick, slow, all.
+# Which tests: quick (not marked slow), slow, all.
 TIER ?= quick
 ROOM ?=
 BIN := $(VENV)/bin

@@ -14,12 +14,10 @@ from hypothesis import Phase, settings
 
 from test.judges import Golden, RayPlane
 from test.shaken import Shaker, shake
-from tools.tiers import ROOMS, TIERS, chooses, entries_of, tier_of
+from tools.tiers import ROOMS, TIERS, holds, paths_of
 
 os.environ['PSD_DEFLECTION_EFFECTS'] = ''
 SHAKER = pytest.StashKey[Shaker]()
-COLLECTED = pytest.StashKey[dict[str, bool]]()
-"""Each test that was found, of any tier, and whether it is marked ``statistics``."""
 
 settings.register_profile('untimed', deadline=None)
 # For `make mutants`: it asks only whether a test fails, each time of the same few examples.
@@ -40,7 +38,7 @@ ROOT = Path(__file__).parents[1]
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--shaken``, ``--tier``, ``--order`` and ``--room``."""
     parser.addoption('--shaken', action='store_true', help='LAPACK answers a last bit off (test/shaken.py)')
-    parser.addoption('--tier', choices=(*TIERS, 'all'), default='all', help='of tools/tiers.py (default all)')
+    parser.addoption('--tier', choices=(*TIERS, 'all'), default='all', help='quick: not marked slow (default all)')
     parser.addoption('--order', type=int, metavar='SEED', help='shuffle the tests: none may depend on another')
     parser.addoption('--room', help='the tests of this folder of test/, or of this room of tools/tiers.py, alone')
 
@@ -61,23 +59,17 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
     if not room or collection_path.suffix != '.py':
         return None
     file = str(collection_path.relative_to(ROOT))
-    return None if any(chooses(entry.partition(' ')[0], file) for entry in entries_of(room)) else True
+    return None if holds(paths_of(room), file) else True
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is of another tier or room; a module's fixture is made by one worker."""
-    tier, room = config.getoption('--tier'), config.getoption('--room')
-    entries = entries_of(room) if room else ('test',)
-    found = {item.nodeid: item.get_closest_marker('statistics') is not None for item in items}
-    config.stash[COLLECTED] = found
-    chosen = {
-        name
-        for name, marked in found.items()
-        if tier in ('all', tier_of(name, marked)) and any(chooses(entry, name) for entry in entries)
-    }
-    config.hook.pytest_deselected(items=[item for item in items if item.nodeid not in chosen])
-    items[:] = [item for item in items if item.nodeid in chosen]
+    """Leave out what is of another tier; a module's fixture is made by one worker."""
+    tier = config.getoption('--tier')
+    if tier != 'all':
+        chosen = [(item.get_closest_marker('slow') is not None) == (tier == 'slow') for item in items]
+        config.hook.pytest_deselected(items=[item for item, its in zip(items, chosen, strict=True) if not its])
+        items[:] = [item for item, its in zip(items, chosen, strict=True) if its]
     if config.getoption('--order') is not None:
         random.Random(config.getoption('--order')).shuffle(items)
     # xdist says so in its workers.

@@ -13,6 +13,8 @@ from tools.deb import one_line, templates, tree
 from tools.release import rosdep_table
 from tools.rosdistro import differences, our_rows, prepared, resolved
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 
 

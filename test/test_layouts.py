@@ -19,6 +19,8 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.ros import names
 from psd_deflection.ros import topics as table
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 CONFIG = ROOT / 'config'
 

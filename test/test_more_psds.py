@@ -81,12 +81,14 @@ def at_rest(rig: Rig, dots: FloatArray, n: int, seed: int) -> Counts:
 # The rig file.
 
 
+@pytest.mark.slow
 def test_a_rig_of_two_has_no_parameter_of_a_third() -> None:
     rig = load_rig()
     assert len(rig.psds) == len(rig.beams) == 2
     assert not [name for name in rig.flat() if name.startswith(('psd_3', 'beam_3'))]
 
 
+@pytest.mark.slow
 def test_what_a_third_psd_leaves_out_has_its_default_and_goes_round(three: Rig) -> None:
     assert three.psds[2].center == (0.08, -0.06)
     assert (three.psds[2].height, three.beams[2].angle, three.psds[2].axes) == (0.0, (0.0, 0.0), ('x', 'y'))
@@ -95,6 +97,7 @@ def test_what_a_third_psd_leaves_out_has_its_default_and_goes_round(three: Rig) 
     assert zero_text(three).endswith('psd_3 (0.0000, 0.0000)')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('values', 'words'),
     [
@@ -110,6 +113,7 @@ def test_a_gap_and_a_psd_without_a_place_are_rejected_by_name(values: dict[str, 
         load_rig(overrides=values)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('changes', 'words'),
     [
@@ -128,7 +132,7 @@ def test_what_is_made_for_two_is_rejected(three: Rig, changes: dict[str, object]
 # By truth.
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('solver', 'more', 'pose', 'unknowns'),
     [
@@ -295,6 +299,7 @@ def test_one_that_stands_still_is_not_taken_for_the_one_that_contradicts(three: 
     assert pipeline.counters.findings['psd_3 stands still'] == 6
 
 
+@pytest.mark.slow
 def test_reject_rejects_only_what_cannot_be_reported(three: Rig) -> None:
     report, _, _ = run(with_solver(three, 'exact', consistency='reject', **LEVEL), inverted(2))
     assert len(primaries(report)) > 110
@@ -346,7 +351,7 @@ def test_two_of_four_may_fail_one_after_the_other(three: Rig) -> None:
     assert pipeline.estimator.most_likely_wrong() == 'psd_1 and psd_4 does not fit the others and is left out'
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(('solver', 'reading'), [('pose', 1), ('pose', 5), ('exact', 3)])
 def test_a_reading_that_drifts_slowly_is_held_by_the_covariance(three: Rig, solver: str, reading: int) -> None:
     """A micrometre a second, from the fifth second on. One degree of freedom names nothing."""
@@ -367,6 +372,7 @@ def test_a_reading_that_drifts_slowly_is_held_by_the_covariance(three: Rig, solv
 # Bit for bit again.
 
 
+@pytest.mark.slow
 def test_a_recording_of_three_is_replayed_without_a_differing_bit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -390,6 +396,7 @@ def test_a_recording_of_three_is_replayed_without_a_differing_bit(
     assert main(['replay', str(tmp_path / 'c.csv'), '--params-file', str(THREE)]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('command', ['check', 'calibrate'])
 def test_commands_for_two_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     words = ['--params-file', str(THREE), '--loads', 'constant:0,0,0:1']
@@ -399,6 +406,7 @@ def test_commands_for_two_say_so(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert 'takes rigs of two PSDs, this one has 3' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('header', 'words'),
     [
@@ -414,6 +422,7 @@ def test_a_csv_with_part_of_a_psd_is_rejected(tmp_path: Path, header: str, words
         open_recording(path)
 
 
+@pytest.mark.slow
 def test_a_bag_whose_number_of_psds_changes_is_rejected(tmp_path: Path, three: Rig) -> None:
     blocks = []
     for index, rig in enumerate((three, load_rig())):
@@ -453,7 +462,7 @@ def test_a_zero_is_of_all_psds(three: Rig) -> None:
     )
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(('solver', 'more'), [('pose', {}), ('exact', LEVEL)])
 def test_the_noise_is_that_of_the_samples_without_any_rest(three: Rig, solver: str, more: dict[str, object]) -> None:
     """A twist by a degree moves every combination of the dots; what the model leaves of them stays noise."""
@@ -475,6 +484,7 @@ STUDIES: dict[str, list[str]] = {
 OF_NO_RIG = {'certificate', 'effects', 'thesis'}
 
 
+@pytest.mark.slow
 def test_every_study_takes_a_rig_of_three_psds_or_says_why_not(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

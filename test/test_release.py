@@ -24,6 +24,8 @@ from tools.release import (
     rosdep_table,
 )
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parent.parent
 NEEDED = (
     'package.xml',

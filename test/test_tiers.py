@@ -1,17 +1,14 @@
 # Copyright 2026 psd_deflection maintainers
 # SPDX-License-Identifier: Apache-2.0
-"""The table of tiers and rooms names what is there; each mutant made by hand changes one line that is there."""
+"""The table of rooms names files that exist; each mutant made by hand changes one line that exists."""
 
 from __future__ import annotations
 
 import ast
 from pathlib import Path
 
-import pytest
-
-from test.conftest import COLLECTED
 from tools.mutants_by_hand import KINDS, hand_made
-from tools.tiers import QUICK_ENTRIES, ROOMS, SLOW_ENTRIES, chooses, entries_of, tier_of
+from tools.tiers import ROOMS, holds, paths_of
 
 ROOT = Path(__file__).parents[1]
 
@@ -25,33 +22,19 @@ def test_each_lies_in_a_room_whose_tests_should_notice() -> None:
             assert (ROOT / path).exists(), path
 
 
-def test_each_entry_of_the_table_chooses_tests(request: pytest.FixtureRequest) -> None:
-    tests = request.config.stash[COLLECTED]
-    files = {name.partition('::')[0] for name in tests}
-    for entry in {*QUICK_ENTRIES, *SLOW_ENTRIES}:
-        path = entry.partition(' ')[0]
-        assert (ROOT / path).exists(), entry
-        folder = {str(f.relative_to(ROOT)) for f in (ROOT / path).rglob('test_*.py')}
-        # A run of some files has not seen the others.
-        if (folder or {path}) <= files:
-            own = {tier_of(name, marked) for name, marked in tests.items() if chooses(entry, name)}
-            assert own >= ({'quick'} if entry in QUICK_ENTRIES else set()), entry
-            assert own, entry
+def test_each_room_has_quick_tests_in_each_of_its_files() -> None:
+    for room in ROOMS.values():
+        for path in map(ROOT.joinpath, (*room.tests, *room.slow)):
+            files = list(path.rglob('test_*.py')) or [path]
+            slow = ['pytestmark = pytest.mark.slow' in file.read_text() for file in files]
+            assert not all(slow) or str(path.relative_to(ROOT)) not in room.tests, path
 
 
-def test_a_test_is_slow_unless_a_room_counts_on_it() -> None:
-    assert tier_of('test/blind/test_day.py::test_a_day[3]', False) == 'slow'
-    assert tier_of('test/measure/test_timing.py::test_a_jump', False) == 'quick'
-    assert tier_of('test/measure/test_timing.py::test_a_jump', True) == 'slow'
-    # Slow for the room plate, counted on by the room solvers.
-    assert tier_of('test/model/solvers/test_truth.py::test_it', False) == 'quick'
-    assert chooses('test/a.py -k not (this or That) and other', 'test/a.py::test_OTHER')
-    assert not chooses('test/a.py -k not (this or That) and other', 'test/a.py::test_other[that]')
-    assert not chooses('test/a', 'test/ab.py::test_it')
-    with pytest.raises(ValueError, match='words, and, or, not'):
-        chooses('test/a.py -k 1', 'test/a.py::test_it')
-    assert entries_of('measure') == ('test/measure',)
-    assert entries_of('averaging') == ('test/averaging', *ROOMS['averaging'].tests)
+def test_a_room_is_a_folder_and_the_tests_of_its_mutants() -> None:
+    assert paths_of('measure') == ('test/measure',)
+    assert paths_of('averaging') == ('test/averaging', *ROOMS['averaging'].tests)
+    assert holds(('test/a', 'test/b.py'), 'test/a/test_it.py')
+    assert not holds(('test/a', 'test/b.py'), 'test/ab.py')
 
 
 def test_each_mutant_made_by_hand_changes_one_line_and_can_run() -> None:

@@ -2,12 +2,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run pytest in one child after another of a process that has imported all libraries already.
 
-Arguments: a tier of tools/tiers.py, and the tests, a file or folder each, perhaps with "-k WORDS". At first all of
-them are run, to see which functions of the checkout each test enters and how long it takes; the first line of the
-output is 1 if all passed, 0 if not. Then each line of the input is a file of the checkout and the first line of a
-function in it, 0 for what is in no function. The tests that enter it are run, the quickest first, as many as take
-``MOST`` seconds together, and a line of the output is 1 if all passed, 0 if not. Every child imports the program
-again.
+Arguments: a tier of the tests (quick, slow, all), then files and folders. At first all of them are run, to see which
+functions of the checkout each test enters and how long it takes; the first line of the output is 1 if all passed, 0 if
+not. Then each line of the input is a file of the checkout and the first line of a function in it, 0 for what is in no
+function. The tests that enter it are run, the quickest first, as many as take ``MOST`` seconds together, and a line of
+the output is 1 if all passed, 0 if not. Every child imports the program again.
 """
 
 from __future__ import annotations
@@ -150,8 +149,8 @@ def known(tier: str, tests: Sequence[str]) -> dict[str, Test] | None:
     out: dict[str, Test] = {}
     with tempfile.TemporaryDirectory() as folder:
         answer = Path(folder, 'seen.json')
-        for words in tests:
-            if not passed(functools.partial(watched, tier, words.split(' ', 2), answer), LONGEST):
+        for path in tests:
+            if not passed(functools.partial(watched, tier, [path], answer), LONGEST):
                 return None
             for name, (seconds, entered) in json.loads(answer.read_text()).items():
                 out[name] = Test(seconds, frozenset((file, line) for file, line in entered))

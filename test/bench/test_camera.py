@@ -5,9 +5,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from bench.campaign.camera import discs_picture, pose_bounds
 from blind.render import Scene
+
+pytestmark = pytest.mark.slow
 
 
 def test_a_bound_of_all_pixels_is_that_of_a_mask_of_all_and_half_of_them_know_less() -> None:

@@ -26,6 +26,8 @@ from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.reading.acquisition import Acquisition
 from test.heard import WAIT_S
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).resolve().parents[2]
 FOUND = sorted((ROOT / 'test' / 'data' / 'fuzz').glob('*'))
 
@@ -152,7 +154,6 @@ def test_a_spread_is_numpy_s() -> None:
     assert spread.mean == pytest.approx(float(np.mean(values)))
 
 
-@pytest.mark.statistics
 def test_simulated_minutes_lose_nothing_and_keep_time(capsys: pytest.CaptureFixture[str]) -> None:
     assert soak.simulated_time(100 / 3600)
     assert 'wrapped past 2^32' in capsys.readouterr().out

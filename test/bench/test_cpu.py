@@ -26,6 +26,7 @@ class Ticks:
         self.now += ns
 
 
+@pytest.mark.slow
 def test_a_part_has_its_own_time_without_that_of_the_parts_inside() -> None:
     ticks = Ticks()
     clocks = cpu.Clocks(ticks)
@@ -45,6 +46,7 @@ def test_a_part_has_its_own_time_without_that_of_the_parts_inside() -> None:
     assert clocks.calls[thread] == {'inner': 2, 'outer': 1, cpu.COLLECTION: 1}
 
 
+@pytest.mark.slow
 def test_a_part_that_raises_is_left() -> None:
     clocks = cpu.Clocks(Ticks())
 
@@ -57,6 +59,7 @@ def test_a_part_that_raises_is_left() -> None:
     assert clocks.calls[threading.get_native_id()] == {'rejected': 1, 'next': 1}
 
 
+@pytest.mark.slow
 def test_what_is_in_no_part_is_the_rest_of_its_thread() -> None:
     def task(name: str, used: int, calls: int, **spent: int) -> dict[str, object]:
         return {'name': name, 'used': used, 'spent': spent, 'calls': calls}
@@ -79,6 +82,7 @@ def test_what_is_in_no_part_is_the_rest_of_its_thread() -> None:
     assert round(sum(f.median for f in row.figures), 6) == 100.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('frames', 'kind'),
     [

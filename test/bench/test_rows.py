@@ -11,6 +11,8 @@ import pytest
 from bench import cpu, limits, page
 from bench.rows import ROOT, Row, figure, keep, read
 
+pytestmark = pytest.mark.slow
+
 
 def test_ratios_and_bounds_are_those_of_peers_and_limits() -> None:
     ours, peer = figure('mine', 'ours', [2.0, 1.8, 2.2]), figure('theirs', 'peer', [6.0], 3.0)

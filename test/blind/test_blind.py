@@ -33,6 +33,8 @@ from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig
 from psd_deflection.studies.discover.observation import Observation
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_second_generator_agrees_with_an_adaptive_integrator() -> None:
     loads = np.repeat([[0.0, 0.0, 0.0], [10.0, -50.0, -29.0], [0.0, 20.0, 5.0]], 100, axis=0)
@@ -57,7 +59,6 @@ def test_both_generators_show_the_nominal_rig_alike() -> None:
     assert np.abs(g.clean([]) - ours).max() < 2e-6
 
 
-@pytest.mark.statistics
 @pytest.mark.parametrize('first', sorted(LINK & set(EFFECTS)))
 def test_both_generators_show_two_effects_of_the_link_alike(first: str) -> None:
     """What each reads of the other: the mass the clamp, the second mode the creep. A case of several has both."""
@@ -87,7 +88,6 @@ def test_cases_are_many_and_each_its_own() -> None:
     assert len({c.wanted[0][0] for c in cases if c.kind == 'single'}) >= 25
 
 
-@pytest.mark.statistics
 @pytest.mark.parametrize('key', ['single-sensor_rotation-3-s', 'single-plane_tilt-3-s', 'single-quantisation-3-s'])
 def test_a_hidden_effect_is_named(key: str) -> None:
     case = next(c for c in short_cases() if c.key == key)
@@ -96,7 +96,6 @@ def test_a_hidden_effect_is_named(key: str) -> None:
     assert found.simulations <= 2000
 
 
-@pytest.mark.statistics
 def test_times_at_the_noise_stay_beside_a_nonlinear_effect() -> None:
     """Friction: a further step of the free times led away."""
     key = 'hand-slow-64146-clamp_friction'
@@ -153,7 +152,6 @@ def test_every_mistake_has_five_sizes_and_changes_the_recording() -> None:
         assert not all(same), name
 
 
-@pytest.mark.statistics
 def test_a_mistake_is_named_and_no_effect_beside_it() -> None:
     case = next(c for c in short_cases() if c.kind == 'mistake')
     answer, _ = run.answer(case, [])
@@ -165,7 +163,6 @@ def test_a_mistake_is_named_and_no_effect_beside_it() -> None:
     assert 'mistake named where there is none: 100.0 % (1/1' in score.summary([worse])[0]
 
 
-@pytest.mark.statistics
 def test_an_unnoted_torque_beside_a_soft_link_has_its_time() -> None:
     key = 'hand-forgotten-65019-torsional_stiffness'
     case = Case(key, 'hand', 'hand-forgotten-65019', (), mistake=('hand', 0.0))
@@ -180,7 +177,6 @@ def test_an_unnoted_torque_beside_a_soft_link_has_its_time() -> None:
     assert forgotten['value'] == pytest.approx([0.0, -40.0, -23.4], abs=0.002)
 
 
-@pytest.mark.statistics
 def test_right_loads_beside_a_sticking_clamp_stay() -> None:
     case = Case('spread-81014-tip_mass-mount_tilt-clamp_friction', 'spread', 'two', ())
     found, _ = run.answer(
@@ -217,7 +213,6 @@ def test_a_false_effect_fails_the_suite_unless_equivalent() -> None:
     assert 'an effect named that is none: 0.0 % (0/1;' in score.summary([row])[0]
 
 
-@pytest.mark.statistics
 @pytest.mark.parametrize('peer', ['subsets', 'stlsq'])
 def test_a_peer_answers_the_same_cases(peer: str) -> None:
     if peer == 'stlsq':

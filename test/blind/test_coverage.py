@@ -9,6 +9,8 @@ import pytest
 from blind.coverage import ROWS, UNEQUAL, Inside, on_a_moving_base, over_the_bound, score, warming
 from blind.faults import fault
 
+pytestmark = pytest.mark.slow
+
 LABELS = ('white', 'AR(1) 0.9', 'twice the noise', '1, 2, 4, 2 mV', 'unequal channels')
 
 
@@ -38,7 +40,6 @@ def test_the_truth_is_inside_on_a_moving_base() -> None:
     assert covers(on_a_moving_base(30, seed=3))
 
 
-@pytest.mark.statistics
 def test_weights_from_the_stated_noise_reach_the_bound() -> None:
     ratios = over_the_bound(UNEQUAL, ('wls', 'ols'), rest_s=160)
     assert (ratios['wls'] < 1.02).all()

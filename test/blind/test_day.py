@@ -15,6 +15,8 @@ from blind import day
 from blind.generator import RATE
 from psd_deflection.devices.protocol.frames import FrameDecoder, HelloFrame, SampleFrame
 
+pytestmark = pytest.mark.slow
+
 
 def test_our_decoder_reads_its_frames() -> None:
     counts = (-3, 4, 16_384, -32_768, 32_767, 0)

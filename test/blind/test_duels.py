@@ -20,6 +20,8 @@ from blind.silverbox import RATE, Silverbox, rmse
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plant_search import discover_in
 
+pytestmark = pytest.mark.slow
+
 COUNT, CUBIC = 2700, 4.0
 
 

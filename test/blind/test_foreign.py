@@ -28,6 +28,7 @@ def names(found: PlantDiscovery) -> set[str]:
     return {e.active.effect.name for e in found.effects}
 
 
+@pytest.mark.slow
 def test_the_boom_lacks_gravity_and_its_root_gives_way() -> None:
     """Its stiffness is not known and no finding. Clamp and length cannot be told apart, and are named so."""
     found = discover_in(Boom(without=('tip_force',)))
@@ -46,13 +47,14 @@ def test_the_boom_lacks_gravity_and_its_root_gives_way() -> None:
     assert 0.0 < sd['scale'] < 0.1
 
 
+@pytest.mark.slow
 def test_the_weighed_boom_lacks_no_weight() -> None:
     found = discover_in(Boom(weighed=True))
     assert names(found) <= {'tip_force', 'root_length', 'clamp_compliance'}
     assert found.gap_after == pytest.approx(1.58e-3, rel=0.02)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_telescope_has_five_effects_and_their_sizes_are_those_of_tpoint() -> None:
     """More than four effects by evidence. TPOINT, with 22 free terms: AN 44.26, AW 69.89, NPAE -50.97 arcsec."""
     found = discover_in(AuxTel())
@@ -71,14 +73,14 @@ def test_the_telescope_has_five_effects_and_their_sizes_are_those_of_tpoint() ->
     assert found.verdict == 'unknown_effect'
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize('name', ['AN', 'AW'])
 def test_a_term_that_the_model_of_the_telescope_lacks_is_named(name: str) -> None:
     known = [n for n in ('AN', 'AW', 'NPAE', 'CA') if n != name]
     assert name in names(discover_in(AuxTel(known=known)))
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_of_collimation_and_axes_the_stars_show_one_and_it_is_named() -> None:
     found = discover_in(AuxTel(known=('AN', 'AW')))
     (between,) = (e for e in found.effects if {'NPAE', 'CA'} & {e.active.effect.name, *e.equivalent})
@@ -96,7 +98,7 @@ def test_of_collimation_and_axes_the_stars_show_one_and_it_is_named() -> None:
     assert min(bic(*beside, 'NPAE'), bic(*beside, 'CA')) + 1.0 < bic(*beside, 'NPAE', 'CA')
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_sd_of_the_weight_is_its_scatter_over_lengths() -> None:
     """Lengths drawn by chance, with replacement, against the sd of one search."""
     found = discover_in(Boom(without=('tip_force',)))
@@ -118,6 +120,7 @@ class Resampled(Boom):
         self.cases = tuple(f'{self.cases[i]} ({k})' for k, i in enumerate(picked))
 
 
+@pytest.mark.slow
 def test_what_the_drive_lacks_is_found_together() -> None:
     """Neither may be found alone first: more viscous friction seems to explain the lack of both."""
     plant = emps.Emps(('coulomb_friction', 'force_offset'), step=10)
@@ -132,12 +135,14 @@ def test_what_the_drive_lacks_is_found_together() -> None:
     assert found.gap_after < 3e-3 < 0.05 < found.gap_before
 
 
+@pytest.mark.slow
 def test_the_published_drive_lacks_nothing() -> None:
     plant = emps.Emps(step=10)
     plant.library = tuple(e for e in plant.library if e.name not in ('input_delay', 'position_gain', 'mass'))
     assert discover_in(plant).verdict == 'nothing_missing'
 
 
+@pytest.mark.slow
 def test_what_was_found_missing_of_the_arm_closes_its_gap() -> None:
     # The search itself takes longer: python -m blind.foreign arm.
     arm = Arm()
@@ -155,6 +160,7 @@ def test_what_was_found_missing_of_the_arm_closes_its_gap() -> None:
     assert both[1] < 0.4 * nominal[1]
 
 
+@pytest.mark.slow
 def test_the_command_writes_result_and_report(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

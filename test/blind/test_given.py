@@ -15,6 +15,8 @@ from blind.cases import Case
 from blind.run import observe, seal
 from psd_deflection.rig.config import load_rig
 
+pytestmark = pytest.mark.slow
+
 CASE = Case('mistake-sensitivity-0-7', 'mistake', 'one', (), mistake=('sensitivity', 0.5))
 
 

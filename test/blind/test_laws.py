@@ -16,6 +16,8 @@ from psd_deflection.studies.discover.laws.laws import find_law
 from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.workspace import Workspace
 
+pytestmark = pytest.mark.slow
+
 
 def test_laws_are_drawn_over_stages_and_forms_and_each_is_its_own() -> None:
     laws = drawn(40, 24)
@@ -122,7 +124,6 @@ def test_a_threshold_that_is_missed_is_reported() -> None:
     assert 'MISS laws where nothing is missing: 1/1' in text
 
 
-@pytest.mark.statistics
 def test_a_drawn_law_is_found_on_its_stage_with_its_variables() -> None:
     law = next(law for law in drawn(40, 12) if law['name'] == 'law_link')
     truth = law_forms.truth_of(law)

@@ -13,6 +13,8 @@ import pytest
 
 from blind.redone import SHORT, HeldLoad, main, motion
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_weight_on_the_sidebar_turns_the_link_as_far_as_the_beam_says() -> None:
     """50 N, 0.585 m from the link: -2.23 mm and 0.94 degrees, 0.12 mm sideways because the rig leans."""
@@ -24,7 +26,6 @@ def test_the_weight_on_the_sidebar_turns_the_link_as_far_as_the_beam_says() -> N
     assert motion(SHORT, HeldLoad(50.0, 0))[-1, 2] == 0.0
 
 
-@pytest.mark.statistics
 def test_calibrated_on_the_sidebar_the_rig_is_right_on_the_link(tmp_path: Path) -> None:
     out = tmp_path / 'thesis'
     assert main(['--short', '--seed', '2', '--out', str(out)]) == 0

@@ -9,8 +9,9 @@ import pytest
 from bench.campaign.camera import SIGMAS, off_by, runs
 from psd_deflection.camera.answer import Status
 
+pytestmark = pytest.mark.slow
 
-@pytest.mark.statistics
+
 def test_a_bad_frame_is_rejected_or_right() -> None:
     found = [(hurt, off_by(answer, truth)) for hurt, answer, truth in runs(24, 3) if answer.status is Status.OK]
     assert len(found) >= 5

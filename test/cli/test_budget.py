@@ -19,6 +19,8 @@ from psd_deflection.studies.budget.chain import MeasuringChain, measure
 from psd_deflection.studies.budget.evaluate import CAUSES
 from psd_deflection.studies.budget.inputs import INPUTS
 
+pytestmark = pytest.mark.slow
+
 RIG = str(Path(__file__).parent.parent.parent / 'config' / 'thesis_rig.yaml')
 
 

@@ -12,6 +12,8 @@ import pytest
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:

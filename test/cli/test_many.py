@@ -49,6 +49,7 @@ def scheduler() -> Iterator[str]:
         yield 'dask://' + cluster.scheduler_address.removeprefix('tcp://')
 
 
+@pytest.mark.slow
 def test_every_engine_gives_the_serial_answer(
     archive: Path, scheduler: str, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,6 +13,8 @@ from psd_deflection.arms.shapers import Shaper, in_series, recommended, shaper
 from psd_deflection.cli._options import of_options
 from psd_deflection.cli.main import main, make_parser
 
+pytestmark = pytest.mark.slow
+
 CONFIG = Path(__file__).parents[2] / 'config'
 RIG = str(CONFIG / 'thesis_rig.yaml')
 

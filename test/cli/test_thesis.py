@@ -15,6 +15,8 @@ from psd_deflection.model.solvers import SOLVERS
 from psd_deflection.studies.thesis.comparison import CAUSES, methods
 from psd_deflection.studies.thesis.figures import FIGURES
 
+pytestmark = pytest.mark.slow
+
 DOCS = Path(__file__).parents[2] / 'docs'
 
 

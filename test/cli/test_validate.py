@@ -15,6 +15,8 @@ from psd_deflection.base.errors import PsdDeflectionError
 from psd_deflection.cli.main import main
 from psd_deflection.rig.config import load_rig
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope='module')
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -28,6 +28,8 @@ from psd_deflection.devices.thorlabs import SharedRig, SimulatedAligner
 from psd_deflection.rig.config import load_rig
 from psd_deflection.rig.parameter_files import read_parameter_file
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:

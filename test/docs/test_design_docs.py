@@ -10,6 +10,8 @@ import pytest
 
 from psd_deflection.cli.main import main
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 RIG = str(ROOT / 'config' / 'thesis_rig.yaml')
 

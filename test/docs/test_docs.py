@@ -336,6 +336,7 @@ def outputs(notebook: Path) -> list[list[tuple[str, object]]]:
     return [[(o['output_type'], o.get('text') or sorted(o.get('data', {}))) for o in c['outputs']] for c in cells]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('notebook', NOTEBOOKS, ids=lambda p: p.name)
 def test_a_notebook_is_shipped_executed_and_runs_in_any_folder(notebook: Path, tmp_path: Path) -> None:
     pytest.importorskip('nbmake')

@@ -11,6 +11,8 @@ import pytest
 from tools import gallery
 from tools.gallery_cases import CASES, STUDIES, Case
 
+pytestmark = pytest.mark.slow
+
 
 def test_every_case_is_on_the_page_with_its_picture() -> None:
     message = gallery.kept()

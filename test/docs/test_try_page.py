@@ -25,6 +25,8 @@ from psd_deflection.studies.study import StudyResult
 from tools import pyodide_site, try_page
 from tools.program import ROOT
 
+pytestmark = pytest.mark.slow
+
 WORK = pyodide_site.WORK
 CHOICES = re.findall(
     r'<option value="([^"]+)" data-size="([\d.]+)" data-least="([\d.]+)" data-most="([\d.]+)" data-unit="[^"]+" '

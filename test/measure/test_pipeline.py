@@ -81,6 +81,7 @@ BOUND_2UM = np.array([1.657e-6, 1.830e-6, np.deg2rad(1.328e-3)])
 SCALE = np.sqrt(((2e-3) ** 2 + STEP**2 / 12) / 20) * 5e-4 / 2e-6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('load', [(0.0, 0.0, 0.0), sidebar(10.0), sidebar(50.0), direct(30.0), (20.0, 5.0, -3.0)])
 def test_rms_errors_are_within_a_tenth_of_the_cramer_rao_bound(rig: Rig, load: tuple[float, float, float]) -> None:
     pose = LinkStatics.from_rig(rig).deflection(*load)
@@ -101,6 +102,7 @@ def test_rms_errors_are_within_a_tenth_of_the_cramer_rao_bound(rig: Rig, load: t
     np.testing.assert_allclose(wrench, load, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_iterative_agrees_with_exact_and_wls_shows_its_small_angle_error(rig: Rig) -> None:
     pose = (0.002, -0.002, np.deg2rad(1.0))
     records = run(Pipeline(rig).process, chunk_of(still(pose, 20 * 500, 3)))
@@ -214,6 +216,7 @@ def test_an_effect_in_the_rig_file_is_simulated_and_corrected(rig: Rig, effect: 
     assert (blind > 3.0 * corrected).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('effect', 'words'),
     [
@@ -364,6 +367,7 @@ def test_an_acceleration_is_there_after_the_last_block(rig: Rig) -> None:
     assert Pipeline(pipeline.rig).accelerate(base, 12_345) == 12_345
 
 
+@pytest.mark.slow
 def test_what_drifts_is_taken_off_by_time_and_temperature_as_far_as_they_are_known() -> None:
     """A beam wanders by 1 mm/s, a PSD by 5 um/K: of readings that do so, a tip at rest is left."""
     values = {

@@ -320,7 +320,7 @@ def test_drift_ringing_and_gaps_are_no_alarm() -> None:
     assert fed.watch.spoilt > 0
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', SIZES)
 def test_events_of_the_second_generator_are_observed(kind: str) -> None:
     run = watch_run((kind, 1000))

@@ -50,6 +50,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_every_record_comes_back(bag: Path) -> None:
     recording = open_recording(bag)
     records = list(run(150))
@@ -67,6 +68,7 @@ def test_every_record_comes_back(bag: Path) -> None:
     assert recording.sample_rate_hz == pytest.approx(1000.0, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_recorded_estimates_come_back(bag: Path) -> None:
     series = open_recording(bag).estimates()
     assert set(series) == {
@@ -88,6 +90,7 @@ def test_recorded_estimates_come_back(bag: Path) -> None:
     assert series['/link_tip/deflection'].covariance is None
 
 
+@pytest.mark.slow
 def test_the_samples_are_one_array(bag: Path) -> None:
     recording = psd_deflection.open(bag)
     blocks = list(recording.blocks())
@@ -100,6 +103,7 @@ def test_the_samples_are_one_array(bag: Path) -> None:
     assert (samples['flags'] != 0).sum() == sum((b.flags != 0).sum() for b in blocks) > 0
 
 
+@pytest.mark.slow
 def test_a_lone_file_and_a_folder_without_metadata_are_read(bag: Path, tmp_path: Path) -> None:
     expected = list(open_recording(bag).blocks())
     assert_same(list(open_recording(bag / 'run_0.mcap').blocks()), expected)
@@ -111,6 +115,7 @@ def test_a_lone_file_and_a_folder_without_metadata_are_read(bag: Path, tmp_path:
     assert_same(list(open_recording(bag / 'metadata.yaml').blocks()), expected)
 
 
+@pytest.mark.slow
 def test_several_files_are_read_in_their_order(tmp_path: Path) -> None:
     records = [block(i) for i in range(44)]
     folder = tmp_path / 'run'
@@ -137,6 +142,7 @@ def modulo(path: Path, records: Sequence[SampleBlock]) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('write', [write_mcap, modulo])
 def test_numbers_go_on_past_32_bits_within_a_file(
     tmp_path: Path, write: Callable[[Path, Sequence[SampleBlock]], Path]
@@ -162,6 +168,7 @@ def test_a_long_gap_with_a_wrap_in_it_is_a_gap(
     assert_same(list(open_recording(write(tmp_path / 'a.mcap', records)).blocks()), records)
 
 
+@pytest.mark.slow
 def test_a_jump_of_the_whole_number_needs_no_guess(tmp_path: Path) -> None:
     records = [block(5), block(3 * 2**32, first_index=3 * 2**32 - 10)]
     recording = open_recording(write_mcap(tmp_path / 'a.mcap', records))
@@ -169,6 +176,7 @@ def test_a_jump_of_the_whole_number_needs_no_guess(tmp_path: Path) -> None:
     assert not recording.warnings
 
 
+@pytest.mark.slow
 def test_changes_of_parameters_come_back(tmp_path: Path) -> None:
     changes = [
         ParameterChange(T0, 3, (('psd_1.zero', (1e-3, -2e-3)), ('psd_2.zero', (0.1, 1 / 3)))),
@@ -186,6 +194,7 @@ def with_state(folder: Path, text: str) -> Path:
     return folder / 'a.mcap'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'text',
     [
@@ -212,6 +221,7 @@ def test_a_restarted_device_does_not_mix_blocks(tmp_path: Path) -> None:
     assert any('start again after 99' in w for w in recording.warnings)
 
 
+@pytest.mark.slow
 def test_other_blocks_are_those_of_a_recording_opened_so(tmp_path: Path) -> None:
     # After a restart numbers go on with the next block, so they depend on its size.
     again = [block(i, lost=(0, 1, 2) if i == 1 else (), t0=T0 + 5 * 10**9) for i in (1, 2)]
@@ -257,6 +267,7 @@ def test_a_block_in_two_messages_is_one_block_again(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.slow
 def test_another_block_size_gives_the_same_samples(bag: Path) -> None:
     blocks = list(open_recording(bag, block_size=50).blocks())
     assert [b.index for b in blocks] == list(range(60))
@@ -264,6 +275,7 @@ def test_another_block_size_gives_the_same_samples(bag: Path) -> None:
     assert sum(len(b.seq) for b in blocks) == len(open_recording(bag).samples)
 
 
+@pytest.mark.slow
 def test_the_recorded_block_size_counts(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / 'a.mcap', [block(i) for i in range(5)], rig_values={'block_size': 10})
     assert [len(b.seq) for b in open_recording(path).blocks()] == [10] * 10
@@ -310,6 +322,7 @@ def cloud(
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('big', [False, True])
 @pytest.mark.parametrize('compression', list(CompressionType))
 @pytest.mark.parametrize('chunked', [False, True])
@@ -333,6 +346,7 @@ def test_other_layouts_compressions_and_no_chunks(
     assert (recording.complete, recording.parameters, recording.hello) == (True, {}, None)
 
 
+@pytest.mark.slow
 def test_a_bag_that_rosbags_wrote_is_read(tmp_path: Path) -> None:
     types = STORE.types
     header, time = types['std_msgs/msg/Header'], types['builtin_interfaces/msg/Time']
@@ -367,6 +381,7 @@ def test_a_bag_that_rosbags_wrote_is_read(tmp_path: Path) -> None:
     assert recording.topics() == {SAMPLES: 60, LOAD: 1}
 
 
+@pytest.mark.slow
 def test_samples_that_are_no_numbers_count_as_lost(tmp_path: Path) -> None:
     b = block(0)
     b.volts[3, 2] = np.nan
@@ -377,6 +392,7 @@ def test_samples_that_are_no_numbers_count_as_lost(tmp_path: Path) -> None:
     assert 'NaN' in recording.warnings[0]
 
 
+@pytest.mark.slow
 def test_a_load_without_a_stamp_counts_from_when_it_came(tmp_path: Path) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         for t_ns in (0, T0 + 7):
@@ -395,6 +411,7 @@ def information(folder: Path, **changes: object) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('changes', 'message'),
     [
@@ -412,6 +429,7 @@ def test_bags_of_another_kind_are_rejected(tmp_path: Path, changes: dict[str, ob
     assert '\n' not in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('name', 'content', 'message'),
     [
@@ -433,6 +451,7 @@ def test_files_that_are_none_are_rejected_in_one_line(tmp_path: Path, name: str,
     assert '\n' not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_what_is_not_there_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match='no such recording'):
         open_recording(tmp_path / 'nothing')
@@ -440,6 +459,7 @@ def test_what_is_not_there_is_rejected(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
+@pytest.mark.slow
 def test_another_type_on_our_topic_is_rejected(tmp_path: Path) -> None:
     with McapFile(tmp_path / 'a.mcap', rig_values={}) as out:
         (m,) = to_messages(TemperatureReading(T0, 20.0))
@@ -448,6 +468,7 @@ def test_another_type_on_our_topic_is_rejected(tmp_path: Path) -> None:
         list(open_recording(tmp_path / 'a.mcap').blocks())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('change', 'message'),
     [
@@ -465,6 +486,7 @@ def test_points_out_of_order_are_rejected(tmp_path: Path, change: Any, message: 
         list(open_recording(tmp_path / 'a.mcap').blocks())
 
 
+@pytest.mark.slow
 def test_times_of_samples_are_those_of_the_device(bag: Path) -> None:
     t_ns = open_recording(bag).samples['t_ns']
     assert set(np.diff(t_ns).tolist()) == {STEP, 3 * STEP}

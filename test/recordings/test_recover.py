@@ -56,7 +56,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp('recover') / 'run')
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @settings(max_examples=25)
 @given(part=st.floats(0.05, 1.0))
 def test_a_bag_cut_anywhere_opens_elsewhere_after_recover(

@@ -14,6 +14,8 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.recordings.read.references import read_references, references_in
 from test.recordings.making import write_bag
 
+pytestmark = pytest.mark.slow
+
 
 def written(folder: Path, text: str) -> Path:
     path = folder / 'camera.csv'

@@ -69,6 +69,7 @@ def test_images_become_references_and_a_rejected_one_its_reason(domain: int, pee
         node.end(signal.SIGINT)
 
 
+@pytest.mark.slow
 def test_a_parameter_that_is_set_acts_and_the_lens_is_found_beside_the_image(
     domain: int, peer: Any, tmp_path: Path
 ) -> None:

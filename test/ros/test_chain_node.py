@@ -81,6 +81,7 @@ def test_end_effector_links_joints_zero_and_recording(chain: Program, peer: Any,
         assert open_recording(tmp_path / folder).topics()['/link_tip/deflection'] > 5
 
 
+@pytest.mark.slow
 def test_the_frames_lead_from_the_base_to_the_deflected_end_effector() -> None:
     file = read_chain(EXAMPLE)
     tips = file.chain.tips_under(np.array([3.0, 5.0, -2.0]), file.angles)
@@ -107,6 +108,7 @@ def test_the_frames_lead_from_the_base_to_the_deflected_end_effector() -> None:
     assert at == pytest.approx(end.deflected.position, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_a_prefix_is_before_every_frame() -> None:
     file = read_chain(EXAMPLE).with_settings(ChainSettings(frame_prefix='left_'))
     tips = file.chain.tips_under(np.array([3.0, 5.0, -2.0]), file.angles)

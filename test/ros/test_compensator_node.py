@@ -117,6 +117,7 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
     assert plant.step() <= WITHIN
 
 
+@pytest.mark.slow
 def test_a_transition_lets_the_offsets_go_back_to_zero(compensator: Program, peer: Any) -> None:
     plant = Plant(peer.node)
     peer.until(lambda: plant.error() > 2e-3, 'a deflection')
@@ -145,6 +146,7 @@ def changed_state(peer: Any, wanted: int) -> bool:
     return bool(peer.call(ChangeState, '/compensator/change_state', change).success)
 
 
+@pytest.mark.slow
 def test_a_transition_with_offsets_that_stay_fails_and_says_so(compensator: Program, peer: Any) -> None:
     """Offsets that take too long to go back, and a controller that does not tell what it has."""
     plant = Plant(peer.node)
@@ -175,6 +177,7 @@ def test_a_transition_with_offsets_that_stay_fails_and_says_so(compensator: Prog
     assert plant.step() <= WITHIN
 
 
+@pytest.mark.slow
 def test_a_main_thread_that_hangs_does_not_keep_the_offsets_from_holding(domain: int, peer: Any) -> None:
     reading, writing = os.pipe()
     process = subprocess.Popen([sys.executable, '-c', HANGS, *ARGUMENTS, '--stale', STALE], cwd=ROOT, stdin=reading)
@@ -298,6 +301,7 @@ def test_a_parameter_that_cannot_be_is_rejected(domain: int, words: list[str], r
     assert reported in ended.stderr
 
 
+@pytest.mark.slow
 def test_a_robot_that_does_not_run_holds_the_offsets(domain: int, peer: Any) -> None:
     """By what its driver said before the node came, by its speed, and by a controller that ends."""
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -349,6 +353,7 @@ def test_a_controller_state_that_is_not_installed_is_rejected(domain: int) -> No
     assert 'no message of that name is installed' in ended.stderr
 
 
+@pytest.mark.slow
 def test_after_an_error_of_its_own_the_offsets_go_back_to_zero(domain: int, peer: Any, tmp_path: Path) -> None:
     flag = tmp_path / 'flag'
     plant = Plant(peer.node)
@@ -393,6 +398,7 @@ def test_a_gate_that_fails_on_the_way_out_leaves_no_offset(domain: int, peer: An
         node.end()
 
 
+@pytest.mark.slow
 def test_killed_and_started_again_it_makes_no_step(domain: int, peer: Any) -> None:
     """The controller keeps the offsets that it had, and says so; ours begin there. Two at once hold."""
     command = [*PSD_DEFLECTION, *ARGUMENTS, '--stale', STALE]
@@ -445,6 +451,7 @@ def test_without_a_file_the_arm_is_the_one_of_robot_description(domain: int, pee
         assert node.end() == 0
 
 
+@pytest.mark.slow
 def test_a_signal_ends_the_waiting_for_robot_description(domain: int) -> None:
     node = Program((*PSD_DEFLECTION, 'compensator', '--tip', 'tool'), env={'PYTHONWARNINGS': WARNINGS})
     node.until('waiting for the robot on /robot_description')

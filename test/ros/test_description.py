@@ -58,6 +58,7 @@ def test_an_empty_one_is_no_description(signals: Signals, peer: Any) -> None:
         robot_description(signals, texts(reported.append), wait_s=5.0, clock=clock)
 
 
+@pytest.mark.slow
 def test_a_signal_ends_the_waiting(signals: Signals) -> None:
     signals.stop = True
     with pytest.raises(StopRequestedError):

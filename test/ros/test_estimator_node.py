@@ -126,6 +126,7 @@ def test_what_is_published_and_how_often(start: Callable[..., Any], peer: Any) -
     assert float(values['rate (samples/s)']) > 0
 
 
+@pytest.mark.slow
 def test_another_vendors_dds_sees_the_same_values(start: Callable[..., Any], peer: Any) -> None:
     start()
     poses = peer.collect(PoseStamped, '/link_tip/deflection')
@@ -239,6 +240,7 @@ def test_the_rig_is_latched_and_reported_again_when_it_changes(
     assert len(changes()) == 2
 
 
+@pytest.mark.slow
 def test_a_disk_that_hangs_holds_up_its_own_requests_alone(
     start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str
 ) -> None:
@@ -354,6 +356,7 @@ def each_parameter_says_what_it_takes(peer: Any) -> None:
     assert constraints['autostart'] == 'read at the start of the process'
 
 
+@pytest.mark.slow
 def test_a_dump_of_the_parameters_starts_the_node_again(start: Callable[..., Any], peer: Any, tmp_path: Path) -> None:
     first = start('--ros-args', '-p', 'sum_min:=2.4', '-p', "psd_1.axes:=[-y, 'x']")
     first.until('publishing on ROS domain')
@@ -377,6 +380,7 @@ def test_a_dump_of_the_parameters_starts_the_node_again(start: Callable[..., Any
     ]
 
 
+@pytest.mark.slow
 def test_the_log_file_of_the_process_has_the_lines(start: Callable[..., Any], tmp_path: Path) -> None:
     daemon = start('--ros-args', '-p', f'zero_file:={tmp_path}', '--log-level', 'warn', '--log-file-name', 'tip')
     daemon.until('no port given')
@@ -491,6 +495,7 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     peer.until(lambda: shown() != [0.0, 0.0], 'the zero among the parameters')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('signals', [[signal.SIGINT], [signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
 def test_signals_end_it_and_leave_a_whole_recording(
     start: Callable[..., Any], peer: Any, tmp_path: Path, signals: list[int]

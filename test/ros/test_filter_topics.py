@@ -25,6 +25,7 @@ from psd_deflection.records import KNOWN_LOAD  # noqa: E402
 from test.ros.conftest import BLOCK_NS, stamp  # noqa: E402
 
 
+@pytest.mark.slow
 def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     start: Callable[..., Any], peer: Any, tmp_path: Path, simulated_port: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -84,6 +85,7 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     assert 'no bit differs' in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_without_the_filter_there_is_no_topic_of_it(start: Callable[..., Any], peer: Any, simulated_port: str) -> None:
     start('--port', simulated_port)
     health = peer.collect(DiagnosticArray, '/diagnostics')

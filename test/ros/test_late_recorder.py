@@ -25,6 +25,8 @@ from psd_deflection.run.fanout import published
 from test.late import Heard, written
 from tools.program import WAIT_S
 
+pytestmark = pytest.mark.slow
+
 
 def recorded_late(peer: Any, poses: list[Any], folder: Path) -> Path:
     """A bag of what is heard from now on until two seconds after the node has told all that it remembers."""

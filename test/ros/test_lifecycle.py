@@ -208,6 +208,7 @@ def test_a_device_that_is_not_there_leaves_the_node_unconfigured(start: Callable
     assert daemon.wait() == 0, daemon.lines
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], device: Any, number: signal.Signals) -> None:
     device.answer = b''
@@ -218,6 +219,7 @@ def test_a_signal_ends_the_waiting_for_a_device(start: Callable[..., Any], devic
     assert not any('Traceback' in line for line in daemon.lines)
 
 
+@pytest.mark.slow
 def test_the_zero_holds_for_the_next_run(
     start: Callable[..., Any], peer: Any, simulated_port: str, tmp_path: Path
 ) -> None:

@@ -89,6 +89,7 @@ def test_markers_are_removed_without_an_estimate() -> None:
     assert {m.lifetime.sec for m in moving(slow, estimate(), dots, 10.0).markers} == {6}
 
 
+@pytest.mark.slow
 def test_a_late_rviz_sees_both(start: Callable[..., Any], peer: Any) -> None:
     start('--ros-args', '-p', 'markers:=true')
     moves = peer.collect(MarkerArray, '/link_tip/markers')

@@ -14,6 +14,7 @@ pytest.importorskip('rclpy')
 from psd_deflection.ros.running import OTHER_CHOICES, TRANSPORTS, ros  # noqa: E402
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('shared_memory', [False, True])
 def test_a_process_that_is_killed_makes_no_other_deaf(
     domain: int, monkeypatch: pytest.MonkeyPatch, shared_memory: bool
@@ -25,6 +26,7 @@ def test_a_process_that_is_killed_makes_no_other_deaf(
         assert os.environ.get(TRANSPORTS) == (None if shared_memory else 'UDPv4')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('choice', OTHER_CHOICES)
 def test_the_choice_of_the_user_stays(domain: int, monkeypatch: pytest.MonkeyPatch, choice: str) -> None:
     for one in OTHER_CHOICES:

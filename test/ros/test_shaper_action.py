@@ -154,6 +154,7 @@ def test_a_goal_is_shaped_and_its_result_is_that_of_the_controller(begin: Callab
     assert len(arm.feedback[-1].feedback.actual.positions) == 2
 
 
+@pytest.mark.slow
 def test_a_new_goal_takes_the_place_of_the_old_without_a_step(begin: Callable[..., Arm]) -> None:
     arm = begin()
     first = arm.send(arm.goal(seconds=2.0))
@@ -170,6 +171,7 @@ def test_a_new_goal_takes_the_place_of_the_old_without_a_step(begin: Callable[..
     np.testing.assert_allclose(two.states[0, :2], here, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_cancelled_goal_is_held_and_the_next_begins_there(begin: Callable[..., Arm]) -> None:
     arm = begin()
     handle = arm.send(arm.goal(seconds=2.0))
@@ -188,6 +190,7 @@ def test_a_cancelled_goal_is_held_and_the_next_begins_there(begin: Callable[...,
     np.testing.assert_allclose(path.states[0], [held, [0.0, 0.0]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_followed_is_aborted_with_the_reason(begin: Callable[..., Arm]) -> None:
     arm = begin('--urdf', str(ROOT / 'config' / 'two_links.urdf'), *WORDS)
     assert arm.controller is not None
@@ -243,6 +246,7 @@ def test_what_no_goal_may_be_is_rejected_at_the_gate(begin: Callable[..., Arm]) 
     rejected(arm.goal(), 'the node is not active')
 
 
+@pytest.mark.slow
 def test_a_flood_of_goals_is_cut_off(begin: Callable[..., Arm]) -> None:
     arm = begin()
 
@@ -254,6 +258,7 @@ def test_a_flood_of_goals_is_cut_off(begin: Callable[..., Arm]) -> None:
     arm.peer.until(flooded, 'the end of the flood')
 
 
+@pytest.mark.slow
 def test_what_no_client_of_ros_sends_ends_nothing(begin: Callable[..., Arm]) -> None:
     arm = begin()
     for kind in ('half', 'text'):
@@ -276,6 +281,7 @@ def test_what_no_client_of_ros_sends_ends_nothing(begin: Callable[..., Arm]) -> 
     arm.peer.until(taken, 'a goal that succeeds')
 
 
+@pytest.mark.slow
 def test_a_controller_that_is_not_there_ends_a_goal_at_once(begin: Callable[..., Arm]) -> None:
     arm = begin()
     assert arm.controller is not None
@@ -295,6 +301,7 @@ def test_a_controller_that_is_not_there_ends_a_goal_at_once(begin: Callable[...,
     assert arm.followed(arm.goal())[0] == SUCCEEDED
 
 
+@pytest.mark.slow
 def test_a_controller_that_says_nothing_more_ends_a_goal(begin: Callable[..., Arm]) -> None:
     arm = begin()
     assert arm.controller is not None
@@ -306,6 +313,7 @@ def test_a_controller_that_says_nothing_more_ends_a_goal(begin: Callable[..., Ar
     assert 'no feedback for 5 s' in response.result.error_string
 
 
+@pytest.mark.slow
 def test_a_controller_that_does_not_answer_ends_a_goal(
     begin: Callable[..., Arm], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -342,6 +350,7 @@ def test_what_rclpy_cannot_take_is_rejected(control_msgs: None, peer: Peer, monk
     node.destroy_node()
 
 
+@pytest.mark.slow
 def test_a_stopped_shaper_stops_the_arm(begin: Callable[..., Arm]) -> None:
     arm = begin()
     handle = arm.send(arm.goal(seconds=20.0))
@@ -379,6 +388,7 @@ def test_an_action_that_cannot_be_is_rejected(
     assert why in ended.stderr
 
 
+@pytest.mark.slow
 def test_without_control_msgs_the_package_to_install_is_named(domain: int, tmp_path: Path) -> None:
     words = ['shaper', '--shaper', 'none']
     command = [sys.executable, '-c', NO_ACTION, *words, '--action', ACTION]

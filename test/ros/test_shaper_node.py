@@ -127,6 +127,7 @@ def test_a_move_is_shaped_and_a_bad_one_rejected(node: Program, peer: Any) -> No
     peer.until(lambda: any(not h.points for h in heard), 'the stop')
 
 
+@pytest.mark.slow
 def test_the_limits_come_from_the_robots_description(domain: int, peer: Any) -> None:
     words = [*ZVD, '--urdf', 'robot_description']
     node = Program([*PSD_DEFLECTION, 'shaper', *words], env={'PYTHONWARNINGS': WARNINGS})

@@ -109,6 +109,7 @@ def test_the_tip_moves_with_each_primary_estimate_while_active(monkeypatch: pyte
     assert len(node.destroyed) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec('tf2_msgs') is None, reason='tf2_msgs comes with a ROS installation')
 def test_the_node_publishes_the_tree_by_default(start: Callable[..., Any], peer: Any) -> None:
     from tf2_msgs.msg import TFMessage
@@ -122,6 +123,7 @@ def test_the_node_publishes_the_tree_by_default(start: Callable[..., Any], peer:
     assert {t.child_frame_id for m in moving for t in m.transforms} == {'left_link_tip'}
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec('tf2_msgs') is not None, reason='tf2_msgs is there')
 def test_without_tf2_msgs_the_node_says_that_there_are_no_frames_if_they_were_asked_for(
     start: Callable[..., Any],

@@ -31,6 +31,8 @@ from psd_deflection.run.reading.arrivals import Arrival, Ended, Item, Noted, Res
 from psd_deflection.run.reading.pinger import UNANSWERED
 from test.heard import WAIT_S
 
+pytestmark = pytest.mark.slow
+
 HELLO_INFO: dict[str, object] = {
     'serial': 'T-1',
     'firmware': 'test',

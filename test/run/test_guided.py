@@ -14,6 +14,8 @@ from psd_deflection.rig.config import load_rig
 from psd_deflection.run.guided import run_guided
 from psd_deflection.studies.check.result import WRONG
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_simulated_rig_and_hand_show_a_wrong_wiring() -> None:
     logged: list[str] = []

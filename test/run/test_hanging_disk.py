@@ -276,6 +276,7 @@ def test_a_start_that_hangs_does_not_hold_up_the_end_of_the_run(live: Live, disk
     assert not disk.go_on.is_set()
 
 
+@pytest.mark.slow
 def test_starts_and_ends_without_end_on_a_disk_that_hangs_make_a_few_threads(live: Live, disk: Disk) -> None:
     disk.hang('open')
     before = threading.active_count()
@@ -289,6 +290,7 @@ def test_starts_and_ends_without_end_on_a_disk_that_hangs_make_a_few_threads(liv
     disk.go_on.set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('asked_for', [False, True])
 def test_an_end_that_hangs_holds_up_the_end_of_the_run_for_its_time_alone(
     live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch, asked_for: bool
@@ -383,6 +385,7 @@ def test_estimates_flow_while_the_disk_hangs_at_a_zero(live: Live, disk: Disk, t
     assert kept() == [1e-4, -2e-4]
 
 
+@pytest.mark.slow
 def test_a_zero_that_hangs_holds_up_the_end_of_the_run_for_its_time_alone(
     live: Live, disk: Disk, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -29,6 +29,8 @@ from psd_deflection.run.reading.acquisition import Acquisition
 from psd_deflection.run.reading.arrivals import Arrival
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
 
+pytestmark = pytest.mark.slow
+
 VOLTS = 10.0 / 32768
 GOOD: dict[str, object] = {
     'serial': 'T-1',

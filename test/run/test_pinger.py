@@ -11,6 +11,8 @@ import pytest
 from psd_deflection.devices.source import PortClosedError, Source
 from psd_deflection.run.reading.pinger import PING_S, UNANSWERED, Pinger
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def source() -> Mock:

@@ -26,6 +26,8 @@ from psd_deflection.run.session import Session
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice
 
+pytestmark = pytest.mark.slow
+
 Sample = Callable[..., SampleFrame]
 
 STARTS = [(3000, 205), (2**31 + 7, 193), (5, 200), (4_000_000_000, 120), (3_999_999_870, 110)]

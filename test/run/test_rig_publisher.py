@@ -95,7 +95,7 @@ def loads() -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
     return out
 
 
-@pytest.fixture(scope='module', params=[{}, MODAL], ids=['defaults', 'modal'])
+@pytest.fixture(scope='module', params=[{}, pytest.param(MODAL, marks=pytest.mark.slow)], ids=['defaults', 'modal'])
 def running(request: pytest.FixtureRequest) -> Running:
     return Running(load_rig(overrides=request.param), 4000)
 

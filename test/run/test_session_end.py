@@ -50,6 +50,7 @@ class Hanging:
         self.waited_s += timeout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('part', 'reported'),
     [
@@ -186,6 +187,7 @@ def test_a_disk_that_fills_gives_a_true_sentence_and_status(
     assert main(['replay', str(folder), '--compare']) == 0
 
 
+@pytest.mark.slow
 def test_what_waits_at_the_end_behind_a_part_that_hangs_is_counted_and_the_part_named(
     device: Any,
     rig: Rig,

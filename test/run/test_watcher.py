@@ -33,6 +33,8 @@ from psd_deflection.studies.discover.from_recordings import read_observation
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice
 
+pytestmark = pytest.mark.slow
+
 START_NS = 1_700_000_000_000_000_000
 
 

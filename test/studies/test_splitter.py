@@ -54,7 +54,7 @@ def test_two_lenses_leave_two_parallel_beams_apart() -> None:
     assert dots_apart(0.010, (0.100, 0.025), between=0.0, path=0.020) == pytest.approx(0.0, abs=1e-15)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_one_that_fails_costs_certainty_and_a_cold_spare_its_warm_up() -> None:
     both, out, alone, cold, spare = simulated(RIG, Lasers((1e-3, 1e-3), 1e-3, 0.5))
     assert [p.estimates for p in (both, out, alone, cold, spare)] == [1.0, 1.0, 1.0, 0.0, 1.0]

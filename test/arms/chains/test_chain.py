@@ -147,7 +147,7 @@ def test_a_chain_that_says_nothing_takes_the_load_to_hang_at_its_end() -> None:
     assert_agrees(chain.compose([TipDeflection(tip, CERTAIN) for tip in frame.tips]), frame.end, 0.007)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('slopes', 'share'), [('end_force', 0.0), ('end_force', 0.3), ('end_force', 1.0), ('ratio', 0.0)]
 )
@@ -171,7 +171,7 @@ def test_the_covariance_holds_what_the_assumption_about_the_load_leaves(slopes: 
     assert np.median(stated) < 6.0 * np.median(error)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize('slopes', ['ratio', 'end_force'])
 def test_covariance_is_that_of_chance(slopes: str) -> None:
     rng = np.random.default_rng(5)

@@ -49,7 +49,7 @@ def judged() -> dict[str, motion.Result]:
     return {kind: motion.judge(motion.make(kind, seconds[kind], 2), RIG) for kind in motion.KINDS}
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', motion.KINDS)
 def test_velocity_prediction_and_innovations(kind: str, judged: dict[str, motion.Result]) -> None:
     for axis in motion.figures([judged[kind]]):
@@ -60,7 +60,7 @@ def test_velocity_prediction_and_innovations(kind: str, judged: dict[str, motion
         assert axis.foretold < 0.5 * axis.held
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(judged: dict[str, motion.Result]) -> None:
     swept = judged['chirp']
     # The frequency rises with time, from 0.5 Hz to 1.2 times that of the mode.
@@ -68,7 +68,7 @@ def test_the_prediction_is_better_than_the_held_estimate_at_every_frequency(judg
         assert np.all(np.square(foretold).mean(axis=0) < 0.9 * np.square(held).mean(axis=0))
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_covariance_of_the_pose_is_that_of_its_errors() -> None:
     run = motion.make('operation', 10.0, 6)
     moved = through(Pipeline(RIG), run, range(500))[150:]
@@ -81,6 +81,7 @@ def test_the_covariance_of_the_pose_is_that_of_its_errors() -> None:
     np.testing.assert_allclose(found / scale, stated / scale, atol=0.3)
 
 
+@pytest.mark.slow
 def test_without_samples_for_100_ms_the_truth_is_within_three_deviations(operation: motion.Run) -> None:
     beyond = []
     pipeline = Pipeline(RIG)
@@ -100,13 +101,14 @@ def test_without_samples_for_100_ms_the_truth_is_within_three_deviations(operati
     assert after.covariance[0] < 100.0 * before.covariance[0]
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize('kind', motion.KINDS)
 def test_100_ms_later_the_truth_is_within_three_deviations(kind: str, judged: dict[str, motion.Result]) -> None:
     unseen = judged[kind].unseen
     assert np.all(np.mean(np.abs(unseen[np.isfinite(unseen[:, 0])]) < 3.0, axis=0) > 0.97)
 
 
+@pytest.mark.slow
 def test_what_loads_did_is_recorded_and_goes_on_from_there() -> None:
     run = motion.make('steps', 6.0, 2)
     run.volts[5200:5300, 2] = 0.0
@@ -123,6 +125,7 @@ def test_what_loads_did_is_recorded_and_goes_on_from_there() -> None:
     assert np.all(np.array(found[262].covariance[::4]) > 4.0 * np.array(found[255].covariance[::4]))
 
 
+@pytest.mark.slow
 def test_a_lost_laser_is_coasted_through_and_reported(operation: motion.Run) -> None:
     dark = motion.Run(operation.loads, operation.pose, operation.velocity, operation.volts.copy())
     dark.volts[4000:4100, 2] = 0.0
@@ -135,6 +138,7 @@ def test_a_lost_laser_is_coasted_through_and_reported(operation: motion.Run) -> 
     assert np.all(np.diff(deviations, axis=0) > 0.0)
 
 
+@pytest.mark.slow
 def test_coasting_ends(operation: motion.Run) -> None:
     dark = motion.Run(operation.loads, operation.pose, operation.velocity, operation.volts.copy())
     dark.volts[4000:, 2] = 0.0
@@ -146,6 +150,7 @@ def test_coasting_ends(operation: motion.Run) -> None:
     assert STATE not in dict(memory.values)
 
 
+@pytest.mark.slow
 def test_ahead_is_the_prediction(operation: motion.Run) -> None:
     now, later = Pipeline(RIG), Pipeline(motion.rig_of({'filter_ahead': 0.005}))
     there = through(later, operation, range(250))[-1]
@@ -159,6 +164,7 @@ def test_ahead_is_the_prediction(operation: motion.Run) -> None:
     assert np.all(np.abs(pose(there) - truth(operation, there)) < 4.0 * np.sqrt(there.covariance[::4]))
 
 
+@pytest.mark.slow
 def test_a_known_load_is_foretold() -> None:
     run = motion.make('steps', 6.0, 11)
     reported, untold = Pipeline(RIG), Pipeline(RIG)
@@ -174,6 +180,7 @@ def test_a_known_load_is_foretold() -> None:
     assert off < 0.5 * blind
 
 
+@pytest.mark.slow
 def test_the_process_noise_can_be_stated(operation: motion.Run) -> None:
     pipeline = Pipeline(motion.rig_of({'filter_load_walk': [10.0, 10.0, 1.0]}))
     through(pipeline, operation, range(200))
@@ -240,6 +247,7 @@ def test_a_load_is_noted_once() -> None:
     assert pipeline.load(AppliedLoad(1_700_000_001_000_000_000, 1.0, 0.0, 0.0)) is None
 
 
+@pytest.mark.slow
 def test_a_simulated_recording_replays_to_the_bit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rig = tmp_path / 'rig.yaml'
     rig.write_text('/**:\n  ros__parameters:\n    filter: modal\n')

@@ -90,7 +90,7 @@ def test_a_ringing_plate_is_followed_where_samples_are_missing_too(slots: IntArr
     assert worst_of_mean > 3e-5
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_what_is_stated_of_a_dying_motion_is_its_error() -> None:
     """A mode of 14 Hz with 2 % of damping, from 0.1 mm to nothing: motion that is over is stated no longer."""
     rng = np.random.default_rng(4)
@@ -276,7 +276,7 @@ def shaken(fit: BlockFit, hz: float, amplitude: float, blocks: int, seed: int = 
     return np.array(errors) / np.array(sds), np.array(sds)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(('hz', 'amplitude'), [(5.0, 15e-6), (20.0, 15e-6), (30.0, 10e-6)])
 def test_a_steady_motion_that_bends_a_block_by_as_much_as_its_noise_is_in_the_variance(
     hz: float, amplitude: float
@@ -285,7 +285,7 @@ def test_a_steady_motion_that_bends_a_block_by_as_much_as_its_noise_is_in_the_va
     assert 0.94 < np.mean(np.abs(z[500:]) < 1.959964) < 0.97
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_at_rest_the_memory_of_motion_adds_little_noise() -> None:
     z, sds = shaken(fitter(), 5.0, 0.0, 4000)
     assert np.std(z * sds) < 1.04 * SIGMA / SIZE**0.5 / 2.0**0.5 * 2.0**0.5

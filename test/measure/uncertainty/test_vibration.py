@@ -127,6 +127,7 @@ def test_a_vibration_is_counted_and_named(hz: float) -> None:
     assert s.words == f'vibrates: 14 µm rms near {hz:g} Hz'
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('label', [row.label for row in ROWS])
 @pytest.mark.parametrize('loss', ['none', '20 %'])
 def test_it_does_not_fire(label: str, loss: str) -> None:

@@ -87,6 +87,7 @@ def test_it_is_simulated_and_corrected(rig: Rig) -> None:
     assert blind.max() > 1e-6
 
 
+@pytest.mark.slow
 def test_it_is_discovered_and_named(rig: Rig, tmp_path: Path) -> None:
     run, out = tmp_path / 'run', tmp_path / 'found'
     words = ['--loads', 'identification', '--temperature', '20,26,22', '--effect', f'{NAME},psd=2,k=2e-4']

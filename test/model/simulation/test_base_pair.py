@@ -22,6 +22,8 @@ from psd_deflection.recordings.read.readers import open_recording
 from psd_deflection.rig.config import load_rig
 from test.judges import RayPlane
 
+pytestmark = pytest.mark.slow
+
 BASE = {'psd_1.height': -0.585, 'psd_2.height': -0.485, 'solver': 'base_pair', 'solvers': ['base_pair']}
 
 

@@ -13,6 +13,8 @@ from psd_deflection.model.plate import Geometry
 from psd_deflection.model.solvers import make_solver
 from psd_deflection.studies.thesis.comparison import VARIANCES, dots_of, grid, thesis_geometry
 
+pytestmark = pytest.mark.slow
+
 UNITS = np.array([1e6, 1e6, 1e3 * 180.0 / np.pi])
 
 

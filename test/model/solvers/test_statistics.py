@@ -51,7 +51,7 @@ BIASED = {'ols', 'wls', 'appendix_d_ols', 'appendix_d_wls', 'minimum_tilt'}
 """Their answer to noise-free dots is not the pose; the interval is then about that answer."""
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(('method', 'options', 'where', 'tilt'), CASES)
 def test_covariance_and_coverage(
     golden: Any, rays: Any, method: str, options: dict[str, Any], where: str, tilt: tuple[float, ...]

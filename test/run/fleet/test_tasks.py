@@ -127,6 +127,7 @@ def test_a_worker_of_another_version_is_named(monkeypatch: pytest.MonkeyPatch) -
     assert answer.error.startswith(f'a worker has psd_deflection {__version__}, here is 99.0')
 
 
+@pytest.mark.slow
 def test_a_killed_process_costs_only_its_task(tmp_path: Path) -> None:
     names = [str(tmp_path / name) for name in ('a', 'poison', 'bb', 'once', 'ccc')]
     with open_engine('processes:2') as pool:
@@ -135,6 +136,7 @@ def test_a_killed_process_costs_only_its_task(tmp_path: Path) -> None:
     assert found[1].error.endswith('poison: its worker was killed, twice; too little memory?')
 
 
+@pytest.mark.slow
 def test_a_run_that_is_given_up_leaves_no_process() -> None:
     before = multiprocessing.active_children()
 

@@ -507,6 +507,7 @@ def test_a_recording_is_paused_and_sought(page: Page, start: Start) -> None:
     assert page.complaints() == []
 
 
+@pytest.mark.slow
 def test_half_an_hour_leaves_the_heap_as_it_was(page: Page, serve: Callable[..., Serving]) -> None:
     serving = serve()
     look_on, connections = serving.server.look_on, 0

@@ -177,6 +177,7 @@ def test_the_hours_fit_the_screen(page: Page, hour: Serving, width: int) -> None
     choose(page, '30 s')
 
 
+@pytest.mark.slow
 def test_looking_at_hours_for_long_leaves_the_heap_as_it_was(
     page: Page, hour: Serving, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -86,7 +86,7 @@ def test_a_deviation_that_is_hardly_known_is_drawn_wider() -> None:
     assert ratio == pytest.approx(math.sqrt(8.0 / 6.0), rel=0.03)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_u_is_half_of_the_drawn_interval() -> None:
     answer = budget(BudgetProblem(RIG, draws=20_000))
     assert answer.interval is not None

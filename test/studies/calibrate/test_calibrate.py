@@ -154,7 +154,7 @@ def test_every_recording_has_a_zero_of_its_own(nominal: Rig) -> None:
     assert np.mean(errors**2) < 2.0
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_late_reference_is_put_right(nominal: Rig, pose: FloatArray) -> None:
     recorded = misaligned.record(only(), pose, np.random.default_rng(2))
     run = campaign.run_of(recorded)
@@ -183,7 +183,7 @@ def test_a_recording_without_reference_and_loads_is_rejected(nominal: Rig, pose:
         calibrate([CalibrationRun(run.name, run.t, run.volts, run.reference_t[:0], run.reference[:0])], nominal)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_redundant_reading_alone_reports_a_relative_gain(nominal: Rig, pose: FloatArray) -> None:
     run = campaign.run_of(misaligned.record(only(psd_1__gain_x=0.02), pose, np.random.default_rng(2)))
     found = calibrate(
@@ -210,7 +210,7 @@ def test_known_loads_alone_leave_the_scale_to_the_clamp(nominal: Rig) -> None:
     assert found.sd[AT['psd_1.gain_x']] > 0.003
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
     rng = np.random.default_rng(9)
     truth = misaligned.draw(rng)
@@ -224,7 +224,7 @@ def test_check_names_what_moved(nominal: Rig, pose: FloatArray) -> None:
     assert abs(value - 0.03) < 4.0 * sd
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_short_campaign_covers_the_truth() -> None:
     """`make campaign NAME=blind-calibration` in its shortest form: wide bounds, for it is one rig, and it is moved."""
     found = campaign.summary([campaign.score(1)])

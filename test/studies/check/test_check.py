@@ -111,7 +111,7 @@ def lines_of(turn: Turn) -> dict[str, object]:
     return out
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_each_of_127_wrong_wirings_is_named_from_three_pushes() -> None:
     turns = every_turn()
     assert len(turns) == 128
@@ -126,7 +126,7 @@ def test_each_of_127_wrong_wirings_is_named_from_three_pushes() -> None:
     assert not misnamed
 
 
-@pytest.mark.parametrize('seeds', [range(2), pytest.param(range(2, 20), marks=pytest.mark.statistics)])
+@pytest.mark.parametrize('seeds', [range(2), pytest.param(range(2, 20), marks=pytest.mark.slow)])
 def test_a_right_rig_is_accused_by_none_of_20_seeds(seeds: range) -> None:
     for size, seed in itertools.product((10.0, 10.0 * BLOCK), seeds):
         loads = pushes(size)

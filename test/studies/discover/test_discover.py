@@ -83,6 +83,7 @@ def test_the_hidden_effect_is_named_with_its_size(rotated: Discovery) -> None:
     assert rotated.simulations < 2000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('large', 'small'),
     [
@@ -114,6 +115,7 @@ def test_a_small_effect_behind_a_large_one_is_named_too(large: dict[str, object]
     assert f'{found.floors:.2f} times what noise alone leaves' in found.sentence
 
 
+@pytest.mark.slow
 def test_a_size_that_the_recordings_leave_open_has_no_number_for_its_sd(rotated: Discovery) -> None:
     without = replace(rotated, effects=tuple(replace(e, sd={'angle': 14000.0}) for e in rotated.effects))
     known, left_open = (
@@ -124,7 +126,7 @@ def test_a_size_that_the_recordings_leave_open_has_no_number_for_its_sd(rotated:
     assert '1.4e+04' not in left_open
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(
     'hidden',
     [
@@ -178,7 +180,7 @@ def test_result_keeps_to_the_contract_and_to_json(rotated: Discovery) -> None:
     assert json.loads(json.dumps(tree, allow_nan=False)) == tree
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_what_one_length_cannot_report_two_can() -> None:
     one = discover([observe(with_effect('clamp_bending_compliance', compliance=2e-7))], RIG, bank=BANK)
     (effect,) = one.effects
@@ -197,6 +199,7 @@ def test_what_one_length_cannot_report_two_can() -> None:
     assert effect.equivalent == ()
 
 
+@pytest.mark.slow
 def test_a_load_cell_with_a_wrong_zero_is_named_from_two_lengths() -> None:
     history = loads.steps([(0, 0, 0), (5, -20, -9), (0, 0, 0)], 0.5).loads
     zero = {'effects.e.name': 'tip_force', 'effects.e.x': 0.05, 'effects.e.y': -0.1}
@@ -215,7 +218,7 @@ def test_a_load_cell_with_a_wrong_zero_is_named_from_two_lengths() -> None:
     assert 'The estimates of the pose are right without' in found.sentence
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_what_is_not_in_the_library_is_unknown_and_not_merged() -> None:
     observed = observe(RIG, seed=3)
     volts = observed.volts.copy()
@@ -232,7 +235,7 @@ def two_effects(first: dict[str, object], second: dict[str, object]) -> Rig:
     return replace_values(RIG, {f'effects.{k}.{n}': v for k, e in both.items() for n, v in e.items()})
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
     lag = observe(with_effect('amplifier_lag', time_constant=3e-5))
     near = {*NEAR} - {'amplifier_lag'}
@@ -247,7 +250,7 @@ def test_sizes_that_agree_beyond_chance_are_put_down_to_one_cause() -> None:
     assert [e.active.effect.name for e in discover([lag], RIG, bank=BANK).effects] == ['amplifier_lag']
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_independent_sizes_are_left_alone() -> None:
     skews = [{'name': 'channel_skew', 'psd': psd, 'delay': delay} for psd, delay in ((1, 2e-5), (2, 3.1e-5))]
     found = discover([observe(two_effects(*skews))], RIG, bank=BANK)
@@ -255,6 +258,7 @@ def test_independent_sizes_are_left_alone() -> None:
     assert coincidences(found.fit, found.workspace.physics) == []
 
 
+@pytest.mark.slow
 def test_a_parameter_stays_where_the_rig_lets_it() -> None:
     workspace = Workspace([observe(RIG)])
     ambient = make_active('ambient_light', {'psd': 2, 'level': 0.01, 'x': 0.4, 'y': 0.0}, 'test')
@@ -265,6 +269,7 @@ def test_a_parameter_stays_where_the_rig_lets_it() -> None:
 # Pieces.
 
 
+@pytest.mark.slow
 def test_directions_that_cannot_be_observed_are_left_alone() -> None:
     fisher = np.array([[1.0, 1.0], [1.0, 1.0]])
     gain, rank, c = solve_observable(fisher, np.array([2.0, 2.0]), np.diag(fisher))
@@ -306,6 +311,7 @@ def test_from_simulate_to_model(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert [a.effect.name for a in effects_of_rig(load_rig(model))] == ['sensor_gain']
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('effect', 'wrong'), [('sensor_rotation,psd=1,angle=0.02', True), ('amplifier_lag,time_constant=2e-4', False)]
 )
@@ -323,6 +329,7 @@ def test_what_an_estimate_is_wrong_by_is_what_the_model_changes_in_a_replay(
     assert ('An estimate is not corrected for amplifier_lag.' in found.sentence) is not wrong
 
 
+@pytest.mark.slow
 def test_a_bag_reports_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     short = tmp_path / 'short.yaml'
     short.write_text(described(replace_values(RIG, {'link.length': 0.4}), ()))
@@ -336,6 +343,7 @@ def test_a_bag_reports_its_own_rig_but_not_what_was_hidden(tmp_path: Path, capsy
     assert found.verdict == 'nothing_missing'
 
 
+@pytest.mark.slow
 def test_a_zero_taken_while_it_ran_is_part_of_the_rig(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert main(['simulate', '--out', str(tmp_path / 'run'), '--loads', 'thesis:0.5']) == 0
     recording = open_recording(tmp_path / 'run')
@@ -344,7 +352,7 @@ def test_a_zero_taken_while_it_ran_is_part_of_the_rig(tmp_path: Path, monkeypatc
     assert rig_at_end(recording).zeros.tolist() == [[0.0, 0.0], [1e-4, -2e-4]]
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ['--loads', 'thesis:1', '--effect', 'creep,amplitude=0.02,time_constant=1', '--temperature', '20,22']
     answers = []
@@ -358,6 +366,7 @@ def test_a_bag_and_a_csv_of_one_run_give_one_answer(tmp_path: Path, capsys: pyte
     capsys.readouterr()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('listed', 'message'),
     [
@@ -380,6 +389,7 @@ def test_a_bad_list_is_rejected_by_name(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('arguments', 'message'),
     [
@@ -399,6 +409,7 @@ def test_bad_words_of_simulate_are_rejected(
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_recording_without_loads_is_rejected_with_the_way_out(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -409,6 +420,7 @@ def test_a_recording_without_loads_is_rejected_with_the_way_out(
     assert 'holds no loads' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_finding_has_a_name_that_other_programs_know() -> None:
     known = SCHEMA['properties']['setup']['items']['properties']['name']['enum']
     assert set(NAMES) <= set(known)
@@ -416,6 +428,7 @@ def test_a_finding_has_a_name_that_other_programs_know() -> None:
         Finding('load_size', 'load 3', None, '')
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not SHARED_SCHEMA.is_file(), reason='the schema is not beside the checkout')
 def test_the_schema_is_that_of_other_programs() -> None:
     assert json.loads(SHARED_SCHEMA.read_text()) == SCHEMA

@@ -43,7 +43,7 @@ def searched(volts: FloatArray, noted: FloatArray) -> Discovery:
     return discover([Observation('x', RIG, volts, noted)])
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_weight_that_was_hung_and_never_noted_is_reported_with_what_hung() -> None:
     found = searched(read(HELD, **TURNED), noted_as(2, (0, -20, 0)))
     assert [(f.name, f.where) for f in found.setup] == [('missing_load', '8.000 s')]
@@ -55,7 +55,7 @@ def test_a_weight_that_was_hung_and_never_noted_is_reported_with_what_hung() -> 
     assert found.floors < 1.05
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_load_that_was_noted_twice_is_reported() -> None:
     found = searched(read(HELD), noted_as(5, (80, -80, 40)))
     assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 5')]
@@ -64,7 +64,7 @@ def test_a_load_that_was_noted_twice_is_reported() -> None:
     assert found.verdict == 'nothing_missing'
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_rounded_loads_are_reported_one_by_one_and_the_effect_beside_them() -> None:
     odd = LEVELS + np.array(
         [(0, 0, 0), (0, 1.3, 0), (0, -2.1, 0), (0, 1.7, 0.9), (2.2, 0, 0), (-1.1, 2.4, 0), (0, 1.9, 0), (0, 0, 0)]
@@ -78,7 +78,7 @@ def test_rounded_loads_are_reported_one_by_one_and_the_effect_beside_them() -> N
     assert found.law is None
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_rounded_loads_beside_beam_drift_are_reported() -> None:
     drift = {'effects__e__name': 'laser_pointing_drift', 'effects__e__psd': 2}
     rates = {'effects__e__rate_x': 5e-6, 'effects__e__rate_y': -5e-6}
@@ -91,7 +91,7 @@ def test_rounded_loads_beside_beam_drift_are_reported() -> None:
     assert found.simulations <= 600
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_lag_of_the_amplifiers_is_found_beside_fitted_times_which_follow_it() -> None:
     """All times a little later leave of a lag only what bends; and they are settled again beside it."""
     noted = np.tile(LEVELS[0], (len(HELD), 1))
@@ -112,7 +112,7 @@ OFF = np.zeros((8, 3))
 OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search() -> None:
     found = searched(read(np.repeat(ROUNDED + OFF, DWELL, axis=0)), np.repeat(ROUNDED, DWELL, axis=0))
     assert [(f.name, f.where) for f in found.setup] == [('load_value', f'load {i}') for i in range(1, 7)]
@@ -121,7 +121,7 @@ def test_loads_that_are_rounded_nearly_in_proportion_are_asked_before_the_search
     assert found.simulations <= 600
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(('force', 'frequency'), [(1.0, 1.3), (2.0, 1.6)])
 def test_a_weight_that_sways_is_reported_and_its_time_left_out(force: float, frequency: float) -> None:
     """So much that its swings are taken for steps of a load that nobody noted, too."""
@@ -136,7 +136,7 @@ def test_a_weight_that_sways_is_reported_and_its_time_left_out(force: float, fre
     assert found.verdict == 'nothing_missing'
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_clamp_that_sticks_is_found_beside_loads_that_were_noted_late() -> None:
     """It keeps where the load was, so that a mended load must not turn back by a thousandth behind its step."""
     sticks = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
@@ -151,7 +151,7 @@ def test_a_clamp_that_sticks_is_found_beside_loads_that_were_noted_late() -> Non
     assert found.floors < 1.05
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_noise_of_a_load_cell_is_no_effect() -> None:
     noise = np.random.default_rng(1).normal(size=HELD.shape) * (0.05, 0.05, 0.01)
     found = searched(read(HELD), HELD + noise)
@@ -167,6 +167,7 @@ def prepared(volts: FloatArray, noted: FloatArray) -> Recorded:
     return compared(recorded)[0]
 
 
+@pytest.mark.slow
 def test_the_fourth_reading_names_only_a_rotated_detector() -> None:
     soft = read(HELD, link__youngs_modulus=0.9 * RIG.link.youngs_modulus)
     for volts, noted in ((read(HELD), HELD), (read(HELD), 1.3 * HELD), (soft, HELD)):
@@ -179,7 +180,7 @@ def test_the_fourth_reading_names_only_a_rotated_detector() -> None:
     assert not turned.acquits
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wrong() -> None:
     found = searched(read(HELD, effects__e__name='bending_stiffness', effects__e__scale=-0.06), HELD)
     (effect,) = found.effects
@@ -190,7 +191,7 @@ def test_no_detector_is_named_for_what_the_link_does_and_no_estimate_called_wron
     assert 'is wrong by up to' not in found.sentence
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(('bending', 'torsion'), [(1.05, 1.03), (1.02, 1.0), (1.0, 0.97), (0.96, 1.05)])
 def test_other_natural_frequencies_than_the_rig_file_says_are_lines_for_it(bending: float, torsion: float) -> None:
     true = {'dynamics__bending_frequency': 14.0 * bending, 'dynamics__torsion_frequency': 21.0 * torsion}
@@ -211,14 +212,14 @@ def test_other_natural_frequencies_than_the_rig_file_says_are_lines_for_it(bendi
     assert 'The estimates of the pose are right without' in found.sentence
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_lower_frequency_of_the_bending_alone_may_be_a_mass_at_the_tip() -> None:
     found = searched(read(HELD, dynamics__bending_frequency=14.0 * 0.97), HELD)
     assert [(e.name, e.equivalent) for e in found.effects] == [('tip_mass', ('bending_frequency',))]
     assert found.setup == ()
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_other_frequencies_are_reported_beside_an_effect() -> None:
     true = {'dynamics__bending_frequency': 14.0 * 1.05, 'dynamics__torsion_frequency': 21.0 * 0.97}
     found = searched(read(HELD, **true, **TURNED), HELD)
@@ -228,7 +229,7 @@ def test_other_frequencies_are_reported_beside_an_effect() -> None:
     assert found.verdict == 'effects_found'
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize('step', [0.01, 0.07])
 def test_positions_that_step_alone_accuse_no_cable(step: float) -> None:
     volts = read(HELD)
@@ -250,7 +251,7 @@ def test_positions_that_step_alone_accuse_no_cable(step: float) -> None:
     assert again.floors < 1.1
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_small_delays_beside_a_twisting_clamp_are_found() -> None:
     """What is found first is a stiffness; beside the delay, which is better, the clamp is looked for again."""
     levels = np.array([(0, 0, 0), (0, -50, 0), (0, -20, 0), (0, -40, 0), (20, -30, 17.55), (-25, -15, 0), (0, -40, 0)])
@@ -265,7 +266,7 @@ def test_small_delays_beside_a_twisting_clamp_are_found() -> None:
     assert (found.verdict, found.unknown) == ('effects_found', ())
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(('late', 'angle'), [(1, 0.02), (2, 0.02), (5, 0.02), (2, 0.06)])
 def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: float) -> None:
     """Neither leaves next to nothing without the other, and stiffnesses would stand in for the delay."""
@@ -279,7 +280,7 @@ def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: floa
     assert found.floors < 1.05
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_small_delays_beside_a_second_mode_are_found() -> None:
     mode = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
     found = searched(
@@ -292,7 +293,7 @@ def test_small_delays_beside_a_second_mode_are_found() -> None:
     assert (found.verdict, found.unknown) == ('effects_found', ())
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_first_load_noted_twice_is_reported_if_no_other_pulls_that_way() -> None:
     down = [(0, -20, 0), (0, -40, -23.4), (0, -10, 0), (0, -30, 17.55)]
     acting = np.repeat(np.array([(0, 0, 0), (15, 0, 0), *down, (0, 0, 0)]), DWELL, axis=0)
@@ -306,7 +307,7 @@ def test_the_first_load_noted_twice_is_reported_if_no_other_pulls_that_way() -> 
     assert (found.verdict, found.unknown, found.law) == ('effects_found', (), None)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_no_noise_is_reported_of_what_rings_and_is_unknown() -> None:
     ringing = {'name': 'second_bending_mode', 'gain': 0.53, 'frequency': 107.0, 'damping_ratio': 0.0223, 'shares': 2}
     volts = read(HELD, **{f'effects__e__{k}': v for k, v in ringing.items()})
@@ -315,7 +316,7 @@ def test_no_noise_is_reported_of_what_rings_and_is_unknown() -> None:
     assert 'noise_level' not in [f.name for f in found.setup]
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_loads_that_are_one_sample_late_are_reported() -> None:
     found = searched(read(HELD), np.vstack((np.zeros((1, 3)), HELD[:-1])))
     assert [f.name for f in found.setup] == ['load_delay']
@@ -323,7 +324,7 @@ def test_loads_that_are_one_sample_late_are_reported() -> None:
     assert (found.verdict, found.effects) == ('nothing_missing', ())
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_spot_that_is_clipped_at_the_ends_of_the_swing_alone_is_found() -> None:
     """For moments a dot is far off: the fourth reading, in which an outlier counts little, acquits nothing then."""
     clipped = {'effects__e__name': 'spot_clipping', 'effects__e__psd': 1, 'effects__e__radius': 2e-3}
@@ -348,7 +349,7 @@ def test_a_dot_off_for_moments_is_unseen_by_the_fourth_reading() -> None:
     assert excess(comparison, table) == pytest.approx((24.0 * 2000.0, 24.0))
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_only_torque_noted_twice_is_reported_with_the_clamp_that_twists() -> None:
     """If the load were free, nothing would tell it from what the clamp does."""
     levels = np.array(
@@ -388,7 +389,7 @@ def test_free_times_are_settled_again_if_an_effect_fails() -> None:
     assert refitted(same) is same
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_link_that_rings_on_through_loads_applied_slowly_has_its_damping() -> None:
     """What rings outlasts what is left out, and a search begins far from it."""
     t = np.arange(len(HELD)) / 1000.0
@@ -448,7 +449,7 @@ def test_the_time_of_a_load_is_unseen_if_it_was_hung_in_what_is_left_out() -> No
     assert not unseen(ws, ZeroDirection(0, 0, 1e-6))
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_two_effects_under_loads_in_whole_steps_are_no_rounded_loads() -> None:
     """One of them moves the plate as a load does. Whether loads were rounded is asked first, at no search's expense."""
     two = {**TURNED, 'effects__f__name': 'load_direction', 'effects__f__angle': 0.02}

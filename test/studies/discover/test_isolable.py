@@ -20,6 +20,8 @@ from psd_deflection.studies.discover.isolable import Isolability, Isolable, isol
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
 
+pytestmark = pytest.mark.slow
+
 RIG = load_rig()
 LOADS = load_history('thesis:1', RIG.converter.sample_rate_hz).loads
 

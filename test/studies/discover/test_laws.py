@@ -87,7 +87,7 @@ def test_noise_that_follows_a_variable_is_a_law_of_its_variance() -> None:
     assert found.law.terms[0].coefficient == pytest.approx(5e-8, rel=0.1)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_law_is_reported_adopted_and_then_explains_the_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -143,7 +143,7 @@ def test_noise_beside_a_movement_is_no_law() -> None:
         assert find_jitter(ws, dataclasses.replace(null, difference=difference), penalty) is None
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_what_switches_with_the_loads_is_no_law_of_times() -> None:
     # Without the sweep, in which the load changes all the time.
     changes = np.flatnonzero(np.any(np.diff(HISTORY[:STEPS], axis=0) != 0.0, axis=1)) * 1e-3

@@ -58,6 +58,7 @@ def plan(models: tuple[Workspace, Fit, Fit]) -> Plan:
     return planned
 
 
+@pytest.mark.slow
 def test_another_length_is_planned_where_only_that_reports(plan: Plan) -> None:
     assert plan.setting.changes == {'link.length': pytest.approx(0.7 * RIG.link.length, abs=1e-3)}
     (reported,) = plan.discriminations
@@ -76,6 +77,7 @@ def test_another_length_is_planned_where_only_that_reports(plan: Plan) -> None:
     assert tree['rivals'][0]['separable']
 
 
+@pytest.mark.slow
 def test_it_is_reported_if_nothing_within_the_limits_reports(models: tuple[Workspace, Fit, Fit]) -> None:
     workspace, named, rival = models
     plan = plan_next(workspace, named, [rival], Limits(swing=0.0, sweep=0.0, lengths=(), seconds=12.0))
@@ -133,6 +135,7 @@ def test_every_proposal_is_within_the_limits_and_on_the_sensors(limits: Limits, 
     assert len(settings(rig, dataclasses.replace(limits, lengths=(), rates=(), swing=0.0))) == 1
 
 
+@pytest.mark.slow
 def test_a_rig_without_anything_can_still_be_looked_at_at_rest() -> None:
     (only,) = pieces(RIG, Limits(force=0.0, torque=0.0, sweep=0.0))
     assert only.words == '30 s unloaded'
@@ -150,6 +153,7 @@ def test_limits_are_read(words: list[str], expected: Limits) -> None:
     assert limits_from_words(words) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('word', 'part'),
     [
@@ -229,7 +233,7 @@ def soft(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_command_settles_what_one_length_leaves_open(
     soft: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -257,6 +261,7 @@ class Nothing:
         return {}
 
 
+@pytest.mark.slow
 def test_a_plan_is_written_as_files_that_the_commands_take(
     plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,6 +17,8 @@ from psd_deflection.model.simulation.declaration import Effect, EffectParameter
 from psd_deflection.records import FloatArray
 from psd_deflection.studies.discover.plants import Model, Plant, plant_effect
 
+pytestmark = pytest.mark.slow
+
 STIFFNESS = plant_effect('stiffness', EffectParameter('scale', '', -0.9, 9.0, 0.1, 'of k'))
 CUBIC = plant_effect('cubic', EffectParameter('c', 'N/mm^3', -9.0, 9.0, 0.1, 'of u^3'), equation='F += c u^3')
 SQUARE = plant_effect('square', EffectParameter('c', 'N/mm^2', -9.0, 9.0, 0.1, 'of u^2'))

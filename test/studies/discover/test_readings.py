@@ -23,6 +23,8 @@ from psd_deflection.studies.discover.from_recordings import read_tables
 from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.readings import CHANNELS, Readings, ReadingsPlant
 
+pytestmark = pytest.mark.slow
+
 RIG = load_rig()
 LOADS = np.array(
     [

@@ -103,6 +103,7 @@ def test_wiring_signs_and_units_are_put_right(
     assert replace_values(RIG, lines).values == mended.rig.values
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('factor', 'unit'), [(9.80665e-3, 'kg mm'), (1e-2, 'N cm'), (9.80665e-2, 'kg cm')], ids=['kg mm', 'N cm', 'kg cm']
 )
@@ -112,6 +113,7 @@ def test_the_nearest_of_two_units_that_are_alike_is_named(factor: float, unit: s
     assert f'it is noted in {unit} instead' in findings[0].fix
 
 
+@pytest.mark.slow
 def test_alike_units_differ_where_movement_is_nonlinear() -> None:
     """50 N at the end of a bar: what moves in proportion to the load is 1 % off, and the units are 2 % apart."""
     loads = np.repeat([(0, 0, 0), (0, -50, -29.25), (0, 0, 0)], 2000, axis=0).astype(np.float64)
@@ -122,6 +124,7 @@ def test_alike_units_differ_where_movement_is_nonlinear() -> None:
         assert [(f.where, f.value) for f in findings] == [('tz', factor)]
 
 
+@pytest.mark.slow
 def test_loads_in_grams_have_one_factor_for_forces_and_torque() -> None:
     _, findings, _ = wire([loaded(recorded(), *[1.0 / 9.80665e-3] * 3)], ())
     assert [(f.where, f.value) for f in findings] == [('fx fy', 9.80665e-3), ('tz', 9.80665e-3)]
@@ -147,6 +150,7 @@ def found_in(*observations: Observation, whole: bool = False) -> Discovery:
     return found
 
 
+@pytest.mark.slow
 def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
     """A longer link makes EI and GJ look wrong by a cube and by itself: one length explains both."""
     found = found_in(recorded(link__length=0.585 * 1.02), whole=True)
@@ -159,6 +163,7 @@ def test_a_setup_that_explains_all_leaves_nothing_missing() -> None:
     assert 'The set-up is not as' in found.sentence
 
 
+@pytest.mark.slow
 def test_an_effect_behind_a_mistake_is_named_beside_it() -> None:
     o = recorded(effects__e__name='sensor_rotation', effects__e__psd=2, effects__e__angle=0.004)
     found = found_in(changed(o, turned(1)))
@@ -168,6 +173,7 @@ def test_an_effect_behind_a_mistake_is_named_beside_it() -> None:
     assert found.gap_before > 100 * found.gap_after
 
 
+@pytest.mark.slow
 def test_late_loads_are_named_with_their_delay_and_the_end_is_left_out() -> None:
     late = recorded()
     late = dataclasses.replace(late, loads=np.concatenate((np.zeros((40, 3)), late.loads[:-40])))
@@ -177,6 +183,7 @@ def test_late_loads_are_named_with_their_delay_and_the_end_is_left_out() -> None
     assert found.setup[0].value == pytest.approx(0.040, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_the_zero_of_one_of_two_recordings_is_named_with_its_recording() -> None:
     second = dataclasses.replace(recorded(seed=2), name='second')
     shift = np.array([0.3, -0.2, 0.0, 0.1, 0.4, 0.0])
@@ -218,6 +225,7 @@ def test_outliers_of_any_rate_and_size_are_left_out_and_movement_is_not(share: f
     assert not outliers(o.volts + 0.2 * np.sin(2.0 * np.pi * 50.0 * t), 5e-4).any()
 
 
+@pytest.mark.slow
 def test_what_no_load_is_known_of_does_not_count() -> None:
     """The first 1.5 s fall into a push; before the first known load it is not taken for zero."""
     o = recorded()
@@ -229,6 +237,7 @@ def test_what_no_load_is_known_of_does_not_count() -> None:
     assert found.floors < 1.1
 
 
+@pytest.mark.slow
 def test_a_recording_may_start_under_load_and_in_motion() -> None:
     o = recorded()
     cut = dataclasses.replace(o, volts=o.volts[1100:], loads=o.loads[1100:])
@@ -237,6 +246,7 @@ def test_a_recording_may_start_under_load_and_in_motion() -> None:
     assert found.floors < 1.05
 
 
+@pytest.mark.slow
 def test_lost_samples_cost_precision_and_nothing_else() -> None:
     o = recorded(effects__e__name='sensor_rotation', effects__e__psd=2, effects__e__angle=0.004)
     o.volts[np.random.default_rng(1).random(len(o.volts)) < 0.6] = np.nan
@@ -258,6 +268,7 @@ def csv_of(o: Observation, path: Path, step: float, rows: Sequence[int] | None =
     return path
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_lines_and_puts_them_into_the_model(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

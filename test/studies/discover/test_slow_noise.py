@@ -184,7 +184,7 @@ def test_a_workspace_has_the_slow_noise_of_its_recording_and_reports_it() -> Non
     assert float(residual @ residual) / ws.size == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize('corner', [0.3, 1.0, 5.0, 30.0])
 def test_nothing_is_missing_from_slow_noise(corner: float) -> None:
     found = discover([observed(corner, 1)])
@@ -192,7 +192,7 @@ def test_nothing_is_missing_from_slow_noise(corner: float) -> None:
     assert not found.setup
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_an_effect_beside_slow_noise_is_named_and_its_sd_covers() -> None:
     off = []
     for seed in range(6):

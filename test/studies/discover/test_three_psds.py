@@ -69,6 +69,7 @@ def test_a_hidden_effect_is_named_with_its_psd(word: str, name: str, value: floa
     assert list(found.per_channel) == list(dot_names(3))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize('seed', [1, 2])
 def test_nothing_is_missing_where_nothing_is_hidden(seed: int) -> None:
     found = discover([make_observation(RIG, seed=seed)])
@@ -76,12 +77,14 @@ def test_nothing_is_missing_where_nothing_is_hidden(seed: int) -> None:
     assert 0.95 < found.floors < 1.05
 
 
+@pytest.mark.slow
 def test_of_six_psds_a_wrong_wiring_and_an_effect_are_named_together() -> None:
     found = discover([make_observation(SIX, 'sensor_rotation,psd=5,angle=0.01', world={'psd_6.axes': ['-x', 'y']})])
     assert [(f.name, f.where) for f in found.setup] == [('channel_sign', 'x6')]
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 5)']
 
 
+@pytest.mark.slow
 def test_a_law_may_act_on_the_third_psd(tmp_path: Path) -> None:
     """Beyond 12 N downwards the third detector lifts."""
     plain = make_observation(RIG)
@@ -112,7 +115,7 @@ def test_a_rig_without_the_psd_of_a_law_rejects_it(tmp_path: Path, monkeypatch: 
     assert make_active('lifts', {'c1': 1.0}, 'test').effect.least_psds == 4
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_hum_is_named_on_the_channels_of_the_third_psd() -> None:
     hidden = 'mains_interference,frequency=50,amplitude_y3=0.004,amplitude_sum3=0.003,phase_sum3=1.0'
     (effect,) = discover([make_observation(RIG, hidden)]).effects
@@ -136,6 +139,7 @@ def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
 # Wirings.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('world', 'reported'),
     [
@@ -152,6 +156,7 @@ def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], reporte
     assert right.volts == pytest.approx(Wiring.from_rig(replace_values(RIG, world)).to_psds(given.volts))
 
 
+@pytest.mark.slow
 def test_two_others_that_are_exchanged_are_named_and_put_right() -> None:
     """No parameter says it, so there is no line for it."""
     right = make_observation(RIG, world={'psd_1.axes': ['x', '-y']})
@@ -305,6 +310,7 @@ def test_volts_of_another_number_of_psds_than_the_rig_has_are_rejected() -> None
         Observation('x', SIX, make_observation(RIG).volts, LOADS)
 
 
+@pytest.mark.slow
 def test_the_command_searches_a_recording_of_three_and_writes_what_it_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -326,6 +332,7 @@ def test_the_command_searches_a_recording_of_three_and_writes_what_it_found(
         read_observations([tmp_path / 'three.csv', tmp_path / 'two.csv'], RIG)
 
 
+@pytest.mark.slow
 def test_a_table_of_readings_may_be_of_three_psds(tmp_path: Path) -> None:
     levels = np.array(
         [(0, 0, 0), (0, -5, 0), (0, -10, 0), (0, -30, 0), (0, -10, -5.85), (0, -50, -29.25), (20, 0, 0), (-20, 0, 0)],

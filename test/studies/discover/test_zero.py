@@ -46,20 +46,20 @@ def faultless() -> Discovery:
     return discover([recorded(taken=True)])
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_what_the_noise_of_a_taken_zero_leaves_is_nothing_unknown(faultless: Discovery) -> None:
     assert faultless.verdict == 'nothing_missing'
     assert not faultless.effects
     assert not faultless.unknown
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_same_constants_are_reported_if_no_zero_was_taken() -> None:
     found = discover([recorded(taken=False)])
     assert found.effects or found.unknown
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_an_effect_beside_such_a_zero_is_named_alone() -> None:
     found = discover([recorded(taken=True, turned=0.004)])
     assert [e.active.effect.name for e in found.effects] == ['sensor_rotation']
@@ -67,7 +67,7 @@ def test_an_effect_beside_such_a_zero_is_named_alone() -> None:
     assert found.verdict == 'effects_found'
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_the_free_zero_costs_no_simulation_and_no_turn_of_settling(faultless: Discovery) -> None:
     same = recorded(taken=True)
     exact = replace(same, rig=RIG, zero_variances=())

@@ -15,7 +15,7 @@ from psd_deflection.records import FloatArray
 from psd_deflection.studies.identify.modes import modes_of
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ('name', 'frequency_off', 'damping_off'),
     [('ring-down', 0.0005, 0.03), ('equal releases', 0.0005, 0.03), ('noise of memory 0.9', 0.003, 0.15)],

@@ -105,6 +105,7 @@ def test_other_natural_frequencies_than_the_rig_file_says_change_no_time() -> No
     assert mended(read, noted((0.0,) * 6)) is None
 
 
+@pytest.mark.slow
 def test_a_faultless_rig_whose_loads_were_noted_some_ms_off_lacks_nothing() -> None:
     observed = Observation('hung', RIG, QUIET, noted(JITTER), None)
     found = discover([observed], RIG)
@@ -185,6 +186,7 @@ def test_check_and_calibrate_say_the_same() -> None:
     assert as_acted(right, RIG, log.append) is right
 
 
+@pytest.mark.slow
 def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
     found = discover([Observation('x', RIG, TURNED, noted(LATE))])
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
@@ -216,6 +218,7 @@ def test_a_load_between_two_samples_moves_the_link_as_one_at_that_time(moments: 
     assert np.abs(moved - exact)[away].max() < 5e-5
 
 
+@pytest.mark.slow
 def test_a_late_note_beside_channels_that_are_read_after_one_another() -> None:
     read = volts(hung(), effects__e__name='channel_skew', effects__e__psd=2, effects__e__delay=2e-4)
     found = discover([Observation('x', RIG, read, noted((0.0, 0.0, 3.4, 0.0, 0.0, 0.0)))])
@@ -249,7 +252,7 @@ def test_a_step_between_two_samples_has_its_time() -> None:
         assert (loads + later([more]))[11:] == pytest.approx(np.tile([4.0, -8.0, 2.0], (9, 1)))
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_ramps_beside_a_sticking_clamp_have_the_fitted_times() -> None:
     read = volts(hung(0.8), effects__e__name='clamp_friction', effects__e__axis=3, effects__e__width=2.3e-5)
     found = discover([Observation('x', RIG, read, noted((0.0,) * 6))])

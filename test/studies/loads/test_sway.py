@@ -76,7 +76,7 @@ def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
     assert (found.plateau.first, found.plateau.last) == (3 * DWELL, 4 * DWELL)
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_a_clamp_that_sticks_keeps_the_last_of_a_sway() -> None:
     """Without the sway its friction would hold the link on the other side, as a law that switches then."""
     friction = {'effects__e__name': 'clamp_friction', 'effects__e__width': 3e-6, 'effects__e__axis': 3}

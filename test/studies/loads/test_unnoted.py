@@ -52,7 +52,7 @@ def test_check_calibrate_and_discover_say_the_same() -> None:
     assert found.simulations <= 300
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_an_effect_beside_loads_that_were_not_noted_is_named() -> None:
     found = discover([Observation('x', RIG, read(HELD, **TURNED), STOPPED)])
     assert [f.name for f in found.setup] == ['load_coverage']

@@ -19,7 +19,7 @@ def motion_of(run: ClockRecording, kept: Array | None = None) -> Motion:
     return motion_of_samples(run.t[index], run.dots[index])
 
 
-@pytest.mark.statistics
+@pytest.mark.slow
 def test_intervals_hold_the_truth() -> None:
     """`python -m blind.clock` has the figures of 200 runs. At 95 %, fewer than 35 of 40 are one case in 2000."""
     score = scored(range(40))
