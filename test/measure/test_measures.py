@@ -55,7 +55,7 @@ def test_a_golden_recording_in_chunks_of_any_size_has_the_same_bits(name: str) -
         assert list(in_chunks(rig, samples, blocks)) == one
 
 
-@pytest.mark.parametrize('seed', range(6))
+@pytest.mark.parametrize('seed', range(2))
 def test_blocks_by_chance_have_the_same_bits_one_by_one_and_together(seed: int) -> None:
     """Losses, dark lasers, tones, more noise, a constant detector and a flag; two, three and four PSDs."""
     rng = np.random.default_rng(seed)

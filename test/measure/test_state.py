@@ -158,9 +158,9 @@ LINK = {
 }
 THIRD = {'psd_3.center': [0.08, -0.06]}
 CASES = {
-    'sound': Case(NOISE, (1, 40, 99, 130, 173, 251)),
-    'y1 dead': Case(PSDS + '0_1', (1, 99, 173), dead),
-    'vibrates': Case(VIBRATION, (99, 149, 171), vibrating),
+    'sound': Case(NOISE, (1, 40, 130, 251)),
+    'y1 dead': Case(PSDS + '0_1', (99,), dead),
+    'vibrates': Case(VIBRATION, (99, 171), vibrating),
     'ten bits': Case(STEPS, (160,), coarse),
     'PSD 2 dark': Case(HELD, (212, 260), dark, {'degraded': 'hold'}),
     'PSD 1 stands still': Case(FROZEN, (178,), stuck, {'frozen': 'reject'}),

@@ -54,8 +54,6 @@ def make_observation(rig: Rig, *words: str, seed: int = 0, world: Mapping[str, o
     ('word', 'name', 'value'),
     [
         ('sensor_rotation,psd=3,angle=0.01', 'angle', 0.01),
-        ('sensor_rotation,psd=1,angle=-0.01', 'angle', -0.01),
-        ('sensor_gain,psd=3,x=0.02', 'x', 0.02),
         ('load_offset,x=0.01', 'x', 0.01),
     ],
 )
