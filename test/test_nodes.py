@@ -38,8 +38,8 @@ def test_each_check_has_its_row_and_each_reason_its_note() -> None:
         report('frame_is_rejected', 'shaper', 'skipped', why=('file', 1, 'Skipped: there is no frame')),
     )
     assert made.lines() == [
-        '                   chain   shaper',
-        'log is there        yes     yes',
+        '                    chain   shaper',
+        'log is there         yes     yes',
         'frame is rejected    yes     (1)',
         '',
         '(1) there is no frame',

@@ -68,7 +68,7 @@ class Launched:
     def check_types(self, declared: Mapping[str, Any]) -> None:
         """Every argument that is a parameter of the node reaches it with its type, and no other does."""
         for name, (kind, text) in self.names['PARAMETERS'].items():
-            assert KINDS[declared[name].kind] is kind, name
+            assert KINDS[declared[name].kind] == kind, name
             assert text, name
             # Under the node's own name: a line of a file for every node does not win over it.
             assert self.start(**{name: '1'}).parameters == [{name: (name, kind)}]

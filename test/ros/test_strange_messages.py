@@ -27,7 +27,7 @@ from bench.campaign.messages import main
 from psd_deflection.arms.inputs import KnownJoints
 def broken(*_):
     raise RuntimeError('a defect')
-KnownJoints.tell = broken
+KnownJoints.notify = broken
 sys.exit(main())
 """
 

@@ -352,11 +352,11 @@ def test_what_a_plant_simulates_is_what_the_model_says() -> None:
 @pytest.mark.parametrize(
     ('change', 'words'),
     [
-        ({'seen': [np.zeros((2, 3, 1))] * 3}, r'measured, a: has the shape \(2, 3, 1\): must be \(2, n\)'),
-        ({'seen': [np.zeros((2, 0))] * 3}, r'measured, a: has the shape \(2, 0\)'),
-        ({'seen': [[['x']]] * 3}, r'measured, a: must be numbers, \(channels, n\)'),
-        ({'seen': [[[1.0], [2.0, 3.0]]] * 3}, r'measured, a: must be numbers'),
-        ({'seen': [np.zeros((2, 1)), *[np.full((2, 1), math.nan)] * 2]}, 'force has 1 values in all'),
+        ({'observed': [np.zeros((2, 3, 1))] * 3}, r'measured, a: has the shape \(2, 3, 1\): must be \(2, n\)'),
+        ({'observed': [np.zeros((2, 0))] * 3}, r'measured, a: has the shape \(2, 0\)'),
+        ({'observed': [[['x']]] * 3}, r'measured, a: must be numbers, \(channels, n\)'),
+        ({'observed': [[[1.0], [2.0, 3.0]]] * 3}, r'measured, a: must be numbers'),
+        ({'observed': [np.zeros((2, 1)), *[np.full((2, 1), math.nan)] * 2]}, 'force has 1 values in all'),
         ({'noise': (1.0,)}, 'one number above 0 for each channel'),
         ({'noise': (1.0, 0.0)}, 'one number above 0 for each channel'),
         ({'units': ('N',)}, 'units: 1 of them for 2 channels'),

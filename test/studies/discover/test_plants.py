@@ -196,11 +196,11 @@ def test_the_answer_is_the_same_again() -> None:
         ({'noise': (0.0,)}, r'noise = \(0.0,\): must be one number above 0'),
         ({'library': (CUBIC, CUBIC)}, 'cubic is there twice'),
         ({'nuisance': (CUBIC,)}, 'cubic is there twice'),
-        ({'seen': [np.zeros((2, 5))] * 6}, r'measured, a: has the shape \(2, 5\): must be \(1, n\)'),
-        ({'seen': [np.full((1, 5), math.nan)] * 6}, 'force has 0 values in all'),
-        ({'seen': [np.zeros((1, 5))] * 6}, r'simulate, a: has the shape \(1, 50\): must be that of measured'),
+        ({'observed': [np.zeros((2, 5))] * 6}, r'measured, a: has the shape \(2, 5\): must be \(1, n\)'),
+        ({'observed': [np.full((1, 5), math.nan)] * 6}, 'force has 0 values in all'),
+        ({'observed': [np.zeros((1, 5))] * 6}, r'simulate, a: has the shape \(1, 50\): must be that of measured'),
         ({'u': [np.full(50, math.nan)] * 6}, 'simulate, a: not finite with'),
-        ({'seen': [np.zeros((1, 50))] * 5}, 'measured: 5 tables for 6 cases'),
+        ({'observed': [np.zeros((1, 50))] * 5}, 'measured: 5 tables for 6 cases'),
     ],
 )
 def test_a_plant_that_contradicts_itself_is_rejected(change: Mapping[str, object], words: str) -> None:
