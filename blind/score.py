@@ -21,7 +21,7 @@ from blind.cases import SHOWS_ACROSS_LENGTHS
 THRESHOLDS: dict[str, float] = {
     'named_or_equivalent': 0.95,
     'mean_set_size': 1.7,
-    'named_first_where_told_apart': 0.95,
+    'named_first_where_separated': 0.95,
     'false_alarm_right_noise': 0.01,
     'false_alarm_wrong_noise': 0.03,
     'both_of_a_pair': 0.85,
@@ -207,7 +207,7 @@ def _detections(sheet: _Sheet, single: Sequence[Row]) -> None:
         sheet.check(size <= most, f'mean size of that set: {size:.2f}, wanted <= {most}')
     apart = [r for r in single if r.separated]
     first = [bool(r.named) and r.named[0] == r.truth[0]['name'] for r in apart]
-    wanted = THRESHOLDS['named_first_where_told_apart']
+    wanted = THRESHOLDS['named_first_where_separated']
     sheet.rate('named first where the design tells it apart', apart, first, wanted, 1.0, True)
 
 

@@ -90,11 +90,11 @@ def test_the_loop_is_closed_held_and_handed_over(compensator: Program, peer: Any
 
     # Held.
     for topic, fault, why in (
-        ('tell', *DEFLECTIONS['not finite']),
-        ('tell', *DEFLECTIONS['silent']),
-        ('tell', *DEFLECTIONS['wrong frame']),
-        ('tell_joints', *JOINTS['stale joints']),
-        ('tell_joints', *JOINTS['leaping joints']),
+        ('notify', *DEFLECTIONS['not finite']),
+        ('notify', *DEFLECTIONS['silent']),
+        ('notify', *DEFLECTIONS['wrong frame']),
+        ('notify_joints', *JOINTS['stale joints']),
+        ('notify_joints', *JOINTS['leaping joints']),
     ):
         stated, since = len(compensator.text), len(plant.offsets)
         setattr(plant, topic, fault)

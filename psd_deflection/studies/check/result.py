@@ -170,7 +170,7 @@ class Checkup(StudyResult):
             'pushes': [
                 {
                     'loads': list(p.loads),
-                    'seen': p.observed,
+                    'observed': p.observed,
                     'channels': _by(DOTS, p.channels.tolist()),
                     'sd': _by(DOTS, p.sd.tolist()),
                     'size': size if p.sized else None,

@@ -110,7 +110,7 @@ class Validated(StudyResult):
 
     def tree(self) -> dict[str, Any]:
         """In SI units."""
-        offset = {**asdict(self.offset), 'interval': self.offset.interval, 'told': self.offset.determined}
+        offset = {**asdict(self.offset), 'interval': self.offset.interval, 'determined': self.offset.determined}
         return {
             'solver': self.solver,
             'references': len(self.t),

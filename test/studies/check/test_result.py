@@ -246,8 +246,8 @@ def test_the_tree_and_the_table_have_all_numbers() -> None:
         {'name': 'channel_sign', 'where': 'x1', 'value': 1.5, 'fix': 'turn', 'evidence': 0.25, 'equivalent': ['a']}
     ]
     first, second = tree['pushes']
-    assert (first['loads'], first['seen'], first['size']) == (['fx'], True, None)
-    assert (second['loads'], second['seen'], second['size']) == (['fy', 'tz'], True, -0.5)
+    assert (first['loads'], first['observed'], first['size']) == (['fx'], True, None)
+    assert (second['loads'], second['observed'], second['size']) == (['fy', 'tz'], True, -0.5)
     assert second['sd'] == pytest.approx({'x1': 1e-7, 'y1': 2e-7, 'x2': 3e-7, 'y2': 4e-7})
     assert tree['noise']['sum2'] == pytest.approx(6.5e-3)
     assert tree['noise']['rig_file'] == 2.2e-3

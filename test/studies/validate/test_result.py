@@ -136,7 +136,7 @@ def test_programs_get_si_units() -> None:
     offset = tree['offset']
     assert offset['value'] == 0.0123
     assert offset['interval'] == pytest.approx((0.0123 - 0.196e-3, 0.0123 + 0.196e-3))
-    assert (offset['told'], offset['applied'], offset['unit']) == (True, False, 's')
+    assert (offset['determined'], offset['applied'], offset['unit']) == (True, False, 's')
     assert offset['sentence'] == BEHIND.sentence
     assert list(tree['solvers']) == ['exact', 'wls']
     assert [one['unit'] for one in tree['solvers']['exact'].values()] == ['m', 'm', 'rad']
