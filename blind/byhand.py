@@ -37,9 +37,11 @@ CELL = (0.05, 0.05, 0.01)
 
 @dataclass(frozen=True, eq=False)
 class Hand:
-    """``acted``, ``noted`` (n, 3) N, N, N m. ``wrong``: what is to be told, one by one: its name, what is right."""
+    """``effective``, ``annotated`` (n, 3) N, N, N m. ``wrong``: what is to be told, one by one: its name, what is
+    right.
+    """
 
-    acted: Array
+    effective: Array
     annotated: Array
     temperature: Array
     wrong: tuple[dict[str, Any], ...]
@@ -73,17 +75,17 @@ def _held(levels: Array, times: Array, n: int) -> Array:
 
 def _moved(kind: str, times: Array, ends: float, rng: np.random.Generator) -> Array:
     """Return the times of the notes."""
-    noted = times.copy()
+    annotated = times.copy()
     edges = np.concatenate(([0.5], times, [ends]))
     which = [int(rng.integers(0, len(times)))] if kind == 'one' else range(len(times))
     for i in which:
         early = kind != 'late' and rng.random() < 0.5
-        room = edges[i + 1] - max(edges[i], noted[i - 1] if i else 0.5) if early else edges[i + 2] - edges[i + 1]
+        room = edges[i + 1] - max(edges[i], annotated[i - 1] if i else 0.5) if early else edges[i + 2] - edges[i + 1]
         size = float(rng.uniform(0.3 if kind == 'one' else 0.0, 1.0)) * min(15.0, 0.85 * room)
-        noted[i] += -size if early else size
-    for i in range(1, len(noted)):
-        noted[i] = max(noted[i], noted[i - 1] + 0.4)
-    return np.asarray(np.round(noted, 3))
+        annotated[i] += -size if early else size
+    for i in range(1, len(annotated)):
+        annotated[i] = max(annotated[i], annotated[i - 1] + 0.4)
+    return np.asarray(np.round(annotated, 3))
 
 
 @functools.cache
@@ -95,26 +97,26 @@ def drawn(name: str) -> Hand:
     spans = rng.uniform(3.0, 14.0, len(levels))
     times = np.round(np.cumsum(spans)[:-1], 3)
     n = round(spans.sum() * RATE)
-    acted = _held(levels, times, n)
-    noted, wrong = acted.copy(), list[dict[str, Any]]()
+    effective = _held(levels, times, n)
+    annotated, wrong = effective.copy(), list[dict[str, Any]]()
     if kind in ('late', 'mixed', 'one'):
         message = _moved(kind, times, n / RATE, rng)
-        noted = _held(levels, message, n)
+        annotated = _held(levels, message, n)
         wrong = [
             {'name': 'load_time', 'where': f'load {i + 1}', 'value': float(b - a)}
             for i, (a, b) in enumerate(zip(times, message, strict=True))
             if abs(b - a) > LEAST_S
         ]
     elif kind == 'slow':
-        acted = np.zeros((n, 3))
+        effective = np.zeros((n, 3))
         for i, at in enumerate(times.tolist()):
             took = float(rng.uniform(0.3, 1.3))
             share = np.clip((np.arange(n) / RATE - at) / took, 0.0, 1.0)
-            acted += share[:, None] * (levels[i + 1] - levels[i])
+            effective += share[:, None] * (levels[i + 1] - levels[i])
             wrong.append({'name': 'load_ramp', 'where': f'load {i + 1}', 'value': took})
     elif kind == 'rounded':
         reported_levels = np.round(levels / np.array([5.0, 5.0, 2.0])) * np.array([5.0, 5.0, 2.0])
-        noted = _held(reported_levels, times, n)
+        annotated = _held(reported_levels, times, n)
         wrong = [
             {'name': 'load_value', 'where': f'load {i + 1}', 'load': levels[i + 1].tolist()}
             for i in range(len(times) - 1)
@@ -125,33 +127,33 @@ def drawn(name: str) -> Hand:
         reported_levels = levels.copy()
         # Never noted: the load before is held on. Noted twice: what was added is added once more.
         reported_levels[i + 1] = levels[i] if kind == 'forgotten' else 2.0 * levels[i + 1] - levels[i]
-        noted = _held(reported_levels, times, n)
+        annotated = _held(reported_levels, times, n)
         where = {'name': 'missing_load', 'from': float(times[i])}
         if kind == 'twice':
             where = {'name': 'load_value', 'where': f'load {i + 1}'}
         wrong = [{**where, 'load': levels[i + 1].tolist()}]
     elif kind == 'unit':
         factor = float(rng.choice(TORQUES))
-        noted[:, 2] /= factor
+        annotated[:, 2] /= factor
         wrong = [{'name': 'load_unit', 'where': 'tz', 'value': factor}]
     elif kind == 'ms':
         late = round(float(rng.uniform(2e-3, 8e-3)) * RATE) / RATE
-        noted = _held(levels, times + late, n)
+        annotated = _held(levels, times + late, n)
         wrong = [{'name': 'load_delay', 'value': late}]
     elif kind == 'near':
         off = np.round(rng.choice((-1.0, 1.0), len(times)) * rng.uniform(4e-3, 28e-3, len(times)), 3)
-        noted = _held(levels, times + off, n)
+        annotated = _held(levels, times + off, n)
         wrong = [
             {'name': 'load_time', 'where': f'load {i}', 'value': late} for i, late in enumerate(off.tolist(), start=1)
         ]
     elif kind == 'cell':
-        noted = acted + rng.normal(size=acted.shape) * np.array(CELL)
+        annotated = effective + rng.normal(size=effective.shape) * np.array(CELL)
     elif kind == 'sway':
         i = 1 + int(rng.integers(0, 5))
         at = np.arange(n) / RATE - times[i]
         swing = np.where((at > 0.0) & (at < spans[i + 1]), np.exp(-np.maximum(at, 0.0) / 8.0), 0.0)
-        acted[:, 0] += swing * np.sin(2.0 * np.pi * float(rng.uniform(0.8, 1.6)) * at)
+        effective[:, 0] += swing * np.sin(2.0 * np.pi * float(rng.uniform(0.8, 1.6)) * at)
         wrong = [{'name': 'load_value', 'where': f'load {i + 1}'}]
     at = np.arange(n) / RATE
     temperature = 21.0 + 2.0 * np.sin(0.07 * at) + 0.5 * np.sin(0.31 * at)
-    return Hand(acted, noted, temperature, tuple(wrong))
+    return Hand(effective, annotated, temperature, tuple(wrong))

@@ -69,7 +69,7 @@ def designs(name: str) -> tuple[Generator, ...]:
     """``one``: a link of 0.585 m; ``two``: that and one of 0.400 m; ``hand-...``: loads hung by hand."""
     if name.startswith('hand-'):
         hand = byhand.drawn(name)
-        return (Generator(hand.acted, hand.temperature, 0.585),)
+        return (Generator(hand.effective, hand.temperature, 0.585),)
     loads, temperature = histories()
     lengths = (0.585,) if name == 'one' else (0.585, 0.400)
     return tuple(Generator(loads, temperature, length) for length in lengths)

@@ -30,7 +30,7 @@ from cobs import cobs
 from blind.campaign import options
 from blind.generator import LSB, RATE, Array, Generator
 
-HUNG = ((0, -20, 0), (0, -50, 0), (0, -50, -29.25), (30, 0, 0), (20, -40, 12), (0, 0, 0))
+LOADS_IN_TURN = ((0, -20, 0), (0, -50, 0), (0, -50, -29.25), (30, 0, 0), (20, -40, 12), (0, 0, 0))
 """N, N, N m: five weights, then none."""
 FIRST_S, EACH_S = 16.0, 12.0
 """On a slow machine a command takes seconds: the zero must be taken before the first weight hangs."""
@@ -101,10 +101,10 @@ class Device:
 
 def measured(turn: float, seed: int) -> tuple[Array, list[float]]:
     """Counts (n, 6) of the day, and when each of the loads began to act, s."""
-    times = [FIRST_S + EACH_S * i for i in range(len(HUNG))]
+    times = [FIRST_S + EACH_S * i for i in range(len(LOADS_IN_TURN))]
     n = round((times[-1] + EACH_S) * RATE)
     loads = np.zeros((n, 3))
-    for at, load in zip(times, HUNG, strict=True):
+    for at, load in zip(times, LOADS_IN_TURN, strict=True):
         loads[round(at * RATE) :] = load
     turned = {'name': 'sensor_rotation', 'psd': 1, 'angle': turn}
     volts = Generator(loads, np.full(n, 21.0), 0.585).record([turned], 'white', seed)
@@ -138,20 +138,20 @@ def recorded(turn: float, seed: int, folder: Path) -> tuple[Path, list[tuple[flo
     until(4.0)
     print(command('zero', '--url', url).strip())
     print(command('load', '--url', url, '0', '0', '0').strip())
-    noted = []
-    for at, load, seconds in zip(times, HUNG, late, strict=True):
+    annotated = []
+    for at, load, seconds in zip(times, LOADS_IN_TURN, late, strict=True):
         until(at + seconds)
         words = [f'{v:g}' for v in load]
         print(f'hung at {at:g} s, noted {seconds:g} s later: load {" ".join(words)}: ', end='')
         asked = time.monotonic() - device.began
         print(command('load', '--url', url, *words).strip())
-        noted.append((asked - at, time.monotonic() - device.began - at))
+        annotated.append((asked - at, time.monotonic() - device.began - at))
     until(times[-1] + EACH_S)
     daemon.terminate()
     daemon.wait(60.0)
     print(f'{device.lost} samples were lost by the device')
     (found,) = folder.iterdir()
-    return found, noted
+    return found, annotated
 
 
 def judged(out: Path, turn: float, late: list[tuple[float, float]]) -> list[str]:

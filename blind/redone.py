@@ -49,7 +49,7 @@ LEAN = 0.054
 """How far the weight's line is off the rig's Y axis, rad: 0.12 mm of dX at 50 N."""
 CLOCK = 7.3e-3
 """By how much the camera's clock is ahead, s."""
-HUNG = 0.35
+RAMP_S = 0.35
 """Time in which a hand lets go of a weight, s."""
 LIMIT = 0.002
 """Largest error on the link, as a share of the deflection at 50 N."""
@@ -151,23 +151,23 @@ def bench(folder: Path, plan: Plan) -> Bench:
     return Bench(plan, folder, truth, scene, rng)
 
 
-def motion(plan: Plan, hung: HeldLoad) -> Array:
+def motion(plan: Plan, load_case: HeldLoad) -> Array:
     """True poses (n, 3) at the samples: at rest, then a weight that a hand lets go of."""
     n = round((plan.rest + plan.held) * generator.RATE)
     t = np.arange(n) / generator.RATE
-    share = 0.5 - 0.5 * np.cos(np.pi * np.clip((t - plan.rest) / HUNG, 0.0, 1.0))
-    force = hung.force * np.array([math.sin(LEAN), -math.cos(LEAN)])
-    loads = share[:, None] * np.array([*force, hung.side * ARM * force[1]])
+    share = 0.5 - 0.5 * np.cos(np.pi * np.clip((t - plan.rest) / RAMP_S, 0.0, 1.0))
+    force = load_case.force * np.array([math.sin(LEAN), -math.cos(LEAN)])
+    loads = share[:, None] * np.array([*force, load_case.side * ARM * force[1]])
     return misaligned.poses(loads)
 
 
-def record(made: Bench, hung: HeldLoad) -> None:
+def record(made: Bench, load_case: HeldLoad) -> None:
     """``NAME.csv``, what the PSDs say; ``NAME/``, the camera's images; ``NAME_truth.csv``, the pose at the images."""
     plan, rng = made.plan, made.rng
-    pose = motion(plan, hung)
+    pose = motion(plan, load_case)
     t = np.arange(len(pose)) / generator.RATE
     volts = misaligned.record(made.truth, pose, rng).volts
-    with (made.folder / f'{hung.name}.csv').open('w', newline='') as stream:
+    with (made.folder / f'{load_case.name}.csv').open('w', newline='') as stream:
         rows = csv.writer(stream)
         rows.writerow(('t', 'x1', 'y1', 'sum1', 'x2', 'y2', 'sum2'))
         rows.writerows([f'{s:.9f}', *(f'{v:.9g}' for v in row)] for s, row in zip(t, volts.tolist(), strict=True))
@@ -178,7 +178,7 @@ def record(made: Bench, hung: HeldLoad) -> None:
         dx, dy, theta = (float(v) for v in at(instant))
         return render.Pose(dx, dy, theta, -k * dy, k * dx)
 
-    images = made.folder / hung.name
+    images = made.folder / load_case.name
     images.mkdir()
     cv2 = opencv()
     starts = np.arange(0.02, t[-1] - 0.02, 1.0 / plan.rate)
@@ -194,7 +194,7 @@ def record(made: Bench, hung: HeldLoad) -> None:
         true.append((f'{start + plan.exposure / 2:.9f}', *render.mean_of(poses)))
     for path, head, lines in (
         (images / 'frames.csv', ('file', 't', 'exposure'), listed),
-        (made.folder / f'{hung.name}_truth.csv', ('t', *AXES), true),
+        (made.folder / f'{load_case.name}_truth.csv', ('t', *AXES), true),
     ):
         with path.open('w', newline='') as stream:
             csv.writer(stream).writerows([head, *lines])
@@ -234,13 +234,13 @@ def rig_files(made: Bench, stem: str, values: Mapping[str, object]) -> None:
         (made.folder / f'{stem}_{place}.yaml').write_text(with_values(text, tuned, words, path))
 
 
-def curves(made: Bench, hung: HeldLoad, stem: str) -> Curves:
+def curves(made: Bench, load_case: HeldLoad, stem: str) -> Curves:
     """What every method says of a recording with the rig file ``STEM.yaml``, by ``replay``."""
     found: dict[str, Array] = {}
     t = np.empty(0)
     for variant in ('', *(f'_{place}' for place in WEIGHTS)):
-        out = f'{hung.name}_{stem}{variant}.csv'
-        made.run('replay', f'{hung.name}.csv', '--params-file', f'{stem}{variant}.yaml', '--out', out)
+        out = f'{load_case.name}_{stem}{variant}.csv'
+        made.run('replay', f'{load_case.name}.csv', '--params-file', f'{stem}{variant}.yaml', '--out', out)
         rows = table(made.folder / out)
         t = rows['t']
         for name in ('wls',) if variant else ('wls', 'iterative', 'exact'):
@@ -249,13 +249,13 @@ def curves(made: Bench, hung: HeldLoad, stem: str) -> Curves:
     return Curves(t, found)
 
 
-def judged(made: Bench, hung: HeldLoad, stem: str, by: str) -> Any:
+def judged(made: Bench, load_case: HeldLoad, stem: str, by: str) -> Any:
     """Return the answer of ``validate``: by the camera, its clock put right, or by the truth."""
-    reference = f'{hung.name}_{by}.csv'
+    reference = f'{load_case.name}_{by}.csv'
     align = ['--align', '--exposure', str(made.plan.exposure)] if by == 'camera' else []
     rig = ('--params-file', f'{stem}.yaml')
     words = ('--reference', reference, '--solver', 'all', *rig, *align, '--json')
-    return json.loads(made.run('validate', f'{hung.name}.csv', *words))
+    return json.loads(made.run('validate', f'{load_case.name}.csv', *words))
 
 
 def calibrated(made: Bench, runs: Sequence[HeldLoad], stem: str) -> str:
@@ -280,15 +280,15 @@ def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
     every = [*sidebar, *link]
     bar = tqdm(total=3 * len(every) + 2, unit=' steps', disable=quiet, ncols=80)
     cameras: dict[str, dict[str, Array]] = {}
-    for hung in every:
-        bar.set_description(hung.name)
-        record(made, hung)
+    for load_case in every:
+        bar.set_description(load_case.name)
+        record(made, load_case)
         bar.update()
-        made.run('camera', hung.name, '--params-file', 'camera.yaml', '--out', f'{hung.name}_camera.csv')
-        cameras[hung.name] = table(made.folder / f'{hung.name}_camera.csv')
-        images = sorted((made.folder / hung.name).glob('*.png'))
-        shutil.copy(images[-1], made.folder / f'{hung.name}.png')
-        shutil.rmtree(made.folder / hung.name)
+        made.run('camera', load_case.name, '--params-file', 'camera.yaml', '--out', f'{load_case.name}_camera.csv')
+        cameras[load_case.name] = table(made.folder / f'{load_case.name}_camera.csv')
+        images = sorted((made.folder / load_case.name).glob('*.png'))
+        shutil.copy(images[-1], made.folder / f'{load_case.name}.png')
+        shutil.rmtree(made.folder / load_case.name)
         bar.update()
     bar.set_description('calibrate')
     shutil.copy(made.folder / 'nominal.yaml', made.folder / 'before.yaml')
@@ -299,13 +299,13 @@ def redone(folder: Path, plan: Plan, *, quiet: bool = False) -> dict[str, Any]:
     bar.update()
     drawn: dict[str, dict[str, Curves]] = {}
     answers: dict[str, dict[str, Any]] = {}
-    for hung in every:
-        bar.set_description(f'validate {hung.name}')
-        if hung.side >= 0:
-            drawn[hung.name] = {stem: curves(made, hung, stem) for stem in STEMS}
-        if hung.side == 0:
-            answers[hung.name] = {f'{stem} truth': judged(made, hung, stem, 'truth') for stem in RIGS}
-            answers[hung.name] |= {f'{stem} camera': judged(made, hung, stem, 'camera') for stem in STEMS}
+    for load_case in every:
+        bar.set_description(f'validate {load_case.name}')
+        if load_case.side >= 0:
+            drawn[load_case.name] = {stem: curves(made, load_case, stem) for stem in STEMS}
+        if load_case.side == 0:
+            answers[load_case.name] = {f'{stem} truth': judged(made, load_case, stem, 'truth') for stem in RIGS}
+            answers[load_case.name] |= {f'{stem} camera': judged(made, load_case, stem, 'camera') for stem in STEMS}
         bar.update()
     bar.close()
     summary = _summary(made, link, answers)

@@ -270,7 +270,7 @@ def _mistakes(sheet: _Sheet, rows: Sequence[Row]) -> None:
 
 NEAR = {'load_time': 0.05, 'load_ramp': 0.15, 'load_delay': 5e-4}
 """s by which a told time may be off."""
-HUNG = (0.25, 0.25, 0.12)
+TOLERANCES = (0.25, 0.25, 0.12)
 """N, N, N m, and 2 %, by which a told load may be off."""
 
 
@@ -284,7 +284,7 @@ def _reported(wrong: dict[str, Any], setup: Sequence[dict[str, Any]]) -> tuple[b
     if not of:
         return False, False
     if 'load' in wrong:
-        pairs = zip(of[0]['value'] or (math.nan,) * 3, wrong['load'], HUNG, strict=True)
+        pairs = zip(of[0]['value'] or (math.nan,) * 3, wrong['load'], TOLERANCES, strict=True)
         return True, all(abs(a - b) < most + 0.02 * abs(b) for a, b, most in pairs)
     if 'value' not in wrong:
         return True, True

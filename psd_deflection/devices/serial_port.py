@@ -55,8 +55,8 @@ class SerialPort(DescriptorPort):
         self._empty_reads += 1
         poll = select.poll()
         poll.register(self._fd, select.POLLIN)
-        hung_up = any(mask & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, mask in poll.poll(0))
-        return hung_up or self._empty_reads > MAX_EMPTY_READS
+        closed = any(mask & (select.POLLHUP | select.POLLERR | select.POLLNVAL) for _, mask in poll.poll(0))
+        return closed or self._empty_reads > MAX_EMPTY_READS
 
     def discard_input(self) -> None:
         """Discard unread bytes: they are older than their time of reading."""

@@ -114,7 +114,7 @@ class Recording(abc.ABC):
         other.requested_block_size = block_size
         # After a restart numbers go on with the next block, so they depend on its size.
         other.__dict__.pop('samples', None)
-        other.restarts = self._noted_restarts()
+        other.restarts = self._recorded_restarts()
         return other
 
     def crop(self, first: Bound | None = None, last: Bound | None = None) -> Recording:
@@ -162,7 +162,7 @@ class Recording(abc.ABC):
             raise ConfigError(f'recording[{part!r}]: must be a part of time, as recording[2.0:5.0]')
         return self.crop(part.start, part.stop)
 
-    def _noted_restarts(self) -> set[tuple[int, int]]:
+    def _recorded_restarts(self) -> set[tuple[int, int]]:
         """The restarts that the recorder noted, before any pass over the recording."""
         return {r for change in self.changes if (r := _restart_in(change)) is not None}
 

@@ -25,10 +25,10 @@ def changed_parameters(parameters: Mapping[str, Any]) -> dict[str, Any]:
     return {k: v for k, v in parameters.items() if k not in BY_NAME or BY_NAME[k].default != BY_NAME[k].meant(v)}
 
 
-def _noted(recording: Recording, name: str) -> list[tuple[ParameterChange, float]]:
+def _values_of(recording: Recording, name: str) -> list[tuple[ParameterChange, float]]:
     """The changes that note ``name``, a number."""
-    noted = [(change, dict(change.values).get(name)) for change in recording.changes]
-    return [(change, float(value)) for change, value in noted if isinstance(value, float | int)]
+    found = [(change, dict(change.values).get(name)) for change in recording.changes]
+    return [(change, float(value)) for change, value in found if isinstance(value, float | int)]
 
 
 def lacks(recording: Recording, topics: Mapping[str, int]) -> list[str]:
@@ -107,8 +107,8 @@ def summary(recording: Recording, topics: Mapping[str, int], blocks_of_it: Itera
         'lost': recording.lost(first[0], last[0], samples) if samples else 0,
         'dropped_here': {'samples': recording.dropped_here[0], 'messages': recording.dropped_here[1]},
         'restarts': len(recording.restarts),
-        'clock_steps': [{'t_ns': c.t_ns, 'step_s': s} for c, s in _noted(recording, CLOCK_STEP)],
-        'squeezed': sum(int(n) for _, n in _noted(recording, CLOCK_SQUEEZED)),
+        'clock_steps': [{'t_ns': c.t_ns, 'step_s': s} for c, s in _values_of(recording, CLOCK_STEP)],
+        'squeezed': sum(int(n) for _, n in _values_of(recording, CLOCK_SQUEEZED)),
         'flagged': counted.flagged,
         'sample_rate_hz': counted.rate_hz,
         'vibration': counted.vibration.found() if counted.vibration is not None else None,

@@ -22,7 +22,7 @@ from psd_deflection.base.log import INFO, WARNING, LogCallback
 from psd_deflection.measure.pipeline import Pipeline
 from psd_deflection.records import Record
 from psd_deflection.run.behind import lag_reason
-from psd_deflection.run.reading.arrivals import Arrival, ItemQueue, Noted, Restarted
+from psd_deflection.run.reading.arrivals import Annotation, Arrival, ItemQueue, Restarted
 
 T = TypeVar('T')
 
@@ -189,7 +189,7 @@ class Processing:
                     if self.give(self.pipeline.process(item.raw)):
                         self._note_latency(item.read_ns)
                         self._notify_rejections()
-                elif isinstance(item, Noted):
+                elif isinstance(item, Annotation):
                     self.give([item.change])
                 elif isinstance(item, Restarted):
                     self.give(self.pipeline.flush())

@@ -38,7 +38,7 @@ from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
 from psd_deflection.run.watcher import Watcher, WatcherWire
 from psd_deflection.run.zero_store import ZeroStore
 
-HUNG_S = 5.0
+STALLED_S = 5.0
 """A thread that has completed no round for this long hangs: the watchdog gets no more signals."""
 
 SILENT_S = 5.0
@@ -180,7 +180,7 @@ class Session:
     def responsive(self) -> bool:
         """Whether reader and pipeline completed a round lately; they do so even while the device is away."""
         now = time.monotonic()
-        return all(now - beat < HUNG_S for beat in (self.acquisition.beat, self.processing.beat))
+        return all(now - beat < STALLED_S for beat in (self.acquisition.beat, self.processing.beat))
 
     def start(self) -> None:
         """Start recording if the rig says so, and let samples flow.

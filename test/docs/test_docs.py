@@ -402,7 +402,7 @@ def test_completion_knows_commands_and_options(shell: str, capsys: pytest.Captur
 def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[str]) -> None:
     values: dict[str, object] = {}
 
-    class Noted(argparse.Action):
+    class Record(argparse.Action):
         def __init__(self, option_strings: Sequence[str], dest: str, **named: Any) -> None:
             super().__init__(option_strings, dest, **named)
             if self.choices is None:
@@ -410,7 +410,7 @@ def test_completion_knows_which_values_are_paths(capsys: pytest.CaptureFixture[s
                 values[re.sub(r'\W', '_', f'{name}_{flag}')] = self.metavar or dest.upper()
 
     for name in COMMANDS:
-        make_parser([name], Noted)
+        make_parser([name], Record)
     assert main(['completion', 'bash']) == 0
     script = capsys.readouterr().out
     completed = r'_shtab_psd_deflection_(\w+)_COMPGEN=_(?:shtab_compgen_(?:files|dirs)|psd_deflection_port)'

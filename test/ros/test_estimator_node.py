@@ -472,21 +472,21 @@ def test_a_second_rig_in_a_namespace_and_beside_a_clock_that_stands_still(start:
     # A load of another node is known to the page; what is noted there acts beside it.
     weights = peer.node.create_publisher(WrenchStamped, '/left/link_tip/load', 10)
     peer.until(lambda: weights.get_subscription_count() > 0, 'the subscription to loads')
-    hung = WrenchStamped()
-    hung.wrench.force.y = -10.0
+    applied = WrenchStamped()
+    applied.wrench.force.y = -10.0
 
-    def noted(fy: float) -> str:
+    def annotated(fy: float) -> str:
         body = json.dumps({'fx': 0, 'fy': fy, 'tz': 0, 'add': True}).encode()
         with urllib.request.urlopen(urllib.request.Request(url + 'api/load', body, headers), timeout=60.0) as answer:
             return str(json.load(answer)['message'])
 
     def known() -> bool:
         # Matched on this side only at first: it may be lost.
-        weights.publish(hung)
-        return 'Fy -10 N' in noted(0.0)
+        weights.publish(applied)
+        return 'Fy -10 N' in annotated(0.0)
 
     peer.until(known, 'the load')
-    assert 'Fy -15 N' in noted(-5.0)
+    assert 'Fy -15 N' in annotated(-5.0)
     request = GetParameters.Request(names=['psd_1.zero'])
 
     def shown() -> list[float]:

@@ -74,8 +74,8 @@ def test_velocity_and_filtered_pose_are_published_and_replay_to_the_bit(
     (wanted, *_) = [line for line in estimator.lines if '/link_base/acceleration: rejected' in line]
     assert "frame_id 'tool0': must be link_base" in wanted or 'angular x = nan: must be finite' in wanted
     recording = open_recording(folder)
-    noted = [name for change in recording.changes for name, _ in change.values]
-    assert noted.count(KNOWN_LOAD) == 2
+    annotated = [name for change in recording.changes for name, _ in change.values]
+    assert annotated.count(KNOWN_LOAD) == 2
     # Recorded is what the filter was told, and no more.
     bases = [base for _, base in recording.accelerations()]
     assert 10 <= len(bases) == recording.topics()['/link_base/acceleration'] <= reported * 8 // 10

@@ -27,7 +27,7 @@ from psd_deflection.records import CLOCK_SQUEEZED, CLOCK_STEP, RESTART
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.run.reading import acquisition as module
 from psd_deflection.run.reading.acquisition import Acquisition
-from psd_deflection.run.reading.arrivals import Arrival, Ended, Item, Noted, Restarted
+from psd_deflection.run.reading.arrivals import Annotation, Arrival, Ended, Item, Restarted
 from psd_deflection.run.reading.pinger import UNANSWERED
 from test.heard import WAIT_S
 
@@ -154,7 +154,7 @@ def test_a_note_of_the_time_map_takes_no_block_s_room(sample: Any) -> None:
     # 0.3 s of samples within a millisecond: the map steps.
     acquisition.feed([sample(s) for s in range(20, 320)], 10**9 + 10**6)
     items = [acquisition.queue.get() for _ in range(acquisition.queue.qsize())]
-    assert any(isinstance(item, Noted) for item in items)
+    assert any(isinstance(item, Annotation) for item in items)
     assert numbers(items) == list(range(40))
 
 
@@ -363,7 +363,7 @@ def test_a_line_that_is_late_at_first_is_reported_and_recorded(late_s: float, sa
     acquisition = Acquisition(load_rig(), lambda text, _level=0: lines.append(text))
     ends_ms = 3000 + round(late_s * 1000)
     given: dict[int, int] = {}
-    noted: dict[str, list[float]] = {}
+    annotated: dict[str, list[float]] = {}
     fed = 0
     for now_ms in range(round(late_s * 1000) + 10, 9000, 10):
         # What was sent when the line recovers comes with the first that is in time.
@@ -375,16 +375,16 @@ def test_a_line_that_is_late_at_first_is_reported_and_recorded(late_s: float, sa
             if isinstance(item, Arrival):
                 times = item.raw.t_ns - acquisition.to_ros_ns
                 given |= dict(zip(item.raw.seq.tolist(), times.tolist(), strict=True))
-            elif isinstance(item, Noted):
-                noted.setdefault(item.change.values[0][0], []).append(float(item.change.values[0][1]))  # type: ignore[arg-type]
+            elif isinstance(item, Annotation):
+                annotated.setdefault(item.change.values[0][0], []).append(float(item.change.values[0][1]))  # type: ignore[arg-type]
     assert list(given) == list(range(min(given), max(given) + 1))
-    assert noted[CLOCK_STEP] == [pytest.approx(-late_s, abs=0.011)]
-    assert sum(noted[CLOCK_SQUEEZED]) == pytest.approx(1000 * late_s, abs=25)
+    assert annotated[CLOCK_STEP] == [pytest.approx(-late_s, abs=0.011)]
+    assert sum(annotated[CLOCK_SQUEEZED]) == pytest.approx(1000 * late_s, abs=25)
     wrong = [k for k, t_ns in given.items() if abs(t_ns - k * 10**6) > 5_000_000]
     assert wrong == list(range(min(given), max(wrong) + 1))
     assert max(wrong) == pytest.approx(3000 + 1000 * late_s, abs=25)
     assert any(f'{1000 * late_s:.0f}' in line and 'too late' in line for line in lines), lines
-    assert any(f'{sum(noted[CLOCK_SQUEEZED]):.0f} samples have stamps 1 ns apart' in line for line in lines)
+    assert any(f'{sum(annotated[CLOCK_SQUEEZED]):.0f} samples have stamps 1 ns apart' in line for line in lines)
 
 
 class Clockwork(Source):

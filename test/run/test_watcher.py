@@ -250,14 +250,14 @@ def an_alarm(chain: Chain) -> Path:
 def test_the_oldest_of_what_was_kept_is_deleted_and_nothing_else(tmp_path: Path) -> None:
     older = [keep(tmp_path, f'watch_2023_{n}', 100 - n) for n in range(5)]
     recorded = keep(tmp_path, 'psd_20230101_000000', 1000)
-    noted = keep(tmp_path, 'watch_2022', 2000, 'what I saw.txt')
+    annotated = keep(tmp_path, 'watch_2022', 2000, 'what I saw.txt')
     elsewhere = keep(tmp_path / 'deep', 'watch_2021', 3000)
     (tmp_path / 'watch_2020').symlink_to(elsewhere)
     chain = Chain(tmp_path, watch_dir_max_recordings=3)
     chain.feed(0.2)
     folder = an_alarm(chain)
     assert [path.exists() for path in older] == [False, False, False, True, True]
-    assert all(path.exists() for path in (folder, recorded, noted, elsewhere / 'watch_2021_0.mcap'))
+    assert all(path.exists() for path in (folder, recorded, annotated, elsewhere / 'watch_2021_0.mcap'))
     reported = [line for line in chain.logged if 'deleted' in line]
     assert len(reported) == 3
     assert reported[0].startswith(f'watch: {older[0]}: deleted, the oldest')

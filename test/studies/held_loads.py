@@ -12,7 +12,7 @@ from psd_deflection.model.simulation.catalogue import effect_names
 from psd_deflection.model.simulation.simulator import RigSimulator
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import load_rig, replace_values
-from psd_deflection.studies.calibrate.from_recordings import as_acted
+from psd_deflection.studies.calibrate.from_recordings import with_effective_loads
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.check.checkup import check, of_recording
 from psd_deflection.studies.check.result import Checkup
@@ -39,7 +39,7 @@ def read(acting: FloatArray, seed: int = 3, /, **true: object) -> FloatArray:
     return np.asarray(RigSimulator(rig, seed).step(acting).counts * RIG.converter.volts_per_count, dtype=np.float64)
 
 
-def noted_as(number: int, load: tuple[float, float, float]) -> FloatArray:
+def annotated_as(number: int, load: tuple[float, float, float]) -> FloatArray:
     """Return the loads with another one noted for hold ``number``."""
     out = HELD.copy()
     out[number * DWELL : (number + 1) * DWELL] = load
@@ -55,9 +55,11 @@ class Answers(NamedTuple):
     found: Discovery
 
 
-def answers(volts: FloatArray, noted: FloatArray) -> Answers:
+def answers(volts: FloatArray, annotated: FloatArray) -> Answers:
     """Return what check, calibrate and discover say of a recording named x."""
     log: list[str] = []
-    run = CalibrationRun('x', np.arange(len(noted)) / 1000.0, volts, np.zeros(0), np.zeros((0, 3)), noted)
-    found = discover([Observation('x', RIG, volts, noted)], without=OTHERS)
-    return Answers(check(of_recording(RIG, volts, noted, 'x')), as_acted(run, RIG, log.append), log, found)
+    run = CalibrationRun('x', np.arange(len(annotated)) / 1000.0, volts, np.zeros(0), np.zeros((0, 3)), annotated)
+    found = discover([Observation('x', RIG, volts, annotated)], without=OTHERS)
+    return Answers(
+        check(of_recording(RIG, volts, annotated, 'x')), with_effective_loads(run, RIG, log.append), log, found
+    )

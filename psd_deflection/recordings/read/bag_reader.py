@@ -103,7 +103,7 @@ class BagRecording(Recording):
         self.version, self.node = software.get('version', ''), software.get(META_NODE, '')
         self.dropped_here = _dropped(metadata.get(META_DROPPED, {}))
         self._take_rig()
-        self.restarts = self._noted_restarts()
+        self.restarts = self._recorded_restarts()
 
     def _files_of(self, folder: Path) -> list[Path]:
         """The bag's files in the order of ``metadata.yaml``, else of their numbers."""

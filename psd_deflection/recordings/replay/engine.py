@@ -182,11 +182,11 @@ class _BesideSamples:
         self._recording, self._pipeline = recording, pipeline
         self._changes = list(recording.changes)
         # Our recorder notes when a temperature or a load took effect; for other recordings the stamps decide.
-        noted = {name for change in self._changes for name, _ in change.values}
-        warms = pipeline.needs_temperature and noted.isdisjoint(ENVIRONMENT)
+        changed = {name for change in self._changes for name, _ in change.values}
+        warms = pipeline.needs_temperature and changed.isdisjoint(ENVIRONMENT)
         self._temperatures = recording.temperatures() if warms else []
         filtered = pipeline.motion_filter is not None
-        self._loads = recording.loads() if filtered and KNOWN_LOAD not in noted else []
+        self._loads = recording.loads() if filtered and KNOWN_LOAD not in changed else []
         self._loads.reverse()
         self._accelerations = recording.accelerations() if filtered else iter(())
         self._acceleration = next(self._accelerations, None)

@@ -38,7 +38,7 @@ from psd_deflection.records import (
 )
 from psd_deflection.rig.config import Rig
 from psd_deflection.run.behind import SLOW
-from psd_deflection.run.reading.arrivals import Arrival, Ended, ItemQueue, Noted, Restarted, SampleBuffer
+from psd_deflection.run.reading.arrivals import Annotation, Arrival, Ended, ItemQueue, Restarted, SampleBuffer
 from psd_deflection.run.reading.clock_watch import ClockWatch
 from psd_deflection.run.reading.counters import AWAY, BY_DEVICE, DAMAGED, UNSEEN, AcquisitionCounters
 from psd_deflection.run.reading.hello import AnotherDeviceError, HelloGate
@@ -416,7 +416,7 @@ class Acquisition:
         """Put a note of the time map into the recording, unless there are many."""
         if count <= RECORDED_RESTARTS:
             block = max(self._last_number, 0) // self._block_size
-            self.queue.put(Noted(ParameterChange(self._last_t_ns, block, ((name, value),))))
+            self.queue.put(Annotation(ParameterChange(self._last_t_ns, block, ((name, value),))))
 
     def _note_squeezed(self, squeezed: int, now: int) -> None:
         """Count samples whose stamps had to be raised; log and record them when there are no more."""

@@ -34,7 +34,7 @@ class Restarted:
     change: ParameterChange | None
 
 
-class Noted(NamedTuple):
+class Annotation(NamedTuple):
     """On the queue: something that the recording is to have, and no estimate depends on."""
 
     change: ParameterChange
@@ -44,7 +44,7 @@ class Ended:
     """On the queue: nothing follows."""
 
 
-Item = Arrival | Restarted | Noted | Ended
+Item = Arrival | Restarted | Annotation | Ended
 
 
 class ItemQueue:

@@ -25,8 +25,8 @@ from psd_deflection.studies.calibrate.calibrate import calibrate
 from psd_deflection.studies.calibrate.dark import DarkLevel, dark_levels, values_of_levels
 from psd_deflection.studies.calibrate.observation import CalibrationRun, usable_dots
 from psd_deflection.studies.calibrate.result import Calibrated
-from psd_deflection.studies.loads.acted import loads_that_acted
-from psd_deflection.studies.loads.noted_times import correct_loads
+from psd_deflection.studies.loads.annotated_times import correct_loads
+from psd_deflection.studies.loads.effective import effective_loads
 from psd_deflection.studies.study import Notify, opened
 
 
@@ -106,7 +106,7 @@ def read_runs(
     ]
 
 
-def as_acted(run: CalibrationRun, rig: Rig, notify: Notify) -> CalibrationRun:
+def with_effective_loads(run: CalibrationRun, rig: Rig, notify: Notify) -> CalibrationRun:
     """``run`` with the loads that hung, at the times at which they acted, without what swayed; ``notify`` gets what was
     noted wrong.
     """
@@ -114,12 +114,12 @@ def as_acted(run: CalibrationRun, rig: Rig, notify: Notify) -> CalibrationRun:
         return run
     corrected = correct_loads(rig, usable_dots(run, rig), run.loads)
     loads, notes = (run.loads, ()) if corrected is None else (corrected.loads, corrected.notes)
-    acted = loads_that_acted(rig, run.volts, loads)
-    for note in (*notes, *acted.notes):
+    effective = effective_loads(rig, run.volts, loads)
+    for note in (*notes, *effective.notes):
         notify(note.words(run.name))
-    if corrected is None and not acted.notes:
+    if corrected is None and not effective.notes:
         return run
-    return replace(run, volts=acted.volts, loads=acted.loads)
+    return replace(run, volts=effective.volts, loads=effective.loads)
 
 
 def today() -> str:
@@ -180,7 +180,7 @@ class CalibrationOptions:
         """Return the answer; ``notify`` gets a warning if a load was noted late, or if the rig file cannot be
         edited.
         """
-        runs = [as_acted(run, rig, notify) for run in runs]
+        runs = [with_effective_loads(run, rig, notify) for run in runs]
         lit = replace_values(rig, values_of_levels(levels))
         calibration = replace(calibrate(runs, lit, alone=self.alone, progress=progress), dark=levels)
         return Calibrated(calibration, lit, self.params_file, self.date, notify)

@@ -33,8 +33,8 @@ from psd_deflection.studies.check.wirings import (
     fitting_wirings,
     misfit,
 )
-from psd_deflection.studies.loads.acted import LoadNote, loads_that_acted
-from psd_deflection.studies.loads.noted_times import CorrectedNote, correct_loads
+from psd_deflection.studies.loads.annotated_times import CorrectedNote, correct_loads
+from psd_deflection.studies.loads.effective import LoadNote, effective_loads
 
 DEAD = 0.1
 """A channel that moves less than this share of every push does not answer."""
@@ -76,10 +76,10 @@ def of_recording(rig: Rig, volts: FloatArray, loads: FloatArray, source: str = '
         loads, late = corrected.loads, corrected.notes
         moved = np.where(corrected.unused[:, None], np.nan, volts)
     wiring = Wiring.from_rig(rig)
-    acted = loads_that_acted(rig, wiring.to_psds(moved), loads)
-    moved = np.where(np.isfinite(acted.volts).any(axis=1, keepdims=True), moved, np.nan)
-    answered = responses(rig, moved, acted.loads)
-    notes = (*late, *acted.notes)
+    effective = effective_loads(rig, wiring.to_psds(moved), loads)
+    moved = np.where(np.isfinite(effective.volts).any(axis=1, keepdims=True), moved, np.nan)
+    answered = responses(rig, moved, effective.loads)
+    notes = (*late, *effective.notes)
     return CheckProblem(rig, answered.pushes, levels(rig, volts), answered.drift, answered.drift_sd, source, notes)
 
 

@@ -15,7 +15,7 @@ from psd_deflection.rig.declarations import LEAST_BITS
 from psd_deflection.rig.wiring import Wiring
 from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import differences, fix_of, line, parameters
-from psd_deflection.studies.loads.acted import LoadNote
+from psd_deflection.studies.loads.effective import LoadNote
 
 NOISE_FACTOR = 2.0
 """Report noise that differs from the rig file's by more than this factor.

@@ -31,8 +31,8 @@ from psd_deflection.studies.discover.search.hold_out import HeldOut
 from psd_deflection.studies.discover.search.signatures import SignatureBank
 from psd_deflection.studies.discover.search.weighing import UNSAID, NamedEffect, unknown_of
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.applied import wrong_load_findings
 from psd_deflection.studies.discover.setup.hidden import RIG_NUMBERS, SETUP
-from psd_deflection.studies.discover.setup.hung import wrong_load_findings
 from psd_deflection.studies.discover.setup.setup import finding_of_effect, noise_of
 from psd_deflection.studies.discover.steps import alternatives, fields_of, predict, solve, where, without_effect
 from psd_deflection.studies.loads.plate_motion import dots_of

@@ -23,7 +23,7 @@ from psd_deflection.studies.discover.search.signatures import (
 )
 from psd_deflection.studies.discover.search.weighing import UNSAID
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hung import directions, levels, ringing_on, times, unseen
+from psd_deflection.studies.discover.setup.applied import directions, levels, ringing_on, times, unseen
 from psd_deflection.studies.discover.setup.redundant import fourth_reading
 from psd_deflection.studies.discover.steps import search, solve, weigh
 from psd_deflection.studies.loads.plateaus import all_free, may_be_rounded, rounded

@@ -27,15 +27,15 @@ from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.free import Direction, LoadDirection, ZeroDirection
 from psd_deflection.studies.discover.search.proposals import CoarseStep, coarse_step
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.discover.setup.applied import directions, in_time, levels, of_plateau, swayed, times
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
-from psd_deflection.studies.discover.setup.hung import directions, in_time, levels, of_plateau, swayed, times
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
 from psd_deflection.studies.discover.setup.setup import likely_delays, wire
-from psd_deflection.studies.loads.noted_times import CorrectedLoads
+from psd_deflection.studies.loads.annotated_times import CorrectedLoads
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_applied, wrong_notes_against
 from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swung
-from psd_deflection.studies.loads.unnoted import UnnotedTime, unnoted_times, without_times
+from psd_deflection.studies.loads.unannotated import UnannotatedTime, unannotated_times, without_times
 
 MUCH = 10.0
 """A gap of so many times the noise is held against wrong notes and swaying weights before any search."""
@@ -223,7 +223,7 @@ def _corrected(recorded: Recorded, workspace: Workspace) -> tuple[Recorded, Work
         stated_gap=recorded.stated_gap or gap,
     )
     workspace = beside(workspace, observations, recorded.known)
-    if any(isinstance(n, UnnotedTime) for notes_of_recording in notes for n in notes_of_recording):
+    if any(isinstance(n, UnannotatedTime) for notes_of_recording in notes for n in notes_of_recording):
         return _corrected(recorded, workspace)
     return recorded, with_free(recorded, workspace)
 
@@ -237,13 +237,15 @@ def _stated_floor(workspace: Workspace) -> float:
     return float(np.sqrt(np.mean(np.square(dots))))
 
 
-def _wrong_notes(workspace: Workspace, i: int, difference: FloatArray) -> list[WrongNote | SwayingLoad | UnnotedTime]:
+def _wrong_notes(
+    workspace: Workspace, i: int, difference: FloatArray
+) -> list[WrongNote | SwayingLoad | UnannotatedTime]:
     """What of recording ``i`` was noted otherwise than it hung; ``difference`` (3P, m), V: measured minus simulated."""
     o = workspace.observations[i]
     implied = levels(workspace, i, difference, times(o, i))
     wrong = wrong_notes_against(o.loads, o.period, partial(_implied_loads, workspace, i, implied), MOST_AN_EFFECT_DOES)
-    if not wrong and (unnoted := unnoted_times(implied, len(o.loads), o.period)):
-        return [*unnoted]
+    if not wrong and (unannotated := unannotated_times(implied, len(o.loads), o.period)):
+        return [*unannotated]
     return [*swayed(workspace, i, difference, implied), *wrong]
 
 
@@ -256,13 +258,13 @@ def _implied_loads(workspace: Workspace, i: int, implied: PlateauLoads, acting: 
     return levels(workspace, i, moved.residual(moved.base)[1][i], implied.plateaus)
 
 
-def _with_effective_loads(o: Observation, notes: Sequence[WrongNote | SwayingLoad | UnnotedTime]) -> Observation:
+def _with_effective_loads(o: Observation, notes: Sequence[WrongNote | SwayingLoad | UnannotatedTime]) -> Observation:
     """With the loads that hung, without the times in which nobody knows them."""
     if not notes:
         return o
     swayed = [n for n in notes if isinstance(n, SwayingLoad)]
     volts = excluded(o.rig, o.volts, swayed)
-    volts = without_times(volts, [n for n in notes if isinstance(n, UnnotedTime)])
+    volts = without_times(volts, [n for n in notes if isinstance(n, UnannotatedTime)])
     loads = as_applied(o.loads, [n for n in notes if isinstance(n, WrongNote)])
     return dataclasses.replace(_with_volts(o, volts), loads=loads, swing=swung(len(loads), swayed))
 

@@ -20,8 +20,8 @@ from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
+from psd_deflection.studies.loads.annotated_times import ordinal, unannotated_steps
 from psd_deflection.studies.loads.fine import FINE_SECONDS, fine_means
-from psd_deflection.studies.loads.noted_times import ordinal, unnoted_steps
 from psd_deflection.studies.loads.plate_motion import across_plate, dot_rows, moved_plate
 
 BoolArray = npt.NDArray[np.bool_]
@@ -67,17 +67,17 @@ CLOSES = 0.2
 class Plateau:
     """One time between two changes of the load: samples ``first`` to ``last`` of recording ``recording``.
 
-    ``number``: of the noted change that began it, from 1; 0 before the first. ``unnoted``: nothing was noted when it
-    began; ``end_unnoted``: nor when it ended. ``annotated`` (3,): N, N, N m.
+    ``number``: of the noted change that began it, from 1; 0 before the first. ``unannotated``: nothing was noted when
+    it began; ``end_unannotated``: nor when it ended. ``annotated`` (3,): N, N, N m.
     """
 
     recording: int
     first: int
     last: int
     number: int
-    unnoted: bool
+    unannotated: bool
     annotated: FloatArray
-    end_unnoted: bool = False
+    end_unannotated: bool = False
 
     def of(self, loads: FloatArray) -> FloatArray:
         """(3,): the load in its middle, of ``loads`` (n, 3)."""
@@ -97,16 +97,16 @@ def plateaus(
     # A load that was applied slowly changes from sample to sample: what counts is its end.
     ends = changed[np.append(np.diff(changed) > 1, True)].tolist() if len(changed) else []
     dots = volts[:, dot_rows(len(rig.psds))] * rig.sensitivities.ravel()
-    unnoted = [] if annotated_only else [round(t / period) for t in unnoted_steps(rig, dots, loads)]
-    starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unnoted)])
-    stops = np.append(np.union1d(changed, unnoted), len(loads))
+    unannotated = [] if annotated_only else [round(t / period) for t in unannotated_steps(rig, dots, loads)]
+    starts = sorted([(0, False), *((c, False) for c in ends), *((c, True) for c in unannotated)])
+    stops = np.append(np.union1d(changed, unannotated), len(loads))
     out, number = [], 0
     for first, alone in starts:
         number += not alone and first > 0
         last = int(stops[np.searchsorted(stops, first, side='right')])
         if (last - first) * period >= LONG_S:
             middle = loads[(first + last) // 2].copy()
-            out.append(Plateau(recording, first, last, number, alone, middle, last in unnoted))
+            out.append(Plateau(recording, first, last, number, alone, middle, last in unannotated))
     return out
 
 
@@ -271,7 +271,7 @@ def _annotated_twice(implied: PlateauLoads, k: int) -> FloatArray | None:
     Of the first load that is ambiguous: half of it may be another unit, or another stiffness.
     """
     annotated, before = implied.annotated[k], implied.annotated[k - 1]
-    if k == 0 or implied.plateaus[k].unnoted or not np.any(before != 0.0):
+    if k == 0 or implied.plateaus[k].unannotated or not np.any(before != 0.0):
         return None
     applied = 0.5 * (before + annotated)
     off = np.abs(implied.more[k] - (applied - annotated))
@@ -382,13 +382,13 @@ class WrongNote:
     @property
     def name(self) -> str:
         """Of the finding."""
-        return 'missing_load' if self.plateau.unnoted else 'load_value'
+        return 'missing_load' if self.plateau.unannotated else 'load_value'
 
     @property
     def where(self) -> str:
         """``load 3``, or when it was hung."""
         p = self.plateau
-        return f'{p.first * self.period:.3f} s' if p.unnoted else f'load {p.number}'
+        return f'{p.first * self.period:.3f} s' if p.unannotated else f'load {p.number}'
 
     @property
     def value(self) -> tuple[float, ...]:
@@ -477,7 +477,7 @@ def as_applied(loads: FloatArray, wrong: Sequence[WrongNote]) -> FloatArray:
 
 
 def _begun(p: Plateau, name: str) -> str:
-    if not p.unnoted:
+    if not p.unannotated:
         return f'the {ordinal(p.number)} load of {name} was noted wrong'
     after = f' after the {ordinal(p.number)} noted load' if p.number else ''
     return f'something was hung or taken off{after} of {name} and not noted'

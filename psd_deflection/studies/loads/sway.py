@@ -15,7 +15,7 @@ import numpy as np
 
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.noted_times import SETTLED_S
+from psd_deflection.studies.loads.annotated_times import SETTLED_S
 from psd_deflection.studies.loads.plateaus import FEWEST, Plateau, PlateauLoads, implied_beside_rig, plateaus
 
 SWAYS, SLOWEST_HZ, FASTEST_HZ = 8.0, 0.3, 6.0

@@ -48,7 +48,7 @@ class StillShown:
         self.folder = 'recordings/test'
         self.reports = 0
         self.alarmed: Alarm | None = None
-        self.acted = threading.Event()
+        self.finished = threading.Event()
 
     def describe(self) -> dict[str, Any]:
         return {'kind': 'live', 'name': 'test', 'recording': self.recordings[-1] if self.recordings else None}
@@ -66,7 +66,7 @@ class StillShown:
         if self.rejection:
             raise RejectedError(self.rejection)
         self.zeros += 1
-        self.acted.set()
+        self.finished.set()
         return 'unloaded dots taken'
 
     async def record(self, wanted: bool) -> str:

@@ -339,7 +339,7 @@ def test_what_cannot_be_checked_is_rejected(
 
 
 # A perfect rig: nothing drifts, whatever hangs on it.
-HUNG = (
+SWAYS = (
     'steps:0,0,0;0,-10,-5.85;0,-30,-17.55;0,-50,-29.25:9',
     'steps:0,0,0;0,-1,-0.585;0,-3,-1.755;0,-5,-2.925:9',
     'steps:0,-50,-29.25;0,0,0:4',
@@ -358,7 +358,7 @@ def drift_of(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> d
 
 
 @pytest.mark.parametrize('seed', ['1', '2'])
-@pytest.mark.parametrize('loads', HUNG)
+@pytest.mark.parametrize('loads', SWAYS)
 def test_loads_and_ringing_are_no_drift(
     loads: str, seed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -374,7 +374,7 @@ def test_a_drift_under_a_staircase_of_loads_is_found_to_a_hundredth(
 ) -> None:
     # 4.5 um/K over 4 K in a minute.
     hidden = ('--temperature', '20,24', '--effect', 'thermal_drift,psd=1,x=4.5e-6')
-    found = drift_of(tmp_path, capsys, '--loads', HUNG[0].replace(':9', ':15'), *hidden)
+    found = drift_of(tmp_path, capsys, '--loads', SWAYS[0].replace(':9', ':15'), *hidden)
     assert found['drift']['x1'] * 60.0 == pytest.approx(18e-6, rel=0.01)
     (note,) = [note for note in found['notes'] if 'drift' in note]
     assert 'on x1; let lasers and amplifier warm up' in note
@@ -386,7 +386,7 @@ def test_a_weight_that_is_taken_off_moves_the_dots_by_what_it_held(
     rig = load_rig()
     before, after = ForwardModel(rig, settled=True).run(np.array([[0.0, 0.0, 0.0], [0.0, -50.0, -29.25]])).true_dots.T
     made = str(tmp_path / 'made')
-    assert main(['simulate', '--out', made, '--loads', HUNG[2]]) == 0
+    assert main(['simulate', '--out', made, '--loads', SWAYS[2]]) == 0
     observed = read_observation(made, rig)
     (push,) = responses(rig, observed.volts, observed.loads).pushes
     # Named by the load upwards; what hung there pulled down.

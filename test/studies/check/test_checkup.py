@@ -19,7 +19,7 @@ from psd_deflection.studies.check.checkup import CheckProblem, check
 from psd_deflection.studies.check.levels import Levels
 from psd_deflection.studies.check.result import CANNOT_TELL, RIGHT, SIGNIFICANT_DRIFT, WRONG, Checkup
 from psd_deflection.studies.check.wirings import WIRINGS, PushResponse, WiringFit, on_channels
-from psd_deflection.studies.loads.noted_times import CorrectedNote
+from psd_deflection.studies.loads.annotated_times import CorrectedNote
 
 RIG = load_rig()
 STATED = math.hypot(2e-3, 20.0 / 2**16 / math.sqrt(12.0))

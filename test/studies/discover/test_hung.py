@@ -27,11 +27,11 @@ from psd_deflection.studies.discover.search.fit import refit
 from psd_deflection.studies.discover.search.free import LoadDirection, ZeroDirection, moved
 from psd_deflection.studies.discover.search.search import SearchResult
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.hung import ringing_on, unseen
+from psd_deflection.studies.discover.setup.applied import ringing_on, unseen
 from psd_deflection.studies.discover.setup.redundant import excess
-from psd_deflection.studies.loads.noted_times import CorrectedNote
+from psd_deflection.studies.loads.annotated_times import CorrectedNote
 from psd_deflection.studies.loads.steps import applied
-from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, noted_as, read
+from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, annotated_as, read
 
 NUMBER = np.arange(len(HELD))
 
@@ -39,13 +39,13 @@ NUMBER = np.arange(len(HELD))
 TURNED = {'effects__e__name': 'sensor_rotation', 'effects__e__psd': 1, 'effects__e__angle': 0.004}
 
 
-def searched(volts: FloatArray, noted: FloatArray) -> Discovery:
-    return discover([Observation('x', RIG, volts, noted)])
+def searched(volts: FloatArray, annotated: FloatArray) -> Discovery:
+    return discover([Observation('x', RIG, volts, annotated)])
 
 
 @pytest.mark.slow
 def test_a_weight_that_was_hung_and_never_noted_is_reported_with_what_hung() -> None:
-    found = searched(read(HELD, **TURNED), noted_as(2, (0, -20, 0)))
+    found = searched(read(HELD, **TURNED), annotated_as(2, (0, -20, 0)))
     assert [(f.name, f.where) for f in found.setup] == [('missing_load', '8.000 s')]
     assert found.setup[0].value == pytest.approx((0.0, -50.0, 0.0), abs=0.2)
     assert 'not noted: from 8.000 s to 12.000 s (0 N, -50 N, 0 N m) hung, not (0 N, -20 N, 0 N m)' in found.setup[0].fix
@@ -57,7 +57,7 @@ def test_a_weight_that_was_hung_and_never_noted_is_reported_with_what_hung() -> 
 
 @pytest.mark.slow
 def test_a_load_that_was_noted_twice_is_reported() -> None:
-    found = searched(read(HELD), noted_as(5, (80, -80, 40)))
+    found = searched(read(HELD), annotated_as(5, (80, -80, 40)))
     assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 5')]
     assert 'the 5th load of x was noted wrong' in found.setup[0].fix
     assert '(40 N, -40 N, 20 N m) hung, not (80 N, -80 N, 40 N m)' in found.setup[0].fix
@@ -94,10 +94,10 @@ def test_rounded_loads_beside_beam_drift_are_reported() -> None:
 @pytest.mark.slow
 def test_a_lag_of_the_amplifiers_is_found_beside_fitted_times_which_follow_it() -> None:
     """All times a little later leave of a lag only what bends; and they are settled again beside it."""
-    noted = np.tile(LEVELS[0], (len(HELD), 1))
+    annotated = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
-        noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
-    found = searched(read(HELD, effects__e__name='amplifier_lag', effects__e__time_constant=4e-4), noted)
+        annotated[number * DWELL + round(1000 * late) :] = LEVELS[number]
+    found = searched(read(HELD, effects__e__name='amplifier_lag', effects__e__time_constant=4e-4), annotated)
     assert [e.active.effect.name for e in found.effects] == ['amplifier_lag']
     assert found.effects[0].active.values['time_constant'] == pytest.approx(4e-4, rel=0.1)
     assert found.verdict == 'effects_found'
@@ -140,10 +140,10 @@ def test_a_weight_that_sways_is_reported_and_its_time_left_out(force: float, fre
 def test_a_clamp_that_sticks_is_found_beside_loads_that_were_noted_late() -> None:
     """It keeps where the load was, so that a mended load must not turn back by a thousandth behind its step."""
     sticks = {'effects__e__name': 'clamp_friction', 'effects__e__width': 1.4e-5, 'effects__e__axis': 3}
-    noted = np.tile(LEVELS[0], (len(HELD), 1))
+    annotated = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
-        noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
-    found = searched(read(HELD, **sticks), noted)
+        annotated[number * DWELL + round(1000 * late) :] = LEVELS[number]
+    found = searched(read(HELD, **sticks), annotated)
     assert [f.name for f in found.setup] == ['load_time'] * 7
     assert [(e.active.effect.name, e.active.values['axis']) for e in found.effects] == [('clamp_friction', 3)]
     assert found.effects[0].active.values['width'] == pytest.approx(1.4e-5, rel=5e-3)
@@ -160,8 +160,8 @@ def test_the_noise_of_a_load_cell_is_no_effect() -> None:
     assert found.floors < 1.05
 
 
-def prepared(volts: FloatArray, noted: FloatArray) -> Recorded:
-    recorded = Recorded((Observation('x', RIG, volts, noted),), RIG, ())
+def prepared(volts: FloatArray, annotated: FloatArray) -> Recorded:
+    recorded = Recorded((Observation('x', RIG, volts, annotated),), RIG, ())
     for step in STEPS:
         recorded = step(recorded)
     return compared(recorded)[0]
@@ -170,8 +170,8 @@ def prepared(volts: FloatArray, noted: FloatArray) -> Recorded:
 @pytest.mark.slow
 def test_the_fourth_reading_names_only_a_rotated_detector() -> None:
     soft = read(HELD, link__youngs_modulus=0.9 * RIG.link.youngs_modulus)
-    for volts, noted in ((read(HELD), HELD), (read(HELD), 1.3 * HELD), (soft, HELD)):
-        fourth = prepared(volts, noted).fourth
+    for volts, annotated in ((read(HELD), HELD), (read(HELD), 1.3 * HELD), (soft, HELD)):
+        fourth = prepared(volts, annotated).fourth
         assert fourth is not None
         assert fourth.acquits
         assert 0.8 * fourth.values < fourth.chi_square < 1.05 * fourth.values
@@ -202,12 +202,12 @@ def test_other_natural_frequencies_than_the_rig_file_says_are_lines_for_it(bendi
     assert found.verdict == 'effects_found'
     assert found.floors < 1.05
     assert found.setup == ()
-    mended = {f'dynamics.{key}_frequency': (14.0 if key == 'bending' else 21.0) * f for key, f in wrong.items()}
-    assert found.values == pytest.approx(mended, rel=1e-5)
-    lines = [f'rig file: {key}: {found.values[key]}' for key in mended]
+    corrected = {f'dynamics.{key}_frequency': (14.0 if key == 'bending' else 21.0) * f for key, f in wrong.items()}
+    assert found.values == pytest.approx(corrected, rel=1e-5)
+    lines = [f'rig file: {key}: {found.values[key]}' for key in corrected]
     assert [words for words in found.lines() if words.startswith('rig file')] == lines
     again = flat_parameters(found.model_yaml(), Path('model.yaml'))
-    assert {key: again[key] for key in mended} == found.values
+    assert {key: again[key] for key in corrected} == found.values
     assert not any(key.startswith('effects.') for key in again)
     assert 'The estimates of the pose are right without' in found.sentence
 
@@ -257,8 +257,8 @@ def test_small_delays_beside_a_twisting_clamp_are_found() -> None:
     levels = np.array([(0, 0, 0), (0, -50, 0), (0, -20, 0), (0, -40, 0), (20, -30, 17.55), (-25, -15, 0), (0, -40, 0)])
     acting = np.repeat(np.vstack((levels, np.zeros(3))), DWELL, axis=0).astype(np.float64)
     soft = {'effects__e__name': 'clamp_torsional_compliance', 'effects__e__compliance': 1.56e-5}
-    noted = np.vstack((np.zeros((4, 3)), acting[:-4]))
-    found = searched(read(acting, **soft), noted)
+    annotated = np.vstack((np.zeros((4, 3)), acting[:-4]))
+    found = searched(read(acting, **soft), annotated)
     assert [f.name for f in found.setup] == ['load_delay']
     assert found.setup[0].value == pytest.approx(0.004, abs=1e-5)
     # One torque cannot tell the clamp from the link.
@@ -270,8 +270,8 @@ def test_small_delays_beside_a_twisting_clamp_are_found() -> None:
 @pytest.mark.parametrize(('late', 'angle'), [(1, 0.02), (2, 0.02), (5, 0.02), (2, 0.06)])
 def test_small_delays_beside_a_rotated_detector_are_found(late: int, angle: float) -> None:
     """Neither leaves next to nothing without the other, and stiffnesses would stand in for the delay."""
-    noted = np.vstack((np.zeros((late, 3)), HELD[:-late]))
-    found = searched(read(HELD, **{**TURNED, 'effects__e__angle': angle}), noted)
+    annotated = np.vstack((np.zeros((late, 3)), HELD[:-late]))
+    found = searched(read(HELD, **{**TURNED, 'effects__e__angle': angle}), annotated)
     assert [f.name for f in found.setup] == ['load_delay']
     assert found.setup[0].value == pytest.approx(1e-3 * late, abs=1e-5)
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
@@ -297,10 +297,10 @@ def test_small_delays_beside_a_second_mode_are_found() -> None:
 def test_the_first_load_noted_twice_is_reported_if_no_other_pulls_that_way() -> None:
     down = [(0, -20, 0), (0, -40, -23.4), (0, -10, 0), (0, -30, 17.55)]
     acting = np.repeat(np.array([(0, 0, 0), (15, 0, 0), *down, (0, 0, 0)]), DWELL, axis=0)
-    noted = acting.copy()
-    noted[DWELL : 2 * DWELL] *= 2.0
+    annotated = acting.copy()
+    annotated[DWELL : 2 * DWELL] *= 2.0
     more = {'name': 'sensor_gain', 'psd': 1, 'x': 0.004, 'y': 0.004}
-    found = searched(read(acting, **{f'effects__e__{k}': v for k, v in more.items()}), noted)
+    found = searched(read(acting, **{f'effects__e__{k}': v for k, v in more.items()}), annotated)
     assert [(f.name, f.where) for f in found.setup] == [('load_value', 'load 1')]
     assert found.setup[0].value == pytest.approx((15.0, 0.0, 0.0), abs=0.05)
     assert [e.active.label for e in found.effects] == ['sensor_gain (psd 1)']
@@ -356,10 +356,10 @@ def test_the_only_torque_noted_twice_is_reported_with_the_clamp_that_twists() ->
         [(0, 0, 0), (0, -20, 0), (15, 0, 0), (24, -40, 0), (20, -30, 17.5), (-15, 0, 0), (0, -35, 0), (0, 0, 0)]
     )
     acting = np.repeat(levels, DWELL, axis=0)
-    noted = acting.copy()
-    noted[4 * DWELL : 5 * DWELL] = (16, -20, 35)
+    annotated = acting.copy()
+    annotated[4 * DWELL : 5 * DWELL] = (16, -20, 35)
     clamp = {'effects__e__name': 'clamp_torsional_compliance', 'effects__e__compliance': 6e-6}
-    found = searched(read(acting, **clamp), noted)
+    found = searched(read(acting, **clamp), annotated)
     assert [(f.name, f.where, f.value) for f in found.setup] == [('load_value', 'load 4', (20.0, -30.0, 17.5))]
     (effect,) = found.effects
     assert 'clamp_torsional_compliance' in (effect.active.effect.name, *effect.equivalent)
@@ -368,10 +368,10 @@ def test_the_only_torque_noted_twice_is_reported_with_the_clamp_that_twists() ->
 
 
 def test_free_times_are_settled_again_if_an_effect_fails() -> None:
-    noted = np.tile(LEVELS[0], (len(HELD), 1))
+    annotated = np.tile(LEVELS[0], (len(HELD), 1))
     for number, late in enumerate((0.4, 1.2, 2.1, 0.9, 1.7, 0.6, 2.6), start=1):
-        noted[number * DWELL + round(1000 * late) :] = LEVELS[number]
-    machine = RecordedRig.of([Observation('x', RIG, read(HELD), noted)], RIG, (), None, lambda _: None)
+        annotated[number * DWELL + round(1000 * late) :] = LEVELS[number]
+    machine = RecordedRig.of([Observation('x', RIG, read(HELD), annotated)], RIG, (), None, lambda _: None)
     problem = Problem.of(machine, 0, lambda _: None, np.random.default_rng(0))
     ws = machine.workspace
     assert ws.free is not None

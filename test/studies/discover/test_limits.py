@@ -43,9 +43,9 @@ def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch
     """It pulled the other way, half as much as noted: that is no unit, but the sign is wrong."""
     o = make_observation(warm=None)
     observed = dataclasses.replace(o, loads=o.loads * [1.0, -2.0, 1.0])
-    mended, findings, lines = setup.wire([observed], ())
+    corrected, findings, lines = setup.wire([observed], ())
     assert [(f.name, f.where) for f in findings] == [('load_sign', 'fy')]
-    np.testing.assert_allclose(mended[0].loads, o.loads * [1.0, 2.0, 1.0])
+    np.testing.assert_allclose(corrected[0].loads, o.loads * [1.0, 2.0, 1.0])
     assert lines == {}
 
 

@@ -91,10 +91,10 @@ def test_nothing_is_named_if_nothing_is_missing(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_table_with_times_gives_the_same_rows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     t, poses = measured([SOFT])
-    noted = np.searchsorted(HELD * np.arange(len(LOADS)) + np.array(LATE), t, side='right') - 1
+    annotated = np.searchsorted(HELD * np.arange(len(LOADS)) + np.array(LATE), t, side='right') - 1
     lines = [
         ','.join(map(repr, (at, *map(float, LOADS[i]), *pose)))
-        for at, i, pose in zip(t.tolist(), noted.tolist(), poses.tolist(), strict=True)
+        for at, i, pose in zip(t.tolist(), annotated.tolist(), poses.tolist(), strict=True)
     ]
     lines[5] = lines[5].rsplit(',', 3)[0] + ',,,'
     path = tmp_path / 'camera.csv'

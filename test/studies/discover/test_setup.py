@@ -95,12 +95,12 @@ def test_wiring_signs_and_units_are_put_right(
 ) -> None:
     o = recorded()
     wrong = mistake(o)
-    (mended,), findings, lines = wire([wrong], ())
+    (corrected,), findings, lines = wire([wrong], ())
     assert [(f.name, f.where, f.value, f.fix) for f in findings] == named
-    np.testing.assert_array_equal(mended.volts, o.volts)
-    np.testing.assert_allclose(mended.loads, o.loads, rtol=1e-9)
+    np.testing.assert_array_equal(corrected.volts, o.volts)
+    np.testing.assert_allclose(corrected.loads, o.loads, rtol=1e-9)
     # The lines alone wire the rig file right.
-    assert replace_values(RIG, lines).values == mended.rig.values
+    assert replace_values(RIG, lines).values == corrected.rig.values
 
 
 @pytest.mark.slow
@@ -119,8 +119,8 @@ def test_alike_units_differ_where_movement_is_nonlinear() -> None:
     loads = np.repeat([(0, 0, 0), (0, -50, -29.25), (0, 0, 0)], 2000, axis=0).astype(np.float64)
     volts = np.asarray(RigSimulator(RIG, 1).step(loads).counts * RIG.converter.volts_per_count, dtype=np.float64)
     for factor in (9.80665e-3, 1e-2):
-        noted = np.asarray(loads / (1.0, 1.0, factor), dtype=np.float64)
-        _, findings, _ = wire([Observation('x', RIG, volts, noted)], ())
+        annotated = np.asarray(loads / (1.0, 1.0, factor), dtype=np.float64)
+        _, findings, _ = wire([Observation('x', RIG, volts, annotated)], ())
         assert [(f.where, f.value) for f in findings] == [('tz', factor)]
 
 

@@ -159,11 +159,11 @@ def test_two_others_that_are_exchanged_are_named_and_put_right() -> None:
     """No parameter says it, so there is no line for it."""
     right = make_observation(RIG, world={'psd_1.axes': ['x', '-y']})
     exchanged = dataclasses.replace(right, volts=right.volts[:, [6, 7, 8, 3, 4, 5, 0, 1, 2]])
-    (mended,), findings, lines = wire([exchanged], ())
+    (corrected,), findings, lines = wire([exchanged], ())
     assert [(f.name, f.where) for f in findings] == [('psd_swap', 'psd_1 psd_3'), ('channel_sign', 'y3')]
     assert findings[0].fix.startswith('exchange the cables of psd_1 and psd_3 at the device')
     assert lines == {'psd_1.axes': ['x', '-y']}
-    assert mended.volts == pytest.approx(right.volts * [1, -1, 1, *[1] * 6])
+    assert corrected.volts == pytest.approx(right.volts * [1, -1, 1, *[1] * 6])
 
 
 def test_a_crossed_wiring_goes_to_the_device_and_back() -> None:

@@ -13,11 +13,11 @@ import pytest
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
-from psd_deflection.studies.loads import noted_times
+from psd_deflection.studies.loads import annotated_times
 from psd_deflection.studies.loads import steps as steps_module
-from psd_deflection.studies.loads.noted_times import (
+from psd_deflection.studies.loads.annotated_times import (
     correct_loads,
-    unnoted_steps,
+    unannotated_steps,
 )
 from psd_deflection.studies.loads.steps import last_step
 from test.studies.loads.test_note_parts import as_steps, note
@@ -174,7 +174,7 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
     there = np.asarray(np.isfinite(dots).all(axis=1))
     rest = np.where(there[:, None], dots - design @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0], np.nan)
     with np.errstate(invalid='raise', divide='raise'):
-        left, means = noted_times.residual_of_dots(RIG, dots, loads)
+        left, means = annotated_times.residual_of_dots(RIG, dots, loads)
     assert left == pytest.approx(float(np.nansum(rest**2)), rel=1e-6)
     assert means.shape == dots.shape
     for first in range(0, 1010, 20):
@@ -182,12 +182,12 @@ def test_what_is_left_of_the_dots_is_what_least_squares_leave() -> None:
         wanted = np.nanmean(part, axis=0) if np.isfinite(part).any() else np.full(4, np.nan)
         assert means[first : first + 20] == pytest.approx(np.tile(wanted, (len(part), 1)), rel=1e-4, nan_ok=True)
     # A millionth of the loads moves the dots alike.
-    assert noted_times.residual_of_dots(RIG, dots, 1e-6 * loads)[0] == pytest.approx(left, rel=1e-6)
+    assert annotated_times.residual_of_dots(RIG, dots, 1e-6 * loads)[0] == pytest.approx(left, rel=1e-6)
     # And one axis that is never loaded does nothing.
     loads[:, 1] = 0.0
     design[:, 3] = 0.0
     rest = dots[there] - design[there] @ np.linalg.lstsq(design[there], dots[there], rcond=None)[0]
-    assert noted_times.residual_of_dots(RIG, dots, loads)[0] == pytest.approx(float((rest**2).sum()), rel=1e-6)
+    assert annotated_times.residual_of_dots(RIG, dots, loads)[0] == pytest.approx(float((rest**2).sum()), rel=1e-6)
 
 
 def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
@@ -196,13 +196,13 @@ def test_a_link_moves_for_five_time_constants_of_its_slower_mode() -> None:
     # 1 / (2 pi f ratio): 0.568 s of 14 Hz at 0.02, 0.318 s of 10 Hz at 0.05.
     wanted = 5.0 / (2.0 * math.pi * 14.0 * 0.02)
     for took in (0.0, 0.7):
-        moving = np.flatnonzero(noted_times.in_motion(rig, note(3.0, 2.0, took), t))
+        moving = np.flatnonzero(annotated_times.in_motion(rig, note(3.0, 2.0, took), t))
         assert moving[0] == 1980
         assert moving[-1] == math.floor(1000.0 * (2.0 + took + wanted))
         assert len(moving) == moving[-1] - moving[0] + 1
     # Without damping of a thousandth or more it would never end.
     free = load_rig(overrides={'dynamics.torsion_frequency': 200.0, 'dynamics.torsion_damping_ratio': 0.0})
-    assert np.flatnonzero(noted_times.in_motion(free, note(3.0, 2.0), t))[-1] == math.floor(
+    assert np.flatnonzero(annotated_times.in_motion(free, note(3.0, 2.0), t))[-1] == math.floor(
         2000.0 + 5e6 / (400.0 * math.pi)
     )
 
@@ -220,21 +220,21 @@ def test_ringing_is_rough_beyond_three_times_the_noise() -> None:
     # Six that are s off their mean, of four dots: 4 s^2, above 9 * 2 if s is above 2.1.
     for size, rough in ((2.1, False), (2.14, True)):
         rest = rest_of([*quiet, *[size, -size] * 3])
-        assert noted_times.is_rough(rest, rings, 4) is rough
+        assert annotated_times.is_rough(rest, rings, 4) is rough
         # About their own mean.
         rest[-24:] += 50.0
-        assert noted_times.is_rough(rest, rings, 4) is rough
+        assert annotated_times.is_rough(rest, rings, 4) is rough
     # Exactly three times is not beyond: 1.5 of two dots, beside quiet ones of which one differs by 1.
     rest = rest_of([*quiet, *[1.5, -1.5] * 3]) * (1.0, 0.0, 0.0, 0.0)
     rest[-24:, 1] = rest[-24:, 0]
-    assert not noted_times.is_rough(rest, rings, 4)
-    assert noted_times.is_rough(1.01 * rest - 0.01 * rest * ~rings[:, None], rings, 4)
+    assert not annotated_times.is_rough(rest, rings, 4)
+    assert annotated_times.is_rough(1.01 * rest - 0.01 * rest * ~rings[:, None], rings, 4)
     # A lost block counts as none, and of three nothing is told.
     rest = rest_of([*quiet, *[5.0, -5.0] * 3])
     rest[-8:] = np.nan
-    assert noted_times.is_rough(rest, rings, 4)
+    assert annotated_times.is_rough(rest, rings, 4)
     rest[-12:, 2] = np.nan
-    assert not noted_times.is_rough(rest, rings, 4)
+    assert not annotated_times.is_rough(rest, rings, 4)
 
 
 def test_rough_motion_under_a_slow_load_is_excluded() -> None:
@@ -244,8 +244,8 @@ def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     rest[2500:4000] += 20.0 * np.sin(np.arange(1500) / 40.0)[:, None]
     slow, sudden = note(2.0, 2.0, 0.5), note(2.5, 2.5)
     rough = note(2.0, 2.0, 0.5, rest_only=True)
-    assert noted_times.without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
-    found = noted_times.without_rough_motion(RIG, loads, [sudden, slow], rest)
+    assert annotated_times.without_rough_motion(RIG, loads, [slow, sudden], rest).notes == (rough, sudden)
+    found = annotated_times.without_rough_motion(RIG, loads, [sudden, slow], rest)
     assert found.loads is loads
     assert found.notes == (sudden, rough)
     ends = 2.5 + 5.0 / (2.0 * math.pi * 14.0 * 0.02)
@@ -254,7 +254,7 @@ def test_rough_motion_under_a_slow_load_is_excluded() -> None:
     rest = quiet.copy()
     rest[1000:2520] += 100.0 * np.sin(np.arange(1520) / 40.0)[:, None]
     rest[2500:2520] = 1000.0
-    found = noted_times.without_rough_motion(RIG, loads, [slow], rest)
+    found = annotated_times.without_rough_motion(RIG, loads, [slow], rest)
     assert (found.notes, found.unused.sum(), len(found.unused)) == ((slow,), 0, count)
 
 
@@ -277,16 +277,16 @@ def with_pieces(
         return fitted[step.at]
 
     leaves = iter([left[0], left[1]] * 9)
-    monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
+    monkeypatch.setattr(annotated_times, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
-    monkeypatch.setattr(noted_times, 'time_of_step', fit)
+    monkeypatch.setattr(annotated_times, 'time_of_step', fit)
     monkeypatch.setattr(
-        noted_times, 'residual_of_dots', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4)))
+        annotated_times, 'residual_of_dots', lambda rig, dots, loads: (next(leaves), 1e-7 * np.ones((len(dots), 4)))
     )
     return between
 
 
-def noted_at(*places: int, count: int = 20_000) -> FloatArray:
+def annotated_at(*places: int, count: int = 20_000) -> FloatArray:
     """Loads (n, 3) that change along X, along Y and by a torque in turn."""
     loads = np.zeros((count, 3))
     for k, at in enumerate(places):
@@ -304,19 +304,19 @@ def test_steps_without_a_note_near_them_are_reported_by_their_fitted_time(monkey
     fitted = {3000.0: (3.01, 0.5), 8000.0: (8.02, 0.7), 15000.0: (15.03, 0.9)}
     between = with_pieces(monkeypatch, steps, fitted)
     dots = np.zeros((20_000, 4))
-    assert unnoted_steps(RIG, dots, np.zeros((20_000, 3))) == [3.01, 8.02, 15.03]
+    assert unannotated_steps(RIG, dots, np.zeros((20_000, 3))) == [3.01, 8.02, 15.03]
     assert between == [(0.0, 8000.0), (3000.0, 15000.0), (8000.0, 20000.0)]
     # Near: two widths of 286 before the step's first sample, or after its last.
     for at, near in ((7228, True), (7227, False), (8772, True), (8773, False)):
-        reported = unnoted_steps(RIG, dots, noted_at(3000, at, 15000))
+        reported = unannotated_steps(RIG, dots, annotated_at(3000, at, 15000))
         assert reported == ([] if near else [8.02])
     # One axis is enough for a note, and two samples may be one change after the other.
     for axis in range(3):
         loads = np.zeros((20_000, 3))
         for at in (3000, 8000, 15000):
             loads[at:, axis] += 1.0
-        assert unnoted_steps(RIG, dots, loads) == []
-        assert unnoted_steps(RIG, dots, loads[:, [axis, axis, axis]]) == []
+        assert unannotated_steps(RIG, dots, loads) == []
+        assert unannotated_steps(RIG, dots, loads[:, [axis, axis, axis]]) == []
 
 
 def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -324,55 +324,55 @@ def test_changes_within_a_quarter_of_a_second_are_a_sweep(monkeypatch: pytest.Mo
     with_pieces(monkeypatch, steps, {3000.0: (3.01, 0.0), 8000.0: (8.0, 0.0)})
     dots = np.zeros((20_000, 4))
     for apart, reported in ((249, []), (250, [3.01])):
-        assert unnoted_steps(RIG, dots, noted_at(8000, 8000 + apart)) == reported
-        assert (correct_loads(RIG, dots, noted_at(3000, 9000, 9000 + apart)) is None) == (not reported)
+        assert unannotated_steps(RIG, dots, annotated_at(8000, 8000 + apart)) == reported
+        assert (correct_loads(RIG, dots, annotated_at(3000, 9000, 9000 + apart)) is None) == (not reported)
     # A ramp is one change, which ends once; one that comes two samples later is another.
-    ramp = noted_at(*range(8000, 8100))
-    assert unnoted_steps(RIG, dots, ramp) == [3.01]
-    assert unnoted_steps(RIG, dots, noted_at(8000, 8002)) == []
+    ramp = annotated_at(*range(8000, 8100))
+    assert unannotated_steps(RIG, dots, ramp) == [3.01]
+    assert unannotated_steps(RIG, dots, annotated_at(8000, 8002)) == []
     # Its end may come with a note of the next one within a quarter of a second.
-    assert unnoted_steps(RIG, dots, noted_at(*range(8000, 8100), 8200)) == []
-    assert unnoted_steps(RIG, dots, noted_at(*range(8000, 8100), 8400)) == [3.01]
+    assert unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8200)) == []
+    assert unannotated_steps(RIG, dots, annotated_at(*range(8000, 8100), 8400)) == [3.01]
 
 
 def test_times_are_mended_if_they_differ_and_leave_a_quarter_of_the_movement(monkeypatch: pytest.MonkeyPatch) -> None:
     places = (3000.0, 8000.0, 15000.0)
-    sizes = noted_times.expected_movements(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
+    sizes = annotated_times.expected_movements(RIG, np.array([(10.0, 0, 0), (0, 10.0, 0), (0, 0, 3.0)])).tolist()
     steps = [
         steps_module.DotStep(at, size, int(at) - 200, int(at) + 200) for at, size in zip(places, sizes, strict=True)
     ]
     fitted = {3000.0: (3.0, 0.0), 8000.0: (8.0, 0.0), 15000.0: (15.0, 0.0)}
     dots = np.zeros((20_000, 4))
     between = with_pieces(monkeypatch, steps, fitted)
-    late = noted_at(3000, 9500, 15000)
+    late = annotated_at(3000, 9500, 15000)
     found = correct_loads(RIG, dots, late)
     assert found is not None
     assert [(n.number, n.annotated, n.applied, n.took) for n in found.notes] == [(2, 9.5, 8.0, 0.0)]
     assert [n.number for n in found.timed] == [1, 2, 3]
-    assert found.loads == pytest.approx(noted_at(3000, 8000, 15000))
+    assert found.loads == pytest.approx(annotated_at(3000, 8000, 15000))
     assert between == [(0.0, 8000.0), (3000.0, 15000.0), (8000.0, 20000.0)]
     assert not found.unused.any()
     assert found.measured == ()
     # Right as noted, all late alike, or two milliseconds off: nothing is fitted.
-    for noted_so in (noted_at(3000, 8000, 15000), noted_at(3500, 8500, 15500), noted_at(3002, 8000, 14998)):
+    for loads in (annotated_at(3000, 8000, 15000), annotated_at(3500, 8500, 15500), annotated_at(3002, 8000, 14998)):
         between.clear()
-        assert correct_loads(RIG, dots, noted_so) is None
+        assert correct_loads(RIG, dots, loads) is None
         assert between == []
     # A step that is longer than two widths and a tenth of a second is looked at: 2 * 286 + 100 samples.
     for long, looks in ((672, 0), (673, 3)):
         between.clear()
         some = [steps[0], steps_module.DotStep(8000.0, sizes[1], 7700, 7700 + long), steps[2]]
-        monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width, some=some: some)
+        monkeypatch.setattr(annotated_times, 'lasting_steps', lambda dots, width, some=some: some)
         monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width, some=some: some)
-        assert correct_loads(RIG, dots, noted_at(3000, 8000, 15000)) is None
+        assert correct_loads(RIG, dots, annotated_at(3000, 8000, 15000)) is None
         assert len(between) == looks
     # Applied over a tenth of a second is a step.
     for took, reported in ((0.1, None), (0.101, [0.101])):
         fitted[8000.0] = (8.0, took)
-        ramp = correct_loads(RIG, dots, noted_at(3000, 8000, 15000))
+        ramp = correct_loads(RIG, dots, annotated_at(3000, 8000, 15000))
         assert (None if ramp is None else [n.took for n in ramp.notes]) == reported
     fitted[8000.0] = (8.0, 0.0)
-    monkeypatch.setattr(noted_times, 'lasting_steps', lambda dots, width: steps)
+    monkeypatch.setattr(annotated_times, 'lasting_steps', lambda dots, width: steps)
     monkeypatch.setattr(steps_module, 'lasting_steps', lambda dots, width: steps)
     # Alike by the fitted times, though not by the middles of the steps.
     fitted.update({3000.0: (2.999, 0.0), 8000.0: (9.498, 0.0), 15000.0: (15.0, 0.0)})
@@ -409,12 +409,12 @@ def test_means_take_four_periods_of_bending_and_two_samples_at_least(
         widths.append(width)
         return []
 
-    monkeypatch.setattr(noted_times, 'lasting_steps', none)
+    monkeypatch.setattr(annotated_times, 'lasting_steps', none)
     monkeypatch.setattr(steps_module, 'lasting_steps', none)
     rig = load_rig(overrides={'converter.sample_rate_hz': rate, 'dynamics.bending_frequency': 14.0})
     loads = np.zeros((100, 3))
     loads[50:] = 1.0
-    assert unnoted_steps(rig, np.zeros((100, 4)), loads) == []
+    assert unannotated_steps(rig, np.zeros((100, 4)), loads) == []
     assert last_step(rig, np.zeros((100, 4)), 1.0 / rate) is None
     assert correct_loads(rig, np.zeros((100, 4)), loads) is None
     assert widths == [width] * 3

@@ -12,9 +12,9 @@ import pytest
 
 from psd_deflection.records import FloatArray, IntArray
 from psd_deflection.rig.config import load_rig
-from psd_deflection.studies.loads import noted_times
+from psd_deflection.studies.loads import annotated_times
 from psd_deflection.studies.loads import steps as steps_module
-from psd_deflection.studies.loads.noted_times import (
+from psd_deflection.studies.loads.annotated_times import (
     ALIKE_S,
     CorrectedNote,
     ordinal,
@@ -22,8 +22,10 @@ from psd_deflection.studies.loads.noted_times import (
 )
 
 
-def note(noted: float, hung: float, took: float = 0.0, *, rest_only: bool = False, number: int = 3) -> CorrectedNote:
-    return CorrectedNote(number, (1.5, -2.0, 0.25), noted, hung, took, rest_only)
+def note(
+    annotated: float, applied: float, took: float = 0.0, *, rest_only: bool = False, number: int = 3
+) -> CorrectedNote:
+    return CorrectedNote(number, (1.5, -2.0, 0.25), annotated, applied, took, rest_only)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +99,7 @@ def test_numbers_up_to_a_thousand_have_the_ending_of_their_last_word() -> None:
     ],
 )
 def test_equal_delays_are_near_the_median_and_below_0_9_s(late: list[float], alike: bool) -> None:
-    assert noted_times.are_alike(np.array(late), 0.125) is alike
+    assert annotated_times.are_alike(np.array(late), 0.125) is alike
 
 
 def test_the_dots_move_by_what_a_cantilever_and_a_shaft_do() -> None:
@@ -113,7 +115,7 @@ def test_the_dots_move_by_what_a_cantilever_and_a_shaft_do() -> None:
         x, y, turn = bend * fx, bend * fy, twist * tz
         moved = [(-x + turn * ly, -y - turn * lx) for lx, ly in beams]
         wanted.append(math.sqrt(sum(a * a + b * b for a, b in moved)))
-    assert noted_times.expected_movements(rig, np.array(loads)) == pytest.approx(wanted, rel=1e-9)
+    assert annotated_times.expected_movements(rig, np.array(loads)) == pytest.approx(wanted, rel=1e-9)
 
 
 # ---- steps of the dots
@@ -246,7 +248,7 @@ def test_notes_and_steps_are_paired_at_the_least_cost_of_all_ways(seed: int) -> 
     sizes[chance.integers(5)] *= 0.01
     places = np.sort(changes[:4] + chance.normal(size=4) * chance.choice([1.0, 4.0, 20.0, 300.0, 1500.0]))
     steps = as_steps(*zip(places.tolist(), (2e-4 * np.exp(chance.normal(size=4))).tolist(), strict=True))
-    assert noted_times.matched_notes(changes, sizes, steps, 0.01) == cheapest(changes, sizes, steps, 0.01)
+    assert annotated_times.matched_notes(changes, sizes, steps, 0.01) == cheapest(changes, sizes, steps, 0.01)
 
 
 def test_a_note_on_time_like_half_of_the_others_stays() -> None:
@@ -254,10 +256,10 @@ def test_a_note_on_time_like_half_of_the_others_stays() -> None:
     sizes = np.array([40.0, 30.0, 40.0])
     steps = as_steps((1000.0, 40.0), (3000.0, 30.0), (3800.0, 35.0), (5000.0, 10.0))
     on_time = np.array([1000, 3000, 5000])
-    assert noted_times.matched_notes(on_time, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 3)]
+    assert annotated_times.matched_notes(on_time, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 3)]
     # If the others are late, that one is at a step by chance.
     late = np.array([1400, 3600, 5000])
-    assert noted_times.matched_notes(late, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 2)]
+    assert annotated_times.matched_notes(late, sizes, steps, 0.01) == [(0, 0), (1, 1), (2, 2)]
 
 
 # ---- loads between samples
@@ -284,21 +286,21 @@ def test_later_and_slower_shift_what_the_load_changed_by() -> None:
     # Applied from sample 20 to 28: before is the sample before 19, after is the second one beyond 28.
     step = loads[30] - loads[18]
     ramp = note(12.0, 10.0, 4.0)
-    acted = shifted(ramp, loads, 0.5)
+    effective = shifted(ramp, loads, 0.5)
 
     def share(start: float, took: float) -> FloatArray:
         return np.asarray(np.clip((t + 0.5 - start) / took, 0.0, 1.0))
 
     # A moment is an eighth of a second here.
-    assert acted([4.0, 0.0]) == pytest.approx(np.outer(share(10.5, 4.0) - share(10.0, 4.0), step), abs=1e-3)
-    assert acted([0.0, 8.0]) == pytest.approx(np.outer(share(10.0, 5.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert effective([4.0, 0.0]) == pytest.approx(np.outer(share(10.5, 4.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert effective([0.0, 8.0]) == pytest.approx(np.outer(share(10.0, 5.0) - share(10.0, 4.0), step), abs=1e-3)
     # Faster than at once it cannot be.
-    assert acted([0.0, -100.0]) == pytest.approx(np.outer((t >= 10.0) - share(10.0, 4.0), step), abs=1e-3)
-    assert acted([0.0, 0.0]) == pytest.approx(0.0)
+    assert effective([0.0, -100.0]) == pytest.approx(np.outer((t >= 10.0) - share(10.0, 4.0), step), abs=1e-3)
+    assert effective([0.0, 0.0]) == pytest.approx(0.0)
     # Both at once are no sum of the two: its end moves by both.
     both = np.outer(share(9.5, 4.75) - share(10.0, 4.0), step)
-    assert acted([-4.0, 6.0]) == pytest.approx(both, abs=1e-3)
-    assert np.abs(acted([-4.0, 0.0]) + acted([0.0, 6.0]) - both).max() > 0.01 * np.abs(step).max()
+    assert effective([-4.0, 6.0]) == pytest.approx(both, abs=1e-3)
+    assert np.abs(effective([-4.0, 0.0]) + effective([0.0, 6.0]) - both).max() > 0.01 * np.abs(step).max()
     # At the begin and at the end of a recording there is no more.
     first = shifted(note(0.0, 0.0, 1.0), loads, 0.5)
     assert first([4.0, 0.0])[0] == pytest.approx(-(loads[4] - loads[0]) / 2.0, rel=1e-5)
@@ -311,26 +313,28 @@ def test_effective_loads_change_at_the_fitted_times() -> None:
     loads[5:] = (1.0, 0.0, 0.0)
     loads[12:] = (1.0, -2.0, 0.0)
     loads[20:] = (0.0, 0.0, 3.0)
-    acted, notes = noted_times.loads_with_times(loads, np.array([5, 12, 20]), {0: (0.3, 0.0), 2: (1.8, 0.2)}, 0.1)
+    effective, notes = annotated_times.loads_with_times(
+        loads, np.array([5, 12, 20]), {0: (0.3, 0.0), 2: (1.8, 0.2)}, 0.1
+    )
     wanted = np.zeros((30, 3))
     wanted[3:] += (1.0, 0.0, 0.0)
     wanted[12:] += (0.0, -2.0, 0.0)
     wanted[18:] += 0.5 * np.array((-1.0, 2.0, 3.0))
     wanted[19:] += 0.5 * np.array((-1.0, 2.0, 3.0))
-    assert acted == pytest.approx(wanted, abs=1e-5)
+    assert effective == pytest.approx(wanted, abs=1e-5)
     assert [(n.number, n.load) for n in notes] == [(1, (1.0, 0.0, 0.0)), (3, (0.0, 0.0, 3.0))]
     assert [(n.annotated, n.applied, n.took) for n in notes] == [
         pytest.approx((0.5, 0.3, 0.0)),
         pytest.approx((2.0, 1.8, 0.2)),
     ]
     # What took a tenth of a second was no ramp.
-    (one,) = noted_times.loads_with_times(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
+    (one,) = annotated_times.loads_with_times(loads, np.array([5]), {0: (0.3, 0.1)}, 0.1)[1]
     assert one.took == 0.0
     # From the second sample on, and one right after the other.
     loads = np.zeros((6, 3))
     loads[1:], loads[2:] = (1.0, 0.0, 0.0), (5.0, 2.0, 0.0)
-    assert noted_times.loads_with_times(loads, np.array([1, 2]), {}, 0.1)[0] == pytest.approx(loads)
+    assert annotated_times.loads_with_times(loads, np.array([1, 2]), {}, 0.1)[0] == pytest.approx(loads)
     loads = np.zeros((30, 3))
     loads[5:], loads[12:], loads[20:] = (1.0, 0.0, 0.0), (1.0, -2.0, 0.0), (0.0, 0.0, 3.0)
     begun = np.add(loads, (7.0, 8.0, 9.0))
-    assert noted_times.loads_with_times(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)
+    assert annotated_times.loads_with_times(begun, np.array([5, 12, 20]), {}, 0.1)[0] == pytest.approx(begun)

@@ -12,11 +12,11 @@ import pytest
 from psd_deflection.model.simulation.modes import Filter, mode_coefficients
 from psd_deflection.records import DOT_CHANNELS, FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.calibrate.from_recordings import as_acted
+from psd_deflection.studies.calibrate.from_recordings import with_effective_loads
 from psd_deflection.studies.calibrate.observation import CalibrationRun
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.loads.noted_times import (
+from psd_deflection.studies.loads.annotated_times import (
     ALIKE_S,
     CorrectedLoads,
     CorrectedNote,
@@ -33,7 +33,7 @@ LATE = (1.3, 1.7, 3.4, 2.7, 0.3, 2.3)
 JITTER = (0.012, -0.02, 0.004, 0.028, -0.009, 0.017)
 
 
-def hung(took: float = 0.0) -> FloatArray:
+def applied(took: float = 0.0) -> FloatArray:
     """Loads as they act: the next level every 5 s, in ``took`` s."""
     out = np.empty((COUNT, 3))
     for i, level in enumerate(LEVELS):
@@ -43,7 +43,7 @@ def hung(took: float = 0.0) -> FloatArray:
     return out
 
 
-def noted(late: tuple[float, ...]) -> FloatArray:
+def annotated(late: tuple[float, ...]) -> FloatArray:
     """Loads as a person notes them, each so many seconds late."""
     out = np.tile(LEVELS[0], (COUNT, 1))
     for i, seconds in enumerate(late, start=1):
@@ -56,11 +56,11 @@ def volts(loads: FloatArray, seed: int = 0, **true: object) -> FloatArray:
     return read(loads, seed, **true)
 
 
-QUIET = volts(hung())
-TURNED = volts(hung(), effects__e__name='sensor_rotation', effects__e__psd=1, effects__e__angle=0.02)
+QUIET = volts(applied())
+TURNED = volts(applied(), effects__e__name='sensor_rotation', effects__e__psd=1, effects__e__angle=0.02)
 
 
-def mended(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedLoads | None:
+def corrected(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedLoads | None:
     return correct_loads(rig, read[:, list(DOT_CHANNELS)] * RIG.amplifier.sensitivity, loads)
 
 
@@ -82,32 +82,32 @@ def mended(read: FloatArray, loads: FloatArray, rig: Rig = RIG) -> CorrectedLoad
     ],
 )
 def test_each_late_or_early_load_gets_the_time_of_its_motion(late: tuple[float, ...], turned: bool) -> None:
-    found = mended(TURNED if turned else QUIET, noted(late))
+    found = corrected(TURNED if turned else QUIET, annotated(late))
     assert found is not None
     wrong = {i: seconds for i, seconds in enumerate(late, start=1) if abs(seconds) > ALIKE_S}
     assert {n.number: n.delay for n in found.notes} == pytest.approx(wrong, abs=0.002)
     assert not found.unused.any()
-    assert np.count_nonzero(np.abs(found.loads - hung()).max(axis=1) > 0.1) <= 2 * len(LEVELS)
+    assert np.count_nonzero(np.abs(found.loads - applied()).max(axis=1) > 0.1) <= 2 * len(LEVELS)
 
 
 @pytest.mark.parametrize(
     'loads',
-    [noted((0.0,) * 6), noted((0.3,) * 6), noted((0.001, 0, 0.002, 0, 0.001, 0)), hung(1.2)],
+    [annotated((0.0,) * 6), annotated((0.3,) * 6), annotated((0.001, 0, 0.002, 0, 0.001, 0)), applied(1.2)],
     ids=['right', 'alike', 'a sample', 'a noted ramp'],
 )
 def test_right_times_and_one_small_delay_of_all_are_left_as_they_are(loads: FloatArray) -> None:
-    assert mended(QUIET, loads) is None
-    assert mended(TURNED, loads) is None
+    assert corrected(QUIET, loads) is None
+    assert corrected(TURNED, loads) is None
 
 
 def test_other_natural_frequencies_than_the_rig_file_says_change_no_time() -> None:
-    read = volts(hung(), dynamics__bending_frequency=14.7, dynamics__torsion_frequency=20.4)
-    assert mended(read, noted((0.0,) * 6)) is None
+    read = volts(applied(), dynamics__bending_frequency=14.7, dynamics__torsion_frequency=20.4)
+    assert corrected(read, annotated((0.0,) * 6)) is None
 
 
 @pytest.mark.slow
 def test_a_faultless_rig_whose_loads_were_noted_some_ms_off_lacks_nothing() -> None:
-    observed = Observation('hung', RIG, QUIET, noted(JITTER), None)
+    observed = Observation('hung', RIG, QUIET, annotated(JITTER), None)
     found = discover([observed], RIG)
     assert found.verdict == 'nothing_missing'
     assert found.floors < 1.1
@@ -117,7 +117,7 @@ def test_a_faultless_rig_whose_loads_were_noted_some_ms_off_lacks_nothing() -> N
 
 def test_wiring_signs_and_units_change_no_time() -> None:
     other = QUIET[:, [1, 0, 2, 4, 3, 5]] * np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
-    found = mended(other, noted(LATE) * np.array([-0.102, 0.102, 0.102]))
+    found = corrected(other, annotated(LATE) * np.array([-0.102, 0.102, 0.102]))
     assert found is not None
     assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.002)
 
@@ -126,13 +126,13 @@ def test_lost_samples_change_no_time() -> None:
     read = QUIET.copy()
     read[np.random.default_rng(1).random(COUNT) < 0.3] = np.nan
     read[2 * DWELL - 20 : 2 * DWELL + 20] = np.nan
-    found = mended(read, noted(LATE))
+    found = corrected(read, annotated(LATE))
     assert found is not None
     assert [n.delay for n in found.notes] == pytest.approx(LATE, abs=0.003)
 
 
 def test_a_load_applied_over_a_second_and_noted_as_a_step_is_a_ramp() -> None:
-    found = mended(volts(hung(0.8)), noted((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
+    found = corrected(volts(applied(0.8)), annotated((0.0, 2.0, 0.0, 0.0, 0.0, 0.0)))
     assert found is not None
     assert [n.took for n in found.notes] == pytest.approx([0.8] * 6, abs=0.01)
     assert [n.name for n in found.notes] == ['load_ramp', 'load_time', *['load_ramp'] * 4]
@@ -142,12 +142,12 @@ def test_a_load_applied_over_a_second_and_noted_as_a_step_is_a_ramp() -> None:
 
 
 def test_motion_that_no_ramp_describes_is_left_out() -> None:
-    smooth = hung(0.8)
+    smooth = applied(0.8)
     for i in range(1, len(LEVELS)):
         share = np.clip(np.arange(DWELL) / 800.0, 0.0, 1.0)
         part = slice(i * DWELL, (i + 1) * DWELL)
         smooth[part] = LEVELS[i - 1] + (LEVELS[i] - LEVELS[i - 1]) * (share**2 * (3.0 - 2.0 * share))[:, None]
-    found = mended(volts(smooth), noted((1.0, 2.0, 1.5, 1.0, 0.5, 2.0)))
+    found = corrected(volts(smooth), annotated((1.0, 2.0, 1.5, 1.0, 0.5, 2.0)))
     assert found is not None
     assert found.notes[0].rest_only
     assert found.unused[DWELL + 300]
@@ -156,7 +156,7 @@ def test_motion_that_no_ramp_describes_is_left_out() -> None:
 
 
 def test_the_words_say_what_to_do() -> None:
-    found = mended(QUIET, noted(LATE))
+    found = corrected(QUIET, annotated(LATE))
     assert found is not None
     third = found.notes[2]
     assert (third.name, third.where) == ('load_time', 'load 3')
@@ -171,10 +171,10 @@ def test_the_words_say_what_to_do() -> None:
 
 
 def test_check_and_calibrate_say_the_same() -> None:
-    expected = mended(QUIET, noted(LATE))
+    expected = corrected(QUIET, annotated(LATE))
     assert expected is not None
     words = [n.words('x') for n in expected.notes]
-    checked, again, log, _ = answers(QUIET, noted(LATE))
+    checked, again, log, _ = answers(QUIET, annotated(LATE))
     assert [f.fix for f in checked.findings if f.name == 'load_time'] == words
     assert {f.name for f in checked.findings} == {'load_time'}
     assert checked.sizes == pytest.approx([1.0] * 3, abs=0.01)
@@ -182,13 +182,13 @@ def test_check_and_calibrate_say_the_same() -> None:
     assert again.loads is not None
     # The correction gives dots in 32 bits: a time differs by some microseconds.
     assert np.abs(again.loads - expected.loads).max() < 0.5
-    right = CalibrationRun('x', np.arange(COUNT) / 1000.0, QUIET, np.zeros(0), np.zeros((0, 3)), hung())
-    assert as_acted(right, RIG, log.append) is right
+    right = CalibrationRun('x', np.arange(COUNT) / 1000.0, QUIET, np.zeros(0), np.zeros((0, 3)), applied())
+    assert with_effective_loads(right, RIG, log.append) is right
 
 
 @pytest.mark.slow
 def test_discover_mends_the_times_and_names_the_hidden_effect() -> None:
-    found = discover([Observation('x', RIG, TURNED, noted(LATE))])
+    found = discover([Observation('x', RIG, TURNED, annotated(LATE))])
     assert [e.active.label for e in found.effects] == ['sensor_rotation (psd 1)']
     assert found.effects[0].active.values['angle'] == pytest.approx(0.02, abs=1e-4)
     assert found.verdict == 'effects_found'
@@ -220,8 +220,8 @@ def test_a_load_between_two_samples_moves_the_link_as_one_at_that_time(moments: 
 
 @pytest.mark.slow
 def test_a_late_note_beside_channels_that_are_read_after_one_another() -> None:
-    read = volts(hung(), effects__e__name='channel_skew', effects__e__psd=2, effects__e__delay=2e-4)
-    found = discover([Observation('x', RIG, read, noted((0.0, 0.0, 3.4, 0.0, 0.0, 0.0)))])
+    read = volts(applied(), effects__e__name='channel_skew', effects__e__psd=2, effects__e__delay=2e-4)
+    found = discover([Observation('x', RIG, read, annotated((0.0, 0.0, 3.4, 0.0, 0.0, 0.0)))])
     assert [e.active.label for e in found.effects] == ['channel_skew (psd 2)']
     assert found.effects[0].active.values['delay'] == pytest.approx(2e-4, abs=2e-6)
     assert found.verdict == 'effects_found'
@@ -254,8 +254,8 @@ def test_a_step_between_two_samples_has_its_time() -> None:
 
 @pytest.mark.slow
 def test_ramps_beside_a_sticking_clamp_have_the_fitted_times() -> None:
-    read = volts(hung(0.8), effects__e__name='clamp_friction', effects__e__axis=3, effects__e__width=2.3e-5)
-    found = discover([Observation('x', RIG, read, noted((0.0,) * 6))])
+    read = volts(applied(0.8), effects__e__name='clamp_friction', effects__e__axis=3, effects__e__width=2.3e-5)
+    found = discover([Observation('x', RIG, read, annotated((0.0,) * 6))])
     assert [e.active.label for e in found.effects] == ['clamp_friction (axis 3)']
     assert found.effects[0].active.values['width'] == pytest.approx(2.3e-5, rel=1e-3)
     assert found.verdict == 'effects_found'

@@ -14,7 +14,7 @@ from psd_deflection.model.simulation.simulator import ForwardModel
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig, load_rig
 from psd_deflection.studies.loads import plateaus
-from psd_deflection.studies.loads.noted_times import correct_loads, unnoted_steps
+from psd_deflection.studies.loads.annotated_times import correct_loads, unannotated_steps
 from psd_deflection.studies.loads.plateaus import (
     EXACT,
     STANDS_OUT,
@@ -26,11 +26,11 @@ from psd_deflection.studies.loads.plateaus import (
     as_applied,
     wrong_notes,
 )
-from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, answers, noted_as, read
+from test.studies.held_loads import DWELL, HELD, LEVELS, RIG, annotated_as, answers, read
 
 QUIET = read(HELD)
-TWICE = noted_as(5, (80, -80, 40))
-NEVER = noted_as(2, (0, -20, 0))
+TWICE = annotated_as(5, (80, -80, 40))
+NEVER = annotated_as(2, (0, -20, 0))
 WORDS = {
     'load_value': 'the 5th load of x was noted wrong: from 20.000 s to 24.000 s (40 N, -40 N, 20 N m) hung, not '
     '(80 N, -80 N, 40 N m): note that',
@@ -40,10 +40,12 @@ WORDS = {
 
 
 @pytest.mark.parametrize(
-    ('noted', 'name', 'where'), [(TWICE, 'load_value', 'load 5'), (NEVER, 'missing_load', '8.000 s')]
+    ('annotated', 'name', 'where'), [(TWICE, 'load_value', 'load 5'), (NEVER, 'missing_load', '8.000 s')]
 )
-def test_check_calibrate_and_discover_say_what_hung_in_the_same_words(noted: FloatArray, name: str, where: str) -> None:
-    checked, run, log, found = answers(QUIET, noted)
+def test_check_calibrate_and_discover_say_what_hung_in_the_same_words(
+    annotated: FloatArray, name: str, where: str
+) -> None:
+    checked, run, log, found = answers(QUIET, annotated)
     assert [(f.name, f.where) for f in checked.findings] == [(name, where)]
     assert _rounded(checked.findings[0].fix) == WORDS[name]
     assert checked.verdict == 'wrong'
@@ -57,8 +59,8 @@ def test_check_calibrate_and_discover_say_what_hung_in_the_same_words(noted: Flo
 def _rounded(words: str) -> str:
     """With whole numbers of N and N m, as noise moves their decimals."""
     before, after = words.split('(', 1)
-    hung, rest = after.split(')', 1)
-    numbers = [cell.split(' ', 1) for cell in hung.split(', ')]
+    applied, rest = after.split(')', 1)
+    numbers = [cell.split(' ', 1) for cell in applied.split(', ')]
     return f'{before}({", ".join(f"{round(float(n)) + 0} {unit}" for n, unit in numbers)}){rest}'
 
 
@@ -77,7 +79,7 @@ def test_no_note_is_called_wrong_for_what_the_rig_does(true: dict[str, object]) 
 
 
 def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
-    both = noted_as(5, (80, -80, 40))
+    both = annotated_as(5, (80, -80, 40))
     both[DWELL : 2 * DWELL] = (0, -30, 0)
     found = wrong_notes(RIG, QUIET, both)
     assert [n.where for n in found] == ['load 1', 'load 5']
@@ -101,7 +103,7 @@ def test_two_wrong_notes_are_found_if_enough_others_are_right() -> None:
     ],
 )
 def test_a_note_that_is_far_off_is_wrong_however_far(number: int, load: tuple[float, float, float]) -> None:
-    (note,) = wrong_notes(RIG, QUIET, noted_as(number, load))
+    (note,) = wrong_notes(RIG, QUIET, annotated_as(number, load))
     assert note.where == f'load {number}'
     assert note.applied == pytest.approx(LEVELS[number], abs=0.1)
     assert note.size == pytest.approx(np.abs(LEVELS[number] - load).max(), abs=0.1)
@@ -112,10 +114,10 @@ LONG = np.concatenate((LEVELS[:-1], LEVELS[1:]))
 LONG_QUIET = read(np.repeat(LONG, DWELL, axis=0))
 
 
-def long_as(**noted: tuple[float, float, float]) -> FloatArray:
+def long_as(**annotated: tuple[float, float, float]) -> FloatArray:
     """The long row of loads with others noted: ``p5`` for that after the fifth change."""
     levels = LONG.copy()
-    for name, load in noted.items():
+    for name, load in annotated.items():
         levels[int(name[1:])] = load
     return np.repeat(levels, DWELL, axis=0)
 
@@ -128,13 +130,13 @@ def test_of_loads_that_follow_each_other_both_are_found() -> None:
 def test_three_wrong_notes_and_one_off_by_1_n_are_reported() -> None:
     found = wrong_notes(RIG, LONG_QUIET, long_as(p5=(40, -80, 20), p4=(60, 0, 0), p6=(0, 0, 0)))
     assert [n.where for n in found] == ['load 4', 'load 5', 'load 6']
-    (note,) = wrong_notes(RIG, QUIET, noted_as(4, (29, 0, 0)))
+    (note,) = wrong_notes(RIG, QUIET, annotated_as(4, (29, 0, 0)))
     assert note.words('x').endswith('(30 N, 0 N, 0 N m) hung, not (29 N, 0 N, 0 N m): note that')
 
 
 def test_a_load_that_no_other_is_like_may_be_a_sign_a_unit_or_an_effect() -> None:
     # The only loads along X: both other ways.
-    both = noted_as(4, (-30, 0, 0))
+    both = annotated_as(4, (-30, 0, 0))
     both[5 * DWELL : 6 * DWELL] = (-40, -40, 20)
     assert wrong_notes(RIG, QUIET, both) == []
     # The only torque.
@@ -146,7 +148,7 @@ def test_a_load_that_no_other_is_like_may_be_a_sign_a_unit_or_an_effect() -> Non
 def test_nobody_is_accused_if_another_load_may_be_the_wrong_one() -> None:
     # Without the third load a link that is soft by chance would explain the fourth.
     soft = read(HELD, link__youngs_modulus=0.97 * RIG.link.youngs_modulus)
-    assert wrong_notes(RIG, soft, noted_as(4, (28.5, 0, 0))) == []
+    assert wrong_notes(RIG, soft, annotated_as(4, (28.5, 0, 0))) == []
     # A fault of one reading under one load is none of the load.
     reading = QUIET.copy()
     reading[4 * DWELL : 5 * DWELL, 0] += 0.1
@@ -176,15 +178,15 @@ OFF = np.zeros((8, 3))
 OFF[1:7] = [(0, -0.36, 0), (0.48, 0.86, 0), (0, -0.21, 0), (1.3, -1.4, -0.1), (0, -0.16, -0.72), (1.03, -1.71, 0)]
 
 
-def asked(off: FloatArray, noted: FloatArray = ROUNDED, acting: FloatArray | None = None) -> bool:
-    """Whether ``noted`` loads are asked for, if the movement says that they are ``off``; all (8, 3).
+def asked(off: FloatArray, annotated: FloatArray = ROUNDED, acting: FloatArray | None = None) -> bool:
+    """Whether ``annotated`` loads are asked for, if the movement says that they are ``off``; all (8, 3).
 
     ``acting`` (n, 3): with what is simulated, if it is something else.
     """
-    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, noted[i]) for i in range(len(noted)))
+    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, annotated[i]) for i in range(len(annotated)))
     moved = np.repeat(off.T * 1e-6, 10, axis=1)
     found = PlateauLoads(listed, off, np.zeros_like(moved), moved, moved[0], np.zeros(8), np.ones(3), 400)
-    return all_free(found, np.repeat(noted, DWELL, axis=0) if acting is None else acting)
+    return all_free(found, np.repeat(annotated, DWELL, axis=0) if acting is None else acting)
 
 
 def test_rounded_notes_free_the_loads_exact_ones_do_not() -> None:
@@ -201,16 +203,16 @@ def test_rounded_notes_free_the_loads_exact_ones_do_not() -> None:
 
 def test_a_step_without_a_note_has_its_time() -> None:
     dots = read(HELD)[:, [0, 1, 3, 4]] * RIG.amplifier.sensitivity
-    assert unnoted_steps(RIG, dots, noted_as(2, (0, -20, 0))) == pytest.approx([8.0], abs=2e-3)
-    assert unnoted_steps(RIG, dots, HELD) == []
-    assert correct_loads(RIG, dots, noted_as(2, (0, -20, 0))) is None
+    assert unannotated_steps(RIG, dots, annotated_as(2, (0, -20, 0))) == pytest.approx([8.0], abs=2e-3)
+    assert unannotated_steps(RIG, dots, HELD) == []
+    assert correct_loads(RIG, dots, annotated_as(2, (0, -20, 0))) is None
 
 
 # ---- the pieces, by hand
 
 
 def reported(listed: list[Plateau]) -> list[tuple[int, int, int, bool]]:
-    return [(p.first, p.last, p.number, p.unnoted) for p in listed]
+    return [(p.first, p.last, p.number, p.unannotated) for p in listed]
 
 
 def test_holds_of_a_second_have_the_number_of_their_note() -> None:
@@ -246,10 +248,10 @@ def test_holds_of_a_second_have_the_number_of_their_note() -> None:
 
 def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
     acting = np.repeat([(0.0, 0.0, 0.0), (0.0, -20.0, 0.0), (0.0, -50.0, 0.0), (0.0, 0.0, 0.0)], 2000, axis=0)
-    noted = acting.copy()
-    noted[4000:6000] = (0.0, -20.0, 0.0)
-    listed = plateaus.plateaus(RIG, read(acting), noted)
-    assert [(p.number, p.unnoted) for p in listed] == [(0, False), (1, False), (1, True), (2, False)]
+    annotated = acting.copy()
+    annotated[4000:6000] = (0.0, -20.0, 0.0)
+    listed = plateaus.plateaus(RIG, read(acting), annotated)
+    assert [(p.number, p.unannotated) for p in listed] == [(0, False), (1, False), (1, True), (2, False)]
     assert [p.first for p in listed] == pytest.approx([0, 2000, 4000, 6000], abs=2)
     assert [p.last for p in listed] == pytest.approx([2000, 4000, 6000, 8000], abs=2)
 
@@ -257,11 +259,11 @@ def test_an_unnoted_time_has_the_number_of_the_note_before() -> None:
 def test_steps_without_a_note_are_looked_for_in_the_dots_in_metres(monkeypatch: pytest.MonkeyPatch) -> None:
     looked: list[FloatArray] = []
 
-    def unnoted(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
+    def unannotated(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
         looked.append(dots)
         return [2.0, 5.5]
 
-    monkeypatch.setattr(plateaus, 'unnoted_steps', unnoted)
+    monkeypatch.setattr(plateaus, 'unnoted_steps', unannotated)
     volts, loads = np.random.default_rng(1).normal(size=(9000, 6)), np.zeros((9000, 3))
     loads[4000:] = 1.0
     listed = plateaus.plateaus(GIVEN, volts, loads)
@@ -292,19 +294,19 @@ SPREAD = np.array(
 
 def observed(
     more: dict[int, tuple[float, float, float]],
-    noted: FloatArray = SPREAD,
+    annotated: FloatArray = SPREAD,
     *,
     across: dict[int, float] | None = None,
     left: float = 0.0,
     everywhere: FloatArray | float = 0.0,
 ) -> PlateauLoads:
     """What readings say if loads are off by ``more``; ``left``: share of the movement that no load explains."""
-    off = np.zeros(noted.shape) + everywhere
+    off = np.zeros(annotated.shape) + everywhere
     for k, load in more.items():
         off[k] += load
-    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, noted[i]) for i in range(len(noted)))
+    listed = tuple(Plateau(0, i * DWELL, (i + 1) * DWELL, i, False, annotated[i]) for i in range(len(annotated)))
     moved = np.repeat((off * (1e-5, 1e-5, 1e-4)).T, 10, axis=1)
-    beside = np.zeros(len(noted))
+    beside = np.zeros(len(annotated))
     for k, far in (across or {}).items():
         beside[k] = far
     return PlateauLoads(listed, off, left * moved, moved, moved[0], beside, np.array([1e-5, 1e-5, 1e-4]), 400)
@@ -394,12 +396,12 @@ def test_a_note_beside_effects_is_wrong_only_if_no_other_fits() -> None:
 
 
 def test_a_wrong_load_is_known_if_the_others_span_it() -> None:
-    noted = np.array([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 20.0, 0.0), (3.0, 4.0, 0.24), (3.0, 4.0, 0.26)])
+    annotated = np.array([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 20.0, 0.0), (3.0, 4.0, 0.24), (3.0, 4.0, 0.26)])
 
     def known(k: list[int], more: tuple[float, float, float] = (0.0, 0.0, 1.0), largest: float = 1e9) -> bool:
         rows = [i for i in range(5) if i < 3 or i in k]
         here = [rows.index(i) for i in k]
-        return plateaus.is_known(observed(dict.fromkeys(here, more), noted[rows]), np.array(here), largest)
+        return plateaus.is_known(observed(dict.fromkeys(here, more), annotated[rows]), np.array(here), largest)
 
     # A torque of 5 % of (3, 4) is as good as none.
     assert known([3])
@@ -431,13 +433,15 @@ def test_all_loads_are_free_if_they_explain_the_movement_and_two_are_off() -> No
 
 
 def test_rounded_loads_are_off_by_half_a_step_at_most() -> None:
-    noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
-    loads = np.repeat(noted, DWELL, axis=0)
+    annotated = np.array(
+        [(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)]
+    )
+    loads = np.repeat(annotated, DWELL, axis=0)
 
     def rounded(*off: tuple[float, float, float], count: int = 5) -> bool:
         more = np.zeros((5, 3))
         more[: len(off)] = off
-        return plateaus.are_rounded(observed({}, noted[:count], everywhere=more[:count]), loads)
+        return plateaus.are_rounded(observed({}, annotated[:count], everywhere=more[:count]), loads)
 
     # Forces in steps of 5 N, torques in steps of 2 N m.
     assert rounded((2.5, 0.0, 0.0), (0.0, -2.5, 0.0), (0.0, 0.0, 1.0))
@@ -465,9 +469,11 @@ def test_loads_of_which_none_held_were_not_rounded() -> None:
 
 
 def test_loads_off_by_less_than_a_step_may_be_rounded() -> None:
-    noted = np.array([(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)])
+    annotated = np.array(
+        [(10.0, -10.0, 0.0), (0.0, -35.0, 2.0), (20.0, -30.0, 18.0), (0.0, -25.0, -14.0), (0.0, 0.0, 0.0)]
+    )
 
-    def may_be(*off: tuple[float, float, float], loads: FloatArray = noted) -> bool:
+    def may_be(*off: tuple[float, float, float], loads: FloatArray = annotated) -> bool:
         more = np.zeros((len(loads), 3))
         more[: len(off)] = off
         return plateaus.may_be_rounded(observed({}, loads, everywhere=more))
@@ -476,17 +482,17 @@ def test_loads_off_by_less_than_a_step_may_be_rounded() -> None:
     assert not may_be((5.1, 0.0, 0.0))
     assert not may_be((0.0, -5.1, 0.0))
     # In no steps, no forces at all, fewer than four loads.
-    assert not may_be((0.0, 0.0, 0.0), loads=noted + 0.3 * np.eye(3)[0])
-    assert not may_be((0.0, 0.0, 0.0), loads=noted * [0.0, 0.0, 1.0])
-    assert not may_be((0.0, 0.0, 0.0), loads=noted[1:])
+    assert not may_be((0.0, 0.0, 0.0), loads=annotated + 0.3 * np.eye(3)[0])
+    assert not may_be((0.0, 0.0, 0.0), loads=annotated * [0.0, 0.0, 1.0])
+    assert not may_be((0.0, 0.0, 0.0), loads=annotated[1:])
 
 
 # ---- what is said
 
 
 def test_a_wrong_note_says_what_hung_from_when_to_when() -> None:
-    noted = np.array([1.0, -2.0, 0.5])
-    wrong = WrongNote(Plateau(0, 1234, 5678, 2, False, noted), np.array([1.004, -2.5, -0.001]), 1e-3)
+    annotated = np.array([1.0, -2.0, 0.5])
+    wrong = WrongNote(Plateau(0, 1234, 5678, 2, False, annotated), np.array([1.004, -2.5, -0.001]), 1e-3)
     assert (wrong.name, wrong.where) == ('load_value', 'load 2')
     assert wrong.value == (1.004, -2.5, -0.001)
     assert wrong.off == pytest.approx([0.004, 0.5, 0.501])
@@ -495,29 +501,29 @@ def test_a_wrong_note_says_what_hung_from_when_to_when() -> None:
         'the 2nd load of x was noted wrong: from 1.234 s to 5.678 s (1 N, -2.5 N, 0 N m) hung, '
         'not (1 N, -2 N, 0.5 N m): note that'
     )
-    before = WrongNote(Plateau(0, 0, 5678, 0, True, noted), np.array([-0.004, 0.006, 2.125]), 1e-2)
+    before = WrongNote(Plateau(0, 0, 5678, 0, True, annotated), np.array([-0.004, 0.006, 2.125]), 1e-2)
     assert (before.name, before.where) == ('missing_load', '0.000 s')
     assert before.words('x') == (
         'something was hung or taken off of x and not noted: from 0.000 s to 56.780 s (0 N, 0.01 N, 2.12 N m) hung, '
         'not (1 N, -2 N, 0.5 N m): note that'
     )
-    after = WrongNote(Plateau(0, 100, 5678, 1, True, noted), noted, 1e-3)
+    after = WrongNote(Plateau(0, 100, 5678, 1, True, annotated), annotated, 1e-3)
     assert (after.where, after.size) == ('0.100 s', 0.0)
     assert after.words('x').startswith('something was hung or taken off after the 1st noted load of x and not noted: ')
 
 
 def world(
-    hung: FloatArray, noted: FloatArray, share: FloatArray, offset: float = 0.0, bend: float = 0.0
+    applied: FloatArray, annotated: FloatArray, share: FloatArray, offset: float = 0.0, bend: float = 0.0
 ) -> Callable[[FloatArray], PlateauLoads]:
-    """Readings under loads that ``hung``, which effects change by a ``share`` and an ``offset``; what is simulated
+    """Readings under loads that ``applied``, which effects change by a ``share`` and an ``offset``; what is simulated
     more than 5 N or N m off is told ``bend`` of what is beyond it too small.
     """
-    acted = hung + hung @ share + offset
+    effective = applied + applied @ share + offset
 
     def asked(acting: FloatArray) -> PlateauLoads:
-        off = acted - acting[DWELL // 2 :: DWELL]
+        off = effective - acting[DWELL // 2 :: DWELL]
         off -= bend * np.sign(off) * np.maximum(np.abs(off) - 5.0, 0.0)
-        return observed({}, noted, everywhere=off)
+        return observed({}, annotated, everywhere=off)
 
     return asked
 
@@ -535,23 +541,23 @@ def world(
 def test_what_hung_is_what_readings_say_without_what_effects_do(
     wrong: dict[int, tuple[float, float, float]], share: float, offset: float, bend: float
 ) -> None:
-    noted = SPREAD.copy()
+    annotated = SPREAD.copy()
     for k, load in wrong.items():
-        noted[k] = load
+        annotated[k] = load
     slopes = share * np.array([[1.0, 0.1, 0.0], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
-    asked = world(SPREAD, noted, slopes, offset, bend)
-    found = plateaus.wrong_notes_against(np.repeat(noted, DWELL, axis=0), 1e-3, asked)
+    asked = world(SPREAD, annotated, slopes, offset, bend)
+    found = plateaus.wrong_notes_against(np.repeat(annotated, DWELL, axis=0), 1e-3, asked)
     assert [n.plateau.number for n in found] == sorted(wrong)
     for one in found:
         assert one.applied == pytest.approx(SPREAD[one.plateau.number], abs=0.05)
         assert one.period == 1e-3
 
 
-@pytest.mark.parametrize(('hung', 'far'), [(46.6, False), (46.8, True), (33.9, True), (34.1, False)])
-def test_a_load_off_by_2_n_is_simulated_as_the_readings_say(hung: float, far: bool) -> None:
+@pytest.mark.parametrize(('applied', 'far'), [(46.6, False), (46.8, True), (33.9, True), (34.1, False)])
+def test_a_load_off_by_2_n_is_simulated_as_the_readings_say(applied: float, far: bool) -> None:
     # 46.67 - 40 is 2 + 4.667; 40 - 34 is 2 + 4, as the other force is 40.
     truth = SPREAD.copy()
-    truth[5] = (hung, -40.0, 20.0)
+    truth[5] = (applied, -40.0, 20.0)
     asked_with = []
     inner = world(truth, SPREAD, np.zeros((3, 3)))
 
@@ -633,11 +639,11 @@ ONE_TORQUE = np.array(
     [(0, 0, 0), (0, -20, 0), (15, 0, 0), (24, -40, 0), (16, -20, 35), (-15, 0, 0), (0, -35, 0), (0, 0, 0)], float
 )
 """The fifth is the only torque, and its change from the fourth was noted twice: (20, -30, 17.5) hung."""
-HUNG_ONCE = np.array((20.0, -30.0, 17.5))
+APPLIED_ONCE = np.array((20.0, -30.0, 17.5))
 
 
 def test_the_only_torque_is_accused_if_its_change_was_noted_twice() -> None:
-    more = HUNG_ONCE - ONE_TORQUE[4]
+    more = APPLIED_ONCE - ONE_TORQUE[4]
     for allowed in ((0.0, 0.0, 0.0), (1.0, -1.5, 1.5)):
         off = tuple((more + allowed).tolist())
         assert plateaus.outliers(observed({4: (off[0], off[1], off[2])}, ONE_TORQUE)).gone == (4,)
@@ -651,23 +657,23 @@ def test_the_only_torque_is_accused_if_its_change_was_noted_twice() -> None:
 
 
 def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> None:
-    more = HUNG_ONCE - ONE_TORQUE[4] + (0.2, -0.01, 0.4)
+    more = APPLIED_ONCE - ONE_TORQUE[4] + (0.2, -0.01, 0.4)
     listed = observed({4: (float(more[0]), float(more[1]), float(more[2]))}, ONE_TORQUE)
-    noted = np.repeat(ONE_TORQUE, DWELL, axis=0)
+    annotated = np.repeat(ONE_TORQUE, DWELL, axis=0)
 
     def asked(acting: FloatArray) -> PlateauLoads:
         held = acting[DWELL // 2 :: DWELL]
-        hung = ONE_TORQUE + listed.more
-        return replace(listed, more=hung - held)
+        applied = ONE_TORQUE + listed.more
+        return replace(listed, more=applied - held)
 
-    (note,) = plateaus.wrong_notes_against(noted, 1e-3, asked)
+    (note,) = plateaus.wrong_notes_against(annotated, 1e-3, asked)
     assert note.exact
-    assert note.applied.tolist() == HUNG_ONCE.tolist()
+    assert note.applied.tolist() == APPLIED_ONCE.tolist()
     assert note.where == 'load 4'
     # One that others are like is what the readings say.
     other = observed({3: (0.0, 5.0, 0.0)}, ONE_TORQUE)
     (free,) = plateaus.wrong_notes_against(
-        noted, 1e-3, lambda acting: replace(other, more=ONE_TORQUE + other.more - acting[DWELL // 2 :: DWELL])
+        annotated, 1e-3, lambda acting: replace(other, more=ONE_TORQUE + other.more - acting[DWELL // 2 :: DWELL])
     )
     assert not free.exact
     assert free.applied == pytest.approx((24.0, -35.0, 0.0))
@@ -676,10 +682,10 @@ def test_what_hung_is_then_what_was_noted_once_whatever_effects_do_to_it() -> No
 def test_the_times_of_a_note_are_in_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
     periods: list[float] = []
 
-    def noted(loads: FloatArray, period: float, asked: object) -> list[WrongNote]:
+    def annotated(loads: FloatArray, period: float, asked: object) -> list[WrongNote]:
         periods.append(period)
         return []
 
-    monkeypatch.setattr(plateaus, 'wrong_notes_against', noted)
+    monkeypatch.setattr(plateaus, 'wrong_notes_against', annotated)
     wrong_notes(load_rig(overrides={'converter.sample_rate_hz': 200.0}), np.zeros((100, 6)), np.zeros((100, 3)))
     assert periods == pytest.approx([0.005])

@@ -64,15 +64,15 @@ def test_force_and_frequency_are_those_of_the_swing(force: float, frequency: flo
 
 
 def test_a_sway_that_seems_to_step_is_left_out_from_its_beginning() -> None:
-    asked, noted = implied_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, annotated_only=True)
+    asked, annotated = implied_beside_rig(RIG, SWUNG, HELD), plateaus(RIG, SWUNG, HELD, annotated_only=True)
     cut = 3 * DWELL + 1200
     pieces = [
-        *noted[:3],
-        dataclasses.replace(noted[3], last=cut),
-        dataclasses.replace(noted[3], first=cut, unnoted=True),
-        *noted[4:],
+        *annotated[:3],
+        dataclasses.replace(annotated[3], last=cut),
+        dataclasses.replace(annotated[3], first=cut, unannotated=True),
+        *annotated[4:],
     ]
-    (found,) = sway.swaying(asked(pieces), noted, asked, 1e-3)
+    (found,) = sway.swaying(asked(pieces), annotated, asked, 1e-3)
     assert (found.plateau.first, found.plateau.last) == (3 * DWELL, 4 * DWELL)
 
 

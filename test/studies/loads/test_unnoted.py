@@ -9,9 +9,9 @@ import pytest
 
 from psd_deflection.studies.discover.discover import discover
 from psd_deflection.studies.discover.observation import Observation
-from psd_deflection.studies.loads.acted import loads_that_acted
+from psd_deflection.studies.loads.effective import effective_loads
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads
-from psd_deflection.studies.loads.unnoted import unnoted_times
+from psd_deflection.studies.loads.unannotated import unannotated_times
 from test.studies.held_loads import RIG, answers, read
 
 LEVELS = np.array(
@@ -62,34 +62,36 @@ def test_an_effect_beside_loads_that_were_not_noted_is_named() -> None:
 
 
 def test_loads_missing_in_the_middle_are_left_out_until_the_next_note() -> None:
-    noted = HELD.copy()
-    noted[2 * DWELL : 10 * DWELL] = LEVELS[1]
-    acted = loads_that_acted(RIG, VOLTS, noted)
-    assert [n.words('x') for n in acted.notes] == [f'x: from 4.000 s to 20.000 s the load changed 8 times, and {WORDS}']
-    gone = np.flatnonzero(np.isnan(acted.volts).all(axis=1))
+    annotated = HELD.copy()
+    annotated[2 * DWELL : 10 * DWELL] = LEVELS[1]
+    effective = effective_loads(RIG, VOLTS, annotated)
+    assert [n.words('x') for n in effective.notes] == [
+        f'x: from 4.000 s to 20.000 s the load changed 8 times, and {WORDS}'
+    ]
+    gone = np.flatnonzero(np.isnan(effective.volts).all(axis=1))
     assert (gone[0], gone[-1], len(gone)) == (4000, 19_999, 16_000)
-    np.testing.assert_array_equal(acted.loads, noted)
+    np.testing.assert_array_equal(effective.loads, annotated)
 
 
 def test_two_loads_that_were_not_noted_are_reported_one_by_one() -> None:
-    noted = HELD.copy()
-    noted[2 * DWELL : 4 * DWELL] = LEVELS[1]
-    acted = loads_that_acted(RIG, VOLTS, noted)
-    assert [n.name for n in acted.notes] == ['missing_load', 'missing_load']
-    assert np.isfinite(acted.volts).all()
+    annotated = HELD.copy()
+    annotated[2 * DWELL : 4 * DWELL] = LEVELS[1]
+    effective = effective_loads(RIG, VOLTS, annotated)
+    assert [n.name for n in effective.notes] == ['missing_load', 'missing_load']
+    assert np.isfinite(effective.volts).all()
 
 
 def test_a_recording_without_any_noted_load_stays_as_it_is() -> None:
-    acted = loads_that_acted(RIG, VOLTS, np.zeros_like(HELD))
-    assert not acted.notes
-    assert np.isfinite(acted.volts).all()
+    effective = effective_loads(RIG, VOLTS, np.zeros_like(HELD))
+    assert not effective.notes
+    assert np.isfinite(effective.volts).all()
 
 
-def asked(more: list[float], *, alone: int, across: float = 0.0, noted: float = 10.0) -> PlateauLoads:
+def asked(more: list[float], *, alone: int, across: float = 0.0, annotated: float = 10.0) -> PlateauLoads:
     """Plateaus of 2 s under one noted load; all but the first ``alone`` are unnoted. ``more``: N along Y."""
     rows = np.array([(0.0, y, 0.0) for y in more])
     listed = tuple(
-        Plateau(0, 2000 * i, 2000 * (i + 1), 1, i >= alone, np.array((0.0, noted, 0.0))) for i in range(len(more))
+        Plateau(0, 2000 * i, 2000 * (i + 1), 1, i >= alone, np.array((0.0, annotated, 0.0))) for i in range(len(more))
     )
     other = Plateau(0, 2000 * len(more), 2000 * len(more) + 2000, 2, False, np.array((0.0, 20.0, 0.0)))
     nothing = np.zeros((3, 0))
@@ -107,12 +109,12 @@ def asked(more: list[float], *, alone: int, across: float = 0.0, noted: float = 
 
 def test_a_change_counts_by_three_times_what_effects_may_do_to_the_load() -> None:
     """That is 0.3 N and 1 % of the largest load, which is 20 N: 1.5 N in all."""
-    (found,) = unnoted_times(asked([0.0, 1.6, 0.0, 1.6], alone=1), 20_000, 0.001)
+    (found,) = unannotated_times(asked([0.0, 1.6, 0.0, 1.6], alone=1), 20_000, 0.001)
     assert (found.first, found.last, found.changes) == (2000, 8000, 3)
     assert found.value == found.size == pytest.approx(0.3)
-    assert unnoted_times(asked([0.0, 1.4, 0.0, 1.4], alone=1), 20_000, 0.001) == []
+    assert unannotated_times(asked([0.0, 1.4, 0.0, 1.4], alone=1), 20_000, 0.001) == []
 
 
 def test_two_changes_are_too_few_and_noted_ones_do_not_count() -> None:
-    assert unnoted_times(asked([0.0, 9.0, 0.0], alone=1), 20_000, 0.001) == []
-    assert unnoted_times(asked([0.0, 9.0, 0.0, 9.0], alone=2), 20_000, 0.001) == []
+    assert unannotated_times(asked([0.0, 9.0, 0.0], alone=1), 20_000, 0.001) == []
+    assert unannotated_times(asked([0.0, 9.0, 0.0, 9.0], alone=2), 20_000, 0.001) == []

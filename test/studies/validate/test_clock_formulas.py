@@ -421,13 +421,13 @@ def steps_of(monkeypatch: pytest.MonkeyPatch, start: float, noise: float) -> lis
     steps = []
     solved = UsedReferences.solved
 
-    def noted(used: UsedReferences, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
+    def recorded(used: UsedReferences, weights: FloatArray) -> tuple[float, OffsetFit, FloatArray]:
         found = solved(used, weights)
         steps.append(abs(found[0]))
         return found
 
     with monkeypatch.context() as patched:
-        patched.setattr(UsedReferences, 'solved', noted)
+        patched.setattr(UsedReferences, 'solved', recorded)
         assert refined_offset(motion, at - 0.0123, poses, start, 0.0, None) is not None
     return steps
 

@@ -60,7 +60,7 @@ EXPLAINS = 0.5
 """Share of what is left that a law must explain: in chi-square, and on unseen load cases."""
 MANY_TIMES, NEAR_S = 3, 0.3
 """So many times of switching, most of them so near to changes of the load, s, are the loads'."""
-NOTED = 1.1
+NOTABLE = 1.1
 """A gap of more floors asks for something that makes it: noise that follows a variable must make half of it."""
 MOVES = 3.0
 """Means of blocks that differ by more floors than this are no noise."""
@@ -426,7 +426,7 @@ def find_jitter(ws: Workspace, fit: Fit, penalty: float) -> FoundLaw | None:
     added /= float(len(ws.channels)) * ws.observations[0].rig.estimator.block_size
     added = 0.0 if channel.startswith('sum') else added
     more = ws.gap(fit.difference) ** 2 - ws.floor() ** 2
-    if ws.gap(fit.difference) > NOTED * ws.floor() and added < EXPLAINS * more:
+    if ws.gap(fit.difference) > NOTABLE * ws.floor() and added < EXPLAINS * more:
         return None
     with_jitter = dataclasses.replace(fit, effects=(*fit.effects, ActiveEffect(effect_of(law), values_of(law))))
     alternatives = [dataclasses.replace(law, stage='psd')]

@@ -23,7 +23,7 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.check.wirings import line
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.proposals import coarse_step
-from psd_deflection.studies.loads.noted_times import CorrectedLoads, correct_loads
+from psd_deflection.studies.loads.annotated_times import CorrectedLoads, correct_loads
 
 FAR = 8.0
 """A sample this many standard deviations from what its neighbours predict is an outlier."""

@@ -22,7 +22,7 @@ MANY = 3
 
 
 @dataclass(frozen=True, slots=True)
-class UnnotedTime:
+class UnannotatedTime:
     """Samples ``first`` to ``last`` of ``samples``, in which ``changes`` of the load were not noted. ``period``: s from
     one sample to the next.
     """
@@ -62,7 +62,7 @@ class UnnotedTime:
         )
 
 
-def unnoted_times(implied: PlateauLoads, samples: int, period: float) -> list[UnnotedTime]:
+def unannotated_times(implied: PlateauLoads, samples: int, period: float) -> list[UnannotatedTime]:
     """Those of a recording of so many ``samples``; none if no noted load would be left. ``period``: s from one sample
     to the next.
 
@@ -75,18 +75,20 @@ def unnoted_times(implied: PlateauLoads, samples: int, period: float) -> list[Un
         in_group = list(group)
         more = implied.more[in_group]
         steps = np.abs(np.diff(more, axis=0)).max(axis=1) > allowed
-        alone = [k for k, stepped in zip(in_group[1:], steps, strict=True) if stepped and implied.plateaus[k].unnoted]
+        alone = [
+            k for k, stepped in zip(in_group[1:], steps, strict=True) if stepped and implied.plateaus[k].unannotated
+        ]
         as_plate = np.abs(implied.across[in_group]).max() <= PLATE * float(implied.sizes[in_group].max()) + PLATE_M
         if len(alone) >= MANY and as_plate:
             first, last = implied.plateaus[alone[0]].first, implied.plateaus[in_group[-1]].last
-            out.append(UnnotedTime(first, last, samples, len(alone), period))
+            out.append(UnannotatedTime(first, last, samples, len(alone), period))
     remaining = [
         p for p in implied.plateaus if not any(u.first <= p.first < u.last for u in out) and np.any(p.annotated != 0.0)
     ]
     return out if remaining else []
 
 
-def without_times(volts: FloatArray, times: Sequence[UnnotedTime]) -> FloatArray:
+def without_times(volts: FloatArray, times: Sequence[UnannotatedTime]) -> FloatArray:
     """``volts`` (n, 3P) without these."""
     out = volts.copy()
     for u in times:

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 from psd_deflection.records import FloatArray
 from psd_deflection.rig.config import Rig
-from psd_deflection.studies.loads.noted_times import CorrectedNote
+from psd_deflection.studies.loads.annotated_times import CorrectedNote
 from psd_deflection.studies.loads.plateaus import WrongNote, as_applied, implied_beside_rig, plateaus, wrong_notes
 from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swaying_loads
-from psd_deflection.studies.loads.unnoted import MANY, UnnotedTime, unnoted_times, without_times
+from psd_deflection.studies.loads.unannotated import MANY, UnannotatedTime, unannotated_times, without_times
 
-LoadNote = CorrectedNote | WrongNote | SwayingLoad | UnnotedTime
+LoadNote = CorrectedNote | WrongNote | SwayingLoad | UnannotatedTime
 """What was noted of a load otherwise than it was."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ActedLoads:
+class EffectiveLoads:
     """``loads`` (n, 3) N, N, N m, as they acted; ``volts`` (n, 3P) V without the times in which nobody knows; ``notes``
     of what was noted otherwise.
     """
@@ -28,7 +28,7 @@ class ActedLoads:
     notes: tuple[LoadNote, ...]
 
 
-def loads_that_acted(rig: Rig, volts: FloatArray, loads: FloatArray) -> ActedLoads:
+def effective_loads(rig: Rig, volts: FloatArray, loads: FloatArray) -> EffectiveLoads:
     """Those of a recording. ``volts`` (n, 3P) V of the PSDs, NaN if a sample is lost; ``loads`` (n, 3) N, N, N m, held,
     at the times at which they acted.
     """
@@ -37,10 +37,10 @@ def loads_that_acted(rig: Rig, volts: FloatArray, loads: FloatArray) -> ActedLoa
     steady = excluded(rig, volts, swayed)
     wrong = wrong_notes(rig, steady, loads)
     listed = plateaus(rig, volts, loads)
-    if not wrong and sum(p.unnoted for p in listed) >= MANY:
+    if not wrong and sum(p.unannotated for p in listed) >= MANY:
         implied = implied_beside_rig(rig, volts, loads)(listed)
-        if unnoted := unnoted_times(implied, len(loads), period):
+        if unannotated := unannotated_times(implied, len(loads), period):
             # What seemed to sway there was hung and taken off.
-            rest = loads_that_acted(rig, without_times(volts, unnoted), loads)
-            return ActedLoads(rest.loads, rest.volts, (*unnoted, *rest.notes))
-    return ActedLoads(as_applied(loads, wrong), steady, (*swayed, *wrong))
+            rest = effective_loads(rig, without_times(volts, unannotated), loads)
+            return EffectiveLoads(rest.loads, rest.volts, (*unannotated, *rest.notes))
+    return EffectiveLoads(as_applied(loads, wrong), steady, (*swayed, *wrong))

@@ -168,7 +168,7 @@ def correct_loads(rig: Rig, dots: FloatArray, loads: FloatArray) -> CorrectedLoa
     return replace(corrected, measured=measured)
 
 
-def unnoted_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
+def unannotated_steps(rig: Rig, dots: FloatArray, loads: FloatArray) -> list[float]:
     """When a load began to act that nobody noted, s from the first sample: steps of ``dots`` (n, 2P), m, without a
     change of ``loads`` (n, 3) near them.
     """

@@ -25,8 +25,8 @@ from psd_deflection.studies.check.result import Finding
 from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.search.free import Direction, LoadDirection
 from psd_deflection.studies.discover.search.workspace import Workspace
+from psd_deflection.studies.loads.annotated_times import CorrectedNote, shifted
 from psd_deflection.studies.loads.load_cell import MeasuredLoad
-from psd_deflection.studies.loads.noted_times import CorrectedNote, shifted
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, implied_loads, plateaus
 from psd_deflection.studies.loads.sway import SwayingLoad, swaying
 
@@ -71,7 +71,7 @@ def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
     for p in wrong:
         o = ws.observations[p.recording]
         out += of_plateau(o, p.recording, p, free)
-        for at in _unnoted(p):
+        for at in _unannotated(p):
             out += in_time(
                 o,
                 p.recording,
@@ -80,18 +80,19 @@ def directions(ws: Workspace, wrong: Sequence[Plateau]) -> list[LoadDirection]:
     return out
 
 
-def _unnoted(p: Plateau) -> list[int]:
+def _unannotated(p: Plateau) -> list[int]:
     """Return the samples at which it began and ended, if nothing was noted then."""
-    return [*([p.first] if p.unnoted else []), *([p.last] if p.end_unnoted else [])]
+    return [*([p.first] if p.unannotated else []), *([p.last] if p.end_unannotated else [])]
 
 
 def in_time(o: Observation, recording: int, note: CorrectedNote) -> list[LoadDirection]:
     """Return the time of a ``note`` and, if its load was applied slowly, how long that took."""
-    acted = shifted(note, o.loads, o.period)
+    effective = shifted(note, o.loads, o.period)
     none = (0.0, 0.0) if note.took > 0.0 else (0.0,)
-    changes = [acted([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
+    changes = [effective([float(k == axis) for k in range(len(none))]) for axis in range(len(none))]
     return [
-        LoadDirection(recording, change, FREE_MOMENTS, note, axis, acted, none) for axis, change in enumerate(changes)
+        LoadDirection(recording, change, FREE_MOMENTS, note, axis, effective, none)
+        for axis, change in enumerate(changes)
     ]
 
 
@@ -160,5 +161,5 @@ def _timed(ws: Workspace, p: Plateau) -> Plateau:
         if isinstance(d, LoadDirection) and d.recording == p.recording and isinstance(d.of, CorrectedNote):
             period = ws.observations[d.recording].period
             moved[round(d.of.applied / period)] = round(d.of.moved(d.sizes, period).applied / period)
-    first, last = (moved.get(at, at) if at in _unnoted(p) else at for at in (p.first, p.last))
+    first, last = (moved.get(at, at) if at in _unannotated(p) else at for at in (p.first, p.last))
     return dataclasses.replace(p, first=first, last=last)
