@@ -68,7 +68,7 @@ BOUNDED_BY = {
     'ros/chain.py:_inputs': 'the links of the chain',
     'ros/follow.py:_goals': 'MOST_WAITING, and MOST_GOALS a second that end within ANSWER_S of being replaced',
     'ros/chain.py:_reported': 'the links of the chain',
-    'ros/chain.py:_wires': 'the links of the chain',
+    'ros/chain.py:_sinks': 'the links of the chain',
     'ros/log.py:_lines': 'MOST_LINES',
     'ros/node.py:_published': 'our own topics',
     'ros/wires.py:_publishers': 'our own topics',

@@ -149,17 +149,17 @@ def main() -> int:
         session.close()
     finally:
         qemu.end()
-    wire = session.acquisition.counters
+    counters = session.acquisition.counters
     print(
-        f'firmware in qemu: {checked.samples} samples in {checked.span_s:.1f} s, {wire.lost} lost '
-        f'({wire.device_overruns} dropped by the device), {checked.wrong} wrong, {bad + wire.bad} bad frames, '
-        f'{wire.restarts} restarts, skew {clock.skew_ppm:.1f} ppm, PING median {trip * 1e3:.2f} ms'
+        f'firmware in qemu: {checked.samples} samples in {checked.span_s:.1f} s, {counters.lost} lost '
+        f'({counters.device_overruns} dropped by the device), {checked.wrong} wrong, {bad + counters.bad} bad frames, '
+        f'{counters.restarts} restarts, skew {clock.skew_ppm:.1f} ppm, PING median {trip * 1e3:.2f} ms'
     )
     # On a busy host the device in qemu drops samples: those sent and those reported as dropped must make up the time.
-    enough = checked.enough.is_set() and checked.samples + wire.lost >= 0.95 * 1000 * checked.span_s
+    enough = checked.enough.is_set() and checked.samples + counters.lost >= 0.95 * 1000 * checked.span_s
     enough = enough and checked.samples > 1000
-    silent = wire.lost > wire.device_overruns or (wire.lost > 0 and wire.device_dropped == 0)
-    good = enough and not (checked.wrong or bad or wire.bad or wire.restarts or silent)
+    silent = counters.lost > counters.device_overruns or (counters.lost > 0 and counters.device_dropped == 0)
+    good = enough and not (checked.wrong or bad or counters.bad or counters.restarts or silent)
     print('firmware: OK' if good else 'firmware: FAILED')
     return 0 if good else 1
 

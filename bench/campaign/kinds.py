@@ -71,7 +71,7 @@ def _set(line: Line, attributes: Mapping[str, object]) -> None:
 
 def _changed(change: Callable[[Line, bytes], bytes | None], seconds: float) -> Act:
     """Each frame goes through ``change``; None leaves it as it is."""
-    return lambda line, pid: _while(seconds, wire=lambda identity, frame: change(line, frame))(line, pid)
+    return lambda line, pid: _while(seconds, tamper=lambda identity, frame: change(line, frame))(line, pid)
 
 
 def _once(change: Callable[[Line, bytes], bytes]) -> Act:
@@ -80,11 +80,11 @@ def _once(change: Callable[[Line, bytes], bytes]) -> Act:
     def act(line: Line, pid: int) -> None:
         first = iter((change,))
 
-        def wire(line: Line, frame: bytes) -> bytes | None:
+        def tamper(line: Line, frame: bytes) -> bytes | None:
             todo = next(first, None)
             return todo(line, frame) if todo is not None else None
 
-        _changed(wire, 0.03)(line, pid)
+        _changed(tamper, 0.03)(line, pid)
 
     return act
 
@@ -200,7 +200,7 @@ def _swapped(line: Line, pid: int) -> None:
     waiting: list[bytes] = []
     done: list[bool] = []
 
-    def wire(identity: int, frame: bytes) -> bytes | None:
+    def tamper(identity: int, frame: bytes) -> bytes | None:
         if done:
             return None
         if not waiting:
@@ -211,7 +211,7 @@ def _swapped(line: Line, pid: int) -> None:
             line.taken_by_fault.discard(identity)
         return None
 
-    _while(0.02, wire=wire)(line, pid)
+    _while(0.02, tamper=tamper)(line, pid)
     line.inject(waiting[0] if waiting else b'')
     pause(0.01)
 

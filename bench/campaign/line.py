@@ -47,7 +47,7 @@ LOOK_S = 0.005
 QUIET_LOOKS = 5
 READ_LIMIT_S = 5.0
 
-Wire = Callable[[int, bytes], bytes | None]
+Tamper = Callable[[int, bytes], bytes | None]
 """What becomes of a sample's frame on the line; None where it arrives as it is."""
 
 
@@ -79,7 +79,7 @@ class Line:
         self.random = random.Random(1)
         self.taken_by_fault: set[int] = set()
         self.sent = 0
-        self.wire: Wire | None = None
+        self.tamper: Tamper | None = None
         self.mute = False
         self.hold = False
         self.obedient = False
@@ -248,7 +248,7 @@ class Line:
             counts[3:] = [high - DIGIT // 2, 0, 16384]
         flags, self.flags = self.flags, 0
         frame = encode(SampleFrame(flags, seq % 2**32, max(t_us, 0), tuple(counts)))
-        changed = self.wire(identity, frame) if self.wire is not None else None
+        changed = self.tamper(identity, frame) if self.tamper is not None else None
         if changed is not None:
             self.taken_by_fault.add(identity)
             frame = changed

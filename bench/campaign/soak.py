@@ -316,13 +316,13 @@ def simulated_time(hours: float) -> bool:
         numbers = first + second + np.arange(1000)
         counts = rng.integers(-13, 14, (1000, 6))
         counts[:, [2, 5]] += 16384
-        wire = sample_frames(numbers, numbers * 1000, counts)
+        encoded = sample_frames(numbers, numbers * 1000, counts)
         late = rng.exponential(50_000, 50).astype(np.int64).tolist()
         for number, read in enumerate(late):
             true_last = round((second + 20 * number + 19) * MS / (1.0 + SKEW))
             arrival = -(-true_last // MS) * MS + 200_000 + read
             size = 20 * (FRAME.itemsize + 2)
-            piece = wire[number * size : (number + 1) * size]
+            piece = encoded[number * size : (number + 1) * size]
             acquisition.feed(decoder.feed(piece + (once_a_second if number == 0 else b'')), arrival)
             while not acquisition.queue.empty():
                 item = acquisition.queue.get()

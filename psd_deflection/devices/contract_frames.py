@@ -16,7 +16,7 @@ from psd_deflection import __version__
 from psd_deflection.base.errors import DeviceError
 from psd_deflection.devices.device import (
     OUTPUT_LIMIT,
-    WIRE_BITS,
+    PROTOCOL_BITS,
     Answer,
     Device,
     PowerUp,
@@ -269,7 +269,7 @@ class SimulatedFrames:
         If no room is left, a sample is taken and dropped.
         """
         out = bytearray()
-        top, wide = 2 ** (self._bits - 1) - 1, self._bits > WIRE_BITS
+        top, wide = 2 ** (self._bits - 1) - 1, self._bits > PROTOCOL_BITS
         while self.due_in_ns(since_power_up_ns) <= 0:
             number = self._feed.taken
             row = self._feed.next()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 PSDS = 'psds'
 """Key of a HELLO: the number of PSDs, 2 if it is absent."""
 
-WIRE_BITS = 16
+PROTOCOL_BITS = 16
 """Bits of a count unless the device says otherwise."""
 
 OUTPUT_LIMIT = 4096
@@ -117,7 +117,7 @@ class Device:
 def described(rig: Rig) -> dict[str, object]:
     """What a simulated device says beside ``volts_per_count``: bits and PSDs if they are not the usual ones."""
     bits, psds = rig.converter.bits, len(rig.psds)
-    return ({'bits': bits} if bits != WIRE_BITS else {}) | described_psds(psds)
+    return ({'bits': bits} if bits != PROTOCOL_BITS else {}) | described_psds(psds)
 
 
 def described_psds(psds: int) -> dict[str, object]:
@@ -137,10 +137,10 @@ def converter_parameters(info: Mapping[str, object]) -> dict[str, object]:
     if rate is not None:
         out['converter.sample_rate_hz'] = rate
     if volts is not None:
-        bits = info.get('bits', WIRE_BITS)
+        bits = info.get('bits', PROTOCOL_BITS)
         if not isinstance(bits, int) or not LEAST_BITS <= bits <= MOST_BITS:
-            bits = WIRE_BITS
-        if bits != WIRE_BITS:
+            bits = PROTOCOL_BITS
+        if bits != PROTOCOL_BITS:
             out['converter.bits'] = bits
         out['converter.full_scale'] = round(volts * 2.0 ** (bits - 1), 6)
     return out

@@ -30,9 +30,9 @@ from psd_deflection.ros.names import BASE, END, END_REST, RECORD, REST, TIP, ZER
 from psd_deflection.ros.node import AUTOSTART, BaseNode, Health, serve
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.services import Zeroed, add_rig_services
+from psd_deflection.ros.sinks import InputRecorder, PublisherSink, topics_of
 from psd_deflection.ros.topics import JOINT_STATES, PUBLISHED
 from psd_deflection.ros.transforms import FramePublisher, installed, static_transforms, transform_message
-from psd_deflection.ros.wires import InputRecorder, PublisherSink, topics_of
 from psd_deflection.run.chain import ChainSession, Composed
 from psd_deflection.run.diagnostics import ERROR, OK, STALE, WARN, HealthReporter
 from psd_deflection.run.fanout import subscribed
@@ -60,7 +60,7 @@ class ChainNode(BaseNode[ChainSettings]):
         self.chain: ChainSession | None = None
         self._path, self._given, self._slopes = path, given, slopes
         self._signals = signals
-        self._wires: list[PublisherSink] = []
+        self._sinks: list[PublisherSink] = []
         self._inputs: list[InputRecorder] = []
         self._reported: list[RigPublisher] = []
         self._health: list[HealthReporter] = []
@@ -91,7 +91,7 @@ class ChainNode(BaseNode[ChainSettings]):
         else:
             self.log('tf2_msgs is not installed: no frames on /tf', WARNING)
         for name, rig in zip(file.names, file.rigs, strict=True):
-            self._wires.append(PublisherSink(node, topics_of(rig), name))
+            self._sinks.append(PublisherSink(node, topics_of(rig), name))
             self._inputs.append(InputRecorder(node, subscribed(rig), name))
         if any(joint.name for joint in file.joints):
             self.gate.listen(JOINT_STATES, self._joints_fault, self._joints)
@@ -106,9 +106,9 @@ class ChainNode(BaseNode[ChainSettings]):
         try:
             self._health = [HealthReporter(session) for session in chain.sessions]
             self._reported = []
-            for wire, inputs, session in zip(self._wires, self._inputs, chain.sessions, strict=True):
-                session.fanout.wires.insert(0, wire)
-                reported = RigPublisher(wire, session)
+            for sink, inputs, session in zip(self._sinks, self._inputs, chain.sessions, strict=True):
+                session.fanout.sinks.insert(0, sink)
+                reported = RigPublisher(sink, session)
                 session.fanout.change_sinks.append(reported)
                 session.processing.sinks.append(reported)
                 self._reported.append(reported)
@@ -123,21 +123,21 @@ class ChainNode(BaseNode[ChainSettings]):
     def activate(self) -> None:
         """Publish."""
         super().activate()
-        for wire in self._wires:
-            wire.active = True
+        for sink in self._sinks:
+            sink.active = True
         if self._frames is not None:
             now = time.time_ns()
             self._frames.fix([t for rig in self._file.rigs for t in static_transforms(rig, now)])
         for reported in self._reported:
             reported.notify()
-        topics = [self._end.topic_name, *(w.names((DEFLECTION_WITH_COVARIANCE,))[0] for w in self._wires)]
+        topics = [self._end.topic_name, *(w.names((DEFLECTION_WITH_COVARIANCE,))[0] for w in self._sinks)]
         self.log(f'publishing {", ".join(topics)} …; services {ZERO} and {RECORD} of {NODE_NAME}')
 
     def deactivate(self) -> None:
         """Publish no more; the rigs are read on."""
         super().deactivate()
-        for wire in self._wires:
-            wire.active = False
+        for sink in self._sinks:
+            sink.active = False
 
     def cleanup(self) -> None:
         """End the rigs."""

@@ -27,8 +27,8 @@ from psd_deflection.ros.node import BaseNode, serve
 from psd_deflection.ros.parameters import LiveParameters
 from psd_deflection.ros.running import ros
 from psd_deflection.ros.services import Zeroed, add_rig_services
+from psd_deflection.ros.sinks import InputRecorder, PublisherSink, VoltsPublisher, topics_of
 from psd_deflection.ros.transforms import TransformPublisher, installed
-from psd_deflection.ros.wires import InputRecorder, PublisherSink, VoltsPublisher, topics_of
 from psd_deflection.run.diagnostics import STALE, HealthReporter
 from psd_deflection.run.fanout import subscribed
 from psd_deflection.run.monitor.start import Views, start_views
@@ -67,18 +67,18 @@ class EstimatorNode(BaseNode[Rig]):
     def set_up(self) -> None:
         """Make what is on the graph while the node lives."""
         add_rig_services(self.node, lambda: self.session, self._zero, lambda session, on: [session.record(on)])
-        self._wire = PublisherSink(self.node, topics_of(self.settings))
+        self._sink = PublisherSink(self.node, topics_of(self.settings))
         self._inputs = InputRecorder(self.node, subscribed(self.settings))
 
     def watched(self) -> Iterable[str]:
         """The estimate: whoever publishes that publishes all the rest."""
-        return self._wire.names((DEFLECTION,))
+        return self._sink.names((DEFLECTION,))
 
     def _make_views(self, session: Session) -> None:
         """What the parameters ask for beside the messages of the records."""
         shown = session.rig.monitor
         if shown.publish_volts:
-            session.processing.sinks.append(VoltsPublisher(self._wire, shown.frame_prefix))
+            session.processing.sinks.append(VoltsPublisher(self._sink, shown.frame_prefix))
         if shown.publish_tf and installed():
             self._transforms = TransformPublisher(self.node, session.rig)
             session.processing.sinks.append(self._transforms)
@@ -93,7 +93,7 @@ class EstimatorNode(BaseNode[Rig]):
     def configure(self) -> None:
         """Open the port and let samples flow; nothing is published yet."""
         node, rig, unzeroed = self.full_name(), self.settings, self._live.unzeroed
-        self._wire.offer(topics_of(rig))
+        self._sink.offer(topics_of(rig))
         self._inputs.offer(subscribed(rig))
         session = self._signals.interruptible(lambda: Session(rig, self.log, node, unzeroed))
         self.session = session
@@ -101,8 +101,8 @@ class EstimatorNode(BaseNode[Rig]):
             self._live.session = session
             self._live.show()
             self._health = HealthReporter(session)
-            session.fanout.wires.insert(0, self._wire)
-            self._rig_reported = RigPublisher(self._wire, session)
+            session.fanout.sinks.insert(0, self._sink)
+            self._rig_reported = RigPublisher(self._sink, session)
             session.fanout.change_sinks.append(self._rig_reported)
             session.processing.sinks.append(self._rig_reported)
             self._make_views(session)
@@ -117,7 +117,7 @@ class EstimatorNode(BaseNode[Rig]):
     def activate(self) -> None:
         """Publish."""
         super().activate()
-        self._wire.active = True
+        self._sink.active = True
         if self._transforms is not None:
             self._transforms.active = True
         if self._rig_reported is not None:
@@ -126,7 +126,7 @@ class EstimatorNode(BaseNode[Rig]):
             self._markers.session = self.session
         domain = os.environ.get('ROS_DOMAIN_ID') or '0'
         node = self.full_name()
-        topics = ', '.join(self._wire.names((DEFLECTION, WRENCH, SAMPLES, DIAGNOSTICS)))
+        topics = ', '.join(self._sink.names((DEFLECTION, WRENCH, SAMPLES, DIAGNOSTICS)))
         self.log(f'publishing on ROS domain {domain}: {topics} …; services {node}/zero, {node}/record')
 
     def deactivate(self) -> None:
@@ -161,7 +161,7 @@ class EstimatorNode(BaseNode[Rig]):
 
     def _silence(self) -> None:
         super().deactivate()
-        self._wire.active = False
+        self._sink.active = False
         if self._transforms is not None:
             self._transforms.active = False
         if self._markers is not None:
@@ -187,7 +187,7 @@ class EstimatorNode(BaseNode[Rig]):
         now = time.time_ns()
         entry = DiagnosticEntry('psd_deflection: node', STALE, 'not configured', ())
         (message,) = to_messages(self.named(DiagnosticReport(now, (entry,))))
-        self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)
+        self._sink.put(message.topic, message.type, cdr.encode(message.type, message.fields), now)
 
 
 def run(

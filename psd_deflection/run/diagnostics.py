@@ -66,19 +66,19 @@ class HealthReporter:
         """The report for the time since the last one. ``t_ns``: now, ROS time."""
         s = self._session
         s.settle()
-        wire, pipeline = s.acquisition.counters, s.pipeline.counters
-        dropped = wire.queue_dropped + s.recorder.dropped
+        counters, pipeline = s.acquisition.counters, s.pipeline.counters
+        dropped = counters.queue_dropped + s.recorder.dropped
         now = CounterSnapshot(
             t_ns,
-            wire.samples,
-            wire.lost,
-            wire.bad,
+            counters.samples,
+            counters.lost,
+            counters.bad,
             dropped,
             pipeline.blocks,
             pipeline.estimates,
             pipeline.degraded,
             s.pipeline.estimator.contradictions,
-            wire.clock_jumps,
+            counters.clock_jumps,
             s.rejected.total(),
         )
         # The first report counts from the start. The time that it covers is unknown, so it gives no rates.
@@ -111,7 +111,7 @@ class HealthReporter:
 
     def _acquisition(self, new: CounterSnapshot, rate: str) -> DiagnosticEntry:
         s = self._session
-        wire = s.acquisition.counters
+        counters = s.acquisition.counters
         level, message = OK, 'samples flow'
         if s.simulated:
             level, message = WARN, 'samples of the simulated rig flow: no port is given'
@@ -125,41 +125,41 @@ class HealthReporter:
         values = [
             ('port', s.rig.acquisition.port),
             ('rate (samples/s)', rate),
-            ('samples', str(wire.samples)),
-            ('lost', str(wire.lost)),
-            *((f'lost: {cause}', str(count)) for cause, count in sorted(wire.lost_by.items())),
-            ('repeated', str(wire.repeated)),
-            ('bad frames', str(wire.bad)),
-            *((f'bad frames: {reason}', str(count)) for reason, count in sorted(wire.bad_frames.items())),
-            ('dropped by the device', str(wire.device_overruns)),
-            ('dropped by a full queue', str(wire.queue_dropped)),
-            ('device restarts', str(wire.restarts)),
-            ('disconnects', str(wire.disconnects)),
-            ('silences', str(wire.silences)),
-            ('rejected on coming back', str(wire.rejected_reopenings)),
+            ('samples', str(counters.samples)),
+            ('lost', str(counters.lost)),
+            *((f'lost: {cause}', str(count)) for cause, count in sorted(counters.lost_by.items())),
+            ('repeated', str(counters.repeated)),
+            ('bad frames', str(counters.bad)),
+            *((f'bad frames: {reason}', str(count)) for reason, count in sorted(counters.bad_frames.items())),
+            ('dropped by the device', str(counters.device_overruns)),
+            ('dropped by a full queue', str(counters.queue_dropped)),
+            ('device restarts', str(counters.restarts)),
+            ('disconnects', str(counters.disconnects)),
+            ('silences', str(counters.silences)),
+            ('rejected on coming back', str(counters.rejected_reopenings)),
             *((f'messages rejected: {topic}', str(count)) for topic, count in sorted(s.rejected.items())),
             ('blocks waiting', str(s.acquisition.queue.blocks)),
             ('inputs dropped, because the pipeline was held up', str(s.processing.requests_dropped)),
         ]
         values.append(('simulated', 'yes' if s.simulated else 'no'))
         values += s.acquisition.source.describe().items()
-        if wire.temperature is not None:
-            values.append(('device temperature (degC)', f'{wire.temperature:.2f}'))
+        if counters.temperature is not None:
+            values.append(('device temperature (degC)', f'{counters.temperature:.2f}'))
         return DiagnosticEntry('psd_deflection: acquisition', level, message, tuple(values))
 
     def _clock(self, new: CounterSnapshot) -> DiagnosticEntry:
         acquisition = self._session.acquisition
-        clock, wire = acquisition.clock_state(), acquisition.counters
+        clock, counters = acquisition.clock_state(), acquisition.counters
         stepped = acquisition.system_clock_step_ns()
         values = [
             ('skew (ppm)', f'{clock.skew_ppm:z.2f}'),
             ('offset (ns)', str(clock.offset_ns)),
             ('residual (us)', f'{clock.residual_ns / 1e3:.1f}'),
             ('seconds in the fit', str(clock.points)),
-            ('device clock jumps', str(wire.clock_jumps)),
+            ('device clock jumps', str(counters.clock_jumps)),
             ('laid anew', str(clock.resets)),
-            ('pings', str(wire.pings)),
-            ('pings answered', str(wire.pongs)),
+            ('pings', str(counters.pings)),
+            ('pings answered', str(counters.pongs)),
             ('system clock moved since the start (ms)', f'{stepped / 1e6:.3f}'),
         ]
         if clock.round_trip_ns is not None:
@@ -168,8 +168,8 @@ class HealthReporter:
         late = 'not known, no ping is answered' if clock.round_trip_ns is None else f'{clock.round_trip_ns / 1e6:.3f}'
         values += [
             ('stamps late by at most (ms)', late),
-            ('steps of the time map', str(wire.map_steps)),
-            ('samples with stamps 1 ns apart', str(wire.squeezed)),
+            ('steps of the time map', str(counters.map_steps)),
+            ('samples with stamps 1 ns apart', str(counters.squeezed)),
         ]
         level, message = OK, f'skew {clock.skew_ppm:z.1f} ppm'
         if clock.round_trip_ns is not None and clock.round_trip_ns > LATE_NS:

@@ -36,14 +36,14 @@ def subscribed(rig: Rig) -> tuple[str, ...]:
     return tuple(topic for topic in INPUTS if rig.estimator.filter != 'none' or topic not in FILTER_INPUTS)
 
 
-class Wire(Protocol):
+class MessageSink(Protocol):
     """Takes encoded messages."""
 
     def put(self, topic: str, type_name: str, cdr: bytes, t_ns: int) -> None:
         """``type_name`` as ``pkg/msg/Name``; ``t_ns`` is the header's stamp."""
 
 
-class ChangeWire(Protocol):
+class ChangeSink(Protocol):
     """Takes changes of parameters, which are not messages."""
 
     def put_change(self, change: ParameterChange) -> None:
@@ -51,18 +51,18 @@ class ChangeWire(Protocol):
 
 
 class Fanout:
-    """A sink of records. ``wires`` in the order in which they are served. ``frame_prefix``: before names of frames."""
+    """A sink of records. ``sinks`` in the order in which they are served. ``frame_prefix``: before names of frames."""
 
     def __init__(self, frame_prefix: str = '') -> None:
         self._frame_prefix = frame_prefix
-        self.wires: list[Wire] = []
-        self.change_sinks: list[ChangeWire] = []
+        self.sinks: list[MessageSink] = []
+        self.change_sinks: list[ChangeSink] = []
 
     def put(self, record: Record) -> None:
         """Encode and hand on."""
         if isinstance(record, ParameterChange):
-            for change_wire in self.change_sinks:
-                change_wire.put_change(record)
+            for change_sink in self.change_sinks:
+                change_sink.put_change(record)
             return
         last: object = None
         encoded = b''
@@ -70,8 +70,8 @@ class Fanout:
             # The same message on two topics is encoded once.
             if fields is not last:
                 last, encoded = fields, cdr.encode(type_name, fields)
-            for wire in self.wires:
-                wire.put(topic, type_name, encoded, t_ns)
+            for sink in self.sinks:
+                sink.put(topic, type_name, encoded, t_ns)
 
     def close(self) -> None:
         """Nothing is held back."""

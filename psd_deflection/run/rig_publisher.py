@@ -15,7 +15,7 @@ from psd_deflection.recordings import cdr
 from psd_deflection.recordings.provenance import provenance
 from psd_deflection.records import ENVIRONMENT, KNOWN_LOAD, ParameterChange, Record, RigState, SampleBlock
 from psd_deflection.rig.config import Rig
-from psd_deflection.run.fanout import Wire
+from psd_deflection.run.fanout import MessageSink
 from psd_deflection.run.session import Session
 
 MEMORY_S = 10.0
@@ -34,8 +34,8 @@ class RigPublisher:
     replays bit for bit from there; :meth:`notify` encodes and publishes it, in its own thread.
     """
 
-    def __init__(self, wire: Wire, session: Session) -> None:
-        self._wire = wire
+    def __init__(self, sink: MessageSink, session: Session) -> None:
+        self._sink = sink
         self._session = session
         self._reported: Mapping[str, object] | None = None
         self._last = ParameterChange(0, 0, ())
@@ -117,4 +117,4 @@ class RigPublisher:
 
     def _send(self, state: RigState) -> None:
         for message in to_messages(state):
-            self._wire.put(message.topic, message.type, cdr.encode(message.type, message.fields), time.time_ns())
+            self._sink.put(message.topic, message.type, cdr.encode(message.type, message.fields), time.time_ns())

@@ -35,7 +35,7 @@ from psd_deflection.run.recorder import Recorder
 from psd_deflection.run.repeats import RateLimitedLog
 from psd_deflection.run.session_texts import ANEW, load_text, mark_text, zero_text
 from psd_deflection.run.simulated_rig import SimulatedRigProcess, simulates
-from psd_deflection.run.watcher import Watcher, WatcherWire
+from psd_deflection.run.watcher import Watcher, WatcherSink
 from psd_deflection.run.zero_store import ZeroStore
 
 STALLED_S = 5.0
@@ -193,9 +193,9 @@ class Session:
         if self.rig.acquisition.realtime:
             self._report(lock_memory())
         # The recorder comes last: publishing has priority.
-        self.fanout.wires.append(self.recorder)
+        self.fanout.sinks.append(self.recorder)
         if self.watcher is not None and self.watcher.keeps:
-            self.fanout.wires.append(WatcherWire(self.watcher))
+            self.fanout.sinks.append(WatcherSink(self.watcher))
         self.processing.start()
         if self.rig.acquisition.record:
             asked = self.record(True)

@@ -285,7 +285,7 @@ def _size_of(path: Path) -> int:
     return size
 
 
-class WatcherWire:
+class WatcherSink:
     """The watcher as one of the wires of the fan-out."""
 
     def __init__(self, watcher: Watcher) -> None:

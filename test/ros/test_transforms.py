@@ -20,8 +20,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 
 from psd_deflection.records import DeflectionEstimate  # noqa: E402
 from psd_deflection.rig.config import Rig, load_rig  # noqa: E402
+from psd_deflection.ros.sinks import topics_of  # noqa: E402
 from psd_deflection.ros.transforms import TransformPublisher, static_transforms, tip_transform  # noqa: E402
-from psd_deflection.ros.wires import topics_of  # noqa: E402
 from psd_deflection.run.processing import RecordSink  # noqa: E402
 
 AT_NS = 5_000_000_007

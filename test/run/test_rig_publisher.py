@@ -41,7 +41,7 @@ class Running:
         self.reported = RigPublisher(self, cast(Any, session))
         self._session = session
         self._fanout = Fanout()
-        self._fanout.wires.append(self)
+        self._fanout.sinks.append(self)
         self._fanout.change_sinks.append(self.reported)
         self.reported.notify()
         self.records: list[Record] = []

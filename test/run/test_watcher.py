@@ -28,7 +28,7 @@ from psd_deflection.run import watcher as module
 from psd_deflection.run.diagnostics import OK, WARN, HealthReporter
 from psd_deflection.run.fanout import Fanout
 from psd_deflection.run.session import Session
-from psd_deflection.run.watcher import Watcher, WatcherWire
+from psd_deflection.run.watcher import Watcher, WatcherSink
 from psd_deflection.studies.discover.from_recordings import read_observation
 from test.heard import WAIT_S
 from test.run.conftest import Estimates, ScriptedDevice
@@ -50,7 +50,7 @@ class Chain:
         self.watcher = Watcher(self.pipeline, texts(self.logged.append), {'serial': 'abc'}, '/arm/psd_estimator')
         self.fanout = Fanout()
         if self.watcher.keeps:
-            self.fanout.wires.append(WatcherWire(self.watcher))
+            self.fanout.sinks.append(WatcherSink(self.watcher))
         self._rig = RigSimulator(rig, 3)
         self._seq = 0
         self._volts = rig.converter.volts_per_count

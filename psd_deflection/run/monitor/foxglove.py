@@ -199,7 +199,7 @@ class FeedBeside(Feed):
         self._present = dict(rig.flat())
         self._reported = False
         self._fanout = Fanout(rig.monitor.frame_prefix)
-        self._fanout.wires.append(server)
+        self._fanout.sinks.append(server)
 
     def put(self, record: Record) -> None:
         """Take one record."""

@@ -65,22 +65,22 @@ def of_pipeline(pipeline: Pipeline) -> list[Family]:
 
 def of_session(session: Session) -> list[Family]:
     """What was acquired, lost, rejected and recorded, and what was computed."""
-    wire, recorder = session.acquisition.counters, session.recorder
+    device, recorder = session.acquisition.counters, session.recorder
     out = [
-        counter('samples', 'Samples that the device sent', wire.samples),
-        counters('samples_lost', 'cause', 'Samples that never came', wire.lost_by),
-        counter('samples_dropped', 'Samples that came, and for which this machine was too slow', wire.queue_dropped),
-        counters('frames_bad', 'reason', 'Frames of the wire that could not be read', wire.bad_frames),
-        counter('device_disconnects', 'Times that the port was gone', wire.disconnects),
-        counter('device_restarts', 'Times that the device began anew', wire.restarts),
+        counter('samples', 'Samples that the device sent', device.samples),
+        counters('samples_lost', 'cause', 'Samples that never came', device.lost_by),
+        counter('samples_dropped', 'Samples that came, and for which this machine was too slow', device.queue_dropped),
+        counters('frames_bad', 'reason', 'Frames of the wire that could not be read', device.bad_frames),
+        counter('device_disconnects', 'Times that the port was gone', device.disconnects),
+        counter('device_restarts', 'Times that the device began anew', device.restarts),
         counters('messages_rejected', 'topic', 'Messages of other nodes that could not be used', session.rejected),
         counter('record_dropped', 'Messages for which the disk was too slow', recorder.dropped),
         Family('recording', 'gauge', '1 while a recording is written', (({}, float(recorder.folder is not None)),)),
         *of_pipeline(session.pipeline),
     ]
-    if wire.temperature is not None:
+    if device.temperature is not None:
         about = 'Temperature that the device measures'
-        out.append(Family('device_temperature_celsius', 'gauge', about, (({}, wire.temperature),), 'celsius'))
+        out.append(Family('device_temperature_celsius', 'gauge', about, (({}, device.temperature),), 'celsius'))
     if session.watcher is not None:
         watch = session.watcher.watch
         out.append(counter('watch_alarms', 'Times that the rig was found to be no longer its model', watch.alarms))

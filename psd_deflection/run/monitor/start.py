@@ -76,10 +76,10 @@ def _start_foxglove(session: Session, log: LogCallback, views: Views, reports: b
     views.parts.append(server)
     log(server.words())
     fanout = Fanout(session.rig.monitor.frame_prefix)
-    fanout.wires.append(server)
+    fanout.sinks.append(server)
     rig_reported = RigPublisher(server, session)
     rig_reported.notify()
-    session.fanout.wires.append(server)
+    session.fanout.sinks.append(server)
     session.fanout.change_sinks.append(rig_reported)
     session.input_sinks.append(fanout)
     if reports:

@@ -31,7 +31,7 @@ from psd_deflection.studies.discover.setup.applied import directions, in_time, l
 from psd_deflection.studies.discover.setup.cleaning import clean, time_loads
 from psd_deflection.studies.discover.setup.hidden import beginning
 from psd_deflection.studies.discover.setup.redundant import FourthReading, fourth_reading, solved
-from psd_deflection.studies.discover.setup.setup import likely_delays, wire
+from psd_deflection.studies.discover.setup.setup import correct_wiring, likely_delays
 from psd_deflection.studies.loads.annotated_times import CorrectedLoads
 from psd_deflection.studies.loads.plateaus import Plateau, PlateauLoads, WrongNote, as_applied, wrong_notes_against
 from psd_deflection.studies.loads.sway import SwayingLoad, excluded, swung
@@ -110,7 +110,7 @@ def cleaned(recorded: Recorded) -> Recorded:
 def put_right(recorded: Recorded) -> Recorded:
     """With loads at the times at which they acted, and with wiring, signs and units as they are."""
     timed = [time_loads(o) for o in recorded.observations]
-    observations, wrong, lines = wire([o for o, _ in timed], recorded.known)
+    observations, wrong, lines = correct_wiring([o for o, _ in timed], recorded.known)
     gap = 0.0
     if wrong or any(corrected is not None and corrected.notes for _, corrected in timed):
         stated = Workspace(recorded.observations, recorded.known)

@@ -95,9 +95,9 @@ def decode(stream: bytes) -> list[Frame]:
     return FrameDecoder().feed(b'\x00' + stream)
 
 
-@pytest.mark.parametrize(('label', 'wire', 'frame'), GOOD, ids=[c[0] for c in GOOD])
-def test_a_frame_and_its_bytes(label: str, wire: str, frame: GoodFrame) -> None:
-    received = bytes.fromhex(wire)
+@pytest.mark.parametrize(('label', 'encoded', 'frame'), GOOD, ids=[c[0] for c in GOOD])
+def test_a_frame_and_its_bytes(label: str, encoded: str, frame: GoodFrame) -> None:
+    received = bytes.fromhex(encoded)
     assert decode(received) == [frame]
     if not (isinstance(frame, HelloFrame) and frame.version != 1):
         assert encode(frame, wide=label == WIDE) == received
@@ -108,9 +108,9 @@ def test_a_sample_goes_with_16_bits_a_count_unless_asked_otherwise() -> None:
     assert len(encode(SAMPLE, wide=True)) == len(encode(SAMPLE)) + 2 * len(SAMPLE.counts)
 
 
-@pytest.mark.parametrize(('label', 'wire', 'reason'), BAD, ids=[c[0] for c in BAD])
-def test_bytes_that_are_no_frame(label: str, wire: str, reason: BadReason) -> None:
-    received = bytes.fromhex(wire)
+@pytest.mark.parametrize(('label', 'encoded', 'reason'), BAD, ids=[c[0] for c in BAD])
+def test_bytes_that_are_no_frame(label: str, encoded: str, reason: BadReason) -> None:
+    received = bytes.fromhex(encoded)
     assert decode(received + SAMPLE_BYTES) == [BadFrame(reason, len(received) - 1), SAMPLE]
 
 
@@ -213,18 +213,18 @@ def test_random_bytes_never_raise_and_never_grow(stream: bytes) -> None:
 
 @given(samples, st.data())
 def test_one_flipped_bit_never_yields_a_sample(sample: SampleFrame, data: st.DataObject) -> None:
-    wire = bytearray(encode(sample))
-    bit = data.draw(st.integers(0, 8 * len(wire) - 1))
-    wire[bit // 8] ^= 1 << (bit % 8)
-    got = decode(bytes(wire) + b'\x00')
+    encoded = bytearray(encode(sample))
+    bit = data.draw(st.integers(0, 8 * len(encoded) - 1))
+    encoded[bit // 8] ^= 1 << (bit % 8)
+    got = decode(bytes(encoded) + b'\x00')
     assert not any(isinstance(f, SampleFrame) for f in got)
 
 
 def test_every_single_flipped_bit_of_one_sample_is_noticed() -> None:
     for bit in range(8 * len(SAMPLE_BYTES)):
-        wire = bytearray(SAMPLE_BYTES)
-        wire[bit // 8] ^= 1 << (bit % 8)
-        assert not any(isinstance(f, SampleFrame) for f in decode(bytes(wire) + b'\x00')), bit
+        encoded = bytearray(SAMPLE_BYTES)
+        encoded[bit // 8] ^= 1 << (bit % 8)
+        assert not any(isinstance(f, SampleFrame) for f in decode(bytes(encoded) + b'\x00')), bit
 
 
 @st.composite

@@ -43,7 +43,7 @@ def test_a_load_with_the_other_sign_has_any_size(monkeypatch: pytest.MonkeyPatch
     """It pulled the other way, half as much as noted: that is no unit, but the sign is wrong."""
     o = make_observation(warm=None)
     observed = dataclasses.replace(o, loads=o.loads * [1.0, -2.0, 1.0])
-    corrected, findings, lines = setup.wire([observed], ())
+    corrected, findings, lines = setup.correct_wiring([observed], ())
     assert [(f.name, f.where) for f in findings] == [('load_sign', 'fy')]
     np.testing.assert_allclose(corrected[0].loads, o.loads * [1.0, 2.0, 1.0])
     assert lines == {}
@@ -223,7 +223,7 @@ def test_other_wirings_that_are_as_good_are_reported(monkeypatch: pytest.MonkeyP
     file = Wiring.from_rig(o.rig)
     good = [w for w in WIRINGS if len(differences(w, file)) == 1][:4]
     monkeypatch.setattr(setup, 'load_sizes', lambda m, w: (0.0 if w in good else m.squared, np.ones(3)))
-    _, (finding,), _ = setup.wire([o], ())
+    _, (finding,), _ = setup.correct_wiring([o], ())
     assert len(finding.equivalent) == 2
 
 

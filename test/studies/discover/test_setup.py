@@ -24,7 +24,7 @@ from psd_deflection.studies.discover.observation import Observation
 from psd_deflection.studies.discover.result import Discovery
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.cleaning import clean, outliers
-from psd_deflection.studies.discover.setup.setup import likely_delays, likely_jumps, wire
+from psd_deflection.studies.discover.setup.setup import correct_wiring, likely_delays, likely_jumps
 
 RIG = load_rig()
 PUSHES = [(0.0, -40.0, -15.0), (0.0, -40.0, 0.0), (25.0, 0.0, 0.0), (0.0, 15.0, 20.0)]
@@ -95,7 +95,7 @@ def test_wiring_signs_and_units_are_put_right(
 ) -> None:
     o = recorded()
     wrong = mistake(o)
-    (corrected,), findings, lines = wire([wrong], ())
+    (corrected,), findings, lines = correct_wiring([wrong], ())
     assert [(f.name, f.where, f.value, f.fix) for f in findings] == named
     np.testing.assert_array_equal(corrected.volts, o.volts)
     np.testing.assert_allclose(corrected.loads, o.loads, rtol=1e-9)
@@ -108,7 +108,7 @@ def test_wiring_signs_and_units_are_put_right(
     ('factor', 'unit'), [(9.80665e-3, 'kg mm'), (1e-2, 'N cm'), (9.80665e-2, 'kg cm')], ids=['kg mm', 'N cm', 'kg cm']
 )
 def test_the_nearest_of_two_units_that_are_alike_is_named(factor: float, unit: str) -> None:
-    _, findings, _ = wire([loaded(recorded(), 1.0, 1.0, 1.0 / factor)], ())
+    _, findings, _ = correct_wiring([loaded(recorded(), 1.0, 1.0, 1.0 / factor)], ())
     assert [(f.name, f.where, f.value) for f in findings] == [('load_unit', 'tz', factor)]
     assert f'it is noted in {unit} instead' in findings[0].fix
 
@@ -120,19 +120,19 @@ def test_alike_units_differ_where_movement_is_nonlinear() -> None:
     volts = np.asarray(RigSimulator(RIG, 1).step(loads).counts * RIG.converter.volts_per_count, dtype=np.float64)
     for factor in (9.80665e-3, 1e-2):
         annotated = np.asarray(loads / (1.0, 1.0, factor), dtype=np.float64)
-        _, findings, _ = wire([Observation('x', RIG, volts, annotated)], ())
+        _, findings, _ = correct_wiring([Observation('x', RIG, volts, annotated)], ())
         assert [(f.where, f.value) for f in findings] == [('tz', factor)]
 
 
 @pytest.mark.slow
 def test_loads_in_grams_have_one_factor_for_forces_and_torque() -> None:
-    _, findings, _ = wire([loaded(recorded(), *[1.0 / 9.80665e-3] * 3)], ())
+    _, findings, _ = correct_wiring([loaded(recorded(), *[1.0 / 9.80665e-3] * 3)], ())
     assert [(f.where, f.value) for f in findings] == [('fx fy', 9.80665e-3), ('tz', 9.80665e-3)]
 
 
 def test_a_soft_or_stiff_link_is_no_other_unit() -> None:
     for modulus in (6.9e11, 6.9e9, 7.2e10, 5e10):
-        _, findings, _ = wire([recorded(link__youngs_modulus=modulus)], ())
+        _, findings, _ = correct_wiring([recorded(link__youngs_modulus=modulus)], ())
         assert findings == []
 
 
@@ -290,4 +290,4 @@ def test_the_command_prints_the_lines_and_puts_them_into_the_model(
     assert [s['name'] for s in tree['setup']] == ['sample_rate', 'channel_sign']
     # With the model nothing is wrong any more.
     assert clean(read_observation(path, model), ())[1] == []
-    assert wire([read_observation(path, model)], ())[1] == []
+    assert correct_wiring([read_observation(path, model)], ())[1] == []

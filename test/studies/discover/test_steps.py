@@ -33,7 +33,7 @@ from psd_deflection.studies.discover.search.screen import Screen
 from psd_deflection.studies.discover.search.search import Search
 from psd_deflection.studies.discover.search.signatures import Candidate
 from psd_deflection.studies.discover.search.workspace import Workspace
-from psd_deflection.studies.discover.setup.setup import load_sizes, movement_sums, noise_energy, wire
+from psd_deflection.studies.discover.setup.setup import correct_wiring, load_sizes, movement_sums, noise_energy
 from psd_deflection.studies.discover.steps import alternatives
 
 from .test_formulas import RIG, make_observation
@@ -567,12 +567,12 @@ def test_what_comes_close_in_bic_is_a_rival(loss: float, is_rival: bool) -> None
 
 def test_evidence_is_what_the_file_leaves_over_what_is_left() -> None:
     o = make_observation(warm=None)
-    _, (unit,), _ = wire([dataclasses.replace(o, loads=o.loads / [9.80665, 9.80665, 1.0])], ())
+    _, (unit,), _ = correct_wiring([dataclasses.replace(o, loads=o.loads / [9.80665, 9.80665, 1.0])], ())
     # The wiring is right: a unit leaves no more of the movement than another size does.
     assert (unit.name, unit.where) == ('load_unit', 'fx fy')
     assert unit.evidence == pytest.approx(1.0)
     turned = dataclasses.replace(o, volts=o.volts * [1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
-    _, (sign,), _ = wire([turned], ())
+    _, (sign,), _ = correct_wiring([turned], ())
     m, file = movement_sums([turned], ()), Wiring.from_rig(RIG)
     right = dataclasses.replace(file, axes=(('x', '-y'), file.axes[1]))
     energy = noise_energy([turned])

@@ -30,7 +30,7 @@ from psd_deflection.studies.discover.plant_search import discover_in
 from psd_deflection.studies.discover.readings import Readings, ReadingsPlant
 from psd_deflection.studies.discover.search.workspace import Workspace
 from psd_deflection.studies.discover.setup.redundant import fourth, fourth_reading
-from psd_deflection.studies.discover.setup.setup import wire
+from psd_deflection.studies.discover.setup.setup import correct_wiring
 from psd_deflection.studies.discover.setup.slow_noise import corners_of
 from psd_deflection.studies.loads.plate_motion import across_of, across_plate, moved_plate
 
@@ -148,7 +148,7 @@ def test_an_effect_has_the_parameters_of_the_psds_that_there_are() -> None:
 )
 def test_a_wrong_wiring_is_named_and_put_right(world: dict[str, object], reported: list[tuple[str, str]]) -> None:
     given = make_observation(RIG, world=world)
-    (right,), findings, lines = wire([given], ())
+    (right,), findings, lines = correct_wiring([given], ())
     assert [(f.name, f.where) for f in findings] == reported
     assert lines == world
     assert right.volts == pytest.approx(Wiring.from_rig(replace_values(RIG, world)).to_psds(given.volts))
@@ -159,7 +159,7 @@ def test_two_others_that_are_exchanged_are_named_and_put_right() -> None:
     """No parameter says it, so there is no line for it."""
     right = make_observation(RIG, world={'psd_1.axes': ['x', '-y']})
     exchanged = dataclasses.replace(right, volts=right.volts[:, [6, 7, 8, 3, 4, 5, 0, 1, 2]])
-    (corrected,), findings, lines = wire([exchanged], ())
+    (corrected,), findings, lines = correct_wiring([exchanged], ())
     assert [(f.name, f.where) for f in findings] == [('psd_swap', 'psd_1 psd_3'), ('channel_sign', 'y3')]
     assert findings[0].fix.startswith('exchange the cables of psd_1 and psd_3 at the device')
     assert lines == {'psd_1.axes': ['x', '-y']}
@@ -181,7 +181,7 @@ def test_a_wiring_as_the_rig_file_says_it_is_no_finding() -> None:
     file = replace_values(RIG, {'psd_1.axes': ['y', '-x'], 'psd_3.axes': ['-x', 'y']})
     right = make_observation(file)
     read = dataclasses.replace(right, volts=Wiring.from_rig(file).to_psds(right.volts))
-    assert wire([read], ())[1:] == ([], {})
+    assert correct_wiring([read], ())[1:] == ([], {})
 
 
 def test_the_wirings_of_more_psds_are_those_with_two_wrong_ones_and_those_alike() -> None:

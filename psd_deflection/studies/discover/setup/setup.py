@@ -153,7 +153,7 @@ def _over_simulated(observations: Sequence[Observation], base: Sequence[ActiveEf
     return np.asarray(1.0 + np.linalg.lstsq(squares / np.outer(scale, scale), along / scale, rcond=1e-6)[0] / scale)
 
 
-def wire(
+def correct_wiring(
     observations: Sequence[Observation], base: Sequence[ActiveEffect]
 ) -> tuple[list[Observation], list[Finding], dict[str, object]]:
     """The recordings as they would be if wiring, signs and units were right; what was wrong; lines for the rig file."""

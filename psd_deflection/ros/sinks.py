@@ -68,17 +68,17 @@ class PublisherSink:
 class VoltsPublisher:
     """A sink of records: each raw sample as plain numbers, which plots draw; the bag has them as ``/psd/samples``."""
 
-    def __init__(self, wire: PublisherSink, frame_prefix: str) -> None:
-        self._wire = wire
+    def __init__(self, sink: PublisherSink, frame_prefix: str) -> None:
+        self._sink = sink
         self._frame_prefix = frame_prefix
         self._encode = cdr.encoder_of(vector3_stamped.MESSAGE)
 
     def put(self, record: Record) -> None:
         """Publish the samples of a block."""
-        if isinstance(record, SampleBlock) and self._wire.active:
+        if isinstance(record, SampleBlock) and self._sink.active:
             for psd, topic in enumerate(VOLTS[: record.volts.shape[1] // 3], 1):
                 for t_ns, fields in vector3_stamped.from_block(record, psd, self._frame_prefix):
-                    self._wire.put(topic, vector3_stamped.MESSAGE.name, self._encode(fields), t_ns)
+                    self._sink.put(topic, vector3_stamped.MESSAGE.name, self._encode(fields), t_ns)
 
 
 class InputRecorder(InputGate):
